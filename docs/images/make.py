@@ -20,9 +20,10 @@ from omegaconf import OmegaConf
 from PIL import Image
 from torch import Tensor
 
+from devrf.apps.camera_paths import orbit
 from devrf.apps.images import image_grid, scaled, to_bytes
 from devrf.apps.still import still
-from devrf.apps.video import VideoSettings, orbit
+from devrf.apps.video import VideoSettings
 from devrf.checkpoints.checkpoint import load_checkpoint
 from devrf.geometry.cameras import Cameras
 from devrf.methods.base import Renderable
@@ -47,7 +48,8 @@ def scene_columns(run: Path) -> tuple[list[list[Tensor]], list[str]]:
     scene, recipe = data.scene, data.recipe
     shape, film = recipe.model(), VideoSettings(frames=8, height=HEIGHT)
     camera = film.sized(scene.dynamic.test.cameras[[0]])
-    around = orbit(film.sized(scene.static.train.cameras), model.box, film)
+    middle = torch.tensor(model.box.middle)
+    around = orbit(film.sized(scene.static.train.cameras), middle, film)
     filming = Filming(shape, extent(shape).reach, recipe.supersample, recipe.light)
     shots: list[tuple[Cameras, float, str]] = [
         *((camera, time, f"{scene.name}, t = {time:g}") for time in (0.0, 0.5, 1.0)),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import imageio.v3 as iio
@@ -20,20 +19,11 @@ from devrf.apps.images import (
     to_bytes,
 )
 from devrf.apps.still import StillSettings, write_contact_sheet
-from devrf.apps.video import (
-    VideoSettings,
-    bullet_time,
-    held_out_images,
-    held_out_pictures,
-    orbit,
-    time_freeze,
-)
+from devrf.apps.video import VideoSettings, held_out_images, held_out_pictures
 from devrf.apps.video_file import write_pictures
 from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import HeldOutView, truth_image
-from devrf.geometry.box import Box
-from devrf.geometry.cameras import Cameras
 from devrf.rendering.renderer import Renderer
 
 
@@ -124,28 +114,6 @@ def test_a_film_that_fails_leaves_nothing_behind(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-CAMERAS = Cameras.looking_at(
-    torch.tensor([[3.0, 0, 1], [0, 3, 1], [-3, 0, 1], [0, -3, 1]]),
-    torch.zeros(4, 3),
-    focal=20.0,
-    width=15,
-    height=10,
-)
-
-
-def test_an_orbit_circles_the_box_at_the_cameras_distance(cube):
-    settings = VideoSettings(frames=8, orbit_turns=2.0, orbit_elevation=30.0)
-    cameras = orbit(CAMERAS, cube, settings)
-    assert len(cameras) == 8 and (cameras.width, cameras.height) == (15, 10)
-    torch.testing.assert_close(cameras.positions.norm(dim=1), torch.full((8,), math.sqrt(10)))
-    torch.testing.assert_close(cameras.positions[:, 2], torch.full((8,), math.sqrt(10) / 2))
-    # Two turns in eight pictures: a quarter turn each.
-    steps = cameras.positions[:-1, :2] * cameras.positions[1:, :2]
-    torch.testing.assert_close(steps.sum(dim=1), torch.zeros(7), atol=1e-5, rtol=0)
-    toward = torch.nn.functional.normalize(-cameras.positions, dim=1)
-    torch.testing.assert_close(cameras.forwards, toward)
-
-
 def test_held_out_pictures_are_rendered_in_the_films_size_beside_the_truth(
     moving, reference, tiny_scene
 ):
@@ -179,29 +147,13 @@ def test_held_out_images_are_the_nearest_in_time(tiny_scene):
 
 
 def test_rendering_keeps_to_its_seconds():
-    film = VideoSettings(frames=60, fps=20, max_seconds=12)
-    assert film.within_limit(0.2) == film
-    fewer = film.within_limit(0.4)
-    assert (fewer.frames, fewer.fps) == (30, 10)
-    assert film.within_limit(100.0).frames == 8
-    assert VideoSettings(frames=60).within_limit(100.0).frames == 60
-
-
-def circle(settings):
-    return orbit(CAMERAS, Box((-1.0, -1, -1), (1.0, 1, 1)), settings)
-
-
-def test_in_a_time_freeze_time_runs_then_the_camera_then_time():
-    cameras, times = time_freeze(circle, 0.5, VideoSettings(frames=9))
-    assert times == pytest.approx([0, 1 / 6, 1 / 3, 0.5, 0.5, 0.5, 0.5, 0.75, 1])
-    start, around = cameras.positions[0], circle(VideoSettings(frames=3)).positions
-    for k in (1, 2, 6, 7, 8):
-        torch.testing.assert_close(cameras.positions[k], start)
-    torch.testing.assert_close(cameras.positions[3:6], around)
-    # In bullet time the camera alone moves.
-    cameras, times = bullet_time(circle, 0.3, VideoSettings(frames=3))
-    assert times == [0.3] * 3
-    torch.testing.assert_close(cameras.positions, around)
+    film = VideoSettings(max_seconds=12)
+    assert film.within_limit(0.1, 400) == film
+    # A quarter of the pixels, then the fewest rows and half the frames; 24 a second all the same.
+    assert film.within_limit(0.4, 400) == replace(film, height=200)
+    assert film.within_limit(0.8, 400) == replace(film, height=200, frames=60)
+    assert film.within_limit(100.0, 96) == replace(film, height=96, frames=8)
+    assert VideoSettings().within_limit(100.0, 400) == VideoSettings()
 
 
 def test_the_camera_that_is_meant(tiny_scene):

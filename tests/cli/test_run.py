@@ -107,7 +107,7 @@ def test_the_last_lines_are_commands_that_work(devrf, tmp_path, trained):
     folder, outcome = trained
     lines = outcome.out.splitlines()
     at = next(k for k, line in enumerate(lines) if line.startswith("results:"))
-    results = "(metrics.json, images, videos/orbit.mp4, checkpoints)"
+    results = "(metrics.json, images, videos, checkpoints)"
     assert lines[at] == f"results: outputs/robot/quickstart {results}"
     commands = [shlex.split(line) for line in lines[at + 2 :]]
     assert [words[:3] for words in commands] == [["python", "-m", "devrf"]] * 3

@@ -208,7 +208,8 @@ def read_path(file: Path) -> CameraPath:
     Raises:
         DevrfError: there is no such file, or it is no camera path.
     """
-    return _path(read_json(file, _PathFile, "give video.path a file that the viewer saved"), file)
+    known = "orbit, spiral, captured, bullet_time, time_freeze, or a file that the viewer saved"
+    return _path(read_json(file, _PathFile, f"give video.path {known}"), file)
 
 
 def path_from(content: bytes, name: str) -> CameraPath:

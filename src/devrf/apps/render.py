@@ -4,35 +4,29 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 from torch import Tensor
 
+from devrf.apps.camera_paths import PRESETS, WAYS, default_way, focus_distance, looked_at
 from devrf.apps.keyframes import CameraPath, cameras_of, read_path
 from devrf.apps.still import still
 from devrf.apps.video import (
+    MIN_HEIGHT,
     VideoSettings,
-    bullet_time,
-    focus_distance,
     held_out_images,
     held_out_pictures,
-    orbit,
-    orbit_pictures,
-    spiral,
-    time_freeze,
+    path_pictures,
 )
 from devrf.evaluation.held_out import background_value
 from devrf.geometry.cameras import Cameras
 from devrf.rendering.renderer import Renderer
-from devrf.scenes.scene import Scene, Views
+from devrf.scenes.scene import Scene
 
 log = logging.getLogger(__name__)
-
-# What video.path may be beside a file.
-PRESETS = {"bullet_time": bullet_time, "time_freeze": time_freeze}
 
 
 class Video(NamedTuple):
@@ -50,7 +44,7 @@ def camera_path(settings: VideoSettings) -> CameraPath | None:
     Raises:
         DevrfError: it holds no camera path, or one of too many frames.
     """
-    if settings.path is None or settings.path in PRESETS:
+    if settings.path is None or settings.path in (*WAYS, *PRESETS):
         return None
     path = read_path(Path(settings.path))
     _ = path.frames
@@ -58,21 +52,21 @@ def camera_path(settings: VideoSettings) -> CameraPath | None:
 
 
 def videos(renderer: Renderer, scene: Scene, settings: VideoSettings) -> Iterator[Video]:
-    """The held-out views over time, and an orbit (or a spiral) while time runs.
+    """The held-out views over time, and the scene from a moving camera while time runs.
 
     With ``video.path`` there is that path alone.
     """
-    behind, captured = background_value(scene.background), scene.static.train.cameras
+    behind, static = background_value(scene.background), scene.static.train.cameras
     views = (scene.dynamic if scene.moves else scene.static).test
     path = camera_path(settings)
     if path is not None:
         settings = replace(settings, frames=path.frames, fps=path.fps)
-    settings, sized = _within_limit(settings, renderer, views), settings.sized(captured)
+    settings = _within_limit(settings, renderer, settings.sized(views.cameras))
+    sized, space = settings.sized(static), renderer.model.space
 
-    def ring(of: VideoSettings) -> Cameras:
-        if scene.kind == "forward":
-            return spiral(sized, focus_distance(renderer, captured), of)
-        return orbit(sized, renderer.model.box, of)
+    def filmed(name: str) -> Callable[[VideoSettings], Cameras]:
+        target = looked_at(renderer.model, static, lambda: focus_distance(renderer, static))
+        return lambda of: WAYS[name](sized, target, of)
 
     def video(name: str, pictures: Iterator[Tensor]) -> Video:
         return Video(name, settings.fps, settings.frames, pictures)
@@ -81,31 +75,37 @@ def videos(renderer: Renderer, scene: Scene, settings: VideoSettings) -> Iterato
         keyframes = path.sampled(settings.frames)
         cameras = cameras_of(keyframes, path.aspect, sized.height)
         times = [frame.time for frame in keyframes]
-        yield video(Path(str(settings.path)).stem, orbit_pictures(renderer, cameras, behind, times))
-    elif settings.path is not None:
+        yield video(Path(str(settings.path)).stem, path_pictures(renderer, cameras, behind, times))
+        return
+    if settings.path in PRESETS:
+        ring = filmed(default_way(space, closed=True))
         cameras, times = PRESETS[settings.path](ring, settings.time, settings)
-        yield video(settings.path, orbit_pictures(renderer, cameras, behind, times))
-    else:
+        yield video(settings.path, path_pictures(renderer, cameras, behind, times))
+        return
+    if settings.path is None:
         images = held_out_images(views, settings.frames)
         shown = held_out_pictures(renderer, views, images, settings, scene.background)
         yield video("held_out", shown)
-        name = "spiral" if scene.kind == "forward" else "orbit"
-        yield video(name, orbit_pictures(renderer, ring(settings), behind))
+    name = settings.path or default_way(space)
+    yield video(name, path_pictures(renderer, filmed(name)(settings), behind))
 
 
-def _within_limit(settings: VideoSettings, renderer: Renderer, views: Views) -> VideoSettings:
-    """The settings, with fewer frames where ``video.max_seconds`` would not suffice."""
+def _within_limit(settings: VideoSettings, renderer: Renderer, cameras: Cameras) -> VideoSettings:
+    """The settings with which each video is rendered in ``video.max_seconds``.
+
+    One picture of the captured ``cameras``, of the video's size, says how long they take.
+    """
     if settings.max_seconds is None:
         return settings
-    cameras = settings.sized(views.cameras[[0]])
+    still(renderer, cameras.of_height(MIN_HEIGHT), 0.5, 1.0)  # what only the first one needs
     began = time.perf_counter()
     still(renderer, cameras, 0.5, 1.0)
-    seconds = time.perf_counter() - began
-    fewer = settings.within_limit(seconds)
-    if fewer.frames < settings.frames:
-        log.warning(
-            "videos have %d frames, not %d: rendering one takes %.1f s; video.max_seconds=null "
-            "renders all, a lower video.height is faster",
-            *(fewer.frames, settings.frames, seconds),
+    within = settings.within_limit(time.perf_counter() - began, cameras.height)
+    if within != settings:
+        log.info(
+            "videos have %d frames of %d rows, not %d of %d, which would take longer than "
+            "video.max_seconds=%g; null renders them",
+            *(within.frames, within.height, settings.frames, cameras.height),
+            settings.max_seconds,
         )
-    return fewer
+    return within

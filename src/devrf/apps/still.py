@@ -39,7 +39,8 @@ log = logging.getLogger(__name__)
 READABLE = 400
 # Contact sheets: lower images are enlarged to this height, higher ones reduced to the other.
 MIN_HEIGHT, MAX_HEIGHT = 300, 640
-HEADINGS = ("truth", "rendered", "error: 0 to 0.25 or more", "depth: near is bright")
+DEPTH = "depth: near is bright"
+HEADINGS = ("truth", "rendered", "error: 0 to 0.25 or more", DEPTH)
 
 
 @dataclass(frozen=True)
@@ -55,11 +56,14 @@ class StillSettings:
         expect(0 <= self.time <= 1, "still.time", "0 to 1", self.time)
         expect(self.height is None or self.height >= 1, "still.height", "at least 1", self.height)
 
-    @property
-    def name(self) -> str:
-        """What the image's file is called, without its suffix: ``still_held_out_t0.5_h800``."""
+    def name(self, moves: bool) -> str:
+        """What the image's file is called, without its suffix: ``still_held_out_t0.5_h800``.
+
+        Of a scene that never ``moves`` it says no time.
+        """
+        time = f"_t{self.time:g}" if moves else ""
         size = "" if self.height is None else f"_h{self.height}"
-        return f"still_{self.view}_t{self.time:g}{size}"
+        return f"still_{self.view}{time}{size}"
 
     def camera(self, viewpoints: Viewpoints) -> Cameras:
         """The chosen camera, with images of the chosen height.
@@ -132,7 +136,10 @@ def preview(model: Viewable, views: Views, index: int, background: Background) -
 
 
 def write_contact_sheet(path: Path, views: Sequence[HeldOutView], rows: int = 6) -> Tensor:
-    """Write a PNG of ``rows`` of the views with name, time and scores; the sheet (H, W, 3)."""
+    """Write a PNG of ``rows`` of the views with name, time and scores; the sheet (H, W, 3).
+
+    Where all are at time 0 none is said.
+    """
     shown = [views[k] for k in evenly(len(views), rows)]
     near, far = _depth_range(shown)
     height = min(max(shown[0].truth.shape[0], MIN_HEIGHT), MAX_HEIGHT)
@@ -144,7 +151,8 @@ def write_contact_sheet(path: Path, views: Sequence[HeldOutView], rows: int = 6)
         rows_of_tiles.append([scaled(tile, height) for tile in tiles])
         name = wrap(short_name(view.name), 16, break_long_words=False, break_on_hyphens=False)
         scores = f"PSNR {view.psnr:.2f} dB", f"SSIM {view.ssim:.3f}"
-        labels.append([*name, f"time {view.time:.2f}", *scores])
+        time = [f"time {view.time:.2f}"] if any(view.time for view in views) else []
+        labels.append([*name, *time, *scores])
     sheet = image_grid(rows_of_tiles, HEADINGS, labels)
     write_image(path, sheet)
     return sheet

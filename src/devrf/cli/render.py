@@ -64,7 +64,7 @@ def picture(run: RunContext) -> None:
     camera = settings.camera(viewpoints)
     renderer = Renderer(stored.model.to_view(run.device), half=settings.half)
     color, depth = still(renderer, camera, settings.time, background_value(viewpoints.background))
-    write_still(run.folder / "images" / f"{settings.name}.png", color, depth)
+    write_still(run.folder / "images" / f"{settings.name(stored.model.moves)}.png", color, depth)
 
 
 def _is_its_data(run: RunContext, metadata: CheckpointMetadata) -> bool:

@@ -63,7 +63,7 @@ AFTER_LEARNING = ("evaluate", "render")
 # Steps for which the run's scene and stages need not be right.
 APART = {"report", "fetch", "capture", "selfcheck"}
 # What a run's folder may hold that a person looks at first, and what to try next.
-RESULTS = ("metrics.json", "images", "videos/orbit.mp4", "videos/spiral.mp4", "checkpoints")
+RESULTS = ("metrics.json", "images", "videos", "checkpoints")
 NEXT = ("stage=still still.time=0.35 still.height=400", "stage=render video.frames=120")
 
 # Lightning's messages on accelerators, tips and data loaders say nothing about this run.

@@ -69,6 +69,10 @@ class Viewable(Protocol):
     def device(self) -> torch.device:
         """The device of its tensors."""
 
+    @property
+    def moves(self) -> bool:
+        """Whether it has learned to move: False for a rest state alone."""
+
     def at(self, time: float, *, half: bool = False) -> View:
         """The scene at ``time`` in [0, 1]; ``half``: in half precision where that is possible."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 import torch
 import viser
 
+from devrf.apps.camera_paths import WAYS, bullet_time, default_way, looked_at, time_freeze
 from devrf.apps.keyframes import (
     CameraPath,
     Keyframe,
@@ -20,12 +22,11 @@ from devrf.apps.keyframes import (
     path_from,
     write_path,
 )
-from devrf.apps.video import VideoSettings, bullet_time, orbit, spiral, time_freeze
+from devrf.apps.video import VideoSettings
 from devrf.apps.viewer.cameras import from_browser
 from devrf.apps.viewer.controls import set_value
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
-from devrf.geometry.ndc import NormalizedDevice
 from devrf.rendering.view import Viewable
 from devrf.scenes.bounds import nearest_point
 
@@ -41,23 +42,26 @@ Act = Callable[[viser.GuiEvent[Any]], None]
 
 
 def known_paths(cameras: Cameras, model: Callable[[], Viewable]) -> dict[str, Preset]:
-    """An orbit while time runs, bullet time, and a freeze in time, by name.
-
-    They lead around a scene, or before a forward-facing one, as the static ``cameras`` saw it.
-    """
+    """The paths that ``video.path`` names, with the time, from the static ``cameras``."""
     once, longer = VideoSettings(frames=KEYFRAMES), VideoSettings(frames=3 * KEYFRAMES)
     times = torch.linspace(0, 1, KEYFRAMES).tolist()
 
+    def filmed(name: str, video: VideoSettings) -> Cameras:
+        target = looked_at(model(), cameras, lambda: distance_ahead(cameras))
+        if name == "captured":
+            return WAYS[name](cameras, target, replace(video, fps=KEYFRAMES / SECONDS))
+        # Comes back to where it began.
+        video = replace(video, frames=video.frames - 1)
+        return WAYS[name](cameras, target, video)[[*range(video.frames), 0]]
+
+    def running(name: str, _: float) -> tuple[Keyframe, ...]:
+        return keyframes_of(filmed(name, once), times, SECONDS)
+
     def ring(video: VideoSettings) -> Cameras:
-        """Comes back to where it began."""
-        space, video = model().space, replace(video, frames=video.frames - 1)
-        closed = [*range(video.frames), 0]
-        if isinstance(space, NormalizedDevice):
-            return spiral(cameras, distance_ahead(cameras), video)[closed]
-        return orbit(cameras, space.inner(model().box), video)[closed]
+        return filmed(default_way(model().space, closed=True), video)
 
     return {
-        "orbit": lambda _: keyframes_of(ring(once), times, SECONDS),
+        **{name: partial(running, name) for name in WAYS},
         "bullet time": lambda stop: keyframes_of(*bullet_time(ring, stop, once), SECONDS),
         "time freeze": lambda stop: keyframes_of(*time_freeze(ring, stop, longer), 3 * SECONDS),
     }

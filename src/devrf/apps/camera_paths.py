@@ -1,0 +1,258 @@
+"""Where a video's cameras go: around what was captured, before it, or through the captured ones."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from devrf.apps.images import evenly
+from devrf.apps.video import VideoSettings
+from devrf.geometry.cameras import Cameras
+from devrf.geometry.ndc import NormalizedDevice
+from devrf.geometry.poses import average_pose
+from devrf.geometry.space import Space
+from devrf.rendering.renderer import Renderer, points_at_depth
+from devrf.rendering.view import Viewable
+
+# Cameras stand all around where the widest gap between two, seen from above, is no more than this,
+# or than so many times what even spacing would leave.
+WIDEST_GAP, UNEVEN = math.radians(60), 1.5
+# The variance of cameras' own horizontals, as a share, below which their mean up counts.
+LEVEL = 0.02
+# Cameras that look the same way differ by less than 45 degrees.
+SAME_WAY = math.sqrt(0.5)
+# The way through the captured cameras: so many of them at most, and points on it; a film's order
+# is at most so many times longer than a short tour. Distances count in what cameras look at.
+MAX_STOPS, POINTS, OF_A_FILM = 300, 1000, 2.0
+# Tours are made shorter to the pace that leads once around in 4.4 seconds, with at least so many
+# stops; motion of under 0.3 seconds, or 1.5 stops, is smoothed, by a twelfth of the way at most.
+PACE, MIN_STOPS = 2.0, 6
+SMOOTH_SECONDS, SMOOTH_STOPS, SMOOTH_MOST = 0.3, 1.5, 1 / 12
+
+# The cameras of a video, from captured ones, what they look at (3,), and settings.
+Way = Callable[[Cameras, Tensor, VideoSettings], Cameras]
+# The cameras of a video of some settings, around a scene or before it.
+Ring = Callable[[VideoSettings], Cameras]
+# Cameras and as many times in [0, 1].
+Shots = tuple[Cameras, list[float]]
+
+
+def orbit(cameras: Cameras, target: Tensor, settings: VideoSettings) -> Cameras:
+    """Cameras on a circle around ``target`` (3,), looking at it, as far from it as the captured.
+
+    They go all around where these did; else to and fro in the sector that these covered, and that
+    ``video.orbit_turns`` times. Without ``video.orbit_elevation`` they are as high as these.
+    """
+    offsets, up = cameras.positions - target, upward(cameras)
+    east = normalize(torch.linalg.cross(torch.eye(3)[int(up.abs().argmin())], up), dim=0)
+    axes = torch.stack([east, torch.linalg.cross(up, east)])
+    radius = float(offsets.norm(dim=1).mean())
+    elevation = float(torch.asin(normalize(offsets, dim=1) @ up).median())
+    if settings.orbit_elevation is not None:
+        elevation = math.radians(settings.orbit_elevation)
+    turn = torch.arange(settings.frames) * (2 * math.pi * settings.orbit_turns / settings.frames)
+    east_and_north = offsets @ axes.T
+    first, extent = sector(torch.atan2(east_and_north[:, 1], east_and_north[:, 0]))
+    angle = turn if extent == 2 * math.pi else first + extent * (1 + turn.sin()) / 2
+    around = math.cos(elevation) * torch.stack([angle.cos(), angle.sin()], dim=1) @ axes
+    return _looking(cameras, target + radius * (around + math.sin(elevation) * up), target, up)
+
+
+def sector(angles: Tensor) -> tuple[float, float]:
+    """The first of N angles (N,), counted from their widest gap on, and the extent of all; radians.
+
+    The extent is 2π where they lie all around.
+    """
+    ascending = angles.sort().values
+    gaps = torch.diff(ascending, append=ascending[:1] + 2 * math.pi)
+    widest = int(gaps.argmax())
+    first = float(ascending[(widest + 1) % len(angles)])
+    if float(gaps[widest]) <= max(WIDEST_GAP, UNEVEN * 2 * math.pi / len(angles)):
+        return first, 2 * math.pi
+    return first, 2 * math.pi - float(gaps[widest])
+
+
+def upward(cameras: Cameras) -> Tensor:
+    """The direction (3,) that is up where N cameras were.
+
+    It is across the horizontals of their images, which the mean of their own up is not where they
+    look down from one side. It is that mean as far as horizontals are parallel.
+    """
+    right, own = cameras.camera_to_world[:, :, 0], cameras.camera_to_world[:, :, 1].mean(dim=0)
+    spread = right.T @ right / len(right) + LEVEL * torch.eye(3)
+    return normalize(torch.linalg.solve(spread, own), dim=0)
+
+
+def spiral(cameras: Cameras, target: Tensor, settings: VideoSettings) -> Cameras:
+    """Cameras on a small ring among those captured that look the same way, looking at ``target``.
+
+    Where cameras look in many directions, that is the one that most of them share.
+    """
+    alike = cameras.forwards @ cameras.forwards.T
+    cameras = cameras[alike[int(alike.sum(dim=1).argmax())] > SAME_WAY]
+    right, up, _, middle = average_pose(cameras.camera_to_world).unbind(dim=1)
+    axes = torch.stack([right, up])
+    radii = 0.9 * ((cameras.positions - middle) @ axes.T).abs().quantile(0.8, dim=0)
+    turn = torch.arange(settings.frames) * (2 * math.pi * settings.orbit_turns / settings.frames)
+    positions = middle + torch.stack([turn.cos(), turn.sin()], dim=1) @ (radii[:, None] * axes)
+    return _looking(cameras, positions, target, up)
+
+
+def captured(cameras: Cameras, target: Tensor, settings: VideoSettings) -> Cameras:
+    """Cameras on a smooth way through the captured ones, at an even pace, looking as they did.
+
+    Frames of a film are passed in their order, photographs on a short tour, which leaves some out
+    where the video is too short for all. ``target`` (3,) says how far away it is that they see.
+    """
+    cameras = cameras[evenly(len(cameras), MAX_STOPS)]
+    reach = float((cameras.positions - target).norm(dim=1).median())
+    places = torch.cat([cameras.positions / reach, cameras.forwards], dim=1).double()
+    apart = torch.cdist(places, places).numpy()
+    seconds = settings.frames / settings.fps
+    stops = in_order(apart, PACE * seconds)
+    poses = cameras.camera_to_world[stops].double().flatten(1)
+    even = torch.linspace(0, 1, POINTS, dtype=torch.float64)
+    poses = _resampled(poses, places[stops], even)
+    share = max(SMOOTH_SECONDS / seconds, SMOOTH_STOPS / len(stops))
+    nearness = (even[:, None] - even) / min(share, SMOOTH_MOST)
+    poses = torch.softmax(-0.5 * nearness**2, dim=1) @ poses
+    # Smoothing has slowed the camera down where it turned.
+    passed = torch.cat([poses[:, 3::4] / reach, -poses[:, 2::4]], dim=1)
+    frames = torch.linspace(0, 1, settings.frames, dtype=torch.float64)
+    poses = _resampled(poses, passed, frames).view(-1, 3, 4)
+    left, _, right = torch.linalg.svd(poses[:, :, :3])
+    poses = torch.cat([left @ right, poses[:, :, 3:]], dim=2).float()
+    return _with_one_lens(cameras, poses)
+
+
+def in_order(apart: np.ndarray, longest: float) -> list[int]:
+    """In which order to pass N places, by the distances (N, N) between them.
+
+    The order that they have, if it is that of a film; else a tour, which leaves places out where it
+    would be longer than ``longest``.
+    """
+    order = tour(apart)
+    if np.diag(apart, 1).sum() <= OF_A_FILM * _length(apart, order):
+        return list(range(len(apart)))
+    while _length(apart, order) > longest and len(order) > MIN_STOPS:
+        fewer = [place for k, place in enumerate(order) if k % 3 != 1]
+        order = [fewer[k] for k in tour(apart[np.ix_(fewer, fewer)])]
+    return order
+
+
+def tour(apart: np.ndarray) -> list[int]:
+    """A short way through N places that are (N, N) apart: to the nearest next, then 2-opt.
+
+    A place that is next to all others makes the way a ring, in which it stands for the open end.
+    """
+    order = [int(apart.sum(axis=1).argmax())]
+    while len(order) < len(apart):
+        distances = apart[order[-1]].copy()
+        distances[order] = np.inf
+        order.append(int(distances.argmin()))
+    ring, closed = np.array([*order, len(apart)]), np.pad(apart, (0, 1))
+    while True:
+        after = np.roll(ring, -1)
+        legs = closed[ring, after]
+        # Two legs less, two others more: what lies between them is passed the other way.
+        saved = legs[:, None] + legs - closed[np.ix_(ring, ring)] - closed[np.ix_(after, after)]
+        np.fill_diagonal(saved, 0.0)
+        first, last = sorted(np.unravel_index(saved.argmax(), saved.shape))
+        if saved[first, last] < 1e-9 * legs.sum():
+            break
+        ring[first + 1 : last + 1] = ring[first + 1 : last + 1][::-1].copy()
+    opened: list[int] = np.roll(ring, -1 - int(ring.argmax()))[:-1].tolist()
+    return opened if opened[0] <= opened[-1] else opened[::-1]
+
+
+def _length(apart: np.ndarray, order: list[int]) -> float:
+    return float(apart[order[:-1], order[1:]].sum())
+
+
+def _resampled(values: Tensor, places: Tensor, at: Tensor) -> Tensor:
+    """``values`` (N, C) at N ``places`` (N, D), as (M, C) at shares ``at`` (M,) of the way."""
+    steps = (places[1:] - places[:-1]).norm(dim=1).clamp(min=1e-12)
+    along = torch.cat([steps.new_zeros(1), steps.cumsum(dim=0)])
+    columns = [np.interp(at * along[-1], along, column) for column in values.T]
+    return torch.from_numpy(np.stack(columns, axis=1))
+
+
+def _looking(cameras: Cameras, positions: Tensor, target: Tensor, up: Tensor) -> Cameras:
+    """Cameras at ``positions`` (N, 3) with the captured ones' lens that look at ``target`` (3,)."""
+    poses = Cameras.looking_at(
+        positions, target.expand_as(positions), focal=1.0, width=1, height=1, up=up
+    )
+    return _with_one_lens(cameras, poses.camera_to_world)
+
+
+def _with_one_lens(cameras: Cameras, poses: Tensor) -> Cameras:
+    """Cameras at ``poses`` (N, 3, 4), all with the mean focal length of the captured ones."""
+    focal = cameras.focal.mean().expand(len(poses), 2)
+    center = focal.new_tensor([cameras.width / 2, cameras.height / 2]).expand(len(poses), 2)
+    return Cameras(poses, focal, center, cameras.width, cameras.height)
+
+
+# By the names that video.path has for them.
+WAYS: dict[str, Way] = {"orbit": orbit, "spiral": spiral, "captured": captured}
+
+
+def default_way(space: Space, closed: bool = False) -> str:
+    """What films a scene best; ``closed``: and comes back to where it began.
+
+    Photographs know nothing of what is beside their cameras.
+    """
+    if isinstance(space, NormalizedDevice):
+        return "spiral"
+    return "orbit" if space.is_linear or closed else "captured"
+
+
+def looked_at(model: Viewable, cameras: Cameras, ahead: Callable[[], float]) -> Tensor:
+    """What captured cameras look at (3,), world units: the middle of the scene.
+
+    Of a forward-facing scene it is so far ``ahead`` of their middle.
+    """
+    if not isinstance(model.space, NormalizedDevice):
+        return torch.tensor(model.space.inner(model.box).middle)
+    back, position = average_pose(cameras.camera_to_world)[:, 2:].unbind(dim=1)
+    return position - ahead() * back
+
+
+def focus_distance(renderer: Renderer, cameras: Cameras) -> float:
+    """Median depth along the optical axis, world units, of what the first camera sees at rest."""
+    cameras = cameras.to(renderer.device)
+    rays = cameras.image_rays(0)
+    image = renderer.picture(rays, 0.0, 1.0)
+    solid = (image.opacity > 0.5).nonzero()[:, 0]
+    if len(solid) == 0:
+        return float(cameras.positions.norm(dim=1).mean()) + 1.0
+    points = points_at_depth(renderer.model.space, rays[solid], image.depth[solid])
+    _, depth = cameras.project_into(0, points)
+    return float(depth.median())
+
+
+def bullet_time(ring: Ring, stop: float, settings: VideoSettings) -> Shots:
+    """Once around the scene while its time stands still at ``stop``."""
+    return ring(settings), [stop] * settings.frames
+
+
+def time_freeze(ring: Ring, stop: float, settings: VideoSettings) -> Shots:
+    """Time runs to ``stop`` and stands still while the camera goes round; then it runs on.
+
+    Each takes a third of the frames.
+    """
+    third = settings.frames // 3
+    around = settings.frames - 2 * third
+    cameras = ring(replace(settings, frames=around))
+    before, after = torch.linspace(0, stop, third + 1)[:-1], torch.linspace(stop, 1, third)
+    times = [*before.tolist(), *[stop] * around, *after.tolist()]
+    return cameras[[0] * third + list(range(around)) + [0] * third], times
+
+
+# Beside them, videos in which the camera moves while time stands still.
+PRESETS = {"bullet_time": bullet_time, "time_freeze": time_freeze}

@@ -1,0 +1,103 @@
+"""Paths of a video's cameras: they stay where captured cameras were."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from devrf.apps.camera_paths import bullet_time, captured, orbit, spiral, time_freeze, tour, upward
+from devrf.apps.video import VideoSettings
+from devrf.geometry.cameras import Cameras
+
+ORIGIN = torch.zeros(3)
+
+
+def looking_in(azimuths, elevations, distance=2.0):
+    """Cameras that look at the origin, angles in degrees, z up."""
+    east, up = torch.deg2rad(torch.as_tensor(azimuths)), torch.deg2rad(torch.as_tensor(elevations))
+    flat = torch.stack([east.cos() * up.cos(), east.sin() * up.cos(), up.sin()], dim=1)
+    positions = distance * flat
+    return Cameras.looking_at(positions, 0 * positions, focal=20.0, width=15, height=10)
+
+
+def azimuths(cameras):
+    return torch.rad2deg(torch.atan2(cameras.positions[:, 1], cameras.positions[:, 0]))
+
+
+FOUR = looking_in([0.0, 90.0, 180.0, 270.0], [20.0] * 4)
+# A walk on one side of the scene, looking down at it.
+WALK = looking_in(torch.linspace(40, 120, 33), 30 + 2 * torch.arange(33.0).sin())
+
+
+def test_an_orbit_of_cameras_all_around_is_a_full_turn_at_their_distance():
+    settings = VideoSettings(frames=8, orbit_turns=2.0, orbit_elevation=30.0)
+    cameras = orbit(FOUR, ORIGIN, settings)
+    assert len(cameras) == 8 and (cameras.width, cameras.height) == (15, 10)
+    torch.testing.assert_close(cameras.positions.norm(dim=1), torch.full((8,), 2.0))
+    torch.testing.assert_close(cameras.positions[:, 2], torch.full((8,), 1.0))
+    # Two turns in eight pictures: a quarter turn each.
+    steps = cameras.positions[:-1, :2] * cameras.positions[1:, :2]
+    torch.testing.assert_close(steps.sum(dim=1), torch.zeros(7), atol=1e-5, rtol=0)
+    torch.testing.assert_close(cameras.forwards, -cameras.positions / 2)
+
+
+def test_an_orbit_swings_within_the_sector_that_was_seen():
+    cameras = orbit(WALK, ORIGIN, VideoSettings(frames=40))
+    angles = azimuths(cameras)
+    assert float(angles.min()) == pytest.approx(40, abs=1)
+    assert float(angles.max()) == pytest.approx(120, abs=1)
+    # From the middle to one end, to the other, and back: every place twice, no jump at the seam.
+    torch.testing.assert_close(angles[:20] + angles[20:], torch.full((20,), 160.0), atol=3, rtol=0)
+    # As high as the cameras, with a level horizon.
+    heights = torch.rad2deg(torch.asin(cameras.positions[:, 2] / 2))
+    torch.testing.assert_close(heights, torch.full((40,), 30.0), atol=3, rtol=0)
+    assert float(upward(WALK)[2]) > 0.997
+
+
+@pytest.mark.parametrize("shuffled", [False, True])
+def test_the_captured_path_follows_the_cameras_smoothly_in_any_order(shuffled):
+    generator = torch.Generator().manual_seed(0)
+    order = torch.randperm(33, generator=generator).tolist() if shuffled else list(range(33))
+    cameras = captured(WALK[order], ORIGIN, VideoSettings(frames=48))
+    angles = azimuths(cameras)
+    turned = angles.diff() * (angles[-1] - angles[0]).sign()
+    assert float((angles[-1] - angles[0]).abs()) > 60 and float(turned.min()) > 0
+    assert 38 < float(angles.min()) and float(angles.max()) < 122
+    steps = cameras.positions.diff(dim=0).norm(dim=1)
+    assert float(steps.max() / steps.min()) < 1.2
+    # They look at what was looked at, and their own jolts are gone.
+    toward = torch.nn.functional.normalize(-cameras.positions, dim=1)
+    assert float((cameras.forwards * toward).sum(dim=1).min()) > 0.995
+    assert float(cameras.positions[:, 2].diff(n=2, dim=0).abs().max()) < 0.01
+    rotations = cameras.camera_to_world[:, :, :3]
+    torch.testing.assert_close(torch.linalg.det(rotations), torch.ones(48))
+
+
+def test_a_tour_is_shorter_than_always_going_to_the_nearest():
+    places = torch.tensor([[2.0, 1], [0, 0], [4, 0], [1, 1], [1, 0], [3, 2]])
+    # From (4, 0) the nearest are (2, 1), (1, 1), (1, 0), (0, 0); then all the way to (3, 2).
+    assert tour(torch.cdist(places, places).numpy()) == [1, 4, 3, 0, 5, 2]
+
+
+def test_a_spiral_stays_among_cameras_that_look_the_same_way():
+    cameras = spiral(looking_in([-8.0, 0, 8, 180], [0.0, 4, 0, 0]), ORIGIN, VideoSettings(frames=9))
+    assert float(azimuths(cameras).abs().max()) < 8
+    away = cameras.positions.norm(dim=1)
+    torch.testing.assert_close(away, torch.full((9,), 2.0), atol=0.05, rtol=0)
+
+
+def circle(settings):
+    return orbit(FOUR, ORIGIN, settings)
+
+
+def test_in_a_time_freeze_time_runs_then_the_camera_then_time():
+    cameras, times = time_freeze(circle, 0.5, VideoSettings(frames=9))
+    assert times == pytest.approx([0, 1 / 6, 1 / 3, 0.5, 0.5, 0.5, 0.5, 0.75, 1])
+    start, around = cameras.positions[0], circle(VideoSettings(frames=3)).positions
+    for k in (1, 2, 6, 7, 8):
+        torch.testing.assert_close(cameras.positions[k], start)
+    torch.testing.assert_close(cameras.positions[3:6], around)
+    # In bullet time the camera alone moves.
+    cameras, times = bullet_time(circle, 0.3, VideoSettings(frames=3))
+    assert times == [0.3] * 3
+    torch.testing.assert_close(cameras.positions, around)
