@@ -19,7 +19,12 @@ from devrf.apps.images import (
     to_bytes,
 )
 from devrf.apps.still import StillSettings, write_contact_sheet
-from devrf.apps.video import VideoSettings, held_out_images, held_out_pictures
+from devrf.apps.video import (
+    VideoSettings,
+    held_out_images,
+    held_out_pictures,
+    path_pictures,
+)
 from devrf.apps.video_file import write_pictures
 from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError
@@ -129,6 +134,16 @@ def test_held_out_pictures_are_rendered_in_the_films_size_beside_the_truth(
         )
         seen = reference(moving, large.image_rays(index), time, torch.ones(3))
         torch.testing.assert_close(rendered.reshape(-1, 3), seen.color, atol=0.51 / 255, rtol=0)
+
+
+def test_films_of_a_scene_at_rest_speak_of_no_time(learned, tiny_scene, monkeypatch):
+    headings = []
+    monkeypatch.setattr("devrf.apps.video.image_grid", lambda _, heads: headings.extend(heads))
+    renderer, views = Renderer(learned[0].scene_model), tiny_scene.dynamic.test
+    list(path_pictures(renderer, views.cameras[[0]], 1.0))
+    list(held_out_pictures(renderer, views, [1], VideoSettings(height=18), "white"))
+    depth = "depth: near is bright"
+    assert headings == ["rendered", depth, "truth (24x18)", "rendered", depth]
 
 
 def test_held_out_images_are_the_nearest_in_time(tiny_scene):

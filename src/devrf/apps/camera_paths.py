@@ -156,7 +156,7 @@ def tour(apart: np.ndarray) -> list[int]:
         distances = apart[order[-1]].copy()
         distances[order] = np.inf
         order.append(int(distances.argmin()))
-    ring, closed = np.array([*order, len(apart)]), np.pad(apart, (0, 1))
+    ring, closed = np.array([*order, len(apart)]), np.pad(apart.astype(float), (0, 1))
     while True:
         after = np.roll(ring, -1)
         legs = closed[ring, after]
@@ -164,7 +164,8 @@ def tour(apart: np.ndarray) -> list[int]:
         saved = legs[:, None] + legs - closed[np.ix_(ring, ring)] - closed[np.ix_(after, after)]
         np.fill_diagonal(saved, 0.0)
         first, last = sorted(np.unravel_index(saved.argmax(), saved.shape))
-        if saved[first, last] < 1e-9 * legs.sum():
+        # Rounding, which could go to and fro for ever, is no gain; nor is NaN.
+        if not saved[first, last] > 1e-6 * legs.sum():
             break
         ring[first + 1 : last + 1] = ring[first + 1 : last + 1][::-1].copy()
     opened: list[int] = np.roll(ring, -1 - int(ring.argmax()))[:-1].tolist()
