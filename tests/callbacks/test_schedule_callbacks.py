@@ -6,6 +6,8 @@ import logging
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import count
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -95,3 +97,19 @@ def test_progress_and_curves_name_the_frames_of_a_visit(
     assert last[-1] == "frames 1, 3"  # nothing is left
     assert " dB" in lines[-1]
     assert fitted.callback_metrics["dynamic/frame"] == 1
+
+
+def test_the_time_left_knows_that_finer_levels_take_longer(
+    fit, canonical, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage = canonical(upsample_at=(2, 3, 4))
+    # Sides of 6 for two iterations, of 12 for the last eight.
+    assert (stage.cost(0, 2), stage.cost(4, 12)) == pytest.approx((2 * 6, 8 * 12))
+    # Every iteration takes a second so far: each of the last eight will take two.
+    clock = SimpleNamespace(perf_counter=map(float, count()).__next__)
+    monkeypatch.setattr("devrf.callbacks.progress.time", clock)
+    caplog.set_level(logging.INFO, logger="devrf")
+    fit(stage, Progress(line_every_seconds=0.0))
+    first = next(line for line in caplog.messages if line.startswith("static 1/12"))
+    # (6 + 7.6 + 9.5 + 8 · 12) / 6, not 11 s
+    assert first.endswith("  about 20 s left")

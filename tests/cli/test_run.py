@@ -247,7 +247,10 @@ def test_the_pipeline_of_a_scene_at_rest_learns_no_motion(devrf, tmp_path, short
     assert len(iio.imread(run / "videos" / "held_out.mp4")) == 4
     report = devrf("stage=report", "report.runs=run")
     assert report.status == 0 and f"{found['static']['psnr']:.2f}" in report.out
+    # Where nothing moves there are no times.
+    assert "run stage=still still.height=400" in done.out and "still.time" not in done.out
     assert devrf(*where, *short, "stage=still").status == 0
+    assert (run / "images" / "still_held_out.png").is_file()
 
 
 @pytest.mark.parametrize(

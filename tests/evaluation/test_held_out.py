@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
 
-from devrf.evaluation.held_out import score, truth_image
+from devrf.evaluation.held_out import score, score_all, truth_image
+from devrf.evaluation.suite import MetricSuite
 from devrf.metrics.image import psnr, ssim
 from devrf.rendering.renderer import Renderer
+from devrf.system.progress import followed
 
 
 def test_truth_by_hand(tiny_scene):
@@ -64,3 +68,15 @@ def test_static_views_are_scored_at_rest_whatever_their_time(moving, tiny_scene)
     moved, rest = (score(renderer, views, 2, "white", time=time) for time in (None, 0.0))
     assert (moved.time, rest.time) == (1.0, 1.0)
     assert rest.psnr == rest.rest_pose_psnr == moved.rest_pose_psnr != moved.psnr
+
+
+def test_scoring_says_how_far_it_is(learned, tiny_scene, caplog, monkeypatch):
+    monkeypatch.setattr(
+        "devrf.evaluation.held_out.followed", partial(followed, line_every_seconds=0.0)
+    )
+    caplog.set_level(logging.INFO, logger="devrf")
+    views = tiny_scene.dynamic.test
+    scored = score_all(learned[0].scene_model, views, "white", MetricSuite(), "held-out images")
+    assert [view.name for view in scored] == list(views.names) and len(views) > 2
+    said = [line.split(", ")[0] for line in caplog.messages]
+    assert said == [f"held-out images: {k} of {len(views)}" for k in range(1, len(views))]

@@ -51,8 +51,9 @@ class LiveView(Callback):
         if scheduler is None or not scheduler.watched or now - self._last < PAUSE:
             return
         self._last = now
-        speed = (pl_module.iteration - self._first) / (now - self._began)
-        line = in_one_line(pl_module.logged, pl_module, speed)
+        seconds, done = now - self._began, pl_module.iteration
+        pace = pl_module.cost(self._first, done) / seconds
+        line = in_one_line(pl_module.logged, pl_module, (done - self._first) / seconds, pace)
         self.session.controls.tell(f"**{pl_module.name}**: {line}")
         if self.seconds > self.share * (now - self._began):
             return

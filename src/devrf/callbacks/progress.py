@@ -9,7 +9,7 @@ from typing import Any
 
 from lightning import Callback, LightningModule, Trainer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 from torch import Tensor
 
@@ -22,36 +22,41 @@ log = logging.getLogger(__name__)
 
 # Each update reads one number from the device.
 BAR_EVERY_SECONDS = 0.5
+# Share of the latest line's pace in the one that tells the time left.
+LATEST = 0.4
 
 
 class Progress(Callback):
-    """Shows a bar on a terminal, else a line every ``line_every_seconds``."""
+    """Shows a bar on a terminal, else a line every ``line_every_seconds``.
+
+    The time left comes from the pace so far and from what the phases to come cost
+    (:meth:`~devrf.engine.learner.Learner.cost`).
+    """
 
     def __init__(self, line_every_seconds: float = 15.0) -> None:
         self.line_every_seconds = line_every_seconds
         self._bar: Bar | None = None
-        self._shown = (0.0, 0)
+        self._shown, self._pace = (0.0, 0), 0.0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Open the bar."""
         assert isinstance(pl_module, ScheduledStage)
         if not trainer.is_global_zero:
             return
-        self._shown = (time.perf_counter(), pl_module.iteration)
+        self._shown, self._pace = (time.perf_counter(), pl_module.iteration), 0.0
         console = Console()
         if console.is_terminal:
             self._bar = Bar(
                 TextColumn("{task.description}"),
                 BarColumn(),
-                MofNCompleteColumn(),
                 TextColumn("{task.fields[state]}"),
                 TimeRemainingColumn(),
                 console=console,
             )
             self._bar.add_task(
                 type(pl_module).__name__,
-                total=pl_module.total_iterations,
-                completed=pl_module.iteration,
+                total=pl_module.cost(0, pl_module.total_iterations),
+                completed=int(pl_module.cost(0, pl_module.iteration)),
                 state="",
             )
             self._bar.start()
@@ -65,13 +70,16 @@ class Progress(Callback):
         since, done = now - self._shown[0], pl_module.iteration
         if since < (self.line_every_seconds if self._bar is None else BAR_EVERY_SECONDS):
             return
-        speed = (done - self._shown[1]) / since
+        before, total = self._shown[1], pl_module.total_iterations
+        speed, pace = (done - before) / since, pl_module.cost(before, done) / since
         self._shown = (now, done)
         if self._bar is None:
-            log.info("%s", in_one_line(outputs or {}, pl_module, speed))
+            self._pace = pace if self._pace == 0 else self._pace + LATEST * (pace - self._pace)
+            log.info("%s", in_one_line(outputs or {}, pl_module, speed, self._pace))
         else:
-            state = describe(outputs or {}, pl_module, speed)
-            self._bar.update(self._bar.task_ids[0], completed=done, state=state)
+            state = f"{done}/{total}  {describe(outputs or {}, pl_module, speed)}"
+            completed = pl_module.cost(0, done)
+            self._bar.update(self._bar.task_ids[0], completed=completed, state=state)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Close the bar."""
@@ -85,15 +93,19 @@ class Progress(Callback):
 
     def _close(self) -> None:
         if self._bar is not None:
-            self._bar.update(self._bar.task_ids[0], completed=self._shown[1])
             self._bar.stop()
             self._bar = None
 
 
-def in_one_line(means: Mapping[str, Tensor], stage: ScheduledStage, speed: float) -> str:
-    """Where a stage is, what :func:`describe` says, and the time left."""
+def in_one_line(
+    means: Mapping[str, Tensor], stage: ScheduledStage, speed: float, pace: float
+) -> str:
+    """Where a stage is, what :func:`describe` says, and the time left.
+
+    ``speed`` is in iterations a second, ``pace`` in their cost, which levels to come have more of.
+    """
     done, total = stage.iteration, stage.total_iterations
-    left = f"  {time_left((total - done) / speed)}" if 0 < speed and done < total else ""
+    left = f"  {time_left(stage.cost(done, total) / pace)}" if 0 < pace and done < total else ""
     return f"{stage.capture} {done}/{total}  {describe(means, stage, speed)}{left}"
 
 

@@ -20,11 +20,10 @@ from devrf.checkpoints.checkpoint import CheckpointMetadata, TrainingFigures
 from devrf.checkpoints.checkpoint_file import digest_of
 from devrf.cli.config import choices, overrides
 from devrf.cli.context import GIVEN_REST, OWN_REST, RunContext
-from devrf.evaluation.held_out import HeldOutView, score
+from devrf.evaluation.held_out import HeldOutView, score_all
 from devrf.evaluation.objective import TRAINING
 from devrf.evaluation.suite import MetricSuite
 from devrf.methods.base import Renderable
-from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import CaptureName
 from devrf.system.files import write_json
 
@@ -128,9 +127,8 @@ def _score(
 ) -> list[HeldOutView]:
     """Score a capture's held-out views; the static ones show the rest state at any time."""
     views, background = run.scene.capture(capture).test, run.scene.background
-    time = 0.0 if capture == "static" else None
-    renderer = Renderer(model)
-    scored = [score(renderer, views, k, background, suite, time=time) for k in range(len(views))]
+    name, time = f"held-out images, {capture}", 0.0 if capture == "static" else None
+    scored = score_all(model, views, background, suite, name, time=time)
     sheet = write_contact_sheet(run.folder / "images" / f"{capture}.png", scored)
     for tracker in run.trackers:
         tracker.show_image(f"held_out/{capture}", sheet)

@@ -64,7 +64,7 @@ AFTER_LEARNING = ("evaluate", "render")
 APART = {"report", "fetch", "capture", "selfcheck"}
 # What a run's folder may hold that a person looks at first, and what to try next.
 RESULTS = ("metrics.json", "images", "videos", "checkpoints")
-NEXT = ("stage=still still.time=0.35 still.height=400", "stage=render video.frames=120")
+NEXT = ("stage=still still.time=0.35 still.height=400", "stage=render video.path=captured")
 
 # Lightning's messages on accelerators, tips and data loaders say nothing about this run.
 for _name in ("lightning.pytorch", "lightning.fabric"):
@@ -164,14 +164,16 @@ def _all_done(run: RunContext, learning: Names, steps: Names) -> bool:
 
 def _ended(run: RunContext, steps: Names) -> float | None:
     """The objective; a pipeline ends with its results, and what to try next."""
-    folder = run.folder
+    folder, metrics = run.folder, json.loads((run.folder / "metrics.json").read_text())
     if steps == AFTER_LEARNING and not in_sweep():
         results = ", ".join(name for name in RESULTS if (folder / name).exists())
         place = Path(os.path.relpath(folder)) if folder.is_relative_to(Path.cwd()) else folder
         log.info("results: %s (%s)", place, results)
         further = [[f"hydra.run.dir={place}", *words.split()] for words in NEXT]
+        if metrics.get("at_rest"):
+            further[0].remove("still.time=0.35")
         say_next(*further, ["stage=report"])
-    return objective(run.config.objective, json.loads((folder / "metrics.json").read_text()))
+    return objective(run.config.objective, metrics)
 
 
 def learn_beside(config: dict[str, Any], folder: Path) -> None:

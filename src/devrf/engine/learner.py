@@ -38,6 +38,11 @@ class Phase:
     stop: int
     frames: tuple[int, ...] = ()
 
+    @property
+    def cost(self) -> float:
+        """How long an iteration takes, about, in a unit that the stage's phases share."""
+        return 1.0
+
 
 def in_words(frames: tuple[int, ...]) -> str:
     """``frame 3``, or ``frames 3, 10``."""
@@ -110,6 +115,15 @@ class Learner(LightningModule, ABC):
     @abstractmethod
     def phase_at(self, iteration: int) -> Phase:
         """The phase that contains ``iteration``."""
+
+    def cost(self, first: int, last: int) -> float:
+        """How long iterations ``first`` to ``last`` take, in the unit of the phases' costs."""
+        cost = 0.0
+        while first < last:
+            phase = self.phase_at(first)
+            stop = min(phase.stop, last)
+            cost, first = cost + (stop - first) * phase.cost, stop
+        return cost
 
     @abstractmethod
     def learning_rate_factor(self, iteration: int) -> float:

@@ -11,7 +11,9 @@ from devrf.evaluation.suite import MetricInput, MetricSuite
 from devrf.metrics.image import psnr, psnr_masked, ssim, ssim_masked, ssim_within
 from devrf.rendering.output import RenderedImage
 from devrf.rendering.renderer import Renderer, points_at_depth
+from devrf.rendering.view import Viewable
 from devrf.scenes.scene import Background, Views
+from devrf.system.progress import followed
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,21 @@ def score(
         depth=rendered.depth.cpu().view(truth.shape[:2]),
         opacity=opacity,
     )
+
+
+def score_all(
+    model: Viewable,
+    views: Views,
+    background: Background,
+    suite: MetricSuite,
+    name: str,
+    *,
+    time: float | None = None,
+) -> list[HeldOutView]:
+    """:func:`score` of each of the held-out ``views``; progress is shown by the ``name`` of all."""
+    renderer, count = Renderer(model), len(views)
+    scored = (score(renderer, views, k, background, suite, time=time) for k in range(count))
+    return list(followed(scored, count, name))
 
 
 def compare(prediction: Tensor, truth: Tensor, valid_mask: Tensor | None) -> Tensor:

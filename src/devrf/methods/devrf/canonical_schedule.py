@@ -28,6 +28,11 @@ class CanonicalPhase(Phase):
 
     voxels: int
 
+    @property
+    def cost(self) -> float:
+        """Grows with the side of the grid, and so with the samples of a ray."""
+        return float(self.voxels ** (1 / 3))
+
 
 @dataclass(frozen=True)
 class CanonicalSchedule:

@@ -13,6 +13,8 @@ from typing import Any, Literal, get_args
 from devrf.engine.learner import Phase
 from devrf.errors import DevrfError, expect
 
+# Motion grids of this side take Adam about as long as a batch of rays takes; estimated.
+FINE_SIDE = 160
 # In time, from a visit of a level to the next.
 Order = Literal["forward", "backward"]
 
@@ -67,6 +69,11 @@ class DeformationPhase(Phase):
     init_from_previous: bool
     has_previous: bool
     backward: bool
+
+    @property
+    def cost(self) -> float:
+        """A batch of rays for each frame, beside which Adam on motion grids counts only if fine."""
+        return len(self.frames) * (1 + (self.side / FINE_SIDE) ** 3)
 
     def learning_rate_at(self, iteration: int) -> float:
         """Factor of the learning rate in the visit (docs/method.md#motion-learning-rate)."""
