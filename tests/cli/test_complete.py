@@ -281,9 +281,11 @@ def test_a_job_of_an_experiment_that_sweeps_does_not_start_its_sweep(devrf, run,
 
 def test_a_command_is_recorded_without_what_is_of_that_command_alone(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "a b").mkdir()
     typed = ["stage=render", "trainer=cpu", "data.root='a b'", "+x=1", "~y", "still.time=1"]
-    typed += ["ckpt=c", "seed=2", "hydra/launcher=joblib"]
-    assert recorded(typed) == [f'data.root="{tmp_path}/a b"', "+x=1", "~y", "seed=2"]
+    typed += ["ckpt=c", "seed=2", "video.path=spiral", "hydra/launcher=joblib"]
+    kept = [f'data.root="{tmp_path}/a b"', "+x=1", "~y", "seed=2", "video.path=spiral"]
+    assert recorded(typed) == recorded(kept) == kept
 
 
 def test_a_checkpoint_does_not_choose_which_code_is_run(run, learned_by):

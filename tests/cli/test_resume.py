@@ -157,6 +157,19 @@ def test_a_run_that_was_cut_short_goes_on(devrf, cut_short, tmp_path):
     assert (ours.density.values == whole.density.values).all()
 
 
+def test_a_run_that_was_cut_short_says_where_it_stands(devrf, cut_short, tmp_path):
+    _, checkpoints = cut_short
+    (checkpoints / "canonical.ckpt").unlink()
+    stands = "canonical-progress-4.ckpt: iteration 4 of 6 of the canonical stage"
+    go_on = "python -m devrf hydra.run.dir=run goes on"
+    outcome = devrf("stage=evaluate", "hydra.run.dir=run")
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert f"{stands}; {go_on}" in outcome.err and not (tmp_path / "run/metrics.json").exists()
+    outcome = devrf("stage=still", "hydra.run.dir=run", "still.height=20")
+    assert outcome.status == 0 and f"{stands}; {go_on}" in outcome.out
+    assert len([*tmp_path.glob("run/images/still*")]) == 2
+
+
 def test_a_damaged_progress_file_gives_way_to_the_one_before(devrf, cut_short):
     command, checkpoints = cut_short
     newest = checkpoints / "canonical-progress-4.ckpt"

@@ -189,6 +189,20 @@ def test_what_differs_or_is_missing_is_done(devrf, tiny, run):
     assert redone == scores | {"held_out.mp4", "orbit.mp4"}
 
 
+def test_a_film_by_path_leaves_the_others_alone(devrf, tiny, run, tmp_path):
+    pose, keyframes = [1, 0, 0, 0, 0, 0, -1, -3, 0, 1, 0, 0, 0, 0, 0, 1], tmp_path / "walk.json"
+    row = {"matrix": pose, "fov": 40, "aspect": 1.5, "render_time": 0, "seconds": 0}
+    keyframes.write_text(json.dumps({"keyframes": [row, {**row, "seconds": 0.1}]}))
+    by_path, before = (*tiny, "hydra.run.dir=run", f"video.path={keyframes}"), stamps(run)
+    assert devrf(*by_path).status == 0
+    assert "render: done already (videos/held_out.mp4, " in devrf(*tiny, "hydra.run.dir=run").out
+    assert {name: stamps(run)[name] for name in before} == before
+    # Other keyframes, another film.
+    assert "render: done already (videos/walk.mp4)" in devrf(*by_path).out
+    keyframes.write_text(keyframes.read_text().replace("40", "50"))
+    assert "video written to" in devrf(*by_path).out
+
+
 # The number that a run is judged by
 
 
@@ -251,6 +265,12 @@ def test_the_pipeline_of_a_scene_at_rest_learns_no_motion(devrf, tmp_path, short
     assert "run stage=still still.height=400" in done.out and "still.time" not in done.out
     assert devrf(*where, *short, "stage=still").status == 0
     assert (run / "images" / "still_held_out.png").is_file()
+    # Nothing is left to do: the scene, which may not be there any more, is not read again.
+    at_rest.rename(at_rest.parent / "away")
+    again = devrf(*where, *short, "objective=dynamic.psnr", "evaluation.metrics=[]")
+    (at_rest.parent / "away").rename(at_rest)
+    assert (again.status, again.err) == (0, "")
+    assert "canonical: learned already" in again.out and "render: done already" in again.out
 
 
 @pytest.mark.parametrize(

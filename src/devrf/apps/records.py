@@ -16,9 +16,17 @@ import pandas as pd
 import torch
 
 import devrf
+from devrf.checkpoints.checkpoint import GIVEN_REST, OWN_REST, CheckpointMetadata
 from devrf.evaluation.held_out import HeldOutView
+from devrf.evaluation.objective import TRAINING
 from devrf.geometry.clock import FrameClock
+from devrf.scenes.scene import Scene
 from devrf.system.files import atomic_write
+
+# Held-out images of the dynamic capture at times that a training view has, and at others.
+OF_TIMES = ("training_times", "novel_times")
+# How iterations were carried out.
+EXECUTION = ("kernels", "startup_seconds", "graph_captures", "short_lists", "peak_reserved_gb")
 
 
 def mean_scores(views: Sequence[HeldOutView]) -> dict[str, float | None]:
@@ -40,10 +48,66 @@ def dynamic_scores(views: Sequence[HeldOutView], clock: FrameClock) -> dict[str,
     novel = [view for view in views if not clock.knows(view.time)]
     known = [view for view in views if clock.knows(view.time)]
     scores: dict[str, Any] = _with_rest_pose(views)
-    for name, some in (("training_times", known), ("novel_times", novel)):
+    for name, some in zip(OF_TIMES, (known, novel), strict=True):
         if novel and some:
             scores[name] = {**_with_rest_pose(some), "images": len(some)}
     return scores
+
+
+def scores_by_section(
+    frames: Mapping[str, Sequence[HeldOutView]],
+    clock: FrameClock,
+    metadata: CheckpointMetadata,
+    rest: str | None,
+    checkpoint_mb: float,
+) -> dict[str, Any]:
+    """The sections of ``metrics.json``: mean scores, and what training took.
+
+    Args:
+        frames: held-out views by capture: ``static``, and ``dynamic`` where motion was learned.
+        clock: of the training views.
+        metadata: of the checkpoint.
+        rest: the stage that learned the scene at rest; None: one stage learned all.
+        checkpoint_mb: the size of the checkpoint.
+
+    Returns:
+        ``static`` and ``dynamic``, and the same under the names of their stages. A single stage's
+        training stands in the dynamic section, where there is one.
+    """
+
+    def training(stage: str) -> dict[str, Any]:
+        return {name: metadata.records.get(stage, {}).get(name) for name in TRAINING}
+
+    static: dict[str, Any] = mean_scores(frames["static"])
+    sections, last = {"static": static}, metadata.stage
+    if rest is not None or "dynamic" not in frames:
+        sections["static"] = sections[rest or last] = static | training(rest or last)
+    if "dynamic" in frames:
+        sections["dynamic"] = dynamic_scores(frames["dynamic"], clock) | training(last)
+        if rest is not None:
+            sections[last] = sections["dynamic"]
+    sections["dynamic" if "dynamic" in frames else "static"]["checkpoint_mb"] = checkpoint_mb
+    return sections
+
+
+def shown_sections(sections: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """The scores of each capture without those of some times, which are sections of their own."""
+    captures = {name: sections[name] for name in ("static", "dynamic") if name in sections}
+    of_times = {key: row[key] for row in captures.values() for key in OF_TIMES if key in row}
+    return {
+        name: {key: value for key, value in row.items() if key not in OF_TIMES}
+        for name, row in (captures | of_times).items()
+    }
+
+
+def tracked_scores(sections: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
+    """Scores by trackers' names, ``test/dynamic/psnr``; those of training curves have no test."""
+    return {
+        f"test/{section}/{key}": value
+        for section, row in sections.items()
+        for key, value in row.items()
+        if value is not None and key not in OF_TIMES
+    }
 
 
 def _with_rest_pose(views: Sequence[HeldOutView]) -> dict[str, float | None]:
@@ -66,6 +130,36 @@ def frame_rows(
         for capture, group in captures.items()
         for view in group
     ]
+
+
+def data_record(scene: Scene) -> dict[str, Any]:
+    """How much data a scene is: views that train, frames held out."""
+    frames = scene.clock.frames_of(scene.dynamic.train.times)
+    return {
+        # A camera that moves is one view, however many images it took.
+        "train_views": int(frames.bincount().max()) if scene.moves else None,
+        "test_frames": len(scene.dynamic.test),
+    }
+
+
+def learning_record(metadata: CheckpointMetadata, stages: Sequence[str]) -> dict[str, Any]:
+    """How the ``stages`` were learned: settings, seconds, and which kernels and graphs really ran.
+
+    ``settings`` are those that decided what was learned, by config key, in all stages.
+    """
+    settings: dict[str, Any] = {}
+    for of_stage in (*metadata.earlier_configs.values(), metadata.training_config):
+        settings |= of_stage
+    records = {name: metadata.records.get(name, {}) for name in stages}
+    return {
+        **({"seed": settings["seed"]} if "seed" in settings else {}),
+        "settings": {k: settings[k] for k in sorted(settings) if k not in (OWN_REST, GIVEN_REST)},
+        "fingerprint": metadata.fingerprint,
+        "wall_seconds": {name: record.get("wall_seconds") for name, record in records.items()},
+        "execution": {
+            n: {key: record.get(key) for key in EXECUTION} for n, record in records.items()
+        },
+    }
 
 
 def provenance(size: int, device: torch.device) -> dict[str, Any]:

@@ -21,10 +21,11 @@ from devrf.apps.video import (
     held_out_pictures,
     path_pictures,
 )
+from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.evaluation.held_out import background_value
 from devrf.geometry.cameras import Cameras
 from devrf.rendering.renderer import Renderer
-from devrf.scenes.scene import Scene
+from devrf.scenes.scene import Views
 
 log = logging.getLogger(__name__)
 
@@ -51,17 +52,18 @@ def camera_path(settings: VideoSettings) -> CameraPath | None:
     return path
 
 
-def videos(renderer: Renderer, scene: Scene, settings: VideoSettings) -> Iterator[Video]:
-    """The held-out views over time, and the scene from a moving camera while time runs.
+def videos(
+    renderer: Renderer, viewpoints: Viewpoints, settings: VideoSettings, held_out: Views | None
+) -> Iterator[Video]:
+    """The ``held_out`` views over time, if any, and the scene from a moving camera meanwhile.
 
     With ``video.path`` there is that path alone.
     """
-    behind, static = background_value(scene.background), scene.static.train.cameras
-    views = (scene.dynamic if scene.moves else scene.static).test
+    behind, static = background_value(viewpoints.background), viewpoints.static
     path = camera_path(settings)
     if path is not None:
         settings = replace(settings, frames=path.frames, fps=path.fps)
-    settings = _within_limit(settings, renderer, settings.sized(views.cameras))
+    settings = _within_limit(settings, renderer, settings.sized(viewpoints.held_out))
     sized, space = settings.sized(static), renderer.model.space
 
     def filmed(name: str) -> Callable[[VideoSettings], Cameras]:
@@ -82,9 +84,9 @@ def videos(renderer: Renderer, scene: Scene, settings: VideoSettings) -> Iterato
         cameras, times = PRESETS[settings.path](ring, settings.time, settings)
         yield video(settings.path, path_pictures(renderer, cameras, behind, times))
         return
-    if settings.path is None:
-        images = held_out_images(views, settings.frames)
-        shown = held_out_pictures(renderer, views, images, settings, scene.background)
+    if held_out is not None:
+        images, background = held_out_images(held_out, settings.frames), viewpoints.background
+        shown = held_out_pictures(renderer, held_out, images, settings, background)
         yield video("held_out", shown)
     name = settings.path or default_way(space)
     yield video(name, path_pictures(renderer, filmed(name)(settings), behind))

@@ -71,6 +71,15 @@ class PeriodicCheckpoint(Callback):
         """End the training after the present Lightning step, with a progress file written."""
         self._asked = True
 
+    def left_at(self, stage: ScheduledStage) -> str:
+        """Where a signal has ended the run, in one line."""
+        done, total = stage.iteration, stage.total_iterations
+        where = f"interrupted at iteration {done} of {total} of the {stage.name} stage"
+        if done < total and self.saved != done:
+            last = "there is none" if self.saved is None else f"the last is of {self.saved}"
+            where += f" (its progress could not be written; {last})"
+        return f"{where}; run the same command again to go on"
+
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the clock, and remove half-written files of a process that was killed."""
         assert isinstance(pl_module, ScheduledStage)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import torch
 from lightning import Trainer
 from lightning.fabric.plugins import CheckpointIO
 
@@ -19,10 +20,14 @@ from devrf.checkpoints.checkpoint_file import (
 )
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
+from devrf.geometry.clock import FrameClock
 from devrf.scenes.scene import Background, Scene
 
 # The stage's attribute that holds the model: what its entries of a state begin with.
 MODEL = "scene_model."
+# Keys of a training config for the digest of the canonical checkpoint that is built on: the run's
+# own, or a given one.
+OWN_REST, GIVEN_REST = "checkpoints/canonical.ckpt", "ckpt"
 # What training took: by name, numbers, and words that say how it ran.
 TrainingFigures = dict[str, float | str | None]
 
@@ -44,6 +49,7 @@ class CheckpointMetadata:
         command: the overrides of the command that learned it, without those that say only what to
             do; None where none did.
         complete: whether the stage has gone through its whole schedule.
+        moves: whether the scene was seen at more than one time; None in a file of before.
     """
 
     scene: str
@@ -56,26 +62,48 @@ class CheckpointMetadata:
     earlier_configs: dict[str, dict[str, Any]] = field(default_factory=dict)
     command: list[str] | None = None
     complete: bool = True
+    moves: bool | None = None
 
 
 @dataclass(frozen=True)
 class Viewpoints:
-    """The cameras of a scene, without its images.
+    """What is known of a scene without its images: who saw it, and when.
 
     Attributes:
-        static: cameras of the static training images.
-        held_out: the camera of the first held-out image of the moving scene: one camera.
         background: what is behind the alpha mask.
+        clock: the times of the training images.
+        static: cameras of the static training images.
+        dynamic: cameras of the training images in motion, a fixed one once; of a scene at rest the
+            static ones.
+        held_out: the camera of the first held-out image of the moving scene: one camera.
     """
 
-    static: Cameras
-    held_out: Cameras
     background: Background
+    clock: FrameClock
+    static: Cameras
+    dynamic: Cameras
+    held_out: Cameras
+
+    @property
+    def moves(self) -> bool:
+        """Whether the scene was seen at more than one time."""
+        return len(self.clock) > 1
 
     @classmethod
     def of(cls, scene: Scene) -> Viewpoints:
         """The viewpoints of a scene."""
-        return cls(scene.static.train.cameras, scene.dynamic.test.cameras[[0]], scene.background)
+        train = scene.dynamic.train
+        first = [int((train.view == view).nonzero()[0]) for view in torch.unique(train.view)]
+        static, held_out = scene.static.train.cameras, scene.dynamic.test.cameras[[0]]
+        return cls(scene.background, scene.clock, static, train.cameras[first], held_out)
+
+    @classmethod
+    def stored(cls, entry: dict[str, Any]) -> Viewpoints | None:
+        """The viewpoints of which a checkpoint holds ``asdict``; None in one of before."""
+        if "clock" not in entry:
+            return None
+        cameras = {name: Cameras(**entry[name]) for name in ("static", "dynamic", "held_out")}
+        return cls(**{**entry, **cameras, "clock": FrameClock(**entry["clock"])})
 
 
 @dataclass(frozen=True)
@@ -145,7 +173,7 @@ def load_checkpoint(path: Path, scene: Scene | None = None) -> LoadedCheckpoint:
         own_config = {k: v for k, v in metadata.model.items() if k != "_target_"}
         model = model_class.from_config(own_config)
         model.load_stored_state(state)
-        viewpoints = None if "viewpoints" not in data else _viewpoints(**data["viewpoints"])
+        viewpoints = Viewpoints.stored(data.get("viewpoints", {}))
     except (RuntimeError, LookupError, ValueError, TypeError, AttributeError):
         raise DevrfError(f"{path}: its fields do not fit its description; train again") from None
     return LoadedCheckpoint(metadata, model, viewpoints)
@@ -202,12 +230,6 @@ def metadata_in(path: Path, data: dict[str, Any]) -> CheckpointMetadata:
         raise DevrfError(
             f"{path}: its description lacks or has an unknown entry ({error}); train again"
         ) from None
-
-
-def _viewpoints(
-    static: dict[str, Any], held_out: dict[str, Any], background: Background
-) -> Viewpoints:
-    return Viewpoints(Cameras(**static), Cameras(**held_out), background)
 
 
 def _model_class(path: Path, metadata: CheckpointMetadata) -> Any:

@@ -19,7 +19,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
-from devrf.cli.config import config_folder, group_choices, rows
+from devrf.cli.config import config_folder, group_choices, overrides, rows
 from devrf.cli.messages import in_quotes
 from devrf.cli.restore_config import of_named_run, parsed, value, values
 from devrf.errors import DevrfError
@@ -195,7 +195,10 @@ def with_recognised_data(config: DictConfig) -> DictConfig:
     with open_dict(config):
         config.data = OmegaConf.merge(chosen_data, user_options, {"flow_cache": raw["flow_cache"]})
     if HydraConfig.initialized():
-        chosen: Any = HydraConfig.get().runtime.choices
-        with open_dict(chosen), read_write(chosen):
-            chosen.data = layout.choice  # as if it had been typed: reports compare choices
+        hydra: Any = HydraConfig.get()
+        typed = [text for text in overrides() if not re.match(r"data(=auto|\.\w+=null)$", text)]
+        with open_dict(hydra), read_write(hydra):
+            # As if it had been typed: reports compare choices, later commands need no folder.
+            hydra.runtime.choices.data = layout.choice
+            hydra.overrides.task = [*typed, f"data={layout.choice}"]
     return config

@@ -17,25 +17,29 @@ from omegaconf import DictConfig, OmegaConf
 
 from devrf.apps.fitting import SIZE
 from devrf.apps.trackers import Tracker, trackers
-from devrf.checkpoints.checkpoint import LoadedCheckpoint, Viewpoints, learned_with, load_checkpoint
+from devrf.checkpoints.checkpoint import (
+    OWN_REST,
+    LoadedCheckpoint,
+    Viewpoints,
+    learned_with,
+    load_checkpoint,
+    metadata_of,
+)
 from devrf.checkpoints.checkpoint_file import digest_of
+from devrf.checkpoints.progress import progress_files
 from devrf.cli.config import PIPELINE
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.ddp import ManualDDP
 from devrf.engine.stage import ScheduledStage
 from devrf.errors import DevrfError
 from devrf.evaluation.suite import Evaluation
-from devrf.methods.protocol import Protocol, ProtocolStage
+from devrf.methods.protocol import Protocol
 from devrf.scenes.scene import Scene
 
 if TYPE_CHECKING:
     from devrf.apps.viewer.session import Session
 
 log = logging.getLogger(__name__)
-
-# Keys in a checkpoint's training config for the digest of the canonical checkpoint it builds on:
-# the run's own, or a given one.
-OWN_REST, GIVEN_REST = "checkpoints/canonical.ckpt", "ckpt"
 
 
 class RunContext:
@@ -53,6 +57,12 @@ class RunContext:
         self.folder = folder
         self.step_began = time.perf_counter()
         self.chooses_size = False
+
+    @property
+    def place(self) -> Path:
+        """The folder as a command names it: relative, where it is below the working folder."""
+        inside = self.folder.is_relative_to(Path.cwd())
+        return self.folder.relative_to(Path.cwd()) if inside else self.folder
 
     @property
     def step_seconds(self) -> float:
@@ -87,23 +97,32 @@ class RunContext:
 
     @property
     def learning_stages(self) -> tuple[str, ...]:
-        """Names of the protocol's stages, in their order."""
-        return tuple(step.name for step in self.protocol.steps if self._has(step))
-
-    def _has(self, step: ProtocolStage) -> bool:
-        """Whether the method learns by a stage that is optional: it has one, with iterations."""
-        iterations = OmegaConf.select(self.config, f"{step.name}.schedule.iterations")
-        return not step.optional or bool(iterations)
+        """Names of the protocol's stages, in their order; of optional ones, if they iterate."""
+        return tuple(
+            step.name
+            for step in self.protocol.steps
+            if not step.optional
+            or OmegaConf.select(self.config, f"{step.name}.schedule.iterations")
+        )
 
     @property
     def stages_with_images(self) -> tuple[str, ...]:
         """The protocol's stages; of a scene at rest those that learn from the static set alone."""
-        if self.scene.moves:
+        if self.moves:
             return self.learning_stages
         return tuple(step.name for step in self.protocol.steps if step.capture == "static")
 
+    @property
+    def moves(self) -> bool:
+        """Whether the scene moves; the scene is read, unless what was learned of it says so."""
+        for path in map(self.own_checkpoint, self.learning_stages if self.config.resume else ()):
+            moves = metadata_of(path).moves if path.is_file() else None
+            if moves is not None:
+                return moves
+        return self.scene.moves
+
     def learnable(self, names: Sequence[str]) -> tuple[str, ...]:
-        """Those of the stages ``names`` that the scene has images for; the scene is read.
+        """Those of the stages ``names`` that the scene has images for.
 
         Raises:
             DevrfError: there is none.
@@ -112,7 +131,7 @@ class RunContext:
         left = tuple(name for name in names if name in known)
         if left:
             return left
-        at_rest = f"{self.scene.name} is at rest: all its images show one moment"
+        at_rest = f"{self.config.scene} is at rest: all its images show one moment"
         if known:
             raise DevrfError(
                 f"stage={names[0]}: learns motion, but {at_rest}; use stage={known[0]} or "
@@ -213,8 +232,7 @@ class RunContext:
     @property
     def device(self) -> torch.device:
         """The trainer's device."""
-        device: torch.device = self.strategy.root_device
-        return device
+        return self.strategy.root_device
 
     @cached_property
     def evaluation(self) -> Evaluation:
@@ -227,7 +245,9 @@ class RunContext:
         return self.folder / "checkpoints" / f"{name}.ckpt"
 
     def checkpoint(self, name: str | None = None) -> Path:
-        """The checkpoint ``ckpt``, else the run's own of a stage; by default, of the last stage.
+        """The checkpoint ``ckpt``, else the run's own of a stage.
+
+        By default of the last stage, which may be a progress file.
 
         Raises:
             DevrfError: there is none.
@@ -237,20 +257,21 @@ class RunContext:
                 raise DevrfError(f"{self.config.ckpt}: no such checkpoint; set ckpt to a file")
             return Path(self.config.ckpt)
         names = self.learning_stages[::-1] if name is None else (name,)
-        paths = [path for path in map(self.own_checkpoint, names) if path.exists()]
-        if not paths:
-            raise DevrfError(
-                f"{self.own_checkpoint(names[-1])}: no such checkpoint; run stage={names[-1]} "
-                "first, or give ckpt=PATH"
-            )
-        return paths[0]
+        for path in map(self.own_checkpoint, names):
+            left = progress_files(path.parent, path.stem) if name is None else []
+            if path.exists() or left:
+                return path if path.exists() else left[0]
+        raise DevrfError(
+            f"{self.own_checkpoint(names[-1])}: no such checkpoint; run stage={names[-1]} "
+            "first, or give ckpt=PATH"
+        )
 
-    def load(self, name: str | None = None, *, unread: bool = False) -> LoadedCheckpoint:
+    def load(self, name: str | None = None, scene: Scene | None = None) -> LoadedCheckpoint:
         """Load :meth:`checkpoint`; one that builds on another than the run's is passed over.
 
-        With ``unread`` any scene's is taken, so that the scene is not read.
+        It has to be of the ``scene``; None takes any.
         """
-        path, scene = self.checkpoint(name), None if unread else self.scene
+        path = self.checkpoint(name)
         loaded = load_checkpoint(path, scene)
         if self.config.ckpt is None and loaded.metadata.stage in self.learning_stages:
             below = self.protocol[loaded.metadata.stage].builds_on

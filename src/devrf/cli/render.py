@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from contextlib import closing
 from pathlib import Path
 
@@ -13,15 +14,18 @@ from devrf.apps.export.scene import export_scene
 from devrf.apps.images import to_bytes
 from devrf.apps.render import videos
 from devrf.apps.settings import ViewerSettings
-from devrf.apps.still import StillSettings, still, write_still
+from devrf.apps.still import StillSettings, write_still
+from devrf.apps.still import still as rendered
 from devrf.apps.video import VideoSettings
 from devrf.apps.video_file import write_pictures
-from devrf.checkpoints.checkpoint import CheckpointMetadata, Viewpoints, check_scene
+from devrf.checkpoints.checkpoint import Viewpoints, check_scene, metadata_of
+from devrf.cli.config import overrides
 from devrf.cli.context import RunContext
-from devrf.cli.restore_config import parsed, value
-from devrf.cli.resume import deciding_settings
+from devrf.cli.restore_config import recorded
+from devrf.cli.resume import unfinished
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
+from devrf.methods.base import Renderable
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
 from devrf.system.process import handle_signals
@@ -33,13 +37,18 @@ log = logging.getLogger(__name__)
 CACHED = 6
 
 
-def render(run: RunContext) -> list[Path]:
-    """Write the videos that ``video`` asks for; return their files."""
+def render(run: RunContext) -> list[Path] | None:
+    """Write the videos that ``video`` asks for; return their files, None if one was left out."""
     settings: VideoSettings = instantiate(run.config.video)
-    stored, scene = run.load(), run.scene
-    renderer = Renderer(stored.model.to_view(run.device), half=settings.half)
-    paths = []
-    for video in videos(renderer, scene, settings):
+    model, viewpoints = _learned(run)
+    scene = (
+        _with_images(run, "held_out.mp4, which shows its images, is left out")
+        if settings.path is None
+        else None
+    )
+    held_out = None if scene is None else (scene.dynamic if scene.moves else scene.static).test
+    renderer, paths = Renderer(model, half=settings.half), []
+    for video in videos(renderer, viewpoints, settings, held_out):
         path = run.folder / "videos" / f"{video.name}.mp4"
         pictures = (to_bytes(picture).numpy() for picture in video.pictures)
         write_pictures(path, followed(pictures, video.frames, path.name), video.fps)
@@ -47,34 +56,17 @@ def render(run: RunContext) -> list[Path]:
         for tracker in run.trackers:
             tracker.show_video(f"videos/{video.name}", path)
         paths.append(path)
-    return paths
+    return paths if settings.path or held_out else None
 
 
-def picture(run: RunContext) -> None:
-    """Render the scene from one camera at one time; earlier pictures stay.
-
-    No image of the scene is read where its data is that of the checkpoint.
-    """
+def still(run: RunContext) -> None:
+    """Render the scene from one camera at one time; earlier pictures stay."""
     settings: StillSettings = instantiate(run.config.still)
-    stored = run.load(unread=True)
-    viewpoints = stored.viewpoints
-    if viewpoints is None or not _is_its_data(run, stored.metadata):
-        stored = run.load()  # refuses another scene
-        viewpoints = Viewpoints.of(run.scene)
-    camera = settings.camera(viewpoints)
-    renderer = Renderer(stored.model.to_view(run.device), half=settings.half)
-    color, depth = still(renderer, camera, settings.time, background_value(viewpoints.background))
-    write_still(run.folder / "images" / f"{settings.name(stored.model.moves)}.png", color, depth)
-
-
-def _is_its_data(run: RunContext, metadata: CheckpointMetadata) -> bool:
-    """Whether the configured data is, by its settings, what the checkpoint was learned from."""
-    data = {k: v for k, v in metadata.training_config.items() if k.startswith("data.")}
-    present = deciding_settings(run.config, metadata.stage)
-    if metadata.command is None or data != {k: present[k] for k in present if k in data}:
-        return False
-    root, before = run.config.data.get("root"), value(parsed(metadata.command), "data.root")
-    return root is None or (before is not None and Path(root).resolve() == Path(before).resolve())
+    model, viewpoints = _learned(run)
+    camera, behind = settings.camera(viewpoints), background_value(viewpoints.background)
+    renderer = Renderer(model, half=settings.half)
+    color, depth = rendered(renderer, camera, settings.time, behind)
+    write_still(run.folder / "images" / f"{settings.name(model.moves)}.png", color, depth)
 
 
 def view(run: RunContext) -> None:
@@ -83,28 +75,45 @@ def view(run: RunContext) -> None:
     from devrf.apps.viewer.session import Session  # an extra
 
     settings: ViewerSettings = instantiate(run.config.viewer)
-    stored = run.load(unread=True)
-    scene: Scene | None = None
-    try:
-        check_scene(run.checkpoint(), stored.metadata, run.scene)
-        scene = run.scene
-    except DevrfError as error:
-        if stored.viewpoints is None:
-            raise
-        log.warning("%s; its training cameras are shown without pictures", error)
-    viewpoints = stored.viewpoints if scene is None else Viewpoints.of(scene)
-    assert viewpoints is not None
-    renderer = Renderer(stored.model.to_view(run.device), times=CACHED)
+    model, viewpoints = _learned(run)
+    scene = _with_images(run, "its cameras are shown without pictures")
     with (
         closing(Session(settings, viewpoints, scene, run.folder, run.config.ckpt)) as session,
         handle_signals(lambda _: session.stop()),
     ):
-        session.present(Drawing(renderer, background_value(viewpoints.background)))
+        drawing = Drawing(Renderer(model, times=CACHED), background_value(viewpoints.background))
+        session.present(drawing)
         session.serve()
 
 
 def export(run: RunContext) -> None:
     """Write geometry that moves, for other programs."""
     settings: ExportSettings = instantiate(run.config.export, _convert_="all")
-    model = run.load().model.to_view(run.device)
-    export_scene(model, run.scene, settings, run.folder / "export")
+    model, viewpoints = _learned(run)
+    export_scene(model, viewpoints, settings, run.folder / "export")
+
+
+def _learned(run: RunContext) -> tuple[Renderable, Viewpoints]:
+    """What was learned, on the trainer's device, and who saw it; another scene is refused.
+
+    The scene is read only where other data is typed than what the checkpoint was learned from.
+    """
+    if (standing := unfinished(run)) is not None:
+        log.warning("shown as far as it is learned: %s", standing)
+    stored = run.load()
+    viewpoints = stored.viewpoints
+    changed = {*recorded(overrides())} ^ {*(stored.metadata.command or ())}
+    if viewpoints is None or any(re.match(r"[+~]*data\W", text) for text in changed):
+        check_scene(run.checkpoint(), stored.metadata, run.scene)
+        viewpoints = Viewpoints.of(run.scene)
+    return stored.model.to_view(run.device), viewpoints
+
+
+def _with_images(run: RunContext, without: str) -> Scene | None:
+    """The run's scene; None, and a line that says what comes ``without``, if it is not there."""
+    try:
+        check_scene(path := run.checkpoint(), metadata_of(path), run.scene)
+        return run.scene
+    except DevrfError as error:
+        log.warning("%s; %s", error, without)
+        return None

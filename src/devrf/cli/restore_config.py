@@ -30,7 +30,7 @@ OF_A_COMMAND |= {"viewer"}
 # Names code to be run, which a checkpoint, perhaps a stranger's, may not choose.
 CODE = "_target_"
 # Values that are relative to the folder in which they were typed.
-RELATIVE = {"data.root", "evaluation.lpips_weights"}
+RELATIVE = {"data.root", "evaluation.lpips_weights", "video.path"}
 
 # Where the present command's settings come from, until a log is there to say so.
 _source: list[str] = []
@@ -76,7 +76,7 @@ def recorded(overrides: Iterable[str]) -> list[str]:
         if _root(key) in OF_A_COMMAND or CODE in text:
             continue
         path = None if override.is_delete() else override.value()
-        if key in RELATIVE and isinstance(path, str) and "${" not in path:
+        if key in RELATIVE and isinstance(path, str) and Path(path).expanduser().exists():
             text = f"{key}={in_quotes(str(Path(path).expanduser().absolute()))}"
         lasting.append(text)
     return lasting

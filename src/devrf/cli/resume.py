@@ -18,18 +18,25 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
 import devrf
-from devrf.checkpoints.checkpoint import CheckpointMetadata, metadata_in
-from devrf.checkpoints.checkpoint_file import digest_of, read_checkpoint_file
+from devrf.checkpoints.checkpoint import (
+    GIVEN_REST,
+    OWN_REST,
+    CheckpointMetadata,
+    metadata_in,
+)
+from devrf.checkpoints.checkpoint_file import digest_of, read_checkpoint_file, read_description
 from devrf.checkpoints.progress import progress_files
 from devrf.cli.config_check import REFERENCE
-from devrf.cli.context import GIVEN_REST, OWN_REST, RunContext
+from devrf.cli.context import RunContext
 from devrf.errors import DevrfError
 from devrf.system.files import write_json
 from devrf.system.folder_lock import PLACE
@@ -143,9 +150,7 @@ def _agrees(path: Path, metadata: CheckpointMetadata, training_config: Mapping[s
 
 
 def _shown(settings: Mapping[str, Any], key: str) -> str:
-    if key not in settings:
-        return "nothing"
-    text = json.dumps(settings[key])
+    text = json.dumps(settings[key]) if key in settings else "nothing"
     return text if len(text) <= 40 else f"{text[:37]}..."
 
 
@@ -155,21 +160,36 @@ def remove_progress(folder: Path, stage: str) -> None:
         path.unlink(missing_ok=True)
 
 
-def done(run: RunContext, step: str) -> list[str]:
-    """The files of a step that need not be done again; none where it must be."""
-    noted, present = _notes(run.folder).get(step), _made_with(run, step)
-    if noted is None or present is None or noted["with"] != present:
-        return []
-    files: list[str] = noted["files"]
-    return files if all((run.folder / name).is_file() for name in files) else []
+def unfinished(run: RunContext) -> str | None:
+    """Where the run's last stage stands, and how to go on; None if there is nothing left of it."""
+    path = run.checkpoint()
+    progress = read_description(path).get("progress")
+    if progress is None:
+        return None
+    return (
+        f"{path}: iteration {progress['iteration']} of {progress['total']} of the "
+        f"{progress['stage']} stage; python -m devrf hydra.run.dir={run.place} goes on"
+    )
 
 
-def note_done(run: RunContext, step: str, files: Sequence[Path]) -> None:
-    """Note that a step was done, and the files it wrote."""
-    if step in DECIDES:
+def done(run: RunContext, step: str) -> bool:
+    """Whether a step has been done with the same checkpoint and settings; says so."""
+    present = _made_with(run, step)
+    for note in _notes(run.folder):
+        files = note["files"]
+        if note["with"] == present and all((run.folder / name).is_file() for name in files):
+            log.info("%s: done already (%s); stage=%s does it again", step, ", ".join(files), step)
+            return True
+    return False
+
+
+def note_done(run: RunContext, step: str, files: Sequence[Path] | None) -> None:
+    """Note what a step has written, and forget what these files were before."""
+    if step in DECIDES and files:
         names = sorted(path.relative_to(run.folder).as_posix() for path in files)
-        note = {step: {"with": _made_with(run, step), "files": names}}
-        write_json(run.folder / PLACE / NOTE, _notes(run.folder) | note)
+        others = [note for note in _notes(run.folder) if not {*names} & {*note["files"]}]
+        note = {"with": _made_with(run, step), "files": names}
+        write_json(run.folder / PLACE / NOTE, {"notes": [*others, note]})
 
 
 def _made_with(run: RunContext, step: str) -> dict[str, Any] | None:
@@ -183,12 +203,14 @@ def _made_with(run: RunContext, step: str) -> dict[str, Any] | None:
     if data.get("root") is not None:
         data["root"] = str(Path(data["root"]).resolve())
     made = {"checkpoint": checkpoint, "version": devrf.__version__, "data": data}
+    keyframes = Path(str(config["video"]["path"]))
+    if step == "render" and keyframes.is_file():
+        made["keyframes"] = sha256(keyframes.read_bytes()).hexdigest()
     return made | {"logger": config["logger"]["_target_"], "step": config[DECIDES[step]]}
 
 
-def _notes(folder: Path) -> dict[str, Any]:
-    try:
-        notes: dict[str, Any] = json.loads((folder / PLACE / NOTE).read_text())
-    except (OSError, ValueError):
-        return {}
-    return notes
+def _notes(folder: Path) -> list[dict[str, Any]]:
+    with suppress(OSError, ValueError, LookupError):
+        notes: list[dict[str, Any]] = json.loads((folder / PLACE / NOTE).read_text())["notes"]
+        return notes
+    return []

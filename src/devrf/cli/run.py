@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import json
 import logging
-import os
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -27,8 +26,8 @@ from devrf.cli.evaluate import evaluate
 from devrf.cli.memory import compare
 from devrf.cli.messages import as_own_errors
 from devrf.cli.preparation import capture, fetch, inspect, prepare, say_next, selfcheck
-from devrf.cli.render import export, picture, render, view
-from devrf.cli.resume import beginning, done, note_done
+from devrf.cli.render import export, render, still, view
+from devrf.cli.resume import done, note_done
 from devrf.cli.run_folder import archive_previous
 from devrf.cli.sweep import report
 from devrf.cli.train import learn
@@ -47,17 +46,11 @@ Names = tuple[str, ...]
 
 # What devrf.cli.config.STEPS names.
 STEPS: dict[str, Step] = {
-    "prepare": prepare,
-    "inspect": inspect,
-    "evaluate": evaluate,
-    "render": render,
-    "still": picture,
-    "view": view,
-    "export": export,
-    "report": report,
-    "fetch": fetch,
-    "capture": capture,
-    "selfcheck": selfcheck,
+    step.__name__: step
+    for step in (
+        *(prepare, inspect, evaluate, render, still, view, export),
+        *(report, fetch, capture, selfcheck),
+    )
 }
 AFTER_LEARNING = ("evaluate", "render")
 # Steps for which the run's scene and stages need not be right.
@@ -104,9 +97,6 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
     learning, steps = plan(config.stage, run.learning_stages)
     with shortage_in_words(config.stage, run.device, None):  # of networks that are too wide
         _check(run, learning, steps)
-    several = isinstance(run.strategy, ManualDDP)
-    if not several and _all_done(run, learning, steps):
-        return _ended(run, steps)
     ended = False
     try:
         if learning:
@@ -115,7 +105,7 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
             _learn(run, learning)
         if not learning or run.leads:
             for name in steps:
-                if not (learning and _is_done(run, name)):
+                if not (learning and done(run, name)):
                     _take(run, name, STEPS[name])
         ended = True
     finally:
@@ -128,7 +118,7 @@ def _prepare_to_learn(run: RunContext, requested: Names, steps: Names) -> None:
     learning = run.learnable(requested)
     if learning != requested:
         left = ", ".join(learning + steps)
-        log.info("%s is at rest: %s; no motion is learned", run.scene.name, left)
+        log.info("%s is at rest: %s; no motion is learned", run.config.scene, left)
     resume = run.config.resume
     names = [name for name in learning if not (resume and run.own_checkpoint(name).is_file())]
     needed, shortage = compare(run, names) if names and run.config.memory_check else (None, None)
@@ -141,35 +131,13 @@ def _prepare_to_learn(run: RunContext, requested: Names, steps: Names) -> None:
         log.info("%s", needed)
 
 
-def _is_done(run: RunContext, name: str) -> bool:
-    """Whether a step has been done with the same checkpoint and settings; says so."""
-    files = done(run, name)
-    if files:
-        log.info("%s: done already (%s); stage=%s does it again", name, ", ".join(files), name)
-    return bool(files)
-
-
-def _all_done(run: RunContext, learning: Names, steps: Names) -> bool:
-    """Whether nothing of a pipeline is left to do, so that its scene need not be read; says so."""
-    if steps != AFTER_LEARNING or not run.config.resume:
-        return False
-    learned = all(run.own_checkpoint(name).is_file() for name in learning)
-    if not (learned and all(done(run, name) for name in steps)):
-        return False
-    # Refuses other settings than those that it was learned with.
-    if not all(beginning(run, name).finished for name in learning):
-        return False
-    return all(_is_done(run, name) for name in steps)
-
-
 def _ended(run: RunContext, steps: Names) -> float | None:
     """The objective; a pipeline ends with its results, and what to try next."""
-    folder, metrics = run.folder, json.loads((run.folder / "metrics.json").read_text())
+    metrics = json.loads((run.folder / "metrics.json").read_text())
     if steps == AFTER_LEARNING and not in_sweep():
-        results = ", ".join(name for name in RESULTS if (folder / name).exists())
-        place = Path(os.path.relpath(folder)) if folder.is_relative_to(Path.cwd()) else folder
-        log.info("results: %s (%s)", place, results)
-        further = [[f"hydra.run.dir={place}", *words.split()] for words in NEXT]
+        results = ", ".join(name for name in RESULTS if (run.folder / name).exists())
+        log.info("results: %s (%s)", run.place, results)
+        further = [[f"hydra.run.dir={run.place}", *words.split()] for words in NEXT]
         if metrics.get("at_rest"):
             further[0].remove("still.time=0.35")
         say_next(*further, ["stage=report"])
@@ -206,7 +174,7 @@ def _take(run: RunContext, name: str, step: Step) -> None:
     known = OmegaConf.select(run.config, rays) is not None
     with using(run.config.kernels), shortage_in_words(name, run.device, rays if known else None):
         files = step(run)
-    note_done(run, name, files or ())
+    note_done(run, name, files)
     run.step_began = time.perf_counter()
 
 
@@ -224,13 +192,15 @@ def _check(run: RunContext, learning: Names, steps: Names) -> None:
     _ = run.datamodule
     for name in run.learning_stages:
         run.stage_builder(name)
-    run.evaluation.check()
-    check_objective(config.objective, run.evaluation.metrics)
+    if learning or "evaluate" in steps:
+        run.evaluation.check()
+        check_objective(config.objective, run.evaluation.metrics)
     if in_search() and "evaluate" not in steps:
         raise DevrfError(
             f"stage: a search needs the objective, which stage={config.stage} does not score"
         )
-    camera_path(instantiate(config.video))
+    if learning or "render" in steps:
+        camera_path(instantiate(config.video))
     instantiate(config.still)
     instantiate(config.export)
     viewer: ViewerSettings = instantiate(config.viewer)

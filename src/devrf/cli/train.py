@@ -29,14 +29,15 @@ log = logging.getLogger(__name__)
 
 def learn(run: RunContext, name: str) -> None:
     """Learn a stage of the protocol, or the rest of it."""
-    begin = _begin(run, name)
+    begin = run.strategy.broadcast(beginning(run, name) if run.leads else None)
+    assert begin is not None
     if begin.finished:
         return
     build, below = run.stage_builder(name), run.protocol[name].builds_on
     if below is None:
         stage = build()
     else:
-        rest = run.load(below)
+        rest = run.load(below, run.scene)
         if rest.metadata.stage != below:
             raise DevrfError(
                 f"ckpt: stage={name} needs a checkpoint of the {below} stage, not of the "
@@ -48,13 +49,6 @@ def learn(run: RunContext, name: str) -> None:
     stage.protocol = run.protocol.name
     stage.command = recorded(overrides())
     _fit(run, stage, begin)
-
-
-def _begin(run: RunContext, stage: str) -> ResumePoint:
-    """Where the stage begins, as rank 0 finds it."""
-    agreed = run.strategy.broadcast(beginning(run, stage) if run.leads else None)
-    assert isinstance(agreed, ResumePoint)
-    return agreed
 
 
 def _fit(run: RunContext, stage: ScheduledStage, begin: ResumePoint) -> None:
@@ -88,7 +82,7 @@ def _fit(run: RunContext, stage: ScheduledStage, begin: ResumePoint) -> None:
             _keep(run, trainer, stage)
         strategy.barrier("the checkpoint is written")
     if stopping:
-        raise Interrupted(stop.number or signal.SIGTERM, _where(stage, saving))
+        raise Interrupted(stop.number or signal.SIGTERM, saving.left_at(stage))
 
 
 def _keep(run: RunContext, trainer: Trainer, stage: ScheduledStage) -> None:
@@ -110,13 +104,3 @@ def _keep(run: RunContext, trainer: Trainer, stage: ScheduledStage) -> None:
     if stage.iteration >= stage.total_iterations:
         remove_progress(path.parent, stage.name)
     log.info("%s: %s; written to %s", stage.name, in_words(stage.record), path)
-
-
-def _where(stage: ScheduledStage, saving: PeriodicCheckpoint) -> str:
-    """Where a signal has ended the run, in one line."""
-    done, total = stage.iteration, stage.total_iterations
-    where = f"interrupted at iteration {done} of {total} of the {stage.name} stage"
-    if done < total and saving.saved != done:
-        last = "there is none" if saving.saved is None else f"the last is of {saving.saved}"
-        where += f" (its progress could not be written; {last})"
-    return f"{where}; run the same command again to go on"

@@ -115,6 +115,7 @@ class ScheduledStage(Learner):
             earlier_configs=self.earlier_configs,
             command=self.command,
             complete=self.iteration >= self.total_iterations,
+            moves=self.scene.moves,
         )
 
     def abort(self, why: str) -> None:

@@ -6,19 +6,17 @@ import logging
 from collections.abc import Iterator
 from pathlib import Path
 
-import torch
-
 from devrf.apps.export.geometry import ExportSettings, MovingMesh, UpFrame, carried, seen_points
 from devrf.apps.export.gltf import write_gltf
 from devrf.apps.export.sequence import Drawn, mesh_files, point_file, write_sequence
 from devrf.apps.export.surface import canonical_surface
 from devrf.apps.export.usd import write_usd
+from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
 from devrf.geometry.cameras import Cameras
 from devrf.methods.base import Renderable
 from devrf.rendering.renderer import Renderer
-from devrf.scenes.scene import Scene
 from devrf.system.progress import followed
 
 log = logging.getLogger(__name__)
@@ -27,7 +25,9 @@ log = logging.getLogger(__name__)
 SINGLE = {"gltf": ("scene.glb", write_gltf), "usd": ("scene.usdc", write_usd)}
 
 
-def export_scene(model: Renderable, scene: Scene, settings: ExportSettings, folder: Path) -> None:
+def export_scene(
+    model: Renderable, viewpoints: Viewpoints, settings: ExportSettings, folder: Path
+) -> None:
     """Write the surface of what was learned, as it moves, or coloured points of each time.
 
     ``folder`` is where, unless the settings say.
@@ -36,18 +36,18 @@ def export_scene(model: Renderable, scene: Scene, settings: ExportSettings, fold
         DevrfError: what is asked for cannot be had of the method, or is empty.
     """
     folder = folder if settings.into is None else Path(settings.into)
-    times = settings.export_times(scene.clock) if model.moves else (0.0,)
+    times = settings.export_times(viewpoints.clock) if model.moves else (0.0,)
     if _takes_surface(model, settings):
-        surface = canonical_surface(model, scene.static.train.cameras, settings)
+        surface = canonical_surface(model, viewpoints.static, settings)
         mesh = carried(surface, model, times)
-        path = _write_mesh(folder, mesh, scene, settings)
+        path = _write_mesh(folder, mesh, viewpoints, settings)
         faces, vertices = len(mesh.faces), mesh.vertices.shape[1]
         log.info(
             "%d faces, %d vertices at %d times written to %s", faces, vertices, len(times), path
         )
     else:
         path = folder / "points"
-        max_points = _write_points(path, model, scene, settings, times)
+        max_points = _write_points(path, model, viewpoints, settings, times)
         log.info(
             "%d coloured points at most at %d times written to %s", max_points, len(times), path
         )
@@ -73,33 +73,35 @@ def _takes_surface(model: Renderable, settings: ExportSettings) -> bool:
     return wanted
 
 
-def _write_mesh(folder: Path, mesh: MovingMesh, scene: Scene, settings: ExportSettings) -> Path:
+def _write_mesh(
+    folder: Path, mesh: MovingMesh, viewpoints: Viewpoints, settings: ExportSettings
+) -> Path:
     """Write in the wanted format; the file, or the folder of files."""
     if settings.format not in SINGLE:
         path, drawn = folder / settings.format, mesh_files(mesh)
         write_sequence(path, settings.format, mesh.times, drawn, "surface", settings.seconds)
         return path
     name, write = SINGLE[settings.format]
-    frame = UpFrame.of(scene.static.train.cameras, settings.up, settings.metres)
-    write(folder / name, mesh, _named_cameras(scene), frame, settings.seconds)
+    frame = UpFrame.of(viewpoints.static, settings.up, settings.metres)
+    write(folder / name, mesh, _named_cameras(viewpoints), frame, settings.seconds)
     return folder / name
 
 
 def _write_points(
     folder: Path,
     model: Renderable,
-    scene: Scene,
+    viewpoints: Viewpoints,
     settings: ExportSettings,
     times: tuple[float, ...],
 ) -> int:
     """Write what the static cameras see at each time; the points of the time with the most."""
-    renderer, behind = Renderer(model, times=1), background_value(scene.background)
-    cameras, max_points = scene.static.train.cameras, 0
+    renderer, behind = Renderer(model, times=1), background_value(viewpoints.background)
+    max_points = 0
 
     def drawn() -> Iterator[Drawn]:
         nonlocal max_points
         for time in times:
-            points, colors = seen_points(renderer, cameras, time, behind, settings.points)
+            points, colors = seen_points(renderer, viewpoints.static, time, behind, settings.points)
             max_points = max(max_points, len(points))
             yield point_file(points, colors)
 
@@ -108,13 +110,12 @@ def _write_points(
     return max_points
 
 
-def _named_cameras(scene: Scene) -> dict[str, Cameras]:
+def _named_cameras(viewpoints: Viewpoints) -> dict[str, Cameras]:
     """The cameras of the training images, each place of the dynamic ones once."""
-    static = scene.static.train.cameras
-    named = {f"static_{k}": static[[k]] for k in range(len(static))}
-    if scene.moves:
-        views = scene.dynamic.train
-        for view in torch.unique(views.view).tolist():
-            first = int((views.view == view).nonzero()[0])
-            named[f"dynamic_{view}"] = views.cameras[[first]]
-    return named
+    captures = {"static": viewpoints.static, "dynamic": viewpoints.dynamic}
+    return {
+        f"{name}_{k}": cameras[[k]]
+        for name, cameras in captures.items()
+        if name == "static" or viewpoints.moves
+        for k in range(len(cameras))
+    }
