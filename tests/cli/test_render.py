@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import signal
 import socket
 import threading
@@ -17,8 +16,6 @@ import trimesh
 
 from devrf.apps.keyframes import CameraPath, Keyframe, write_path
 from devrf.checkpoints.checkpoint import load_checkpoint
-from devrf.scenes.export import export as export_layout
-from devrf.scenes.procedural import ProceduralScene
 
 
 @pytest.fixture
@@ -130,37 +127,26 @@ def test_what_cannot_be_exported_is_said_in_one_line(of_run, tmp_path, arguments
 # Without the scene
 
 
-def test_a_run_is_shown_without_its_scene(devrf, tmp_path, short):
-    size = {"width": 24, "height": 18, "static_views": 6, "train_views": 2, "frames": 3}
-    scene = tmp_path / "walker"
-    export_layout(ProceduralScene(supersample=1, static_test_views=2, **size)(), scene)
-    small = ("experiment=cpu_small", *short)
-    assert devrf(f"data.root={scene}", *small, "hydra.run.dir=run", "stage=canonical").status == 0
-    scene.rename(tmp_path / "elsewhere")
-    shutil.copytree(tmp_path / "run", tmp_path / "copy")
-
-    def shown(stage, *more):
-        outcome = devrf(f"stage={stage}", "hydra.run.dir=copy", *more)
-        assert (outcome.status, outcome.err) == (0, ""), outcome.err
-        return outcome.out
-
-    shown("still", "still.height=20")
-    shown("export", FAINT, "export.faces=200")
-    assert f"{scene}: no such folder" in shown("render")  # the video beside the truth needs it
-    shown("render", "video.path=bullet_time")
-    made = {str(path.relative_to(tmp_path / "copy")) for path in tmp_path.glob("copy/*/*")}
-    assert {"export/scene.glb", "videos/orbit.mp4", "videos/bullet_time.mp4"} <= made
-    assert "videos/held_out.mp4" not in made
-    (mesh,) = [*trimesh.load_scene(tmp_path / "copy" / "export" / "scene.glb").geometry.values()]
-    assert len(mesh.faces) <= 200
-    assert "canonical: learned already" in shown("canonical")
+def test_a_run_is_shown_without_its_scene(devrf, tmp_path, tiny_data, short):
+    assert devrf(*tiny_data, "stage=prepare", "data.export=walker").status == 0
+    learned = ("experiment=cpu_small", "data.root=walker", "stage=canonical", "hydra.run.dir=run")
+    assert devrf(*learned, *short).status == 0
+    (tmp_path / "walker").rename(tmp_path / "moved")
+    (tmp_path / "run").rename(tmp_path / "copy")
+    said = {}
+    for command in ("still still.height=20", f"export {FAINT}", "render", "canonical"):
+        outcome = devrf("hydra.run.dir=copy", *f"stage={command}".split())
+        assert (outcome.status, outcome.err) == (0, "")
+        said[command] = outcome.out
+    assert "canonical: learned already" in said["canonical"]
+    # The video beside the truth, and scores, need images.
     outcome = devrf("stage=evaluate", "hydra.run.dir=copy")
     assert outcome.status == 2 and outcome.err.count("\n") == 1
-    assert "no such folder" in outcome.err
-    # Its folder may be named anew; another scene's is refused.
-    moved = f"data.root={tmp_path / 'elsewhere'}"
-    shown("render", moved)
-    assert (tmp_path / "copy" / "videos" / "held_out.mp4").is_file()
+    assert all("walker: no such folder" in text for text in (said["render"], outcome.err))
+    videos = tmp_path / "copy" / "videos"
+    assert [video.name for video in videos.iterdir()] == ["orbit.mp4"]
+    assert devrf("stage=render", "hydra.run.dir=copy", "data.root=moved").status == 0
+    assert (videos / "held_out.mp4").is_file()
 
 
 # The page in a browser

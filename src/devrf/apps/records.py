@@ -63,16 +63,9 @@ def scores_by_section(
 ) -> dict[str, Any]:
     """The sections of ``metrics.json``: mean scores, and what training took.
 
-    Args:
-        frames: held-out views by capture: ``static``, and ``dynamic`` where motion was learned.
-        clock: of the training views.
-        metadata: of the checkpoint.
-        rest: the stage that learned the scene at rest; None: one stage learned all.
-        checkpoint_mb: the size of the checkpoint.
-
-    Returns:
-        ``static`` and ``dynamic``, and the same under the names of their stages. A single stage's
-        training stands in the dynamic section, where there is one.
+    ``static`` and ``dynamic``, as ``frames`` has, stand under the names of their stages, too.
+    ``rest`` is the stage that learned the scene at rest. If one stage learned all (None), its
+    training stands in the dynamic section, where there is one.
     """
 
     def training(stage: str) -> dict[str, Any]:

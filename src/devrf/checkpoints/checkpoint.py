@@ -73,8 +73,7 @@ class Viewpoints:
         background: what is behind the alpha mask.
         clock: the times of the training images.
         static: cameras of the static training images.
-        dynamic: cameras of the training images in motion, a fixed one once; of a scene at rest the
-            static ones.
+        dynamic: cameras of the training images in motion, a fixed one once.
         held_out: the camera of the first held-out image of the moving scene: one camera.
     """
 
@@ -84,16 +83,12 @@ class Viewpoints:
     dynamic: Cameras
     held_out: Cameras
 
-    @property
-    def moves(self) -> bool:
-        """Whether the scene was seen at more than one time."""
-        return len(self.clock) > 1
-
     @classmethod
     def of(cls, scene: Scene) -> Viewpoints:
         """The viewpoints of a scene."""
         train = scene.dynamic.train
-        first = [int((train.view == view).nonzero()[0]) for view in torch.unique(train.view)]
+        views = torch.unique(train.view) if scene.moves else ()
+        first = [int((train.view == view).nonzero()[0]) for view in views]
         static, held_out = scene.static.train.cameras, scene.dynamic.test.cameras[[0]]
         return cls(scene.background, scene.clock, static, train.cameras[first], held_out)
 

@@ -116,6 +116,5 @@ def _named_cameras(viewpoints: Viewpoints) -> dict[str, Cameras]:
     return {
         f"{name}_{k}": cameras[[k]]
         for name, cameras in captures.items()
-        if name == "static" or viewpoints.moves
         for k in range(len(cameras))
     }
