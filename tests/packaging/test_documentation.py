@@ -77,11 +77,8 @@ def test_commands_compose(command, composed, tmp_path, monkeypatch):
     (tmp_path / "scene" / "transforms_train.json").touch()  # so that a layout is recognised
     # Of the values of a sweep, the first.
     words = [word if "[" in word else word.split(",")[0] for word in command.split()]
-    words = [
-        re.sub(r"=(PATH|FOLDER|…|mine|scenes/fox)$", "=scene", word)
-        for word in words
-        if word != "-m"
-    ]
+    paths = r"=(PATH|FOLDER|…|mine|scenes/fox)$"
+    words = [re.sub(paths, "=scene", word) for word in words if word != "-m"]
     check_config(composed(*completed(words)))
 
 

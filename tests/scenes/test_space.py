@@ -119,3 +119,5 @@ def test_a_given_box_is_the_inner_box(ball_views: Callable[..., Views]) -> None:
     )
     with pytest.raises(DevrfError, match="data.near"):
         chosen(views, "contracted", near=math.inf)
+    with pytest.raises(DevrfError, match=r"not 9 and 3; the cameras say data.near=\S+ data.far="):
+        chosen(views, "world", near=9.0, far=3.0)

@@ -49,7 +49,7 @@ class Advice(NamedTuple):
 
 def advice_on(scene: Scene) -> list[Advice]:
     """Problems that cameras, images, masks, times and flow show."""
-    checks = _held_out, _box_unknown, _one_side, _images, _alpha, _masks, _times, _flow
+    checks = _held_out, _box_unknown, _one_side, _images, _alpha, _masks, _times, _one_camera, _flow
     return [advice for check in checks for advice in check(scene)]
 
 
@@ -250,6 +250,17 @@ def _times(scene: Scene) -> Iterator[Advice]:
             "dynamic training set",
             f"not all views at every time: {listed(fewer)}",
             "add the images, or leave these times or views out: motion is less certain there",
+        )
+
+
+def _one_camera(scene: Scene) -> Iterator[Advice]:
+    views = scene.dynamic.train
+    if scene.moves and views.by_moving_camera and {*scene.static.train.names} <= {*views.names}:
+        yield Advice(
+            "dynamic training set",
+            "one camera, elsewhere in each image as in D-NeRF's scenes, and no static set: DeVRF "
+            "learns little of such motion",
+            "film the scene at rest, then from fixed views, or learn it with method=dnerf",
         )
 
 
