@@ -72,7 +72,7 @@ class LiveView(Callback):
         done, total = pl_module.iteration, pl_module.total_iterations
         self.session.controls.tell(
             f"**{pl_module.name}** has ended after {done} of {total} iterations. The picture stays "
-            "as it is until another stage begins or the run ends."
+            "as it is until another stage begins; `stage=view` shows a run that has ended."
         )
 
 

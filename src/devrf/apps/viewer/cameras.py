@@ -17,6 +17,7 @@ from devrf.apps.images import evenly, scaled, to_bytes
 from devrf.apps.keyframes import Keyframe, keyframes_of
 from devrf.evaluation.held_out import truth_image
 from devrf.geometry.cameras import Cameras
+from devrf.scenes.bounds import nearest_point
 from devrf.scenes.scene import Scene, Views
 
 if TYPE_CHECKING:
@@ -46,6 +47,18 @@ def in_browser(keyframe: Keyframe) -> tuple[np.ndarray, np.ndarray, float]:
     turned = pose[:, :3] * pose.new_tensor(FLIP)
     wxyz = rotation_matrix_to_quaternion(turned[None])[0]
     return wxyz.numpy(), pose[:, 3].numpy(), math.radians(keyframe.fov)
+
+
+def distance_ahead(cameras: Cameras) -> float:
+    """How far before N cameras the point is that lies nearest to all their optical axes.
+
+    Axes that meet nowhere give the cameras' extent.
+    """
+    origins, forwards = cameras.positions, cameras.forwards
+    extent = float((origins - origins.mean(dim=0)).norm(dim=1).max()) or 1.0
+    point = nearest_point(origins, forwards, parallel=1e-3)
+    ahead = 0.0 if point is None else float(((point - origins) * forwards).sum(dim=1).mean())
+    return ahead if ahead > 0 else extent
 
 
 class Frustum(NamedTuple):
@@ -83,14 +96,13 @@ def _thumbnail(scene: Scene, views: Views, index: int) -> Tensor:
 class FrustaLayer:
     """The captured cameras in the page's scene."""
 
-    def __init__(
-        self, server: viser.ViserServer, cameras: Cameras, scene: Scene | None, distance: float
-    ) -> None:
-        """Show none yet; ``cameras`` saw the ``scene`` at rest, from about this ``distance``."""
+    def __init__(self, server: viser.ViserServer, cameras: Cameras, scene: Scene | None) -> None:
+        """Show none yet; ``cameras`` saw the scene at rest, their images are the ``scene``'s."""
         self._server, self._cameras, self._scene = server, cameras, scene
         shown = cameras.positions[evenly(len(cameras), MAX_FRUSTA)]
         apart = torch.cdist(shown, shown).fill_diagonal_(math.inf).amin(dim=1).median()
-        self._depth = float(apart.clamp(MIN_DEPTH * distance, MAX_DEPTH * distance))
+        away = distance_ahead(cameras)
+        self._depth = float(apart.clamp(MIN_DEPTH * away, MAX_DEPTH * away))
         self._handles: dict[str, viser.CameraFrustumHandle] = {}
         self._shown: object = None
 

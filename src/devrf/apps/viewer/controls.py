@@ -87,7 +87,6 @@ class Controls:
                 gui.add_multi_slider(axis, 0, 100, 1, (0, 100), min_range=1, hint="% of the box")
                 for axis in "xyz"
             ]
-            gui.add_button("Reset").on_click(lambda _: self._reset_crop())
         self._cropped_by: int | None = None
         self._time.on_update(self._time_set)
         self._play.on_click(self._play_pressed)
@@ -160,12 +159,9 @@ class Controls:
     def left(self, client: int) -> None:
         """A page was closed: the crop that it set goes with it."""
         if client == self._cropped_by:
-            self._reset_crop()
-
-    def _reset_crop(self) -> None:
-        set_value(self._crop, False)
-        for slider in self._sides:
-            set_value(slider, (0, 100))
+            set_value(self._crop, False)
+            for slider in self._sides:
+                set_value(slider, (0, 100))
 
     def _crop_set(self, event: viser.GuiEvent[Any]) -> None:
         if event.client_id is not None:

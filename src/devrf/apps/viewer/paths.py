@@ -23,12 +23,11 @@ from devrf.apps.keyframes import (
     write_path,
 )
 from devrf.apps.video import VideoSettings
-from devrf.apps.viewer.cameras import from_browser
+from devrf.apps.viewer.cameras import distance_ahead, from_browser
 from devrf.apps.viewer.controls import set_value
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.rendering.view import Viewable
-from devrf.scenes.bounds import nearest_point
 
 # Keyframes of a known path, and the seconds that it takes to go round.
 KEYFRAMES, SECONDS = 13, 8.0
@@ -65,18 +64,6 @@ def known_paths(cameras: Cameras, model: Callable[[], Viewable]) -> dict[str, Pr
         "bullet time": lambda stop: keyframes_of(*bullet_time(ring, stop, once), SECONDS),
         "time freeze": lambda stop: keyframes_of(*time_freeze(ring, stop, longer), 3 * SECONDS),
     }
-
-
-def distance_ahead(cameras: Cameras) -> float:
-    """How far before N cameras the point is that lies nearest to all their optical axes.
-
-    Axes that meet nowhere give the cameras' extent.
-    """
-    origins, forwards = cameras.positions, cameras.forwards
-    extent = float((origins - origins.mean(dim=0)).norm(dim=1).max()) or 1.0
-    point = nearest_point(origins, forwards, parallel=1e-3)
-    ahead = 0.0 if point is None else float(((point - origins) * forwards).sum(dim=1).mean())
-    return ahead if ahead > 0 else extent
 
 
 class PathPanel:

@@ -21,11 +21,7 @@ from devrf.apps.settings import ViewerSettings
 
 
 def open_server(settings: ViewerSettings) -> viser.ViserServer:
-    """A server at the address of the settings, with an empty page.
-
-    Raises:
-        DevrfError: the address is in use, or not this machine's.
-    """
+    """A server at the address of the settings, if it is free, with an empty page."""
     settings.check_free()
     logging.getLogger("websockets").setLevel(logging.WARNING)
     # A probe of the port asks for no page: its traceback would tell nothing.

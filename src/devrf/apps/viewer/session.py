@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import shlex
 import threading
 import time
 from collections.abc import Hashable
@@ -14,10 +13,10 @@ import viser
 
 from devrf.apps.keyframes import CameraPath, keyframes_of
 from devrf.apps.settings import ViewerSettings
-from devrf.apps.viewer.cameras import FrustaLayer, in_browser
+from devrf.apps.viewer.cameras import FrustaLayer, distance_ahead, in_browser
 from devrf.apps.viewer.controls import Controls
 from devrf.apps.viewer.drawing import Drawing, Frame, RenderScheduler
-from devrf.apps.viewer.paths import PathPanel, distance_ahead, known_paths
+from devrf.apps.viewer.paths import PathPanel, known_paths
 from devrf.apps.viewer.server import open_server, quiet
 from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.rendering.view import Viewable
@@ -64,19 +63,17 @@ class Session:
         self.server = open_server(settings)
         self.controls = Controls(self.server, self.refresh)
         learned = [] if ckpt is None else [f"ckpt={Path(ckpt).resolve()}"]
-        self._run = [f"hydra.run.dir={folder}", *learned]
         self.paths = PathPanel(
             self.server,
             folder,
-            self._run,
+            [f"hydra.run.dir={folder}", *learned],
             settings.height,
             known_paths(viewpoints.static, lambda: self._model),
             time=lambda: self.controls.playback.time,
             fly=self._fly,
             changed=self.refresh,
         )
-        away = distance_ahead(viewpoints.static)
-        self._frusta = FrustaLayer(self.server, viewpoints.static, scene, away)
+        self._frusta = FrustaLayer(self.server, viewpoints.static, scene)
         self.controls.dynamic.visible = scene is not None and scene.moves
         self._place_camera()
         self.server.on_client_connect(self._connected)
@@ -114,12 +111,8 @@ class Session:
         return self.scheduler.render_next(timeout)
 
     def close(self) -> None:
-        """Take the page from the network, and say on it how to come back."""
+        """Take the page from the network."""
         self.stop()
-        command = shlex.join(["python", "-m", "devrf", "stage=view", *self._run])
-        self.controls.tell(f"This page has ended; `{command}` opens another.")
-        self.server.flush()
-        time.sleep(0.1)  # it reaches those who have the page open
         with quiet():
             self.server.stop()
 
