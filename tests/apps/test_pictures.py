@@ -166,8 +166,8 @@ def test_rendering_keeps_to_its_seconds():
     assert film.within_limit(0.1, 400) == film
     # A quarter of the pixels, then the fewest rows and half the frames; 24 a second all the same.
     assert film.within_limit(0.4, 400) == replace(film, height=200)
-    assert film.within_limit(0.8, 400) == replace(film, height=200, frames=60)
-    assert film.within_limit(100.0, 96) == replace(film, height=96, frames=8)
+    assert film.within_limit(0.8, 320) == replace(film, height=160, frames=60)
+    assert film.within_limit(100.0, 96) == replace(film, height=96, frames=24)
     assert VideoSettings().within_limit(100.0, 400) == VideoSettings()
 
 

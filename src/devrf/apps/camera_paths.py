@@ -94,14 +94,14 @@ def spiral(cameras: Cameras, target: Tensor, settings: VideoSettings) -> Cameras
 
     Where cameras look in many directions, that is the one that most of them share.
     """
-    alike = cameras.forwards @ cameras.forwards.T
+    level, alike = upward(cameras), cameras.forwards @ cameras.forwards.T
     cameras = cameras[alike[int(alike.sum(dim=1).argmax())] > SAME_WAY]
     right, up, _, middle = average_pose(cameras.camera_to_world).unbind(dim=1)
     axes = torch.stack([right, up])
     radii = 0.9 * ((cameras.positions - middle) @ axes.T).abs().quantile(0.8, dim=0)
     turn = torch.arange(settings.frames) * (2 * math.pi * settings.orbit_turns / settings.frames)
     positions = middle + torch.stack([turn.cos(), turn.sin()], dim=1) @ (radii[:, None] * axes)
-    return _looking(cameras, positions, target, up)
+    return _looking(cameras, positions, target, level)
 
 
 def captured(cameras: Cameras, target: Tensor, settings: VideoSettings) -> Cameras:

@@ -22,7 +22,7 @@ PIXEL = 0.2
 # H.264 has blocks of so many pixels.
 MIN_HEIGHT = 16
 # What rendering is to take decides first the height, down to so many rows, then the frames.
-LOW, MIN_FRAMES = 200, 8
+LOW, MIN_FRAMES = 160, 24
 
 
 @dataclass(frozen=True)
