@@ -6,6 +6,7 @@ import logging
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from itertools import count
 from types import SimpleNamespace
 from typing import Any
@@ -16,9 +17,13 @@ from lightning.pytorch.callbacks import LambdaCallback
 from torch.optim import Optimizer
 
 from devrf.callbacks import Meter, Progress, TrainingRecord
+from devrf.callbacks.trial import seconds_to_learn
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
+from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
+from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.settings import MotionSettings
@@ -113,3 +118,23 @@ def test_the_time_left_knows_that_finer_levels_take_longer(
     first = next(line for line in caplog.messages if line.startswith("static 1/12"))
     # (6 + 7.6 + 9.5 + 8 · 12) / 6, not 11 s
     assert first.endswith("  about 20 s left")
+
+
+def test_how_long_learning_takes_is_told_from_its_first_seconds(datamodule, monkeypatch) -> None:
+    schedule = CanonicalSchedule(
+        search_iterations=0, iterations=40, side=16, upsample_at=(20,), rays=64
+    )
+    stage = CanonicalStage(schedule, Architecture(width=16), iterations_per_step=5)
+    seconds = count(step=10)
+    monkeypatch.setattr("devrf.callbacks.trial.time.perf_counter", lambda: float(next(seconds)))
+    moving = DeformationSchedule(levels=(Level(4, 2),), rays=32)
+    plain = {"enable_checkpointing": False, "enable_progress_bar": False, "max_epochs": 1}
+    taken = seconds_to_learn(
+        stage, moving, datamodule, partial(Trainer, accelerator="cpu", **plain)
+    )
+    # Half the voxels have 0.7937 of the side: 5 iterations of 12.7 voxels a ray were tried in 10 s.
+    # 20 of these, 20 of 16, and 2 for each of 3 frames of 16 with half of the rays.
+    assert stage.iteration == 10
+    assert taken == pytest.approx(
+        (20 * 12.699 + 20 * 16 + 6 * 16 / 2) / (5 * 12.699 / 10), rel=1e-3
+    )

@@ -53,38 +53,36 @@ def needs(run: RunContext, config: DictConfig, scene: Scene) -> dict[str, StageN
     return {name: stages[name] for name in run.stages_with_images or run.learning_stages}
 
 
-def compare(run: RunContext, names: Sequence[str]) -> tuple[str, Advice | None]:
-    """What the stages ``names`` need of what there is; where that lacks, the change that helps.
+def compare(run: RunContext, names: Sequence[str]) -> tuple[str, Advice | None, list[str]]:
+    """What the stages ``names`` need of what there is; where that lacks, the override that helps.
 
     Where the images' size was left to the run, it is changed at once.
     """
-    processes, by = int(getattr(run.strategy, "num_processes", 1)), run.datamodule.downscale
-    on_gpu = run.device.type == "cuda"
+    scene, by = run.scene, run.datamodule.downscale
+    processes = int(getattr(run.strategy, "num_processes", 1))
     free = free_bytes(run.device, run.folder, resume=run.config.resume)
 
     def needed(key: str = "", value: int = 0, pieces: int = MicroBatching.MOST) -> Bytes:
-        config, scene = run.config.copy(), run.scene
+        config, less = run.config.copy(), smaller(scene, value / by) if key == SIZE else scene
         if key:
             OmegaConf.update(config, key, value)
-        if key == SIZE:
-            scene = smaller(scene, value / by)
         with as_own_errors():
-            every = needs(run, config, scene)
+            every = needs(run, config, less)
         stages = [every[name] for name in names]
-        return needed_bytes(scene, stages, processes, pieces, on_gpu=on_gpu)
+        return needed_bytes(less, stages, processes, pieces, on_gpu=run.device.type == "cuda")
 
     whole = needed(pieces=1)
     line, lacks = f"needs about {in_words(whole, free)}", lacking(needed(), free)
     if not lacks:
-        return line + "; batches will be split, slower" * bool(lacking(whole, free)), None
-    every = needs(run, run.config, run.scene)
+        return line + "; batches will be split, slower" * bool(lacking(whole, free)), None, []
+    every = needs(run, run.config, scene)
     parts = max((every[name] for name in names), key=StageNeeds.peak).parts
     present = {key: OmegaConf.select(run.config, key) for key in parts} | {SIZE: by}
     change = least_change(parts, present, lambda *one: not lacking(needed(*one), free))
     problem = f"the run {line}; it would end for lack of {lacks[0]}"
     if change is None:
         remedy = "lower several keys, or free some of it"
-        return line, Advice(max(parts, key=parts.__getitem__), problem, remedy)
+        return line, Advice(max(parts, key=parts.__getitem__), problem, remedy), []
     key, value = change
     if key == SIZE and run.chooses_size:
         log.info("%s=auto: %d, as %s", key, value, problem)
@@ -92,4 +90,4 @@ def compare(run: RunContext, names: Sequence[str]) -> tuple[str, Advice | None]:
         del run.datamodule  # the images are read again
         return compare(run, names)
     then = in_words(needed(key, value, 1), {lacks[0]: free[lacks[0]]})
-    return line, Advice(key, problem, f"give {key}={value} ({then})")
+    return line, Advice(key, problem, f"give {key}={value} ({then})"), [f"{key}={value}"]

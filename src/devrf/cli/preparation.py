@@ -5,10 +5,11 @@ from __future__ import annotations
 import logging
 import shlex
 import sys
+from functools import partial
 from pathlib import Path
 
+from hydra import compose
 from hydra.utils import instantiate
-from omegaconf import OmegaConf
 from rich.console import Console
 from rich.filesize import decimal
 
@@ -23,13 +24,15 @@ from devrf.apps.fetch import (
 from devrf.apps.inspection.report import as_text, inspection_text
 from devrf.apps.needs import needs_table
 from devrf.apps.settings import CaptureSettings
-from devrf.cli.config import config_folder
+from devrf.callbacks.trial import seconds_to_learn
+from devrf.cli.complete import completed, with_recognised_data
 from devrf.cli.context import RunContext
 from devrf.cli.memory import compare, needs
 from devrf.engine.ddp import ManualDDP
 from devrf.errors import DevrfError
 from devrf.scenes.export import export
 from devrf.system.files import write_json
+from devrf.system.progress import duration
 
 log = logging.getLogger(__name__)
 
@@ -64,12 +67,18 @@ def capture(run: RunContext) -> None:
     """Make a scene of the footage ``capture.…``, and report on it as ``stage=inspect`` does."""
     settings: CaptureSettings = instantiate(run.config.capture, _convert_="all")
     folder = scene_from_footage(settings)
-    config = run.config.copy()
-    config.data = OmegaConf.load(config_folder() / "data" / "nerfstudio.yaml")
-    config.data.root, config.data.name = str(folder), folder.resolve().name
-    config.data.flow_cache = str(run.folder / "flow.npz")
-    inspect(RunContext(config, run.folder))
-    say_next([f"data.root={folder}"])
+    words = [f"data.root={folder}"]
+    config = with_recognised_data(compose("config", completed(words)))
+    captured = RunContext(config, run.folder)
+    inspect(captured)
+    _, _, change = compare(captured, captured.stages_with_images)
+    config.merge_with_dotlist(change)
+    log.info("how long learning takes is tried out for some seconds")
+    moving = instantiate(config.deformation.schedule, _convert_="all")
+    stage, trainer = captured.stage_builder("canonical")(), partial(instantiate, config.trainer)
+    seconds = seconds_to_learn(stage, moving, captured.datamodule, trainer)
+    log.info("learning takes %s on this machine", duration(seconds))
+    say_next([*words, *change])
 
 
 def prepare(run: RunContext) -> None:
@@ -91,7 +100,7 @@ def inspect(run: RunContext) -> None:
     # Only this step draws with matplotlib.
     from devrf.apps.inspection.picture import write_inspection_picture
 
-    _, shortage = compare(run, run.stages_with_images or run.learning_stages)
+    _, shortage, _ = compare(run, run.stages_with_images or run.learning_stages)
     table = needs_table(run.scene, needs(run, run.config, run.scene))
     rows = [(name, decimal(round(size))) for name, size in table]
     report = inspection_text(run.scene, rows, shortage)

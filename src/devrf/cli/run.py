@@ -121,7 +121,9 @@ def _prepare_to_learn(run: RunContext, requested: Names, steps: Names) -> None:
         log.info("%s is at rest: %s; no motion is learned", run.config.scene, left)
     resume = run.config.resume
     names = [name for name in learning if not (resume and run.own_checkpoint(name).is_file())]
-    needed, shortage = compare(run, names) if names and run.config.memory_check else (None, None)
+    needed, shortage = None, None
+    if names and run.config.memory_check:
+        needed, shortage, _ = compare(run, names)
     if shortage is not None:
         raise DevrfError(f"{shortage}, or try all the same with memory_check=false")
     if not resume:

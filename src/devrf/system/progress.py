@@ -37,13 +37,18 @@ def followed(
 
 
 def time_left(seconds: float) -> str:
-    """``about 40 s left``, ``about 12 min left``, ``about 3 h 20 min left``: no more digits."""
+    """A :func:`duration` that is left."""
+    return f"{duration(seconds)} left"
+
+
+def duration(seconds: float) -> str:
+    """``about 40 s``, ``about 12 min``, ``about 3 h 20 min``: no more digits."""
     if seconds < 60:
-        return f"about {max(round(seconds), 1)} s left"
+        return f"about {max(round(seconds), 1)} s"
     minutes = round(seconds / 60)
     if minutes <= 60:
-        return f"about {minutes} min left"
+        return f"about {minutes} min"
     hours, minutes = divmod(minutes, 60)
     if hours >= 10 or not minutes:
-        return f"about {round(seconds / 3600)} h left"
-    return f"about {hours} h {minutes} min left"
+        return f"about {round(seconds / 3600)} h"
+    return f"about {hours} h {minutes} min"
