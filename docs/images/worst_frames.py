@@ -4,7 +4,7 @@ Give runs in pairs, the earlier way of learning first, such as those of the qual
 
     python -m devrf -m experiment=quality_table hydra.sweep.dir=outputs/quality_table
     cd outputs/quality_table
-    python ../../docs/images/worst_frames.py 0_robot_published 9_robot_best …
+    python ../../docs/images/worst_frames.py 0_robot_ablation_paper_terms 9_robot_ablation_best …
 """
 
 from __future__ import annotations

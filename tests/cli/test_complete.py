@@ -269,7 +269,7 @@ def test_the_jobs_of_a_sweep_go_on(devrf, tiny, tmp_path, monkeypatch):
     assert devrf("-m", *tiny, there, "stage=inspect", "seed=0,1").status == 0
     outcome = devrf("stage=inspect", there)
     assert (outcome.status, outcome.err) == (0, "")
-    found = [config(tmp_path / "sweep" / f"{k}_robot") for k in (0, 1)]
+    found = [config(tmp_path / "sweep" / f"{k}_robot_seed_{k}") for k in (0, 1)]
     assert [(one.seed, one.data.width) for one in found] == [(0, 24), (1, 24)]
 
 

@@ -70,7 +70,8 @@ def test_a_run_says_how_it_came_about(trained):
     assert ran["choices"]["data"] == "procedural" and ran["choices"]["ablation"] == "full"
     assert ran["choices"]["experiment"] is None and "hydra/launcher" not in ran["choices"]
     assert "data.frames=3" in ran["overrides"]
-    assert (ran["seed"], ran["train_views"], ran["test_frames"]) == (0, 2, 3)
+    assert (ran["seed"], ran["train_views"], ran["test_frames"], ran["frames"]) == (0, 2, 3, 3)
+    assert (ran["kind"], ran["image_size"]) == ("inward", [24, 20])
     for stage in ("canonical", "deformation"):
         assert ran["wall_seconds"][stage] >= found[stage]["seconds"] > 0
 

@@ -58,7 +58,7 @@ def test_a_sweep_and_its_jobs_have_their_folders_to_themselves(devrf, hanging, t
     outcome = devrf("-m", *tiny, *sweep)
     assert outcome.status == 2 and outcome.err.count("\n") == 1
     assert outcome.err.startswith(f"devrf: sweep: another devrf process (pid {first} on ")
-    single = devrf(*tiny, "stage=canonical", "hydra.run.dir=sweep/0_robot")
+    single = devrf(*tiny, "stage=canonical", "hydra.run.dir=sweep/0_robot_seed_0")
     assert single.status == 2 and f"(pid {first} on" in single.err
     assert seen(tmp_path) == before
 

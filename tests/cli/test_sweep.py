@@ -42,18 +42,19 @@ def test_a_mistake_in_one_job_is_recorded_and_the_others_go_on(devrf, tmp_path, 
     outcome = devrf("-m", *tiny, *LEARN, "data.frames=1,3", "seed=7")
     assert outcome.status == 3
     mistake, summary = outcome.err.splitlines()
-    assert mistake.startswith("devrf: job 0_robot: data.frames: ")
-    assert (
-        summary == "devrf: jobs failed: 0_robot; failure.json in each folder below sweep says why"
-    )
-    found = failure(tmp_path / "sweep" / "0_robot")
+    assert mistake.startswith("devrf: job 0_robot_frames_1: data.frames: ")
+    why = "failure.json in each folder below sweep says why"
+    assert summary == f"devrf: jobs failed: 0_robot_frames_1; {why}"
+    # What is the same in all jobs, such as the seed, is in no name.
+    job, other = tmp_path / "sweep" / "0_robot_frames_1", tmp_path / "sweep" / "1_robot_frames_3"
+    found = failure(job)
     assert found["scene"] == "robot" and found["seed"] == 7 and found["mistake"] is True
     assert found["error"].startswith("data.frames: ")
     assert found["choices"]["schedule"] == "quick" and "data.frames=1" in found["overrides"]
     assert found["date"].endswith("+00:00")
-    assert (tmp_path / "sweep" / "0_robot" / ".hydra" / "config.yaml").is_file()
-    assert (tmp_path / "sweep" / "1_robot" / "checkpoints" / "canonical.ckpt").is_file()
-    assert not (tmp_path / "sweep" / "1_robot" / "failure.json").exists()
+    assert (job / ".hydra" / "config.yaml").is_file()
+    assert (other / "checkpoints" / "canonical.ckpt").is_file()
+    assert not (other / "failure.json").exists()
 
 
 def test_a_fault_of_the_program_is_recorded_with_its_traceback_in_the_log(
@@ -66,13 +67,16 @@ def test_a_fault_of_the_program_is_recorded_with_its_traceback_in_the_log(
     outcome = devrf("-m", *tiny, *LEARN, "seed=0,1,2")
     assert outcome.status == 3
     said, summary = outcome.err.splitlines()
-    assert said.startswith("devrf: job 1_robot: ZeroDivisionError: division by zero; the traceback")
-    assert "jobs failed: 1_robot" in summary
+    assert said.startswith(
+        "devrf: job 1_robot_seed_1: ZeroDivisionError: division by zero; the traceback"
+    )
+    assert "jobs failed: 1_robot_seed_1" in summary
     assert "Traceback" not in outcome.out
-    found = failure(tmp_path / "sweep" / "1_robot")
+    found = failure(tmp_path / "sweep" / "1_robot_seed_1")
     assert found["mistake"] is False and found["error"] == "ZeroDivisionError: division by zero"
-    assert "Traceback" in (tmp_path / "sweep" / "1_robot" / "run.log").read_text()
-    assert sorted(p.parent.name for p in tmp_path.glob("sweep/*/done")) == ["0_robot", "2_robot"]
+    assert "Traceback" in (tmp_path / "sweep" / "1_robot_seed_1" / "run.log").read_text()
+    done = sorted(path.parent.name for path in tmp_path.glob("sweep/*/done"))
+    assert done == ["0_robot_seed_0", "2_robot_seed_2"]
 
 
 def test_a_later_success_in_the_folder_removes_the_record(devrf, tmp_path, tiny, steps):
@@ -109,21 +113,19 @@ def test_jobs_in_processes_of_their_own(python, tmp_path, tiny):
     command = (*tiny, *joblib, "stage=inspect", "hydra.sweep.dir=sweep")
     done = python(tmp_path, "-m", "devrf", "-m", *command)
     assert done.status == 3
-    assert "devrf: job 1_robot: data.frames: " in done.err
-    assert "jobs failed: 1_robot" in done.err and "Traceback" not in done.err
-    assert (tmp_path / "sweep" / "0_robot" / "images").is_dir()
-    assert failure(tmp_path / "sweep" / "1_robot")["mistake"] is True
+    assert "devrf: job 1_robot_frames_1: data.frames: " in done.err
+    assert "jobs failed: 1_robot_frames_1" in done.err and "Traceback" not in done.err
+    assert (tmp_path / "sweep" / "0_robot_frames_3" / "images").is_dir()
+    assert failure(tmp_path / "sweep" / "1_robot_frames_1")["mistake"] is True
 
 
 @installed("hydra_optuna_sweeper")
 def test_a_search_maximises_the_objective(devrf, tmp_path, tiny):
     folder = ("hydra.sweep.dir=sweep", "video.frames=1", "evaluation.metrics=[]")
     assert devrf("-m", *tiny, *SEARCH, *folder).status == 0
-    found = {
-        job: json.loads((tmp_path / "sweep" / job / "metrics.json").read_text())
-        for job in ("0_robot", "1_robot")
-    }
-    best = max(found.values(), key=lambda metrics: metrics["deformation"]["psnr"])
+    found = [json.loads(path.read_text()) for path in tmp_path.glob("sweep/*/metrics.json")]
+    assert len(list(tmp_path.glob("sweep/[01]_robot_cycle_*"))) == len(found) == 2
+    best = max(found, key=lambda metrics: metrics["deformation"]["psnr"])
     said = yaml.safe_load((tmp_path / "sweep" / "optimization_results.yaml").read_text())
     assert said["best_value"] == best["deformation"]["psnr"]
     for name, value in said["best_params"].items():
@@ -136,6 +138,6 @@ def test_a_search_of_which_every_job_fails_says_so(devrf, tiny):
     assert outcome.status == 3
     lines = [line for line in outcome.err.splitlines() if line.startswith("devrf: ")]
     why = "stage: a search needs the objective"
-    assert [f"job {k}_robot: {why}" in lines[k] for k in (0, 1)] == [True, True]
-    assert "jobs failed: 0_robot, 1_robot" in lines[2]
+    assert [f"job {k}_robot_" in lines[k] and why in lines[k] for k in (0, 1)] == [True, True]
+    assert "jobs failed: 0_robot_" in lines[2] and ", 1_robot_" in lines[2]
     assert "Traceback" not in outcome.err

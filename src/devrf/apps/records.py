@@ -126,9 +126,13 @@ def frame_rows(
 
 
 def data_record(scene: Scene) -> dict[str, Any]:
-    """How much data a scene is: views that train, frames held out."""
+    """How much data a scene is: kind, held-out images' size and number; of motion frames, views."""
+    height, width = scene.dynamic.test.pixels.shape[1:3]
     frames = scene.clock.frames_of(scene.dynamic.train.times)
     return {
+        "kind": scene.kind,
+        "image_size": [width, height],
+        "frames": len(scene.clock) if scene.moves else None,
         # A camera that moves is one view, however many images it took.
         "train_views": int(frames.bincount().max()) if scene.moves else None,
         "test_frames": len(scene.dynamic.test),

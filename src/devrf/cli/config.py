@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
@@ -130,14 +132,22 @@ def config_record(stage: str) -> str | None:
     return None if stage in ("report", "fetch", "view") else ".hydra"
 
 
-def tracked_name(scene: str, folder: str, overrides: str) -> str:
-    """A tracker's name of a run: the scene; of a sweep's job, its folder and overrides."""
-    return f"{Path(folder).name} {overrides}" if in_sweep() else scene
+def job_folder(number: int, scene: str, sweep: str, overrides: Sequence[str], params: Any) -> str:
+    """The folder of a sweep's job: number, scene, and what else is varied: ``0_robot_tv_0.5``."""
+    record = Path(sweep) / "multirun.yaml"  # some searches write none; they name their params
+    typed = OmegaConf.load(record).hydra.overrides.task if record.is_file() else ()
+    varied = dict.fromkeys(params or (), True)
+    for override in OverridesParser.create().parse_overrides(list(typed)):
+        varied[override.get_key_element()] = override.is_sweep_override()
+    varied |= dict.fromkeys(("data", "data.root", "data.name", "data.shape"), False)
+    values = [override.partition("=") for override in overrides]
+    words = [f"{key.rpartition('.')[2]}_{value}" for key, _, value in values if varied.get(key)]
+    return scene_folder_name("_".join([str(number), scene, *words]))[:150]
 
 
-def tracked_group(folder: str) -> str | None:
-    """A tracker's group of a run: the name of the sweep's folder, None outside a sweep."""
-    return Path(folder).name if in_sweep() else None
+def tracked_name(folder: str, otherwise: str | None) -> str | None:
+    """A tracker's name of a sweep's job, or of a sweep: its folder's; of another run as given."""
+    return Path(folder).name if in_sweep() else otherwise
 
 
 @cache  # for the whole process
@@ -146,7 +156,7 @@ def register_config() -> None:
 
     Each row of a file in ``conf/rows`` is a choice of the group that the file is named after.
     """
-    for word in (scene_name, run_name, run_folder, config_record, tracked_name, tracked_group):
+    for word in (scene_name, run_name, run_folder, config_record, job_folder, tracked_name):
         OmegaConf.register_new_resolver(f"devrf.{word.__name__}", word, replace=True)
     store = ConfigStore.instance()
     # Hydra copies its sources, the store among them, for each group that --help lists.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import logging
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -37,16 +37,10 @@ OF_SWEEP = {"multirun.yaml", PLACE}
 
 def report(run: RunContext) -> None:
     """``stage=report``: tables and plots of the runs below ``report.runs``; needs no scene."""
-    _write_report(run.config.report, log.info)
-
-
-def _write_report(settings: DictConfig, say: Callable[[str], None], **other: Any) -> None:
     # Hydra imports this module with every command; pandas and matplotlib are slow to import.
     from devrf.apps.report.write import write_report
 
-    written = write_report(instantiate(settings, **other))
-    say(written.text)
-    say(f"report written to {written.path}")
+    log.info("%s", write_report(instantiate(run.config.report)))
 
 
 @contextmanager
@@ -122,11 +116,8 @@ class SweepMonitor(Callback):
         """Print which jobs failed, if any did."""
         failed = sorted(job for job, _ in self._records() - self.earlier)
         if failed:
-            print(
-                f"devrf: jobs failed: {', '.join(failed)}; {FAILURE} in each folder below "
-                f"{self.folder} says why",
-                file=sys.stderr,
-            )
+            why = f"{FAILURE} in each folder below {self.folder} says why"
+            print(f"devrf: jobs failed: {', '.join(failed)}; {why}", file=sys.stderr)
         return bool(failed)
 
     def _records(self) -> set[tuple[str, int]]:
@@ -155,6 +146,8 @@ class SweepReport(Callback):
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Write the report into the sweep's folder and print it; nothing if no job was scored."""
+        from devrf.apps.report.write import write_report
+
         with suppress(DevrfError):
             # Printed, because Hydra's last job has closed the log.
-            _write_report(config.report, print, runs=config.hydra.sweep.dir)
+            print(write_report(instantiate(config.report, runs=config.hydra.sweep.dir)))

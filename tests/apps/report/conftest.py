@@ -8,7 +8,7 @@ import json
 import pytest
 
 from devrf.apps.report.runs import collect
-from devrf.apps.report.table import tabulate
+from devrf.apps.report.table import published, tabulate
 
 
 @pytest.fixture
@@ -34,7 +34,8 @@ def ran(runs):
         gpu=(None, None),
         ablation="full",
         choices=None,
-        frames=(),
+        curve=(),
+        at_rest=False,
         **of_run,
     ):
         choices = choices or {}
@@ -45,19 +46,22 @@ def ran(runs):
             | {"seconds": seconds[1], "peak_gpu_gb": gpu[1]},
         }
         usual = {"device": "a processor", "git": "0123456789abcdef", "overrides": [], "seed": 0}
-        named = {"ablation": ablation, "method": method, "protocol": protocol, **choices}
+        usual |= published().data.get(scene, {})
+        named = {"ablation": ablation, "method": method, "protocol": protocol, "data": scene}
+        named |= choices
         settings = {"loss.terms": ablation, **learned}
         run = {**usual, "choices": named, "settings": settings, **of_run}
         record = {"scene": scene, "method": method, "protocol": protocol, **sections, "run": run}
+        record |= {"at_rest": True, "dynamic": {}} if at_rest else {}
         folder = runs / name
         folder.mkdir(parents=True)
         (folder / "metrics.json").write_text(json.dumps(record))
-        if frames:
+        if curve:
             with (folder / "frames.csv").open("w", newline="") as file:
                 table = csv.writer(file)
                 table.writerow(["capture", "name", "time", "psnr", "ssim"])
                 table.writerow(["static", "at rest", 0, 40, 0.9])
-                table.writerows(["dynamic", f"m{t}", t, psnr, ""] for t, psnr in frames)
+                table.writerows(["dynamic", f"m{t}", t, psnr, ""] for t, psnr in curve)
         return folder
 
     return write

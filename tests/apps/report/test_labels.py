@@ -31,7 +31,7 @@ def test_ablations_are_called_and_ordered_as_in_the_paper(labels, ran):
         ran(str(k), ablation=ablation)
     c2f = "Ours w/ c2f"
     known = ["Ours (base)", c2f, f"{c2f}, tv", f"{c2f}, tv, cycle", FULL]
-    assert labels() == [*known, "Ours", "Ours (no_tv)"]
+    assert labels() == [*known, "Ours (no_tv)", "Ours"]
 
 
 @pytest.mark.parametrize(
@@ -39,9 +39,9 @@ def test_ablations_are_called_and_ordered_as_in_the_paper(labels, ran):
     [
         ({"choices": {"field": "a"}}, {"choices": {"field": "b"}}, ["; field=a", "; field=b"]),
         ({"train_views": 1}, {"train_views": 2}, ["; 1 view", "; 2 views"]),
-        ({"device": "GPU"}, {"device": "CPU"}, ["; on CPU", "; on GPU"]),
+        ({"device": "GPU"}, {"device": "CPU"}, ["; on GPU", "; on CPU"]),
         ({"protocol": "joint"}, {}, ["; joint", "; two_stage"]),
-        ({"choices": {"method": "devrf_big"}}, {}, ["", "; method=devrf_big"]),
+        ({"choices": {"method": "devrf_big"}}, {}, ["; method=devrf_big", ""]),
     ],
 )
 def test_two_different_runs_never_share_a_row(labels, ran, one, other, endings):
@@ -56,7 +56,7 @@ def test_methods_have_rows_of_their_own_after_ours(labels, ran):
     ran("c", method="mine", protocol="joint", ablation="small")
     ran("d")
     ran("e", method="dnerf", protocol="dynamic")
-    others = ["D-NeRF; dynamic", "D-NeRF; joint", "NSFF; dynamic", "mine (small); joint"]
+    others = ["D-NeRF; joint", "D-NeRF; dynamic", "NSFF; dynamic", "mine (small); joint"]
     assert labels() == [f"{FULL}; two_stage", *others]
 
 
@@ -87,7 +87,7 @@ def test_equal_runs_share_a_row_whatever_was_typed(rows, learned):
     [
         ({"data.width": 48}, {}, ["; data.width=48", "; data.width=96"]),
         ({"data.near": 0.5}, {}, ["; data.near=0.5", "; data.near=null"]),
-        ({"data.sides": [4, 8]}, {}, ["", "; data.sides=[4, 8]"]),
+        ({"data.sides": [4, 8]}, {}, ["; data.sides=[4, 8]", ""]),
     ],
 )
 def test_unequal_runs_say_what_differs(labels, learned, one, other, endings):
@@ -97,9 +97,32 @@ def test_unequal_runs_say_what_differs(labels, learned, one, other, endings):
     assert labels() == [FULL + ending for ending in endings]
 
 
+def test_every_typed_difference_is_said_with_the_digits_that_it_needs(labels, ran):
+    for k, (tv, cycle) in enumerate(((0.12345678, 1.0), (0.1234999, 10.0))):
+        # The rate follows from the name of the schedule.
+        settings = {"loss.tv": tv, "loss.cycle": cycle, "schedule.rate": k, "data.width": 48 * k}
+        typed = [f"+loss.tv={tv}", f"loss={{cycle: {cycle}}}", "data.width=1", f"schedule={k}"]
+        size = {"image_size": [48 * k, 40], "frames": 50 - k}
+        ran(str(k), settings=settings, overrides=typed, **size, choices={"schedule": f"s{k}"})
+    assert labels() == [
+        f"{FULL}; 50 frames; 0×40; schedule=s0; loss.tv=0.12346; loss.cycle=1",
+        f"{FULL}; 49 frames; 48×40; schedule=s1; loss.tv=0.1235; loss.cycle=10",
+    ]
+
+
+def test_a_scene_at_rest_is_one_of_its_own_without_ablations(rows, ran):
+    ran("a", ablation="base", at_rest=True, settings={})
+    ran("b", ablation="c2f", at_rest=True, settings={})
+    ran("c", ablation="base")
+    assert rows() == [
+        ("robot (at rest)", "Ours", ["a", "b"]),
+        ("robot", "Ours (base)", ["c"]),
+    ]
+
+
 def test_a_name_for_the_settings_is_said_where_all_equal_runs_have_it(labels, learned):
     for k, schedule in enumerate(("quick", "paper")):
         for seed in (0, 1):
             width = {"schedule.side": k, "data.width": 96 + k}
             learned(f"{k}{seed}", width, seed=seed, choices={"schedule": schedule})
-    assert labels() == [f"{FULL}; schedule=paper", f"{FULL}; schedule=quick"]
+    assert labels() == [f"{FULL}; schedule=quick", f"{FULL}; schedule=paper"]

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
+import pytest
+
 from devrf.apps.report.plots import against_views, plots, psnr_against_seconds, psnr_over_time
 
 
@@ -14,10 +18,10 @@ def curves(axes):
 
 
 def test_psnr_over_time_is_the_mean_over_seeds(table, ran):
-    ran("a", seed=0, frames=[(0.0, 30.0), (1.0, 20.0)])
-    ran("b", seed=1, frames=[(0.0, 32.0), (1.0, 22.0)])
-    ran("c", ablation="base", frames=[(0.0, 15.0), (1.0, 14.0)])
-    ran("d", "flower", frames=[(0.0, 1.0)])
+    ran("a", seed=0, curve=[(0.0, 30.0), (1.0, 20.0)])
+    ran("b", seed=1, curve=[(0.0, 32.0), (1.0, 22.0)])
+    ran("c", ablation="base", curve=[(0.0, 15.0), (1.0, 14.0)])
+    ran("d", "flower", curve=[(0.0, 1.0)])
     (axes,) = psnr_over_time(table(), "robot").axes
     assert curves(axes) == {
         "Ours (base)": [(0, 15), (1, 14)],
@@ -38,6 +42,18 @@ def test_psnr_against_seconds_has_a_panel_a_scene_and_the_published_rows(table, 
     assert points[0] == (300, 30) and (540, 29.25) in points
 
 
+@pytest.mark.parametrize("seconds", [0.03, 1.7, 100, 2900, 20_000])
+@pytest.mark.parametrize("factor", [1.01, 12, 900])
+def test_an_axis_of_times_has_some_round_ticks(table, ran, seconds, factor):
+    ran("a", seconds=(seconds / 2, seconds / 2))
+    ran("b", ablation="base", seconds=(seconds * factor / 2, seconds * factor / 2))
+    (axes,) = psnr_against_seconds(table()).axes
+    low, high = axes.get_xlim()
+    ticks = [tick for tick in axes.get_xticks() if low <= tick <= high]
+    assert 2 <= len(ticks) <= 6
+    assert all(later > 1.3 * tick for tick, later in pairwise(ticks))
+
+
 def test_metrics_against_views_need_several_numbers_of_them(table, ran):
     ran("1", train_views=1, scores={"psnr": 20.0, "ssim": 0.8})
     ran("base", ablation="base", train_views=1)
@@ -51,7 +67,7 @@ def test_metrics_against_views_need_several_numbers_of_them(table, ran):
 def test_no_plot_of_what_is_not_there(table, ran):
     ran("a", seconds=(None, None))
     assert plots(table()) == []
-    ran("b", "a scene/of mine", frames=[(0.0, 20.0)], seconds=(1, 2))
+    ran("b", "a scene/of mine", curve=[(0.0, 20.0)], seconds=(1, 2))
     assert [plot.name for plot in plots(table())] == [
         "psnr_against_seconds",
         "psnr_over_time_a_scene_of_mine",
@@ -61,7 +77,7 @@ def test_no_plot_of_what_is_not_there(table, ran):
 def test_a_legend_covers_no_curve_and_is_not_cut_off(table, ran):
     name = "a method with a name that is longer than a plot is wide: "
     for k in range(9):
-        ran(f"{k}", method=f"{name}{k}" * 2, protocol="two_stage", frames=[(0.0, 20.0 + k)])
+        ran(f"{k}", method=f"{name}{k}" * 2, protocol="two_stage", curve=[(0.0, 20.0 + k)])
     figure = psnr_over_time(table(), "robot")
     figure.draw_without_rendering()
     legend, (axes,) = figure.legends[0].get_window_extent(), figure.axes

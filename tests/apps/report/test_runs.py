@@ -53,14 +53,9 @@ def test_a_failure_is_told_in_one_line(runs, failed):
 
 
 @pytest.mark.parametrize(
-    ("content", "reason"),
-    [
-        (b"{", "damaged"),
-        (b"[1, 2]", "the file"),
-        (b'{"scene": "robot", "error": 3, "run": {"seed": "one"}}', "method|error"),
-    ],
+    "content", [b"{", b"\xff", b"[1, 2]", b'{"scene": "robot", "error": 3, "run": {"seed": 1}}']
 )
-def test_damaged_records_are_skipped_with_a_line_that_says_where(runs, ran, content, reason):
+def test_damaged_records_are_skipped_with_a_line_that_says_where(runs, ran, content):
     ran("good")
     for name in ("failure", "metrics"):
         (runs / name).mkdir()
@@ -69,12 +64,11 @@ def test_damaged_records_are_skipped_with_a_line_that_says_where(runs, ran, cont
     assert list(found.runs["folder"]) == ["good"] and found.failures.empty
     assert len(found.skipped) == 2
     for line, name in zip(found.skipped, ("failure", "metrics"), strict=True):
-        assert line.startswith(f"{runs / name / name}.json: skipped; ") and "\n" not in line
-        assert any(part in line for part in reason.split("|"))
+        assert line.startswith(f"{runs / name / name}.json: skipped; it is damaged, or not as")
 
 
 def test_curves_are_over_the_dynamic_images_views_of_a_time_averaged(ran):
-    folder = ran("a", frames=[(1.0, 20.0), (0.0, 30.0), (0.0, 32.0)])
+    folder = ran("a", curve=[(1.0, 20.0), (0.0, 30.0), (0.0, 32.0)])
     assert metric_over_time(folder, "psnr").to_dict() == {0.0: 31.0, 1.0: 20.0}
     assert metric_over_time(folder, "ssim").empty and metric_over_time(folder, "nothing").empty
     (folder / "frames.csv").write_bytes(b"capture,time,psnr\ndynamic,x,3\n")

@@ -21,9 +21,9 @@ def files(folder):
 
 
 def test_a_report_is_written_beside_the_runs_and_not_taken_for_one(runs, ran):
-    ran("a", frames=[(0.0, 20.0), (1.0, 21.0)])
-    written = write_report(ReportSettings(runs))
-    assert written.path == runs / "report" / "report.md"
+    ran("a", curve=[(0.0, 20.0), (1.0, 21.0)])
+    text = write_report(ReportSettings(runs))
+    assert text.endswith(f"\nreport written to {runs / 'report' / 'report.md'}")
     plots = {"figures/psnr_against_seconds", "figures/psnr_over_time_robot"}
     assert files(runs / "report") == {
         "report.md",
@@ -33,7 +33,7 @@ def test_a_report_is_written_beside_the_runs_and_not_taken_for_one(runs, ran):
         *(f"{p}.pdf" for p in plots),
     }
     for plot in plots:
-        assert f"(<{plot}.png>)" in written.path.read_text(encoding="utf-8")
+        assert f"(<{plot}.png>)" in (runs / "report" / "report.md").read_text(encoding="utf-8")
     again = collect(runs)
     assert len(again.runs) == 1 and not again.skipped
 
@@ -53,6 +53,11 @@ def test_csv_has_a_row_for_each_run_and_failure_and_every_number(runs, ran, fail
     expected = {"status": "failed", "error": "data.frames: expected 2, or more", "mistake": "true"}
     expected |= {"run.overrides": "data.frames=1 seed=0", "run.choices.ablation": "base"}
     assert rows["7_robot"].items() >= {**expected, "dynamic.psnr": ""}.items()
+
+
+def test_failures_alone_are_told(runs, failed):
+    failed("0_robot", "data.frames: expected 2")
+    assert write_report(ReportSettings(runs)).startswith("failed: 0_robot: data.frames: expected 2")
 
 
 def test_damaged_runs_alone_are_an_error_and_nothing_is_written(runs):
@@ -90,7 +95,8 @@ def test_each_row_is_a_tile_beside_the_truth_at_the_same_time(runs, ran):
     film(ran("a", method="devrf", protocol="two_stage"), [red, red, green])
     film(ran("b", method="dnerf", protocol="joint"), [blue, blue], height=64)
     ran("c", method="nsff", protocol="joint")  # filmed nothing
-    text = write_report(ReportSettings(runs)).path.read_text(encoding="utf-8")
+    write_report(ReportSettings(runs))
+    text = (runs / "report" / "report.md").read_text(encoding="utf-8")
     assert "(<videos/side_by_side_robot.mp4>)" in text
     pictures = iio.imread(runs / "report" / "videos" / "side_by_side_robot.mp4")
     assert len(pictures) == 2  # as many as the shorter video

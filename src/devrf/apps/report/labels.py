@@ -1,16 +1,14 @@
 """Which runs share a row of a table, and the row's label.
 
 Runs of one scene share a row if they were learned with the same settings but the seed, on the same
-device by the same version, whatever was typed. A label says only what distinguishes its row from
-the others of the scene.
+device by the same version, whatever was typed. A label says how its row differs from others of the
+scene: in data, device and typed settings always; in the rest as little as tells the rows apart.
 """
 
 from __future__ import annotations
 
 import json
-import math
-import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import pandas as pd
@@ -43,48 +41,57 @@ ABLATIONS = {
     "tracks": "+ start along tracks",
     "best": "+ finer field at rest",
 }
-# Config groups and keys that decide what is logged, not what is learned.
-LOGGING = {"logger", "callbacks", "video", "report", "hydra"}
-IGNORED = {"objective", "seed", "stage"}
 CHOICES, SETTINGS = "run.choices.", "run.settings."
+IGNORED = {"objective", "seed", "stage", "method"}
 # Without an experiment a run has the config of this one.
 DEFAULT_EXPERIMENT = "quickstart"
-# Traits that distinguish rows, most important first; other groups and overrides come before LAST.
-ALWAYS = ("method",)
-FIRST = ("protocol", "views", "experiment", "schedule", "field", "sampling", "loss")
-LAST = ("images", "capture", "device", "revision", "version")
-# All that tells a run from unequal ones, whatever it is called; never part of a label.
-IDENTITY = "identity"
-# Traits that every run records: the key, its type, and how it stands in a label.
-RECORDED: tuple[tuple[str, str, type, Callable[[Any], str]], ...] = (
-    ("views", "train_views", int, lambda n: f"{n} view{'s' * (n != 1)}"),
-    ("images", "test_frames", int, lambda n: f"{n} held-out images"),
-    ("capture", "fingerprint", str, lambda hashed: f"capture {hashed[:6]}"),
-    ("device", "device", str, lambda name: f"on {name}"),
-    ("revision", "git", str, lambda git: f"at {git[:9]}{'-dirty' * git.endswith('-dirty')}"),
-    ("version", "devrf", str, lambda version: f"devrf {version}"),
-)
+# Groups whose options are names for many settings, most important first.
+NAMED = ("experiment", "profile", "schedule", "field", "sampling", "loss", "method")
+# What every run records, and how it stands in a label.
+RECORDED: dict[str, Callable[[Any], str]] = {
+    "protocol": str,
+    "run.train_views": lambda n: f"{n} view{'s' * (n != 1)}",
+    "run.frames": lambda n: f"{n} frames",
+    "run.image_size": lambda size: f"{size[0]}×{size[1]}",
+    "run.device": lambda name: f"on {name}",
+    "run.test_frames": lambda n: f"{n} held-out images",
+    "run.fingerprint": lambda hashed: f"capture {hashed[:6]}",
+    "run.git": lambda git: f"at {git[:9]}{'-dirty' * git.endswith('-dirty')}",
+    "run.devrf": lambda version: f"devrf {version}",
+}
+# Of these every difference is said, before names and settings; the others come last.
+SAID = list(RECORDED)[:5]
+# Settings of which the recorded numbers say enough.
+IN_DATA = ["data.width", "data.height", "data.downscale", "data.frames", "data.train_views"]
 
 
 def labelled(runs: pd.DataFrame) -> pd.DataFrame:
-    """The runs in the order of a table: scenes as they come, ablations as in the paper.
+    """The runs in the order of a table: scenes as they come, ablations as in the paper, then jobs.
 
-    Further columns are ``label``, the same for runs that share a row; ``name``, the label without
-    the protocol; ``line``, the label without the number of views; ``views``, the number of dynamic
-    training views (NaN where unknown).
+    A scene at rest is not the one of its name that moves. Further columns are ``label``, the same
+    for runs that share a row; ``name``, the label without the protocol; ``line``, the label without
+    the number of views; ``views``, the number of dynamic training views (NaN where unknown);
+    ``kind``, the same for runs of alike scenes with the same names and typed settings.
     """
-    traits = _distinguishing(runs["scene"], [_traits(run) for run in runs.to_dict("records")])
-    views = runs.get("run.train_views", pd.Series(None, runs.index, dtype=object))
+    names, settings = _names(runs), _settings(runs)
+    typed = _typed(settings, runs)
+    scenes = runs["scene"].where(~runs["at_rest"].eq(True), runs["scene"] + " (at rest)")
+    runs = runs.assign(scene=scenes)
+    traits = _distinguishing(runs, names, settings, typed)
+    same = runs.reindex(columns=["at_rest", "run.kind", "run.image_size", "run.train_views"])
+    views = same.pop("run.train_views").map(number).astype(float)
+    same = same.assign(**names, **{k: settings[k] for k in typed if not k.startswith("data.")})
     ordered = runs.assign(
-        label=[_label(trait) for trait in traits],
-        name=[_label(trait, without="protocol") for trait in traits],
-        line=[_label(trait, without="views") for trait in traits],
-        views=views.map(number).astype(float),
-        by_scene=pd.factorize(runs["scene"])[0],
+        label=_label(traits),
+        name=_label(traits, without="protocol"),
+        line=_label(traits, without="run.train_views"),
+        views=views,
+        kind=list(map(str, same.itertuples(index=False, name=None))),
+        by_scene=pd.factorize(scenes)[0],
         by_method=[_rank(method, METHODS) for method in runs["method"]],
-        by_name=[_rank(trait["method"], ABLATIONS.values()) for trait in traits],
+        by_name=[_rank(name, ABLATIONS.values()) for name in traits["method"]],
     )
-    order = ["by_scene", "by_method", "by_name", "views", "label"]
+    order = ["by_scene", "by_method", "by_name", "views"]
     return ordered.sort_values(order, kind="stable").drop(columns=order[:3])
 
 
@@ -93,71 +100,105 @@ def _rank(name: str, names: Iterable[str]) -> int:
     return [*names, name].index(name)
 
 
-def _traits(run: Mapping[str, Any]) -> dict[str, str]:
-    """A run's configuration, data, device and version, each as it stands in a label."""
-    options = {
-        key.removeprefix(CHOICES): option if isinstance(option, str) else ""
-        for key, option in run.items()
-        if key.startswith(CHOICES)
+def _label(traits: pd.DataFrame, without: str = "") -> list[str]:
+    said = traits.drop(columns=without, errors="ignore")
+    return ["; ".join(filter(None, texts)) for texts in said.itertuples(index=False)]
+
+
+def _distinguishing(
+    runs: pd.DataFrame,
+    names: Mapping[str, pd.Series],
+    settings: Mapping[str, pd.Series],
+    typed: Sequence[str],
+) -> pd.DataFrame:
+    """What labels say of the runs: a column for each trait, empty where it tells no rows apart."""
+    recorded = {
+        key: runs[key].map(text, na_action="ignore").fillna("")
+        for key, text in RECORDED.items()
+        if key in runs
     }
-    ablation = options.get("ablation", "")
-    traits = {"method": _method(run["method"], ablation), "protocol": run["protocol"]}
-    for trait, key, kind, words in RECORDED:
-        value = run.get(f"run.{key}")
-        if isinstance(value, kind):
-            traits[trait] = words(value)
-    traits |= _settings(run)
-    distinct = {key: text for key, text in traits.items() if key != "method"}
-    traits[IDENTITY] = json.dumps({**distinct, "method": run["method"]}, sort_keys=True)
-    if run["method"] == DEFAULT_METHOD:
-        options["experiment"] = options.get("experiment") or DEFAULT_EXPERIMENT
-    for group, option in options.items():
-        if option and group != "ablation" and option != run.get(group):
-            traits[f"={group}" if group in traits else group] = f"{group}={option}"
-    parts = {key: re.split("[./]", key.lstrip("="))[0] for key in traits}
-    return {key: text for key, text in traits.items() if parts[key] not in LOGGING}
+    traits = pd.DataFrame({"method": _methods(runs), **recorded, **names, **settings})
+    # All that tells a run from unequal ones, whatever it is called.
+    identity = pd.DataFrame({"method": runs["method"], **recorded, **settings})
+    equal = traits.groupby([runs["scene"], pd.Series(_label(identity), runs.index)])
+    # Equal runs have one name, that of the ablation that its settings were called by, if any.
+    traits["method"] = equal["method"].transform(
+        lambda names: min(names, key=lambda name: _rank(name, ABLATIONS.values()))
+    )
+    said = [key for key in recorded if key in SAID]
+    chosen = ["method"]
+    for key in dict.fromkeys([*said, *names, *typed, *settings, *recorded]):
+        known = traits[key].mask(traits[key] == "").groupby(runs["scene"])
+        differs = key in (*said, *typed) and known.nunique().gt(1).any()
+        # A name is left out only where other names say it.
+        beside = [trait for trait in chosen if key not in names or trait in ("method", *names)]
+        rows = [runs["scene"], *(traits[trait] for trait in beside)]
+        tells = traits.groupby([*rows, traits[key]]).ngroups > traits.groupby(rows).ngroups
+        # What equal runs call differently, such as an experiment that was typed out, is no name.
+        if (differs or tells) and equal[key].nunique().eq(1).all():
+            chosen.append(key)
+    several = traits.groupby(runs["scene"])[chosen].transform("nunique") > 1
+    return traits[chosen].where(several.assign(method=True), "")
 
 
-def _settings(run: Mapping[str, Any]) -> dict[str, str]:
-    """The settings that a run was learned with, by key."""
+def _methods(runs: pd.DataFrame) -> list[str]:
+    """What methods and ablations are called; of a scene at rest no ablation is."""
+    names, ablations = [], _options(runs, "ablation")
+    for method, ablation, at_rest in zip(runs["method"], ablations, runs["at_rest"], strict=True):
+        name = METHODS.get(method, method)
+        if at_rest is not True and method == DEFAULT_METHOD and ablation in ABLATIONS:
+            name = ABLATIONS[ablation]
+        elif at_rest is not True and ablation not in ("", "full"):
+            name = f"{name} ({ablation})"
+        names.append(name)
+    return names
+
+
+def _options(runs: pd.DataFrame, group: str) -> pd.Series:
+    return runs.get(CHOICES + group, pd.Series(None, runs.index, dtype=object)).fillna("")
+
+
+def _names(runs: pd.DataFrame) -> dict[str, pd.Series]:
+    """The options of config groups; empty where there is none, or it is the method's name."""
+    names = {}
+    for group in NAMED:
+        options = _options(runs, group)
+        # The form of an experiment for its scene: paper_lego is what experiment=paper is there.
+        both = zip(options, runs["scene"], strict=True)
+        options = pd.Series([o.removesuffix(f"_{scene}") for o, scene in both], runs.index)
+        if group == "experiment":
+            usual = options.eq("") & runs["method"].eq(DEFAULT_METHOD)
+            options = options.mask(usual, DEFAULT_EXPERIMENT)
+        said = options.eq("") | options.eq(runs["method"])
+        names[CHOICES + group] = (f"{group}=" + options).mask(said, "")
+    return names
+
+
+def _settings(runs: pd.DataFrame) -> dict[str, pd.Series]:
+    """The settings that runs were learned with, by key; of a run without one the text is empty.
+
+    Numbers have as few digits, three at least, as keep them apart.
+    """
     settings = {}
-    for column, value in run.items():
+    for column in runs:
         key = column.removeprefix(SETTINGS)
-        # Of a key that the run does not have the value is NaN; null is None.
-        absent = isinstance(value, float) and math.isnan(value)
-        if key != column and key not in (*IGNORED, "method") and not absent:
-            text = value if isinstance(value, str) else json.dumps(value)
-            settings[f"={key}"] = f"{key}={text}"
+        if key == column or key in IGNORED:
+            continue
+        values = runs[column]
+        numbers = values.map(number).dropna()
+        for digits in range(3, 18):
+            short = numbers.map(lambda x, n=digits: f"{x:.{max(n, len(f'{x:.0f}'))}g}")
+            if short.nunique() == numbers.nunique():
+                break
+        texts = values.map(lambda value: value if isinstance(value, str) else json.dumps(value))
+        texts.update(short)
+        # null is None; NaN says that there is no such key.
+        settings[key] = (f"{key}=" + texts).mask(values.map(lambda value: value != value), "")
     return settings
 
 
-def _method(method: str, ablation: str) -> str:
-    name = METHODS.get(method, method)
-    if method == DEFAULT_METHOD and ablation in ABLATIONS:
-        return ABLATIONS[ablation]
-    return name if ablation in ("", "full") else f"{name} ({ablation})"
-
-
-def _distinguishing(scenes: pd.Series, traits: list[dict[str, str]]) -> list[dict[str, str]]:
-    """Of each run the traits, as few as possible, that separate the different runs of a scene."""
-    frame = pd.DataFrame(traits, index=scenes.index, dtype=object).fillna("")
-    others = sorted(set(frame) - {*ALWAYS, *FIRST, *LAST, IDENTITY})
-    keys = (*FIRST, *others, *LAST)
-    frame = frame.reindex(columns=[*ALWAYS, *keys, IDENTITY], fill_value="").assign(scene=scenes)
-    equal = frame.groupby(["scene", IDENTITY])
-    # Equal runs have one name, that of the ablation that its settings were called by, if any.
-    frame["method"] = equal["method"].transform(
-        lambda names: min(names, key=lambda name: _rank(name, ABLATIONS.values()))
-    )
-    chosen = list(ALWAYS)
-    rows = frame.groupby(["scene", *chosen]).ngroups
-    for key in keys:
-        finer = frame.groupby(["scene", *chosen, key]).ngroups
-        # What equal runs call differently, such as an experiment that was typed out, is no name.
-        if finer > rows and (equal[key].nunique() == 1).all():
-            chosen, rows = [*chosen, key], finer
-    return list(frame[chosen].to_dict("records"))
-
-
-def _label(traits: Mapping[str, str], without: str = "") -> str:
-    return "; ".join(text for key, text in traits.items() if text and key != without)
+def _typed(settings: Iterable[str], runs: pd.DataFrame) -> list[str]:
+    """The settings of which a run's user typed the value, or that of the mapping they lie in."""
+    keys = {text.partition("=")[0].lstrip("+") for texts in runs["run.overrides"] for text in texts}
+    typed = tuple(f"{key}." for key in keys if CHOICES + key not in runs)
+    return [key for key in settings if f"{key}.".startswith(typed) and key not in IN_DATA]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -47,22 +49,12 @@ STYLE: dict[Any, Any] = {
     "lines.markersize": 4,
 }
 # Markers of the paper's methods, and how the names of their variants end.
-MARKERS = {
-    "DeVRF": "s",
-    "D-NeRF": "^",
-    "Nerfies": "v",
-    "HyperNeRF": "D",
-    "NSFF": "P",
-    "Neural Volumes": "X",
-}
+NAMES = ("DeVRF", "D-NeRF", "Nerfies", "HyperNeRF", "NSFF", "Neural Volumes")
+MARKERS = dict(zip(NAMES, "s^vDPX", strict=True))
 VARIANT = r"-2 ?stage$|-dynamic$| \(base\)$| w/ .*$"
-# Seconds to label on an axis, where times span more than a factor of fifty and where less.
-FEW_TICKS = (0.1, 1, 10, 60, 600, 3600, 36000, 360000)
-TICKS = (
-    *(0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 30),
-    *(60 * minutes for minutes in (1, 2, 5, 10, 20, 30)),
-    *(3600 * hours for hours in (1, 2, 5, 10, 24)),
-)
+# Seconds to label on an axis: of these multiples the first that there is room for.
+UNITS = (0.01, 0.1, 1, 10, 60, 600, 3600, 36000, 360000, math.inf)
+MULTIPLES, MOST_TICKS = ((1, 1.5, 2, 3, 4, 6), (1, 2, 5), (1, 3), (1,)), 6
 
 
 class Plot(NamedTuple):
@@ -168,7 +160,7 @@ def _points(axes: Axes, table: Table, block: Block) -> None:
     axes.set(title=block.title, xscale="log", xlabel="training time", ylabel=f"{PSNR.title} (dB)")
     low, high = axes.get_xlim()
     axes.set_xlim(low / 1.5, high * 1.5)
-    axes.xaxis.set_major_locator(FixedLocator(FEW_TICKS if high > 50 * low else TICKS))
+    axes.xaxis.set_major_locator(FixedLocator(_ticks(*axes.get_xlim())))
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter(_time)
 
@@ -177,6 +169,17 @@ def _seconds_and_psnr(rows: pd.DataFrame) -> list[tuple[str, float, float]]:
     """(label, seconds, PSNR) where both are known and a logarithm can show the time."""
     known = rows["value"][[TIME.title, PSNR.title]].dropna()
     return list(known[known[TIME.title] > 0].itertuples(name=None))
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    """Round times in seconds between two times."""
+    for multiples in MULTIPLES:
+        # No 50 s beside 1 min.
+        times = [m * u for u, above in pairwise(UNITS) for m in multiples if 1.5 * m * u <= above]
+        ticks = [time for time in times if low <= time <= high]
+        if len(ticks) <= MOST_TICKS:
+            break
+    return ticks
 
 
 def _time(seconds: float, position: float) -> str:

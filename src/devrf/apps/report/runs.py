@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 from dataclasses import dataclass
@@ -9,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from pydantic import BaseModel, ConfigDict, ValidationError
 
 from devrf.errors import DevrfError
 
@@ -20,36 +20,6 @@ COLUMNS = (
     *("run.device", "run.overrides", "run.seed", "run.checkpoint", "run.date", "path"),
 )
 DEFAULT_METHOD, DEFAULT_PROTOCOL = "devrf", "two_stage"
-Section = dict[str, Any]
-
-
-class _Setup(BaseModel):
-    model_config = ConfigDict(strict=True, extra="allow")
-    choices: dict[str, str | None] | None = None
-    overrides: list[str] | None = None
-    seed: int | None = None
-    device: str | None = None
-
-
-class _Metrics(BaseModel):
-    """What is checked of ``metrics.json``."""
-
-    model_config = ConfigDict(strict=True, extra="allow")
-    scene: str
-    method: str
-    protocol: str
-    at_rest: bool = False
-    run: _Setup = _Setup()
-    static: Section = {}
-    dynamic: Section = {}
-
-
-class _Failure(_Setup):
-    """What is checked of ``failure.json``."""
-
-    error: str
-    scene: str | None = None
-    mistake: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -91,9 +61,9 @@ def collect(folder: Path) -> Collection:
             if not file.is_file():
                 continue
             try:
-                record = read(file.read_bytes())
-            except (OSError, ValidationError) as error:
-                skipped.append(f"{file}: skipped; {_reason(error)}")
+                record = read(json.loads(file.read_bytes()))
+            except (OSError, ValueError, LookupError, TypeError, AttributeError):
+                skipped.append(f"{file}: skipped; it is damaged, or not as devrf writes it")
             else:
                 records[status].append({**record, "folder": name, "path": place, "status": status})
     runs, failures = _frame(records["finished"]), _frame(records["failed"])
@@ -125,33 +95,23 @@ def _natural(name: str) -> tuple[int, int, str]:
     return (0, int(head), name) if head.isdecimal() else (1, 0, name)
 
 
-def _finished(content: bytes) -> dict[str, Any]:
-    metrics = _Metrics.model_validate_json(content)
-    values = metrics.model_dump(exclude_unset=True) | {"at_rest": metrics.at_rest}
+def _finished(metrics: dict[str, Any]) -> dict[str, Any]:
+    at_rest, static = metrics.get("at_rest", False), metrics.get("static", {})
     # Other protocols may have no stage of their own for the static capture.
-    stages = [] if metrics.at_rest else [metrics.dynamic]
-    of_static = metrics.at_rest or metrics.static.get("seconds") is not None
-    if of_static or metrics.protocol == DEFAULT_PROTOCOL:
-        stages.append(metrics.static)
+    stages = [] if at_rest else [metrics.get("dynamic", {})]
+    if at_rest or static.get("seconds") is not None or metrics["protocol"] == DEFAULT_PROTOCOL:
+        stages.append(static)
     frame = pd.DataFrame(stages, columns=["seconds", "peak_gpu_gb"], dtype=object).map(number)
-    values["train_seconds"] = frame["seconds"].sum(skipna=False)
-    values["peak_gpu_gb"] = frame["peak_gpu_gb"].max(skipna=False)
-    return values
+    seconds, memory = frame["seconds"].sum(skipna=False), frame["peak_gpu_gb"].max(skipna=False)
+    head = {key: metrics[key] for key in ("scene", "method")}
+    return metrics | head | {"at_rest": at_rest, "train_seconds": seconds, "peak_gpu_gb": memory}
 
 
-def _failed(content: bytes) -> dict[str, Any]:
-    failure = _Failure.model_validate_json(content)
-    setup = failure.model_dump(include={"choices", "overrides", "seed"}, exclude_none=True)
-    error = " ".join(failure.error.split())
-    return {"scene": failure.scene, "error": error, "mistake": failure.mistake, "run": setup}
-
-
-def _reason(error: OSError | ValidationError) -> str:
-    if isinstance(error, OSError) or error.errors()[0]["type"] == "json_invalid":
-        return "damaged, or not to be read"
-    first = error.errors()[0]
-    place = ".".join(map(str, first["loc"])) or "the file"
-    return f"not as devrf writes it ({place}: {first['msg'].lower()})"
+def _failed(failure: dict[str, Any]) -> dict[str, Any]:
+    setup = {key: failure[key] for key in ("choices", "overrides", "seed")}
+    error = " ".join(failure["error"].split())
+    head = {"scene": failure["scene"], "error": error, "mistake": failure["mistake"]}
+    return {**head, "run": setup}
 
 
 def _frame(records: list[dict[str, Any]]) -> pd.DataFrame:

@@ -4,55 +4,17 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
+from typing import Any
 
 import pandas as pd
 
 from devrf.apps.report.labels import labelled
 from devrf.apps.report.runs import Collection, number
 from devrf.apps.settings import PublishedScenes
-
-METRICS = ["PSNR", "SSIM", "LPIPS", "GPU (GB)", "Time"]
-
-
-@dataclass(frozen=True)
-class Published:
-    """What the paper reports, and where.
-
-    Attributes:
-        venue: where it appeared, and in which tables.
-        hardware: what it was measured on.
-        tables: the number of the table that holds each scene, by devrf's name of the scene.
-        texts: the cells as printed, indexed by scene and label. The column ``method`` is the
-            paper's own name; its "Ours" is DeVRF in the label.
-        values: the same cells as numbers, the time in seconds.
-    """
-
-    title: str
-    authors: str
-    venue: str
-    hardware: str
-    tables: dict[str, int]
-    texts: pd.DataFrame
-    values: pd.DataFrame
-
-
-@cache
-def published() -> Published:
-    """The paper's rows, from ``published.toml``."""
-    data = tomllib.loads(files(__package__).joinpath("published.toml").read_text("utf-8"))
-    rows = [(scene["name"], *row) for scene in data["scenes"] for row in scene["rows"]]
-    texts = pd.DataFrame(rows, columns=["scene", "method", *METRICS], dtype=object)
-    label = texts["method"].str.replace(r" \[\d+\]", "", regex=True).str.replace("Ours", "DeVRF")
-    texts = texts.assign(label=label).set_index(["scene", "label"])
-    values = texts[METRICS].assign(Time=texts["Time"].str.extract(r"([\d.]+)")[0]).astype(float)
-    values["Time"] *= texts["Time"].str.endswith("hrs").map({True: 3600.0, False: 60.0})
-    tables = {scene["name"]: scene["table"] for scene in data["scenes"]}
-    return Published(**data["source"], tables=tables, texts=texts, values=values)
-
 
 UNKNOWN = "–"
 
@@ -104,6 +66,40 @@ TIMES = (
 
 
 @dataclass(frozen=True)
+class Published:
+    """What the paper reports, and where.
+
+    Attributes:
+        hardware: what it was measured on.
+        credit: where it appeared, in words.
+        data: what each scene's data were, by devrf's name of the scene.
+        texts: the cells as printed, indexed by scene and label. The column ``method`` is the
+            paper's own name; its "Ours" is DeVRF in the label.
+        values: the same cells as numbers, the time in seconds.
+    """
+
+    hardware: str
+    credit: str
+    data: dict[str, dict[str, Any]]
+    texts: pd.DataFrame
+    values: pd.DataFrame
+
+
+@cache
+def published() -> Published:
+    """The paper's rows, from ``published.toml``."""
+    data = tomllib.loads(files(__package__).joinpath("published.toml").read_text("utf-8"))
+    rows = [(scene["name"], *row) for scene in data["scenes"] for row in scene["rows"]]
+    texts = pd.DataFrame(rows, columns=["scene", "method", *TITLES], dtype=object)
+    label = texts["method"].str.replace(r" \[\d+\]", "", regex=True).str.replace("Ours", "DeVRF")
+    texts = texts.assign(label=label).set_index(["scene", "label"])
+    values = texts[TITLES].assign(Time=texts["Time"].str.extract(r"([\d.]+)")[0]).astype(float)
+    values["Time"] *= texts["Time"].str.endswith("hrs").map({True: 3600.0, False: 60.0})
+    described = {scene["name"]: scene["data"] for scene in data["scenes"]}
+    return Published(**data["source"], data=described, texts=texts, values=values)
+
+
+@dataclass(frozen=True)
 class Block:
     """The rows of one scene, or of an average over scenes.
 
@@ -146,7 +142,7 @@ class Table:
 
 
 def tabulate(collection: Collection, published_scenes: PublishedScenes = "matching") -> Table:
-    """The tables of a collection, beside the paper's rows of its scenes, of all, or of none."""
+    """The tables of a collection, beside the paper's rows of the same data, of all, or of none."""
     scored = _values(collection.runs, PSNR).notna()
     again = _scored_again(collection.runs[scored])
     runs = labelled(collection.runs[scored].drop(index=again.index))
@@ -156,14 +152,18 @@ def tabulate(collection: Collection, published_scenes: PublishedScenes = "matchi
     for column in columns:
         runs[column.title] = _values(runs, column)
     groups = runs.groupby(["scene", "label"], sort=False)
-    heads = groups[["name", "protocol", "line", "views"]].first().assign(count=groups.size())
+    described = ["name", "protocol", "line", "views", "kind"]
+    heads = groups[described].first().assign(count=groups.size())
     complete = groups[titles].count().eq(heads["count"], axis=0)
     rows = heads.join(groups[titles].mean().where(complete))
     spread = groups[titles].std().where(complete)
 
-    ours, known = list(runs["scene"].unique()), list(published().tables)
-    beside = {"none": [], "all": known, "matching": [scene for scene in ours if scene in known]}
-    theirs = beside[published_scenes]
+    ours = list(runs["scene"].unique())
+    same = {run["scene"] for run in runs.to_dict("records") if _is_of_published_data(run)}
+    # The paper's scenes by title: they stand below runs of the same data, else alone.
+    theirs = {s if s in same or s not in ours else f"{s}, published": s for s in published().data}
+    if published_scenes != "all":
+        theirs = {scene: scene for scene in same if published_scenes == "matching"}
     blocks: list[Block] = []
     for scene in dict.fromkeys([*ours, *theirs]):
         measured = _cells(
@@ -172,15 +172,29 @@ def tabulate(collection: Collection, published_scenes: PublishedScenes = "matchi
             columns,
             runs.loc[runs["scene"] == scene, "run.device"],
         )
-        blocks.append(Block(scene, measured, _published([scene], theirs, columns)))
+        paper = [theirs[scene]] if scene in theirs else []
+        blocks.append(Block(scene, measured, _published(paper, columns)))
     if len(ours) > 1:
         title = f"average over {len(ours)} scenes"
-        average = Block(
-            title, _average(runs, rows, ours, columns), _published(ours, theirs, columns)
-        )
+        paper = ours if set(ours) <= set(theirs) else []
+        average = Block(title, _average(runs, rows, ours, columns), _published(paper, columns))
         blocks += [average] if len(average.measured) else []
     notes = _notes(runs, collection.runs.loc[~scored, "folder"], again)
+    left_out = [scene for scene in ours if scene in published().data and scene not in theirs]
+    if left_out and published_scenes == "matching":
+        notes.append(
+            f"Of other data than the paper's rows, which are left out: {', '.join(left_out)}."
+        )
     return Table(collection, columns, runs, rows, tuple(blocks), tuple(notes))
+
+
+def _is_of_published_data(run: Mapping[str, Any]) -> bool:
+    """Whether a run's data are said (``data=NAME``) and seen to be those of the paper's rows."""
+    data = {key: run.get(f"run.{key}") for key in ("image_size", "frames", "train_views")}
+    if isinstance(data["image_size"], list):
+        data["image_size"] = sorted(data["image_size"])
+    said = run.get("run.choices.data") == run["scene"]
+    return said and data == published().data.get(run["scene"])
 
 
 def _values(runs: pd.DataFrame, column: Column) -> pd.Series:
@@ -241,23 +255,23 @@ def _cells(
 def _average(
     runs: pd.DataFrame, rows: pd.DataFrame, scenes: list[str], columns: Sequence[Column]
 ) -> pd.DataFrame:
-    """Means over all scenes of the configurations that were run on all of them, without spread."""
+    """Means over all scenes, if they are alike, of what was run on all of them, without spread."""
     groups, titles = rows.groupby("label", sort=False), [column.title for column in columns]
     means = _over_scenes(rows[titles], scenes).join(groups[["name", "protocol"]].first())
-    means = means.assign(counts=groups["count"].agg(set))[groups.size() == len(scenes)]
+    alike = (groups.size() == len(scenes)) & (groups["kind"].nunique() == 1)
+    means = means.assign(counts=groups["count"].agg(set))[alike]
     devices = runs.loc[runs["label"].isin(means.index), "run.device"]
     return _cells(means, means[titles] * math.nan, columns, devices)
 
 
-def _published(scenes: list[str], theirs: list[str], columns: Sequence[Column]) -> pd.DataFrame:
-    """The paper's rows of a scene, or their means over several; none unless it has them all."""
-    published_scenes = scenes if set(scenes) <= set(theirs) else []
-    values = _over_scenes(_of(published().values, published_scenes), scenes).dropna()
+def _published(scenes: list[str], columns: Sequence[Column]) -> pd.DataFrame:
+    """The paper's rows of a scene, or their means over several; of none, none."""
+    values = _over_scenes(_of(published().values, scenes), scenes).dropna()
     values = values.reindex(columns=[column.title for column in columns])
     rows = values.assign(name=values.index, protocol="", counts=[{1} for _ in values.index])
     cells = _cells(rows, values * math.nan, columns, devices=None)
     if len(scenes) == 1:
-        cells["text"] = _of(published().texts[TITLES], published_scenes).reindex(
+        cells["text"] = _of(published().texts[TITLES], scenes).reindex(
             columns=values.columns, fill_value=UNKNOWN
         )
     return cells
@@ -302,9 +316,6 @@ def _notes(runs: pd.DataFrame, at_rest: pd.Series, again: pd.Series) -> list[str
     if runs["run.device"].nunique(dropna=False) > 1:
         notes.append("Memory and time are marked only among rows of one device.")
     notes += _sampled(runs)
-    still = runs.loc[runs["at_rest"].eq(True), "scene"].unique()
-    if len(still):
-        notes.append(f"At rest, scored on held-out images of the static set: {', '.join(still)}.")
     for why, folders in (
         ("Scored at rest only, and therefore not in the tables", at_rest),
         ("Counted once, as last scored elsewhere with the same checkpoint", again),

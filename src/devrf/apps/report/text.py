@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import pandas as pd
@@ -70,33 +70,19 @@ def caption(table: Table) -> str:
     repeated = bool((table.rows["count"] > 1).any())
     spread = " ± is the standard deviation over n runs." * repeated
     return (
-        f"Measured{where}: means over the held-out images of the dynamic scene; peak GPU memory "
-        f"and wall-clock time of optimisation, all stages together.{spread} Marks are within a "
-        "scene, among measured rows; values that look the same share a mark."
-    )
-
-
-def credit() -> str:
-    """The source of the published rows."""
-    paper = published()
-    return (
-        f"As published in {paper.authors}: {paper.title}. {paper.venue}; measured by its authors "
-        f"on an {paper.hardware}, other hardware than ours, and not marked. What they call Ours "
-        "is DeVRF here."
+        f"Measured{where}: means over the held-out images in motion, of a scene at rest over those "
+        f"of the static set; peak GPU memory and wall-clock time of optimisation, all stages "
+        f"together.{spread} Marks are within a scene, among measured rows; values that look the "
+        "same share a mark."
     )
 
 
 def reasons(collection: Collection) -> list[str]:
-    """Which runs failed, and why, a line each; overrides that all runs share are left out."""
-    overrides = pd.concat([collection.runs["run.overrides"], collection.failures["run.overrides"]])
-    typed = [set(texts) for texts in overrides]
-    shared = set.intersection(*typed) if len(typed) > 1 else set()
+    """Which runs failed, by their folders, and why, a line each."""
     lines: list[str] = []
     for failure in collection.failures.to_dict("records"):
-        further = [text for text in failure["run.overrides"] if text not in shared]
-        described = " ".join([failure["scene"] or "unknown scene", *further])
         bug = " (a fault of the program: see its run.log)" * (failure["mistake"] is False)
-        lines.append(f"{failure['folder']} ({described}): {failure['error']}{bug}")
+        lines.append(f"{failure['folder']}: {failure['error']}{bug}")
     return lines
 
 
@@ -122,7 +108,7 @@ def markdown(
         f"{markdown_escaped(caption(table))} **Best**, <ins>second</ins>, *third*.",
     ]
     if table.shows_published:
-        parts.append(f"† {markdown_escaped(credit())}")
+        parts.append(f"† {markdown_escaped(published().credit)}")
     for block in table.blocks:
         frame = printed(table, [block], MARKDOWN).droplevel(0, axis=1)
         left = len(frame.columns) - len(table.columns)
@@ -176,13 +162,8 @@ SPECIAL = str.maketrans(
     {character: rf"\{character}" for character in "&%$#_{}"}
     | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
     | {"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': "''", "–": "--"}
-    | {"±": r"$\pm$", "↑": r"$\uparrow$", "↓": r"$\downarrow$", "†": r"$\dagger$"}
+    | {"±": r"$\pm$", "×": r"$\times$", "↑": r"$\uparrow$", "↓": r"$\downarrow$", "†": r"$\dagger$"}
 )
-COMMANDS = {
-    **dict.fromkeys(("toprule", "midrule", "bottomrule"), ":hline"),
-    "scriptsize": ":{}",
-    "setlength": r":{\tabcolsep}{3pt}",
-}
 
 
 def latex_escaped(text: str) -> str:
@@ -200,7 +181,7 @@ STYLE = Style(
 def latex(table: Table) -> str:
     """The whole report; failures are comments, for a paper does not print them."""
     words = f"{caption(table)} Best, second and third are marked."
-    words += f" † {credit()}" if table.shows_published else ""
+    words += f" † {published().credit}" if table.shows_published else ""
     parts = [HEAD]
     for start in range(0, len(table.blocks), SIDE_BY_SIDE):
         blocks = table.blocks[start : start + SIDE_BY_SIDE]
@@ -212,21 +193,24 @@ def latex(table: Table) -> str:
 
 
 def _tables(table: Table, blocks: Sequence[Block], words: str) -> str:
-    frame = printed(table, blocks, STYLE)
-    width = len(frame.columns)
-    left = "l" * (width - len(table.columns) * len(blocks))
-    style = frame.style.hide(axis="index").set_table_styles(
-        [{"selector": command, "props": options} for command, options in COMMANDS.items()]
+    frame, count = printed(table, blocks, STYLE), len(table.columns)
+    left = len(frame.columns) - count * len(blocks)
+    above = [rf"\multicolumn{{{count}}}{{c|}}{{{STYLE.escape(block.title)}}}" for block in blocks]
+    above[-1] = above[-1].replace("{c|}", "{c}", 1)  # no rule at the right edge
+    lines = [r"\hline", _line([*[""] * left, *above]), _line(frame.columns.get_level_values(1))]
+    lines.append(r"\hline")
+    for first, *cells in frame.itertuples(index=False):
+        if any(cells):
+            lines.append(_line([first, *cells]))
+        else:  # the line above the published rows
+            lines += [r"\hline", rf"\multicolumn{{{len(frame.columns)}}}{{l}}{{{first}}} \\"]
+    formats = "|".join(["l" * left, *["c" * count] * len(blocks)])
+    begin = r"\scriptsize \setlength{\tabcolsep}{3pt} \begin{tabular}"
+    return "\n".join(
+        [r"\begin{table*}[t]", r"\centering", rf"\caption{{{words}}}", f"{begin}{{{formats}}}"]
+        + [*lines, r"\hline", r"\end{tabular}", r"\end{table*}", ""]
     )
-    text = style.to_latex(
-        column_format="|".join([left, *["c" * len(table.columns)] * len(blocks)]),
-        multicol_align="c|",
-        environment="table*",
-        position="t",
-        position_float="centering",
-        caption=words,
-    )
-    text = "{c}".join(text.rsplit("{c|}", 1))  # no rule at the right edge
-    # The line above the published rows goes over all columns.
-    above = rf"\\hline\n\\multicolumn{{{width}}}{{l}}{{\1}} \\\\"
-    return re.sub(r"^(\\textit\{[^&]*\})[ &]*\\\\$", above, text, flags=re.MULTILINE)
+
+
+def _line(cells: Iterable[str]) -> str:
+    return rf"{' & '.join(cells)} \\"

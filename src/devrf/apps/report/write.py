@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -25,17 +24,11 @@ from devrf.system.files import atomic_write
 FPS = 10
 
 
-@dataclass(frozen=True)
-class Report:
-    """A written report: its contents, its text for a terminal, and its ``report.md``."""
-
-    table: Table
-    text: str
-    path: Path
-
-
-def write_report(settings: ReportSettings) -> Report:
+def write_report(settings: ReportSettings) -> str:
     """Write ``report.md``, ``report.csv``, ``report.tex``, the plots and the videos.
+
+    Returns:
+        The tables for a terminal, and where the report is.
 
     Raises:
         DevrfError: no such folder, or nothing below it that a run left; nothing is written.
@@ -52,7 +45,7 @@ def write_report(settings: ReportSettings) -> Report:
     _write(folder / "report.md", markdown(table, figures, videos))
     _write(folder / "report.tex", latex(table))
     _write(folder / "report.csv", csv(table))
-    return Report(table, plain(table), folder / "report.md")
+    return f"{plain(table)}\nreport written to {folder / 'report.md'}"
 
 
 def csv(table: Table) -> str:
