@@ -327,7 +327,7 @@ def test_another_option_of_a_group_begins_from_its_own_values(run, learned_by):
             "devrf export.content=",
             "export.content=auto export.content=surface export.content=points",
         ),
-        ("devrf data.root=x data.flow=d", "data.flow=auto data.flow=files data.flow=dis"),
+        ("devrf data.root=~/x data.flow=d", "data.flow=auto data.flow=files data.flow=dis"),
         ("devrf experiment=paper_l", "experiment=paper_lego"),
         ("devrf data=inward data.bound", "data.bound_scale="),
     ],

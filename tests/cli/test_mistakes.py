@@ -134,7 +134,7 @@ def test_a_torchvision_for_another_torch_is_one_line(python, tmp_path, monkeypat
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     for typed in ("stage=inspect", "hydra.run.dir=run"):
         done = python(tmp_path, "-m", "devrf", typed)
-        assert done.status == 2 and done.err.count("\n") == 1, done.err
+        assert (done.status, done.out) == (2, "") and done.err.count("\n") == 1, done.err
         assert done.err.startswith("devrf: torchvision: ")
         assert "pip install --upgrade torch torchvision" in done.err
 

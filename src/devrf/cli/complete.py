@@ -50,7 +50,7 @@ def completed(arguments: Sequence[str]) -> list[str]:
             scenes of a sweep.
     """
     multirun = not {"-m", "--multirun"}.isdisjoint(arguments)
-    words = [_quoted_path(SHORTHAND.get(word.lower(), word), multirun) for word in arguments]
+    words = [quoted_path(SHORTHAND.get(word.lower(), word), multirun) for word in arguments]
     at = [k for k, w in enumerate(words) if w[:1] != "-" and ("=" in w or w[:1] == "~")]
     texts = [words[k] for k in at]
     try:
@@ -70,7 +70,7 @@ def completed(arguments: Sequence[str]) -> list[str]:
     return [*words[: at[0]], *before, *texts, *after]
 
 
-def _quoted_path(argument: str, multirun: bool) -> str:
+def quoted_path(argument: str, multirun: bool) -> str:
     """An argument as typed; if it names a file, as Hydra's grammar takes just that name.
 
     In a multirun a comma separates paths, as it does other values.

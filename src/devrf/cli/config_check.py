@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import logging
 import re
 import types
 from collections.abc import Iterable, Mapping
@@ -60,6 +61,8 @@ RENAMED = {
     "callbacks.saving": "callbacks.checkpoint",
     "callbacks.curve": "callbacks.training_curve",
 }
+# What cannot be loaded ends the command with one line; Hydra would log it before.
+logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)
 # Hydra's own keys in a part's config.
 RESERVED = {"_target_", "_partial_", "_convert_", "_recursive_", "_args_"}
 REFERENCE = re.compile(r"\$\{([\w.]+)\}")

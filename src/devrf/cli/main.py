@@ -18,7 +18,7 @@ from omegaconf import DictConfig
 
 import devrf
 from devrf.apps.fetch import catalogue
-from devrf.cli.complete import completed, with_recognised_data
+from devrf.cli.complete import completed, quoted_path, with_recognised_data
 from devrf.cli.config import config_folder, in_sweep, known_stages, register_config
 from devrf.cli.config_check import ROOT, check_config, check_extras, choices_at, choices_of
 from devrf.cli.messages import report_user_errors
@@ -119,7 +119,8 @@ def candidates(line: str) -> list[str]:
     Hydra knows keys, groups and their choices; the values of other keys are those that parts
     declare. What only a scene from disk has is known before its folder is typed, too.
     """
-    *before, word = line.split(" ")[1:]
+    *typed, word = line.split(" ")[1:]
+    before = [quoted_path(earlier, multirun=False) for earlier in typed]
     key, is_set, _ = word.partition("=")
     values: Sequence[object] = known_stages() if key == "stage" else choices_of(ROOT.get(key))
     if key == "scene" and "stage=fetch" in before:
@@ -127,9 +128,9 @@ def candidates(line: str) -> list[str]:
     found: list[str] = []
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         plugin = DefaultCompletionPlugin(GlobalHydra.instance().config_loader())
-        for typed in (before, ["data=inward", *before]):
+        for given in (before, ["data=inward", *before]):
             with suppress(HydraException, DevrfError):
-                values = values or (is_set and choices_at(compose("config", typed), key)) or ()
+                values = values or (is_set and choices_at(compose("config", given), key)) or ()
             found = found or [f"{key}={value}" for value in values if is_set]
-            found = found or plugin._query("config", " ".join([*typed, word]))
+            found = found or plugin._query("config", " ".join([*given, word]))
     return [candidate for candidate in found if "_target_" not in candidate]
