@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import gc
+import json
 import logging
 import os
 import re
@@ -23,6 +24,7 @@ os.environ.setdefault("TRITON_INTERPRET", "1")
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
@@ -53,8 +55,9 @@ from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import CanonicalRates
 from devrf.methods.devrf.volume_rendering import render
 from devrf.rendering.output import RenderedImage
+from devrf.scenes.lens import Lens
 from devrf.scenes.procedural import ProceduralForwardScene, ProceduralScene
-from devrf.scenes.scene import Scene
+from devrf.scenes.scene import Scene, Views
 
 logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
 
@@ -261,6 +264,102 @@ def write_sparse() -> Callable[..., None]:
 def write_rig() -> Callable[..., None]:
     """The function :func:`rig_of_videos`."""
     return rig_of_videos
+
+
+def put_json(file: Path, content: Any) -> None:
+    """Write a JSON file, and the folders above it."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(json.dumps(content))
+
+
+def write_item(
+    root: Path, size: str, item: str, pixels: np.ndarray, pose: torch.Tensor, lens: Lens
+) -> None:
+    """An image and its camera file as Nerfies has them; the lens is that of the full image."""
+    (root / "rgb" / size).mkdir(parents=True, exist_ok=True)
+    iio.imwrite(root / f"rgb/{size}/{item}.png", pixels)
+    factor, (fx, fy) = int(size[0]), lens.focal
+    camera = {
+        "orientation": (pose[:, :3] * torch.tensor([1.0, -1.0, -1.0])).T.tolist(),
+        "position": pose[:, 3].tolist(),
+        "focal_length": fx,
+        "pixel_aspect_ratio": fy / fx,
+        "skew": lens.skew,
+        "principal_point": lens.center,
+        "image_size": [pixels.shape[1] * factor, pixels.shape[0] * factor],
+        "radial_distortion": lens.distortion.radial[:3],
+        "tangential_distortion": lens.distortion.tangential,
+    }
+    put_json(root / f"camera/{item}.json", camera)
+
+
+@pytest.fixture
+def write_camera() -> Callable[..., None]:
+    """The function :func:`write_item`."""
+    return write_item
+
+
+def in_one_list(scene: Scene) -> dict[str, tuple[Views, int]]:
+    """Every image of an inward-facing scene by a name, held-out ones last."""
+    parts = {
+        "static": scene.static.train,
+        "moving": scene.dynamic.train,
+        "test_static": scene.static.test,
+        "test_moving": scene.dynamic.test,
+    }
+    return {f"{name}_{i}": (views, i) for name, views in parts.items() for i in range(len(views))}
+
+
+def write_nerfstudio(scene: Scene, root: Path) -> None:
+    """The scene as nerfstudio lists it: all images in one file, at rest at time 0."""
+    root.mkdir(parents=True)
+    frames: list[dict[str, Any]] = []
+    for name, (views, i) in in_one_list(scene).items():
+        iio.imwrite(root / f"{name}.png", views.pixels[i].numpy())
+        pose = [*views.cameras.camera_to_world[i].tolist(), [0, 0, 0, 1]]
+        time = float(views.times[i])
+        frames.append({"file_path": f"{name}.png", "time": time, "transform_matrix": pose})
+    cameras = scene.static.train.cameras
+    (fx, fy), (cx, cy) = cameras.focal[0].tolist(), cameras.center[0].tolist()
+    content = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": cameras.width, "h": cameras.height}
+    names = [frame["file_path"] for frame in frames]
+    content |= {"frames": frames, "test_filenames": [n for n in names if n.startswith("test")]}
+    put_json(root / "transforms.json", content)
+
+
+def write_nerfies(scene: Scene, root: Path, size: str = "4x") -> None:
+    """The scene as Nerfies lists it, its images already made smaller."""
+    images, factor = in_one_list(scene), int(size[0])
+    for name, (views, i) in images.items():
+        focal, center = views.cameras.focal[i] * factor, views.cameras.center[i] * factor
+        lens = Lens(tuple(focal.tolist()), tuple(center.tolist()))
+        pose = views.cameras.camera_to_world[i]
+        write_item(root, size, name, views.pixels[i].numpy(), pose, lens)
+    ids = list(images)
+    held_out = [name for name in ids if name.startswith("test")]
+    times = {name: {"warp_id": round(2 * float(v.times[i]))} for name, (v, i) in images.items()}
+    train = [name for name in ids if name not in held_out]
+    put_json(root / "dataset.json", {"ids": ids, "train_ids": train, "val_ids": held_out})
+    put_json(root / "metadata.json", times)
+    world = {"center": [0, 0, 0], "scale": 1, "near": scene.bounds.near, "far": scene.bounds.far}
+    put_json(root / "scene.json", world)
+
+
+def write_dycheck(scene: Scene, root: Path) -> None:
+    """The scene as DyCheck lists it: the dynamic images alone, made smaller by two."""
+    write_nerfies(scene, root, "2x")
+    times = json.loads((root / "metadata.json").read_text())
+    for split, part in (("train", "moving"), ("val", "test_moving")):
+        names = [name for name in times if name.startswith(part)]
+        ids = [times[name]["warp_id"] for name in names]
+        put_json(root / f"splits/{split}.json", {"frame_names": names, "time_ids": ids})
+
+
+@pytest.fixture(scope="session")
+def write_scene() -> Callable[[str, Scene, Path], None]:
+    """``write_scene(choice, scene, root)``: an inward-facing scene as ``data=CHOICE`` reads it."""
+    writers = {"nerfstudio": write_nerfstudio, "nerfies": write_nerfies, "dycheck": write_dycheck}
+    return lambda choice, scene, root: writers[choice](scene, root)
 
 
 class GivenScene(SceneDataModule):

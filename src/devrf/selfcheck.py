@@ -71,39 +71,21 @@ class SmallScene:
 
     Attributes:
         device: where stages learn.
+        data: serves the robot at rest, and seen moving by three cameras.
         at_rest: the canonical stage's schedule.
         in_motion: the deformation stage's schedule.
         architecture: of the canonical field.
         sampling: how rays are sampled.
-        width: of the images, in pixels; they are three quarters as high.
-        views: static ones.
-        frames: T of the three moving views.
         seed: of everything that is drawn.
     """
 
     device: torch.device
+    data: ProceduralDataModule
     at_rest: CanonicalSchedule
     in_motion: DeformationSchedule
     architecture: Architecture
     sampling: Sampling
-    width: int
-    views: int
-    frames: int
     seed: int = 0
-
-    @cached_property
-    def data(self) -> ProceduralDataModule:
-        """Serves the robot at rest, and seen moving."""
-        return ProceduralDataModule(
-            shape="robot",
-            width=self.width,
-            height=self.width * 3 // 4,
-            static_views=self.views,
-            static_test_views=1,
-            train_views=3,
-            frames=self.frames,
-            supersample=1,
-        )
 
     @cached_property
     def canonical(self) -> LoadedCheckpoint:
@@ -186,18 +168,21 @@ def small_scene(device: torch.device, seed: int = 0) -> SmallScene:
     coarse geometry begins with the visual hull, because it has no time to be found. Frames of one
     level are learned in parallel. On a CPU all is tiny.
     """
+    robot = partial(ProceduralDataModule, static_test_views=1, train_views=3, supersample=1)
     if device.type != "cuda":
+        data = robot(width=24, height=18, static_views=8, frames=3)
         tiny = CanonicalSchedule(0, search_side=12, side=16, upsample_at=[10], rays=192)
         in_motion = DeformationSchedule([Level(4, 5), Level(6, 2)], rays=192)
         sizes = short(tiny, 20), in_motion, Architecture(width=16), Sampling(alpha_threshold=3e-3)
-        return SmallScene(device, *sizes, 24, 8, 3, seed)
+        return SmallScene(device, data, *sizes, seed)
+    data = robot(width=96, height=72, static_views=24, frames=9)
     levels = [replace(level, iterations=20) for level in PAPER_LEVELS]
     levels[2] = replace(levels[2], parallel_frames=4)
     at_rest = replace(short(CanonicalSchedule(), 250), search_iterations=20)
     # Fog that twenty iterations of the search can clear.
     architecture = Architecture(search_alpha_init=1e-2)
     sizes = at_rest, DeformationSchedule(levels), architecture, Sampling()
-    return SmallScene(device, *sizes, 96, 24, 9, seed)
+    return SmallScene(device, data, *sizes, seed)
 
 
 def require(condition: bool, message: str) -> None:

@@ -150,7 +150,6 @@ def test_files_that_came_before_an_interruption_are_kept(devrf, web, tmp_path, p
     ("arguments", "expected"),
     [
         (["scene=fxo"], "scene: stage=fetch knows no 'fxo'; choose one of fox, lego"),
-        (["scene=fox", "ckpt=x"], "ckpt: stage=fetch starts from nothing"),
         (["scene=fox", "fetch.catalogue=none.toml"], "fetch.catalogue: none.toml cannot be read"),
     ],
 )

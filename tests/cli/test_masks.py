@@ -22,37 +22,23 @@ LAYOUT = ("data=nerfstudio", "data.flow=none")
 
 
 @pytest.fixture
-def recorded(tiny_scene: Scene, tmp_path: Path) -> Callable[[str, int], Path]:
+def recorded(tiny_scene: Scene, write_scene: Any, tmp_path: Path) -> Callable[[str, int], Path]:
     """``recorded(name, grey)``: the tiny scene on white in nerfstudio's layout."""
-    parts = [tiny_scene.static.train, tiny_scene.static.test]
-    parts += [tiny_scene.dynamic.train, tiny_scene.dynamic.test]
-    cameras = tiny_scene.static.train.cameras
 
     def write(name: str, grey: int) -> Path:
         root = tmp_path / name
-        root.mkdir()
-        mask = np.full((cameras.height, cameras.width), 255, dtype=np.uint8)
+        write_scene("nerfstudio", tiny_scene, root)
+        content = json.loads((root / "transforms.json").read_text())
+        for frame in content["frames"]:
+            frame["mask_path"] = "mask.png"
+            pixels = iio.imread(root / frame["file_path"]).astype(np.float32)
+            alpha = pixels[..., 3:] / 255
+            shown = (pixels[..., :3] * alpha + 255 * (1 - alpha)).round().astype(np.uint8)
+            shown[MASKED] = grey
+            iio.imwrite(root / frame["file_path"], shown)
+        mask = np.full(shown.shape[:2], 255, dtype=np.uint8)
         mask[MASKED] = 0
         iio.imwrite(root / "mask.png", mask)
-        frames: list[dict[str, Any]] = []
-        for part, views in enumerate(parts):
-            for k, pose in enumerate(views.cameras.camera_to_world.tolist()):
-                pixels = views.pixels[k].numpy().astype(np.float32)
-                alpha = pixels[..., 3:] / 255
-                shown = (pixels[..., :3] * alpha + 255 * (1 - alpha)).round().astype(np.uint8)
-                shown[MASKED] = grey
-                iio.imwrite(root / f"{part}_{k}.png", shown)
-                frames.append(
-                    {
-                        "file_path": f"{part}_{k}.png",
-                        "mask_path": "mask.png",
-                        "time": float(views.times[k]),
-                        "transform_matrix": [*pose, [0, 0, 0, 1]],
-                    }
-                )
-        held_out = [f["file_path"] for f in frames if f["file_path"][0] in "13"]
-        content = {"fl_x": float(cameras.focal[0, 0]), "w": cameras.width, "h": cameras.height}
-        content |= {"frames": frames, "test_filenames": held_out}
         (root / "transforms.json").write_text(json.dumps(content))
         return root
 

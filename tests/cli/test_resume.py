@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 
 import pytest
 from omegaconf import OmegaConf
 
-from devrf.checkpoints.checkpoint import load_checkpoint
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file, write_checkpoint_file
 
 
@@ -30,18 +28,6 @@ def again(devrf, tiny, run):
 def contents(folder: Path) -> dict[str, bytes]:
     files = [path for path in folder.rglob("*") if path.is_file()]
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
-
-
-def test_what_is_finished_is_not_learned_again(again, run):
-    before = contents(run / "checkpoints")
-    scores = json.loads((run / "metrics.json").read_text())
-    outcome = again()
-    assert (outcome.status, outcome.err) == (0, "")
-    for stage in ("canonical", "deformation"):
-        assert f"{stage}: learned already ({run}/checkpoints/{stage}.ckpt)" in outcome.out
-    assert contents(run / "checkpoints") == before
-    now = json.loads((run / "metrics.json").read_text())
-    assert {**now, "run": None} == {**scores, "run": None}
 
 
 def test_what_decides_nothing_may_change(again):
@@ -141,20 +127,6 @@ def cut_short(devrf, tiny, often, tmp_path):
     left = {path.name for path in checkpoints.glob("*.ckpt")}
     assert left == {"canonical-progress-3.ckpt", "canonical-progress-4.ckpt", "canonical.ckpt"}
     return command, checkpoints
-
-
-def test_a_run_that_was_cut_short_goes_on(devrf, cut_short, tmp_path):
-    command, checkpoints = cut_short
-    outcome = devrf(*command)
-    assert outcome.status == 0
-    assert "canonical: goes on at iteration 4" in outcome.out
-    assert {path.name for path in checkpoints.glob("*.ckpt")} == {"canonical.ckpt"}
-    assert devrf(*command, "hydra.run.dir=whole").status == 0
-    ours, whole = (
-        load_checkpoint(tmp_path / folder / "checkpoints" / "canonical.ckpt").model.canonical
-        for folder in ("run", "whole")
-    )
-    assert (ours.density.values == whole.density.values).all()
 
 
 def test_a_run_that_was_cut_short_says_where_it_stands(devrf, cut_short, tmp_path):

@@ -165,6 +165,7 @@ def run(trained, tmp_path) -> Path:
 
 def stamps(run: Path) -> dict[str, int]:
     paths = [*run.glob("*.json"), *run.glob("*.csv"), *run.glob("images/*"), *run.glob("videos/*")]
+    paths += run.glob("checkpoints/*")
     return {path.name: path.stat().st_mtime_ns for path in paths}
 
 
@@ -176,6 +177,8 @@ def test_a_finished_run_says_so_and_reads_nothing(devrf, tiny, run, monkeypatch)
     monkeypatch.setattr("devrf.data.rendered.RenderedDataModule.load", unread)
     outcome = devrf(*tiny, "hydra.run.dir=run")
     assert (outcome.status, outcome.err) == (0, "")
+    for stage in ("canonical", "deformation"):
+        assert f"{stage}: learned already ({run}/checkpoints/{stage}.ckpt)" in outcome.out
     assert "evaluate: done already (frames.csv, " in outcome.out
     assert "render: done already (videos/held_out.mp4, videos/orbit.mp4)" in outcome.out
     assert stamps(run) == before

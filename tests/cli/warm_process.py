@@ -4,8 +4,7 @@ A script, not a test: it loads the program once, without using it, and then fork
 command. It reads a JSON object a line and answers with the command's exit status, negative for
 the signal that ended it. The keys, all but the first two optional:
 
-* ``folder``, ``arguments``: where to run what. What the command says is added to ``said.txt``,
-  and how many steps and file operations it took is in ``counts.json`` if it got to its end.
+* ``folder``, ``arguments``: where to run what. What the command says is added to ``said.txt``.
 * ``after``: ``[kind, count]``, the moment of the signal. The kind is ``step`` (an optimiser step
   begins) or ``file`` (the write of a tensor, an fsync or a rename begins).
 * ``delay``: seconds from that moment to the signal.
@@ -113,7 +112,6 @@ def run(asked: dict[str, Any]) -> int:
         status = stop.code if isinstance(stop.code, int) else 1
     sys.stdout.flush()
     sys.stderr.flush()
-    Path("counts.json").write_text(json.dumps(fuse.counts))
     return status
 
 
