@@ -69,12 +69,10 @@ def entry() -> None:
             except Exception as error:
                 name_failures(error)
                 raise
-    except Interrupted as stop:
-        print(f"devrf: {stop.message}", file=sys.stderr)
-        raise
-    except KeyboardInterrupt:  # raised by another library's handler of Ctrl-C
-        print("devrf: interrupted", file=sys.stderr)
-        sys.exit(130)
+    # A KeyboardInterrupt is raised by another library's handler of Ctrl-C.
+    except (Interrupted, KeyboardInterrupt) as stop:
+        print(f"devrf: {getattr(stop, 'message', 'interrupted')}", file=sys.stderr)
+        sys.exit(getattr(stop, "code", 130))
 
 
 def run(config: DictConfig) -> float | None:
