@@ -39,7 +39,7 @@ def evaluate(run: RunContext) -> list[Path]:
     """
     standing = unfinished(run)
     if standing is not None and run.config.ckpt is None:
-        raise DevrfError(f"{standing}; with stage=evaluate and ckpt= it is scored as it stands")
+        raise DevrfError(f"{standing}, stage=evaluate ckpt=FILE scores that file as it stands")
     loaded = run.load(scene=run.scene)
     model, metadata, scene = loaded.model.to_view(run.device), loaded.metadata, run.scene
     suite = run.evaluation.suite(run.device)
