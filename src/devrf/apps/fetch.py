@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import shutil
 import tarfile
 import tomllib
@@ -19,6 +20,8 @@ from rich.progress import track
 
 from devrf.errors import DevrfError, did_you_mean
 from devrf.system.files import make_folder, write_json
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -165,6 +168,27 @@ def fetched_before(scene: PublishedScene, into: Path) -> Fetched | None:
         raise DevrfError(
             f"{path}: there is something else, without {RECORD}; remove it, or give fetch.into=PATH"
         ) from None
+
+
+def fetched(scene: PublishedScene, settings: FetchSettings, progress: bool) -> Fetched:
+    """A scene in ``settings.into``, downloaded unless it is there; the log says what was done.
+
+    Raises:
+        DevrfError: it cannot be fetched, or is not what was expected.
+        OSError: the disk refuses.
+    """
+    into = Path(settings.into).expanduser()
+    done = fetched_before(scene, into)
+    if done is None:
+        source = scene.collection
+        log.info(
+            "%s: %s; from %s; licence: %s", scene.name, scene.about, source.page, source.licence
+        )
+        done = fetch_scene(scene, into, settings.sha256, progress)
+    log.info("%s: %s", scene.name, f"in {done.path}" if done.anew else f"is in {done.path} already")
+    known = f"none was known to compare it with; kept in {done.path / RECORD}"
+    log.info("SHA-256 %s%s", done.sha256, ", as expected" if done.compared else f": {known}")
+    return done
 
 
 def fetch_scene(scene: PublishedScene, into: Path, sha256: str | None, progress: bool) -> Fetched:

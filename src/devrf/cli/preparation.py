@@ -6,22 +6,14 @@ import logging
 import shlex
 import sys
 from functools import partial
-from pathlib import Path
 
 from hydra import compose
 from hydra.utils import instantiate
-from rich.console import Console
 from rich.filesize import decimal
 
 from devrf.apps.capture.pipeline import scene_from_footage
-from devrf.apps.fetch import (
-    RECORD,
-    FetchSettings,
-    fetch_scene,
-    fetched_before,
-    published_scene,
-)
-from devrf.apps.inspection.report import as_text, inspection_text
+from devrf.apps.fetch import FetchSettings, fetched, published_scene
+from devrf.apps.inspection.report import inspection_text, show
 from devrf.apps.needs import needs_table
 from devrf.apps.settings import CaptureSettings
 from devrf.callbacks.trial import seconds_to_learn
@@ -48,18 +40,7 @@ def fetch(run: RunContext) -> None:
     """Download the scene ``scene=…`` into ``fetch.into``, and say what to do with it."""
     settings: FetchSettings = instantiate(run.config.fetch)
     scene = published_scene(run.config.scene, settings.catalogue)
-    into = Path(settings.into).expanduser()
-    done = fetched_before(scene, into)
-    if done is None:
-        source = scene.collection
-        log.info(
-            "%s: %s; from %s; licence: %s", scene.name, scene.about, source.page, source.licence
-        )
-        done = fetch_scene(scene, into, settings.sha256, progress=sys.stderr.isatty())
-    log.info("%s: %s", scene.name, f"in {done.path}" if done.anew else f"is in {done.path} already")
-    known = f"none was known to compare it with; kept in {done.path / RECORD}"
-    log.info("SHA-256 %s%s", done.sha256, ", as expected" if done.compared else f": {known}")
-    root = f"data.root={done.path}"
+    root = f"data.root={fetched(scene, settings, progress=sys.stderr.isatty()).path}"
     say_next(["stage=inspect", root], [*scene.collection.learn.split(), root])
 
 
@@ -104,11 +85,7 @@ def inspect(run: RunContext) -> None:
     table = needs_table(run.scene, needs(run, run.config, run.scene))
     rows = [(name, decimal(round(size))) for name, size in table]
     report = inspection_text(run.scene, rows, shortage)
-    console = Console()
-    if console.is_terminal:
-        console.print(report)
-    else:
-        log.info("%s", as_text(report))
+    show(report)
     path = run.folder / "images" / "inspect.png"
     write_inspection_picture(path, run.scene)
     log.info("picture written to %s", path)

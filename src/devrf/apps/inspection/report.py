@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 from collections.abc import Sequence
 
 import torch
@@ -18,6 +19,8 @@ from devrf.data.color_change import CHANGING, color_change, color_drift
 from devrf.geometry.clock import FrameClock
 from devrf.scenes.optical_flow import frame_pairs
 from devrf.scenes.scene import Scene, Views
+
+log = logging.getLogger(__name__)
 
 HEADING = "set,images,views x times,size,alpha masks,masks,focal length,distance".split(",")
 Row = tuple[str, ...]
@@ -42,6 +45,15 @@ def inspection_text(
             for where, problem, remedy in advice
         ),
     )
+
+
+def show(report: RenderableType) -> None:
+    """Print a report on a terminal, else log it."""
+    console = Console()
+    if console.is_terminal:
+        console.print(report)
+    else:
+        log.info("%s", as_text(report))
 
 
 def as_text(shown: RenderableType) -> str:
