@@ -84,7 +84,8 @@ def test_a_step_is_never_much_longer_in_contracted_space(
         here = entry + share * (leave - entry - step)
         ray = torch.arange(len(rays))
         moved = rays.at(ray, here + step) - rays.at(ray, here)
-        assert float(moved.abs().max()) < rays.pace * step * 1.05
+        speed = moved.abs().amax(dim=1) / step
+        assert float(speed.max()) < 3.15
     every = torch.linspace(0, 1, count)[:, None] * (leave - entry) + entry
     points = rays.at(torch.arange(len(rays)).repeat(count), every.reshape(-1))
     assert bool(CUBE.box.contains(points).all())

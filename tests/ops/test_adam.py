@@ -55,6 +55,8 @@ def test_an_entry_without_gradient_keeps_value_and_moments() -> None:
     assert state["square"][0, 0, 0, 0].item() == pytest.approx(0.1296)
     move = 0.1 * (0.48 / (1 - 0.9**2)) / math.sqrt(0.1296 / (1 - 0.99**2))
     assert parameter[0, 0, 0, 0].item() == pytest.approx(-0.1 - move, rel=1e-5)
+    # The memory of its gradient is cleared, not given back.
+    assert parameter.grad is not None and not parameter.grad.any()
 
 
 @pytest.mark.parametrize("skip_zero", [False, True])
@@ -155,5 +157,7 @@ def test_other_work_may_replace_the_step_after_the_rates_are_set() -> None:
     assert order == ["asked", "work"] and parameter.item() == pytest.approx(-0.25)
     # The rate may be a tensor, too.
     optimizer.param_groups[0]["lr"] = torch.tensor(0.5)
+    assert parameter.grad is None  # gone after the step
+    parameter.grad = torch.ones(1, 1, 1, 1)
     optimizer.step()
     assert len(order) == 2 and parameter.item() == pytest.approx(-0.75)

@@ -6,10 +6,11 @@ import pytest
 import torch
 
 from devrf.geometry.box import Box
+from devrf.geometry.contraction import ContractedSpace
 from devrf.geometry.rays import Rays
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.sample_capacity import SampleCapacity
-from devrf.rendering.sampling import hits, march
+from devrf.rendering.sampling import hits, march, steps_through
 
 BOX = Box((-1.0, -0.5, 0.0), (1.0, 1.5, 1.0))
 
@@ -45,6 +46,23 @@ def test_finds_exactly_the_samples_in_occupied_cells(share, step, rng):
     torch.testing.assert_close(samples.distance, distance, atol=1e-6, rtol=0)
     torch.testing.assert_close(samples.points, rays.at(ray, distance), atol=1e-6, rtol=0)
     assert samples.rays == len(rays)
+
+
+@pytest.mark.parametrize("high", [(1.0, 1.0, 1.0), (1.0, 0.4, 2.0)])
+def test_curved_rays_find_them_too(high, rng):
+    space = ContractedSpace(tuple(-edge for edge in high), high)
+    inside = scattered_rays(300, rng)
+    rays = space.rays(Rays(0.5 * inside.origins, inside.directions, inside.viewdirs))
+    occupancy = Occupancy(torch.rand(24, 20, 28, generator=rng) < 0.02, space.box)
+    box, limits = space.box, {"step": 0.05, "near": 0.1, "far": float("inf")}
+    entry, count = steps_through(rays, box, **limits)
+    ray = torch.repeat_interleave(count)
+    number = torch.arange(len(ray)) - (count.cumsum(0) - count)[ray]
+    kept = occupancy.at(rays.at(ray, entry[ray] + 0.05 * number))
+    samples = march(rays, box, occupancy, **limits)
+    assert len(samples) > 100 and torch.equal(samples.ray, ray[kept])
+    torch.testing.assert_close(samples.distance, (entry[ray] + 0.05 * number)[kept])
+    assert hits(rays, box, occupancy, near=0.1, far=float("inf"))[ray[kept]].all()
 
 
 def test_sample_places_by_hand(cube):

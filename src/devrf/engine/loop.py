@@ -146,11 +146,11 @@ class Loop:
         """
         for batch in self.batches:
             take(batch, stage.draw(batch))
+        stage.optimizer.make_gradients()  # Lightning drops them where a run is resumed
         try:
             if self.capacities:
                 self._static_step(stage, views, optimizer)
             else:
-                optimizer.zero_grad()
                 self._accumulate(stage, views)
                 with span("optimiser"):
                     optimizer.step()

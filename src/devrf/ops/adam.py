@@ -18,7 +18,8 @@ class GridAdam(torch.optim.Optimizer):
     Each parameter group takes, beside ``lr``, ``betas`` and ``eps``:
 
     * ``skip_zero``: an entry whose gradient is exactly zero keeps its value *and its moments*:
-      momentum does not move a voxel that no sample of this batch touched.
+      momentum does not move a voxel that no sample of this batch touched. Its gradient stays in the
+      same memory: to make one anew takes longer than to clear the few rows that were touched.
     * ``per_voxel_lr``: None, or a tensor (X, Y, Z, 1) of factors of the learning rate.
     * ``smoothing``: weight of the total variation of each grid, whose gradient is added to that
       of the backward pass.
@@ -28,7 +29,7 @@ class GridAdam(torch.optim.Optimizer):
     first; :meth:`apply` then reads nothing from the host and may be captured in a CUDA graph.
 
     Attributes:
-        keeps_gradients: whether gradients stay in the same memory: zero before each iteration,
+        keeps_gradients: whether all gradients stay in the same memory: zero before each iteration,
             accumulated by the backward pass, zeroed by the step.
     """
 
@@ -56,7 +57,10 @@ class GridAdam(torch.optim.Optimizer):
         super().__init__(params, defaults)
 
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
-        """One step on every parameter that has a gradient, after ``closure``."""
+        """One step on every parameter that has a gradient, after ``closure``.
+
+        Gradients are zero afterwards where they are kept, and gone elsewhere.
+        """
         result = None
         if closure is not None:
             with torch.enable_grad():
@@ -109,7 +113,10 @@ class GridAdam(torch.optim.Optimizer):
                         values, gradient, group["smoothing"], touched_only=touched_only
                     )
             rules = [AdamRule(rate, step, **options) for *_, step in taken]
-            adam_steps([four for *four, _ in taken], rules, clear=self.keeps_gradients)
+            kept = self._keeps(group)
+            adam_steps([four for *four, _ in taken], rules, clear=kept)
+            for parameter in () if kept else parameters:
+                parameter.grad = None
 
     def _learned(self, group: dict[str, Any]) -> list[Tensor]:
         """The group's parameters that have a gradient, or get one from their total variation."""
@@ -139,13 +146,14 @@ class GridAdam(torch.optim.Optimizer):
         return state
 
     def zero_grad(self, set_to_none: bool = True) -> None:
-        """Remove all gradients; with ``keeps_gradients`` set them to zero."""
-        super().zero_grad(set_to_none and not self.keeps_gradients)
+        """Remove all gradients; those that are kept are set to zero."""
+        self.drop_gradients(each for group in self.param_groups for each in group["params"])
 
     def drop_gradients(self, parameters: Iterable[Tensor]) -> None:
         """As :meth:`zero_grad`, for some of the parameters."""
+        kept = {id(p) for group in self.param_groups if self._keeps(group) for p in group["params"]}
         for parameter in parameters:
-            if self.keeps_gradients and parameter.grad is not None:
+            if id(parameter) in kept and parameter.grad is not None:
                 parameter.grad.zero_()
             else:
                 parameter.grad = None
@@ -153,10 +161,17 @@ class GridAdam(torch.optim.Optimizer):
     def keep_gradients(self) -> None:
         """Keep gradients in the same memory from now on, for later parameters too."""
         self.keeps_gradients = True
+        self.make_gradients()
+
+    def make_gradients(self) -> None:
+        """Make those gradients that are kept and are not there yet, before a backward pass."""
         for group in self.param_groups:
-            for parameter in group["params"]:
+            for parameter in group["params"] if self._keeps(group) else ():
                 if parameter.grad is None:
                     parameter.grad = torch.zeros_like(parameter)
+
+    def _keeps(self, group: dict[str, Any]) -> bool:
+        return self.keeps_gradients or bool(group["skip_zero"])
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore a state, on the parameters' device."""
@@ -180,8 +195,7 @@ class GridAdam(torch.optim.Optimizer):
             self.state.pop(old, None)
         self.param_groups[group]["params"] = list(parameters)
         self.param_groups[group].update({"per_voxel_lr": None, **settings})
-        if self.keeps_gradients:
-            self.keep_gradients()
+        self.make_gradients()
 
     def forget(self) -> None:
         """Zero all moments, step counts and gradients; the parameters stay."""

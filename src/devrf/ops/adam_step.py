@@ -64,6 +64,9 @@ def adam_step(
     if contiguous and (kernels := accelerated("adam", *tensors)):
         kernels.adam_step(*tensors, rule, clear=clear)
         return
+    if rule.skip_zero:
+        _step_touched(values, gradient, mean, square, rule, clear)
+        return
     _step(values, gradient, mean, square, rule)
     if clear:
         gradient.zero_()
@@ -130,9 +133,6 @@ def _neighbours(grid: Tensor, axis: int) -> tuple[Tensor, Tensor]:
 
 
 def _step(values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, rule: AdamRule) -> None:
-    if rule.skip_zero:
-        _step_touched(values, grad, mean, square, rule)
-        return
     beta1, beta2 = rule.betas
     mean.lerp_(grad, 1 - beta1)
     square.mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
@@ -144,14 +144,14 @@ def _step(values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, rule: Adam
 
 
 def _step_touched(
-    values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, rule: AdamRule
+    values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, rule: AdamRule, clear: bool
 ) -> None:
-    """As :func:`_step`, only on rows with a gradient: most of a grid has none."""
+    """As :func:`_step`, only on rows with a gradient, then cleared: most of a grid has none."""
     beta1, beta2 = rule.betas
     channels = values.shape[-1]
-    flat_grad = grad.reshape(-1, channels).contiguous()
-    rows = _touched_rows(flat_grad)
-    g = flat_grad.index_select(0, rows)
+    gradients = grad.view(-1, channels)
+    rows = _touched_rows(gradients)
+    g = gradients.index_select(0, rows)
     touched = g != 0
     means, squares = mean.view(-1, channels), square.view(-1, channels)
     m, s = means.index_select(0, rows), squares.index_select(0, rows)
@@ -167,21 +167,19 @@ def _step_touched(
     before = table.index_select(0, rows)
     after = before - size * torch.where(touched, move, torch.zeros_like(move))
     table.index_copy_(0, rows, after)
+    if clear:
+        gradients.index_fill_(0, rows, 0.0)
 
 
 def _touched_rows(table: Tensor) -> Tensor:
     """The rows (K,) of a table (N, C) that are not zero; rows of −0 may be among them.
 
-    The bits of a row are combined word by word, if possible two floats at a time: this takes a
-    third of the time of comparing each number with zero.
+    The bits of a row are read as words, if possible of two floats: that takes a third of the time
+    of comparing each number with zero.
     """
     size = table.element_size()
     pairs = table.shape[1] * size % 8 == 0 == table.storage_offset() * size % 8
-    words = table.view(torch.int64 if pairs else torch.int32).unbind(1)
-    bits = words[0]
-    for word in words[1:]:
-        bits = bits | word
-    return bits.nonzero()[:, 0]
+    return table.view(torch.int64 if pairs else torch.int32).any(dim=1).nonzero()[:, 0]
 
 
 def _step_size(rule: AdamRule) -> tuple[Tensor, Tensor]:

@@ -98,7 +98,7 @@ def march(
     start = torch.arange(len(ray), device=ray.device).sub_(first.index_select(0, ray))
     start *= per_segment
     middle = entry.index_select(0, ray) + step * (start + (per_segment - 1) / 2)
-    near_occupied = occupancy.near(rays.at(ray, middle)).nonzero()[:, 0]
+    near_occupied = _near(rays, ray, middle, occupancy).nonzero()[:, 0]
     ray, start = ray.index_select(0, near_occupied), start.index_select(0, near_occupied)
     number = (start[:, None] + torch.arange(per_segment, device=ray.device)).reshape(-1)
     ray = ray.repeat_interleave(per_segment)
@@ -111,6 +111,23 @@ def march(
 def _reach(rays: Rays, occupancy: Occupancy) -> float:
     """The vicinity's reach in units of the rays' distance, which in NDC are not the space's."""
     return occupancy.reach / max(rays.pace, 1e-9) if len(rays) else occupancy.reach
+
+
+def _near(rays: Rays, ray: Tensor, middle: Tensor, occupancy: Occupancy) -> Tensor:
+    """Mask (M,): whether something may be in the segments of rays with such middles.
+
+    All of a ray's segments, one after another. Where a curved ray is faster than its pace, a
+    segment may be longer than the vicinity reaches: something may be there, too.
+    """
+    points = rays.at(ray, middle)
+    near = occupancy.near(points)
+    if rays.is_curved:
+        moved = (points[1:] - points[:-1]).abs().amax(dim=1)
+        follows = ray[1:] == ray[:-1]
+        fast = (moved > 2 * occupancy.reach) & follows
+        near[1:] |= fast
+        near[:-1] |= fast
+    return near
 
 
 @torch.no_grad()
@@ -129,7 +146,7 @@ def _hits(rays: Rays, box: Box, occupancy: Occupancy, near: float, far: float) -
     ray = torch.repeat_interleave(strides)
     first = strides.cumsum(0) - strides
     number = torch.arange(len(ray), device=ray.device) - first[ray]
-    touched = occupancy.near(rays.at(ray, entry[ray] + (number + 0.5) * stride))
+    touched = _near(rays, ray, entry[ray] + (number + 0.5) * stride, occupancy)
     hit = torch.zeros(len(rays), dtype=torch.bool, device=ray.device)
     hit[ray[touched]] = True
     return hit

@@ -110,8 +110,10 @@ def test_in_contracted_space_grids_start_coarse_and_directions_come_late() -> No
     )
     fitted = schedule.in_space(SPACE)
     assert fitted.upsample_at == (100, 200, 300, 400, 500, 600)
-    assert fitted.phases[1].voxels == pytest.approx(15**3, rel=1e-3)
-    assert [fitted.learns_directions(n) for n in (5, 404, 405)] == [False, False, True]
+    # There is no search: what it would find is where fog explains the images.
+    assert fitted.phases[0].kind == "fine"
+    assert fitted.phases[0].voxels == pytest.approx(15**3, rel=1e-3)
+    assert [fitted.learns_directions(n) for n in (0, 399, 400)] == [False, False, True]
     given = replace(schedule, unbounded_initial_side=None, view_dependence_start=0).in_space(SPACE)
     assert given.upsample_at == (10,) and given.learns_directions(5)
     assert schedule.in_space(WORLD) is schedule
@@ -143,6 +145,8 @@ def test_a_room_is_learned_and_moves_inside_the_inner_box(
     fitted = trainer(max_epochs=1)
     fitted.fit(stage, datamodule=data)
     assert stage.scene_model.box == room.bounds.box and stage.schedule.side == pytest.approx(25.6)
+    # Behind the walls nothing has been seen, and nothing is kept there.
+    assert not stage.scene_model.occupancy.at(torch.tensor([room.bounds.box.high])).any()
     # Directions came in at iteration 30: colours have begun to depend on them, little so far.
     decoder = stage.scene_model.canonical.decoder
     assert isinstance(decoder, ColorDecoder) and decoder.learns_directions

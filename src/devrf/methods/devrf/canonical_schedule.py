@@ -41,7 +41,8 @@ class CanonicalSchedule:
     See docs/method.md#geometry-search, #radiance-field, #forward-facing and #scene-contraction.
 
     Attributes:
-        search_iterations: length of the coarse geometry search; 0 leaves it out.
+        search_iterations: length of the coarse geometry search; 0, and contracted space, leave it
+            out.
         search_side: the search grid has about search_side³ voxels.
         visual_hull_init: begin with the visual hull of the static views, if they have alpha masks.
         iterations: length of the radiance field's learning.
@@ -134,6 +135,7 @@ class CanonicalSchedule:
         late = self.view_dependence_start
         return replace(
             self,
+            search_iterations=0,
             side=side,
             search_side=round(self.search_side * space.side_factor),
             upsample_at=tuple(upsample_at),

@@ -171,8 +171,9 @@ class CanonicalStage(VoxelStage):
         self.setup_optimizer()
 
     def _grow(self, phase: CanonicalPhase) -> None:
-        """Crop the field, if asked to, and give it the resolution of ``phase``."""
+        """Give up what no camera sees, and give the field the resolution of ``phase``."""
         field = self.scene_model.canonical
+        self._forget_hidden()
         if self.schedule.crop:
             assert self.pool is not None
             views = self.training_views(self.capture)
@@ -221,12 +222,30 @@ class CanonicalStage(VoxelStage):
     @torch.no_grad()
     def update_occupancy(self) -> None:
         """Find the occupancy at rest on the field's own grid, within the one before."""
-        model, sampling = self.scene_model, self.sampling
-        field = model.canonical
-        opaque = dilate(field.voxel_alpha(sampling.step) > sampling.occupancy_threshold, 1)
+        sampling, field = self.sampling, self.scene_model.canonical
+        threshold = sampling.occupancy_threshold
+        if not self.scene_model.space.is_linear:
+            # Fog in unbounded space clears until it is not coloured, and no further.
+            threshold = max(threshold, sampling.alpha_threshold)
+        self._keep_occupied(field.voxel_alpha(sampling.step) > threshold)
+
+    def _keep_occupied(self, where: Tensor) -> None:
+        """Keep of the occupancy what is within a voxel of ``where`` (X, Y, Z)."""
+        occupancy, field = self.scene_model.occupancy, self.scene_model.canonical
         points = field.box.grid_points(field.density.shape, field.density.values)
-        before = model.occupancy.at(points.view(-1, 3)).view(opaque.shape)
-        model.occupancy.replace(opaque & before, field.box)
+        before = occupancy.at(points.view(-1, 3)).view(where.shape)
+        occupancy.replace(dilate(where, 1) & before, field.box)
+
+    @torch.no_grad()
+    def _forget_hidden(self) -> None:
+        """Of contracted space, occupy only what this phase's rays have reached.
+
+        Most of it lies behind walls: opaque from the start, sampled by every ray, seen by none.
+        What they have reached has a second moment.
+        """
+        state = self.optimizer.state.get(self.scene_model.canonical.density.values)
+        if state and not self.scene_model.space.is_linear:
+            self._keep_occupied(state["square"][..., 0] > 0)
 
     def setup_optimizer(self) -> None:
         """Give the optimiser the present grids (docs/method.md#optimiser).
@@ -291,6 +310,7 @@ class CanonicalStage(VoxelStage):
         if self.iteration < self.total_iterations:
             return
         self.scene_model.canonical.learn_directions(True)
+        self._forget_hidden()
         self.update_occupancy()
         self.scene_model.canonical.clear(~self.scene_model.occupancy.mask, alpha=1e-6)
         super().on_train_end()
