@@ -303,6 +303,8 @@ def test_checkpoints_of_a_sweep_share_what_they_have_in_common(learned_by):
 
 
 def test_another_option_of_a_group_begins_from_its_own_values(run, learned_by):
+    learned_by("experiment=cpu_small", "data.root=gone")
+    assert completed([f"hydra.run.dir={run}"])[:1] == ["experiment=cpu_small"]
     learned_by("data=inward", "data.downscale=2", "seed=1", "field.width=8")
     there = [f"hydra.run.dir={run}", "stage=inspect"]
     kept = ["seed=1", "field.width=8", "hydra.mode=RUN"]

@@ -97,14 +97,15 @@ def _in_form(texts: list[str], before: Sequence[str]) -> list[str]:
     Of ``paper`` with ``data=lego`` that is ``paper_lego``, else ``paper_inward``, else ``paper``;
     of ``best_small`` with an embedded scene ``best_small_embedded``. Of a sweep over scenes with
     settings of their own, ``experiment=paper data=lego,plant``, it is one over such experiments,
-    which name their data themselves. Without an experiment a forward-facing scene from disk has
-    ``best_small_forward``; other methods learn D-NeRF's kind of scene by ``protocol=dynamic``.
+    which name their data. Without an experiment a forward-facing scene from disk has
+    ``best_small_forward``; other methods learn D-NeRF's kind of scene by ``protocol=dynamic``. What
+    a named run was learned with has its form already, and its scene may be gone.
 
     Raises:
         DevrfError: a sweep's scenes need different forms.
     """
     both = parsed([*before, *texts])
-    names, known = values(both, "experiment"), set(group_choices()["experiment"])
+    names, known = values(parsed(texts), "experiment"), set(group_choices()["experiment"])
     roots, chosen = values(both, "data.root"), {override.key_or_group for override in both}
     fresh = bool(roots) and not before
     default = fresh and not names and not chosen & {"method", "comparison", "field", "schedule"}
