@@ -122,7 +122,8 @@ def check_memory(needed: int, where: object, what: str) -> None:
         raise scene_error(
             where,
             f"{what} take {needed / 2**30:.1f} GiB, but this machine has "
-            f"{there / 2**30:.1f} GiB of memory; set data.downscale higher, or data.frames",
+            f"{there / 2**30:.1f} GiB of memory; make data.downscale "
+            f"{math.ceil(math.sqrt(needed / there))} times as large, or give fewer data.frames",
         )
 
 
