@@ -48,7 +48,8 @@ def test_every_term_is_learned_from_and_finite(
     for name in NSFF.losses:
         assert stage.trainer.callback_metrics[f"both/{name}"].isfinite(), name
     assert stage.trainer.callback_metrics["both/chained"] > 0
-    assert all(p.grad is not None for p in stage.scene_model.parameters())
+    # Whatever has had a gradient has moments.
+    assert all(stage.optimizer.state.get(p) for p in stage.scene_model.parameters())
 
 
 def test_batches_have_further_rays_where_something_moves(
