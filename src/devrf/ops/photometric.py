@@ -43,6 +43,25 @@ def background_entropy(transmittance: Tensor) -> Tensor:
     return -(p * p.log() + (1 - p) * torch.log1p(-p)).mean()
 
 
+def distortion(weight: Tensor, distance: Tensor, ray: Tensor, rays: int) -> Tensor:
+    """(1/R) Σ_i Σ_j w_i w_j |s_i − s_j| over the pairs of samples of each ray.
+
+    mip-NeRF 360's distortion loss without its term of single samples, whose steps are equal here.
+
+    Args:
+        weight: (K,) w of the samples, 0 in padding.
+        distance: (K,) s of the samples, ascending along each ray.
+        ray: (K,) int64, ascending.
+        rays: R.
+    """
+    before = torch.stack([weight, weight * distance]).double()
+    sums = torch.nn.functional.pad(before.cumsum(dim=1), (1, 0))
+    first = torch.searchsorted(ray, torch.arange(rays, device=ray.device))[ray]
+    mass, reached = (sums[:, :-1] - sums[:, first]).to(weight.dtype)
+    total: Tensor = (weight * (distance * mass - reached)).sum()
+    return 2 * total / rays
+
+
 def alpha_mask_error(transmittance: Tensor, alpha: Tensor | None) -> Tensor:
     """Mean (T_end − (1 − A))² of T_end and A (R,); 0 without A."""
     if alpha is None:

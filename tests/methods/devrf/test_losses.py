@@ -30,6 +30,7 @@ from devrf.methods.devrf.losses import (
     induced_flow,
 )
 from devrf.methods.weighted_loss import counted_weights
+from devrf.ops.photometric import distortion
 from devrf.rendering.output import VoxelOutput
 from devrf.rendering.sampling import Samples
 from devrf.scenes.procedural import Material, ProceduralScene
@@ -102,6 +103,18 @@ def test_entropy_by_hand_and_with_finite_gradients_at_its_ends(prediction: Predi
     output = replace(prediction.output, transmittance=end)
     PHOTOMETRIC_TERMS["entropy"](replace(prediction, output=output)).backward()
     assert end.grad is not None and end.grad.isfinite().all()
+
+
+def test_distortion_by_hand() -> None:
+    # Rays 0 and 2 of four; 2 · (0.5 · 0.25 · 2 + 0.5 · 0.125 · 3 + 0.25 · 0.125 · 1) of ray 0.
+    weight = torch.tensor([0.5, 0.25, 0.125, 0.75], requires_grad=True)
+    distance, ray = torch.tensor([1.0, 3.0, 4.0, 2.0]), torch.tensor([0, 0, 0, 2])
+    spread = distortion(weight, distance, ray, 4)
+    assert spread.item() == pytest.approx(2 * (0.25 + 0.1875 + 0.03125) / 4)
+    spread.backward()
+    assert weight.grad is not None
+    # A sample alone on its ray may be as opaque as it likes.
+    assert weight.grad.tolist() == pytest.approx([0.4375, 0.5625, 0.875, 0.0])
 
 
 def test_alpha_mask_by_hand_and_without_one(prediction: Prediction) -> None:

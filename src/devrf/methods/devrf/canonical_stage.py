@@ -29,6 +29,7 @@ from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import FINE_LOSS, SEARCH_LOSS, CanonicalRates, Precision, Sampling
 from devrf.methods.devrf.voxel_stage import VoxelStage, field_optimizer
 from devrf.methods.weighted_loss import counted_weights
+from devrf.ops.photometric import distortion
 from devrf.rendering.occupancy import Occupancy, bounding_box, dilate
 from devrf.rendering.sampling import RenderSettings
 from devrf.scenes.scene import CaptureName, Views
@@ -73,7 +74,8 @@ class CanonicalStage(VoxelStage):
             sampling: how rays are sampled.
             search_loss: weights of the loss terms in the geometry search; ``tv`` is the total
                 variation of both grids.
-            fine_loss: their weights in the radiance field.
+            fine_loss: their weights in the radiance field; ``distortion`` counts in contracted
+                space alone, from when directions are learned.
             iterations_per_step: as of every :class:`VoxelStage`.
             graphs: likewise.
             decoder_precision: likewise.
@@ -83,10 +85,11 @@ class CanonicalStage(VoxelStage):
         self.architecture = architecture or Architecture()
         self.rates = rates or CanonicalRates()
         self.sampling = sampling or Sampling()
-        self.weights, self.tv = {}, {}
+        self.weights, self.tv, self.distortion = {}, {}, 0.0
         for kind, given in (("search", search_loss), ("fine", fine_loss)):
             weights = dict(given)
             self.tv[kind] = weights.pop("tv", 0.0)
+            self.distortion = weights.pop("distortion", 0.0)
             self.weights[kind] = counted_weights(weights, PHOTOMETRIC_TERMS, f"loss.{kind}")
         self.pool: PixelPool | None = None
 
@@ -302,7 +305,16 @@ class CanonicalStage(VoxelStage):
         occupancy = self.scene_model.occupancy
         prediction = Prediction(*self.render_pixels(views, pixels, occupancy, batch.capacity))
         with span("losses"):
-            return batch_loss(prediction, PHOTOMETRIC_TERMS, self.weights[self.phase.kind])
+            total, terms = batch_loss(prediction, PHOTOMETRIC_TERMS, self.weights[self.phase.kind])
+            unbounded = not self.scene.space.is_linear
+            # Earlier it would keep whatever surfaces the first iterations have guessed.
+            if self.distortion and unbounded and self.schedule.learns_directions(self.iteration):
+                seen, edges = prediction.output, self.scene.space.inner(self.scene.bounds.box).size
+                distance = seen.samples.distance / (sum(edges) / 6)  # in half edges
+                spread = distortion(seen.weight, distance, seen.samples.ray, len(seen.color))
+                total = total + self.distortion * spread
+                terms = {**terms, "distortion": spread.detach()}
+            return total, terms
 
     @torch.no_grad()
     def on_train_end(self) -> None:

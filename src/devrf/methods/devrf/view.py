@@ -23,8 +23,9 @@ from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import ColorChange, RenderedImage
 from devrf.rendering.sampling import RenderSettings
 
-# Rays at once: on a CPU what its caches hold, on a GPU what keeps it busy and fits.
-ON_CPU, ON_GPU, IN_LISTS = 8192, 2**15, 2**18
+# Rays at once: on a CPU what its caches hold (in unbounded scenes a ray has tens of samples to
+# colour), on a GPU what keeps it busy and fits.
+ON_CPU, UNBOUNDED_ON_CPU, ON_GPU, IN_LISTS = 8192, 1024, 2**15, 2**18
 
 
 def in_lists(space: Space, field: CanonicalField) -> bool:
@@ -87,7 +88,9 @@ class DeVRFView:
         """Rays that are best rendered at once."""
         if in_lists(self.space, self.canonical):
             return IN_LISTS
-        return ON_GPU if self.canonical.density.values.is_cuda else ON_CPU
+        if self.canonical.density.values.is_cuda:
+            return ON_GPU
+        return ON_CPU if self.space.is_linear else UNBOUNDED_ON_CPU
 
     @torch.no_grad()
     def render(self, rays: Rays, background: Tensor) -> RenderedImage:
