@@ -57,7 +57,7 @@ AFTER_LEARNING = ("evaluate", "render")
 APART = {"report", "fetch", "capture", "selfcheck"}
 # What a run's folder may hold that a person looks at first, and what to try next.
 RESULTS = ("metrics.json", "images", "videos", "checkpoints")
-NEXT = ("stage=still still.time=0.35 still.height=400", "stage=render video.path=captured")
+NEXT = ("stage=still still.time=0.35 still.height=400", "stage=view")
 
 # Lightning's messages on accelerators, tips and data loaders say nothing about this run.
 for _name in ("lightning.pytorch", "lightning.fabric"):
