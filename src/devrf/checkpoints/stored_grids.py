@@ -77,6 +77,25 @@ def unpack(packed: Packed) -> Tensor:
     return grids
 
 
+def packed(grids: Tensor, keep: Tensor, *, smooth: bool, many: bool = True) -> Packed | Tensor:
+    """What :func:`pack` gives; the grids themselves where half precision cannot hold a value.
+
+    Unless there are ``many``, what comes back is the one grid (X, Y, Z, C).
+    """
+    try:
+        return {**pack(grids.cpu(), keep.cpu(), smooth=smooth), "many": many}
+    except ValueError:
+        return grids if many else grids[0]
+
+
+def unpacked(value: Any) -> Any:
+    """What :func:`packed` was given; anything else as it is."""
+    if not isinstance(value, dict) or "kept" not in value:
+        return value
+    grids = unpack(value)
+    return grids if value["many"] else grids[0]
+
+
 def _thinned(shape: Sequence[int]) -> tuple[int, int, int]:
     x, y, z = (max(2, math.ceil((points - 1) / THINNING) + 1) for points in shape)
     return x, y, z

@@ -55,6 +55,15 @@ class Occupancy(nn.Module):
         """Mask (M,): whether something may be within :attr:`reach` of ``points`` (M, 3)."""
         return self._look_up(self.vicinity, self.box.nearest(points))
 
+    def points_near(self, shape: tuple[int, int, int], box: Box) -> Tensor:
+        """The points of a grid over ``box`` that interpolation near anything occupied reads."""
+        cells = zip(self.mask.shape, shape, strict=True)
+        # A cell of the grid may span several of the occupancy's cells.
+        reach = max(1, *(-(-(theirs - 1) // max(ours - 1, 1)) for theirs, ours in cells))
+        grown = Occupancy(dilate(self.mask, reach), self.box)
+        points = box.grid_points(shape, torch.empty(0, device=self.mask.device))
+        return dilate(grown.at(points.view(-1, 3)).view(shape), 1)
+
     def _look_up(self, mask: Tensor, points: Tensor) -> Tensor:
         x, y, z = mask.shape
         # Axis by axis: several times faster than rows of three.

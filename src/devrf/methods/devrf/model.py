@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from devrf.checkpoints.stored_grids import pack, unpack
+from devrf.checkpoints.stored_grids import packed, unpacked
 from devrf.engine.frame_store import FrameField
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
@@ -24,7 +24,7 @@ from devrf.methods.devrf.view import CanonicalSurface, DeVRFView
 from devrf.methods.devrf.volume_rendering import Warp
 from devrf.ops.corners import shape_of
 from devrf.rendering.list_rendering import ListRenderer
-from devrf.rendering.occupancy import Occupancy, dilate
+from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import ColorChange
 from devrf.rendering.sampling import RenderSettings
 
@@ -177,29 +177,27 @@ class DeVRFModel(Renderable):
         A grid with a value that half precision cannot hold stays as it is.
         """
         state, motion, residual = self.state_dict(), self.deformation, self.color_residual
-        shown = _points_near(self.occupancy, self.canonical.density.shape, self.box)[None]
+        shown = self.occupancy.points_near(self.canonical.density.shape, self.box)[None]
         if not self.space.is_linear:  # rays end in the field's outer faces
             rim = torch.ones_like(shown)
             rim[:, 1:-1, 1:-1, 1:-1] = False
             shown |= rim
         for name in ("canonical.density.values", "canonical.color.values"):
-            state[name] = _packed(state[name][None], shown, smooth=False, many=False)
+            state[name] = packed(state[name][None], shown, smooth=False, many=False)
         if motion is not None:
-            at_rest = _points_near(self.occupancy, motion.shape, motion.box)[None]
-            near = [
-                _points_near(self.occupancy_at(time), motion.shape, motion.box)
-                for time in motion.clock.times
-            ]
+            place = motion.shape, motion.box
+            at_rest = self.occupancy.points_near(*place)[None]
+            near = [self.occupancy_at(t).points_near(*place) for t in motion.clock.times]
             # Between two frames both are blended.
             moving = [torch.stack(near[max(k - 1, 0) : k + 2]).any(dim=0) for k in range(len(near))]
             frames = {"to_canonical": torch.stack(moving), "to_time": at_rest}
             for name, keep in frames.items():
                 values = getattr(motion.frames, name)
-                state[f"deformation.frames.{name}"] = _packed(values, keep, smooth=True)
+                state[f"deformation.frames.{name}"] = packed(values, keep, smooth=True)
         if residual is not None:
             values = residual.values
-            at_rest = _points_near(self.occupancy, shape_of(values[0]), residual.box)[None]
-            state["color_residual.values"] = _packed(values, at_rest, smooth=False)
+            at_rest = self.occupancy.points_near(shape_of(values[0]), residual.box)[None]
+            state["color_residual.values"] = packed(values, at_rest, smooth=False)
         return state
 
     def load_stored_state(self, state: Mapping[str, Any]) -> None:
@@ -208,34 +206,7 @@ class DeVRFModel(Renderable):
         Raises:
             RuntimeError | KeyError | ValueError: it does not fit, or a packed grid lacks a part.
         """
-        self.load_state_dict(
-            {
-                name: _unpacked(value) if isinstance(value, dict) and "kept" in value else value
-                for name, value in state.items()
-            }
-        )
-
-
-def _packed(grids: Tensor, keep: Tensor, *, smooth: bool, many: bool = True) -> Any:
-    try:
-        return {**pack(grids.cpu(), keep.cpu(), smooth=smooth), "many": many}
-    except ValueError:
-        return grids if many else grids[0]
-
-
-def _unpacked(packed: dict[str, Any]) -> Tensor:
-    grids = unpack(packed)
-    return grids if packed["many"] else grids[0]
-
-
-def _points_near(occupancy: Occupancy, shape: tuple[int, int, int], box: Box) -> Tensor:
-    """The points of a grid over ``box`` that interpolation near anything occupied reads."""
-    cells = zip(occupancy.mask.shape, shape, strict=True)
-    # A cell of the grid may span several of the occupancy's cells.
-    reach = max(1, *(-(-(theirs - 1) // max(ours - 1, 1)) for theirs, ours in cells))
-    grown = Occupancy(dilate(occupancy.mask, reach), occupancy.box)
-    points = box.grid_points(shape, torch.empty(0, device=occupancy.mask.device))
-    return dilate(grown.at(points.view(-1, 3)).view(shape), 1)
+        self.load_state_dict({name: unpacked(value) for name, value in state.items()})
 
 
 def _class_path(field: ColorField | None) -> str | None:
