@@ -14,6 +14,7 @@ from devrf.geometry.space import Space
 # The least value of the schedule's numbers.
 LEAST = {
     **dict.fromkeys(("search_iterations", "dense_tv_iterations", "view_dependence_start"), 0),
+    "unbounded_distortion": 0,
     **dict.fromkeys(("iterations", "decay_iterations", "rays", "min_views"), 1),
     **dict.fromkeys(("side", "search_side", "unbounded_initial_side"), 2),
 }
@@ -61,6 +62,8 @@ class CanonicalSchedule:
         unbounded_initial_side: in contracted space the grid starts with about as many voxels
             along an edge, and doubles at equal intervals over the first three quarters of
             ``iterations`` in place of ``upsample_at``. None: ``upsample_at`` holds there, too.
+        unbounded_distortion: in contracted space, weight of the distortion loss from
+            ``view_dependence_start`` on; earlier it would keep whatever was guessed first.
         crop: in forward-facing scenes, whether the growing grid gives up depths at which the static
             views see nothing (docs/method.md#crop).
     """
@@ -78,6 +81,7 @@ class CanonicalSchedule:
     voxels_per_pixel: float | None = None
     view_dependence_start: int | None = None
     unbounded_initial_side: float | None = 26
+    unbounded_distortion: float = 0.01
     crop: bool = False
     phases: tuple[CanonicalPhase, ...] = field(init=False, repr=False)
 

@@ -74,8 +74,7 @@ class CanonicalStage(VoxelStage):
             sampling: how rays are sampled.
             search_loss: weights of the loss terms in the geometry search; ``tv`` is the total
                 variation of both grids.
-            fine_loss: their weights in the radiance field; ``distortion`` counts in contracted
-                space alone, from when directions are learned.
+            fine_loss: their weights in the radiance field.
             iterations_per_step: as of every :class:`VoxelStage`.
             graphs: likewise.
             decoder_precision: likewise.
@@ -85,11 +84,10 @@ class CanonicalStage(VoxelStage):
         self.architecture = architecture or Architecture()
         self.rates = rates or CanonicalRates()
         self.sampling = sampling or Sampling()
-        self.weights, self.tv, self.distortion = {}, {}, 0.0
+        self.weights, self.tv = {}, {}
         for kind, given in (("search", search_loss), ("fine", fine_loss)):
             weights = dict(given)
             self.tv[kind] = weights.pop("tv", 0.0)
-            self.distortion = weights.pop("distortion", 0.0)
             self.weights[kind] = counted_weights(weights, PHOTOMETRIC_TERMS, f"loss.{kind}")
         self.pool: PixelPool | None = None
 
@@ -302,19 +300,18 @@ class CanonicalStage(VoxelStage):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Render a batch of pixels and compare it with the images."""
         assert self.phase is not None
-        occupancy = self.scene_model.occupancy
-        prediction = Prediction(*self.render_pixels(views, pixels, occupancy, batch.capacity))
+        model, schedule = self.scene_model, self.schedule
+        prediction = Prediction(*self.render_pixels(views, pixels, model.occupancy, batch.capacity))
         with span("losses"):
             total, terms = batch_loss(prediction, PHOTOMETRIC_TERMS, self.weights[self.phase.kind])
-            unbounded = not self.scene.space.is_linear
-            # Earlier it would keep whatever surfaces the first iterations have guessed.
-            if self.distortion and unbounded and self.schedule.learns_directions(self.iteration):
-                seen, edges = prediction.output, self.scene.space.inner(self.scene.bounds.box).size
-                distance = seen.samples.distance / (sum(edges) / 6)  # in half edges
-                spread = distortion(seen.weight, distance, seen.samples.ray, len(seen.color))
-                total = total + self.distortion * spread
-                terms = {**terms, "distortion": spread.detach()}
-            return total, terms
+            if model.space.is_linear:
+                return total, terms
+            seen, edges = prediction.output, model.space.inner(model.box).size
+            distance = seen.samples.distance / (sum(edges) / 6)  # in half edges
+            spread = distortion(seen.weight, distance, seen.samples.ray, len(seen.color))
+            if schedule.learns_directions(self.iteration):
+                total = total + schedule.unbounded_distortion * spread
+            return total, {**terms, "distortion": spread.detach()}
 
     @torch.no_grad()
     def on_train_end(self) -> None:
