@@ -18,6 +18,7 @@ from kornia.geometry.conversions import (
 from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, ValidationError
 from torch import Tensor
 
+from devrf.apps.camera_paths import PRESETS, WAYS
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.files import Number, Positive, read_json
@@ -208,8 +209,9 @@ def read_path(file: Path) -> CameraPath:
     Raises:
         DevrfError: there is no such file, or it is no camera path.
     """
-    known = "orbit, spiral, captured, bullet_time, time_freeze, or a file that the viewer saved"
-    return _path(read_json(file, _PathFile, f"give video.path {known}"), file)
+    known = ", ".join([*WAYS, *PRESETS])
+    remedy = f"give video.path {known}, or a file that the viewer saved"
+    return _path(read_json(file, _PathFile, remedy), file)
 
 
 def path_from(content: bytes, name: str) -> CameraPath:

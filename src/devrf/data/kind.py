@@ -14,7 +14,7 @@ from devrf.errors import DevrfError
 from devrf.scenes.files import read_json
 from devrf.scenes.formats import recognise
 from devrf.scenes.sparse_model import ONE_SIDE, model_folder, read_model, widest_angle
-from devrf.scenes.splits import distinct_poses, distinct_times
+from devrf.scenes.splits import distinct_poses, distinct_times, stand_still
 from devrf.scenes.transforms import TransformsFile
 
 # Options of ``data=`` whose scenes are forward-facing ones, whatever the files say.
@@ -62,10 +62,9 @@ def _transforms(file: Path) -> TransformsFile | None:
 
 
 def _by_one_camera(listing: TransformsFile | None) -> bool:
-    """Whether images of several times are not, two or more of each, from places that stay."""
+    """Whether images of several times are not from cameras that stand still."""
     if listing is None:
         return False
     times = torch.tensor([frame.time for frame in listing.frames if frame.time is not None])
     poses = torch.tensor([frame.transform_matrix[:3] for frame in listing.frames])
-    places = int(distinct_poses(poses).max()) + 1
-    return len(distinct_times(times)) > 1 and len(listing.frames) < 2 * places
+    return len(distinct_times(times)) > 1 and not stand_still(distinct_poses(poses))

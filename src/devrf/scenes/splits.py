@@ -86,6 +86,14 @@ def distinct_poses(poses: Tensor) -> Tensor:
     return torch.tensor(numbers, dtype=torch.int64)
 
 
+def stand_still(pose: Tensor) -> bool:
+    """Whether cameras are fixed, by the number of each image's pose, (N,): two images of each.
+
+    On average: a camera that moves may come back to a place.
+    """
+    return len(pose) >= 2 * (int(pose.max()) + 1)
+
+
 def at_rest(transforms: Transforms) -> Split:
     """A split of a scene at rest: every image its own view, time 0 unless the file says more."""
     count = len(transforms.images)
@@ -107,15 +115,13 @@ def one_moment(*sets: Transforms) -> bool:
 def in_motion(transforms: Transforms) -> Split:
     """A split of a scene in motion.
 
-    Cameras are fixed when each distinct pose took two images or more on average; otherwise the
-    camera moves and each image is its own view. Without times in the file, the images of V fixed
-    views are time-major (frame = position // V; DevrfError if the views do not take turns) and
-    those of a moving camera consecutive.
+    Cameras are fixed (:func:`stand_still`), or one camera moves and each image is its own view.
+    Without times in the file, the images of V fixed views are time-major (frame = position // V;
+    DevrfError if the views do not take turns) and those of a moving camera consecutive.
     """
     order = torch.arange(len(transforms.images))
     camera = distinct_poses(transforms.poses)
-    views = int(camera.max()) + 1
-    fixed = len(order) >= 2 * views
+    views, fixed = int(camera.max()) + 1, stand_still(camera)
     if transforms.times is not None:
         times = torch.tensor(transforms.times)
     else:
