@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
+from torch.autograd.functional import hessian
 
 from devrf.geometry.poses import average_pose, relative_to, rigid_motion
 
@@ -39,22 +41,34 @@ def test_a_pose_relative_to_another() -> None:
 
 def by_matrix(point: torch.Tensor, rotation: torch.Tensor, velocity: torch.Tensor) -> torch.Tensor:
     """The point (3,) moved by the matrix exponential of the 4×4 twist."""
-    x, y, z = rotation.tolist()
-    twist = torch.tensor(
-        [[0, -z, y, 0], [z, 0, -x, 0], [-y, x, 0, 0], [0, 0, 0, 0]], dtype=point.dtype
-    )
-    twist[:3, 3] = velocity
+    (x, y, z), o = rotation, rotation.new_zeros(())
+    turn = torch.stack([o, -z, y, z, o, -x, -y, x, o]).view(3, 3)
+    twist = torch.cat([torch.cat([turn, velocity[:, None]], dim=1), rotation.new_zeros(1, 4)])
     return (torch.linalg.matrix_exp(twist) @ torch.cat([point, point.new_ones(1)]))[:3]
 
 
-@pytest.mark.parametrize("size", [0.0, 0.005, 7.0])
+@pytest.mark.parametrize("size", [0.0, 0.005, 0.499, 0.501, 7.0])
 def test_rigid_motion_is_the_exponential_of_the_twist(size: float, rng: torch.Generator) -> None:
     points, rotation, velocity = torch.randn(3, 5, 3, dtype=torch.float64, generator=rng).unbind()
     rotation = size * rotation / rotation.norm(dim=1, keepdim=True)
     moved = rigid_motion(points, rotation, velocity)
     for k in range(5):
         expected = by_matrix(points[k], rotation[k], velocity[k])
-        torch.testing.assert_close(moved[k], expected, atol=1e-8, rtol=0)
+        torch.testing.assert_close(moved[k], expected, atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("size", [0.0101, 0.49, 0.51])
+def test_second_derivatives_keep_their_digits_in_single_precision(size: float) -> None:
+    point, axis = torch.tensor([[0.5, -1.0, 2.0], [2.0, 1.0, -2.0]], dtype=torch.float64)
+
+    def curvature(moved: Callable[..., torch.Tensor], dtype: torch.dtype) -> torch.Tensor:
+        x, rotation = point.to(dtype), (size * axis / 3).to(dtype)
+        return hessian(lambda r: moved(x, r, x.flip(0)).sum(), rotation).double()
+
+    expected = curvature(by_matrix, torch.float64)
+    for dtype, tolerance in ((torch.float64, 1e-8), (torch.float32, 2e-5)):
+        found = curvature(rigid_motion, dtype)
+        torch.testing.assert_close(found, expected, atol=tolerance, rtol=0)
 
 
 def test_without_numbers_nothing_moves_and_gradients_are_there() -> None:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-# Below this squared angle three terms of the series are exact to single precision.
-SMALL = 1e-4
+# Up to this squared angle A, B and C are summed: in single precision their quotients lose digits,
+# and their second derivatives lose all of them at θ = 0.01.
+SMALL = 0.25
+TERMS = 6
 
 
 def average_pose(poses: Tensor) -> Tensor:
@@ -39,8 +43,7 @@ def rigid_motion(points: Tensor, rotation: Tensor, velocity: Tensor) -> Tensor:
     """x′ = e^{[r]} x + G v: the exponential of se(3), a motion along a screw.
 
     With θ = |r|, [r] y = r × y, A = sin θ / θ, B = (1 − cos θ) / θ², C = (θ − sin θ) / θ³:
-    e^{[r]} = I + A [r] + B [r]² and G = I + B [r] + C [r]². Smooth at θ = 0, where A, B and C are
-    taken from their series.
+    e^{[r]} = I + A [r] + B [r]² and G = I + B [r] + C [r]². They are sums of series up to θ = 0.5.
 
     Args:
         points: (..., 3) x.
@@ -56,10 +59,18 @@ def rigid_motion(points: Tensor, rotation: Tensor, velocity: Tensor) -> Tensor:
     safe = torch.where(near, torch.ones_like(square), square)
     angle = safe.sqrt()
     sine, cosine = angle.sin(), angle.cos()
-    a: Tensor = torch.where(near, 1 - square / 6, sine / angle)
-    b: Tensor = torch.where(near, 0.5 - square / 24, (1 - cosine) / safe)
-    c: Tensor = torch.where(near, 1 / 6 - square / 120, (angle - sine) / (safe * angle))
+    a: Tensor = torch.where(near, _series(square, 1), sine / angle)
+    b: Tensor = torch.where(near, _series(square, 2), (1 - cosine) / safe)
+    c: Tensor = torch.where(near, _series(square, 3), (angle - sine) / (safe * angle))
     turned: Tensor = torch.linalg.cross(rotation, points)
     driven: Tensor = torch.linalg.cross(rotation, velocity)
     twice: Tensor = torch.linalg.cross(rotation, b * turned + c * driven)
     return points + a * turned + velocity + b * driven + twice
+
+
+def _series(square: Tensor, first: int) -> Tensor:
+    """Σ_k (−θ²)^k / (2k + ``first``)!: A, B and C for 1, 2 and 3."""
+    total = torch.zeros_like(square)
+    for k in reversed(range(TERMS)):
+        total = 1 / math.factorial(2 * k + first) - square * total
+    return total
