@@ -108,6 +108,10 @@ def scenes(tmp_path_factory) -> Path:
         ("data=inward experiment=paper seed=1", "data=inward experiment=paper_inward seed=1"),
         ("experiment=paper data=colmap", "experiment=paper_inward data=colmap"),
         ("-m experiment=paper data=lego,plant", "-m experiment=paper_lego,paper_plant"),
+        (
+            "-m experiment=paper_lego,paper_plant data.root=x seed=1",
+            "-m experiment=paper_lego,paper_plant ++data.root=x seed=1",
+        ),
         ("experiment=fast data=rabbit", "experiment=fast_forward data=rabbit"),
         ("experiment=best data=neural_3d_video", "experiment=best_forward data=neural_3d_video"),
         ("experiment=best_small data=flower", "experiment=best_small_embedded data=flower"),

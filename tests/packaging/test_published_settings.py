@@ -131,27 +131,40 @@ def test_the_inward_scenes_have_the_papers_schedule_and_the_authors_bound_scale(
         composed(f"experiment=paper_{scene}", ROOT),
         composed("experiment=paper_inward", ROOT),
     )
-    assert (config.data.name, config.data.bound_scale) == (scene, 1.2)
+    assert (config.data.name, config.data.bound_scale, config.data.space) == (scene, 1.2, "world")
     for part in ("field", "schedule", "sampling", "loss"):
         assert config[part] == general[part]
     assert config.loss.flow_mean == "samples"
 
 
 @pytest.mark.parametrize(
-    ("scene", "frames", "sides", "growths", "total"),
+    ("scene", "frames", "sides", "growths", "total", "factor"),
     [
-        ("pig_toy", 50, [10, 20, 40, 80, 160], [10_000, 15_000, 20_000, 22_500], 25_000),
-        ("rabbit", 40, [40, 80, 160], [8000, 12_000], 13_000),
-        ("plant", 40, [8, 16, 32, 64, 128], [8000, 16_000, 20_000, 22_000], 24_000),
+        ("pig_toy", 50, [10, 20, 40, 80, 160], [10_000, 15_000, 20_000, 22_500], 25_000, 0.5623),
+        ("rabbit", 40, [40, 80, 160], [8000, 12_000], 13_000, 0.3162),
+        ("plant", 40, [8, 16, 32, 64, 128], [8000, 16_000, 20_000, 22_000], 24_000, 0.5623),
     ],
 )
 def test_each_forward_scene_has_its_published_schedule(
-    composed, scene, frames, sides, growths, total
+    composed, scene, frames, sides, growths, total, factor
 ):
     config = composed(f"experiment=paper_{scene}", ROOT)
     schedule = instantiate(config.schedule.deformation, _convert_="all")
     assert (config.data.name, [level.side for level in schedule.levels]) == (scene, sides)
     assert (schedule.growths(frames), schedule.total(frames)) == (growths, total)
+    # From growth to growth down to a tenth.
+    assert schedule.learning_rate_factor(1) == pytest.approx(factor, abs=1e-4)
+    assert schedule.learning_rate_factor(len(sides) - 1) == pytest.approx(0.1)
     assert config.schedule.canonical.dense_tv_iterations == 10_000
     assert config.loss.flow_mean == "samples"
     assert (config.field.planes, config.field.channels, config.field.width) == (128, 9, 64)
+
+
+@pytest.mark.parametrize("scene", ["lego", "flower_360", "pig_toy", "plant", "rabbit"])
+@pytest.mark.parametrize("row", ["devrf_paper", "devrf_paper_c2f"])
+def test_a_job_of_the_published_table_is_the_scenes_own_experiment(composed, scene, row):
+    job = composed("experiment=published_table", f"comparison={row}", f"data={scene}", ROOT)
+    ablation = f"ablation={row.removeprefix('devrf_paper').removeprefix('_') or 'full'}"
+    own = composed(f"experiment=paper_{scene}", ROOT, ablation)
+    for part in ("data", "field", "schedule", "sampling", "loss", "protocol"):
+        assert job[part] == own[part]

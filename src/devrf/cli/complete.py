@@ -19,7 +19,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
-from devrf.cli.config import config_folder, group_choices, overrides, rows
+from devrf.cli.config import config_folder, defaults_of, group_choices, overrides, reader_of
 from devrf.cli.messages import in_quotes
 from devrf.cli.restore_config import of_named_run, parsed, value, values
 from devrf.errors import DevrfError
@@ -62,9 +62,13 @@ def completed(arguments: Sequence[str]) -> list[str]:
     before = of_named_run(typed, multirun)
     texts = _in_form(texts, before)
     both = parsed([*before, *texts])
+    experiments = values(both, "experiment")
     if values(both, "data.root") and not any(override.key_or_group == "data" for override in both):
-        if not any(map(_reads_files, values(both, "experiment"))):
+        if not any(map(_reads_files, experiments)):
             before.append("data=auto")
+        elif len(experiments) > 1:
+            # Hydra composes a sweep once without what is swept: these keys are unknown there.
+            texts = [f"++{text}" if text.startswith("data.") else text for text in texts]
     # Hydra takes all overrides from one place.
     after = [words[k] for k in range(at[0], len(words)) if k not in at]
     return [*words[: at[0]], *before, *texts, *after]
@@ -117,7 +121,7 @@ def _in_form(texts: list[str], before: Sequence[str]) -> list[str]:
 
     options, space = values(both, "data") or ["auto"], value(both, "data.space")
     scenes = [
-        [option, *(EMBEDDED.get(_reader(option)) or kind_of(_reader(option), root, space))]
+        [option, *(EMBEDDED.get(reader_of(option)) or kind_of(reader_of(option), root, space))]
         for option, root in product(options, roots or ([] if "auto" in options else [""]))
     ]
     if peer and not chosen & {"protocol", "comparison"} and all(ONE_CAMERA in k for k in scenes):
@@ -143,25 +147,12 @@ def _in_form(texts: list[str], before: Sequence[str]) -> list[str]:
     return [form if text.startswith("experiment=") else text for text in texts]
 
 
-def _defaults(group: str, option: str) -> list[Any]:
-    """The defaults list of a group's option; empty where there is none."""
-    path = config_folder() / group / f"{option}.yaml"
-    content: Any = OmegaConf.load(path) if path.is_file() else rows(group).get(option, {})
-    return list(content.get("defaults", []))
-
-
-def _reader(option: str) -> str:
-    """The reader that an option of ``data`` goes back to: ``inward`` of ``lego``."""
-    below = [entry for entry in _defaults("data", option) if isinstance(entry, str)]
-    return _reader(below[0]) if below else option
-
-
 def _reads_files(experiment: str) -> bool:
     """Whether an experiment chooses a reader of files itself."""
-    defaults = _defaults("experiment", experiment)
+    defaults = defaults_of("experiment", experiment)
     for entry in defaults:
         if not isinstance(entry, str) and "override /data" in entry:
-            return _reader(entry["override /data"]) not in EMBEDDED
+            return reader_of(entry["override /data"]) not in EMBEDDED
     return any(_reads_files(entry) for entry in defaults if isinstance(entry, str))
 
 

@@ -85,6 +85,24 @@ def meant_stage(word: str) -> str:
     return did_you_mean(word, known_stages(), "stage=")
 
 
+def defaults_of(group: str, option: str) -> list[Any]:
+    """The defaults list of a group's option; empty where there is none."""
+    path = config_folder() / group / f"{option}.yaml"
+    content: Any = OmegaConf.load(path) if path.is_file() else rows(group).get(option, {})
+    return list(content.get("defaults", []))
+
+
+def reader_of(option: str) -> str:
+    """The reader that an option of ``data`` goes back to: ``inward`` of ``lego``."""
+    below = [entry for entry in defaults_of("data", option) if isinstance(entry, str)]
+    return reader_of(below[0]) if below else option
+
+
+def facing(option: str) -> str:
+    """Whether the scenes of ``data=OPTION`` are ``forward`` or ``inward``, as far as known."""
+    return "forward" if "forward" in reader_of(option) else "inward"
+
+
 def scene_name(data: Any) -> str:
     """A scene's name for folders and tables: ``name``, else ``shape``, else the folder's name."""
     if OmegaConf.is_missing(data, "root"):
@@ -135,9 +153,10 @@ def config_record(stage: str) -> str | None:
 def job_folder(number: int, scene: str, sweep: str, overrides: Sequence[str], params: Any) -> str:
     """The folder of a sweep's job: number, scene, and what else is varied: ``0_robot_tv_0.5``."""
     record = Path(sweep) / "multirun.yaml"  # some searches write none; they name their params
-    typed = OmegaConf.load(record).hydra.overrides.task if record.is_file() else ()
+    task = OmegaConf.load(record).hydra.overrides.task if record.is_file() else []
+    typed: Any = OmegaConf.to_container(OmegaConf.create(task))  # a value may refer to the job's
     varied = dict.fromkeys(params or (), True)
-    for override in OverridesParser.create().parse_overrides(list(typed)):
+    for override in OverridesParser.create().parse_overrides(typed):
         varied[override.get_key_element()] = override.is_sweep_override()
     varied |= dict.fromkeys(("data", "data.root", "data.name", "data.shape"), False)
     values = [override.partition("=") for override in overrides]
@@ -156,7 +175,7 @@ def register_config() -> None:
 
     Each row of a file in ``conf/rows`` is a choice of the group that the file is named after.
     """
-    for word in (scene_name, run_name, run_folder, config_record, job_folder, tracked_name):
+    for word in (facing, scene_name, run_name, run_folder, config_record, job_folder, tracked_name):
         OmegaConf.register_new_resolver(f"devrf.{word.__name__}", word, replace=True)
     store = ConfigStore.instance()
     # Hydra copies its sources, the store among them, for each group that --help lists.
