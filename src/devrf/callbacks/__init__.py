@@ -5,6 +5,7 @@ from devrf.callbacks.divergence_guard import DivergenceGuard
 from devrf.callbacks.periodic_checkpoint import PeriodicCheckpoint, StopOnSignal
 from devrf.callbacks.progress import Progress
 from devrf.callbacks.schedule import GridUpscaling, LearningRateDecay
+from devrf.callbacks.time_budget import TimeBudget
 from devrf.callbacks.training_record import TrainingRecord
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "Progress",
     "PeriodicCheckpoint",
     "StopOnSignal",
+    "TimeBudget",
     "TrainingCurve",
     "TrainingRecord",
 ]

@@ -18,7 +18,7 @@ class TrainingRecord(Callback):
     """Measures a stage's training into its ``record``, over all resumed runs."""
 
     def __init__(self) -> None:
-        self._started = 0.0
+        self._stage: ScheduledStage | None = None
         self._seconds_before = 0.0
         self._peaks_before: tuple[float, float] | None = None
         self._startup = 0.0
@@ -26,22 +26,26 @@ class TrainingRecord(Callback):
         self._device: torch.device | None = None
         self._previews: list[Previews] = []
 
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Check and compile the kernels; then start the clock and the memory's high-water mark."""
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Check and compile the kernels before the stage is set up, which starts the clock."""
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
         self._previews = [other for other in callbacks if isinstance(other, Previews)]
-        self._device = pl_module.device
+        assert isinstance(pl_module, ScheduledStage)
+        self._stage = pl_module
+        self._device = trainer.strategy.root_device
         before = time.perf_counter()
         if triton_runs(torch.zeros(1, device=self._device)):
             self._kernels = "triton"
-        if self._device.type == "cuda":
-            torch.cuda.reset_peak_memory_stats(self._device)
-        self._started = time.perf_counter()
-        self._startup = self._started - before
+        self._startup = time.perf_counter() - before
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start the memory's high-water mark; the clock runs since the stage's own setup."""
+        if pl_module.device.type == "cuda":
+            torch.cuda.reset_peak_memory_stats(pl_module.device)
 
     def state_dict(self) -> dict[str, Any]:
         """Seconds and peak memory so far."""
-        return {"seconds": self._seconds(), "peaks": self._peaks()}
+        return {"seconds": self.seconds, "peaks": self._peaks()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Count on from what :meth:`state_dict` gave."""
@@ -56,7 +60,7 @@ class TrainingRecord(Callback):
         """
         assert isinstance(pl_module, ScheduledStage)
         wait(pl_module.device)
-        seconds, done = self._seconds(), pl_module.iteration - pl_module.skipped
+        seconds, done = self.seconds, pl_module.iterations_done
         allocated, reserved = self._peaks() or (None, None)
         pl_module.record = {
             "seconds": round(seconds, 2),
@@ -71,9 +75,12 @@ class TrainingRecord(Callback):
             "short_lists": pl_module.loop.num_short_lists,
         }
 
-    def _seconds(self) -> float:
+    @property
+    def seconds(self) -> float:
+        """Wall clock of the stage so far, in all runs, its setup included, previews not."""
+        assert self._stage is not None
         looking = sum(previews.seconds for previews in self._previews)
-        return self._seconds_before + time.perf_counter() - self._started - looking
+        return self._seconds_before + time.perf_counter() - self._stage.began - looking
 
     def _peaks(self) -> tuple[float, float] | None:
         """GiB allocated and reserved at the peaks so far."""

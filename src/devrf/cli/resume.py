@@ -73,6 +73,8 @@ def deciding_settings(config: DictConfig, stage: str) -> dict[str, Any]:
     parts = {key: OmegaConf.to_container(config[key], resolve=False) for key in ("data", *sections)}
     settings = dict(_values(config, parts, ""))
     settings.update(method=config.method, seed=config.seed)
+    if config.schedule.seconds is not None:
+        settings["schedule.seconds"] = config.schedule.seconds
     return {key: settings[key] for key in sorted(settings)}
 
 

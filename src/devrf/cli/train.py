@@ -38,15 +38,14 @@ def learn(run: RunContext, name: str) -> None:
         stage = build()
     else:
         rest = run.load(below, run.scene)
-        if rest.metadata.stage != below:
-            raise DevrfError(
-                f"ckpt: stage={name} needs a checkpoint of the {below} stage, not of the "
-                f"{rest.metadata.stage} stage"
-            )
+        before = rest.metadata
+        if before.stage != below:
+            needed = f"stage={name} needs a checkpoint of the {below} stage"
+            raise DevrfError(f"ckpt: {needed}, not of the {before.stage} stage")
         stage = build(rest=rest)
-        described = rest.metadata
-        stage.earlier_configs = {**described.earlier_configs, below: described.training_config}
+        stage.earlier_configs = {**before.earlier_configs, below: before.training_config}
     stage.protocol = run.protocol.name
+    stage.time_share = run.protocol.time_share(name, run.stages_with_images)
     stage.command = recorded(overrides())
     _fit(run, stage, begin)
 

@@ -6,6 +6,8 @@ iteration is carried out is in :mod:`devrf.engine.loop`.
 
 from __future__ import annotations
 
+import math
+import time
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -48,7 +50,12 @@ class ScheduledStage(Learner):
 
     Attributes:
         iteration: position in the schedule: optimiser iterations done or skipped.
-        skipped: iterations left out because a phase had converged.
+        skipped: iterations left out because a phase had converged, or for want of time; below 0
+            where a time budget has them done more than once.
+        stride: how far an optimiser iteration goes in the schedule; other than 1 under a
+            ``TimeBudget``.
+        time_share: the part of the whole method's seconds that is this stage's.
+        began: when the stage was set up, by ``time.perf_counter``.
         record: what training took, once a ``TrainingRecord`` callback has measured it.
         earlier_records: the same for the stages that this one builds on, by name.
         seed: of the generator, whose state at the beginning of a Lightning step follows from the
@@ -71,6 +78,7 @@ class ScheduledStage(Learner):
         self.loop = Loop(graphs)
         self.iterations_per_step = iterations_per_step
         self.iteration = self.skipped = self.seed = self.num_rollbacks = 0
+        self.stride, self.time_share, self.began = 1.0, 1.0, 0.0
         self.phase = None
         self.record: TrainingFigures = {}
         self.earlier_records: dict[str, TrainingFigures] = {}
@@ -82,6 +90,8 @@ class ScheduledStage(Learner):
         self.lr_scale = 1.0
         self.abort_reason: str | None = None
         self.logged: dict[str, Tensor] = {}
+        # How far the last iteration went, and what it went less than its stride.
+        self._advance, self._owed = 1, 0.0
         self._plain_background: Tensor | None = None
         self._progress: dict[str, Any] | None = None
         self._finished: dict[str, Any] | None = None
@@ -99,6 +109,29 @@ class ScheduledStage(Learner):
             plain = background_color(name, 0, self.generator).to(image.device)
             self._plain_background = plain
         return plain
+
+    @property
+    def iterations_done(self) -> int:
+        """Optimiser iterations that were carried out."""
+        return self.iteration - self.skipped
+
+    @property
+    def position(self) -> float:
+        """Where a time budget has the stage in its schedule; ``iteration`` follows by phases."""
+        return self.iteration + self._owed
+
+    @property
+    def turn(self) -> int:
+        """Counts iterations for what takes turns in them; under a time budget those done."""
+        return self.iteration if self.stride == 1 else self.iterations_done
+
+    def passes(self, every: int, start: int) -> bool:
+        """Whether this iteration is the first at or beyond a multiple of ``every`` after ``start``.
+
+        A multiple that a time budget leaves out counts, and one at which it stays counts once.
+        """
+        since = self.iteration - start
+        return since // every > max(since - self._advance, 0) // every
 
     def metadata(self) -> CheckpointMetadata:
         """The metadata of a checkpoint of this stage."""
@@ -132,7 +165,7 @@ class ScheduledStage(Learner):
             iteration: where to continue.
             lr_scale: further factor of all learning rates from now on.
         """
-        self.iteration = iteration
+        self.iteration, self._owed = iteration, 0.0
         self.num_rollbacks += 1
         self.lr_scale *= lr_scale
         self.optimizer.forget()
@@ -154,6 +187,7 @@ class ScheduledStage(Learner):
                 "need all their digits; decoder_precision=bfloat16 takes fewer for colours alone"
             )
         check_strategy(self.trainer)
+        self.began = time.perf_counter()
         self.seed = torch.initial_seed()
         # Lightning moves the stage to this device later.
         self.generator = torch.Generator(self.trainer.strategy.root_device)
@@ -215,12 +249,12 @@ class ScheduledStage(Learner):
                 "entered: add devrf.callbacks.GridUpscaling to the trainer's callbacks"
             )
         assert self.phase is not None
-        first, stop = self.iteration, min(self.phase.stop, self.total_iterations)
-        self._iterate(views, stop - first)
+        before, stop = self.iterations_done, min(self.phase.stop, self.total_iterations)
+        self._iterate(views, stop)
         self.loop.poll()
         means: dict[str, Tensor] = {}
-        if self.iteration > first:
-            means, losses = self.loop.metrics.take(self.iteration - first, self.loop.processes)
+        if done := self.iterations_done - before:
+            means, losses = self.loop.metrics.take(done, self.loop.processes)
             if self.iteration < stop and self.converged(losses):
                 self.skipped += stop - self.iteration
                 self.iteration = stop
@@ -232,14 +266,16 @@ class ScheduledStage(Learner):
             self._log(means)
         return means
 
-    def _iterate(self, views: Any, limit: int) -> None:
-        """Run a step's iterations, no more than ``limit``; abort if memory runs out."""
+    def _iterate(self, views: Any, stop: int) -> None:
+        """Run a step's iterations, up to ``stop``; abort if memory runs out."""
         optimizer = self.optimizers()
         assert isinstance(optimizer, LightningOptimizer)
-        count = min(self.iterations_per_step, limit)
+        count = self.iterations_per_step
         if self.trainer.max_steps > 0:
             count = min(count, self.trainer.max_steps - self.trainer.global_step)
         for _ in range(count):
+            if self.iteration >= stop:
+                return
             self.prepare()
             try:
                 self.loop.step(self, views, optimizer)
@@ -251,7 +287,15 @@ class ScheduledStage(Learner):
                     f"{f'lower {lower}, or ' if lower else ''}higher data.downscale"
                 )
                 return
-            self.iteration += 1
+            self._go_on(stop)
+
+    def _go_on(self, stop: int) -> None:
+        """Advance by the stride, to ``stop`` at most; the next phase is owed what is missing."""
+        position = self.position + self.stride
+        self._advance = min(math.floor(position), stop) - self.iteration
+        self.iteration += self._advance
+        self.skipped += self._advance - 1
+        self._owed = min(position - self.iteration, max(self.stride, 1.0))
 
     def logs(self, batch_idx: int) -> bool:
         """Whether loggers write the values of a step, which its last hook asks as well."""
@@ -267,9 +311,7 @@ class ScheduledStage(Learner):
 
     def _reseed(self) -> None:
         """Seed the generator for the next step, differently in each process."""
-        mixed = np.random.SeedSequence(
-            [self.seed, self.global_rank, self.iteration, self.num_rollbacks]
-        )
+        mixed = np.random.SeedSequence([self.seed, self.global_rank, self.turn, self.num_rollbacks])
         self.generator.manual_seed(int(mixed.generate_state(1, np.uint64)[0]))
 
     def on_train_end(self) -> None:

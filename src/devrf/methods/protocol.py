@@ -18,7 +18,7 @@ class ProtocolStage:
     Attributes:
         name: of the stage, its checkpoint, and ``stage=``.
         capture: the part of the scene that is learned from.
-        iterations: share of the method's iterations, in (0, 1].
+        iterations: share of the method's iterations, in (0, 1]; of ``schedule.seconds``, too.
         frozen: parts of the method that stay as they are; ``canonical*`` is every part whose name
             begins so.
         builds_on: the stage whose result is taken up; None begins afresh.
@@ -88,3 +88,7 @@ class Protocol:
             KeyError: there is none.
         """
         return {step.name: step for step in self.steps}[name]
+
+    def time_share(self, name: str, learned: Sequence[str]) -> float:
+        """The part of the method's seconds that is the stage's ``name``, of those ``learned``."""
+        return self[name].iterations / sum(self[other].iterations for other in learned)

@@ -131,8 +131,9 @@ class RayStage(ScheduledStage):
 
     def setup(self, stage: str) -> None:
         """Give the model what it needs of the scene, and make the optimiser."""
-        super().setup(stage)
+        # Before the clock starts: priors are read, or made as a scene's reader makes them.
         self.trainer.datamodule.provide(self.scene_model.priors)  # type: ignore[attr-defined]
+        super().setup(stage)
         if not self._ready:
             # A protocol without a stage that learns from the static set does not look at it.
             alone = self.capture == "dynamic" and self.step_of_protocol.builds_on is None

@@ -216,15 +216,14 @@ class DeformationStage(MotionStage):
     def prepare(self) -> None:
         """Update the frames' occupancy every ``occupancy_every`` iterations."""
         assert self.phase is not None
-        since = self.iteration - self.phase.start
-        if since and since % self.motion.occupancy_every == 0:
+        if self.passes(self.motion.occupancy_every, self.phase.start):
             with span("sampling"):
                 self._update_occupancy()
 
     def draw(self, batch: ParallelBatch) -> Pixels:
         """Random pixels of the batch's frame, of its views in turn or of all."""
         pools = self.active[batch.number].pools
-        return self.draw_pixels(pools[self.iteration % len(pools)])
+        return self.draw_pixels(pools[self.turn % len(pools)])
 
     @property
     def view_cycle(self) -> int:

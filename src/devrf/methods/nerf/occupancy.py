@@ -42,6 +42,7 @@ class LearnedOccupancy(StoredShape):
         """
         super().__init__()
         self.register_buffer("opacity", torch.ones(shape))
+        self._step: int | None = None  # the iteration that was followed last
 
     def occupied(self, cell: Tensor) -> Tensor | None:
         """Whether something may be in cells of row-major numbers (S,): (S,) bool; None: in all."""
@@ -68,15 +69,17 @@ class LearnedOccupancy(StoredShape):
             opacity_at: the opacity (S,) of a step at points (S, 3) of that space and times (S,) in
                 [0, 1].
         """
-        if share is None or not self.opacity.numel():
+        # A time budget may leave iterations out, or stay at one.
+        if share is None or not self.opacity.numel() or step == self._step:
             return
         if step == 0:
             self.opacity.fill_(1)
-        start = round(share * total)
-        if step < start or step % EVERY:
+        start, previous = round(share * total), (step if self._step is None else self._step)
+        self._step, previous = step, min(previous, step - 1)
+        if step < start or step // EVERY == previous // EVERY:
             return
         flat = self.opacity.view(-1)
-        if step < start + EVERY:
+        if previous // EVERY * EVERY < start:
             flat.zero_()
             looks = [torch.arange(len(flat), device=flat.device)] * FIRST
         else:

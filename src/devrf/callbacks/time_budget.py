@@ -1,0 +1,191 @@
+"""Fits a stage's schedule to a budget of wall time: ``schedule.seconds=N``.
+
+The schedule stays as it is. ``stage.iteration`` is the place in it, and all that follows from a
+place (levels, growths, decays, curricula) follows as before. What a budget changes is the
+*stride*, how far an optimiser iteration goes in the schedule: with a stride of 3 a visit of 18
+iterations takes 6, with one of 0.5 it takes 36. Every phase keeps one iteration at least.
+
+* The budget is that of the whole method. A stage has a share of it, in proportion to what its
+  protocol calls ``iterations``, among the stages that are learned.
+* The clock is the one of :class:`~devrf.callbacks.TrainingRecord`: it starts with the stage's
+  setup and stops for previews. The scene has been read by then; scores come later.
+* Before each Lightning step the stride is fitted anew, since the cost of iterations changes from
+  level to level and is not known beforehand:
+
+  stride = pace · (cost of the schedule that is left) / (seconds left − seconds to enter phases)
+
+  ``pace`` is measured, in seconds for a unit of cost, and so is what it takes to enter a phase
+  (grids that grow, a frame's occupancy and pixels). What an iteration of a phase costs beside one
+  of another is the stage's own estimate (:meth:`~devrf.engine.learner.Learner.cost`): where it is
+  wrong, levels get other shares of the time, but the end is where it should be.
+* Of several processes rank 0's clock decides.
+* A progress file holds the seconds so far: a run that was interrupted goes on with those left. What
+  it learns then is not bit for bit what it would have learned: a clock never gives the same twice.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from bisect import bisect_right
+from collections.abc import Sequence
+from itertools import accumulate
+from typing import Any
+
+from lightning import Callback, LightningModule, Trainer
+
+from devrf.callbacks.training_record import TrainingRecord
+from devrf.engine.learner import Phase
+from devrf.engine.stage import ScheduledStage
+from devrf.errors import DevrfError, expect
+from devrf.system.device import wait
+
+log = logging.getLogger(__name__)
+
+# The most of the budget that a Lightning step may take, within which the stride is the same.
+STEP_SHARE = 0.01
+# The share of the budget after which it is checked that the rest suffices.
+TRIAL_SHARE = 0.1
+# How much of an average the latest measurement is.
+LATEST = 0.3
+
+
+def running_mean(mean: float | None, value: float) -> float:
+    """``mean`` with a further ``value``; alone where there is none."""
+    return value if mean is None else mean + LATEST * (value - mean)
+
+
+class PhasesLeft:
+    """The phases of a schedule, and what is left of them from any place."""
+
+    def __init__(self, phases: Sequence[Phase]) -> None:
+        """``phases``: of the whole schedule, in order."""
+        self._stops = [phase.stop for phase in phases]
+        self._costs = [phase.cost for phase in phases]
+        whole = [phase.cost * (phase.stop - phase.start) for phase in phases]
+        self._whole = [*accumulate(whole[::-1], initial=0.0)][::-1]
+        self._once = [*accumulate(self._costs[::-1], initial=0.0)][::-1]
+
+    @classmethod
+    def of(cls, stage: ScheduledStage) -> PhasesLeft:
+        """Those of a stage that has been set up."""
+        phases, place = list[Phase](), 0
+        while place < stage.total_iterations:
+            phases.append(stage.phase_at(place))
+            place = phases[-1].stop
+        return cls(phases)
+
+    def cost(self, place: float) -> float:
+        """The cost of all iterations from a place on."""
+        number = bisect_right(self._stops, place)
+        if number == len(self._stops):
+            return 0.0
+        return self._whole[number + 1] + (self._stops[number] - place) * self._costs[number]
+
+    def after(self, place: float) -> tuple[int, float]:
+        """How many phases begin after a place, and the cost of an iteration of each."""
+        number = min(bisect_right(self._stops, place) + 1, len(self._stops))
+        return len(self._stops) - number, self._once[number]
+
+
+class TimeBudget(Callback):
+    """Has a stage end its schedule when its share of ``seconds`` is over.
+
+    It needs a :class:`~devrf.callbacks.TrainingRecord` among the trainer's callbacks, and a place
+    behind :class:`~devrf.callbacks.GridUpscaling`.
+    """
+
+    def __init__(self, seconds: float | None = None) -> None:
+        """``seconds``: for all stages of the method together; None: the schedule's iterations."""
+        expected = "more than 0, or null"
+        expect(seconds is None or 0 < seconds < math.inf, "schedule.seconds", expected, seconds)
+        self.seconds = seconds
+        self._pace: float | None = None  # seconds for a unit of cost
+        self._entering: float | None = None  # seconds to enter a phase
+        self._warm = self._checked = False
+        self._step_began = self._step_ended = 0.0
+        self._done, self._most_iterations = 0, 1
+        self._phase: Phase | None = None
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Look at the schedule and the clock."""
+        if self.seconds is None:
+            return
+        assert isinstance(pl_module, ScheduledStage)
+        callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+        self._record = next(other for other in callbacks if isinstance(other, TrainingRecord))
+        self._left, self._phase = PhasesLeft.of(pl_module), pl_module.phase
+        self._budget = self.seconds * pl_module.time_share
+        self._most_iterations = pl_module.iterations_per_step
+        pl_module.iterations_per_step = 1  # whose time is not known yet
+        self._step_ended = self._record.seconds
+
+    def on_train_batch_start(
+        self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int
+    ) -> None:
+        """Fit the stride of the coming step, and its number of iterations."""
+        if self.seconds is None:
+            return
+        assert isinstance(pl_module, ScheduledStage)
+        wait(pl_module.device)
+        self._step_began, self._done = self._record.seconds, pl_module.iterations_done
+        if pl_module.phase != self._phase:
+            self._entering = running_mean(self._entering, self._step_began - self._step_ended)
+        self._phase = pl_module.phase
+        if self._pace is not None:
+            fitted = trainer.strategy.broadcast(self._fitted(pl_module))
+            if isinstance(fitted, str):
+                raise DevrfError(fitted)
+            pl_module.stride, pl_module.iterations_per_step = fitted
+
+    def _fitted(self, stage: ScheduledStage) -> tuple[float, int] | str:
+        """Stride and iterations of the coming step; why the budget is too short, if it is."""
+        assert self._pace is not None and stage.phase is not None
+        left = self._budget - self._step_began
+        phases, once = self._left.after(stage.iteration)
+        entering = phases * (self._entering or 0.0)
+        if not self._checked and self._step_began >= TRIAL_SHARE * self._budget:
+            self._checked, least = True, entering + self._pace * once
+            if least > left:
+                return self._too_short(stage, phases, self._step_began + least)
+        whole = self._pace * self._left.cost(stage.position)
+        # Out of time, what is left gets an iteration a phase.
+        stride = whole / (left - entering) if left > entering else float(stage.total_iterations)
+        most = STEP_SHARE * self._budget / (self._pace * stage.phase.cost)
+        return stride, max(1, min(self._most_iterations, int(most)))
+
+    def _too_short(self, stage: ScheduledStage, phases: int, least: float) -> str:
+        assert self.seconds is not None
+        needed = 1.2 * least / stage.time_share
+        digits = max(0, 1 - math.floor(math.log10(needed)))
+        return (
+            f"schedule.seconds: {self.seconds:g} is too little: {self._budget:.3g} s of it are the "
+            f"{stage.name} stage's, where {phases + 1} phases with one iteration each take about "
+            f"{least:.2g} s on this machine; give {needed:.{digits}f} or more"
+        )
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Measure the step."""
+        if self.seconds is None:
+            return
+        assert isinstance(pl_module, ScheduledStage) and self._phase is not None
+        wait(pl_module.device)
+        self._step_ended, done = self._record.seconds, pl_module.iterations_done - self._done
+        if done > 0:  # none, if memory ran out
+            pace = (self._step_ended - self._step_began) / (done * self._phase.cost)
+            # The first step warms up.
+            self._pace = running_mean(self._pace if self._warm else None, pace)
+            self._warm = self._warm or pl_module.iterations_done > done
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Say what the time was enough for."""
+        if self.seconds is None or not trainer.is_global_zero:
+            return
+        assert isinstance(pl_module, ScheduledStage)
+        log.info(
+            "%s: %d iterations for the %d of its schedule, in %.1f s of %.1f",
+            *(pl_module.name, pl_module.iterations_done, pl_module.iteration),
+            *(self._record.seconds, self._budget),
+        )

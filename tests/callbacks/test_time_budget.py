@@ -1,0 +1,77 @@
+"""A schedule that is fitted to seconds, by a clock on which every iteration takes what is said."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from lightning.pytorch.callbacks import LambdaCallback
+
+from devrf.callbacks import TimeBudget, TrainingRecord
+from devrf.checkpoints.checkpoint import LoadedCheckpoint
+from devrf.errors import DevrfError
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
+from devrf.methods.devrf.deformation_stage import DeformationStage
+
+# Three frames: frames 1 and 2 are visited at each level, frame 1 for two shares.
+SCHEDULE = DeformationSchedule(levels=(Level(4, 60), Level(6, 20)), rays=16)
+# Seconds to enter a visit, and for an iteration of each level: 180 of the first, 60 of the second.
+ENTER, ITERATION = 0.2, {0: 0.01, 1: 0.03}
+WHOLE = 4 * ENTER + 180 * 0.01 + 60 * 0.03
+
+
+@pytest.fixture
+def timed(monkeypatch: pytest.MonkeyPatch, fit, rest: LoadedCheckpoint) -> Callable[..., Any]:
+    """``timed(seconds)``: the fitted stage, its seconds, iterations of each visit, last rates."""
+
+    def learn(seconds: float | None, **changes: Any) -> tuple[Any, float, Counter, dict]:
+        stage, now, visits, rates = DeformationStage(rest, SCHEDULE), [0.0], Counter(), {}
+        for name, value in changes.items():
+            setattr(stage, name, value)
+        enter = stage.enter
+
+        def slowly(phase: Any) -> None:
+            enter(phase)
+            now[0] += ENTER
+
+        def tick(trainer: Any, stage: Any, optimizer: Any) -> None:
+            visit = stage.phase.level, *stage.phase.frames
+            now[0] += ITERATION[stage.phase.level]
+            visits[visit] += 1
+            rates[visit] = optimizer.param_groups[0]["lr"]
+
+        stage.enter = slowly
+        monkeypatch.setattr(TrainingRecord, "seconds", property(lambda self: now[0]))
+        record, watch = TrainingRecord(), LambdaCallback(on_before_optimizer_step=tick)
+        fit(stage, TimeBudget(seconds), watch, record)
+        return stage, now[0], visits, rates
+
+    return learn
+
+
+@pytest.mark.parametrize("share", [0.4, 0.7, 3.0])
+def test_a_stage_ends_with_its_seconds_and_its_whole_schedule(timed, share: float) -> None:
+    stage, seconds, visits, rates = timed(share * WHOLE)
+    assert seconds == pytest.approx(share * WHOLE, rel=0.05)
+    assert stage.iteration == SCHEDULE.total(3) and stage.resolution[0] > 4
+    assert stage.record["iterations"] == visits.total() == stage.iterations_done
+    # Levels and visits keep their order and, but for what visits are entered in, their parts.
+    assert list(visits) == [(0, 1), (0, 2), (1, 1), (1, 2)]
+    assert visits[0, 1] == pytest.approx(2 * visits[0, 2], rel=0.35)
+    assert rates[1, 2] == pytest.approx(rates[0, 1] * 10**-0.25)
+
+
+def test_without_a_budget_nothing_is_fitted(timed) -> None:
+    stage, seconds, visits, _ = timed(None)
+    assert (seconds, stage.skipped) == (pytest.approx(WHOLE), 0)
+    assert dict(visits) == {(0, 1): 120, (0, 2): 60, (1, 1): 40, (1, 2): 20}
+
+
+def test_a_stage_takes_its_share_and_refuses_too_little(timed) -> None:
+    assert timed(2 * WHOLE, time_share=0.5)[1] == pytest.approx(WHOLE, rel=0.05)
+    with pytest.raises(DevrfError, match=r"schedule.seconds: 0.3 is too little: .* 4 phases"):
+        timed(0.3)
+    with pytest.raises(DevrfError, match=r"schedule.seconds: expected more than 0, or null, not 0"):
+        TimeBudget(0)
