@@ -91,12 +91,12 @@ def test_smoothing_adds_the_gradient_of_the_total_variation(
     start, grads = torch.randn(SHAPE, generator=rng, dtype=torch.float64), gradients(rng, 5)
     grads = [grad.clamp(min=0) for grad in grads]
     ours, theirs = (start.clone().requires_grad_() for _ in range(2))
-    settings = {"smoothing": 0.4, "touched_only": touched_only}
+    settings = {"smoothing": 0.4, "along_z": 0.5, "touched_only": touched_only}
     smooth = GridAdam([{"params": [ours], **settings}], lr=0.1)
     plain = GridAdam([theirs], lr=0.1)
     for grad in grads:
         more = torch.zeros_like(grad)
-        add_total_variation_gradient(theirs.detach(), more, 0.4)
+        add_total_variation_gradient(theirs.detach(), more, 0.4, along_z=0.5)
         run(plain, theirs, [grad + (more * (grad != 0) if touched_only else more)])
         run(smooth, ours, [grad])
     torch.testing.assert_close(ours, theirs)

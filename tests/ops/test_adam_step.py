@@ -47,5 +47,6 @@ def test_the_gradient_of_the_total_variation(rng: torch.Generator) -> None:
     values = peak()
     touched = torch.zeros(2, 2, 2, 1)
     touched[1, 1, 1] = 1.0
-    add_total_variation_gradient(values, touched, 0.5, touched_only=True)
-    assert touched[1, 1, 1].item() == 2.5 and touched.count_nonzero() == 1
+    add_total_variation_gradient(values, touched, 0.5, along_z=3.0, touched_only=True)
+    # 1 of each of three neighbours, of the one along z three times.
+    assert touched[1, 1, 1].item() == 3.5 and touched.count_nonzero() == 1

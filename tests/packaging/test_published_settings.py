@@ -8,6 +8,7 @@ from __future__ import annotations
 import pytest
 from hydra.utils import instantiate
 
+from devrf.geometry.box import Box
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.deformation_schedule import PAPER_LEVELS
@@ -138,20 +139,33 @@ def test_the_inward_scenes_have_the_papers_schedule_and_the_authors_bound_scale(
 
 
 @pytest.mark.parametrize(
-    ("scene", "frames", "sides", "growths", "total", "factor"),
+    ("scene", "frames", "sides", "growths", "total", "factor", "finest"),
     [
-        ("pig_toy", 50, [10, 20, 40, 80, 160], [10_000, 15_000, 20_000, 22_500], 25_000, 0.5623),
-        ("rabbit", 40, [40, 80, 160], [8000, 12_000], 13_000, 0.3162),
-        ("plant", 40, [8, 16, 32, 64, 128], [8000, 16_000, 20_000, 22_000], 24_000, 0.5623),
+        (
+            "pig_toy",
+            50,
+            [10, 20, 40, 80, 160],
+            [10_000, 15_000, 20_000, 22_500],
+            25_000,
+            0.5623,
+            178,
+        ),
+        ("rabbit", 40, [40, 80, 160], [8000, 12_000], 13_000, 0.3162, 178),
+        ("plant", 40, [8, 16, 32, 64, 128], [8000, 16_000, 20_000, 22_000], 24_000, 0.5623, 128),
     ],
 )
 def test_each_forward_scene_has_its_published_schedule(
-    composed, scene, frames, sides, growths, total, factor
+    composed, scene, frames, sides, growths, total, factor, finest
 ):
     config = composed(f"experiment=paper_{scene}", ROOT)
     schedule = instantiate(config.schedule.deformation, _convert_="all")
     assert (config.data.name, [level.side for level in schedule.levels]) == (scene, sides)
     assert (schedule.growths(frames), schedule.total(frames)) == (growths, total)
+    # 128 planes at the end, halved from level to level downwards.
+    cube = Box((-1.0,) * 3, (1.0,) * 3)
+    shapes = [cube.grid_shape(*schedule.grid(k)) for k in range(len(sides))]
+    assert [z for *_, z in shapes] == [128 // 2**k for k in reversed(range(len(sides)))]
+    assert shapes[-1] == (finest, finest, 128)
     # From growth to growth down to a tenth.
     assert schedule.learning_rate_factor(1) == pytest.approx(factor, abs=1e-4)
     assert schedule.learning_rate_factor(len(sides) - 1) == pytest.approx(0.1)

@@ -83,7 +83,7 @@ def _table(
 
 
 def add_total_variation_gradient(
-    grid: Tensor, gradient: Tensor, weight: float, *, touched_only: bool = False
+    grid: Tensor, gradient: Tensor, weight: float, along_z: float, touched_only: bool
 ) -> None:
     """As devrf.ops.adam_step.add_total_variation_gradient."""
     length = grid.shape[2] * grid.shape[3]
@@ -91,7 +91,7 @@ def add_total_variation_gradient(
     launch(
         total_variation_kernel,
         grid.numel() // max(length, 1) * blocks(length, block),
-        *(grid, gradient, length, *grid.shape[:2], weight),
+        *(grid, gradient, length, *grid.shape[:2], weight, along_z),
         TOUCHED_ONLY=touched_only,
         CHANNELS=grid.shape[3],
         WIDE=_is_wide(grid),
@@ -119,12 +119,13 @@ def total_variation_kernel(
     x,
     y,
     weight,
+    along_z,
     TOUCHED_ONLY: tl.constexpr,
     CHANNELS: tl.constexpr,
     WIDE: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """gradient += weight · Σ clamp(v − v', −1, 1) over the six neighbours.
+    """gradient += weight · Σ clamp(v − v', −1, 1) over the six neighbours, of z times ``along_z``.
 
     A program stays in one row along z: no division for each number, except by constants.
     """
@@ -142,6 +143,7 @@ def total_variation_kernel(
     j = row % y + number * 0
     slope = pull(values, at, value, CHANNELS, mask & (number + CHANNELS < length))
     slope += pull(values, at, value, -CHANNELS, mask & (number >= CHANNELS))
+    slope *= along_z
     slope += pull(values, at, value, length, mask & (j < y - 1))
     slope += pull(values, at, value, -length, mask & (j > 0))
     slope += pull(values, at, value, y * length, mask & (i < x - 1))

@@ -68,14 +68,26 @@ class Box:
         """
         return float((self.volume / voxels) ** (1 / 3))
 
-    def grid_shape(self, voxels: int) -> tuple[int, int, int]:
+    def grid_shape(
+        self, voxels: int, planes: int | None = None, aspect: float = 1.0
+    ) -> tuple[int, int, int]:
         """Grid points along (x, y, z) for about ``voxels`` cubic voxels: floor(size / s).
 
         At least two along each axis, since grid corners sit on the box's corners.
+
+        Args:
+            voxels: about how many.
+            planes: points along z, where these are given; voxels are square along x and y, then.
+            aspect: with planes, points across a unit of x to those across a unit of y.
         """
-        s = self.voxel_size(voxels)
+        width, height, _ = self.size
+        if planes is None:
+            sides = [edge / self.voxel_size(voxels) for edge in self.size]
+        else:
+            edge, wider = (width * height * planes / voxels) ** 0.5, aspect**0.5
+            sides = [width * wider / edge, height / wider / edge, planes]
         # 1e-6 is added so that a cube of 10^3 voxels has side 10 in spite of rounding.
-        x, y, z = (max(2, int(edge / s + 1e-6)) for edge in self.size)
+        x, y, z = (max(2, int(side + 1e-6)) for side in sides)
         return x, y, z
 
     def scaled(self, factor: float) -> Box:

@@ -22,7 +22,7 @@ class GridAdam(torch.optim.Optimizer):
       same memory: to make one anew takes longer than to clear the few rows that were touched.
     * ``per_voxel_lr``: None, or a tensor (X, Y, Z, 1) of factors of the learning rate.
     * ``smoothing``: weight of the total variation of each grid, whose gradient is added to that
-      of the backward pass.
+      of the backward pass; ``along_z`` times as much between neighbours along z.
     * ``touched_only``: add it only to entries that have a gradient.
 
     ``lr`` may be a tensor () on the parameters' device. :meth:`step` copies a number into one
@@ -47,6 +47,7 @@ class GridAdam(torch.optim.Optimizer):
             "skip_zero": False,
             "per_voxel_lr": None,
             "smoothing": 0.0,
+            "along_z": 1.0,
             "touched_only": False,
         }
         self.keeps_gradients = False
@@ -107,11 +108,9 @@ class GridAdam(torch.optim.Optimizer):
                 continue
             assert rate is not None
             if group["smoothing"]:
-                touched_only = group["touched_only"]
+                how = {name: group[name] for name in ("along_z", "touched_only")}
                 for values, gradient, *_ in taken:
-                    add_total_variation_gradient(
-                        values, gradient, group["smoothing"], touched_only=touched_only
-                    )
+                    add_total_variation_gradient(values, gradient, group["smoothing"], **how)
             rules = [AdamRule(rate, step, **options) for *_, step in taken]
             kept = self._keeps(group)
             adam_steps([four for *four, _ in taken], rules, clear=kept)

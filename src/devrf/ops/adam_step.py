@@ -97,7 +97,12 @@ def adam_steps(
 
 
 def add_total_variation_gradient(
-    grid: Tensor, gradient: Tensor, weight: float, *, touched_only: bool = False
+    grid: Tensor,
+    gradient: Tensor,
+    weight: float,
+    *,
+    along_z: float = 1.0,
+    touched_only: bool = False,
 ) -> None:
     """Add ``weight`` times the gradient of a grid's total variation to ``gradient`` in place.
 
@@ -110,19 +115,21 @@ def add_total_variation_gradient(
         grid: (X, Y, Z, C).
         gradient: the same shape.
         weight: factor of the penalty.
+        along_z: further factor between neighbours along z.
         touched_only: add only to entries that are not zero.
     """
     contiguous = grid.is_contiguous() and gradient.is_contiguous()
     if contiguous and (kernels := accelerated("adam", grid, gradient)):
-        kernels.add_total_variation_gradient(grid, gradient, weight, touched_only=touched_only)
+        kernels.add_total_variation_gradient(grid, gradient, weight, along_z, touched_only)
         return
     into = torch.zeros_like(gradient) if touched_only else gradient
     for axis in range(3):
         after, before = _neighbours(grid, axis)
         slope = (after - before).clamp_(-1, 1)
         into_after, into_before = _neighbours(into, axis)
-        into_after.add_(slope, alpha=weight)
-        into_before.sub_(slope, alpha=weight)
+        factor = weight * along_z if axis == 2 else weight
+        into_after.add_(slope, alpha=factor)
+        into_before.sub_(slope, alpha=factor)
     if touched_only:
         gradient += into * (gradient != 0)
 

@@ -250,7 +250,7 @@ def adam_and_variation(draw: Draw) -> Results:
     results: list[Tensor] = []
     for skip_zero in (False, True):
         grid, gradient = 2 * draw(4, 3, 5, 3), draw(4, 3, 5, 3).clamp(min=0)
-        add_total_variation_gradient(grid, gradient, 0.3, touched_only=skip_zero)
+        add_total_variation_gradient(grid, gradient, 0.3, along_z=0.5, touched_only=skip_zero)
         factors = draw(4, 3, 5, 1).abs() if skip_zero else None
         rule = AdamRule(
             draw(1)[0].abs(), 2 + draw(1)[0].abs(), (0.9, 0.99), 1e-8, skip_zero, factors

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 
+from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.methods.devrf.architecture import Architecture, fitted_to, resolved_planes
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
+from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
+from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.scenes.procedural import ProceduralForwardScene
 from devrf.scenes.scene import Scene
 
@@ -63,3 +69,21 @@ def test_a_scene_seen_from_all_around_keeps_its_numbers(tiny_scene: Scene) -> No
     assert fitted_to(tiny_scene, schedule, Architecture()) == (schedule, Architecture())
     with pytest.raises(DevrfError, match=r"field\.planes=7: planes are of forward-facing scenes"):
         fitted_to(tiny_scene, schedule, Architecture(planes=7))
+
+
+def test_planes_of_both_fields(
+    forward_scene: Scene, fit: Callable[..., Any], serve: Callable[..., SceneDataModule]
+) -> None:
+    data = serve(forward_scene)
+    schedule = CanonicalSchedule(0, 8, iterations=10, side=12, upsample_at=(), rays=16)
+    sizes, loss = Architecture(4, 16, 0, planes=7), {"color": 1.0, "tv": 1e-3}
+    rest = fit(CanonicalStage(schedule, sizes, fine_loss=loss), data=data)
+    group, across = rest.optimizer.param_groups[0], max(rest.resolution[:2])
+    assert rest.resolution[2] == 7 < across
+    # Total variation: by the planes along z, by the longer of the other sides along these.
+    assert group["smoothing"] == pytest.approx(1e-3 * across / 128 / 16 / 6)
+    assert group["smoothing"] * group["along_z"] == pytest.approx(1e-3 * 7 / 128 / 16 / 6)
+    levels = DeformationSchedule([Level(4, 1), Level(8, 1)], rays=16, planes=6)
+    motion = fit(DeformationStage(rest.result(), levels), data=data)
+    assert motion.field.shape == motion.field.box.grid_shape(8**3, planes=6)
+    assert (motion.field.shape[2], levels.grid(0)) == (6, (4**3, 3))

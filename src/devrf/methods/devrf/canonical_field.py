@@ -176,12 +176,7 @@ class CanonicalField(nn.Module):
 
     def grid_shape(self, voxels: int) -> tuple[int, int, int]:
         """Grid points along (x, y, z) for about ``voxels`` voxels."""
-        if self.planes is None:
-            return self.box.grid_shape(voxels)
-        width, height, _ = self.box.size
-        edge, wider = (width * height * self.planes / voxels) ** 0.5, self.aspect**0.5
-        across, down = int(width * wider / edge + 1e-6), int(height / wider / edge + 1e-6)
-        return max(2, across), max(2, down), self.planes
+        return self.box.grid_shape(voxels, self.planes, self.aspect)
 
     def step_length(self, step: float) -> float:
         """Length of ``step`` voxels along a ray, in units of the ray's direction.

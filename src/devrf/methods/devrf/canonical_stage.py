@@ -257,7 +257,9 @@ class CanonicalStage(VoxelStage):
         assert self.phase is not None
         searching, field = self.phase.kind == "search", self.scene_model.canonical
         shape, rays = field.density.shape, self.schedule.rays
-        smoothing = total_variation_weight(self.tv[self.phase.kind], max(shape), rays)
+        side = max(shape if field.planes is None else shape[:2])
+        smoothing = total_variation_weight(self.tv[self.phase.kind], side, rays)
+        along_z = 1.0 if field.planes is None else shape[2] / side
         per_voxel_lr = None
         if searching:
             points = field.box.grid_points(shape, field.density.values)
@@ -271,6 +273,7 @@ class CanonicalStage(VoxelStage):
                 per_voxel_lr=per_voxel_lr if grid is field.density else None,
                 skip_zero=not searching,
                 smoothing=smoothing,
+                along_z=along_z,
                 touched_only=not self.schedule.smooths_all(self.iteration),
             )
         decoder, groups = list(field.decoder.parameters()), self.optimizer.param_groups

@@ -60,12 +60,18 @@ class DeformationField(FrameField):
     """
 
     def __init__(
-        self, box: Box, clock: FrameClock, *, voxels: int, still_outside: bool = False
+        self,
+        box: Box,
+        clock: FrameClock,
+        voxels: int,
+        planes: int | None = None,
+        *,
+        still_outside: bool = False,
     ) -> None:
-        """Zero displacements of the clock's T frames, each on about ``voxels`` voxels."""
+        """Zero displacements of T frames on grids of :meth:`~devrf.geometry.box.Box.grid_shape`."""
         super().__init__(box, clock)
         self.still_outside = still_outside
-        self.frames = FrameStore(len(clock), box.grid_shape(voxels))
+        self.frames = FrameStore(len(clock), box.grid_shape(voxels, planes))
 
     @property
     def to_canonical(self) -> Tensor:
@@ -118,9 +124,9 @@ class DeformationField(FrameField):
         return before.lerp(self.to_canonical[moment.after].to(here), moment.weight)
 
     @torch.no_grad()
-    def resize(self, voxels: int) -> None:
-        """Resample every frame to about ``voxels`` voxels, trilinearly."""
-        self.frames.resize(self.box.grid_shape(voxels))
+    def resize(self, voxels: int, planes: int | None = None) -> None:
+        """Resample every frame to about ``voxels`` voxels, in ``planes`` if given, trilinearly."""
+        self.frames.resize(self.box.grid_shape(voxels, planes))
 
     def get_extra_state(self) -> dict[str, Any]:
         """Box and clock, as plain numbers, and whether nothing moves outside."""

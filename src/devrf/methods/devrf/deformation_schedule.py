@@ -102,15 +102,18 @@ class DeformationSchedule:
     Attributes:
         levels: coarse to fine.
         coarse_to_fine: False spends all shares at the finest resolution, at the base rate, each
-            frame starting from the one before it (``ablation=base``, docs/method.md#ablations).
+            frame starting from rest (``ablation=base``, docs/method.md#ablations).
         decay: factor of the learning rate from a level to the next, if its side is another one.
         rays: of a batch.
+        planes: grid points along z at the finest level, in proportion to ``side`` at the others;
+            None: voxels are cubes.
     """
 
     levels: Sequence[Level] = PAPER_LEVELS
     coarse_to_fine: bool = True
     decay: float = 10 ** (-1 / 4)
     rays: int = 8192
+    planes: int | None = None
 
     @classmethod
     def from_rows(
@@ -119,15 +122,17 @@ class DeformationSchedule:
         coarse_to_fine: bool = True,
         decay: float = 10 ** (-1 / 4),
         rays: int = 8192,
+        planes: int | None = None,
     ) -> DeformationSchedule:
         """The schedule of a config, whose levels are rows that are named ``1``, ``2`` and so on.
 
         Args:
             levels: the values of a :class:`Level` in each row; null leaves a row out, so that a
                 schedule may have fewer levels than the one that it starts from.
-            coarse_to_fine: as of the schedule.
-            decay: likewise.
-            rays: likewise.
+            coarse_to_fine: as of the schedule, like all that follows.
+            decay: …
+            rays: …
+            planes: …
 
         Raises:
             DevrfError: a row between two others is missing, or lacks its side or iterations.
@@ -142,25 +147,32 @@ class DeformationSchedule:
                     f"iterations, which row {number} has not; there are {', '.join(sorted(rows))}"
                 )
             numbered.append(Level(**row))
-        return cls(numbered, coarse_to_fine, decay, rays)
+        return cls(numbered, coarse_to_fine, decay, rays, planes)
 
     def __post_init__(self) -> None:
         key = "schedule.deformation"
         expect(len(self.levels) > 0, f"{key}.levels", "at least one", "none")
         expect(self.rays >= 1, f"{key}.rays", "at least 1", self.rays)
         expect(self.decay > 0, f"{key}.decay", "more than 0", self.decay)
+        dense = self.planes is None or self.planes >= 2
+        expect(dense, f"{key}.planes", "at least 2, or null", self.planes)
         for number, level in enumerate(self.levels, 1):
             _check_level(f"{key}.levels.{number}", level)
         first, last = self.levels[0], self.levels[-1]
         together = first.parallel_frames if self.coarse_to_fine else 1
         why = "at the first level, where a frame starts from the one before it"
         expect(together == 1, f"{key}.levels.1.parallel_frames", f"1 {why}", together)
-        expect(first.order == "forward", f"{key}.levels.1.order", f"forward {why}", first.order)
+        forward = first.order == "forward"
+        expect(forward, f"{key}.levels.1.order", f"forward {why}", first.order)
         if not self.coarse_to_fine:
             iterations = sum(level.iterations for level in self.levels)
-            finest = replace(last, order=first.order, parallel_frames=first.parallel_frames)
-            finest = replace(finest, iterations=iterations, lr_factor=None)
+            finest = replace(last, iterations=iterations, lr_factor=None, order="forward")
             object.__setattr__(self, "levels", (finest,))
+
+    def grid(self, level: int) -> tuple[int, int | None]:
+        """About how many voxels the motion grids of a level have, and their planes, if given."""
+        side, finest = self.levels[level].side, self.levels[-1].side
+        return side**3, self.planes and round(self.planes * side / finest)
 
     def learning_rate_factor(self, level: int) -> float:
         """Factor of the learning rate when a visit of ``level`` begins."""
@@ -208,7 +220,7 @@ class DeformationSchedule:
             side=row.side,
             learning_rate_factor=self.learning_rate_factor(level),
             lr_final_factor=row.lr_final_factor,
-            init_from_previous=level == 0 and visit > 0,
+            init_from_previous=self.coarse_to_fine and level == 0 and visit > 0,
             has_previous=not backward and (visit > 0 or visited == (1,)),
             backward=backward,
         )

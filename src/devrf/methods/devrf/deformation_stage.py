@@ -122,13 +122,14 @@ class DeformationStage(MotionStage):
 
     def _build_field(self) -> None:
         """The field over the canonical field's box; in contracted space, over the inner box."""
-        model, motion, levels = self.scene_model, self.motion, self.schedule.levels
+        model, motion, schedule = self.scene_model, self.motion, self.schedule
         box, clock = model.space.inner(model.box), self.scene.clock
-        voxels, still_outside = levels[0].side ** 3, box != model.box
-        model.deformation = DeformationField(box, clock, voxels=voxels, still_outside=still_outside)
-        device, finest = self.trainer.strategy.root_device, box.grid_shape(levels[-1].side ** 3)
+        still_outside, finest = box != model.box, box.grid_shape(*schedule.grid(-1))
+        coarsest = schedule.grid(0)
+        model.deformation = DeformationField(box, clock, *coarsest, still_outside=still_outside)
+        device = self.trainer.strategy.root_device
         half = motion.stored_half(device)
-        parallel = self.schedule.max_parallel_frames(-1, len(clock))
+        parallel = schedule.max_parallel_frames(-1, len(clock))
         model.deformation.frames.keep(motion.store, device, finest, half=half, parallel=parallel)
 
     def enter(self, phase: DeformationPhase) -> None:
@@ -137,7 +138,7 @@ class DeformationStage(MotionStage):
         self.active.write_back()
         if previous is not None and previous.level != phase.level:
             self._free()
-            self.field.resize(phase.side**3)
+            self.field.resize(*self.schedule.grid(phase.level))
         self._initialise(phase)
         self._activate(phase)
         self._prefetch_after(phase)

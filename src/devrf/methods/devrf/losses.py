@@ -139,7 +139,7 @@ def total_variation_weight(weight: float, side: int, rays: int) -> float:
 
     Args:
         weight: ω, the term's weight.
-        side: max(N_x, N_y, N_z) of the grid.
+        side: max(N_x, N_y, N_z) of the grid; across the planes of an NDC grid max(N_x, N_y).
         rays: R, the rays of a batch.
     """
     return weight * (side / 128) / rays / 6
