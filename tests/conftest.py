@@ -452,6 +452,7 @@ def canonical() -> Callable[..., CanonicalStage]:
         side=12,
         upsample_at=(3, 7),
         decay_iterations=6,
+        density_drop=0.0,
         rays=64,
     )
 
@@ -482,6 +483,7 @@ def learned(tiny_scene: Scene) -> tuple[CanonicalStage, Trainer]:
         iterations=120,
         side=20,
         upsample_at=(40,),
+        density_drop=0.0,
         rays=256,
     )
     stage = CanonicalStage(schedule, SMALL)

@@ -46,7 +46,7 @@ def test_canonical_rates_and_phases_are_the_schedules_at_every_step(fit, canonic
     assert [step for step, _, _ in steps] == list(range(12))
     for step, phase, rates in steps:
         assert phase == stage.schedule.phase(step)
-        factor = 0.1 ** (step / 6)
+        factor = 0.1 ** ((step - phase.start) / 6)
         assert rates == pytest.approx([0.1 * factor, 0.1 * factor, 1e-3 * factor])
 
 

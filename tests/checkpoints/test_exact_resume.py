@@ -50,6 +50,7 @@ SEARCHING = CanonicalSchedule(
     side=14,
     upsample_at=(4, 8),
     decay_iterations=6,
+    occupancy_every=5,
     rays=64,
 )
 # Three frames. Level 0: frame 1 in 0–11, frame 2 in 12–17; level 1: 18–25 and 26–29.
@@ -150,7 +151,7 @@ def learn(
 
 
 def test_the_canonical_stage_goes_on_exactly(learn) -> None:
-    # In the search, at its end, mid-level, at an upsampling, at last.
+    # In the search, at its end, before the occupancy is renewed, at an upsampling, at last.
     leaves = (1, 8, 10, 12, 19)
     assert_same(learn(canonical, *leaves), learn(canonical))
 

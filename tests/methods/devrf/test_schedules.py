@@ -57,12 +57,19 @@ def test_canonical_defaults_are_the_papers() -> None:
     assert schedule.rays == 8192
 
 
-def test_canonical_rates_fall_to_a_tenth_in_each_part() -> None:
-    factor = CanonicalSchedule().learning_rate_factor
+def test_canonical_rates_fall_to_a_tenth_in_each_part_or_begin_again_at_each_growth() -> None:
+    factor = CanonicalSchedule(restart_at_growth=False).learning_rate_factor
     assert factor(0) == factor(5000) == 1.0
     assert factor(4999) == pytest.approx(0.1 ** (4999 / 20000))
     assert factor(15000) == pytest.approx(0.1**0.5)
     assert factor(25000) == pytest.approx(0.1)
+    again = CanonicalSchedule().learning_rate_factor
+    assert again(0) == again(5000) == again(6000) == again(9000) == 1.0
+    assert again(8999) == pytest.approx(0.1 ** (999 / 20000))
+    # The authors' last rate: 0.016, forward-facing 0.025.
+    assert 0.1 * again(25000) == pytest.approx(0.0158, abs=1e-4)
+    forward = CanonicalSchedule(search_iterations=0, upsample_at=(2000, 4000, 6000, 8000))
+    assert 0.1 * forward.learning_rate_factor(20000) == pytest.approx(0.0251, abs=1e-4)
 
 
 def test_deformation_defaults_are_the_papers_inward() -> None:

@@ -28,11 +28,9 @@ class Architecture:
     Attributes:
         channels: features per voxel.
         width: units of each of the colour decoder's two hidden layers.
-        frequencies: octaves of the viewing direction that the decoder sees; 0 for the
-            direction alone.
+        frequencies: octaves of the viewing direction for the decoder; 0: the direction alone.
         alpha_init: opacity of a voxel of the radiance field before anything is learned.
-        contracted_opacity: the same of a line through the whole box, along an edge; in contracted
-            space it decides ``alpha_init`` (docs/method.md#scene-contraction).
+        contracted_opacity: of a line through the box; decides ``alpha_init`` in contracted space.
         search_alpha_init: opacity of a voxel in the coarse geometry search.
         planes: planes of an NDC grid, one behind another; None: in NDC as many as the scene's
             views tell apart (:func:`fitted_to`), elsewhere cubic voxels.

@@ -14,9 +14,9 @@ from devrf.geometry.space import Space
 # The least value of the schedule's numbers.
 LEAST = {
     **dict.fromkeys(("search_iterations", "dense_tv_iterations", "view_dependence_start"), 0),
-    "unbounded_distortion": 0,
+    **dict.fromkeys(("unbounded_distortion", "density_drop"), 0),
     **dict.fromkeys(("iterations", "decay_iterations", "rays", "min_views"), 1),
-    **dict.fromkeys(("side", "search_side", "unbounded_initial_side"), 2),
+    **dict.fromkeys(("side", "search_side", "unbounded_initial_side", "occupancy_every"), 2),
 }
 
 
@@ -42,30 +42,27 @@ class CanonicalSchedule:
     See docs/method.md#geometry-search, #radiance-field, #forward-facing and #scene-contraction.
 
     Attributes:
-        search_iterations: length of the coarse geometry search; 0, and contracted space, leave it
-            out.
+        search_iterations: of the coarse geometry; 0, and contracted space, leave it out.
         search_side: the search grid has about search_side³ voxels.
         visual_hull_init: begin with the visual hull of the static views, if they have alpha masks.
-        iterations: length of the radiance field's learning.
+        iterations: of the radiance field.
         side: the final grid has about side³ voxels.
-        upsample_at: iterations, from the search's end, at which the number of voxels doubles; it
-            starts at side³ / 2^len(upsample_at).
+        upsample_at: iterations, from the search's end, at which the number of voxels doubles.
         decay_iterations: after as many iterations the learning rates have fallen to a tenth.
+        restart_at_growth: whether a grid that has grown gets a new optimiser: the decay begins
+            again, and Adam's state is zero, the decoder's too.
+        density_drop: what raw densities are lowered by when the grid has grown.
+        occupancy_every: iterations between renewals of the occupancy; None: only at growth.
         rays: of a batch.
         min_views: cells that fewer training views have in the picture are empty from the start.
-        dense_tv_iterations: so long, from the search's end, the total variation smooths all
-            voxels; afterwards those that a batch has touched.
-        voxels_per_pixel: in forward-facing scenes, grid points for each pixel of a row or column;
-            decides ``side``.
-        view_dependence_start: so many iterations from the search's end colours do not depend on the
-            viewing direction. None: 0; in contracted space half of ``iterations``.
-        unbounded_initial_side: in contracted space the grid starts with about as many voxels
-            along an edge, and doubles at equal intervals over the first three quarters of
-            ``iterations`` in place of ``upsample_at``. None: ``upsample_at`` holds there, too.
-        unbounded_distortion: in contracted space, weight of the distortion loss from
-            ``view_dependence_start`` on; earlier it would keep whatever was guessed first.
-        crop: in forward-facing scenes, whether the growing grid gives up depths at which the static
-            views see nothing (docs/method.md#crop).
+        dense_tv_iterations: so long the total variation smooths untouched voxels, too.
+        voxels_per_pixel: forward-facing, grid points for each pixel across; decides ``side``.
+        view_dependence_start: iteration from which colours depend on the viewing direction. None:
+            0; in contracted space half of ``iterations``.
+        unbounded_initial_side: where the grid starts in contracted space, and then doubles at
+            equal intervals. None: ``upsample_at`` holds there, too.
+        unbounded_distortion: weight of the distortion loss there, from that iteration on.
+        crop: forward-facing, whether the grid gives up empty depths (docs/method.md#crop).
     """
 
     search_iterations: int = 5000
@@ -75,6 +72,9 @@ class CanonicalSchedule:
     side: float = 160
     upsample_at: Sequence[int] = (1000, 2000, 3000, 4000)
     decay_iterations: int = 20000
+    restart_at_growth: bool = True
+    density_drop: float = 1.0
+    occupancy_every: int | None = 1000
     rays: int = 8192
     min_views: int = 3
     dense_tv_iterations: int = 0
@@ -147,6 +147,8 @@ class CanonicalSchedule:
         )
 
     def learning_rate_factor(self, iteration: int) -> float:
-        """0.1^(n / decay_iterations), n from the start of the search or of the radiance field."""
+        """0.1^(n / decay_iterations), n from the start of the phase, or of the radiance field."""
         first = 0 if iteration < self.search_iterations else self.search_iterations
+        if self.restart_at_growth:
+            first = self.phase(iteration).start
         return float(0.1 ** ((iteration - first) / self.decay_iterations))

@@ -42,9 +42,8 @@ log = logging.getLogger(__name__)
 class CanonicalStage(VoxelStage):
     """Learns the canonical field from the static views (docs/method.md#canonical-stage).
 
-    First the coarse geometry (docs/method.md#geometry-search) in the box of the scene's bounds;
-    then the radiance field (docs/method.md#radiance-field) in a box around it that leaves room for
-    motion, on rays that meet the coarse geometry.
+    First the coarse geometry in the box of the scene's bounds; then the radiance field in a box
+    around it that leaves room for motion.
     """
 
     schedule: CanonicalSchedule
@@ -72,9 +71,8 @@ class CanonicalStage(VoxelStage):
             architecture: sizes of the field.
             rates: learning rates.
             sampling: how rays are sampled.
-            search_loss: weights of the loss terms in the geometry search; ``tv`` is the total
-                variation of both grids.
-            fine_loss: their weights in the radiance field.
+            search_loss: weights of the geometry search's terms; ``tv`` is that of both grids.
+            fine_loss: of the radiance field's.
             iterations_per_step: as of every :class:`VoxelStage`.
             graphs: likewise.
             decoder_precision: likewise.
@@ -160,16 +158,21 @@ class CanonicalStage(VoxelStage):
 
     def restore(self, phase: CanonicalPhase, state: dict[str, Any]) -> None:
         """Choose the pixels to learn from, and let the optimiser learn the present grids."""
-        model, searching = self.scene_model, phase.kind == "search"
-        model.settings = self.render_settings(phase)
-        views = self.scene.static.train
-        self.pool = static_pool(views, model, None if searching else model.occupancy)
+        self.scene_model.settings = self.render_settings(phase)
+        self._choose_pixels()
+        self.setup_optimizer()
+
+    def _choose_pixels(self) -> None:
+        """Those whose rays meet occupied space; in the search, all."""
+        assert self.phase is not None
+        model, searching = self.scene_model, self.phase.kind == "search"
+        occupancy = None if searching else model.occupancy
+        self.pool = static_pool(self.scene.static.train, model, occupancy)
         if not len(self.pool):
             raise DevrfError(
                 f"the field has become empty by iteration {self.iteration}: check data.background, "
                 "data.box and data.near, or lower schedule.rates.density"
             )
-        self.setup_optimizer()
 
     def _grow(self, phase: CanonicalPhase) -> None:
         """Give up what no camera sees, and give the field the resolution of ``phase``."""
@@ -183,6 +186,7 @@ class CanonicalStage(VoxelStage):
         kept = field.base_voxels / round(self.schedule.side**3)
         field.resize(round(phase.voxels * kept))
         self.update_occupancy()
+        field.density.values.data.sub_(self.schedule.density_drop)
 
     def _begin_fine(self, phase: CanonicalPhase) -> None:
         """Keep what the search found as the occupancy, and start the radiance field."""
@@ -192,10 +196,7 @@ class CanonicalStage(VoxelStage):
         self.scene_model.canonical = self._radiance_field(occupancy, phase).to(self.device)
 
     def _radiance_field(self, occupancy: Occupancy, phase: CanonicalPhase) -> CanonicalField:
-        """A new radiance field in the tight box around what is occupied, enlarged for motion.
-
-        Contracted space is not made tighter: it is unbounded.
-        """
+        """A new radiance field in the tight box around what is occupied, enlarged for motion."""
         tight = bounding_box(occupancy.mask, occupancy.box)
         if tight is None:
             raise DevrfError(
@@ -239,21 +240,16 @@ class CanonicalStage(VoxelStage):
 
     @torch.no_grad()
     def _forget_hidden(self) -> None:
-        """Of contracted space, occupy only what this phase's rays have reached.
+        """In contracted space, occupy only what this phase's rays have reached.
 
-        Most of it lies behind walls: opaque from the start, sampled by every ray, seen by none.
-        What they have reached has a second moment.
+        That has a second moment.
         """
         state = self.optimizer.state.get(self.scene_model.canonical.density.values)
         if state and not self.scene_model.space.is_linear:
             self._keep_occupied(state["square"][..., 0] > 0)
 
     def setup_optimizer(self) -> None:
-        """Give the optimiser the present grids (docs/method.md#optimiser).
-
-        In the search the learning rate of a voxel's density depends on how many views see it;
-        afterwards a voxel without gradient keeps its Adam state.
-        """
+        """Give the optimiser the present grids (docs/method.md#optimiser)."""
         assert self.phase is not None
         searching, field = self.phase.kind == "search", self.scene_model.canonical
         shape, rays = field.density.shape, self.schedule.rays
@@ -277,16 +273,22 @@ class CanonicalStage(VoxelStage):
                 touched_only=not self.schedule.smooths_all(self.iteration),
             )
         decoder, groups = list(field.decoder.parameters()), self.optimizer.param_groups
-        if [id(p) for p in decoder] != [id(p) for p in groups[2]["params"]]:
+        learns_them = [id(p) for p in decoder] == [id(p) for p in groups[2]["params"]]
+        if self.schedule.restart_at_growth or not learns_them:
             self.optimizer.replace(2, decoder)
         learned = [p for group in groups for p in group["params"]]
         self.bind(rays, [learned])
 
     def prepare(self) -> None:
-        """From the schedule's iterations on, smooth what batches touch, and learn directions."""
+        """At the schedule's iterations renew the occupancy, smooth less, and learn directions."""
         schedule, groups = self.schedule, self.optimizer.param_groups[:2]
+        every, begin = schedule.occupancy_every, schedule.search_iterations
+        begin = begin if self.iteration >= begin else 0
+        if renews := every is not None and self.passes(every, begin - every // 2):
+            self.update_occupancy()
+            self._choose_pixels()
         touched_only = not schedule.smooths_all(self.iteration)
-        changed = touched_only != groups[0]["touched_only"]
+        changed = renews or touched_only != groups[0]["touched_only"]
         for group in groups:
             group["touched_only"] = touched_only
         learns = schedule.learns_directions(self.iteration)

@@ -86,18 +86,14 @@ class DeformationSchedule:
     """The deformation stage's visits; the defaults are the paper's, inward-facing.
 
     Within a level (docs/method.md#coarse-to-fine) the frames t = 1, …, T − 1 are visited one after
-    another, each for the level's share of iterations. Frame 0 is the identity; frame 1 gets its
-    share, so that a level takes share · T iterations.
+    another, each for the level's share of iterations. Frame 0 is the identity; its share goes to
+    the frame that is visited first.
 
     Where K frames may be learned in parallel, the T frames are cut into contiguous stretches of
-    L = max(2, ⌈T / K⌉) frames, so that neighbours are never learned together. Visit j of the level,
-    0 ≤ j < L, is to the j-th frame of every stretch: frames j, j + L, j + 2L, … without frame 0.
-    An iteration is one optimiser step on all of them, each with a batch of its own, so a level
-    takes share · L iterations. With a single stretch visit 0 would be empty, and frame 1 gets its
-    share as above.
-
-    A level whose order is ``backward`` makes the same visits from the last to the first; where
-    frame 0 is alone, its share goes to the last frame.
+    L = max(2, ⌈T / K⌉) frames, so that neighbours are never learned together. Visit j, 0 ≤ j < L,
+    is to the j-th frame of every stretch: j, j + L, j + 2L, … without frame 0. An iteration is one
+    optimiser step on all of them, each with a batch of its own: a level takes share · L of them.
+    A level whose order is ``backward`` makes the same visits from the last to the first.
 
     Attributes:
         levels: coarse to fine.
@@ -126,13 +122,7 @@ class DeformationSchedule:
     ) -> DeformationSchedule:
         """The schedule of a config, whose levels are rows that are named ``1``, ``2`` and so on.
 
-        Args:
-            levels: the values of a :class:`Level` in each row; null leaves a row out, so that a
-                schedule may have fewer levels than the one that it starts from.
-            coarse_to_fine: as of the schedule, like all that follows.
-            decay: …
-            rays: …
-            planes: …
+        null leaves a row out: a schedule may have fewer levels than the one that it starts from.
 
         Raises:
             DevrfError: a row between two others is missing, or lacks its side or iterations.

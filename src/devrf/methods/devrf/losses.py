@@ -135,12 +135,8 @@ def induced_flow(
 def total_variation_weight(weight: float, side: int, rays: int) -> float:
     """ω · (side / 128) / (6R): factor of Σ clamp(v − v', −1, 1) (docs/method.md#total-variation).
 
+    R ``rays``, ω the term's ``weight``; the side is the grid's longest, in NDC across its planes.
     The optimiser adds this gradient, not autograd.
-
-    Args:
-        weight: ω, the term's weight.
-        side: max(N_x, N_y, N_z) of the grid; across the planes of an NDC grid max(N_x, N_y).
-        rays: R, the rays of a batch.
     """
     return weight * (side / 128) / rays / 6
 

@@ -60,16 +60,13 @@ class MotionSettings:
     Attributes:
         learning_rate: base rate, in ``unit`` per step: how far a voxel moves at most.
         unit: ``world`` for world units; ``box`` for the longest edge of the fields' box.
-        views: ``one`` draws a batch from one view of the frame, the views taking turns;
-            ``all`` draws it from all of them.
-        pixels: ``all`` draws from whole images; ``occupied`` from the pixels of the alpha mask
-            and those whose rays hit what the present field has moved there.
+        views: of the frame's views a batch shows ``one``, in turn, or ``all``.
+        pixels: ``all``, or ``occupied``: of the alpha mask, and where rays hit the present field.
         occupancy_every: iterations between updates of the frame's occupancy.
-        store: where the displacements of all frames are kept while one is learned: ``device``,
-            ``host``, or ``auto``: on the device if they fit there beside all else.
+        store: where frames are kept while one is learned; ``auto``: on the device if they fit.
         store_half: whether they are kept in half precision; ``auto``: on a GPU.
-        adam_state: ``fresh`` begins each visit with a fresh Adam; ``carried`` goes on, above the
-            coarsest level, with Adam's state from the visit before.
+        adam_state: of a visit ``fresh``, or ``carried`` over from the visit before, above the
+            coarsest level.
         min_rel_improvement: a visit ends early when two Lightning steps have taken less than
             this share off its loss; None goes through the whole schedule.
     """

@@ -33,14 +33,12 @@ def render(
 ) -> VoxelOutput:
     """Colours Ĉ = Σ w_i c_i + T_end · C_background and depths Σ w_i z_i / Σ w_i of rays.
 
-    Where the fields' space holds infinity, the field's colour there is what rays end in.
-
     Args:
         rays: R rays.
         field: the canonical field.
         occupancy: where something may be, in the space of the rays.
         settings: step length and thresholds.
-        background: (3,) or (R, 3) RGB behind everything, if the space does not hold infinity.
+        background: (3,) or (R, 3) RGB behind all; the field's own where the space holds infinity.
         warp: x → q = x + Δ_b(x, t), points (M, 3) to canonical space; None is the identity.
         precision: what the colour network works in.
         color_change: q → A_t(q), added to the colours' logits; None: nothing is.
