@@ -18,7 +18,7 @@ from devrf.methods.devrf.deformation_stage import DeformationStage
 # Three frames: frames 1 and 2 are visited at each level, frame 1 for two shares.
 SCHEDULE = DeformationSchedule(levels=(Level(4, 60), Level(6, 20)), rays=16)
 # Seconds to enter a visit, and for an iteration of each level: 180 of the first, 60 of the second.
-ENTER, ITERATION = 0.2, {0: 0.01, 1: 0.03}
+ENTER, ITERATION = 0.1, {0: 0.01, 1: 0.03}
 WHOLE = 4 * ENTER + 180 * 0.01 + 60 * 0.03
 
 
@@ -71,7 +71,7 @@ def test_without_a_budget_nothing_is_fitted(timed) -> None:
 
 def test_a_stage_takes_its_share_and_refuses_too_little(timed) -> None:
     assert timed(2 * WHOLE, time_share=0.5)[1] == pytest.approx(WHOLE, rel=0.05)
-    with pytest.raises(DevrfError, match=r"schedule.seconds: 0.3 is too little: .* 4 phases"):
-        timed(0.3)
+    with pytest.raises(DevrfError, match=r"schedule.seconds: 0.2 is too little: .* 4 phases"):
+        timed(0.2)
     with pytest.raises(DevrfError, match=r"schedule.seconds: expected more than 0, or null, not 0"):
         TimeBudget(0)

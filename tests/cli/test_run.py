@@ -21,7 +21,7 @@ from devrf.scenes.procedural import ProceduralScene
 TRAINING = {"seconds", "iterations", "iterations_per_second", "peak_gpu_gb", "num_rollbacks"}
 FURTHER = {"ms_ssim", "lpips", "depth_error", "flow_error"}
 NO_METRICS = "evaluation.metrics=[]"  # beside PSNR and SSIM
-MASKED = {"psnr_masked", "ssim_masked", "lpips_masked"}
+MASKED = {"psnr_masked", "ssim_masked", "lpips_masked", "ssim_covisible", "lpips_covisible"}
 CANONICAL_KEYS = {"psnr", "ssim"} | TRAINING | FURTHER | MASKED
 DEFORMATION_KEYS = CANONICAL_KEYS | {"rest_pose_psnr", "checkpoint_mb"}
 

@@ -96,6 +96,17 @@ def test_the_curriculum_adds_frames(
         assert len(views.frames[image].unique()) == frames
 
 
+def test_the_first_batches_may_see_the_centre_half_alone(ray_stage: Make, fit: Fit) -> None:
+    stage = fit(ray_stage(DNeRF(TINY), centre_crop=2, rays=2000))
+    views = stage.training_views("static")
+    for iteration, share in ((1, 2), (2, 1)):
+        stage.iteration = iteration
+        flat = stage.draw(ParallelBatch(0, [])).flat
+        for place, size in ((flat // views.width, views.height), (flat % views.width, views.width)):
+            edge = (size - size // share) // 2
+            assert (int(place.min()), int(place.max())) == (edge, size - edge - 1)
+
+
 @pytest.mark.parametrize(("step", "times"), [("joint", 3), ("dynamic", 2)])
 def test_a_batch_may_have_few_times(
     step: str, times: int, ray_stage: Make, fit: Fit, four_frames: SceneDataModule

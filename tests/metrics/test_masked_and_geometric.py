@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from devrf.metrics.geometric import depth_error, end_point_error
-from devrf.metrics.image import psnr_masked, ssim, ssim_masked, ssim_within
+from devrf.metrics.image import psnr_masked, ssim, ssim_masked, ssim_partial, ssim_within
 
 
 def test_masked_psnr_counts_the_masked_pixels_alone():
@@ -43,6 +43,25 @@ def test_ssim_within_a_mask_knows_nothing_of_what_is_beyond(rng):
     assert ssim_within(a, b, mask) == pytest.approx(inside, abs=1e-5)
     mask[9, 7] = False  # no window of 11 x 11 is without it
     assert ssim_within(a, b, mask) is None
+
+
+def test_ssim_by_partial_convolutions(rng):
+    a, b = torch.rand(2, 11, 31, 3, generator=rng)
+    whole = ssim_partial(a, b, torch.ones(11, 31, dtype=torch.bool))
+    assert whole == pytest.approx(ssim(a, b), abs=1e-5)
+    assert ssim_partial(a, b, torch.zeros(11, 31, dtype=torch.bool)) is None
+    # One pixel counts, in the middle of the first of 21 windows and at the left of the sixth.
+    mask = torch.zeros(11, 31, dtype=torch.bool)
+    mask[5, 5], a[5, 5], b[5, 5] = True, 0.2, 0.6
+    weight = torch.softmax(-0.5 * ((torch.arange(11.0) - 5) / 1.5) ** 2, dim=0)
+    expected = 15.0  # no pixel counts in the others
+    for place in range(6):
+        scale = float(11 * weight[5] * 11 * weight[5 - place])  # down the column, and along the row
+        means = 2 * scale**2 * 0.2 * 0.6 + 1e-4, scale**2 * (0.2**2 + 0.6**2) + 1e-4
+        spread = max(scale - scale**2, 0.0)  # E x² − (E x)², in units of the values' squares
+        spreads = 2 * spread * 0.2 * 0.6 + 9e-4, spread * (0.2**2 + 0.6**2) + 9e-4
+        expected += means[0] / means[1] * spreads[0] / spreads[1]
+    assert ssim_partial(a, b, mask) == pytest.approx(expected / 21, rel=1e-4)
 
 
 def test_depth_error_by_hand():

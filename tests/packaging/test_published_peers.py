@@ -1,7 +1,7 @@
 """``experiment=peer_paper`` has each peer's published numbers.
 
 Sources: the papers, and what the released configurations say (docs/methods); of Nerfies and
-HyperNeRF those of their validation rig ("vrig"), of NSFF its main branch.
+HyperNeRF those of their validation rig ("vrig"), of D-NeRF and NSFF the releases' (main branch).
 """
 
 from __future__ import annotations
@@ -26,12 +26,13 @@ PUBLISHED = {
     "dnerf": {
         "settings": TRUNK | {
             "skip": 5, "bands": 10, "initialisation": "uniform",
-            "deformation_width": 256, "deformation_depth": 8, "time_bands": 4,
+            "deformation_width": 256, "deformation_depth": 8, "time_bands": 10,
             "sampling": "hierarchical", "coarse": 64, "fine": 128, "separate_coarse": False,
         },
         "schedule": {
-            "iterations": 800_000, "rays": 500, "learning_rate": 5e-4,
-            "final_learning_rate": 5e-5, "betas": [0.9, 0.999],
+            "iterations": 800_000, "rays": 500, "learning_rate": 5e-4, "centre_crop": 500,
+            "final_learning_rate": pytest.approx(5e-4 * 0.1 ** (8 / 5), rel=1e-3),
+            "betas": [0.9, 0.999], "curriculum": 100 / 800,
         },
         "loss": {"color": 1.0, "temporal": 0.0},
     },
@@ -61,17 +62,20 @@ PUBLISHED = {
         },
         "loss": {
             "color": 1, "dynamic": 1, "neighbours": 1, "chained": 1, "cycle": 1.0,
-            "small_flow": 0.1, "smooth_space": 0.1, "smooth_time": 0.1, "depth": 0.04,
-            "flow": 0.02, "disocclusion": 0.1, "blend_entropy": 1e-3,
+            "small_flow": pytest.approx(0.1 / 128, rel=2e-3), "smooth_space": 0.1,
+            "smooth_time": 0.1, "depth": 0.04, "flow": 0.02, "disocclusion": 0.1,
+            "blend_entropy": 1e-3,
         },
     },
     "neural_volumes": {
         # Images of 512 x 334 pixels in 512 x 384; seven convolutions.
         "settings": {
-            "code": 256, "encoder_views": 3, "encoder_width": 512, "encoder_size": [384, 512],
+            "code": 256, "encoder_views": 3, "encoder_width": 512, "encoder_size": [512, 384],
             "encoder_channels": [64, 64, 128, 128, 256, 256, 256],
             "template_channels": [1024, 512, 512, 256, 256, 128, 128],
-            "warp_side": 32, "maps": 16, "warp_scale": 2 / 1024, "step": 4 / 256, "hull": False,
+            "warp": "affinemix", "warp_side": 32, "maps": 16, "identity_start": False,
+            "warp_channels": [1024, 512, 512, 256, 256], "warp_scale": 2 / 1024,
+            "step": 4 / 256, "hull": False,
         },
         "schedule": {
             "iterations": 500_000, "rays": 16 * 128**2, "times_per_batch": 16,

@@ -16,6 +16,7 @@ from devrf.methods.devrf.canonical_field import CanonicalField, look_up
 from devrf.methods.devrf.deformation_field import GridWarp
 from devrf.methods.devrf.volume_rendering import render
 from devrf.ops.dispatch import using
+from devrf.rendering import front_to_back
 from devrf.rendering import list_rendering as module
 from devrf.rendering.list_rendering import ListRenderer, render_static
 from devrf.rendering.occupancy import Occupancy
@@ -117,6 +118,32 @@ def worth(output):
 def kept(output):
     present = output.samples.present
     return slice(None) if present is None else present.nonzero()[:, 0]
+
+
+def test_front_to_back_sees_the_same_and_looks_no_further_than_it_has_to(monkeypatch):
+    world, asked = World(torch.float64, 1), []
+    with torch.no_grad():
+        expected = world.exactly()
+        world.field.density.values += 6.0  # most rays end early
+        opaque = world.exactly()
+    monkeypatch.setattr(front_to_back, "SLAB", 1)
+
+    def warp(points):
+        asked.append(len(points))
+        return world.warp(points)
+
+    scene = world.rays, world.field, world.occupancy, SETTINGS, world.behind, warp
+    seen = front_to_back.picture(*scene, world.color_change)
+    torch.testing.assert_close(seen.color, opaque.color)
+    torch.testing.assert_close(seen.depth, opaque.depth)
+    torch.testing.assert_close(1 - seen.opacity, opaque.transmittance)
+    all_looked_at = sum(asked)
+    asked.clear()
+    with torch.no_grad():
+        world.field.density.values -= 6.0
+    seen = front_to_back.picture(*scene, world.color_change)
+    torch.testing.assert_close(seen.color, expected.color)
+    assert all_looked_at < 0.7 * sum(asked)
 
 
 # How many slices the warp has: at rest, at a frame, between two.

@@ -13,6 +13,7 @@ from devrf.methods.devrf import view as module
 from devrf.rendering.output import RenderedImage
 from devrf.rendering.renderer import MIN_CHUNK, Renderer, in_chunks
 
+CPU = torch.device("cpu")
 WHITE = torch.ones(3)
 RED, BLUE = torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 0, 1])
 NEAR, FAR = 0.5, 10.0
@@ -57,8 +58,12 @@ def rays(rng):
 
 
 def test_rays_come_in_order(rays):
-    assert [len(part) for part in in_chunks(lambda some: some, rays, 300)] == [300, 300, 300, 100]
-    assert [len(part) for part in in_chunks(lambda some: some, rays[:0], 300)] == [0]
+    threads = torch.get_num_threads()
+    parts = in_chunks(lambda part: rays.origins[part], len(rays), 300, CPU)
+    assert [len(part) for part in parts] == [300, 300, 300, 100]
+    assert torch.equal(torch.cat(parts), rays.origins)
+    assert torch.get_num_threads() == threads
+    assert [len(part) for part in in_chunks(lambda part: rays[part], 0, 300, CPU)] == [0]
 
 
 @pytest.mark.parametrize(
@@ -68,15 +73,15 @@ def test_rays_come_in_order(rays):
         (RuntimeError("ours"), [512]),
     ],
 )
-def test_errors_that_smaller_chunks_do_not_prevent(rays, error, sizes):
+def test_errors_that_smaller_chunks_do_not_prevent(error, sizes):
     tried: list[int] = []
 
-    def render(some):
-        tried.append(len(some))
+    def render(part):
+        tried.append(part.stop - part.start)
         raise error
 
     with pytest.raises(type(error), match=str(error)):
-        in_chunks(render, rays, 512)
+        in_chunks(render, 512, 512, CPU)
     assert tried == sizes
 
 
@@ -84,7 +89,7 @@ def test_an_image_is_the_same_with_less_memory(rest, tiny_scene, same, monkeypat
     rays = tiny_scene.static.test.cameras.image_rays(0)
     rays = rays[torch.arange(len(rays)).repeat(2)]
     whole = Renderer(rest.model).picture(rays, 0.0, 1.0)
-    usual, tried = module.render, []
+    usual, tried = module.picture, []
 
     def render(some, *others, **named):
         tried.append(len(some))
@@ -92,7 +97,7 @@ def test_an_image_is_the_same_with_less_memory(rest, tiny_scene, same, monkeypat
             raise torch.OutOfMemoryError("CUDA out of memory.")
         return usual(some, *others, **named)
 
-    monkeypatch.setattr(module, "render", render)
+    monkeypatch.setattr(module, "picture", render)
     same(Renderer(rest.model).picture(rays, 0.0, 1.0), whole)
     assert tried == [864, 432, 432]
     assert caplog.messages[-1].startswith("out of memory: pictures are rendered 432 rays")
@@ -103,7 +108,7 @@ class Walls:
 
     box = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
     depth_limits = NEAR, FAR
-    device = torch.device("cpu")
+    device = CPU
     chunk, at_rest = 2, False
 
     def __init__(self, space=WORLD):

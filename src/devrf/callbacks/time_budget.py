@@ -27,9 +27,6 @@ from __future__ import annotations
 
 import logging
 import math
-from bisect import bisect_right
-from collections.abc import Sequence
-from itertools import accumulate
 from typing import Any
 
 from lightning import Callback, LightningModule, Trainer
@@ -55,37 +52,13 @@ def running_mean(mean: float | None, value: float) -> float:
     return value if mean is None else mean + LATEST * (value - mean)
 
 
-class PhasesLeft:
-    """The phases of a schedule, and what is left of them from any place."""
-
-    def __init__(self, phases: Sequence[Phase]) -> None:
-        """``phases``: of the whole schedule, in order."""
-        self._stops = [phase.stop for phase in phases]
-        self._costs = [phase.cost for phase in phases]
-        whole = [phase.cost * (phase.stop - phase.start) for phase in phases]
-        self._whole = [*accumulate(whole[::-1], initial=0.0)][::-1]
-        self._once = [*accumulate(self._costs[::-1], initial=0.0)][::-1]
-
-    @classmethod
-    def of(cls, stage: ScheduledStage) -> PhasesLeft:
-        """Those of a stage that has been set up."""
-        phases, place = list[Phase](), 0
-        while place < stage.total_iterations:
-            phases.append(stage.phase_at(place))
-            place = phases[-1].stop
-        return cls(phases)
-
-    def cost(self, place: float) -> float:
-        """The cost of all iterations from a place on."""
-        number = bisect_right(self._stops, place)
-        if number == len(self._stops):
-            return 0.0
-        return self._whole[number + 1] + (self._stops[number] - place) * self._costs[number]
-
-    def after(self, place: float) -> tuple[int, float]:
-        """How many phases begin after a place, and the cost of an iteration of each."""
-        number = min(bisect_right(self._stops, place) + 1, len(self._stops))
-        return len(self._stops) - number, self._once[number]
+def phases_of(stage: ScheduledStage) -> list[Phase]:
+    """All phases of a stage that has been set up, in their order."""
+    phases, place = list[Phase](), 0
+    while place < stage.total_iterations:
+        phases.append(stage.phase_at(place))
+        place = phases[-1].stop
+    return phases
 
 
 class TimeBudget(Callback):
@@ -101,11 +74,12 @@ class TimeBudget(Callback):
         expect(seconds is None or 0 < seconds < math.inf, "schedule.seconds", expected, seconds)
         self.seconds = seconds
         self._pace: float | None = None  # seconds for a unit of cost
-        self._entering: float | None = None  # seconds to enter a phase
+        self._entering: dict[str, float] = {}  # seconds to enter a phase of a kind
         self._warm = self._checked = False
         self._step_began = self._step_ended = 0.0
         self._done, self._most_iterations = 0, 1
         self._phase: Phase | None = None
+        self._phases: list[Phase] = []
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Look at the schedule and the clock."""
@@ -114,7 +88,7 @@ class TimeBudget(Callback):
         assert isinstance(pl_module, ScheduledStage)
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
         self._record = next(other for other in callbacks if isinstance(other, TrainingRecord))
-        self._left, self._phase = PhasesLeft.of(pl_module), pl_module.phase
+        self._phases, self._phase = phases_of(pl_module), pl_module.phase
         self._budget = self.seconds * pl_module.time_share
         self._most_iterations = pl_module.iterations_per_step
         pl_module.iterations_per_step = 1  # whose time is not known yet
@@ -129,9 +103,12 @@ class TimeBudget(Callback):
         assert isinstance(pl_module, ScheduledStage)
         wait(pl_module.device)
         self._step_began, self._done = self._record.seconds, pl_module.iterations_done
-        if pl_module.phase != self._phase:
-            self._entering = running_mean(self._entering, self._step_began - self._step_ended)
-        self._phase = pl_module.phase
+        phase = pl_module.phase
+        if phase is not None and phase != self._phase:
+            entering = running_mean(
+                self._entering.get(phase.kind), self._step_began - self._step_ended
+            )
+            self._phase, self._entering[phase.kind] = phase, entering
         if self._pace is not None:
             fitted = trainer.strategy.broadcast(self._fitted(pl_module))
             if isinstance(fitted, str):
@@ -141,17 +118,21 @@ class TimeBudget(Callback):
     def _fitted(self, stage: ScheduledStage) -> tuple[float, int] | str:
         """Stride and iterations of the coming step; why the budget is too short, if it is."""
         assert self._pace is not None and stage.phase is not None
-        left = self._budget - self._step_began
-        phases, once = self._left.after(stage.iteration)
-        entering = phases * (self._entering or 0.0)
+        pace, left = self._pace, self._budget - self._step_began
+        later = [phase for phase in self._phases if phase.start > stage.iteration]
+        # As long as an iteration, where no phase of the kind has been entered yet.
+        entering = sum(self._entering.get(phase.kind, pace * phase.cost) for phase in later)
         if not self._checked and self._step_began >= TRIAL_SHARE * self._budget:
-            self._checked, least = True, entering + self._pace * once
+            self._checked, least = True, entering + pace * sum(phase.cost for phase in later)
             if least > left:
-                return self._too_short(stage, phases, self._step_began + least)
-        whole = self._pace * self._left.cost(stage.position)
+                return self._too_short(stage, len(later), self._step_began + least)
+        whole = pace * sum(
+            phase.cost * max(0.0, phase.stop - max(phase.start, stage.position))
+            for phase in (stage.phase, *later)
+        )
         # Out of time, what is left gets an iteration a phase.
         stride = whole / (left - entering) if left > entering else float(stage.total_iterations)
-        most = STEP_SHARE * self._budget / (self._pace * stage.phase.cost)
+        most = STEP_SHARE * self._budget / (pace * stage.phase.cost)
         return stride, max(1, min(self._most_iterations, int(most)))
 
     def _too_short(self, stage: ScheduledStage, phases: int, least: float) -> str:

@@ -79,14 +79,21 @@ class FramePool:
     images: int
 
     @staticmethod
-    def of(views: Views) -> FramePool:
-        """All valid pixels of some views."""
+    def of(views: Views, *, centre: bool = False) -> FramePool:
+        """All valid pixels of some views; of the ``centre`` half of rows and columns, if any is."""
         assert views.frames is not None
-        everything = all_pixels(views, torch.arange(len(views), device=views.frames.device))
-        frame = views.frames[everything.image.long()]
+        images = torch.arange(len(views), device=views.frames.device)
+        pool = all_pixels(views, images)
+        if centre:
+            inside = torch.zeros(views.height, views.width, dtype=torch.bool, device=images.device)
+            top, left = views.height // 4, views.width // 4
+            inside[top : views.height - top, left : views.width - left] = True
+            middle = wanted_pixels(views, images, inside.flatten().repeat(len(views), 1))
+            pool = middle if len(middle) else pool
+        frame = views.frames[pool.image.long()]
         order = frame.argsort(stable=True)
         _, counts = torch.unique(frame, return_counts=True)
-        return FramePool(everything[order], tuple(counts.cumsum(0).tolist()), len(views))
+        return FramePool(pool[order], tuple(counts.cumsum(0).tolist()), len(views))
 
     @property
     def frames(self) -> int:

@@ -13,8 +13,8 @@ from devrf.data.batch import pixel_positions
 from devrf.data.flow import previous_images
 from devrf.errors import DevrfError, did_you_mean
 from devrf.metrics.geometric import SOLID, depth_error, end_point_error
-from devrf.metrics.image import ms_ssim, psnr_masked, ssim_masked
-from devrf.metrics.lpips import Lpips, Network, load_lpips
+from devrf.metrics.image import ms_ssim, psnr_masked, ssim_masked, ssim_partial
+from devrf.metrics.lpips import TRUNKS, Lpips, Network, load_lpips
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Views
 
@@ -65,6 +65,20 @@ def _lpips(inputs: MetricInput, mask: Tensor | None) -> float | None:
     return None if lpips is None else lpips.forward(inputs.prediction, inputs.truth, mask)
 
 
+def _ssim_covisible(inputs: MetricInput) -> float | None:
+    valid_mask = inputs.valid_mask
+    return None if valid_mask is None else ssim_partial(inputs.prediction, inputs.truth, valid_mask)
+
+
+def _lpips_covisible(inputs: MetricInput) -> float | None:
+    """DyCheck's mLPIPS: with AlexNet, and both images black where pixels are not valid."""
+    valid_mask, lpips = inputs.valid_mask, inputs.lpips
+    if valid_mask is None or lpips is None or lpips.trunk is not TRUNKS["alex"]:
+        return None
+    seen = valid_mask[..., None]
+    return lpips.forward(inputs.prediction * seen, inputs.truth * seen, valid_mask)
+
+
 def _depth_error(inputs: MetricInput) -> float | None:
     truth = inputs.views.depth
     if truth is None:
@@ -79,6 +93,8 @@ MEASURES: dict[str, Callable[[MetricInput], float | None]] = {
     "psnr_masked": lambda inputs: psnr_masked(inputs.prediction, inputs.truth, inputs.mask),
     "ssim_masked": lambda inputs: ssim_masked(inputs.prediction, inputs.truth, inputs.mask),
     "lpips_masked": lambda inputs: _lpips(inputs, inputs.mask),
+    "ssim_covisible": _ssim_covisible,
+    "lpips_covisible": _lpips_covisible,
     "depth_error": _depth_error,
     "flow_error": lambda inputs: flow_error(inputs.renderer, inputs.views, inputs.index),
 }

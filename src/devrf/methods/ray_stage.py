@@ -39,6 +39,7 @@ class RaySchedule:
         betas: of Adam.
         eps: of Adam.
         curriculum: share of a stage during which frames are added in the order of their times.
+        centre_crop: so many first iterations of a stage draw from the images' centre half alone.
         times_per_batch: for a method whose cost grows with them; of a batch of both captures the
             static images' time is one of them. None: any number.
         iterations_per_step: optimiser iterations in one Lightning step.
@@ -51,6 +52,7 @@ class RaySchedule:
     betas: Sequence[float] = (0.9, 0.999)
     eps: float = 1e-8
     curriculum: float = 0.0
+    centre_crop: int = 0
     times_per_batch: int | None = None
     rays_without_hull: int | None = None
     iterations_per_step: int = 10
@@ -63,6 +65,7 @@ class RaySchedule:
         for name in ("times_per_batch", "rays_without_hull"):
             number = getattr(self, name)
             expect(number is None or number >= 1, f"{key}.{name}", "at least 1, or null", number)
+        expect(self.centre_crop >= 0, f"{key}.centre_crop", "at least 0", self.centre_crop)
         holds, expected = 0 <= self.curriculum < 1, "0 or more, below 1"
         expect(holds, f"{key}.curriculum", expected, self.curriculum)
 
@@ -107,6 +110,7 @@ class RayStage(ScheduledStage):
             self.earlier_records = rest.metadata.records
         self.weights = counted_weights(loss, self.scene_model.losses, "ray_stage.loss")
         self.pools: list[FramePool] = []
+        self._centres: list[FramePool] = []
         self._rays = schedule.rays
 
     @property
@@ -155,6 +159,8 @@ class RayStage(ScheduledStage):
         static = [self.training_views("static")] if self.capture != "dynamic" else []
         views = static + ([self.training_views("dynamic")] if self.capture != "static" else [])
         self.pools = [FramePool.of(view_set) for view_set in views]
+        if self.schedule.centre_crop:
+            self._centres = [FramePool.of(view_set, centre=True) for view_set in views]
         self.scene_model.learn_from(views, self.weights)
         groups = self.optimizer.param_groups
         fewer = self.schedule.rays_without_hull
@@ -174,10 +180,11 @@ class RayStage(ScheduledStage):
         with span("batch"):
             rays = rays_per_rank(self._rays)
             static = round(rays * self.static_share)
-            counts = [static, rays - static] if len(self.pools) > 1 else [rays]
+            pools = self._centres if self.iteration < self.schedule.centre_crop else self.pools
+            counts = [static, rays - static] if len(pools) > 1 else [rays]
             images, flats, offset = [], [], 0
             left = self.schedule.times_per_batch
-            for pool, count in zip(self.pools, counts, strict=True):
+            for pool, count in zip(pools, counts, strict=True):
                 shown = self._shown_frames(pool)
                 image, flat = pool.draw(count, shown, self.generator, moments=left)
                 images.append(image + offset)

@@ -5,10 +5,12 @@ from __future__ import annotations
 import torch
 from kornia.metrics import ssim as kornia_ssim
 from torch import Tensor
-from torch.nn.functional import max_pool2d
+from torch.nn.functional import conv2d, max_pool2d
 from torchmetrics.functional.image import multiscale_structural_similarity_index_measure
 
-WINDOW = 11
+# Of SSIM: the window's side and Gaussian deviation in pixels; its constants for a range of 1.
+WINDOW, SIGMA = 11, 1.5
+C1, C2 = 0.01**2, 0.03**2
 # The coarsest of MS-SSIM's five scales, 1/16 of the image, must hold a whole window.
 MS_SSIM_SMALLEST = 16 * WINDOW
 
@@ -80,6 +82,40 @@ def ssim_within(prediction: Tensor, truth: Tensor, mask: Tensor) -> float | None
     padding = (WINDOW - 1) // 2 if values.shape[:2] == mask.shape else 0
     touched = max_pool2d((~mask).float()[None], WINDOW, 1, padding)[0] > 0
     return None if bool(touched.all()) else float(values[~touched].mean())
+
+
+def ssim_partial(prediction: Tensor, truth: Tensor, mask: Tensor) -> float | None:
+    """DyCheck's masked SSIM (mSSIM) of two (H, W, 3) images in [0, 1]: what ``mask`` (H, W) holds.
+
+    Windows are partial convolutions (Liu et al. 2018): along rows, then along columns, what is
+    beyond the mask counts 0, and the sum is scaled by 11 over the number of pixels that count. The
+    mean is over all windows inside the image; one without any such pixel has the similarity 1.
+    None of images smaller than a window, or where the mask is empty.
+    """
+    if min(mask.shape) < WINDOW or not bool(mask.any()):
+        return None
+    a, b = (_batched(image) for image in (prediction, truth))
+    means = (_partial_blur(image, mask) for image in (a, b, a * a, b * b, a * b))
+    mean_a, mean_b, square_a, square_b, product = means
+    variance_a = (square_a - mean_a.square()).clamp(min=0)
+    variance_b = (square_b - mean_b.square()).clamp(min=0)
+    most = (variance_a * variance_b).sqrt()
+    covariance = (product - mean_a * mean_b).clamp(-most, most)
+    alike = (2 * mean_a * mean_b + C1) * (2 * covariance + C2)
+    energy = (mean_a.square() + mean_b.square() + C1) * (variance_a + variance_b + C2)
+    return float((alike / energy).mean())
+
+
+def _partial_blur(image: Tensor, mask: Tensor) -> Tensor:
+    """Gaussian means (1, 3, H − 10, W − 10) of an image (1, 3, H, W) within ``mask`` (H, W)."""
+    away = torch.arange(WINDOW) - WINDOW // 2
+    kernel = torch.softmax(-0.5 * (away / SIGMA).square(), dim=0)
+    valid = mask[None, None].float()
+    for shape in ((1, 1, 1, WINDOW), (1, 1, WINDOW, 1)):
+        total = conv2d(image * valid, kernel.view(shape).repeat(3, 1, 1, 1), groups=3)
+        count = conv2d(valid, torch.ones(shape))
+        image, valid = WINDOW * total / count.clamp(min=1), (count > 0).float()
+    return image
 
 
 def _batched(image: Tensor) -> Tensor:

@@ -30,7 +30,7 @@ SPARE = 1.25
 
 
 class VoxelField(Protocol):
-    """A voxel radiance field, as lists are rendered of it."""
+    """A voxel radiance field, as it is rendered without its stages."""
 
     @property
     def box(self) -> Box:
@@ -49,6 +49,9 @@ class VoxelField(Protocol):
 
     def step_in_base_voxels(self, step: float) -> float:
         """δ, the length that opacities are taken over."""
+
+    def optical_depth(self, points: Tensor, delta: float) -> Tensor:
+        """τ (M,) at ``points`` (M, 3), for steps of δ base voxels."""
 
     def rgb(
         self,

@@ -5,8 +5,10 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
+from itertools import chain
 from typing import TypeVar
 
 import torch
@@ -26,6 +28,8 @@ Part = TypeVar("Part")
 
 # Smaller chunks would hardly need less memory.
 MIN_CHUNK = 256
+# Chunks that are rendered at once on a CPU: each takes memory.
+MOST_WORKERS = 8
 
 
 class Renderer:
@@ -64,9 +68,11 @@ class Renderer:
         rays, space = rays.to(self.device), self.model.space
         cropped = crop and CroppedRays.of(rays, crop, space, self.model.depth_limits[0])
         field_rays = cropped.rays if cropped else space.rays(rays)
-        image = RenderedImage.joined(
-            in_chunks(lambda part: view.render(part, background), field_rays, view.chunk)
-        )
+
+        def shown(part: slice) -> RenderedImage:
+            return view.render(field_rays[part], background)
+
+        image = RenderedImage.joined(in_chunks(shown, len(field_rays), view.chunk, self.device))
         return cropped.completed(image, background) if cropped else image
 
     def view(
@@ -93,15 +99,12 @@ class Renderer:
         if not isinstance(view, MovingView):
             return None
         rays, pixels, camera = rays.to(self.device), pixels.to(self.device), camera.to(self.device)
-        done = 0
+        field_rays = self.model.space.rays(rays)
 
-        def flow(part: Rays) -> tuple[Tensor, Tensor]:
-            nonlocal done
-            mean_and_mass = view.induced_flow(part, pixels[done : done + len(part)], camera, other)
-            done += len(part)
-            return mean_and_mass
+        def flow(part: slice) -> tuple[Tensor, Tensor]:
+            return view.induced_flow(field_rays[part], pixels[part], camera, other)
 
-        parts = in_chunks(flow, self.model.space.rays(rays), view.chunk)
+        parts = in_chunks(flow, len(field_rays), view.chunk, self.device)
         return torch.cat([mean for mean, _ in parts]), torch.cat([mass for _, mass in parts])
 
     def reach(self, position: Tensor) -> Box | None:
@@ -123,26 +126,43 @@ def points_at_depth(space: Space, rays: Rays, depth: Tensor) -> Tensor:
     return space.to_world(field_rays.at(torch.arange(len(field_rays), device=depth.device), depth))
 
 
-def in_chunks(render: Callable[[Rays], Part], rays: Rays, chunk: int) -> list[Part]:
-    """``render(rays[k:l])`` for consecutive chunks of R ``rays``, in order; at least one.
+def in_chunks(
+    render: Callable[[slice], Part], rays: int, chunk: int, device: torch.device
+) -> list[Part]:
+    """``render(slice(k, l))`` for consecutive chunks of R ``rays``, in order; at least one.
 
-    When memory runs out, this and later chunks are halved, down to ``MIN_CHUNK`` rays.
+    On a CPU several at once, each on its share of the cores: one chunk's operations are too small
+    for all of them. When memory runs out, this and later chunks are halved, down to ``MIN_CHUNK``.
     """
-    parts: list[Part] = []
-    first, chunk = 0, min(chunk, max(len(rays), 1))
-    while first < len(rays) or not parts:
-        try:
-            parts.append(render(rays[first : first + chunk]))
-            first += chunk
-            continue
-        except (RuntimeError, MemoryError) as error:
-            if chunk // 2 < MIN_CHUNK or not is_oom(error):
-                raise
-        # Outside the handler, where the error's traceback no longer holds tensors.
-        free_cache(rays.origins.device)
-        chunk //= 2
-        log.warning("out of memory: pictures are rendered %d rays at a time", chunk)
-    return parts
+    most = chunk
+
+    def parts(first: int, last: int) -> list[Part]:
+        nonlocal most
+        size = last - first
+        if size <= most:
+            try:
+                return [render(slice(first, last))]
+            except (RuntimeError, MemoryError) as error:
+                if size // 2 < MIN_CHUNK or not is_oom(error):
+                    raise
+            # Outside the handler, where the error's traceback no longer holds tensors.
+            free_cache(device)
+            most = min(most, size // 2)
+            log.warning("out of memory: pictures are rendered %d rays at a time", most)
+        return parts(first, first + size // 2) + parts(first + size // 2, last)
+
+    firsts = range(0, max(rays, 1), chunk)
+    lasts = [min(first + chunk, rays) for first in firsts]
+    threads = torch.get_num_threads()
+    workers = min(threads, len(firsts), MOST_WORKERS) if device.type == "cpu" else 1
+    if workers == 1:
+        return list(chain.from_iterable(map(parts, firsts, lasts)))
+    share = partial(torch.set_num_threads, threads // workers)
+    try:
+        with ThreadPoolExecutor(workers, initializer=share) as pool:
+            return list(chain.from_iterable(pool.map(parts, firsts, lasts)))
+    finally:
+        torch.set_num_threads(threads)  # threads that start later take the last that was set
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -80,6 +80,62 @@ def most_steps(box: Box, *, step: float, near: float, far: float) -> int:
     return int(min(far - near, box.diagonal) / step) + 2
 
 
+@dataclass(frozen=True)
+class Segments:
+    """Segments of rays that pass near something: ascending by ray, then front to back.
+
+    Attributes:
+        ray: (M,) int64, the ray of each.
+        start: (M,) int64, the number of its first sample on that ray.
+        length: samples of a segment; the last of a ray may end behind the box.
+        entry: (R,) the distance of each ray's first sample.
+        count: (R,) int64 each ray's samples up to its exit.
+        step: the distance between samples.
+    """
+
+    ray: Tensor
+    start: Tensor
+    length: int
+    entry: Tensor
+    count: Tensor
+    step: float
+
+    def __getitem__(self, index: Tensor) -> Segments:
+        """The segments at ascending positions ``index`` (K,)."""
+        ray, start = self.ray.index_select(0, index), self.start.index_select(0, index)
+        return replace(self, ray=ray, start=start)
+
+    def samples(self, rays: Rays, occupancy: Occupancy) -> Samples:
+        """Their samples in occupied cells."""
+        offset = torch.arange(self.length, device=self.ray.device)
+        number = (self.start[:, None] + offset).reshape(-1)
+        ray = self.ray.repeat_interleave(self.length)
+        distance = self.entry.index_select(0, ray).add_(number, alpha=self.step)
+        points = rays.at(ray, distance)
+        occupied = occupancy.at(points) & (number < self.count.index_select(0, ray))
+        return Samples(ray, distance, points, len(rays))[occupied.nonzero()[:, 0]]
+
+
+@torch.no_grad()
+def segments_near(
+    rays: Rays, box: Box, occupancy: Occupancy, *, step: float, near: float, far: float
+) -> Segments:
+    """The segments of R rays, between entry into the box and exit, that pass near something.
+
+    ``step`` is in units of the rays' directions; nothing is before ``near`` or behind ``far``.
+    """
+    entry, count = steps_through(rays, box, step=step, near=near, far=far)
+    length = max(1, int(2 * _reach(rays, occupancy) / step))
+    segments = (count + length - 1) // length
+    ray = torch.repeat_interleave(segments)
+    first = segments.cumsum(0) - segments
+    start = torch.arange(len(ray), device=ray.device).sub_(first.index_select(0, ray))
+    start *= length
+    middle = entry.index_select(0, ray) + step * (start + (length - 1) / 2)
+    found = _near(rays, ray, middle, occupancy).nonzero()[:, 0]
+    return Segments(ray, start, length, entry, count, step)[found]
+
+
 @torch.no_grad()
 def march(
     rays: Rays, box: Box, occupancy: Occupancy, *, step: float, near: float, far: float
@@ -87,25 +143,11 @@ def march(
     """Samples every ``step`` along rays between their entry into the box and their exit.
 
     Empty space is skipped in two passes: first whole segments of a ray, then single samples.
-    ``step`` is in units of the rays' directions; nothing is sampled before ``near`` or behind
-    ``far``. The samples in occupied cells are returned; the k-th of a ray is at entry + k·step.
+    The samples in occupied cells are returned; the k-th of a ray is at entry + k·step.
+    Arguments as for :func:`segments_near`.
     """
-    entry, count = steps_through(rays, box, step=step, near=near, far=far)
-    per_segment = max(1, int(2 * _reach(rays, occupancy) / step))
-    segments = (count + per_segment - 1) // per_segment
-    ray = torch.repeat_interleave(segments)
-    first = segments.cumsum(0) - segments
-    start = torch.arange(len(ray), device=ray.device).sub_(first.index_select(0, ray))
-    start *= per_segment
-    middle = entry.index_select(0, ray) + step * (start + (per_segment - 1) / 2)
-    near_occupied = _near(rays, ray, middle, occupancy).nonzero()[:, 0]
-    ray, start = ray.index_select(0, near_occupied), start.index_select(0, near_occupied)
-    number = (start[:, None] + torch.arange(per_segment, device=ray.device)).reshape(-1)
-    ray = ray.repeat_interleave(per_segment)
-    distance = entry.index_select(0, ray).add_(number, alpha=step)
-    points = rays.at(ray, distance)
-    occupied = occupancy.at(points) & (number < count.index_select(0, ray))
-    return Samples(ray, distance, points, len(rays))[occupied.nonzero()[:, 0]]
+    limits = {"step": step, "near": near, "far": far}
+    return segments_near(rays, box, occupancy, **limits).samples(rays, occupancy)
 
 
 def _reach(rays: Rays, occupancy: Occupancy) -> float:

@@ -93,12 +93,13 @@ def test_forward_facing_and_without_coarse_to_fine() -> None:
     forward = DeformationSchedule(with_level(2, iterations=200), rays=4096)
     assert forward.total(40) == 24000
     assert forward.growths(40) == [8000, 16000, 20000, 22000]
-    # Every share goes to the finest grid.
-    schedule = DeformationSchedule(coarse_to_fine=False)
+    # Every share goes to the finest grid, where each frame starts from the one before it.
+    schedule = DeformationSchedule(with_level(5, parallel_frames=4), coarse_to_fine=False)
     phases = deformation_phases(schedule, 50)
     assert schedule.total(50) == 25000 and schedule.growths(50) == []
     assert {(p.side, p.level, p.learning_rate_factor) for p in phases} == {(160, 0, 1.0)}
     assert [p.frames for p in phases] == [(k,) for k in range(1, 50)]
+    assert [p.init_from_previous for p in phases] == [False] + [True] * 48
 
 
 def course(schedule: DeformationSchedule, frames: int) -> list[tuple[Any, ...]]:

@@ -20,13 +20,13 @@ from devrf.scenes.scene import Capture, Scene
 
 TINY = NeuralVolumesSettings(
     code=4, encoder_views=2, encoder_size=(16, 16), encoder_channels=(4, 4, 4), encoder_width=8,
-    template_channels=(8, 8, 8), warp_side=4, warp_width=4, density_scale=10.0, step=0.2,
+    template_channels=(8, 8, 8), warp_side=4, warp_channels=(4, 4), density_scale=10.0, step=0.2,
     hull=True, occupancy_side=8,
 )  # fmt: skip
 LOSS = {"color": 1.0, "kl": 1e-5, "opacity_prior": 1e-4, "tv": 1e-4}
 
 
-@pytest.mark.parametrize(("warp", "hull"), [("conv", False), ("affine", True)])
+@pytest.mark.parametrize(("warp", "hull"), [("conv", False), ("affinemix", True)])
 def test_it_learns(
     warp: Any, hull: bool, ray_stage: Callable[..., RayStage], fit: Callable[..., RayStage]
 ) -> None:
@@ -39,7 +39,7 @@ def test_it_learns(
     model = NeuralVolumes(replace(TINY, warp=warp, maps=2, hull=hull))
     sizes = {"iterations": 60, "rays": 128, "iterations_per_step": 20, "times_per_batch": 2}
     fit(ray_stage(model, loss=LOSS, learning_rate=3e-3, **sizes), Note())
-    assert len(losses) == 3 and losses[-1] < 0.7 * losses[0]
+    assert len(losses) == 3 and losses[-1] < 0.8 * losses[0]
 
 
 def test_a_frame_looks_the_same_by_its_images_and_by_its_stored_code(

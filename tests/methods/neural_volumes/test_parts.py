@@ -12,7 +12,7 @@ from devrf.errors import DevrfError
 from devrf.methods.neural_volumes.capture import cameras_of_every_frame
 from devrf.methods.neural_volumes.model import NeuralVolumes
 from devrf.methods.neural_volumes.networks import (
-    AffineWarp,
+    AffineMixWarp,
     ConvWarp,
     TimeEncoder,
     doubling,
@@ -34,7 +34,7 @@ def test_a_template_has_four_values_for_each_of_two_to_the_levels_cubed_voxels()
     model = NeuralVolumes(
         NeuralVolumesSettings(
             code=5, encoder_views=1, encoder_size=(4, 4), encoder_channels=(2,), encoder_width=3,
-            template_channels=(8, 4, 4, 2), warp_side=4, warp_width=2,
+            template_channels=(8, 4, 4, 2), warp_side=4,
         )
     )  # fmt: skip
     volumes = model.decoded(torch.randn(3, 5))
@@ -46,10 +46,17 @@ def test_a_template_has_four_values_for_each_of_two_to_the_levels_cubed_voxels()
 
 def test_published_sizes() -> None:
     with torch.device("meta"):
-        model = NeuralVolumes()
-    # Three cameras of 256 channels at 3 x 4 places: 3 x 3072 numbers.
+        model, by_conv = NeuralVolumes(), NeuralVolumes(NeuralVolumesSettings(warp="conv"))
+    # Three cameras of 256 channels at 4 x 3 places: 3 x 3072 numbers.
     assert model.encoder.joined[0].in_features == 3 * 3072
-    assert (model.template.side, model.warp.decoder.side) == (128, 32)
+    assert isinstance(model.warp, AffineMixWarp) and isinstance(by_conv.warp, ConvWarp)
+    for decoder, side, end in (
+        (model.template, 128, [128, 128, 4]),
+        (by_conv.warp.decoder, 32, [3]),
+    ):
+        layers = [k for k in decoder.modules() if isinstance(k, torch.nn.ConvTranspose3d)]
+        assert [1024] + [k.out_channels for k in layers] == [1024, 512, 512, 256, 256, *end]
+        assert decoder.side == side
 
 
 def test_a_doubled_volume_begins_without_a_checkerboard() -> None:
@@ -80,12 +87,23 @@ def test_cameras_that_miss_a_frame_are_not_encoded(tiny_scene: Scene) -> None:
 
 def test_warps_begin_next_to_the_identity() -> None:
     code = torch.randn(2, 6)
-    settings = NeuralVolumesSettings(code=6, warp_side=8, warp_width=4, maps=3)
-    for warp in (ConvWarp(settings), AffineWarp(settings)):
+    settings = NeuralVolumesSettings(
+        code=6, warp_side=8, maps=3, identity_start=True, warp_channels=(4, 4, 4)
+    )
+    for warp in (ConvWarp(settings), AffineMixWarp(settings)):
         found = warp(code)
         torch.testing.assert_close(
             found, identity_grid(8).expand_as(found), atol=0.02, rtol=0, msg=type(warp).__name__
         )
+
+
+def test_maps_begin_at_the_middle_unless_asked_and_their_weights_hold_beyond_the_grid() -> None:
+    settings, code = NeuralVolumesSettings(code=6, warp_side=4, maps=1), torch.zeros(1, 6)
+    assert AffineMixWarp(settings)(code).abs().max() == 0
+    begun = AffineMixWarp(replace(settings, identity_start=True))
+    with torch.no_grad():
+        begun.shift[-1].bias[:] = 30  # by 3: all of the cube is led beyond the grid
+    torch.testing.assert_close(begun(code), identity_grid(4)[None] - 3, atol=1e-3, rtol=0)
 
 
 def test_the_identity_warp_leaves_a_template_where_it_is(rng: torch.Generator) -> None:
@@ -161,7 +179,7 @@ def test_the_total_variation_of_log_opacity() -> None:
     [
         ("encoder_size", (60, 64)),  # no multiples of 128
         ("template_channels", ()),
-        ("warp_side", 12),
+        ("warp_channels", (8, 0)),
         ("step", 0.0),
         ("encoder_views", 0),
     ],

@@ -13,6 +13,8 @@ from devrf.methods.nerf.samples import volume_render
 from devrf.methods.nsff.fields import BACKWARD, FORWARD
 from devrf.methods.nsff.model import NSFF
 from devrf.methods.nsff.renders import Renders
+from devrf.rendering.view import MovingView
+from devrf.scenes.scene import Scene
 
 Compared = Callable[..., Renders]
 
@@ -76,6 +78,29 @@ def test_a_translation_is_chained(placed: NSFF, batch: RayBatch, compared: Compa
     back = after.dynamic.flow[:, BACKWARD]
     torch.testing.assert_close(after.moved + back, torch.zeros_like(back), atol=1e-5, rtol=0)
     assert (further.frame == 2).all() and not replace(renders, step=1).chained().exists.any()
+
+
+def test_what_is_dynamic_moves_in_pictures_frame_by_frame(
+    placed: NSFF, batch: RayBatch, tiny_scene: Scene
+) -> None:
+    """From the last frame of three back by half a frame, one, and two; a pixel is seen alike."""
+    move(placed, (0.05, 0.0, -0.02), (-0.05, 0.0, 0.02))
+    camera, step = tiny_scene.dynamic.train.cameras[[2]], torch.tensor([-0.05, 0.0, 0.02])
+    view, rays, pixels = placed.at(1.0), batch.rays[:3], batch.pixel[:3]
+    assert isinstance(view, MovingView)
+    for v in (1.0, 0.0):
+        share(placed, v)
+        for time, steps in ((0.75, 0.5), (0.5, 1.0), (0.0, 2.0)):
+            out = placed.render_rays(rays, torch.ones(3), torch.zeros(3))
+            shift = v * steps * step * placed.placement.half_edge
+            seen, _ = camera.project_into(0, placed.placement.world(out.points) + shift)
+            weight, ray = (out.blend.dynamic + out.blend.static)[:, None], out.samples.ray
+            total = torch.zeros(3, 2).index_add(0, ray, weight * (seen - pixels[ray]))
+            mass = torch.zeros(3, 1).index_add(0, ray, weight)
+            flow, opacity = view.induced_flow(rays, pixels, camera, time)
+            torch.testing.assert_close(flow, total / mass, atol=1e-3, rtol=1e-3)
+            torch.testing.assert_close(opacity, mass[:, 0])
+            assert (flow.norm(dim=1) > 0.1).all() == bool(v)
 
 
 def test_one_neighbour_is_at_either_side_and_exists(

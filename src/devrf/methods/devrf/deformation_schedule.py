@@ -98,7 +98,7 @@ class DeformationSchedule:
     Attributes:
         levels: coarse to fine.
         coarse_to_fine: False spends all shares at the finest resolution, at the base rate, each
-            frame starting from rest (``ablation=base``, docs/method.md#ablations).
+            frame starting from the one before it (``ablation=base``, docs/method.md#ablations).
         decay: factor of the learning rate from a level to the next, if its side is another one.
         rays: of a batch.
         planes: grid points along z at the finest level, in proportion to ``side`` at the others;
@@ -152,11 +152,11 @@ class DeformationSchedule:
         together = first.parallel_frames if self.coarse_to_fine else 1
         why = "at the first level, where a frame starts from the one before it"
         expect(together == 1, f"{key}.levels.1.parallel_frames", f"1 {why}", together)
-        forward = first.order == "forward"
-        expect(forward, f"{key}.levels.1.order", f"forward {why}", first.order)
+        expect(first.order == "forward", f"{key}.levels.1.order", f"forward {why}", first.order)
         if not self.coarse_to_fine:
             iterations = sum(level.iterations for level in self.levels)
-            finest = replace(last, iterations=iterations, lr_factor=None, order="forward")
+            finest = replace(last, order=first.order, parallel_frames=first.parallel_frames)
+            finest = replace(finest, iterations=iterations, lr_factor=None)
             object.__setattr__(self, "levels", (finest,))
 
     def grid(self, level: int) -> tuple[int, int | None]:
@@ -210,7 +210,7 @@ class DeformationSchedule:
             side=row.side,
             learning_rate_factor=self.learning_rate_factor(level),
             lr_final_factor=row.lr_final_factor,
-            init_from_previous=self.coarse_to_fine and level == 0 and visit > 0,
+            init_from_previous=level == 0 and visit > 0,
             has_previous=not backward and (visit > 0 or visited == (1,)),
             backward=backward,
         )

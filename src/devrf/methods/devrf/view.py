@@ -18,6 +18,7 @@ from devrf.methods.devrf.volume_rendering import render
 from devrf.ops.compositing import sum_by_ray
 from devrf.ops.dispatch import triton_runs
 from devrf.ops.trilinear import resample
+from devrf.rendering.front_to_back import picture
 from devrf.rendering.list_rendering import ListRenderer
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import ColorChange, RenderedImage
@@ -25,7 +26,7 @@ from devrf.rendering.sampling import RenderSettings
 
 # Rays at once: on a CPU what its caches hold (in unbounded scenes a ray has tens of samples to
 # colour), on a GPU what keeps it busy and fits.
-ON_CPU, UNBOUNDED_ON_CPU, ON_GPU, IN_LISTS = 8192, 1024, 2**15, 2**18
+ON_CPU, UNBOUNDED_ON_CPU, ON_GPU, IN_LISTS = 8192, 4096, 2**15, 2**18
 
 
 def in_lists(space: Space, field: CanonicalField) -> bool:
@@ -100,7 +101,7 @@ class DeVRFView:
             shown = self.displacement, background, color_change
             return self.lists.picture(rays, occupancy, *shown)
         scene = self.canonical, occupancy, self.settings, background, self._warp
-        return RenderedImage.of(render(rays, *scene, color_change=color_change))
+        return picture(rays, *scene, color_change)
 
     @torch.no_grad()
     def induced_flow(

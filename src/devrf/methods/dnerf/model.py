@@ -44,17 +44,17 @@ class TranslationField(nn.Module):
 
 @dataclass(frozen=True)
 class DNeRFSettings(FieldSettings):
-    """Sizes and sampling; the defaults are the published ones (docs/methods/dnerf.md).
+    """Sizes and sampling; the defaults are those of the release (docs/methods/dnerf.md).
 
     Attributes:
         deformation_width: units of each layer of the deformation.
         deformation_depth: layers of the deformation.
-        time_bands: octaves of times: 4 in the paper, 10 in the released code.
+        time_bands: octaves of times: 10 in the release, 4 in the paper.
     """
 
     deformation_width: int = 256
     deformation_depth: int = 8
-    time_bands: int = 4
+    time_bands: int = 10
 
 
 class DNeRF(DeformableField):

@@ -16,7 +16,12 @@ from devrf.methods.nerf.occupancy import OccupancyFrames
 from devrf.methods.nerf.placed_model import PlacedModel, RayView
 from devrf.methods.nerf.samples import accumulated
 from devrf.methods.neural_volumes.capture import check_scene, encoder_images
-from devrf.methods.neural_volumes.networks import AffineWarp, ConvWarp, TimeEncoder, VolumeDecoder
+from devrf.methods.neural_volumes.networks import (
+    AffineMixWarp,
+    ConvWarp,
+    TimeEncoder,
+    VolumeDecoder,
+)
 from devrf.methods.neural_volumes.settings import NeuralVolumesSettings
 from devrf.methods.neural_volumes.volumes import (
     Volumes,
@@ -53,7 +58,7 @@ class NeuralVolumes(PlacedModel):
         with torch.no_grad():
             assert self.template.output.bias is not None
             self.template.output.bias[3] = math.log(math.expm1(math.log(2) / s.density_scale))
-        self.warp: ConvWarp | AffineWarp = ConvWarp(s) if s.warp == "conv" else AffineWarp(s)
+        self.warp = ConvWarp(s) if s.warp == "conv" else AffineMixWarp(s)
         self.register_buffer("images", torch.zeros(0, dtype=torch.uint8), persistent=False)
         self.register_buffer("codes", torch.zeros(1, s.code))
         self.register_state_dict_pre_hook(_keep_codes)  # type: ignore[no-untyped-call]

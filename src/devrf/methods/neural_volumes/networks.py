@@ -7,6 +7,7 @@ from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import grid_sample
 
 from devrf.methods.neural_volumes.settings import NeuralVolumesSettings
 
@@ -106,7 +107,7 @@ class TimeEncoder(nn.Module):
 
 # A quaternion of this length or less counts as shorter than one: 0 is no rotation.
 LEAST_NORM = 1e-5**0.5
-# So small are the last layers of the affine maps at first: next to the identity.
+# So small are the last layers of affine maps that begin next to the identity.
 SMALL = 1e-5
 
 
@@ -134,11 +135,11 @@ class ConvWarp(nn.Module):
         return position
 
 
-class AffineWarp(nn.Module):
+class AffineMixWarp(nn.Module):
     """A mixture of affine maps A_k(x) = s_k ⊙ R(q_k)(x − 0.1 t_k).
 
-    The field is Σ w_k(A_k x) A_k x / Σ w_k(A_k x), with the weights w_k on a grid
-    (docs/methods/neural_volumes.md#warp). s_k = 1 + the network's output.
+    The field is Σ w_k(A_k x) A_k x / Σ w_k(A_k x), with the weights w_k on a grid, whose border
+    holds for all that is beyond (docs/methods/neural_volumes.md#warp).
     """
 
     grid: Tensor
@@ -147,23 +148,30 @@ class AffineWarp(nn.Module):
         super().__init__()
         code, side, maps = settings.code, settings.warp_side, settings.maps
         self.side, self.maps = side, maps
-        self.scale, self.rotation, self.shift = (
-            _small_network(code, 128, outputs * maps) for outputs in (3, 4, 3)
+        self.scale, self.rotation, self.shift, self.weight = (
+            nn.Sequential(
+                xavier(nn.Linear(code, width)),
+                nn.LeakyReLU(LEAK),
+                xavier(nn.Linear(width, outputs * maps), 1.0),
+            )
+            for width, outputs in ((128, 3), (128, 4), (128, 3), (64, side**3))
         )
-        first, last = xavier(nn.Linear(code, 64)), xavier(nn.Linear(64, maps * side**3), 1.0)
-        self.weight = nn.Sequential(first, nn.LeakyReLU(LEAK), last)
+        if settings.identity_start:
+            for last in (self.scale[-1], self.rotation[-1], self.shift[-1]):
+                nn.init.uniform_(last.weight, -SMALL, SMALL)  # type: ignore[arg-type]
+            nn.init.ones_(self.scale[-1].bias)  # type: ignore[arg-type]
         self.register_buffer("grid", identity_grid(side), persistent=False)
 
     def forward(self, code: Tensor) -> Tensor:
         """Positions (M, 3, side, side, side) in the template, for codes (M, code)."""
         count, side = len(code), self.side
-        scale = 1 + self.scale(code).view(count, self.maps, 3, 1)
+        scale = self.scale(code).view(count, self.maps, 3, 1)
         rotation = rotation_matrices(self.rotation(code).view(count, self.maps, 4))
         shift = 0.1 * self.shift(code).view(count, self.maps, 3, 1)
         moved = scale * (rotation @ (self.grid.flatten(1) - shift))  # (M, K, 3, side³)
         weight = self.weight(code).exp().view(count * self.maps, 1, side, side, side)
         place = moved.transpose(2, 3).reshape(count * self.maps, side, side, side, 3)
-        mixing = nn.functional.grid_sample(weight, place, align_corners=True)
+        mixing = grid_sample(weight, place, padding_mode="border", align_corners=True)
         mixing = mixing.view(count, self.maps, 1, -1)
         mixed: Tensor = (mixing * moved).sum(dim=1) / mixing.sum(dim=1).clamp(min=1e-3)
         return mixed.view(count, 3, side, side, side)
@@ -179,10 +187,3 @@ def rotation_matrices(quaternion: Tensor) -> Tensor:
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ]
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
-
-
-def _small_network(code: int, width: int, outputs: int) -> nn.Sequential:
-    last = nn.Linear(width, outputs)
-    nn.init.uniform_(last.weight, -SMALL, SMALL)
-    nn.init.zeros_(last.bias)
-    return nn.Sequential(xavier(nn.Linear(code, width)), nn.LeakyReLU(LEAK), last)

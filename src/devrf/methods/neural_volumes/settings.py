@@ -20,11 +20,13 @@ class NeuralVolumesSettings(CheckedSettings):
         encoder_channels: of each convolution, which halves the image.
         encoder_width: units of the layer that joins the cameras.
         template_channels: of each level, from 1³ on; the volume has 2^levels voxels along an edge.
-        warp: ``conv`` (a grid of displacements) or ``affine`` (a mixture of affine maps).
-        warp_side: grid points of the warp along an edge, a power of two.
-        warp_width: channels of each level (conv).
+        warp: ``affinemix`` (a mixture of affine maps) or ``conv`` (a grid of displacements).
+        warp_side: grid points of the warp along an edge (affinemix).
+        maps: how many affine maps are mixed (affinemix).
+        identity_start: whether the maps begin next to the identity; else, as published, with
+            random scales around 0 (affinemix).
+        warp_channels: of each level, from 1³ on; the grid has 2^levels points an edge (conv).
         warp_scale: displacement for an output of 1 (conv); the cube's edge is 2.
-        maps: how many affine maps are mixed (affine).
         density_scale: opacity per unit length of a softplus of 1, in the same unit.
         step: between samples, in the same unit.
         hull: whether what is outside the visual hull of each frame's masks is left out, which the
@@ -34,34 +36,29 @@ class NeuralVolumesSettings(CheckedSettings):
 
     code: int = 256
     encoder_views: int = 3
-    encoder_size: Sequence[int] = (384, 512)
+    encoder_size: Sequence[int] = (512, 384)
     encoder_channels: Sequence[int] = (64, 64, 128, 128, 256, 256, 256)
     encoder_width: int = 512
     template_channels: Sequence[int] = (1024, 512, 512, 256, 256, 128, 128)
-    warp: Literal["conv", "affine"] = "conv"
+    warp: Literal["affinemix", "conv"] = "affinemix"
     warp_side: int = 32
-    warp_width: int = 128
-    warp_scale: float = 2 / 1024
     maps: int = 16
+    identity_start: bool = False
+    warp_channels: Sequence[int] = (1024, 512, 512, 256, 256)
+    warp_scale: float = 2 / 1024
     density_scale: float = 1.0
     step: float = 4 / 256
     hull: bool = False
     occupancy_side: int = 128
 
     def __post_init__(self) -> None:
-        self.check_least(1, "code", "encoder_views", "encoder_width", "warp_width", "maps")
-        self.check_least(2, "occupancy_side")
+        self.check_least(1, "code", "encoder_views", "encoder_width", "maps")
+        self.check_least(2, "occupancy_side", "warp_side")
         for name in ("density_scale", "step", "warp_scale"):
             self.check(name, getattr(self, name) > 0, "more than 0")
-        for name in ("encoder_channels", "template_channels"):
+        for name in ("encoder_channels", "template_channels", "warp_channels"):
             channels = getattr(self, name)
             self.check(name, channels and min(channels) >= 1, "one or more numbers above 0")
-        side, multiple = self.warp_side, 2 ** len(self.encoder_channels)
-        self.check("warp_side", side >= 2 and not side & (side - 1), "a power of two")
+        multiple = 2 ** len(self.encoder_channels)
         fits = [edge >= multiple and edge % multiple == 0 for edge in self.encoder_size]
         self.check("encoder_size", fits == [True, True], f"two multiples of {multiple}")
-
-    @property
-    def warp_channels(self) -> list[int]:
-        """Of each level of the convolutional warp, from 1³ on."""
-        return [self.warp_width] * (self.warp_side.bit_length() - 1)

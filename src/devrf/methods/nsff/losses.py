@@ -60,9 +60,10 @@ def cycle(r: Renders) -> Tensor:
 
 
 def small_flow(r: Renders) -> Tensor:
-    """‖Σ sg(w) f‖₁ of the rendered flow, both ways."""
-    weight = r.seen[1].detach()[:, None, None]
-    return sum_by_ray(weight * r.output.dynamic.flow, r.output.samples.ray, r.rays).abs().mean()
+    """‖Σ w f‖₁ of the rendered flow, there and back: the mean over rays, the sum over x, y, z."""
+    weight, ray = r.seen[1][:, None, None], r.output.samples.ray
+    rendered = sum_by_ray(weight * r.output.dynamic.flow, ray, r.rays)
+    return rendered.abs().mean(dim=0).sum()
 
 
 def smooth_space(r: Renders) -> Tensor:
@@ -80,18 +81,23 @@ def smooth_space(r: Renders) -> Tensor:
 
 
 def smooth_time(r: Renders) -> Tensor:
-    """½‖X⁺ + X⁻ − 2X‖², twice for a ray's own points, once for those of the chained pair."""
-    bending = 2 * _bending(r, r.output.points, r.output.dynamic.flow)
-    if r.chains:
-        bending = bending + _bending(r, r.near.points, r.near.dynamic.flow)
-    return bending
+    """½‖X⁺ + X⁻ − 2X‖², twice around a ray's own points, once around those of a neighbouring frame.
+
+    There the flow that led to the neighbour is chained with the one that leads on from it.
+    """
+    own, near = r.output.points, r.near
+    there, back = (own + r.output.dynamic.flow[:, side] for side in (FORWARD, BACKWARD))
+    moved = torch.arange(len(near.sample), device=own.device)
+    onward = near.points + near.dynamic.flow[moved, near.side[near.ray]]
+    bending = _bending(r, own, (there, own, back))
+    return 2 * bending + _bending(r, own[near.sample], (onward, near.points, own[near.sample]))
 
 
-def _bending(r: Renders, points: Tensor, flow: Tensor) -> Tensor:
-    place = r.placement
-    after, before = (place.euclidean(points + flow[:, side]) for side in (FORWARD, BACKWARD))
-    bend = 0.5 * (after + before - 2 * place.euclidean(points)).square()
-    return _mean(bend, place.within(points, TIME_SHARE)[:, None])
+def _bending(r: Renders, seen: Tensor, path: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+    """½‖X⁺ + X⁻ − 2X‖² () of a ``path`` X⁺, X, X⁻ (S, 3), where ``seen`` (S, 3) are near."""
+    after, middle, before = map(r.placement.euclidean, path)
+    bend = 0.5 * (after + before - 2 * middle).square()
+    return _mean(bend, r.placement.within(seen, TIME_SHARE)[:, None])
 
 
 def _mean(values: Tensor, mask: Tensor) -> Tensor:

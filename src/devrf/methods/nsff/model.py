@@ -6,6 +6,7 @@ import logging
 from collections.abc import Collection, Iterable, Sequence
 from typing import ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -13,16 +14,18 @@ from devrf.data.batch import RayBatch
 from devrf.engine.ddp import rays_per_rank
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
+from devrf.geometry.cameras import Cameras
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import Space
-from devrf.methods.nerf.placed_model import NeuralField
+from devrf.methods.nerf.placed_model import NeuralField, RayView
 from devrf.methods.nerf.samples import accumulated, flattened, limits, stratified
-from devrf.methods.nsff.fields import TwoFields, with_time
+from devrf.methods.nsff.fields import BACKWARD, FORWARD, TwoFields, with_time
 from devrf.methods.nsff.losses import TERMS, missing_terms
 from devrf.methods.nsff.priors import ImagePriors
 from devrf.methods.nsff.renders import BlendedOutput, Renders
 from devrf.methods.nsff.settings import NSFFSettings
+from devrf.ops.compositing import sum_by_ray
 from devrf.rendering.output import RenderOutput
 from devrf.scenes.scene import Scene, Views
 
@@ -155,6 +158,10 @@ class NSFF(NeuralField):
             blend=blend,
         )
 
+    def at(self, time: float, *, half: bool = False) -> FlowingView:
+        """The scene at ``time``."""
+        return FlowingView(self, time, half=half)
+
     def loss_terms(
         self, output: RenderOutput, batch: RayBatch, names: Collection[str]
     ) -> dict[str, Tensor]:
@@ -182,3 +189,45 @@ class NSFF(NeuralField):
         if not terms:
             raise DevrfError("ray_stage.loss: this scene has nothing for any of its terms")
         return terms
+
+
+class FlowingView(RayView):
+    """NSFF at one time: what is dynamic goes where its flows lead, the rest stays."""
+
+    def __init__(self, model: NSFF, time: float, *, half: bool) -> None:
+        """As of every method."""
+        super().__init__(model, model.render_rays, time, half=half)
+        self._model = model
+
+    @torch.no_grad()
+    def induced_flow(
+        self, rays: Rays, pixels: Tensor, cameras: Cameras, time: float
+    ) -> tuple[Tensor, Tensor]:
+        """As of every :class:`~devrf.rendering.view.MovingView`."""
+        now, black = torch.full_like(pixels[:, 0], self._time), torch.zeros_like(rays.origins[0])
+        out = self._model.render_rays(rays, now, black)
+        ray, blend = out.samples.ray, out.blend
+        places = self._moved(out.points, rays.viewdirs, ray, time), out.points
+        moving, still = (
+            cameras.project_into(0, self._model.placement.world(points))[0] - pixels[ray]
+            for points in places
+        )
+        total = blend.dynamic[:, None] * moving + blend.static[:, None] * still
+        mass = sum_by_ray(blend.dynamic + blend.static, ray, len(rays))
+        return sum_by_ray(total, ray, len(rays)) / mass.clamp(min=1e-6)[:, None], mass
+
+    def _moved(self, points: Tensor, viewdirs: Tensor, ray: Tensor, time: float) -> Tensor:
+        """Where dynamic points (S, 3), normalised, are at ``time``: led on from frame to frame.
+
+        Of a step that ends between two frames as much of the flow counts.
+        """
+        clock = self._model.clock
+        frame, last = (m.before + m.weight for m in (clock.at(self._time), clock.at(time)))
+        while abs(last - frame) > clock.TOLERANCE:
+            side, step = FORWARD if last > frame else BACKWARD, min(abs(last - frame), 1.0)
+            now = float(np.interp(frame, range(len(clock)), clock.times))
+            when = torch.full_like(points[:, 0], now)
+            flow = self._model.fields.dynamic.at(points, when, viewdirs, ray).flow
+            points = points + step * flow[:, side]
+            frame += step if side == FORWARD else -step
+        return points
