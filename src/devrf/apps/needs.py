@@ -11,9 +11,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
-from torch import Tensor, nn
+from torch import Tensor
 
 from devrf.geometry.ndc import NormalizedDevice
+from devrf.methods.base import RayTrainable
 from devrf.methods.devrf.architecture import fitted_to
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
@@ -93,7 +94,7 @@ def tensor_bytes(value: object) -> int:
     return 0
 
 
-def needs_of_networks(scene: Scene, model: nn.Module, images: str, rays: float) -> StageNeeds:
+def needs_of_networks(scene: Scene, model: RayTrainable, images: str, rays: float) -> StageNeeds:
     """What a stage needs that trains the whole of a model.
 
     Args:
@@ -103,12 +104,11 @@ def needs_of_networks(scene: Scene, model: nn.Module, images: str, rays: float) 
         rays: of a batch, in each process.
     """
     learned = tensor_bytes(model.parameters())
-    # Three values are kept for each output of each layer, for 128 samples of a ray.
-    outputs = sum(layer.out_features for layer in model.modules() if isinstance(layer, nn.Linear))
     parts = {
         images: float(tensor_bytes(scene.captures.values())),
         "ray_stage.model.settings.width": LEARNED * learned,
-        "ray_stage.schedule.rays": rays * 128 * 12 * outputs,
+        # Three values are kept for each output of each layer, for 128 samples of a ray.
+        "ray_stage.schedule.rays": rays * 128 * 12 * model.sample_outputs,
     }
     return StageNeeds(parts, learned)
 

@@ -218,6 +218,11 @@ class RayTrainable(Renderable):
         """Called before iteration ``step`` of ``total``: for encoding windows and curricula."""
 
     @property
+    def sample_outputs(self) -> int:
+        """How many numbers all layers give for one sample of a ray, to estimate memory by."""
+        return sum(layer.out_features for layer in self.modules() if isinstance(layer, nn.Linear))
+
+    @property
     def has_hull(self) -> bool:
         """Whether the scene's alpha masks tell which space rays need not be sampled in."""
         return False

@@ -49,6 +49,7 @@ def test_published_sizes() -> None:
         model, by_conv = NeuralVolumes(), NeuralVolumes(NeuralVolumesSettings(warp="conv"))
     # Three cameras of 256 channels at 4 x 3 places: 3 x 3072 numbers.
     assert model.encoder.joined[0].in_features == 3 * 3072
+    assert model.sample_outputs < 20  # its layers are asked once a moment, not once a sample
     assert isinstance(model.warp, AffineMixWarp) and isinstance(by_conv.warp, ConvWarp)
     for decoder, side, end in (
         (model.template, 128, [128, 128, 4]),

@@ -86,6 +86,11 @@ class NeuralVolumes(PlacedModel):
             occupancy = OccupancyFrames.of(scene, box, s.occupancy_side, hull=True)
             self.occupancy = occupancy.to(self.device)
 
+    @property
+    def sample_outputs(self) -> int:
+        """A place in the warp, one in the template, colour, opacity and weights: no layers."""
+        return 3 + 3 + 4 + 4
+
     def parts(self) -> dict[str, Iterable[nn.Parameter]]:
         """Encoder, template and warp."""
         return {
