@@ -20,7 +20,7 @@ from devrf.geometry.space import WORLD
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.metrics.image import psnr_masked, ssim_masked, ssim_partial
+from devrf.metrics.image import psnr_masked, ssim_masked
 from devrf.metrics.lpips import TRUNKS, read_lpips
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.renderer import Renderer
@@ -91,20 +91,16 @@ def test_depth_of_a_scene_in_ndc_is_in_world_units():
     assert found == pytest.approx(0.5, abs=0.03)
 
 
-def test_covisible_metrics_are_of_black_images_elsewhere_and_of_alexnet(rng, alex):
+def test_covisible_lpips_is_alexnets_of_images_that_are_black_elsewhere(rng, alex):
     mask = torch.zeros(40, 48, dtype=torch.bool)
     mask[8:20, 10:30] = True
-    prediction, truth = torch.rand(2, 40, 48, 3, generator=rng)
-    lpips = read_lpips("alex", alex)
-    inputs: Any = SimpleNamespace(prediction=prediction, truth=truth, valid_mask=mask, lpips=lpips)
-    found = {name: MEASURES[name](inputs) for name in ("ssim_covisible", "lpips_covisible")}
-    black = [torch.where(mask[..., None], image, 0.0) for image in (prediction, truth)]
-    assert found["lpips_covisible"] == lpips(*black, mask) != lpips(prediction, truth, mask)
-    assert found["ssim_covisible"] == ssim_partial(prediction, truth, mask)
-    inputs.lpips = SimpleNamespace(trunk=TRUNKS["vgg"])
-    assert MEASURES["lpips_covisible"](inputs) is None  # another network's
-    inputs.valid_mask = None
-    assert {MEASURES[name](inputs) for name in found} == {None}
+    images = torch.rand(2, 40, 48, 3, generator=rng)
+    lpips, measure = read_lpips("alex", alex), MEASURES["lpips_covisible"]
+    given = {"prediction": images[0], "truth": images[1], "valid_mask": mask, "lpips": lpips}
+    black = images * mask[..., None]
+    assert measure(SimpleNamespace(**given)) == lpips(*black, mask) != lpips(*images, mask)
+    for unknown in ({"valid_mask": None}, {"lpips": SimpleNamespace(trunk=TRUNKS["vgg"])}):
+        assert measure(SimpleNamespace(**{**given, **unknown})) is None
 
 
 def test_every_metric_of_a_learned_scene(learned, tiny_scene, alex):

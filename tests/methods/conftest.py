@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from lightning import Callback
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint, load_checkpoint, save_checkpoint
 from devrf.data.batch import RayBatch
@@ -45,6 +46,23 @@ def ray_stage() -> Callable[..., RayStage]:
         return RayStage(model, schedule, loss or {"color": 1.0}, step, static_share, rest)
 
     return make
+
+
+@pytest.fixture
+def learned_losses(ray_stage: Callable[..., RayStage], fit: Callable[..., RayStage]) -> Any:
+    """``learned_losses(model, **schedule)``: the loss at each Lightning step of a fitted stage."""
+
+    def learn(model: RayTrainable, **changes: Any) -> list[float]:
+        found: list[float] = []
+
+        class Note(Callback):
+            def on_train_batch_end(self, *arguments: Any) -> None:
+                found.append(float(arguments[2]["loss"]))
+
+        fit(ray_stage(model, **changes), Note())
+        return found
+
+    return learn
 
 
 @pytest.fixture

@@ -97,14 +97,12 @@ def test_the_curriculum_adds_frames(
 
 
 def test_the_first_batches_may_see_the_centre_half_alone(ray_stage: Make, fit: Fit) -> None:
-    stage = fit(ray_stage(DNeRF(TINY), centre_crop=2, rays=2000))
-    views = stage.training_views("static")
-    for iteration, share in ((1, 2), (2, 1)):
+    stage = fit(ray_stage(DNeRF(TINY), centre_crop=2, rays=2000))  # of 24×18 pixels
+    for iteration, rows, columns in ((1, (4, 13), (6, 17)), (2, (0, 17), (0, 23))):
         stage.iteration = iteration
         flat = stage.draw(ParallelBatch(0, [])).flat
-        for place, size in ((flat // views.width, views.height), (flat % views.width, views.width)):
-            edge = (size - size // share) // 2
-            assert (int(place.min()), int(place.max())) == (edge, size - edge - 1)
+        assert (int(flat.min()) // 24, int(flat.max()) // 24) == rows
+        assert (int((flat % 24).min()), int((flat % 24).max())) == columns
 
 
 @pytest.mark.parametrize(("step", "times"), [("joint", 3), ("dynamic", 2)])

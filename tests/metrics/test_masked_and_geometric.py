@@ -56,11 +56,10 @@ def test_ssim_by_partial_convolutions(rng):
     weight = torch.softmax(-0.5 * ((torch.arange(11.0) - 5) / 1.5) ** 2, dim=0)
     expected = 15.0  # no pixel counts in the others
     for place in range(6):
-        scale = float(11 * weight[5] * 11 * weight[5 - place])  # down the column, and along the row
-        means = 2 * scale**2 * 0.2 * 0.6 + 1e-4, scale**2 * (0.2**2 + 0.6**2) + 1e-4
+        scale = 121 * float(weight[5] * weight[5 - place])  # down the column, and along the row
         spread = max(scale - scale**2, 0.0)  # E x² − (E x)², in units of the values' squares
-        spreads = 2 * spread * 0.2 * 0.6 + 9e-4, spread * (0.2**2 + 0.6**2) + 9e-4
-        expected += means[0] / means[1] * spreads[0] / spreads[1]
+        parts = (scale**2, 1e-4), (spread, 9e-4)
+        expected += math.prod((0.24 * part + floor) / (0.4 * part + floor) for part, floor in parts)
     assert ssim_partial(a, b, mask) == pytest.approx(expected / 21, rel=1e-4)
 
 

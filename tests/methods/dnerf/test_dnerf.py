@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 import torch
-from lightning import Callback
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
@@ -44,17 +43,9 @@ def test_the_temporal_term_of_a_deformation_without_time_is_zero(
 
 
 @pytest.mark.parametrize("sampling", ["occupancy", "hierarchical"])
-def test_it_learns(
-    sampling: Any, ray_stage: Callable[..., RayStage], fit: Callable[..., RayStage]
-) -> None:
-    losses: list[float] = []
-
-    class Note(Callback):
-        def on_train_batch_end(self, *arguments: Any) -> None:
-            losses.append(float(arguments[2]["loss"]))
-
+def test_it_learns(sampling: Any, learned_losses: Callable[..., list[float]]) -> None:
     model = DNeRF(replace(TINY, sampling=sampling))
-    fit(ray_stage(model, iterations=60, rays=128, iterations_per_step=20), Note())
+    losses = learned_losses(model, iterations=60, rays=128, iterations_per_step=20)
     assert len(losses) == 3 and losses[-1] < 0.7 * losses[0]
 
 

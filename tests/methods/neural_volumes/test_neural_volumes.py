@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 import torch
-from lightning import Callback
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.errors import DevrfError
@@ -27,18 +26,10 @@ LOSS = {"color": 1.0, "kl": 1e-5, "opacity_prior": 1e-4, "tv": 1e-4}
 
 
 @pytest.mark.parametrize(("warp", "hull"), [("conv", False), ("affinemix", True)])
-def test_it_learns(
-    warp: Any, hull: bool, ray_stage: Callable[..., RayStage], fit: Callable[..., RayStage]
-) -> None:
-    losses: list[float] = []
-
-    class Note(Callback):
-        def on_train_batch_end(self, *arguments: Any) -> None:
-            losses.append(float(arguments[2]["color"]))
-
+def test_it_learns(warp: Any, hull: bool, learned_losses: Callable[..., list[float]]) -> None:
     model = NeuralVolumes(replace(TINY, warp=warp, maps=2, hull=hull))
     sizes = {"iterations": 60, "rays": 128, "iterations_per_step": 20, "times_per_batch": 2}
-    fit(ray_stage(model, loss=LOSS, learning_rate=3e-3, **sizes), Note())
+    losses = learned_losses(model, loss=LOSS, learning_rate=3e-3, **sizes)
     assert len(losses) == 3 and losses[-1] < 0.8 * losses[0]
 
 

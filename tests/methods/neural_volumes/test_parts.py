@@ -14,7 +14,6 @@ from devrf.methods.neural_volumes.model import NeuralVolumes
 from devrf.methods.neural_volumes.networks import (
     AffineMixWarp,
     ConvWarp,
-    TimeEncoder,
     doubling,
     identity_grid,
     rotation_matrices,
@@ -67,18 +66,6 @@ def test_a_doubled_volume_begins_without_a_checkerboard() -> None:
     torch.testing.assert_close(inside, inside[:, :, :1, :1, :1].expand_as(inside))
 
 
-def test_the_encoder_halves_images_and_shrinks_codes() -> None:
-    encoder = TimeEncoder(
-        NeuralVolumesSettings(
-            encoder_views=2, encoder_size=(8, 16), encoder_channels=(4, 4), encoder_width=6, code=5
-        )
-    )
-    assert encoder.joined[0].in_features == 2 * 4 * 2 * 4
-    mean, log_deviation = encoder(torch.rand(3, 2, 3, 8, 16))
-    assert mean.shape == log_deviation.shape == (3, 5)
-    assert log_deviation.abs().max() < 0.1  # deviations begin next to 1
-
-
 def test_cameras_that_miss_a_frame_are_not_encoded(tiny_scene: Scene) -> None:
     views = tiny_scene.dynamic.train
     assert cameras_of_every_frame(views) == [0, 1]
@@ -102,8 +89,7 @@ def test_maps_begin_at_the_middle_unless_asked_and_their_weights_hold_beyond_the
     settings, code = NeuralVolumesSettings(code=6, warp_side=4, maps=1), torch.zeros(1, 6)
     assert AffineMixWarp(settings)(code).abs().max() == 0
     begun = AffineMixWarp(replace(settings, identity_start=True))
-    with torch.no_grad():
-        begun.shift[-1].bias[:] = 30  # by 3: all of the cube is led beyond the grid
+    torch.nn.init.constant_(begun.shift[-1].bias, 30.0)  # by 3: the cube is led beyond the grid
     torch.testing.assert_close(begun(code), identity_grid(4)[None] - 3, atol=1e-3, rtol=0)
 
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 import torch
-from lightning import Callback
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
@@ -27,18 +26,12 @@ EVERY = dict.fromkeys(NSFF.losses, 0.1)
 
 @pytest.mark.parametrize(("sampling", "blend"), [("occupancy", "v"), ("stratified", "additive")])
 def test_it_learns(
-    sampling: Any, blend: Any, tiny: NSFFSettings, ray_stage: Make, fit: Fit
+    sampling: Any, blend: Any, tiny: NSFFSettings, learned_losses: Callable[..., list[float]]
 ) -> None:
-    colors: list[float] = []
-
-    class Note(Callback):
-        def on_train_batch_end(self, *arguments: Any) -> None:
-            colors.append(float(arguments[2]["color"]))
-
     model = NSFF(replace(tiny, sampling=sampling, blend=blend, hard_rays=0))
-    loss = {"color": 1.0, "neighbours": 0.1}
-    fit(ray_stage(model, loss=loss, iterations=45, rays=64, iterations_per_step=15), Note())
-    assert len(colors) == 3 and colors[-1] < 0.8 * colors[0]
+    loss, sizes = {"color": 1.0, "neighbours": 0.1}, {"iterations": 45, "iterations_per_step": 15}
+    losses = learned_losses(model, loss=loss, rays=64, **sizes)
+    assert len(losses) == 3 and losses[-1] < 0.8 * losses[0]
 
 
 def test_every_term_is_learned_from_and_finite(
