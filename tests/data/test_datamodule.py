@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 
+from devrf.data.priors import without_priors
 from devrf.data.recorded import (
     READERS,
     ForwardFacingDataModule,
@@ -151,3 +153,19 @@ def test_forward_flow_is_read_from_files_else_estimated_beside_the_backward_one(
     same = torch.equal(views.forward_flow.vectors[0], views.flow.vectors[2])
     assert same == written
     assert (tmp_path / "flow_forward.npz").exists() != written
+
+
+def test_without_priors_images_stand_before_the_background_and_tell_nothing_else(
+    tiny_scene: Scene,
+) -> None:
+    train = tiny_scene.dynamic.train
+    pixels = train.pixels.clone()
+    pixels[0, 0, 0] = torch.tensor([255, 0, 100, 51])  # a fifth of it, on white
+    known = replace(tiny_scene.dynamic, train=replace(train, pixels=pixels))
+    scene = without_priors(replace(tiny_scene, dynamic=known))
+    bare = scene.dynamic.train
+    assert bare.pixels[0, 0, 0].tolist() == [255, 204, 224] and not bare.has_alpha
+    assert bare.flow is bare.forward_flow is bare.depth is None
+    assert scene.static.train.depth is None and scene.bounds.motion is None
+    assert scene.dynamic.test.has_alpha
+    assert scene.bounds.box == tiny_scene.bounds.box

@@ -142,7 +142,7 @@ class TimeBudget(Callback):
         return (
             f"schedule.seconds: {self.seconds:g} is too little: {self._budget:.3g} s of it are the "
             f"{stage.name} stage's, where {phases + 1} phases with one iteration each take about "
-            f"{least:.2g} s on this machine; give {needed:.{digits}f} or more"
+            f"{least:.3g} s on this machine; give {needed:.{digits}f} or more"
         )
 
     def on_train_batch_end(

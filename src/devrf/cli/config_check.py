@@ -26,6 +26,7 @@ ROOT: dict[str, Any] = {
     "seed": int,
     "resume": bool,
     "memory_check": bool,
+    "priors": Literal["all", "none"],
     "ckpt": str | Path | None,
     "objective": str,
     "scene": str,

@@ -79,6 +79,7 @@ class RunContext:
             data.downscale = known.get(SIZE, "gpu" if self.device.type == "cuda" else "cpu")
             self.chooses_size = SIZE not in known
         built: SceneDataModule = instantiate(data)
+        built.priors = self.config.priors
         return built
 
     @property

@@ -73,8 +73,9 @@ def deciding_settings(config: DictConfig, stage: str) -> dict[str, Any]:
     parts = {key: OmegaConf.to_container(config[key], resolve=False) for key in ("data", *sections)}
     settings = dict(_values(config, parts, ""))
     settings.update(method=config.method, seed=config.seed)
-    if config.schedule.seconds is not None:
-        settings["schedule.seconds"] = config.schedule.seconds
+    for key, usual in (("schedule.seconds", None), ("priors", "all")):
+        if (value := OmegaConf.select(config, key)) != usual:
+            settings[key] = value
     return {key: settings[key] for key in sorted(settings)}
 
 

@@ -54,7 +54,8 @@ def _fit(run: RunContext, stage: ScheduledStage, begin: ResumePoint) -> None:
     if run.leads:
         _ = run.scene  # errors in it come before a logger writes files
     stage.training_config = begin.training_config
-    callbacks = [*instantiate(run.config.callbacks).values(), TrainingRecord()]
+    # The clock stops before curves are drawn.
+    callbacks = [TrainingRecord(), *instantiate(run.config.callbacks).values()]
     saving = next((hook for hook in callbacks if isinstance(hook, PeriodicCheckpoint)), None)
     if saving is None:  # no periodic files, but still one at a signal
         saving = PeriodicCheckpoint(run.folder / "checkpoints", every_seconds=math.inf)

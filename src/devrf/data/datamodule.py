@@ -10,6 +10,7 @@ import torch
 from lightning import LightningDataModule
 from torch.utils.data import DataLoader, Dataset, IterableDataset
 
+from devrf.data.priors import Priors, without_priors
 from devrf.scenes.scene import CaptureName, Scene, Views
 
 
@@ -24,6 +25,8 @@ class SceneDataModule(LightningDataModule, ABC):
 
     # By what images that were read have been made smaller.
     downscale = 1
+    # Whether methods are told what the scene tells beside its images.
+    priors: Priors = "all"
 
     def __init__(self) -> None:
         super().__init__()
@@ -38,7 +41,8 @@ class SceneDataModule(LightningDataModule, ABC):
     def scene(self) -> Scene:
         """The scene, on the host."""
         if self._scene is None:
-            self._scene = self.load()
+            scene = self.load()
+            self._scene = without_priors(scene) if self.priors == "none" else scene
         return self._scene
 
     def provide(self, priors: Collection[str]) -> None:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import Pixels, RayBatch, concatenated
+from devrf.data.datamodule import SceneDataModule
 from devrf.engine.batches import FramePool, gather_batch
 from devrf.engine.ddp import rays_per_rank
 from devrf.engine.learner import ParallelBatch, Phase
@@ -136,7 +137,9 @@ class RayStage(ScheduledStage):
     def setup(self, stage: str) -> None:
         """Give the model what it needs of the scene, and make the optimiser."""
         # Before the clock starts: priors are read, or made as a scene's reader makes them.
-        self.trainer.datamodule.provide(self.scene_model.priors)  # type: ignore[attr-defined]
+        datamodule: SceneDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
+        if datamodule.priors == "all":
+            datamodule.provide(self.scene_model.priors)
         super().setup(stage)
         if not self._ready:
             # A protocol without a stage that learns from the static set does not look at it.

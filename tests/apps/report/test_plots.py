@@ -6,7 +6,13 @@ from itertools import pairwise
 
 import pytest
 
-from devrf.apps.report.plots import against_views, plots, psnr_against_seconds, psnr_over_time
+from devrf.apps.report.plots import (
+    against_budget,
+    against_views,
+    plots,
+    psnr_against_seconds,
+    psnr_over_time,
+)
 
 
 def curves(axes):
@@ -62,6 +68,29 @@ def test_metrics_against_views_need_several_numbers_of_them(table, ran):
     psnr, ssim = against_views(table()).axes
     assert curves(psnr) == {"robot": [(1, 20), (3, 26)]}
     assert curves(ssim) == {"robot": [(1, 0.8), (3, 0.9)]}
+
+
+def test_budgets_have_tables_of_their_own_and_a_plot_with_means_and_spread(table, ran):
+    for budget, seed, psnr in ((15, 0, 20.0), (15, 1, 22.0), (60, 0, 30.0), (60, 1, 30.0)):
+        for priors, gain in (({}, 1.0), ({"priors": "none"}, 0.0)):
+            settings = {"schedule.seconds": budget, **priors}
+            scores = {"psnr": psnr + gain, "ssim": 0.9}
+            ran(f"{budget}{seed}{gain}", settings=settings, seed=seed, scores=scores)
+    made = table()
+    blocks = {block.title: block.measured["text", "PSNR"].tolist() for block in made.blocks}
+    assert blocks == {
+        "robot, 15 s": ["22.00 ± 1.41"],
+        "robot, 60 s": ["31.00 ± 0.00"],
+        "robot, without priors, 15 s": ["21.00 ± 1.41"],
+        "robot, without priors, 60 s": ["30.00 ± 0.00"],
+    }
+    psnr, _ = against_budget(made, "robot, without priors").axes
+    assert [c.get_ydata().tolist() for c in psnr.get_lines()[:1]] == [[21.0, 30.0]]
+    assert psnr.get_xticks().tolist() == [15, 60]
+    assert {plot.name for plot in plots(made)} == {
+        "quality_against_seconds_robot",
+        "quality_against_seconds_robot_without_priors",
+    }
 
 
 def test_no_plot_of_what_is_not_there(table, ran):

@@ -58,8 +58,8 @@ def test_codes_between_two_frames_are_their_blend(tiny_scene: Scene) -> None:
 def test_what_it_cannot_learn_from_is_refused(
     tiny_room: Scene, tiny_scene: Scene, facing: Scene
 ) -> None:
-    opaque = tiny_scene.static.train.pixels[..., :3]
-    static = Capture(replace(tiny_scene.static.train, pixels=opaque), tiny_scene.static.test)
+    both = tiny_scene.static.train, tiny_scene.static.test
+    static = Capture(*(replace(views, pixels=views.pixels[..., :3]) for views in both))
     for scene, said in (
         (tiny_room, "unbounded"),
         (replace(tiny_scene, static=static), "static images of robot have no alpha masks"),

@@ -68,7 +68,9 @@ IN_DATA = ["data.width", "data.height", "data.downscale", "data.frames", "data.t
 def labelled(runs: pd.DataFrame) -> pd.DataFrame:
     """The runs in the order of a table: scenes as they come, ablations as in the paper, then jobs.
 
-    A scene at rest is not the one of its name that moves. Further columns are ``label``, the same
+    A scene at rest is not the one of its name that moves; nor is one that was learned in so many
+    seconds (``budget``, NaN where there was no limit), or without priors. ``place`` is the scene
+    with its priors, without its budget. Further columns are ``label``, the same
     for runs that share a row; ``name``, the label without the protocol; ``line``, the label without
     the number of views; ``views``, the number of dynamic training views (NaN where unknown);
     ``kind``, the same for runs of alike scenes with the same names and typed settings.
@@ -76,9 +78,15 @@ def labelled(runs: pd.DataFrame) -> pd.DataFrame:
     names, settings = _names(runs), _settings(runs)
     typed = _typed(settings, runs)
     scenes = runs["scene"].where(~runs["at_rest"].eq(True), runs["scene"] + " (at rest)")
-    runs = runs.assign(scene=scenes)
+    unknown = pd.Series(None, runs.index, dtype=object)
+    bare = runs.get(f"{SETTINGS}priors", unknown).eq("none")
+    budget = runs.get(f"{SETTINGS}schedule.seconds", unknown).map(number).astype(float)
+    places = scenes.mask(bare, scenes + ", without priors")
+    scenes = places.where(budget.isna(), places + budget.map(", {:g} s".format))
+    runs = runs.assign(scene=scenes, place=places, budget=budget)
     traits = _distinguishing(runs, names, settings, typed)
-    same = runs.reindex(columns=["at_rest", "run.kind", "run.image_size", "run.train_views"])
+    alike = ["at_rest", "run.kind", "run.image_size", "budget", f"{SETTINGS}priors"]
+    same = runs.reindex(columns=[*alike, "run.train_views"])
     views = same.pop("run.train_views").map(number).astype(float)
     same = same.assign(**names, **{k: settings[k] for k in typed if not k.startswith("data.")})
     ordered = runs.assign(

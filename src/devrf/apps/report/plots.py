@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
 
-from devrf.apps.report.runs import metric_over_time
+from devrf.apps.report.runs import DEFAULT_METHOD, metric_over_time
 from devrf.apps.report.table import LPIPS, PSNR, SSIM, TIME, Block, Table
 from devrf.system.files import atomic_write
 
@@ -71,7 +71,10 @@ def plots(table: Table) -> list[Plot]:
         ("psnr_against_seconds", "PSNR against training time", psnr_against_seconds(table)),
         ("metrics_against_views", "Metrics against dynamic training views", against_views(table)),
     ]
-    for scene in table.runs["scene"].unique():
+    for place in table.runs["place"].unique():
+        name = file_name(f"quality_against_seconds_{place}")
+        candidates.append((name, f"{place}: quality against seconds", against_budget(table, place)))
+    for scene in table.runs.loc[table.runs["budget"].isna(), "scene"].unique():
         name = file_name(f"psnr_over_time_{scene}")
         candidates.append((name, f"{scene}: PSNR over time", psnr_over_time(table, scene)))
     return [Plot(name, shows, figure) for name, shows, figure in candidates if figure is not None]
@@ -103,9 +106,13 @@ def psnr_over_time(table: Table, scene: str) -> Figure | None:
 
 @mpl.rc_context(STYLE)
 def psnr_against_seconds(table: Table) -> Figure | None:
-    """PSNR against training time, a panel a scene, the paper's rows hollow; None without both."""
+    """PSNR against training time, a panel a scene, the paper's rows hollow; None without both.
+
+    Without scenes that were learned in a budget of seconds (:func:`against_budget`).
+    """
     both = table.rows[(table.rows[TIME.title] > 0) & table.rows[PSNR.title].notna()]
-    scenes = both.index.get_level_values("scene")
+    limited = table.runs.loc[table.runs["budget"].notna(), "scene"]
+    scenes = both.index.get_level_values("scene").difference(limited)
     blocks = [block for block in table.blocks if block.title in scenes]
     if not blocks:
         return None
@@ -117,6 +124,38 @@ def psnr_against_seconds(table: Table) -> Figure | None:
         _points(axes, table, block)
     for axes in panels[len(blocks) :]:
         axes.remove()
+    _legend(figure)
+    return figure
+
+
+@mpl.rc_context(STYLE)
+def against_budget(table: Table, place: str) -> Figure | None:
+    """PSNR, SSIM and LPIPS of a scene against budgets of seconds, a panel each.
+
+    A line a row, with the standard deviation over its runs: methods have colours, their variants
+    dashes. None unless there are several budgets.
+    """
+    runs = table.runs[table.runs["place"] == place].dropna(subset="budget")
+    budgets = sorted(runs["budget"].unique())
+    if len(budgets) < 2:
+        return None
+    columns = [column for column in (PSNR, SSIM, LPIPS) if runs[column.title].notna().any()]
+    figure = Figure(figsize=(0.8 + 3.3 * len(columns), 4.0), layout="constrained")
+    methods, labels = list(runs["method"].unique()), runs.groupby("method")["label"].unique()
+    for axes, column in zip(
+        figure.subplots(1, len(columns), squeeze=False)[0], columns, strict=True
+    ):
+        for (method, label), row in runs.groupby(["method", "label"], sort=False):
+            values = row.groupby("budget")[column.title]
+            means, spread = values.mean(), values.std().fillna(0.0)
+            dashes = DASHES[list(labels[method]).index(label) % len(DASHES)]
+            look: dict[str, Any] = {"color": COLORS[methods.index(method)], "linestyle": dashes}
+            look |= {"linewidth": 2.8 if method == DEFAULT_METHOD else 1.4, "marker": "o"}
+            axes.errorbar(means.index, means, spread, capsize=2, label=label, **look)
+        axes.set(title=place, xscale="log", xlabel="training time", ylabel=column.heading)
+        axes.xaxis.set_major_locator(FixedLocator(budgets))
+        axes.xaxis.set_minor_locator(NullLocator())
+        axes.xaxis.set_major_formatter(_time)
     _legend(figure)
     return figure
 

@@ -26,10 +26,11 @@ def check_scene(scene: Scene) -> None:
             f"method: neural_volumes needs a scene in a cube, and {scene.name} is unbounded; give "
             "images with alpha masks, or use another method"
         )
-    for capture, views in (("static", scene.static.train), ("dynamic", scene.dynamic.train)):
-        if not views.cut_out:
+    for name, capture in (("static", scene.static), ("dynamic", scene.dynamic)):
+        # With priors=none masks are kept from methods, but the background is known.
+        if not (capture.train.cut_out or capture.test.cut_out):
             raise DevrfError(
-                f"method: neural_volumes needs a known background, and the {capture} images of "
+                f"method: neural_volumes needs a known background, and the {name} images of "
                 f"{scene.name} have no alpha masks; give images with alpha, or use another method"
             )
 

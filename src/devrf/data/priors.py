@@ -1,0 +1,41 @@
+"""What a scene tells beside its images, and the scene without it: ``priors=none``."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import torch
+
+from devrf.data.batch import background_color
+from devrf.scenes.bounds import FALLBACK_BOUND_SCALE
+from devrf.scenes.scene import Background, Capture, Scene, Views
+
+Priors = Literal["all", "none"]
+
+
+def without_priors(scene: Scene) -> Scene:
+    """The scene as posed images before a known background, with nothing that helps a method.
+
+    Training images lose optical flow, depth and alpha masks; the box loses the room for motion that
+    masks, or an embedded scene, told. Held-out images keep what they are scored with. The box at
+    rest and the space stay: without them no method would know where to look.
+    """
+    plain: Background = "white" if scene.background == "random" else scene.background
+    scale = max(scene.bounds.scale, FALLBACK_BOUND_SCALE)
+    bounds = replace(scene.bounds, motion=None, scale=scale, source="priors=none")
+    static, dynamic = (
+        Capture(_bare(capture.train, plain), capture.test)
+        for capture in (scene.static, scene.dynamic)
+    )
+    return replace(scene, static=static, dynamic=dynamic, bounds=bounds, background=plain)
+
+
+def _bare(views: Views, background: Background) -> Views:
+    """Images (N, H, W, 3) on the background, with cameras and times."""
+    pixels = views.pixels
+    if views.has_alpha:
+        behind = 255 * background_color(background, 0, torch.Generator())
+        opacity = pixels[..., 3:].float() / 255
+        pixels = (behind + opacity * (pixels[..., :3] - behind)).round().to(torch.uint8)
+    return replace(views, pixels=pixels, flow=None, forward_flow=None, depth=None)
