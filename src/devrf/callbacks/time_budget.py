@@ -122,10 +122,11 @@ class TimeBudget(Callback):
         later = [phase for phase in self._phases if phase.start > stage.iteration]
         # As long as an iteration, where no phase of the kind has been entered yet.
         entering = sum(self._entering.get(phase.kind, pace * phase.cost) for phase in later)
-        if not self._checked and self._step_began >= TRIAL_SHARE * self._budget:
+        tried = self._warm and self._step_began >= TRIAL_SHARE * self._budget
+        if tried and not self._checked:
             self._checked, least = True, entering + pace * sum(phase.cost for phase in later)
             if least > left:
-                return self._too_short(stage, len(later), self._step_began + least)
+                return self._too_short(stage, self._step_began + least)
         whole = pace * sum(
             phase.cost * max(0.0, phase.stop - max(phase.start, stage.position))
             for phase in (stage.phase, *later)
@@ -135,14 +136,14 @@ class TimeBudget(Callback):
         most = STEP_SHARE * self._budget / (pace * stage.phase.cost)
         return stride, max(1, min(self._most_iterations, int(most)))
 
-    def _too_short(self, stage: ScheduledStage, phases: int, least: float) -> str:
+    def _too_short(self, stage: ScheduledStage, least: float) -> str:
         assert self.seconds is not None
         needed = 1.2 * least / stage.time_share
         digits = max(0, 1 - math.floor(math.log10(needed)))
         return (
             f"schedule.seconds: {self.seconds:g} is too little: {self._budget:.3g} s of it are the "
-            f"{stage.name} stage's, where {phases + 1} phases with one iteration each take about "
-            f"{least:.3g} s on this machine; give {needed:.{digits}f} or more"
+            f"{stage.name} stage's, whose {len(self._phases)} phases of one iteration each take "
+            f"about {least:.3g} s on this machine; give {needed:.{digits}f} or more"
         )
 
     def on_train_batch_end(

@@ -76,6 +76,7 @@ def labelled(runs: pd.DataFrame) -> pd.DataFrame:
     ``kind``, the same for runs of alike scenes with the same names and typed settings.
     """
     names, settings = _names(runs), _settings(runs)
+    settings.pop("schedule.seconds", None)  # said by the scene's title
     typed = _typed(settings, runs)
     scenes = runs["scene"].where(~runs["at_rest"].eq(True), runs["scene"] + " (at rest)")
     unknown = pd.Series(None, runs.index, dtype=object)
@@ -83,8 +84,9 @@ def labelled(runs: pd.DataFrame) -> pd.DataFrame:
     budget = runs.get(f"{SETTINGS}schedule.seconds", unknown).map(number).astype(float)
     places = scenes.mask(bare, scenes + ", without priors")
     scenes = places.where(budget.isna(), places + budget.map(", {:g} s".format))
+    # A row has one name, whatever its budget.
+    traits = _distinguishing(runs.assign(scene=places), names, settings, typed)
     runs = runs.assign(scene=scenes, place=places, budget=budget)
-    traits = _distinguishing(runs, names, settings, typed)
     alike = ["at_rest", "run.kind", "run.image_size", "budget", f"{SETTINGS}priors"]
     same = runs.reindex(columns=[*alike, "run.train_views"])
     views = same.pop("run.train_views").map(number).astype(float)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from devrf.errors import DevrfError
+from devrf.evaluation.held_out import background_value, truth_image
 from devrf.methods.neural_volumes.settings import NeuralVolumesSettings
 from devrf.scenes.scene import Scene, Views
 
@@ -58,15 +59,12 @@ def encoder_images(scene: Scene, settings: NeuralVolumesSettings) -> Tensor:
     scale = min(1.0, height / views.height, width / views.width)
     rows, columns = round(views.height * scale), round(views.width * scale)
     top, left = (height - rows) // 2, (width - columns) // 2
-    behind = 0.0 if scene.background == "black" else 1.0
-    images = torch.full(
-        (len(scene.clock), wanted, 3, height, width), round(255 * behind), dtype=torch.uint8
-    )
+    behind = round(255 * background_value(scene.background))
+    images = torch.full((len(scene.clock), wanted, 3, height, width), behind, dtype=torch.uint8)
     for k in range(wanted):
         camera = cameras[k * (len(cameras) - 1) // max(wanted - 1, 1)]
         for place in (views.view == camera).nonzero()[:, 0].tolist():
-            pixels = views.pixels[place].permute(2, 0, 1).float() / 255
-            color = behind + pixels[3:] * (pixels[:3] - behind)
+            color = truth_image(views, place, scene.background).permute(2, 0, 1)
             if scale < 1:
                 color = nn.functional.interpolate(
                     color[None], (rows, columns), mode="bilinear", antialias=True
