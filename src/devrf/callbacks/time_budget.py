@@ -43,6 +43,8 @@ log = logging.getLogger(__name__)
 STEP_SHARE = 0.01
 # The share of the budget after which it is checked that the rest suffices.
 TRIAL_SHARE = 0.1
+# Added to the last strides, whose sum would else fall short of the end.
+ROUNDING = 1e-6
 # How much of an average the latest measurement is.
 LATEST = 0.3
 
@@ -122,7 +124,8 @@ class TimeBudget(Callback):
         later = [phase for phase in self._phases if phase.start > stage.iteration]
         # As long as an iteration, where no phase of the kind has been entered yet.
         entering = sum(self._entering.get(phase.kind, pace * phase.cost) for phase in later)
-        tried = self._warm and self._step_began >= TRIAL_SHARE * self._budget
+        # The first iteration is slow, and says little unless it has taken all the time.
+        tried = self._step_began >= TRIAL_SHARE * self._budget and (self._warm or left < 0)
         if tried and not self._checked:
             self._checked, least = True, entering + pace * sum(phase.cost for phase in later)
             if least > left:
@@ -133,6 +136,9 @@ class TimeBudget(Callback):
         )
         # Out of time, what is left gets an iteration a phase.
         stride = whole / (left - entering) if left > entering else float(stage.total_iterations)
+        if not later:  # whole iterations are left: as many as end nearest to the budget
+            iterations = max(1, round(left / (pace * stage.phase.cost)))
+            stride = (stage.phase.stop - stage.position) / iterations + ROUNDING
         most = STEP_SHARE * self._budget / (pace * stage.phase.cost)
         return stride, max(1, min(self._most_iterations, int(most)))
 
