@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import pytest
 import torch
 from torch import Tensor
 
-from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 from devrf.methods.dnerf.model import DNeRF, DNeRFSettings
@@ -138,8 +136,3 @@ def test_the_denser_of_two_fields_counts(tiny_scene: Scene) -> None:
     depth = 10 * math.log1p(math.exp(3.0)) * step
     torch.testing.assert_close(found[0], torch.full((2,), 1 - math.exp(-depth)))
     assert torch.equal(found[0], found[1]) and (found[2] < 1e-6).all()
-
-
-def test_what_is_no_share_is_refused() -> None:
-    with pytest.raises(DevrfError, match=r"settings\.empty_from: .* 1\.5"):
-        replace(TINY, empty_from=1.5)

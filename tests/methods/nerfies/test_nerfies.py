@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +11,6 @@ import torch
 from devrf.data.batch import RayBatch
 from devrf.errors import DevrfError
 from devrf.methods.nerfies.model import Nerfies, NerfiesSettings
-from devrf.methods.ray_stage import RayStage
 from devrf.scenes.scene import Scene
 
 TINY = NerfiesSettings(
@@ -61,18 +59,10 @@ def test_a_warp_that_stretches_is_punished_and_one_that_turns_is_not(
     assert 1e-3 < stretched.item() < 0.06
 
 
-def test_coarse_samples_have_a_field_of_their_own_that_learns(
-    ray_stage: Callable[..., RayStage], fit: Callable[..., RayStage]
-) -> None:
-    model = Nerfies(replace(TINY, sampling="hierarchical", separate_coarse=True))
-    assert model.coarse is not None
-    before = model.coarse.color.weight.detach().clone()
-    fit(ray_stage(model, loss={"color": 1.0, "elastic": 0.1}))
-    assert not torch.equal(model.coarse.color.weight, before)
-
-
 def test_what_cannot_be_is_said() -> None:
     with pytest.raises(DevrfError, match=r"settings\.separate_coarse: .*sampling=occupancy"):
         replace(TINY, separate_coarse=True)
     with pytest.raises(DevrfError, match=r"settings\.window: .* 1\.5"):
         replace(TINY, window=1.5)
+    with pytest.raises(DevrfError, match=r"settings\.empty_from: .* 1\.5"):
+        replace(TINY, empty_from=1.5)
