@@ -11,10 +11,8 @@ from torch import Tensor
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.rays import Rays
-from devrf.scenes.procedural.flower import Flower
 from devrf.scenes.procedural.march import CHUNK, MAX_STEPS, block_starts, trace
-from devrf.scenes.procedural.robot import Robot
-from devrf.scenes.procedural.solids import Shape
+from devrf.scenes.procedural.solids import Body, Shape
 from devrf.scenes.scene import Capture, OpticalFlow, Views
 
 # Towards the lamp, world space: fixed, so that shading changes as the shape turns.
@@ -65,7 +63,7 @@ class Extent:
     reach: float
 
 
-def extent(shape: Robot | Flower) -> Extent:
+def extent(shape: Body) -> Extent:
     """Where ``shape`` is, from the paths of the points around its parts."""
     outline = shape.outline()
     times = torch.linspace(0, 1, _TIMES).tolist()

@@ -16,6 +16,7 @@ from devrf.scenes.bounds import forward_bounds, reference_space
 from devrf.scenes.procedural.filming import Filming, extent
 from devrf.scenes.procedural.flower import Flower
 from devrf.scenes.procedural.plush import Plush
+from devrf.scenes.procedural.random_bodies import random_body
 from devrf.scenes.procedural.rigs import (
     HAND_HELD,
     STUDIO,
@@ -25,7 +26,7 @@ from devrf.scenes.procedural.rigs import (
     static_rig,
 )
 from devrf.scenes.procedural.robot import Robot
-from devrf.scenes.procedural.solids import Shape
+from devrf.scenes.procedural.solids import Body, Shape
 from devrf.scenes.procedural.surroundings import REACH, STEPS, Backdrop, Room, Surrounded
 from devrf.scenes.scene import Bounds, Scene
 from devrf.scenes.space import inward_space
@@ -118,7 +119,9 @@ class ProceduralScene(Recipe):
     """An object with cameras all around it, in world units about the origin.
 
     Attributes:
-        shape: ``robot`` (rigid parts, large fast motion) or ``flower`` (non-rigid).
+        shape: ``robot`` (rigid parts, large fast motion), ``flower`` (non-rigid), or ``random``.
+        scene_seed: which random body.
+        sliding: whether its round parts spin, so that texture slides over a still silhouette.
         static_test_views: held-out views of the scene at rest.
         surroundings: ``none``: the images have alpha masks; ``room``: the object stands in a
             furnished room, filmed from inside it, and the images have none.
@@ -126,8 +129,10 @@ class ProceduralScene(Recipe):
             more, in which no place looks like another.
     """
 
-    shape: Literal["robot", "flower"] = "robot"
+    shape: Literal["robot", "flower", "random"] = "robot"
     _: KW_ONLY
+    scene_seed: Annotated[int, Field(strict=True, ge=0)] = 0
+    sliding: bool = False
     static_test_views: Count = 8
     surroundings: Literal["none", "room"] = "none"
     texture: Texture = "soft"
@@ -170,8 +175,10 @@ class ProceduralScene(Recipe):
         room = Room(floor=where.motion.low[2], weave=self.texture == "fine")
         return Surrounded(shape, room, where.reach)
 
-    def model(self) -> Robot | Flower:
+    def model(self) -> Body:
         """The moving shape itself."""
+        if self.shape == "random":
+            return random_body(self.scene_seed, self.speed, self.sliding)
         return Robot(self.speed) if self.shape == "robot" else Flower(self.speed)
 
 

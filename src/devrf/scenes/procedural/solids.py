@@ -50,6 +50,14 @@ class Shape(Protocol):
         ...
 
 
+class Body(Shape, Protocol):
+    """A shape that stands alone, and knows where it is."""
+
+    def outline(self) -> Material:
+        """Points around all its parts at rest."""
+        ...
+
+
 # Lengths that a caller may give as a number, or as a tensor of one length for each primitive.
 Length = float | Tensor
 
