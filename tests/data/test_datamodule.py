@@ -80,6 +80,23 @@ def test_the_procedural_module_renders_what_it_was_told():
     assert scene.static.train.pixels.shape == (3, 8, 12, 4)
     assert len(scene.static.test) == 2 and len(scene.dynamic.train) == 4
     assert scene.clock.times == (0.0, 1.0)
+    assert scene.dynamic.train.flow is not None
+
+
+def test_an_embedded_scene_may_come_without_flow():
+    numbers = {
+        "width": 12,
+        "height": 8,
+        "static_views": 1,
+        "static_test_views": 1,
+        "train_views": 1,
+    }
+    module = ProceduralDataModule("random", flow="none", frames=2, supersample=1, **numbers)
+    assert module.scene.dynamic.train.flow is None
+    module.provide({"forward_flow"})
+    assert module.scene.dynamic.train.forward_flow is None
+    with pytest.raises(DevrfError, match="data.flow: should be 'exact' or 'none', not 'dis'"):
+        ProceduralDataModule("robot", flow="dis")
 
 
 def test_options_are_checked_before_anything_is_read():

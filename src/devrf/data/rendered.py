@@ -5,37 +5,51 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 from devrf.data.datamodule import SceneDataModule
+from devrf.errors import DevrfError
 from devrf.scenes.procedural.filming import exact_flow
 from devrf.scenes.procedural.recipe import ProceduralScene, Recipe
 from devrf.scenes.scene import Scene
+
+Flow = Literal["exact", "none"]
+FLOWS = get_args(Flow)
 
 
 class RenderedDataModule(SceneDataModule):
     """A scene rendered when it is first needed."""
 
-    def __init__(self, recipe: Callable[[], Scene], export: str | Path | None) -> None:
+    def __init__(
+        self, recipe: Callable[[], Scene], export: str | Path | None, flow: Flow = "exact"
+    ) -> None:
         """Say how to render the scene.
 
         Args:
             recipe: renders it when called.
             export: the folder that ``stage=prepare`` writes the scene to.
+            flow: the optical flow that is learned from.
         """
         super().__init__()
         self.recipe = recipe
         self.export = None if export is None else Path(export)
+        if flow not in FLOWS:
+            raise DevrfError(f"data.flow: should be 'exact' or 'none', not {flow!r}")
+        self.flow = flow
 
     def load(self) -> Scene:
         """Render the scene."""
-        return self.recipe()
+        scene = self.recipe()
+        if self.flow == "exact":
+            return scene
+        dynamic = replace(scene.dynamic, train=replace(scene.dynamic.train, flow=None))
+        return replace(scene, dynamic=dynamic)
 
     def provide(self, priors: Collection[str]) -> None:
         """Compute exact forward flow, if a method wants it."""
         scene, train = self.scene, self.scene.dynamic.train
         wanted = "forward_flow" in priors and train.forward_flow is None
-        if wanted and isinstance(self.recipe, Recipe):
+        if self.flow == "exact" and wanted and isinstance(self.recipe, Recipe):
             flow = exact_flow(self.recipe.filmed(), train, forward=True)
             train = replace(train, forward_flow=flow)
             self.replace(replace(scene, dynamic=replace(scene.dynamic, train=train)))
@@ -49,6 +63,7 @@ class ProceduralDataModule(RenderedDataModule):
         *shape: Any,
         recipe: Callable[..., Recipe] = ProceduralScene,
         export: str | Path | None = None,
+        flow: Flow = "exact",
         **numbers: Any,
     ) -> None:
         """Say what to render.
@@ -57,6 +72,7 @@ class ProceduralDataModule(RenderedDataModule):
             shape: which shape, or the scene's name.
             recipe: :class:`ProceduralScene` or :class:`ProceduralForwardScene`.
             export: the folder that ``stage=prepare`` writes the scene to.
+            flow: the optical flow that is learned from.
             numbers: of the recipe.
         """
-        super().__init__(recipe(*shape, **numbers), export)
+        super().__init__(recipe(*shape, **numbers), export, flow)
