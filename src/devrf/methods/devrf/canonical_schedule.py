@@ -59,8 +59,7 @@ class CanonicalSchedule:
         voxels_per_pixel: forward-facing, grid points for each pixel across; decides ``side``.
         view_dependence_start: iteration from which colours depend on the viewing direction. None:
             0; in contracted space half of ``iterations``.
-        unbounded_initial_side: where the grid starts in contracted space, and then doubles at
-            equal intervals. None: ``upsample_at`` holds there, too.
+        unbounded_initial_side: of the grid in contracted space. None: as ``upsample_at`` says.
         unbounded_distortion: weight of the distortion loss there, from that iteration on.
         crop: forward-facing, whether the grid gives up empty depths (docs/method.md#crop).
     """

@@ -40,10 +40,8 @@ class Sampling:
 
     Attributes:
         step: distance between samples in voxels.
-        alpha_threshold: samples of a lower opacity, and then of a lower weight, are dropped
-            before their colour is computed.
-        search_alpha_threshold: the same in the geometry search, which begins almost transparent
-            everywhere.
+        alpha_threshold: samples of a lower opacity, and then of a lower weight, get no colour.
+        search_alpha_threshold: the same in the geometry search, which begins almost transparent.
         occupancy_threshold: opacity of a step up to which a cell counts as empty.
     """
 
@@ -65,10 +63,8 @@ class MotionSettings:
         occupancy_every: iterations between updates of the frame's occupancy.
         store: where frames are kept while one is learned; ``auto``: on the device if they fit.
         store_half: whether they are kept in half precision; ``auto``: on a GPU.
-        adam_state: of a visit ``fresh``, or ``carried`` over from the visit before, above the
-            coarsest level.
-        min_rel_improvement: a visit ends early when two Lightning steps have taken less than
-            this share off its loss; None goes through the whole schedule.
+        adam_state: ``fresh`` at each visit, or above the coarsest level ``carried`` over.
+        min_rel_improvement: of a visit's loss, in two Lightning steps; with less it ends early.
     """
 
     learning_rate: float = 1e-3

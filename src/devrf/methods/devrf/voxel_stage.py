@@ -48,8 +48,7 @@ class VoxelStage(ScheduledStage):
         Args:
             iterations_per_step: optimiser iterations in one Lightning step.
             graphs: whether a GPU replays iterations from CUDA graphs: ``auto`` where it can.
-            decoder_precision: what the colour network computes in while it learns; ``auto``:
-                ``bfloat16`` on a GPU that multiplies it.
+            decoder_precision: of the colour network while it learns; ``auto``: as the GPU allows.
         """
         super().__init__(iterations_per_step, graphs)
         self.decoder_precision = decoder_precision
