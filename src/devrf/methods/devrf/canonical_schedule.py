@@ -49,8 +49,7 @@ class CanonicalSchedule:
         side: the final grid has about side³ voxels.
         upsample_at: iterations, from the search's end, at which the number of voxels doubles.
         decay_iterations: after as many iterations the learning rates have fallen to a tenth.
-        restart_at_growth: whether a grid that has grown gets a new optimiser: the decay begins
-            again, and Adam's state is zero, the decoder's too.
+        restart_at_growth: whether decay and optimiser begin anew when the grid has grown.
         density_drop: what raw densities are lowered by when the grid has grown.
         occupancy_every: iterations between renewals of the occupancy; None: only at growth.
         rays: of a batch.

@@ -40,11 +40,7 @@ log = logging.getLogger(__name__)
 
 
 class CanonicalStage(VoxelStage):
-    """Learns the canonical field from the static views (docs/method.md#canonical-stage).
-
-    First the coarse geometry in the box of the scene's bounds; then the radiance field in a box
-    around it that leaves room for motion.
-    """
+    """Learns the canonical field from the static views (docs/method.md#canonical-stage)."""
 
     schedule: CanonicalSchedule
     name = "canonical"
@@ -149,7 +145,6 @@ class CanonicalStage(VoxelStage):
     def enter(self, phase: CanonicalPhase) -> None:
         """Make grids, occupancy, rays and optimiser ready for ``phase``."""
         previous, self.phase = self.phase, phase
-        self.scene_model.settings = self.render_settings(phase)
         if previous is not None and previous.kind != phase.kind:
             self._begin_fine(phase)
         elif previous is not None:

@@ -49,10 +49,6 @@ class GridWarp:
 class DeformationField(FrameField):
     """Displacements (T, X, Y, Z, 3) over a box, backward and forward (docs/method.md#warp).
 
-    A point x at time t is seen in canonical space at q = x + Δ_b(x, t); a canonical point q is at
-    q + Δ_f(q, t) at time t. Frame 0 is zero and never trained: at t = 0 the warp is exactly the
-    identity.
-
     Attributes:
         frames: the displacements of all frames, in the box's units.
         still_outside: whether nothing moves outside the box, which is then smaller than the

@@ -85,9 +85,8 @@ class DeformationPhase(Phase):
 class DeformationSchedule:
     """The deformation stage's visits; the defaults are the paper's, inward-facing.
 
-    Within a level (docs/method.md#coarse-to-fine) the frames t = 1, …, T − 1 are visited one after
-    another, each for the level's share of iterations. Frame 0 is the identity; its share goes to
-    the frame that is visited first.
+    See docs/method.md#coarse-to-fine. Frame 0 is the identity; its share of a level's iterations
+    goes to the frame that is visited first.
 
     Where K frames may be learned in parallel, the T frames are cut into contiguous stretches of
     L = max(2, ⌈T / K⌉) frames, so that neighbours are never learned together. Visit j, 0 ≤ j < L,

@@ -84,13 +84,15 @@ class DeVRFModel(Renderable):
 
     def config(self) -> dict[str, Any]:
         """Sizes, sampling, space, and which fields there are."""
+        kind = type(self.color_residual)
+        path = None if self.color_residual is None else f"{kind.__module__}:{kind.__qualname__}"
         return {
             "architecture": asdict(self.architecture),
             "settings": asdict(self.settings),
             "space": space_config(self.space),
             "radiance": isinstance(self.canonical.decoder, ColorDecoder),
             "deforms": self.moves,
-            "color_residual": _class_path(self.color_residual),
+            "color_residual": path,
         }
 
     @classmethod
@@ -112,10 +114,8 @@ class DeVRFModel(Renderable):
 
     def warp(self, time: float) -> Warp | None:
         """x → x + Δ_b(x, t), points (M, 3) at ``time`` → canonical space; None is the identity."""
-        deformation = self.deformation
-        if deformation is None or deformation.clock.at(time).after == 0:
-            return None
-        return deformation.warp_at(time)
+        warp = None if self.deformation is None else self.deformation.warp_at(time)
+        return warp if warp is not None and warp.slices else None
 
     def color_change(self, time: float) -> ColorChange | None:
         """q → A_t(q) at ``time``; None where colours are those of the canonical field."""
@@ -151,11 +151,6 @@ class DeVRFModel(Renderable):
         if self.deformation is not None and not self.deformation.to_canonical.is_cuda:
             self.deformation.frames.on_host = True
         return self.to(device)
-
-    @property
-    def device(self) -> torch.device:
-        """Where the canonical field is."""
-        return self.canonical.density.values.device
 
     @property
     def moves(self) -> bool:
@@ -207,11 +202,6 @@ class DeVRFModel(Renderable):
             RuntimeError | KeyError | ValueError: it does not fit, or a packed grid lacks a part.
         """
         self.load_state_dict({name: unpacked(value) for name, value in state.items()})
-
-
-def _class_path(field: ColorField | None) -> str | None:
-    """Where the field's class is, for :func:`_class_at`."""
-    return None if field is None else f"{type(field).__module__}:{type(field).__qualname__}"
 
 
 def _class_at(path: str | None, box: Box, clock: FrameClock) -> ColorField | None:
