@@ -152,6 +152,7 @@ def test_a_fault_of_the_program_keeps_its_traceback(devrf, monkeypatch):
         ("quickstart", "experiment=quickstart"),
         ("fox", "data.root=fox"),
         ("experiment=quickstrat", "experiment=quickstart"),
+        ("experiment=papr", "experiment=paper"),
         ("stage=train", "stage=pipeline"),
         ("kernels=tritn", "kernels=triton"),
         ("evaluation.metrics=[lpisp]", "lpips"),

@@ -140,6 +140,9 @@ def test_a_run_that_was_cut_short_says_where_it_stands(devrf, cut_short, tmp_pat
     outcome = devrf("stage=still", "hydra.run.dir=run", "still.height=20")
     assert outcome.status == 0 and f"{stands}; {go_on}" in outcome.out
     assert len([*tmp_path.glob("run/images/still*")]) == 2
+    progress = f"ckpt={checkpoints / 'canonical-progress-4.ckpt'}"
+    assert devrf("stage=evaluate", progress, "evaluation.metrics=[]").status == 0
+    assert [path.name for path in tmp_path.rglob("metrics*.json")] == ["metrics-unfinished.json"]
 
 
 def test_a_damaged_progress_file_gives_way_to_the_one_before(devrf, cut_short):

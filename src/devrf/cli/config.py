@@ -69,6 +69,12 @@ def group_choices() -> dict[str, list[str]]:
     return names
 
 
+def without_form(name: str) -> str:
+    """The experiment that is typed for a form of it: ``best_forward``, ``paper_lego``."""
+    ends = ("inward", "forward", "embedded", *group_choices()["data"])
+    return next((name.removesuffix(f"_{e}") for e in ends if name.endswith(f"_{e}")), name)
+
+
 def known_stages() -> list[str]:
     """Every stage there is, of all protocols."""
     learning: dict[str, None] = {}  # in order, each once

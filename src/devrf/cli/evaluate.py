@@ -62,7 +62,9 @@ def evaluate(run: RunContext) -> list[Path]:
         "checkpoint": digest_of(run.checkpoint(metadata.stage)),
     }
     ran["wall_seconds"]["evaluate"] = run.step_seconds
-    write_json(run.folder / "metrics.json", {**head, **at_rest, **sections, "run": ran})
+    # A report takes metrics.json for what a finished run has reached.
+    metrics = "metrics.json" if standing is None else "metrics-unfinished.json"
+    write_json(run.folder / metrics, {**head, **at_rest, **sections, "run": ran})
     shown = shown_sections(sections)
     for name, values in shown.items():
         log.info("%s: %s", name.replace("_", " "), in_words(values))
@@ -70,7 +72,7 @@ def evaluate(run: RunContext) -> list[Path]:
         tracker.conclude(tracked_scores(sections | shown))
         tracker.show_table("metrics", [{"section": name, **row} for name, row in shown.items()])
         tracker.show_table("frames", frame_rows(frames))
-    written = ("metrics.json", "frames.csv", *(f"images/{capture}.png" for capture in frames))
+    written = (metrics, "frames.csv", *(f"images/{capture}.png" for capture in frames))
     return [run.folder / name for name in written]
 
 

@@ -27,7 +27,7 @@ from devrf.cli.memory import compare
 from devrf.cli.messages import as_own_errors
 from devrf.cli.preparation import capture, fetch, inspect, prepare, say_next, selfcheck
 from devrf.cli.render import export, render, still, view
-from devrf.cli.resume import done, note_done
+from devrf.cli.resume import done, note_done, unfinished
 from devrf.cli.run_folder import archive_previous
 from devrf.cli.sweep import report
 from devrf.cli.train import learn
@@ -110,7 +110,8 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
         ended = True
     finally:
         run.close(failed=not ended)
-    return _ended(run, steps) if "evaluate" in steps and run.leads else None
+    scored = "evaluate" in steps and run.leads and unfinished(run) is None
+    return _ended(run, steps) if scored else None
 
 
 def _prepare_to_learn(run: RunContext, requested: Names, steps: Names) -> None:
