@@ -154,10 +154,9 @@ def _scaled(part: Part, size: float, motion: float) -> Part:
         if (swing := getattr(part, name)) is not STILL
     }
     slide = replace(part.slide, amplitude=size * motion * part.slide.amplitude)
-    (a, b, c), (x, y, z) = part.half, part.paint.periods
-    paint = replace(part.paint, periods=(size * x, size * y, size * z))
+    a, b, c = part.half
     half, base = (size * a, size * b, size * c), size * part.base
-    return replace(part, half=half, base=base, paint=paint, slide=slide, **moving)
+    return replace(part, half=half, base=base, slide=slide, **moving)
 
 
 def _paths(body: Assembled) -> tuple[Tensor, Tensor]:
@@ -213,5 +212,6 @@ def _paint(draw: Random) -> Paint:
     base, accent = color(), color()
     while math.dist(base, accent) < 0.4:
         accent = color()
-    x, y, z = (draw.choice((0.0, draw.uniform(0.14, 0.3))) for _ in range(3))
-    return Paint(base, accent, (x, y, z or draw.uniform(0.14, 0.3)), draw.uniform(-0.1, 0.35))
+    # Six pixels or more of an image of 64: finer texture would be lost in any small image.
+    x, y, z = (draw.choice((0.0, draw.uniform(0.27, 0.5))) for _ in range(3))
+    return Paint(base, accent, (x, y, z or draw.uniform(0.27, 0.5)), draw.uniform(-0.1, 0.35))
