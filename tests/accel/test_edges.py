@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from devrf.ops.check import BOX, Draw
+from devrf.ops.check import BOX
 from devrf.ops.color_network import ColorNetwork, listed_colors
 from devrf.ops.compositing import composite, composite_segments
 from devrf.ops.dispatch import using
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.gpu
 Both = Callable[[Callable[[], Sequence[Tensor]]], None]
 
 
-def test_nothing_gives_nothing_and_nowhere_a_value(draw: Draw, agree: Both) -> None:
+def test_nothing_gives_nothing_and_nowhere_a_value(draw, agree):
     grid, density, nothing = draw.leaf(4, 5, 3, 3), draw.leaf(4, 3, 5, 1), draw.leaf(0, 3)
     first = torch.zeros(3, dtype=torch.long, device=draw.device)
 
@@ -40,7 +40,7 @@ def test_nothing_gives_nothing_and_nowhere_a_value(draw: Draw, agree: Both) -> N
 
 
 @pytest.mark.parametrize("shift", [-16.0, 30.0])
-def test_faint_and_dense_keep_their_digits(draw: Draw, agree: Both, shift: float) -> None:
+def test_faint_and_dense_keep_their_digits(draw, agree, shift):
     # log(1 + exp(x)) of x about −16 is 1e-7: a plain sum with 1 would lose it.
     x, raw = draw(60, 3), draw.leaf(3, 3, 3, 1)
 
@@ -51,7 +51,7 @@ def test_faint_and_dense_keep_their_digits(draw: Draw, agree: Both, shift: float
     agree(work)
 
 
-def test_what_is_behind_an_opaque_sample(draw: Draw, agree: Both) -> None:
+def test_what_is_behind_an_opaque_sample(draw, agree):
     counts = torch.tensor([0, 3, 0, 33, 70, 0])
     first = torch.nn.functional.pad(counts.cumsum(0), (1, 0)).to(draw.device)
     # Optical depths from 1e-6 to 5, some as good as infinite; the last five are padding.
@@ -72,7 +72,7 @@ def test_what_is_behind_an_opaque_sample(draw: Draw, agree: Both) -> None:
 @pytest.mark.parametrize(
     "changed", [{"rays": 0}, {"capacity": 0}, {"longest": 40}, {"stop": 1.0}], ids=str
 )
-def test_searches_that_end_early(draw: Draw, agree: Both, changed: dict[str, Any]) -> None:
+def test_searches_that_end_early(draw, agree, changed):
     settings = {"rays": 6, "capacity": 200, "longest": 70, "stop": 0.01, **changed}
     rays = int(settings["rays"])
     directions = torch.nn.functional.normalize(draw(rays, 3), dim=1)
@@ -97,9 +97,7 @@ def test_searches_that_end_early(draw: Draw, agree: Both, changed: dict[str, Any
 
 
 @pytest.mark.parametrize("frozen", [(3,), range(8)])
-def test_colors_add_to_gradients_that_are_kept(
-    draw: Draw, agree: Both, frozen: Sequence[int]
-) -> None:
+def test_colors_add_to_gradients_that_are_kept(draw, agree, frozen):
     """Of four rays, 100 samples, 30 places of padding, all that is not frozen."""
     width, places = 6, 130
     shapes = (width, 7), (width,), (width, 21), (width, width), (width,), (3, width)
@@ -126,7 +124,7 @@ def test_colors_add_to_gradients_that_are_kept(
 
 
 @pytest.mark.parametrize("frames", [0, 2])
-def test_warped_depths_add_to_gradients_that_are_kept(draw: Draw, agree: Both, frames: int) -> None:
+def test_warped_depths_add_to_gradients_that_are_kept(draw, agree, frames):
     # Some points start outside the box, others are sent there.
     x, grids = 1.2 * draw(133, 3), [3 * draw(4, 3, 5, 1), *[0.4 * draw(3, 4, 3, 3)] * frames]
     to_q, to_tau = draw(133, 3), draw(133)

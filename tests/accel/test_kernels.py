@@ -10,14 +10,14 @@ from devrf.geometry.box import Box
 from devrf.ops import check, color_network
 from devrf.ops.check import CASES, Draw, check_kernels, compare
 from devrf.ops.color_network import ColorNetwork, listed_colors
-from devrf.ops.dispatch import Kind, using
+from devrf.ops.dispatch import using
 from devrf.ops.motion import ListedSamples, SeenEarlier, motion_sum
 from devrf.ops.photometric import photometric_sum
 from devrf.ops.search import PackedSamples, select_listed
 
 
 @pytest.mark.parametrize("case", [case for cases in CASES.values() for case in cases])
-def test_both_implementations_agree(case: check.Case, device: torch.device) -> None:
+def test_both_implementations_agree(case, device):
     state = torch.get_rng_state()
     error, share = compare(case, device)
     assert error > 0 or case is check.selection, "nothing was compared"
@@ -26,7 +26,7 @@ def test_both_implementations_agree(case: check.Case, device: torch.device) -> N
     assert torch.equal(torch.get_rng_state(), state)
 
 
-def test_a_broken_kernel_is_found(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_broken_kernel_is_found(device, monkeypatch):
     from devrf.accel import compositing
 
     def askew(depth: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
@@ -43,7 +43,7 @@ def test_a_broken_kernel_is_found(device: torch.device, monkeypatch: pytest.Monk
 
 @pytest.mark.parametrize("kernels", ["torch", "triton"])
 @pytest.mark.parametrize("matte", [False, True])
-def test_photometric_terms_by_hand(device: torch.device, kernels: Kind, matte: bool) -> None:
+def test_photometric_terms_by_hand(device, kernels, matte):
     image = torch.tensor([[0.5, 0.0, 0.0], [0.0, 0.0, 0.0]]).to(device)
     left = torch.tensor([0.5, 0.25]).to(device).requires_grad_()
     colors = torch.tensor([[1.0, 1.0, 0.0], [9.0, 9.0, 9.0]]).to(device).requires_grad_()
@@ -67,7 +67,7 @@ def test_photometric_terms_by_hand(device: torch.device, kernels: Kind, matte: b
 
 
 @pytest.mark.parametrize("kernels", ["torch", "triton"])
-def test_motion_terms_by_hand(device: torch.device, kernels: Kind) -> None:
+def test_motion_terms_by_hand(device, kernels):
     """Everything has moved by 0.2 along x, and by 0.1 one frame earlier; a camera looks down −z."""
     points = torch.tensor([[0.5, 0.0, -2.0], [0.0, 0.3, -2.0], [9.0, 9.0, 9.0]])
     canonical = torch.tensor([[0.2, 0.0, -2.0], [0.0, 0.0, -2.0], [0.0, 0.0, 0.0]])
@@ -118,9 +118,7 @@ def test_motion_terms_by_hand(device: torch.device, kernels: Kind) -> None:
 
 @pytest.mark.parametrize("kernels", ["torch", "triton"])
 @pytest.mark.parametrize("ndc", [None, (1.1, 1.3, 1.0)])
-def test_flow_at_infinity_or_at_the_camera_stays_finite(
-    draw: Draw, kernels: Kind, ndc: tuple[float, float, float] | None
-) -> None:
+def test_flow_at_infinity_or_at_the_camera_stays_finite(draw, kernels, ndc):
     device = draw.device
     at = torch.tensor([[0.0, 0.0, 0.0], [0.5, 0.5, 1.0], [0.5, 0.5, 0.0]]).to(device)
     canonical, weight = at.requires_grad_(), torch.ones(3, device=device, requires_grad=True)
@@ -142,7 +140,7 @@ def test_flow_at_infinity_or_at_the_camera_stays_finite(
 
 
 @pytest.mark.parametrize("kernels", ["torch", "triton"])
-def test_selection_of_listed_samples_by_hand(draw: Draw, kernels: Kind) -> None:
+def test_selection_of_listed_samples_by_hand(draw, kernels):
     device = draw.device
     flags = torch.tensor([True, False, True, True, False, True, False, False]).to(device)
     ray, first = torch.tensor([0, 0, 2, 2, 3, 3, 4, 4]), torch.tensor([0, 2, 2, 4, 6]).to(device)
@@ -180,8 +178,8 @@ def test_selection_of_listed_samples_by_hand(draw: Draw, kernels: Kind) -> None:
     ],
 )
 def test_a_network_that_a_program_has_no_room_for_is_left_to_torch(
-    monkeypatch: pytest.MonkeyPatch, width: int, precision: torch.dtype, fused: bool
-) -> None:
+    monkeypatch, width, precision, fused
+):
     draw, decoded = Draw(torch.device("cpu")), []
     usual = color_network.decode
     monkeypatch.setattr(color_network, "decode", lambda *a: decoded.append(a) or usual(*a))

@@ -31,7 +31,7 @@ def gpu_scene() -> SmallScene:
 @pytest.mark.gpu
 @needs_gpu
 @pytest.mark.parametrize("name", selfcheck.CHECKS)
-def test_a_check_passes(name: str, gpu_scene: SmallScene) -> None:
+def test_a_check_passes(name, gpu_scene):
     selfcheck.CHECKS[name](gpu_scene)
 
 
@@ -81,9 +81,7 @@ class ScarceCapture(CudaGraphCapture):
 @pytest.mark.gpu
 @needs_gpu
 @pytest.mark.parametrize("capturer", [ScarceWarmUp, ScarceCapture])
-def test_all_is_learned_when_memory_runs_out(
-    gpu_scene: SmallScene, capturer: type[CudaGraphCapture]
-) -> None:
+def test_all_is_learned_when_memory_runs_out(gpu_scene, capturer):
     stage = gpu_scene.stage("canonical", FAST)
     stage.loop._capture = capturer(GPU)
     losses = gpu_scene.learn(stage, FAST)
@@ -100,9 +98,7 @@ def scene() -> SmallScene:
     return small_scene(torch.device("cpu"))
 
 
-def test_a_stage_that_a_signal_stops_goes_on_to_equal_bits(
-    scene: SmallScene, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stage_that_a_signal_stops_goes_on_to_equal_bits(scene, monkeypatch):
     assert resume(scene, "canonical", EXACT).endswith("equal bits")
     usual = VoxelStage._reseed
 
@@ -143,7 +139,7 @@ def graphs(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     return monkeypatch
 
 
-def test_every_resolution_is_captured(scene: SmallScene, graphs: pytest.MonkeyPatch) -> None:
+def test_every_resolution_is_captured(scene, graphs):
     assert int(capture(scene, "deformation").split()[0]) >= 2
 
     def short(self: CudaGraphCapture, work: Work) -> Any:
@@ -154,7 +150,7 @@ def test_every_resolution_is_captured(scene: SmallScene, graphs: pytest.MonkeyPa
         capture(scene, "canonical")
 
 
-def test_pictures_are_compared(scene: SmallScene, graphs: pytest.MonkeyPatch) -> None:
+def test_pictures_are_compared(scene, graphs):
     assert rendering(scene).startswith("0 off")
     graphs.setattr(selfcheck, "PICTURES", [(True, -1.0)])
     with pytest.raises(DevrfError, match="half=True"):

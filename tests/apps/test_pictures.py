@@ -19,12 +19,7 @@ from devrf.apps.images import (
     to_bytes,
 )
 from devrf.apps.still import StillSettings, write_contact_sheet
-from devrf.apps.video import (
-    VideoSettings,
-    held_out_images,
-    held_out_pictures,
-    path_pictures,
-)
+from devrf.apps.video import VideoSettings, held_out_images, held_out_pictures, path_pictures
 from devrf.apps.video_file import write_pictures
 from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError

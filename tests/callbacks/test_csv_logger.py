@@ -35,7 +35,7 @@ def again(path: Path) -> ResumableCSVLogger:
     return ResumableCSVLogger(path.parents[2], "logs", "pipeline")
 
 
-def test_a_row_is_on_the_disk_at_once(path: Path) -> None:
+def test_a_row_is_on_the_disk_at_once(path):
     rows = table(path)
     assert list(rows[0]) == ["dynamic/flow", "dynamic/loss", "static/loss", "step"]
     assert [row["step"] for row in rows] == ["10", "20", "30", "10", "20"]
@@ -43,7 +43,7 @@ def test_a_row_is_on_the_disk_at_once(path: Path) -> None:
     assert rows[4]["dynamic/flow"] == "0.5"
 
 
-def test_rows_beyond_the_resume_point_are_dropped(path: Path) -> None:
+def test_rows_beyond_the_resume_point_are_dropped(path):
     curves = again(path)
     curves.drop_rows_beyond("dynamic", 10)
     assert [row["step"] for row in table(path)] == ["10", "20", "30", "10"]
@@ -53,16 +53,14 @@ def test_rows_beyond_the_resume_point_are_dropped(path: Path) -> None:
     assert table(path) == []
 
 
-def test_a_line_that_was_cut_off_is_no_row(path: Path) -> None:
+def test_a_line_that_was_cut_off_is_no_row(path):
     whole = path.read_text()
     path.write_text(whole[:-3])  # the last row's step, 20, has become 2
     again(path).log_metrics({"dynamic/loss": 2.0, "dynamic/flow": 0.5}, 20)
     assert path.read_text().split() == whole.split()
 
 
-def test_on_a_full_disk_rows_wait(
-    path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_on_a_full_disk_rows_wait(path, monkeypatch, caplog):
     def full(*_: Any) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 

@@ -66,9 +66,7 @@ def learn(
     return fit
 
 
-def test_previews_come_as_often_as_asked_for_and_look_right(
-    learn, datamodule: SceneDataModule
-) -> None:
+def test_previews_come_as_often_as_asked_for_and_look_right(learn, datamodule):
     album = Album()
     learn(album, Previews(times=3))
     shown = album.images["static/view"]
@@ -84,9 +82,7 @@ def test_previews_come_as_often_as_asked_for_and_look_right(
     torch.testing.assert_close(truth, expected)
 
 
-def test_the_curve_of_a_stage_has_every_step(
-    learn, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_curve_of_a_stage_has_every_step(learn, tmp_path, monkeypatch):
     drawn: list[Any] = []
     module = "devrf.apps.report.plots"
     original = importlib.import_module(module).write_training_curve
@@ -105,7 +101,7 @@ def test_the_curve_of_a_stage_has_every_step(
     assert height > 400 and width > 800
 
 
-def test_a_curve_goes_on_after_a_break_and_a_rollback(learn, tmp_path: Path) -> None:
+def test_a_curve_goes_on_after_a_break_and_a_rollback(learn, tmp_path):
     class Keeping(TrainingCurve):
         def on_train_end(self, trainer: Trainer, pl_module: Any) -> None: ...
 
@@ -124,9 +120,7 @@ def test_a_curve_goes_on_after_a_break_and_a_rollback(learn, tmp_path: Path) -> 
     assert points[-2:] == [(11, pytest.approx(110)), (12, pytest.approx(120))]
 
 
-def test_watching_changes_nothing_of_what_is_learned_and_curves_stand_beside_the_losses(
-    learn,
-) -> None:
+def test_watching_changes_nothing_of_what_is_learned_and_curves_stand_beside_the_losses(learn):
     album = Album()
     stage = learn(album, Meter(), Previews(times=4))
     watched, alone = stage.scene_model.canonical, learn(Album()).scene_model.canonical

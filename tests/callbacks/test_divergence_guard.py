@@ -6,7 +6,6 @@ import copy
 import logging
 import math
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -72,7 +71,7 @@ def finite(state: dict[str, Any]) -> bool:
 
 
 @pytest.mark.parametrize("what", ["gradient", "inf"])
-def test_the_first_time_is_rolled_back(fit, canonical, caplog, what: str) -> None:
+def test_the_first_time_is_rolled_back(fit, canonical, caplog, what):
     spoil, guard = Spoil(what, 14), DivergenceGuard(every_iterations=4)
     stage = fit(canonical(**SHORT), TrainingRecord(), spoil, guard)
     assert finite(stage.state_dict())
@@ -88,9 +87,7 @@ def test_the_first_time_is_rolled_back(fit, canonical, caplog, what: str) -> Non
     assert not torch.equal(first, again)
 
 
-def test_the_second_time_ends_the_stage_in_its_last_good_state(
-    fit, canonical, tmp_path: Path
-) -> None:
+def test_the_second_time_ends_the_stage_in_its_last_good_state(fit, canonical, tmp_path):
     saving = PeriodicCheckpoint(tmp_path, every_seconds=0, share=1.0)
     spoil, guard = Spoil("nan", 3, 14, group=1), DivergenceGuard(every_iterations=4)
     with pytest.raises(DevrfError) as caught:
@@ -113,7 +110,7 @@ def test_the_second_time_ends_the_stage_in_its_last_good_state(
     assert (again.iteration, again.num_rollbacks, again.lr_scale) == (24, 2, 0.25)
 
 
-def test_a_frame_is_visited_again(fit, moving, caplog) -> None:
+def test_a_frame_is_visited_again(fit, moving, caplog):
     stage = fit(moving(), Spoil("nan", 21), DivergenceGuard())
     phase = MOVING.phase(21, 3)
     assert f"(frame {phase.frames[0]}, " in caplog.text
@@ -125,8 +122,8 @@ def test_a_frame_is_visited_again(fit, moving, caplog) -> None:
     ("density", "words", "carve"), [("-100", "empty", True), ("100", "opaque", False)]
 )
 def test_a_field_that_empties_or_fills_is_rolled_back(
-    fit, canonical, caplog, density: str, words: str, carve: bool
-) -> None:
+    fit, canonical, caplog, density, words, carve
+):
     guard = DivergenceGuard(every_iterations=20)
     stage = fit(canonical(**LONG, visual_hull_init=carve), Spoil(density, 30), guard)
     assert f"everything has become {words} by iteration" in caplog.text
@@ -134,7 +131,7 @@ def test_a_field_that_empties_or_fills_is_rolled_back(
     assert stage.num_rollbacks == 1 and stage.iteration == 50
 
 
-def test_a_stage_that_never_saw_anything_warns(fit, canonical, caplog) -> None:
+def test_a_stage_that_never_saw_anything_warns(fit, canonical, caplog):
     clear = {"alpha_init": 1e-7, "rates": CanonicalRates(density=1e-9)}
     guard = DivergenceGuard(every_iterations=20)
     stage = fit(canonical(**{**SHORT, "upsample_at": ()}, **clear), guard)
@@ -145,7 +142,7 @@ def test_a_stage_that_never_saw_anything_warns(fit, canonical, caplog) -> None:
         fit(canonical(**SHORT, **clear), guard)
 
 
-def test_a_sound_stage_is_not_touched(fit, canonical, moving, caplog) -> None:
+def test_a_sound_stage_is_not_touched(fit, canonical, moving, caplog):
     def learned(*callbacks: Callback) -> list[dict[str, Any]]:
         stages = [canonical(**SHORT), moving()]
         torch.manual_seed(4)
@@ -159,12 +156,12 @@ def test_a_sound_stage_is_not_touched(fit, canonical, moving, caplog) -> None:
                 assert torch.equal(value, other[name]), name
 
 
-def test_senseless_settings_are_refused() -> None:
+def test_senseless_settings_are_refused():
     with pytest.raises(DevrfError, match="callbacks.divergence_guard: expected"):
         DivergenceGuard(10, 1.5)
 
 
-def test_emptied_and_filled_by_hand() -> None:
+def test_emptied_and_filled_by_hand():
     assert emptied(opacity=0.001, highest=0.2, expected=0.3)
     assert not emptied(0.02, 0.2, 0.3)  # faint, but there
     assert not emptied(0.001, 0.02, 0.3)  # it has never been there

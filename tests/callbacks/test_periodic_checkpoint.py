@@ -37,9 +37,7 @@ def names(folder: Path) -> list[str]:
 
 
 @pytest.mark.parametrize(("seconds", "left"), [(0, [10, 11]), (1000, [])])
-def test_the_last_two_are_kept_and_none_is_written_before_its_time(
-    learn, tmp_path: Path, seconds: float, left: list[int]
-) -> None:
+def test_the_last_two_are_kept_and_none_is_written_before_its_time(learn, tmp_path, seconds, left):
     saving = PeriodicCheckpoint(tmp_path, seconds, share=1.0)
     learn(saving)
     # The stage's last iteration is its checkpoint's.
@@ -47,7 +45,7 @@ def test_the_last_two_are_kept_and_none_is_written_before_its_time(
     assert saving.saved == (left[-1] if left else None)
 
 
-def test_a_row_of_the_curves_that_is_due_is_waited_for(learn, tmp_path: Path) -> None:
+def test_a_row_of_the_curves_that_is_due_is_waited_for(learn, tmp_path):
     seen: list[list[str]] = []
     watch = at(6, lambda: seen.append(names(tmp_path)))
     learn(PeriodicCheckpoint(tmp_path, every_seconds=0, share=1.0), watch, every=3)
@@ -55,9 +53,7 @@ def test_a_row_of_the_curves_that_is_due_is_waited_for(learn, tmp_path: Path) ->
     assert seen == [["canonical-progress-4.ckpt", "canonical-progress-5.ckpt"]]
 
 
-def test_a_full_disk_does_not_end_the_training(
-    learn, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_full_disk_does_not_end_the_training(learn, tmp_path, monkeypatch, caplog):
     usual = module.save_checkpoint
 
     def full(trainer: Trainer, path: Path, **how: Any) -> None:
@@ -78,7 +74,7 @@ def test_a_full_disk_does_not_end_the_training(
     assert names(tmp_path) == ["canonical-progress-10.ckpt", "canonical-progress-11.ckpt"]
 
 
-def test_senseless_times_are_refused(tmp_path: Path) -> None:
+def test_senseless_times_are_refused(tmp_path):
     with pytest.raises(DevrfError, match="callbacks.checkpoint: expected"):
         PeriodicCheckpoint(tmp_path, -1.0)
 
@@ -88,9 +84,7 @@ def test_senseless_times_are_refused(tmp_path: Path) -> None:
     [(5, ["canonical-progress-5.ckpt"]), (12, [])],
     ids=["on the way", "after the last iteration"],
 )
-def test_a_signal_stops_the_stage_saved(
-    learn, tmp_path: Path, iteration: int, left: list[str]
-) -> None:
+def test_a_signal_stops_the_stage_saved(learn, tmp_path, iteration, left):
     saving = PeriodicCheckpoint(tmp_path, every_seconds=1000)
     with StopOnSignal(saving) as stop:
         stage = learn(at(iteration, lambda: os.kill(os.getpid(), signal.SIGTERM)), saving, stop)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from itertools import count
@@ -18,8 +17,6 @@ from torch.optim import Optimizer
 
 from devrf.callbacks import Meter, Progress, TrainingRecord
 from devrf.callbacks.trial import seconds_to_learn
-from devrf.checkpoints.checkpoint import LoadedCheckpoint
-from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
@@ -41,7 +38,7 @@ def watched(steps: list[tuple[int, Any, list[float]]]) -> Callback:
     return LambdaCallback(on_before_optimizer_step=note)
 
 
-def test_canonical_rates_and_phases_are_the_schedules_at_every_step(fit, canonical) -> None:
+def test_canonical_rates_and_phases_are_the_schedules_at_every_step(fit, canonical):
     stage = fit(canonical(iterations_per_step=10), watched(steps := []))
     assert [step for step, _, _ in steps] == list(range(12))
     for step, phase, rates in steps:
@@ -50,9 +47,7 @@ def test_canonical_rates_and_phases_are_the_schedules_at_every_step(fit, canonic
         assert rates == pytest.approx([0.1 * factor, 0.1 * factor, 1e-3 * factor])
 
 
-def test_deformation_rates_and_phases_are_the_schedules_at_every_step(
-    fit, rest: LoadedCheckpoint
-) -> None:
+def test_deformation_rates_and_phases_are_the_schedules_at_every_step(fit, rest):
     motion = MotionSettings(learning_rate=2e-3, unit="box")
     stage = fit(DeformationStage(rest, DEFORMATION, motion), watched(steps := []))
     assert [step for step, _, _ in steps] == list(range(15))
@@ -66,15 +61,15 @@ def test_deformation_rates_and_phases_are_the_schedules_at_every_step(
 
 
 def test_without_the_upscaling_callback_a_stage_says_what_is_missing(
-    canonical, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
-) -> None:
+    canonical, datamodule, trainer
+):
     bare = trainer(max_steps=1)
     bare.callbacks.pop(0)  # type: ignore[attr-defined]
     with pytest.raises(DevrfError, match="CanonicalStage.*iteration 0.*GridUpscaling"):
         bare.fit(canonical(), datamodule=datamodule)
 
 
-def test_the_record_says_what_training_took(fit, canonical) -> None:
+def test_the_record_says_what_training_took(fit, canonical):
     stage = fit(canonical(), TrainingRecord())
     assert stage.record["iterations"] == 12
     assert stage.record["peak_gpu_gb"] is None and stage.record["peak_reserved_gb"] is None
@@ -85,12 +80,7 @@ def test_the_record_says_what_training_took(fit, canonical) -> None:
     assert stage.metadata().records["canonical"] == stage.record
 
 
-def test_progress_and_curves_name_the_frames_of_a_visit(
-    rest: LoadedCheckpoint,
-    four_frames: SceneDataModule,
-    trainer: Callable[..., Trainer],
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_progress_and_curves_name_the_frames_of_a_visit(rest, four_frames, trainer, caplog):
     caplog.set_level(logging.INFO, logger="devrf")
     schedule = replace(DEFORMATION, coarse_to_fine=False, levels=(Level(6, 5, parallel_frames=2),))
     stage = DeformationStage(rest, schedule, iterations_per_step=100)
@@ -104,9 +94,7 @@ def test_progress_and_curves_name_the_frames_of_a_visit(
     assert fitted.callback_metrics["dynamic/frame"] == 1
 
 
-def test_the_time_left_knows_that_finer_levels_take_longer(
-    fit, canonical, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_time_left_knows_that_finer_levels_take_longer(fit, canonical, caplog, monkeypatch):
     stage = canonical(upsample_at=(2, 3, 4))
     # Sides of 6 for two iterations, of 12 for the last eight.
     assert (stage.cost(0, 2), stage.cost(4, 12)) == pytest.approx((2 * 6, 8 * 12))
@@ -120,7 +108,7 @@ def test_the_time_left_knows_that_finer_levels_take_longer(
     assert first.endswith("  about 20 s left")
 
 
-def test_how_long_learning_takes_is_told_from_its_first_seconds(datamodule, monkeypatch) -> None:
+def test_how_long_learning_takes_is_told_from_its_first_seconds(datamodule, monkeypatch):
     schedule = CanonicalSchedule(
         search_iterations=0, iterations=40, side=16, upsample_at=(20,), rays=64
     )

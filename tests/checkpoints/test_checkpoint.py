@@ -11,9 +11,8 @@ import pytest
 import torch
 from lightning import Trainer
 
-from devrf.checkpoints.checkpoint import LoadedCheckpoint, load_checkpoint, save_checkpoint
+from devrf.checkpoints.checkpoint import load_checkpoint, save_checkpoint
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file, write_checkpoint_file
-from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
@@ -59,9 +58,7 @@ def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> Path:
     return path
 
 
-def test_the_canonical_stage_comes_back(
-    canonical: Path, learned: tuple[CanonicalStage, Trainer], tiny_scene: Scene
-) -> None:
+def test_the_canonical_stage_comes_back(canonical, learned, tiny_scene):
     stored = load_checkpoint(canonical, tiny_scene)
     assert_alike(stored.model, learned[0].scene_model, tiny_scene)
     assert stored.metadata == learned[0].metadata()
@@ -70,12 +67,8 @@ def test_the_canonical_stage_comes_back(
 
 
 def test_the_deformation_stage_comes_back_and_alone_suffices(
-    rest: LoadedCheckpoint,
-    datamodule: SceneDataModule,
-    tiny_scene: Scene,
-    tmp_path: Path,
-    trainer: Callable[..., Trainer],
-) -> None:
+    rest, datamodule, tiny_scene, tmp_path, trainer
+):
     schedule = DeformationSchedule(levels=(Level(4, 4), Level(6, 2)), rays=128)
     stage, fit = DeformationStage(rest, schedule), trainer(max_epochs=1)
     fit.fit(stage, datamodule=datamodule)
@@ -91,7 +84,7 @@ def test_the_deformation_stage_comes_back_and_alone_suffices(
     assert not torch.equal(moved, still)
 
 
-def test_another_scene_is_refused(canonical: Path, tiny_scene: Scene) -> None:
+def test_another_scene_is_refused(canonical, tiny_scene):
     views = tiny_scene.static.train
     fewer = replace(views[torch.arange(7)])
     other = replace(tiny_scene, name="cat", static=replace(tiny_scene.static, train=fewer))
@@ -100,7 +93,7 @@ def test_another_scene_is_refused(canonical: Path, tiny_scene: Scene) -> None:
     assert load_checkpoint(canonical, None).metadata.scene == "robot"
 
 
-def test_checkpoints_of_others_are_refused(tmp_path: Path) -> None:
+def test_checkpoints_of_others_are_refused(tmp_path):
     path = tmp_path / "foreign.ckpt"
     assert "no such checkpoint" in refusal(path)
     write_checkpoint_file(path, {"devrf": "yes", "state_dict": {}})
@@ -117,12 +110,10 @@ CONTRADICTIONS: dict[str, Callable[[dict[str, Any]], object]] = {
 
 
 @pytest.mark.parametrize("change", CONTRADICTIONS.values(), ids=list(CONTRADICTIONS))
-def test_a_checkpoint_that_contradicts_itself_is_refused(
-    canonical: Path, change: Callable[[dict[str, Any]], object]
-) -> None:
+def test_a_checkpoint_that_contradicts_itself_is_refused(canonical, change):
     refusal(edit(canonical, change))
 
 
-def test_a_file_may_not_choose_which_code_is_run(canonical: Path) -> None:
+def test_a_file_may_not_choose_which_code_is_run(canonical):
     path = edit(canonical, lambda data: data["devrf"]["model"].update(_target_="os.system"))
     assert "which is not known here" in refusal(path)

@@ -44,13 +44,13 @@ def refusal(path: Path, data: bytes | None = None) -> str:
     return message
 
 
-def test_plain_values_come_back_as_they_were(path: Path) -> None:
+def test_plain_values_come_back_as_they_were(path):
     assert repr(read_checkpoint_file(path)["plain"]) == repr(PLAIN)
     assert torch.equal(load_file(path)["/fields/density"], GRID)  # safetensors reads it, too
     assert [p.name for p in path.parent.iterdir()] == ["some.ckpt"]
 
 
-def test_tensors_of_every_type_come_back_bit_for_bit(path: Path) -> None:
+def test_tensors_of_every_type_come_back_bit_for_bit(path):
     plain = torch.tensor([[0, 1, 3], [1, 0, 2]]), torch.tensor(1)
     tensors = [tensor.to(dtype) for dtype in DTYPES for tensor in plain]
     write_checkpoint_file(path, {"odd": torch.ones(3, dtype=torch.bool), "all": tensors})
@@ -62,7 +62,7 @@ def test_tensors_of_every_type_come_back_bit_for_bit(path: Path) -> None:
     [GRID[:, 1], GRID.movedim(0, 2), torch.zeros(0, 3), torch.nn.Parameter(torch.ones(2))],
     ids=["view", "transposed", "empty", "parameter"],
 )
-def test_a_tensor_is_stored_by_its_elements(path: Path, tensor: torch.Tensor) -> None:
+def test_a_tensor_is_stored_by_its_elements(path, tensor):
     write_checkpoint_file(path, {1: tensor, "1": tensor, "whole": torch.zeros(1)})
     back = read_checkpoint_file(path)
     assert path.stat().st_size < 1000 + 2 * tensor.nbytes
@@ -70,14 +70,14 @@ def test_a_tensor_is_stored_by_its_elements(path: Path, tensor: torch.Tensor) ->
     assert not back[1].requires_grad
 
 
-def test_what_cannot_be_stored_is_named(path: Path) -> None:
+def test_what_cannot_be_stored_is_named(path):
     before = path.read_bytes()
     with pytest.raises(TypeError, match="^/a/0: a checkpoint cannot hold a PosixPath"):
         write_checkpoint_file(path, {"a": [Path("b")]})
     assert path.read_bytes() == before
 
 
-def test_the_digest_tells_contents_apart(path: Path) -> None:
+def test_the_digest_tells_contents_apart(path):
     other = path.with_name("other.ckpt")
     write_checkpoint_file(other, {**CONTENT, "plain": []})
     assert len(digest_of(path)) == 64 and digest_of(path) != digest_of(other)
@@ -87,7 +87,7 @@ def test_the_digest_tells_contents_apart(path: Path) -> None:
     assert digest_of(other) == ""
 
 
-def test_a_description_is_read_without_tensors(path: Path) -> None:
+def test_a_description_is_read_without_tensors(path):
     write_checkpoint_file(path, {"a": [1, torch.ones(3)], "b": {"c": "d"}})
     assert read_description(path) == {"a": [1, None], "b": {"c": "d"}}
     path.write_bytes(path.read_bytes()[:200])
@@ -95,7 +95,7 @@ def test_a_description_is_read_without_tensors(path: Path) -> None:
         read_description(path)
 
 
-def test_damage_is_noticed(path: Path) -> None:
+def test_damage_is_noticed(path):
     whole, noise = path.read_bytes(), random.Random(0)
     data = int.from_bytes(whole[:8], "little") + 8
     for place in (*range(8, 100, 5), *(noise.randrange(data, len(whole)) for _ in range(10))):
@@ -109,7 +109,7 @@ def test_damage_is_noticed(path: Path) -> None:
     assert "its checksum does not match" in refusal(path, whole.replace(b"three", b"Three"))
 
 
-def test_files_of_others_are_refused(tmp_path: Path) -> None:
+def test_files_of_others_are_refused(tmp_path):
     path = tmp_path / "some.ckpt"
     assert "not a devrf checkpoint" in refusal(path, b"scene: robot\n" * 20)
     torch.save(GRID, path)
@@ -124,9 +124,7 @@ def test_files_of_others_are_refused(tmp_path: Path) -> None:
     assert "not a devrf" in refusal(path, len(header).to_bytes(8, "little") + header + bytes(40))
 
 
-def test_a_failed_write_leaves_the_file_of_before(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_write_leaves_the_file_of_before(path, monkeypatch):
     before = path.read_bytes()
 
     def fail(tensor: torch.Tensor) -> memoryview:

@@ -38,7 +38,6 @@ from devrf.methods.devrf.extensions.priors import Elastic
 from devrf.methods.devrf.extensions.refinement import RefinementSchedule, RefinementStage
 from devrf.methods.devrf.extensions.tracks import StartAlongFlow
 from devrf.methods.devrf.settings import MotionSettings
-from devrf.scenes.scene import Scene
 
 SMALL = Architecture(channels=4, width=8, frequencies=1, search_alpha_init=1e-2)
 # Search 0–7, then fine 8–19 with upsample_at after 4 and 8 of its iterations.
@@ -150,7 +149,7 @@ def learn(
     return run
 
 
-def test_the_canonical_stage_goes_on_exactly(learn) -> None:
+def test_the_canonical_stage_goes_on_exactly(learn):
     # In the search, at its end, before the occupancy is renewed, at an upsampling, at last.
     leaves = (1, 8, 10, 12, 19)
     assert_same(learn(canonical, *leaves), learn(canonical))
@@ -173,18 +172,14 @@ def deformation(
         (4, (4, 26)),
     ],
 )
-def test_the_deformation_stage_goes_on_exactly(
-    learn, rest: LoadedCheckpoint, each: int, leaves: tuple[int, ...]
-) -> None:
+def test_the_deformation_stage_goes_on_exactly(learn, rest, each, leaves):
     build = deformation(rest, MOVING, OFTEN, each=each, tracks=StartAlongFlow("tracks"))
     assert_same(learn(build, *leaves), learn(build))
 
 
 # A visit ends after three steps, as their losses tell.
 @pytest.mark.parametrize("motion", [OFTEN, replace(ROUNDED, min_rel_improvement=1.0)])
-def test_frames_that_are_visited_together_go_on_exactly(
-    learn, rest: LoadedCheckpoint, four_frames: SceneDataModule, motion: MotionSettings
-) -> None:
+def test_frames_that_are_visited_together_go_on_exactly(learn, rest, four_frames, motion):
     build = deformation(rest, TOGETHER, motion, tracks=StartAlongFlow("tracks"))
     whole = learn(build, data=four_frames)
     # At a visit of level 1, and mid-visit.
@@ -192,9 +187,7 @@ def test_frames_that_are_visited_together_go_on_exactly(
     assert len(whole["optimizer"]["param_groups"][0]["params"]) == 4
 
 
-def test_colours_that_change_go_on_exactly(
-    learn, rest: LoadedCheckpoint, four_frames: SceneDataModule
-) -> None:
+def test_colours_that_change_go_on_exactly(learn, rest, four_frames):
     colors = ColorResidual("always", side=5, start_level=2)
     build = deformation(rest, TOGETHER, ROUNDED, color_residual=colors)
     # Mid-visit at both levels, at the level's end.
@@ -203,16 +196,14 @@ def test_colours_that_change_go_on_exactly(
     assert len(whole["optimizer"]["param_groups"][1]["params"]) == 2
 
 
-def test_a_second_sweep_with_the_elastic_prior_goes_on_exactly(
-    learn, rest: LoadedCheckpoint, four_frames: SceneDataModule
-) -> None:
+def test_a_second_sweep_with_the_elastic_prior_goes_on_exactly(learn, rest, four_frames):
     build = deformation(rest, BACKWARD, ROUNDED, PRIORS, elastic=Elastic())
     # At a look at the occupancy, at the end of a level, mid-visit.
     whole = learn(build, data=four_frames)
     assert_same(learn(build, 20, 28, 34, data=four_frames), whole)
 
 
-def test_the_refinement_goes_on_exactly(learn, rest: LoadedCheckpoint) -> None:
+def test_the_refinement_goes_on_exactly(learn, rest):
     moving = DeformationField(rest.model.box, FrameClock((0.0, 0.5, 1.0)), voxels=4**3)
     rest.model.deformation = moving
 
@@ -226,8 +217,8 @@ def test_the_refinement_goes_on_exactly(learn, rest: LoadedCheckpoint) -> None:
 
 
 def test_only_what_is_to_be_gone_on_from_holds_the_way_there(
-    datamodule: SceneDataModule, trainer: Callable[..., Trainer], tmp_path: Path, tiny_scene: Scene
-) -> None:
+    datamodule, trainer, tmp_path, tiny_scene
+):
     stage, path = canonical(), tmp_path / "left.ckpt"
     fit = trainer(leave(path, 10), max_epochs=1)
     fit.fit(stage, datamodule=datamodule)
@@ -238,9 +229,7 @@ def test_only_what_is_to_be_gone_on_from_holds_the_way_there(
     assert not load_checkpoint(path, tiny_scene).metadata.complete
 
 
-def test_another_schedule_is_refused(
-    datamodule: SceneDataModule, trainer: Callable[..., Trainer], tmp_path: Path
-) -> None:
+def test_another_schedule_is_refused(datamodule, trainer, tmp_path):
     path, longer = tmp_path / "left.ckpt", CanonicalStage(replace(SEARCHING, iterations=13), SMALL)
     trainer(leave(path, 2), max_epochs=1).fit(canonical(), datamodule=datamodule)
     fit = trainer(max_epochs=1)

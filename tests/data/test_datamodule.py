@@ -21,7 +21,6 @@ from devrf.data.rendered import ProceduralDataModule, RenderedDataModule
 from devrf.errors import DevrfError
 from devrf.scenes.export import export
 from devrf.scenes.procedural import ProceduralForwardScene
-from devrf.scenes.scene import Scene
 
 
 def test_the_scene_is_loaded_once_and_only_when_needed(tiny_scene, serve):
@@ -45,9 +44,7 @@ def test_training_views_move_to_the_device_once_for_each_capture(tiny_scene, ser
 @pytest.mark.parametrize(
     ("capture", "images", "held_out"), [("static", (8,), 2), ("both", (8, 6), 3)]
 )
-def test_a_stage_is_served_what_it_learns_from(
-    tiny_scene: Scene, serve: Any, capture: str, images: tuple[int, ...], held_out: int
-) -> None:
+def test_a_stage_is_served_what_it_learns_from(tiny_scene, serve, capture, images, held_out):
     module, cpu = serve(tiny_scene), torch.device("cpu")
     learner: Any = SimpleNamespace(lightning_module=SimpleNamespace(capture=capture))
     module.trainer = learner
@@ -59,7 +56,7 @@ def test_a_stage_is_served_what_it_learns_from(
     assert module.transfer_batch_to_device(1, cpu, 0) == 1
 
 
-def test_the_training_loader_never_ends(tiny_scene: Scene, serve: Any) -> None:
+def test_the_training_loader_never_ends(tiny_scene, serve):
     loader = serve(tiny_scene).train_dataloader()
     assert list(itertools.islice(loader, 50)) == [None] * 50
 
@@ -172,9 +169,7 @@ def test_forward_flow_is_read_from_files_else_estimated_beside_the_backward_one(
     assert (tmp_path / "flow_forward.npz").exists() != written
 
 
-def test_without_priors_images_stand_before_the_background_and_tell_nothing_else(
-    tiny_scene: Scene,
-) -> None:
+def test_without_priors_images_stand_before_the_background_and_tell_nothing_else(tiny_scene):
     train = tiny_scene.dynamic.train
     pixels = train.pixels.clone()
     pixels[0, 0, 0] = torch.tensor([255, 0, 100, 51])  # a fifth of it, on white

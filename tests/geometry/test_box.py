@@ -18,7 +18,7 @@ def ray(origin: Xyz, direction: Xyz) -> Rays:
     return Rays(torch.tensor([origin]), d, d)
 
 
-def test_a_cube_of_side_cubed_voxels_has_that_side() -> None:
+def test_a_cube_of_side_cubed_voxels_has_that_side():
     # The paper's grids: cube roots in floating point must not lose one.
     for side in (2, 3, 10, 20, 40, 80, 100, 160, 161):
         for edge in (1.0, 2.26, 0.3):
@@ -33,13 +33,11 @@ def test_a_cube_of_side_cubed_voxels_has_that_side() -> None:
         ((100.0, 1.0, 1.0), 8, (43, 2, 2)),  # at least two along every axis
     ],
 )
-def test_a_grid_follows_the_box_proportions(
-    size: Xyz, voxels: int, shape: tuple[int, int, int]
-) -> None:
+def test_a_grid_follows_the_box_proportions(size, voxels, shape):
     assert Box((0.0, 0.0, 0.0), size).grid_shape(voxels) == shape
 
 
-def test_derived_boxes_by_hand() -> None:
+def test_derived_boxes_by_hand():
     box, other = Box((0.0, 0.0, 0.0), (2.0, 4.0, 1.0)), Box((-1.0, 1.0, 0.5), (1.0, 5.0, 2.0))
     assert box.size == (2.0, 4.0, 1.0) and box.longest == 4.0 and box.volume == 8.0
     assert box.scaled(1.5) == Box((-0.5, -1.0, -0.25), (2.5, 5.0, 1.25))
@@ -47,12 +45,12 @@ def test_derived_boxes_by_hand() -> None:
     assert box.clipped(other) == Box((0.0, 1.0, 0.5), (1.0, 4.0, 1.0))
 
 
-def test_a_flat_box_is_an_error() -> None:
+def test_a_flat_box_is_an_error():
     with pytest.raises(ValueError, match="low < high"):
         Box((0.0, 0.0, 0.0), (1.0, 1.0, 0.0))
 
 
-def test_grid_points_sit_on_the_corners_and_to_grid_counts_them() -> None:
+def test_grid_points_sit_on_the_corners_and_to_grid_counts_them():
     box, shape = Box((-1.0, 0.0, 2.0), (1.0, 3.0, 2.5)), (5, 4, 2)
     points = box.grid_points(shape, torch.zeros(()))
     assert points.shape == (5, 4, 2, 3)
@@ -63,7 +61,7 @@ def test_grid_points_sit_on_the_corners_and_to_grid_counts_them() -> None:
     torch.testing.assert_close(box.to_grid(points.reshape(-1, 3), shape), valid_mask)
 
 
-def test_contains_its_faces_and_nearest_moves_only_what_is_outside() -> None:
+def test_contains_its_faces_and_nearest_moves_only_what_is_outside():
     box = Box((0.0, 0.0, 0.0), (1.0, 2.0, 3.0))
     points = torch.tensor([[0.0, 2.0, 3.0], [0.5, 1.0, 1.0], [1.001, 1.0, 1.0], [-4.0, 9.0, 2.0]])
     assert box.contains(points).tolist() == [True, True, False, False]
@@ -83,14 +81,12 @@ def test_contains_its_faces_and_nearest_moves_only_what_is_outside() -> None:
         ((3.0, 0.0, 0.0), (1.0, 0.0, 0.0), -4.0, -2.0),
     ],
 )
-def test_crossing_by_hand(
-    cube: Box, origin: Xyz, direction: Xyz, entry: float, leave: float
-) -> None:
+def test_crossing_by_hand(cube, origin, direction, entry, leave):
     got = cube.crossing(ray(origin, direction))
     assert [float(v) for v in got] == pytest.approx([entry, leave], rel=1e-5)
 
 
-def test_a_miss_enters_after_it_leaves(cube: Box) -> None:
+def test_a_miss_enters_after_it_leaves(cube):
     for rays in (
         ray((0.0, 0.0, 1.001), (0.6, 0.8, 0.0)),  # parallel above it
         ray((-3.0, 0.0, 0.0), (1.0, 1.0, 0.0)),  # slanted past a corner

@@ -34,7 +34,7 @@ def scattered(rng: torch.Generator) -> Cameras:
     return Cameras(looking.camera_to_world, focal, center, 30, 20)
 
 
-def test_a_ray_by_hand() -> None:
+def test_a_ray_by_hand():
     rays = plain().rays(torch.tensor([0]), torch.tensor([[14.0, 8.0]]))
     # ((14 − 4)/10, −(8 − 3)/5, −1) = (1, −1, −1): right, down, ahead.
     torch.testing.assert_close(rays.directions, torch.tensor([[1.0, -1.0, -1.0]]) / 3**0.5)
@@ -42,7 +42,7 @@ def test_a_ray_by_hand() -> None:
     assert torch.equal(rays.origins, torch.zeros(1, 3))
 
 
-def test_a_moved_camera_sees_a_pixel_by_hand() -> None:
+def test_a_moved_camera_sees_a_pixel_by_hand():
     # At (0, 0, 5) turned a quarter about y: it looks along −x, its right is −z.
     pose = torch.tensor([[[0.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 5.0]]])
     camera = Cameras(pose, torch.tensor([[10.0, 5.0]]), torch.tensor([[4.0, 3.0]]), 8, 6)
@@ -54,7 +54,7 @@ def test_a_moved_camera_sees_a_pixel_by_hand() -> None:
     assert depth.item() == 2.0
 
 
-def test_projection_undoes_rays(scattered: Cameras, rng: torch.Generator) -> None:
+def test_projection_undoes_rays(scattered, rng):
     camera = torch.randint(5, (200,), generator=rng)
     pixels = torch.rand(200, 2, generator=rng) * torch.tensor([30.0, 20.0])
     rays = scattered.rays(camera, pixels)
@@ -65,9 +65,7 @@ def test_projection_undoes_rays(scattered: Cameras, rng: torch.Generator) -> Non
     torch.testing.assert_close(depth, along, atol=1e-5, rtol=1e-5)
 
 
-def test_image_rays_go_through_the_pixel_grid_and_project_into_undoes_them(
-    scattered: Cameras,
-) -> None:
+def test_image_rays_go_through_the_pixel_grid_and_project_into_undoes_them(scattered):
     # Row by row, x first.
     assert scattered.pixel_grid()[[0, 1, 30]].tolist() == [[0.5, 0.5], [1.5, 0.5], [0.5, 1.5]]
     rays = scattered.image_rays(3)
@@ -76,9 +74,7 @@ def test_image_rays_go_through_the_pixel_grid_and_project_into_undoes_them(
     torch.testing.assert_close(depth, 2 * rays.directions @ scattered.forwards[3])
 
 
-def test_resizing_scales_each_axis_by_its_own_factor(
-    scattered: Cameras, rng: torch.Generator
-) -> None:
+def test_resizing_scales_each_axis_by_its_own_factor(scattered, rng):
     small = scattered.resized(10, 4)
     assert (small.width, small.height) == (10, 4)
     camera = torch.randint(5, (40,), generator=rng)
@@ -87,7 +83,7 @@ def test_resizing_scales_each_axis_by_its_own_factor(
     torch.testing.assert_close(same.directions, scattered.rays(camera, pixels).directions)
 
 
-def test_looking_at_puts_the_target_in_the_middle_and_up_above(rng: torch.Generator) -> None:
+def test_looking_at_puts_the_target_in_the_middle_and_up_above(rng):
     positions, targets = torch.randn(6, 3, generator=rng) * 3, torch.randn(6, 3, generator=rng)
     cameras = Cameras.looking_at(positions, targets, focal=20.0, width=12, height=8)
     every = torch.arange(6)
@@ -99,7 +95,7 @@ def test_looking_at_puts_the_target_in_the_middle_and_up_above(rng: torch.Genera
     assert (above[:, 1] < 4).all()
 
 
-def test_looking_at_gives_right_handed_rigid_poses_even_straight_down() -> None:
+def test_looking_at_gives_right_handed_rigid_poses_even_straight_down():
     positions = torch.tensor([[0.0, 0.0, 3.0], [0.0, 0.0, -3.0], [2.0, 1.0, 1.0]])
     cameras = Cameras.looking_at(positions, torch.zeros(3, 3), focal=1.0, width=4, height=4)
     turn = cameras.camera_to_world[:, :, :3]
@@ -109,7 +105,7 @@ def test_looking_at_gives_right_handed_rigid_poses_even_straight_down() -> None:
 
 
 @pytest.mark.parametrize(("height", "width"), [(40, 60), (5, 8)])
-def test_another_height_keeps_the_proportions(scattered: Cameras, height: int, width: int) -> None:
+def test_another_height_keeps_the_proportions(scattered, height, width):
     # The cameras have 30 x 20 pixels; a width of 7.5 is rounded to even.
     sized = scattered.of_height(height)
     assert (sized.width, sized.height) == (width, height)
@@ -119,7 +115,7 @@ def test_another_height_keeps_the_proportions(scattered: Cameras, height: int, w
 BARREL = Distortion((-0.28, 0.07, 0.05, 0.0), (-0.001, 0.002))
 
 
-def test_opencv_puts_points_in_the_same_places() -> None:
+def test_opencv_puts_points_in_the_same_places():
     axis = torch.linspace(-0.7, 0.7, 15, dtype=torch.float64)
     points = torch.cartesian_prod(axis, 0.75 * axis)
     (k1, k2, k3, _), tangential = BARREL.radial, BARREL.tangential
@@ -131,7 +127,7 @@ def test_opencv_puts_points_in_the_same_places() -> None:
     torch.testing.assert_close(BARREL.distort(points), torch.from_numpy(theirs[:, 0]))
 
 
-def test_points_beyond_the_fold_are_not_upright() -> None:
+def test_points_beyond_the_fold_are_not_upright():
     # r·(1 − r²/4) has its greatest value 0.7698 at r = 1.1547.
     lens = Distortion((-0.25, 0.0, 0.0, 0.0))
     fold = 2 / math.sqrt(3)

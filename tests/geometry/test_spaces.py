@@ -11,7 +11,7 @@ from devrf.geometry.box import Box
 from devrf.geometry.contraction import ContractedSpace
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.rays import Rays
-from devrf.geometry.space import WORLD, Space, space_config, space_from
+from devrf.geometry.space import WORLD, space_config, space_from
 
 # Inner half edges 1, 2, 4 about (1, 0, 0): not a cube, so that a swap of axes shows.
 SPACE = ContractedSpace((0.0, -2.0, -4.0), (2.0, 2.0, 4.0), shell=1.0)
@@ -27,21 +27,19 @@ CUBE = ContractedSpace((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), shell=0.5)
         ((1.0, 0.0, -(2.0**19)), (1.0, 0.0, -8 + 2.0**-15)),  # far away: the outer face
     ],
 )
-def test_points_by_hand(
-    world: tuple[float, float, float], contracted: tuple[float, float, float]
-) -> None:
+def test_points_by_hand(world, contracted):
     torch.testing.assert_close(SPACE.from_world(torch.tensor([world])), torch.tensor([contracted]))
     torch.testing.assert_close(SPACE.to_world(torch.tensor([contracted])), torch.tensor([world]))
 
 
-def test_a_thin_shell_by_hand() -> None:
+def test_a_thin_shell_by_hand():
     assert CUBE.box == Box((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5))
     assert CUBE.inner() == Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
     contracted = CUBE.from_world(torch.tensor([[0.0, -5.0, 2.5]]))
     torch.testing.assert_close(contracted, torch.tensor([[0.0, -1.4, 0.7]]))
 
 
-def test_there_and_back(rng: torch.Generator) -> None:
+def test_there_and_back(rng):
     points = 20 * torch.randn(1000, 3, generator=rng, dtype=torch.float64)
     for space in (SPACE, CUBE):
         contracted = space.from_world(points)
@@ -58,7 +56,7 @@ def _rays(rng: torch.Generator, count: int, scale: float) -> Rays:
     return Rays(scale * torch.randn(count, 3, generator=rng), directions, directions)
 
 
-def test_samples_are_evenly_spaced_in_disparity_along_a_ray() -> None:
+def test_samples_are_evenly_spaced_in_disparity_along_a_ray():
     x = torch.tensor([[1.0, 0.0, 0.0]])
     rays = CUBE.rays(Rays(0 * x, x, x))
     entry, leave = CUBE.box.crossing(rays, 0.25, math.inf)
@@ -73,9 +71,7 @@ def test_samples_are_evenly_spaced_in_disparity_along_a_ray() -> None:
 
 
 @pytest.mark.parametrize("scale", [0.3, 6.0])
-def test_a_step_is_never_much_longer_in_contracted_space(
-    rng: torch.Generator, scale: float
-) -> None:
+def test_a_step_is_never_much_longer_in_contracted_space(rng, scale):
     rays = CUBE.rays(_rays(rng, 300, scale))
     entry, leave = CUBE.box.crossing(rays, 0.0, math.inf)
     assert bool((leave > entry).all())
@@ -108,14 +104,12 @@ NDC = NormalizedDevice(width=16, height=12, focal=(8.0, 9.0), near=1.0)
         ((0.0, 0.0, -(2.0**20)), (0.0, 0.0, 1 - 2.0**-19)),  # infinity: the far face
     ],
 )
-def test_ndc_points_by_hand(
-    world: tuple[float, float, float], device: tuple[float, float, float]
-) -> None:
+def test_ndc_points_by_hand(world, device):
     torch.testing.assert_close(NDC.from_world(torch.tensor([world])), torch.tensor([device]))
     torch.testing.assert_close(NDC.to_world(torch.tensor([device])), torch.tensor([world]))
 
 
-def test_points_of_a_world_ray_lie_on_its_ndc_ray(rng: torch.Generator) -> None:
+def test_points_of_a_world_ray_lie_on_its_ndc_ray(rng):
     origins = 0.3 * torch.randn(50, 3, generator=rng, dtype=torch.float64)
     d = torch.randn(50, 3, generator=rng, dtype=torch.float64)
     d[:, 2] = -1 - d[:, 2].abs()
@@ -129,7 +123,7 @@ def test_points_of_a_world_ray_lie_on_its_ndc_ray(rng: torch.Generator) -> None:
     torch.testing.assert_close(rays.at(torch.arange(50), share), device)
 
 
-def test_infinity_in_ndc_is_far_away_and_its_pixel_stays() -> None:
+def test_infinity_in_ndc_is_far_away_and_its_pixel_stays():
     # Half to the right in the picture: at any depth x / −z is 0.5, as the slope is 1.
     points = torch.tensor([[0.5, 0.0, 1.0]], requires_grad=True)
     world = NDC.to_world(points)
@@ -142,5 +136,5 @@ def test_infinity_in_ndc_is_far_away_and_its_pixel_stays() -> None:
 @pytest.mark.parametrize(
     "space", [WORLD, CUBE, NormalizedDevice(16, 12, (8.0, 9.0), 0.5)], ids=["world", "cube", "ndc"]
 )
-def test_spaces_come_back_from_plain_data(space: Space) -> None:
+def test_spaces_come_back_from_plain_data(space):
     assert space_from(space_config(space)) == space

@@ -10,13 +10,7 @@ import psutil
 import pytest
 import torch
 
-from devrf.system.memory import (
-    free_host_memory,
-    gib,
-    is_oom,
-    numbers,
-    page_locked,
-)
+from devrf.system.memory import free_host_memory, gib, is_oom, numbers, page_locked
 
 MIB = 2**20
 GPU = "CUDA out of memory. Tried to allocate 20.00 MiB. GPU 0 has a total capacity of 23.68 GiB"

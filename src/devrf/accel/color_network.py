@@ -18,14 +18,7 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from devrf.accel.blocks import (
-    blocks,
-    gradient_target,
-    launch,
-    load_vectors,
-    sigmoid,
-    store_vectors,
-)
+from devrf.accel.blocks import blocks, gradient_target, launch, load_vectors, sigmoid, store_vectors
 from devrf.accel.color_layers import (
     BLOCK,
     SHARE,

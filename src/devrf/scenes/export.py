@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from devrf.geometry.clock import FrameClock
 from devrf.scenes.files import Numbers
 from devrf.scenes.flow_files import write_flow
 from devrf.scenes.formats.llff_poses import BOUND_FACTOR
@@ -118,8 +119,6 @@ def _write_split(views: Views, split: str, folder: Path) -> None:
 FACTOR = 4
 # Readers hold out every eighth static image, the first one included.
 HOLDOUT = 8
-# Times are not written, but counted: k / (T − 1).
-_TIME_TOLERANCE = 1e-5
 # The largest depth where none is known, in multiples of the least one.
 _FAR = 100.0
 
@@ -156,9 +155,10 @@ def _by_camera(views: Views) -> list[Views]:
 
 def _check_times(views: list[Views]) -> None:
     frames = len(views[-1])
-    expected = torch.arange(frames) / (frames - 1)
+    # Times are not written, but counted.
+    expected, near = torch.arange(frames) / (frames - 1), FrameClock.TOLERANCE
     for view in views:
-        if len(view) != frames or bool(((view.times - expected).abs() > _TIME_TOLERANCE).any()):
+        if len(view) != frames or bool(((view.times - expected).abs() > near).any()):
             raise scene_error(
                 "data.export",
                 "the layout has no times: each view needs the same frames, evenly spread; set "
@@ -179,7 +179,7 @@ def _intrinsics(views: Views, factor: int) -> Numbers:
     return np.concatenate([sides, focal], axis=1) * factor
 
 
-def _write_static(static: Capture, held_out: Flags, bounds: Numbers, folder: Path) -> None:
+def _write_static(static: Capture, held_out: Tensor, bounds: Numbers, folder: Path) -> None:
     rows = np.empty((len(held_out), 17))
     for views, own in ((static.train, ~held_out), (static.test, held_out)):
         right, up, back, position = _double(views.cameras.camera_to_world).transpose(2, 0, 1)

@@ -97,11 +97,8 @@ def read_header(path: Path, camera: Size | None = None) -> Header:
         if image.mode in DEEP_MODES:
             raise scene_error(path, f"expected 8 bits a channel, not mode {image.mode}; convert it")
         alpha = "A" in image.mode or "a" in image.mode or "transparency" in image.info
-        turn, ambiguous_orientation = _turn(
-            _orientation(image), (image.width, image.height), camera
-        )
-        size = (image.width, image.height)
-        width, height = size[::-1] if turn in QUARTER_TURNS else size
+        turn, ambiguous_orientation = _turn(_orientation(image), image.size, camera)
+        width, height = image.size[::-1] if turn in QUARTER_TURNS else image.size
         return Header(width, height, alpha, turn, ambiguous_orientation)
 
 
@@ -233,8 +230,7 @@ def load_images(
 
     in_threads(fill, range(len(paths)), (first.width, first.height))
     log.info("read %s from %s in %.1f s", what, paths[0].parent, time.perf_counter() - start)
-    turned = sum(header.turn != 1 for header in headers)
-    if turned:
+    if turned := sum(header.turn != 1 for header in headers):
         log.info(
             "%d of them turned as their EXIF orientation says: only so they fit their cameras",
             turned,

@@ -135,7 +135,7 @@ def estimate_flow(
         )
     key = content_key(views, f"{method} forward" if forward else method)
     if cache is not None:
-        stored = load_flow(cache, key, (len(views), views.height, views.width))
+        stored = load_flow(cache, key)
         if stored is not None:
             log.info("read estimated optical flow from %s", cache)
             return stored
@@ -150,12 +150,8 @@ def estimate_flow(
         flow.vectors[image] = vectors * valid[..., None]
         if (done + 1) % 100 == 0:
             log.info("optical flow: %d of %d pairs", done + 1, len(pairs))
-    log.info(
-        "estimated optical flow (%s) of %d pairs in %.1f s",
-        method,
-        len(pairs),
-        time.perf_counter() - start,
-    )
+    seconds = time.perf_counter() - start
+    log.info("estimated optical flow (%s) of %d pairs in %.1f s", method, len(pairs), seconds)
     if cache is not None:
         save_flow(cache, key, flow)
     return flow

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 import torch
+from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -75,13 +76,7 @@ class SparseModel:
     def poses(self) -> Tensor:
         """(N, 3, 4) float64 camera-to-world, OpenGL axes, world units."""
         quaternion = torch.tensor([one.quaternion for one in self.images], dtype=torch.float64)
-        w, x, y, z = (quaternion / quaternion.norm(dim=1, keepdim=True)).unbind(dim=1)
-        rows = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-        to_camera = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+        to_camera = quaternion_to_rotation_matrix(quaternion)
         moved = torch.tensor([one.translation for one in self.images], dtype=torch.float64)
         # COLMAP's y points down and its z ahead; ours point up and back.
         axes = to_camera.mT * to_camera.new_tensor([1, -1, -1])

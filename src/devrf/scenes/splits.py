@@ -60,9 +60,7 @@ class Split:
 
     def where(self, keep: Tensor) -> Split:
         """The same split, with only those used images for which the mask ``keep`` (N,) holds."""
-        return Split(
-            self.transforms, self.times, self.view, self.fixed, self.index[keep[self.index]]
-        )
+        return replace(self, index=self.index[keep[self.index]])
 
     @property
     def used_times(self) -> Tensor:

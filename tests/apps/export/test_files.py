@@ -13,13 +13,7 @@ import torch
 import trimesh
 from pxr import Gf, Usd, UsdGeom
 
-from devrf.apps.export.geometry import (
-    ExportSettings,
-    MovingMesh,
-    UpFrame,
-    carried,
-    seen_points,
-)
+from devrf.apps.export.geometry import ExportSettings, MovingMesh, UpFrame, carried, seen_points
 from devrf.apps.export.gltf import write_gltf
 from devrf.apps.export.sequence import mesh_files, write_sequence
 from devrf.apps.export.surface import canonical_surface

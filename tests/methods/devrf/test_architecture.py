@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
 
-from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.methods.devrf.architecture import Architecture, fitted_to, resolved_planes
@@ -31,7 +28,7 @@ SPACE = NormalizedDevice(200, 100, (150.0, 120.0), near=1.0)
         (50.0, 1.0, 256),
     ],
 )
-def test_planes_are_four_pixels_of_parallax_apart(apart: float, near: float, planes: int) -> None:
+def test_planes_are_four_pixels_of_parallax_apart(apart, near, planes):
     # The distance along the line of sight does not count.
     positions = torch.tensor([[0.0, 0, 0], [0.6 * apart, 0.8 * apart, 9.0], [0.1 * apart, 0, 0]])
     assert resolved_planes(positions, replace(SPACE, near=near)) == planes
@@ -43,7 +40,7 @@ def forward_scene() -> Scene:
     return ProceduralForwardScene(**size, frames=2, supersample=1)()
 
 
-def test_the_grid_has_so_many_points_to_a_pixel(forward_scene: Scene) -> None:
+def test_the_grid_has_so_many_points_to_a_pixel(forward_scene):
     schedule = CanonicalSchedule(side=30, upsample_at=(), voxels_per_pixel=0.5)
     fitted, sizes = fitted_to(forward_scene, schedule, Architecture(planes=40))
     box = forward_scene.bounds.box
@@ -56,7 +53,7 @@ def test_the_grid_has_so_many_points_to_a_pixel(forward_scene: Scene) -> None:
     assert fitted.phases[-1].voxels == round(fitted.side**3)
 
 
-def test_planes_are_told_by_the_scene_where_none_are_given(forward_scene: Scene) -> None:
+def test_planes_are_told_by_the_scene_where_none_are_given(forward_scene):
     schedule = CanonicalSchedule(side=30, upsample_at=())
     asked = fitted_to(forward_scene, schedule, Architecture())
     assert asked == (schedule, Architecture(planes=32))
@@ -64,16 +61,14 @@ def test_planes_are_told_by_the_scene_where_none_are_given(forward_scene: Scene)
     assert fitted_to(forward_scene, schedule, given) == (schedule, given)
 
 
-def test_a_scene_seen_from_all_around_keeps_its_numbers(tiny_scene: Scene) -> None:
+def test_a_scene_seen_from_all_around_keeps_its_numbers(tiny_scene):
     schedule = CanonicalSchedule(voxels_per_pixel=0.5)
     assert fitted_to(tiny_scene, schedule, Architecture()) == (schedule, Architecture())
     with pytest.raises(DevrfError, match=r"field\.planes=7: planes are of forward-facing scenes"):
         fitted_to(tiny_scene, schedule, Architecture(planes=7))
 
 
-def test_planes_of_both_fields(
-    forward_scene: Scene, fit: Callable[..., Any], serve: Callable[..., SceneDataModule]
-) -> None:
+def test_planes_of_both_fields(forward_scene, fit, serve):
     data = serve(forward_scene)
     schedule = CanonicalSchedule(0, 8, iterations=10, side=12, upsample_at=(), rays=16)
     sizes, loss = Architecture(4, 16, 0, planes=7), {"color": 1.0, "tv": 1e-3}

@@ -29,7 +29,7 @@ BOX = Box((-1.0, 0.0, 2.0), (3.0, 2.0, 3.0))
 PLANES, AHEAD = 16, Box((-1.5, -1.0, -1.0), (1.5, 1.0, 1.0))
 
 
-def test_resizing_keeps_a_linear_function_exactly(rng: torch.Generator) -> None:
+def test_resizing_keeps_a_linear_function_exactly(rng):
     slope = torch.tensor([[1.0, -2.0], [0.5, 0.0], [3.0, 1.0]])
     grid, (low, high) = VoxelGrid((5, 4, 3), 2), BOX.corners(torch.zeros(()))
     with torch.no_grad():
@@ -41,7 +41,7 @@ def test_resizing_keeps_a_linear_function_exactly(rng: torch.Generator) -> None:
         torch.testing.assert_close(grid(points, BOX), points @ slope + 0.25)
 
 
-def test_a_resized_grid_lies_in_memory_as_a_new_one() -> None:
+def test_a_resized_grid_lies_in_memory_as_a_new_one():
     # A single channel may keep a stray stride, which makes look-ups slow and not bit-equal.
     grid = VoxelGrid((3, 3, 3), 1)
     grid.resize((4, 5, 6))
@@ -52,7 +52,7 @@ def opacity(field: CanonicalField, delta: float) -> Tensor:
     return -torch.expm1(-field.optical_depth(torch.zeros(1, 3), delta))
 
 
-def test_the_same_length_has_the_same_opacity_at_every_resolution(cube: Box) -> None:
+def test_the_same_length_has_the_same_opacity_at_every_resolution(cube):
     # 512 voxels at full size, 64 now: a voxel is twice a base voxel, half a voxel is one.
     field = SMALL.radiance_field(cube, 64, 512)
     assert field.step_length(1.0) == pytest.approx(0.5)
@@ -64,7 +64,7 @@ def test_the_same_length_has_the_same_opacity_at_every_resolution(cube: Box) -> 
     assert field.voxel_alpha(0.5).max().item() == pytest.approx(1 - math.sqrt(0.99), rel=1e-4)
 
 
-def test_optical_depth_by_hand(cube: Box) -> None:
+def test_optical_depth_by_hand(cube):
     field = SMALL.radiance_field(cube, 8, 8)
     with torch.no_grad():
         field.density.values.fill_(2.0)
@@ -74,7 +74,7 @@ def test_optical_depth_by_hand(cube: Box) -> None:
     assert field.optical_depth(torch.zeros(1, 3), 0.5).item() == pytest.approx(expected, rel=1e-5)
 
 
-def test_clearing_leaves_almost_nothing_there_and_all_elsewhere(cube: Box) -> None:
+def test_clearing_leaves_almost_nothing_there_and_all_elsewhere(cube):
     field = SMALL.radiance_field(cube, 64, 64)
     with torch.no_grad():
         field.density.values.normal_(3.0)
@@ -90,7 +90,7 @@ def test_clearing_leaves_almost_nothing_there_and_all_elsewhere(cube: Box) -> No
     assert field.density.values[3, 3, 3].item() == -60.0
 
 
-def test_the_decoder_is_the_network_of_the_concatenated_input(rng: torch.Generator) -> None:
+def test_the_decoder_is_the_network_of_the_concatenated_input(rng):
     decoder = ColorDecoder(channels=3, width=6, frequencies=4)
     features, ray = torch.randn(5, 3, generator=rng), torch.tensor([0, 0, 1, 1, 1])
     dirs = torch.nn.functional.normalize(torch.randn(2, 3, generator=rng), dim=1)
@@ -102,9 +102,7 @@ def test_the_decoder_is_the_network_of_the_concatenated_input(rng: torch.Generat
     torch.testing.assert_close(decoder(features, dirs, ray), expected)
 
 
-def test_directions_can_be_forgotten_and_are_learned_when_they_are_let(
-    rng: torch.Generator,
-) -> None:
+def test_directions_can_be_forgotten_and_are_learned_when_they_are_let(rng):
     field = SMALL.radiance_field(Box((0.0,) * 3, (1.0,) * 3), 27, 27)
     field.forget_directions()
     points, ray, dirs = torch.rand(3, 3, generator=rng), torch.zeros(3).long(), torch.eye(3)
@@ -121,7 +119,7 @@ def test_directions_can_be_forgotten_and_are_learned_when_they_are_let(
     assert weight.grad is not None and bool(weight.grad.any())
 
 
-def test_the_search_field_shows_its_channels_through_a_sigmoid(cube: Box) -> None:
+def test_the_search_field_shows_its_channels_through_a_sigmoid(cube):
     field = SMALL.search_field(cube, 64)
     with torch.no_grad():
         field.color.values.copy_(torch.tensor([0.0, 1.0, -1.0]).expand(4, 4, 4, 3))
@@ -137,7 +135,7 @@ def planes(voxels: int = 24 * 16 * PLANES) -> CanonicalField:
     )
 
 
-def test_every_plane_starts_with_an_equal_share_and_the_last_one_is_opaque() -> None:
+def test_every_plane_starts_with_an_equal_share_and_the_last_one_is_opaque():
     field = planes()
     points = torch.stack(
         [torch.full((PLANES,), 0.2), torch.full((PLANES,), 0.1), torch.linspace(-1, 1, PLANES)], 1
@@ -148,7 +146,7 @@ def test_every_plane_starts_with_an_equal_share_and_the_last_one_is_opaque() -> 
     assert float(end.detach()) < 1e-5
 
 
-def test_samples_are_evenly_spaced_from_the_first_plane_to_the_last() -> None:
+def test_samples_are_evenly_spaced_from_the_first_plane_to_the_last():
     field = planes()
     # From the near plane at z = −1 to infinity at z = 1, as rays in NDC are.
     ray = Rays(*(torch.tensor([v]) for v in ([0.2, 0.1, -1.0], [0.0, 0.0, 2.0], [0.0, 0.0, -1.0])))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +10,6 @@ import torch
 from lightning import Callback, Trainer
 from lightning.pytorch.callbacks import LambdaCallback
 
-from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
@@ -20,7 +18,6 @@ from devrf.methods.devrf.canonical_field import ColorDecoder
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.free_space import possibly_occupied, view_count, view_count_weight
-from devrf.scenes.scene import Scene
 
 SMALL = Architecture(channels=4, width=16, frequencies=2)
 CARVED = CanonicalSchedule(
@@ -50,9 +47,7 @@ class Watch(Callback):
         self.seen.append((pl_module.phase.kind, pl_module.resolution, decoder))
 
 
-def test_the_color_network_learns_in_the_chosen_precision(
-    datamodule: SceneDataModule, trainer: Callable[..., Trainer], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_color_network_learns_in_the_chosen_precision(datamodule, trainer, monkeypatch):
     used, forward = [], ColorDecoder.forward
 
     def watched(self: ColorDecoder, *args: Any) -> torch.Tensor:
@@ -68,17 +63,13 @@ def test_the_color_network_learns_in_the_chosen_precision(
         used.clear()
 
 
-def test_all_in_reduced_precision_is_refused(
-    datamodule: SceneDataModule, trainer: Callable[..., Trainer]
-) -> None:
+def test_all_in_reduced_precision_is_refused(datamodule, trainer):
     with pytest.raises(DevrfError, match="trainer.precision"):
         fit = trainer(max_steps=1, precision="bf16-mixed")
         fit.fit(CanonicalStage(CARVED, SMALL), datamodule=datamodule)
 
 
-def test_the_whole_schedule_is_run_and_the_loss_falls(
-    datamodule: SceneDataModule, trainer: Callable[..., Trainer]
-) -> None:
+def test_the_whole_schedule_is_run_and_the_loss_falls(datamodule, trainer):
     watch, stage = Watch(), CanonicalStage(CARVED, SMALL, iterations_per_step=7)
     fit = trainer(watch, max_epochs=1)
     fit.fit(stage, datamodule=datamodule)
@@ -91,8 +82,8 @@ def test_the_whole_schedule_is_run_and_the_loss_falls(
 
 
 def test_the_search_hands_over_to_a_radiance_field_with_room_for_motion(
-    datamodule: SceneDataModule, tiny_scene: Scene, trainer: Callable[..., Trainer]
-) -> None:
+    datamodule, tiny_scene, trainer
+):
     watch, stage = Watch(), CanonicalStage(SEARCHED, SMALL)
     trainer(watch, max_epochs=1).fit(stage, datamodule=datamodule)
     kinds = [(kind, decoder) for kind, _, decoder in watch.seen]
@@ -104,15 +95,13 @@ def test_the_search_hands_over_to_a_radiance_field_with_room_for_motion(
     assert box.volume < tiny_scene.bounds.box.scaled(1.05).union(motion).volume
 
 
-def test_a_search_that_finds_nothing_says_what_to_check(
-    datamodule: SceneDataModule, trainer: Callable[..., Trainer]
-) -> None:
+def test_a_search_that_finds_nothing_says_what_to_check(datamodule, trainer):
     schedule = CanonicalSchedule(1, 8, False, 10, 8, (), rays=16)
     with pytest.raises(DevrfError, match="search_iterations"):
         trainer(max_epochs=1).fit(CanonicalStage(schedule, SMALL), datamodule=datamodule)
 
 
-def test_afterwards_what_is_not_occupied_is_empty(learned: tuple[CanonicalStage, Trainer]) -> None:
+def test_afterwards_what_is_not_occupied_is_empty(learned):
     model = learned[0].scene_model
     alpha = model.canonical.voxel_alpha(1.0)
     assert model.occupancy.mask.shape == alpha.shape
@@ -121,7 +110,7 @@ def test_afterwards_what_is_not_occupied_is_empty(learned: tuple[CanonicalStage,
     assert 0.01 < model.occupancy.share < 0.6
 
 
-def test_share_of_views_by_hand() -> None:
+def test_share_of_views_by_hand():
     # Two cameras at the origin, along −z and along +x, with a right angle of view.
     poses = torch.eye(3, 4).repeat(2, 1, 1)
     poses[1, :, :3] = torch.tensor([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
@@ -133,9 +122,7 @@ def test_share_of_views_by_hand() -> None:
     assert share.flatten().tolist() == [0.5, 0.5, 1.0, 0.5]
 
 
-def test_no_matter_is_possible_before_a_lens(
-    datamodule: SceneDataModule, tiny_scene: Scene, trainer: Callable[..., Trainer]
-) -> None:
+def test_no_matter_is_possible_before_a_lens(datamodule, tiny_scene, trainer):
     bounds = replace(tiny_scene.bounds, box=Box((-3.0, -3.0, -3.0), (3.0, 3.0, 3.0)), near=3.0)
     datamodule._scene = replace(tiny_scene, bounds=bounds)
     schedule = CanonicalSchedule(2, 16, False, 2, 8, (), rays=16, min_views=1)
@@ -148,7 +135,7 @@ def test_no_matter_is_possible_before_a_lens(
     assert 0 < occupancy.share < 1
 
 
-def test_no_matter_is_possible_where_too_few_cameras_look(tiny_scene: Scene) -> None:
+def test_no_matter_is_possible_where_too_few_cameras_look(tiny_scene):
     bounds = replace(tiny_scene.bounds, box=Box((-3.0, -3.0, -3.0), (3.0, 3.0, 3.0)))
     scene = replace(tiny_scene, bounds=bounds)
     points = bounds.box.grid_points((12, 12, 12), torch.zeros(()))
@@ -161,7 +148,7 @@ def test_no_matter_is_possible_where_too_few_cameras_look(tiny_scene: Scene) -> 
     assert torch.equal(everywhere, apart[1])
 
 
-def test_a_grown_grid_is_thinned_and_gets_a_new_optimiser(fit: Callable[..., Any]) -> None:
+def test_a_grown_grid_is_thinned_and_gets_a_new_optimiser(fit):
     renewed, grown = [], []
 
     class Watched(CanonicalStage):
@@ -186,9 +173,7 @@ def test_a_grown_grid_is_thinned_and_gets_a_new_optimiser(fit: Callable[..., Any
     assert grown[2:] == [(0, 0), (1.5, 7)]  # what the decoder's weights and biases have
 
 
-def test_the_total_variation_reaches_all_voxels_until_the_schedule_says_so(
-    datamodule: SceneDataModule, trainer: Callable[..., Trainer]
-) -> None:
+def test_the_total_variation_reaches_all_voxels_until_the_schedule_says_so(datamodule, trainer):
     schedule = CanonicalSchedule(0, 8, True, 40, 8, (), rays=16, dense_tv_iterations=20)
     stage = CanonicalStage(schedule, SMALL, fine_loss={"color": 1.0, "tv": 1e-3})
     touched: list[list[bool]] = []

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 import torch
-from lightning import Trainer
 
 from devrf.data.rendered import RenderedDataModule
 from devrf.geometry.box import Box
@@ -29,13 +27,12 @@ from devrf.methods.devrf.settings import MotionSettings
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.renderer import Renderer
 from devrf.rendering.sampling import RenderSettings
-from devrf.scenes.scene import Scene
 
 SPACE = ContractedSpace((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), shell=0.5)
 BUILD = Architecture(channels=4, width=8, frequencies=1)
 
 
-def test_displacements_are_zero_outside_where_they_are_asked_to_be() -> None:
+def test_displacements_are_zero_outside_where_they_are_asked_to_be():
     points = torch.tensor([[0.5, 0.0, 0.0], [1.0, 1.0, 1.0], [1.001, 0.0, 0.0], [0.0, 1.4, 0.0]])
     grid, box = torch.full((3, 3, 3, 3), 0.25), SPACE.inner()
     assert torch.equal(GridWarp((grid,), box)(points), points + 0.25)
@@ -45,7 +42,7 @@ def test_displacements_are_zero_outside_where_they_are_asked_to_be() -> None:
     assert torch.equal(moved[2:], points[2:])
 
 
-def test_a_field_knows_that_what_is_outside_stays() -> None:
+def test_a_field_knows_that_what_is_outside_stays():
     clock = FrameClock((0.0, 1.0))
     field = DeformationField(SPACE.inner(), clock, voxels=27, still_outside=True)
     field.to_canonical[1:] = 0.25
@@ -81,7 +78,7 @@ def _views(count: int = 60) -> Rays:
     return Rays(torch.tensor([[-2.0, 0.0, 0.0]]).expand(count, 3), directions, directions)
 
 
-def test_rays_that_meet_nothing_end_in_the_fields_colour_at_infinity(model: DeVRFModel) -> None:
+def test_rays_that_meet_nothing_end_in_the_fields_colour_at_infinity(model):
     rays = _views()
     seen = Renderer(model).picture(rays, 0.0, 1.0)
     missed = seen.opacity < 1e-6
@@ -94,7 +91,7 @@ def test_rays_that_meet_nothing_end_in_the_fields_colour_at_infinity(model: DeVR
     torch.testing.assert_close(Renderer(model).picture(rays, 0.0, 0.0).color, seen.color)
 
 
-def test_a_checkpoint_keeps_the_outer_faces(model: DeVRFModel) -> None:
+def test_a_checkpoint_keeps_the_outer_faces(model):
     other = DeVRFModel.from_config(model.config())
     other.load_stored_state(model.stored_state())
     assert other.space == SPACE and other.deformation is not None
@@ -103,7 +100,7 @@ def test_a_checkpoint_keeps_the_outer_faces(model: DeVRFModel) -> None:
     torch.testing.assert_close(ours.color, theirs.color, atol=5e-3, rtol=0)
 
 
-def test_in_contracted_space_grids_start_coarse_and_directions_come_late() -> None:
+def test_in_contracted_space_grids_start_coarse_and_directions_come_late():
     # 50 · 1.2 = 60 voxels a side from 15: six doublings, over 600 of 800 iterations.
     schedule = CanonicalSchedule(
         5, side=50, iterations=800, upsample_at=(10,), unbounded_initial_side=15
@@ -119,7 +116,7 @@ def test_in_contracted_space_grids_start_coarse_and_directions_come_late() -> No
     assert schedule.in_space(WORLD) is schedule
 
 
-def test_the_fields_opacity_does_not_depend_on_its_resolution() -> None:
+def test_the_fields_opacity_does_not_depend_on_its_resolution():
     sizes = Architecture(alpha_init=0.01, contracted_opacity=0.75)
     assert sizes.in_space(WORLD, 2.0) is sizes
     # A line through two voxels, of opacity a half each: 1 − ¼.
@@ -128,9 +125,7 @@ def test_the_fields_opacity_does_not_depend_on_its_resolution() -> None:
     assert sizes.in_space(SPACE, 4.0).alpha_init == pytest.approx(1 - 0.25**0.25)
 
 
-def test_a_room_is_learned_and_moves_inside_the_inner_box(
-    tiny_room: Scene, trainer: Callable[..., Trainer]
-) -> None:
+def test_a_room_is_learned_and_moves_inside_the_inner_box(tiny_room, trainer):
     room, data = tiny_room, RenderedDataModule(lambda: tiny_room, None)
     schedule = CanonicalSchedule(
         search_iterations=0,

@@ -26,13 +26,13 @@ def points(count: int, rng: torch.Generator) -> Tensor:
     return 2 * torch.rand(count, 3, generator=rng) - 1
 
 
-def test_time_zero_is_exactly_the_identity(field: DeformationField, rng: torch.Generator) -> None:
+def test_time_zero_is_exactly_the_identity(field, rng):
     x = 1.5 * points(500, rng)
     assert torch.equal(field.warp(x, 0.0), x)
     assert torch.equal(field.unwarp(x, 0.0), x)
 
 
-def test_between_frames_by_hand(cube: Box) -> None:
+def test_between_frames_by_hand(cube):
     field = DeformationField(cube, CLOCK, voxels=8)
     # Frame 1 moves along x by 1 at the upper x face; frame 2 everything along y by 0.4.
     field.to_canonical[1, 1, :, :, 0] = 1.0
@@ -48,9 +48,7 @@ def test_between_frames_by_hand(cube: Box) -> None:
     torch.testing.assert_close(field.unwarp(x, 0.3), x)
 
 
-def test_resizing_keeps_a_linear_motion_exactly_and_frames_never_trained_zero(
-    cube: Box, rng: torch.Generator
-) -> None:
+def test_resizing_keeps_a_linear_motion_exactly_and_frames_never_trained_zero(cube, rng):
     field = DeformationField(cube, CLOCK, voxels=27)
     turn = torch.tensor([[0.1, -0.3, 0.0], [0.2, 0.0, 0.1], [0.0, 0.5, -0.2]])
     field.to_canonical[2] = cube.grid_points(field.shape, turn) @ turn + 0.05

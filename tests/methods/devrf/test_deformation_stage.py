@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -11,8 +10,6 @@ import torch
 from lightning import Trainer
 from lightning.pytorch.callbacks import LambdaCallback
 
-from devrf.checkpoints.checkpoint import LoadedCheckpoint
-from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import score
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
@@ -22,16 +19,13 @@ from devrf.methods.devrf.extensions.tracks import StartAlongFlow
 from devrf.methods.devrf.settings import MotionSettings
 from devrf.ops.adam_step import add_total_variation_gradient
 from devrf.rendering.renderer import Renderer
-from devrf.scenes.scene import Scene
 
 SHORT = DeformationSchedule(levels=(Level(4, 20), Level(8, 10)), rays=256)
 TINY = DeformationSchedule(levels=(Level(4, 4), Level(6, 2)), rays=64)
 FAST = MotionSettings(learning_rate=5e-3, views="all", pixels="occupied")
 
 
-def test_two_steps_move_the_first_frame_only(
-    rest: LoadedCheckpoint, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
-) -> None:
+def test_two_steps_move_the_first_frame_only(rest, datamodule, trainer):
     before = {k: v.clone() for k, v in rest.model.canonical.named_parameters()}
     stage, fit = DeformationStage(rest, SHORT), trainer(max_steps=2)
     fit.fit(stage, datamodule=datamodule)
@@ -45,23 +39,15 @@ def test_two_steps_move_the_first_frame_only(
         assert torch.equal(value, before[name])
 
 
-def test_a_scene_at_rest_has_no_motion_to_learn(
-    rest: LoadedCheckpoint,
-    tiny_scene: Scene,
-    serve: Callable[[Scene], SceneDataModule],
-    trainer: Callable[..., Trainer],
-) -> None:
+def test_a_scene_at_rest_has_no_motion_to_learn(rest, tiny_scene, serve, trainer):
     module = serve(replace(tiny_scene, dynamic=tiny_scene.static))
     with pytest.raises(DevrfError, match="is at rest"):
         trainer(max_steps=1).fit(DeformationStage(rest, SHORT), datamodule=module)
 
 
 def test_a_whole_schedule_sees_the_motion_better_than_the_rest_pose(
-    rest: LoadedCheckpoint,
-    datamodule: SceneDataModule,
-    tiny_scene: Scene,
-    trainer: Callable[..., Trainer],
-) -> None:
+    rest, datamodule, tiny_scene, trainer
+):
     schedule = DeformationSchedule(levels=(Level(4, 30), Level(8, 15)), rays=128)
     stage = DeformationStage(rest, schedule, FAST)
     trainer(max_epochs=1).fit(stage, datamodule=datamodule)
@@ -78,9 +64,7 @@ def test_a_whole_schedule_sees_the_motion_better_than_the_rest_pose(
     assert min(gains[2:]) > 0.5 and sum(gains[2:]) / 4 > 1
 
 
-def test_total_variation_alone_smooths_both_directions(
-    rest: LoadedCheckpoint, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
-) -> None:
+def test_total_variation_alone_smooths_both_directions(rest, datamodule, trainer):
     # With "render" at a vanishing weight only the closed-form gradient moves Δ_f.
     stage = DeformationStage(rest, SHORT, loss={"render": 1e-20, "tv": 1.0})
     before, mean = [], []
@@ -102,9 +86,7 @@ def test_total_variation_alone_smooths_both_directions(
     torch.testing.assert_close(mean[0], expected)
 
 
-def test_each_level_has_its_weights_and_rates(
-    rest: LoadedCheckpoint, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
-) -> None:
+def test_each_level_has_its_weights_and_rates(rest, datamodule, trainer):
     second = Level(
         6, 2, lr_factor=0.5, lr_final_factor=0.01, weight_factors={"elastic": 3, "tv": 0}
     )
@@ -131,18 +113,15 @@ def test_each_level_has_its_weights_and_rates(
     assert rates[1] == pytest.approx(falls)
 
 
-def test_factors_are_those_of_terms(rest: LoadedCheckpoint) -> None:
+def test_factors_are_those_of_terms(rest):
     schedule = DeformationSchedule((Level(4, 2, weight_factors={"elastik": 1}),))
     with pytest.raises(DevrfError, match="1.weight_factors: elastik"):
         DeformationStage(rest, schedule)
 
 
 def test_the_flow_of_a_moving_camera_neither_starts_nor_teaches_a_frame(
-    rest: LoadedCheckpoint,
-    tiny_scene: Scene,
-    serve: Callable[[Scene], SceneDataModule],
-    trainer: Callable[..., Trainer],
-) -> None:
+    rest, tiny_scene, serve, trainer
+):
     train = tiny_scene.dynamic.train
     train = train[(train.view == 0).nonzero()[:, 0]]
     motion, tracks = MotionSettings(learning_rate=1e-9), {"tracks": StartAlongFlow("flow")}
@@ -156,9 +135,7 @@ def test_the_flow_of_a_moving_camera_neither_starts_nor_teaches_a_frame(
         assert ("flow" in stage.weights) is not moving
 
 
-def test_state_and_model_hold_what_an_active_frame_has_learned(
-    rest: LoadedCheckpoint, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
-) -> None:
+def test_state_and_model_hold_what_an_active_frame_has_learned(rest, datamodule, trainer):
     stage, last = DeformationStage(rest, TINY, FAST, iterations_per_step=3), []
 
     def look(trainer: Trainer, stage: DeformationStage, *_: Any) -> None:
@@ -175,8 +152,8 @@ def test_state_and_model_hold_what_an_active_frame_has_learned(
 
 
 def test_where_the_field_is_kept_changes_what_is_learned_by_its_rounding_alone(
-    rest: LoadedCheckpoint, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
-) -> None:
+    rest, datamodule, trainer
+):
     fields = []
     for store, rounded in (("device", False), ("host", False), ("host", True)):
         torch.manual_seed(0)
@@ -194,12 +171,8 @@ def test_where_the_field_is_kept_changes_what_is_learned_by_its_rounding_alone(
     ("moments", "fine"), [("fresh", [1, 2, 3, 4, 1, 2]), ("carried", [1, 2, 3, 4, 5, 6])]
 )
 def test_adam_begins_anew_at_each_visit_or_goes_on_above_the_coarsest_level(
-    rest: LoadedCheckpoint,
-    datamodule: SceneDataModule,
-    trainer: Callable[..., Trainer],
-    moments: Any,
-    fine: list[int],
-) -> None:
+    rest, datamodule, trainer, moments, fine
+):
     # Three frames; frame 1 gets the share of frame 0 as well.
     schedule = DeformationSchedule(levels=(Level(4, 2), Level(6, 2)), rays=16)
     motion = replace(FAST, adam_state=moments)

@@ -21,7 +21,6 @@ from devrf.methods.devrf.deformation_field import GridWarp
 from devrf.methods.devrf.losses import (
     MOTION_TERMS,
     PHOTOMETRIC_TERMS,
-    FlowMean,
     MotionPrediction,
     Prediction,
     batch_loss,
@@ -80,7 +79,7 @@ def prediction() -> Prediction:
     return Prediction(output, batch)
 
 
-def test_color_and_per_sample_color_by_hand(prediction: Prediction) -> None:
+def test_color_and_per_sample_color_by_hand(prediction):
     assert PHOTOMETRIC_TERMS["color"](prediction).item() == pytest.approx((0.25 + 0.36 + 0.09) / 9)
     # |c − C|²: (0, .25, 0)² = .0625; (1, .75, 0)² = 1.5625; (.1, .1, .4)² = .18; three rays.
     expected = (0.5 * 0.0625 + 0.25 * 1.5625 + 0.8 * 0.18) / 3
@@ -93,7 +92,7 @@ def test_color_and_per_sample_color_by_hand(prediction: Prediction) -> None:
     assert prediction.output.sample_color.grad[0, 1].item() == pytest.approx(2 * 0.5 * -0.25 / 3)
 
 
-def test_entropy_by_hand_and_with_finite_gradients_at_its_ends(prediction: Prediction) -> None:
+def test_entropy_by_hand_and_with_finite_gradients_at_its_ends(prediction):
     def entropy(p: float) -> float:
         return -(p * math.log(p) + (1 - p) * math.log(1 - p))
 
@@ -105,7 +104,7 @@ def test_entropy_by_hand_and_with_finite_gradients_at_its_ends(prediction: Predi
     assert end.grad is not None and end.grad.isfinite().all()
 
 
-def test_distortion_by_hand() -> None:
+def test_distortion_by_hand():
     # Rays 0 and 2 of four; 2 · (0.5 · 0.25 · 2 + 0.5 · 0.125 · 3 + 0.25 · 0.125 · 1) of ray 0.
     weight = torch.tensor([0.5, 0.25, 0.125, 0.75], requires_grad=True)
     distance, ray = torch.tensor([1.0, 3.0, 4.0, 2.0]), torch.tensor([0, 0, 0, 2])
@@ -117,14 +116,14 @@ def test_distortion_by_hand() -> None:
     assert weight.grad.tolist() == pytest.approx([0.4375, 0.5625, 0.875, 0.0])
 
 
-def test_alpha_mask_by_hand_and_without_one(prediction: Prediction) -> None:
+def test_alpha_mask_by_hand_and_without_one(prediction):
     # T − (1 − alpha) = 0.25, 0, −0.3.
     assert PHOTOMETRIC_TERMS["alpha_mask"](prediction).item() == pytest.approx((0.0625 + 0.09) / 3)
     without = replace(prediction, batch=replace(prediction.batch, alpha=None))
     assert PHOTOMETRIC_TERMS["alpha_mask"](without).item() == 0
 
 
-def test_the_loss_weighs_what_counts_and_reports_it_unweighted(prediction: Prediction) -> None:
+def test_the_loss_weighs_what_counts_and_reports_it_unweighted(prediction):
     weights = counted_weights({"alpha_mask": 2.0, "color": 0.0}, PHOTOMETRIC_TERMS, "loss.fine")
     total, values = batch_loss(prediction, PHOTOMETRIC_TERMS, weights)
     assert (
@@ -202,9 +201,7 @@ def by_hand() -> MotionPrediction:
     )
 
 
-def test_cycle_of_an_exact_motion_is_zero_and_of_another_by_hand(
-    by_hand: MotionPrediction,
-) -> None:
+def test_cycle_of_an_exact_motion_is_zero_and_of_another_by_hand(by_hand):
     assert cycle(by_hand).item() == pytest.approx(0, abs=1e-12)
     # There by −0.3, back by (0.3, 0.2, −0.1): ½ (0.04 + 0.01) at each sample.
     way = torch.tensor([0.3, 0.2, -0.1])
@@ -212,7 +209,7 @@ def test_cycle_of_an_exact_motion_is_zero_and_of_another_by_hand(
     assert cycle(off).item() == pytest.approx(0.025)
 
 
-def test_flow_by_hand(by_hand: MotionPrediction) -> None:
+def test_flow_by_hand(by_hand):
     # Through image 0's lens both samples of ray 0 lie on its pixel. Moved back by 0.2 along x
     # they shift by −10·0.2/2 = −1 and −10·0.2/4 = −0.5 pixels, with none along y.
     # Against (−1, 0.5): 0.5 and 1.0, weighted by 0.5 and 0.25; one valid ray; ray 1 is masked.
@@ -224,7 +221,7 @@ def test_flow_by_hand(by_hand: MotionPrediction) -> None:
     assert flow(replace(by_hand, batch=both)).item() == pytest.approx((0.5 + 19) / 2, abs=1e-4)
 
 
-def test_without_observed_flow_or_samples_nothing_is_learned(by_hand: MotionPrediction) -> None:
+def test_without_observed_flow_or_samples_nothing_is_learned(by_hand):
     blind = replace(by_hand.batch, flow=None, flow_valid=None)
     masked = replace(by_hand.batch, flow_valid=torch.tensor([False, False]))
     assert [flow(replace(by_hand, batch=batch)).item() for batch in (blind, masked)] == [0, 0]
@@ -236,9 +233,7 @@ def test_without_observed_flow_or_samples_nothing_is_learned(by_hand: MotionPred
 
 @pytest.mark.parametrize("flow_mean", ["rays", "samples"])
 @pytest.mark.parametrize("name", MOTION_TERMS)
-def test_padding_changes_no_term_and_no_gradient(
-    by_hand: MotionPrediction, name: str, flow_mean: FlowMean, rng: torch.Generator
-) -> None:
+def test_padding_changes_no_term_and_no_gradient(by_hand, name, flow_mean, rng):
     """Lists of fixed length end in places of weight 0, of any ray, where nothing is looked at."""
     pose = by_hand.cameras.camera_to_world + torch.tensor([0.0, 0.0, 0.0, 1.0])
     cameras = replace(by_hand.cameras, camera_to_world=pose)
@@ -308,9 +303,7 @@ def exact(scene: Scene, recipe: ProceduralScene, frame: int) -> MotionPrediction
     )
 
 
-def test_induced_flow_of_the_exact_motion_is_the_exact_flow(
-    tiny_scene: Scene, tiny_recipe: ProceduralScene
-) -> None:
+def test_induced_flow_of_the_exact_motion_is_the_exact_flow(tiny_scene, tiny_recipe):
     prediction = exact(tiny_scene, tiny_recipe, 2)
     batch, output = prediction.batch, prediction.output
     assert batch.flow is not None and len(batch.flow) > 100

@@ -11,7 +11,7 @@ from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.rays import Rays
-from devrf.geometry.space import WORLD, Space
+from devrf.geometry.space import WORLD
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.deformation_field import DeformationField, deformed_occupancy
 from devrf.methods.devrf.model import DeVRFModel
@@ -62,19 +62,19 @@ def middle(model: DeVRFModel, time: float) -> float:
 
 
 @pytest.mark.parametrize(("time", "way"), [(0.5, 0.2), (0.8, 0.32)])
-def test_the_block_is_seen_where_it_has_moved(model: DeVRFModel, time: float, way: float) -> None:
+def test_the_block_is_seen_where_it_has_moved(model, time, way):
     # 0.8 lies between frames: seen times in between move evenly.
     assert middle(model, time) - middle(model, 0.0) == pytest.approx(way, abs=0.02)
 
 
-def test_at_rest_nothing_is_warped(model: DeVRFModel) -> None:
+def test_at_rest_nothing_is_warped(model):
     assert model.warp(0.0) is None and model.occupancy_at(0.0) is model.occupancy
     moving, model.deformation = picture(model, looking_down(31), 0.0), None
     still = picture(model, looking_down(31), 0.7)
     assert torch.equal(moving.color, still.color) and torch.equal(moving.depth, still.depth)
 
 
-def test_deformed_occupancy_by_hand(model: DeVRFModel) -> None:
+def test_deformed_occupancy_by_hand(model):
     shift = torch.tensor([0.0, 0.4, 0.0])
     found = deformed_occupancy(model.occupancy, model.box, lambda points: points + shift)
     assert torch.equal(found.mask, dilate(torch.roll(model.occupancy.mask, -2, dims=1), 1))
@@ -82,7 +82,7 @@ def test_deformed_occupancy_by_hand(model: DeVRFModel) -> None:
 
 
 @pytest.mark.parametrize("space", [WORLD, NormalizedDevice(8, 6, (40.0, 40.0), near=2.0)])
-def test_a_model_built_from_its_config_takes_its_state(model: DeVRFModel, space: Space) -> None:
+def test_a_model_built_from_its_config_takes_its_state(model, space):
     model.space = space
     other = DeVRFModel.from_config(model.config())
     other.load_stored_state(model.state_dict())
@@ -93,9 +93,7 @@ def test_a_model_built_from_its_config_takes_its_state(model: DeVRFModel, space:
         assert torch.equal(picture(other, rays, time).color, picture(model, rays, time).color)
 
 
-def test_to_be_viewed_frames_stay_where_they_are_until_they_are_looked_at(
-    model: DeVRFModel,
-) -> None:
+def test_to_be_viewed_frames_stay_where_they_are_until_they_are_looked_at(model):
     assert model.deformation is not None
     resting = model.deformation.to_canonical
     before = model.deformation.warp(torch.full((1, 3), 0.1), 0.75)
@@ -106,7 +104,7 @@ def test_to_be_viewed_frames_stay_where_they_are_until_they_are_looked_at(
     assert torch.equal(moved.float().deformation.warp(torch.full((1, 3), 0.1), 0.75), before)
 
 
-def test_a_voxel_has_the_initial_opacity_where_something_may_be(cube: Box) -> None:
+def test_a_voxel_has_the_initial_opacity_where_something_may_be(cube):
     mask = torch.zeros(5, 5, 5, dtype=torch.bool)
     mask[0] = True
     build = Architecture()
@@ -121,7 +119,7 @@ def test_a_voxel_has_the_initial_opacity_where_something_may_be(cube: Box) -> No
     assert torch.equal(model.forward_map(0.7)(depth[:, None]), depth[:, None])
 
 
-def test_points_go_where_the_forward_displacements_lead(model: DeVRFModel) -> None:
+def test_points_go_where_the_forward_displacements_lead(model):
     points = torch.tensor([[0.1, 0.2, 0.3]])
     assert torch.equal(model.forward_map(0.0)(points), points)
     moved = model.forward_map(0.25)(points)
@@ -129,7 +127,7 @@ def test_points_go_where_the_forward_displacements_lead(model: DeVRFModel) -> No
     assert not moved.requires_grad
 
 
-def test_a_finished_checkpoint_is_small_and_shows_the_same(model: DeVRFModel) -> None:
+def test_a_finished_checkpoint_is_small_and_shows_the_same(model):
     stored = model.stored_state()
     after = DeVRFModel.from_config(model.config())
     after.load_stored_state(stored)
@@ -145,7 +143,7 @@ def test_a_finished_checkpoint_is_small_and_shows_the_same(model: DeVRFModel) ->
     )
 
 
-def test_what_half_precision_cannot_hold_stays_as_it_is(model: DeVRFModel) -> None:
+def test_what_half_precision_cannot_hold_stays_as_it_is(model):
     with torch.no_grad():
         model.canonical.density.values[5, 5, 5] = 1e5
     after = DeVRFModel.from_config(model.config())

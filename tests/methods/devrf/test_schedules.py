@@ -41,7 +41,7 @@ def deformation_phases(schedule: DeformationSchedule, frames: int) -> list[Defor
     return in_order(lambda at: schedule.phase(at, frames), schedule.total(frames))
 
 
-def test_canonical_defaults_are_the_papers() -> None:
+def test_canonical_defaults_are_the_papers():
     schedule = CanonicalSchedule()
     assert schedule.total == 25000
     found = [(p.kind, p.start, p.stop, p.voxels) for p in in_order(schedule.phase, schedule.total)]
@@ -57,7 +57,7 @@ def test_canonical_defaults_are_the_papers() -> None:
     assert schedule.rays == 8192
 
 
-def test_canonical_rates_fall_to_a_tenth_in_each_part_or_begin_again_at_each_growth() -> None:
+def test_canonical_rates_fall_to_a_tenth_in_each_part_or_begin_again_at_each_growth():
     factor = CanonicalSchedule(restart_at_growth=False).learning_rate_factor
     assert factor(0) == factor(5000) == 1.0
     assert factor(4999) == pytest.approx(0.1 ** (4999 / 20000))
@@ -72,7 +72,7 @@ def test_canonical_rates_fall_to_a_tenth_in_each_part_or_begin_again_at_each_gro
     assert 0.1 * forward.learning_rate_factor(20000) == pytest.approx(0.0251, abs=1e-4)
 
 
-def test_deformation_defaults_are_the_papers_inward() -> None:
+def test_deformation_defaults_are_the_papers_inward():
     schedule, frames = DeformationSchedule(), 50
     assert schedule.total(frames) == 25000
     assert schedule.growths(frames) == [10000, 15000, 20000, 22500]
@@ -89,7 +89,7 @@ def test_deformation_defaults_are_the_papers_inward() -> None:
     assert schedule.rays == 8192
 
 
-def test_forward_facing_and_without_coarse_to_fine() -> None:
+def test_forward_facing_and_without_coarse_to_fine():
     forward = DeformationSchedule(with_level(2, iterations=200), rays=4096)
     assert forward.total(40) == 24000
     assert forward.growths(40) == [8000, 16000, 20000, 22000]
@@ -108,7 +108,7 @@ def course(schedule: DeformationSchedule, frames: int) -> list[tuple[Any, ...]]:
     return [(p.level, p.frames, p.start, p.stop) for p in phases]
 
 
-def test_frames_of_two_stretches_are_visited_together() -> None:
+def test_frames_of_two_stretches_are_visited_together():
     schedule = DeformationSchedule((Level(4, 6), Level(6, 4, parallel_frames=2)))
     # Frames 0 to 6 and 7 to 13.
     assert course(schedule, 14) == [
@@ -125,7 +125,7 @@ def test_frames_of_two_stretches_are_visited_together() -> None:
     assert (schedule.max_parallel_frames(0, 14), schedule.max_parallel_frames(1, 14)) == (1, 2)
 
 
-def test_a_further_level_goes_backward_through_the_frames() -> None:
+def test_a_further_level_goes_backward_through_the_frames():
     schedule = DeformationSchedule(
         (
             Level(4, 6),
@@ -160,9 +160,7 @@ def test_a_further_level_goes_backward_through_the_frames() -> None:
     st.booleans(),
     st.booleans(),
 )
-def test_deformation_phases_tile_every_schedule(
-    levels: list[tuple[int, int, int]], frames: int, coarse_to_fine: bool, together: bool
-) -> None:
+def test_deformation_phases_tile_every_schedule(levels, frames, coarse_to_fine, together):
     rows = [Level(*level[:2], parallel_frames=level[2] if together else 1) for level in levels]
     rows[0] = replace(rows[0], parallel_frames=1)
     schedule = DeformationSchedule(rows, coarse_to_fine)
@@ -201,12 +199,12 @@ def test_deformation_phases_tile_every_schedule(
         ),
     ],
 )
-def test_a_wrong_schedule_is_an_error(build: Callable[[], Any], key: str) -> None:
+def test_a_wrong_schedule_is_an_error(build, key):
     with pytest.raises(DevrfError, match=key):
         build()
 
 
-def test_rows_of_a_config_are_levels_in_the_order_of_their_numbers() -> None:
+def test_rows_of_a_config_are_levels_in_the_order_of_their_numbers():
     rows: dict[str, Any] = {
         "2": {"side": 6, "iterations": 4, "order": "backward"},
         "1": {"side": 4, "iterations": 6},
@@ -219,7 +217,7 @@ def test_rows_of_a_config_are_levels_in_the_order_of_their_numbers() -> None:
             DeformationSchedule.from_rows({**rows, **wrong})
 
 
-def test_a_level_may_have_a_rate_of_its_own() -> None:
+def test_a_level_may_have_a_rate_of_its_own():
     last = Level(8, 2, lr_factor=0.3, lr_final_factor=0.1)
     schedule = DeformationSchedule((Level(4, 2), Level(8, 2, lr_factor=0.5), last))
     phases = [schedule.phase(i, frames=2) for i in (0, 4, 8)]

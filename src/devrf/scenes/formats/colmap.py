@@ -10,12 +10,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from devrf.scenes.files import scene_folder
-from devrf.scenes.image_folders import (
-    Downscale,
-    ImageFolder,
-    image_folder,
-    present_images,
-)
+from devrf.scenes.image_folders import Downscale, ImageFolder, image_folder, present_images
 from devrf.scenes.images import image_at
 from devrf.scenes.layout import Layout, fewer, load_layout, static_alone
 from devrf.scenes.reader import EstimatedFlow, FixedViewsReader, PosedReader
@@ -40,6 +35,8 @@ from devrf.scenes.view_folders import (
 )
 
 IMAGES = "images"
+# From where the cameras look, by ``data.space``; else inward.
+FACING: dict[str, Facing] = {"auto": "auto", "ndc": "forward"}
 
 
 def images_of(model: SparseModel, root: Path, factor: int) -> ImageFolder:
@@ -105,7 +102,7 @@ class ColmapReader(PosedReader, FixedViewsReader):
                 folder, "no COLMAP model; set data.root to the folder of sparse/ and images/"
             )
         model = read_model(place)
-        world = normalised(model, _facing(self.space))
+        world = normalised(model, FACING.get(self.space, "inward"))
         camera = model.cameras[model.images[0].camera]
         width, height = int(camera["w"]), int(camera["h"])
         factor = self.choose_factor(lambda factor: (width // factor, height // factor))
@@ -143,12 +140,6 @@ class ColmapReader(PosedReader, FixedViewsReader):
         train, test = [k for k in train if k not in unseen], sorted({*test, *unseen})
         rest_sets = at_rest(images[train]), at_rest(images[test])
         return Layout(*rest_sets, *moving_sets), views[0].downscale
-
-
-def _facing(space: str) -> Facing:
-    if space == "auto":
-        return "auto"
-    return "forward" if space == "ndc" else "inward"
 
 
 def _bounds(world: World, cut_out: bool) -> SceneBounds:

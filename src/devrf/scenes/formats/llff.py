@@ -24,14 +24,7 @@ from devrf.scenes.layout import Layout, fewer, load_layout, static_alone, withou
 from devrf.scenes.reader import FixedViewsReader, Time
 from devrf.scenes.scene import OpticalFlow, Scene, Views
 from devrf.scenes.space import forward_facing_scene
-from devrf.scenes.splits import (
-    Split,
-    at_rest,
-    at_times,
-    evenly_spread,
-    every_nth,
-    in_motion,
-)
+from devrf.scenes.splits import Split, at_rest, at_times, evenly_spread, every_nth, in_motion
 from devrf.scenes.transforms import Transforms
 from devrf.scenes.validation import scene_error
 from devrf.scenes.view_folders import (

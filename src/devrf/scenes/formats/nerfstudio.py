@@ -18,14 +18,8 @@ from devrf.scenes.layout import Layout, fewer, load_layout, one_capture, static_
 from devrf.scenes.masks import Masks
 from devrf.scenes.reader import Count, EstimatedFlow, Holdout, PosedReader, Time
 from devrf.scenes.scene import Scene
-from devrf.scenes.splits import (
-    at_rest,
-    distinct_poses,
-    every_nth,
-    in_motion,
-    one_moment,
-)
-from devrf.scenes.transforms import Transforms, read_transforms
+from devrf.scenes.splits import at_rest, distinct_poses, every_nth, in_motion, one_moment
+from devrf.scenes.transforms import TIME_TOLERANCE, Transforms, read_transforms
 from devrf.scenes.validation import abbreviated, scene_error
 
 log = logging.getLogger(__name__)
@@ -33,7 +27,6 @@ log = logging.getLogger(__name__)
 FILE = "transforms.json"
 # So many images at time 0 are a static set: from fewer no field can be learned.
 _SEVERAL = 3
-_AT_REST = 1e-6
 
 
 @dataclass(frozen=True)
@@ -144,13 +137,13 @@ def _one_file(train: Transforms, test: Transforms, static_until: float | None) -
     if one_moment(train, test):
         return one_capture(train, test, 1.0)
     times = _times(train)
-    at_zero = times <= _AT_REST
+    at_zero = times <= TIME_TOLERANCE
     if static_until is None:
         static_until = 0.0 if int(at_zero.sum()) >= _SEVERAL else 1.0
     if static_until > 0 or not bool(at_zero.any()):
         return one_capture(train, test, static_until)
     still = at_zero.nonzero()[:, 0].tolist()
-    still_test = (_times(test) <= _AT_REST).nonzero()[:, 0].tolist()
+    still_test = (_times(test) <= TIME_TOLERANCE).nonzero()[:, 0].tolist()
     moving, moving_test = _seen_moving(train), _seen_moving(test)
     if not moving or not moving_test:
         raise scene_error(
@@ -158,11 +151,10 @@ def _one_file(train: Transforms, test: Transforms, static_until: float | None) -
             f"{len(moving)} images to learn motion from and {len(moving_test)} held out; expected "
             "one of each above time 0: correct the times, or train_filenames and test_filenames",
         )
+    rest_test = test
     if not still_test:
         log.warning("no held-out image at time 0: the static scene is tested on one in training")
         still_test, rest_test = still[:1], train
-    else:
-        rest_test = test
     log.info("%d images at time 0 are the static set of %d", len(still), len(times))
     return Layout(
         at_rest(train[still]),
@@ -178,7 +170,7 @@ def _seen_moving(transforms: Transforms) -> list[int]:
     What else there is at time 0 tells nothing of motion, and its many cameras would hide that
     the others stand still.
     """
-    later = _times(transforms) > _AT_REST
+    later = _times(transforms) > TIME_TOLERANCE
     camera = distinct_poses(transforms.poses)
     kept: list[int] = (later | torch.isin(camera, camera[later])).nonzero()[:, 0].tolist()
     return kept

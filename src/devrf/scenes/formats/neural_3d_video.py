@@ -158,7 +158,8 @@ class Neural3DVideoReader(SceneReader):
         moving = Capture(
             *(_views(videos, posed, chosen, frames, times, factor) for chosen in (train, [test]))
         )
-        still = Capture(_at_rest(moving.train), _at_rest(moving.test))
+        first = (views[(views.times == 0).nonzero()[:, 0]] for views in (moving.train, moving.test))
+        still = Capture(*first)
         return forward_facing_scene(self.name_of(folder), still, moving, self.near, self.background)
 
     def _split(self, videos: CameraVideos) -> tuple[int, list[int]]:
@@ -210,8 +211,3 @@ def _views(
         view,
         tuple(f"{path.name} frame {frame}" for frame in frames for path in paths),
     )
-
-
-def _at_rest(views: Views) -> Views:
-    """The first frame of each view."""
-    return views[(views.times == 0).nonzero()[:, 0]]

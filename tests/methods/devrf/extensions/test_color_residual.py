@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
-from lightning import Trainer
 from lightning.pytorch.callbacks import LambdaCallback
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
-from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.methods.devrf.canonical_field import ColorDecoder, SigmoidColor
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.methods.devrf.extensions.color_residual import (
-    NAME,
-    ColorResidual,
-    ResidualField,
-)
+from devrf.methods.devrf.extensions.color_residual import NAME, ColorResidual, ResidualField
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import DEFORMATION_LOSS, MotionSettings
 from devrf.rendering.renderer import Renderer
@@ -44,7 +38,7 @@ def field(cube: Box) -> ResidualField:
     return made
 
 
-def test_the_residual_is_blended_between_frames_and_absent_at_rest(field: ResidualField) -> None:
+def test_the_residual_is_blended_between_frames_and_absent_at_rest(field):
     assert field.at(0.0) is None
     point = torch.zeros(1, 3)
     for time, red in ((0.25, 0.5), (0.5, 1.0), (0.75, 2.0), (1.0, 3.0)):
@@ -54,7 +48,7 @@ def test_the_residual_is_blended_between_frames_and_absent_at_rest(field: Residu
 
 
 @pytest.mark.parametrize("decoder", [SigmoidColor(), ColorDecoder(3, 8)], ids=["plain", "network"])
-def test_it_is_added_before_the_sigmoid(decoder: torch.nn.Module) -> None:
+def test_it_is_added_before_the_sigmoid(decoder):
     torch.manual_seed(0)
     features, ray = torch.randn(2, 3), torch.zeros(2, dtype=torch.long)
     rest = decoder(features, torch.eye(3)[:1], ray)
@@ -94,12 +88,7 @@ def error(model: DeVRFModel, views: Views, image: int) -> float:
     return float((seen.view(-1, 3)[mask] - truth[mask, :3]).square().mean())
 
 
-def test_what_grows_darker_is_learned_by_the_residual(
-    rest: LoadedCheckpoint,
-    serve: Callable[[Scene], SceneDataModule],
-    tiny_scene: Scene,
-    trainer: Callable[..., Trainer],
-) -> None:
+def test_what_grows_darker_is_learned_by_the_residual(rest, serve, tiny_scene, trainer):
     scene, stage = fading(tiny_scene), stage_with(rest, SHORT)
     trainer(max_epochs=1).fit(stage, datamodule=serve(scene))
     model, views = stage.scene_model, scene.dynamic.train
@@ -115,14 +104,8 @@ def test_what_grows_darker_is_learned_by_the_residual(
     ("drift", "if_static", "first"), [(0.01, None, None), (0.1, 2, 0), (None, 2, 1)]
 )
 def test_auto_learns_colours_that_drift_early_and_others_late(
-    rest: LoadedCheckpoint,
-    datamodule: SceneDataModule,
-    trainer: Callable[..., Trainer],
-    monkeypatch: pytest.MonkeyPatch,
-    drift: float | None,
-    if_static: int | None,
-    first: int | None,
-) -> None:
+    rest, datamodule, trainer, monkeypatch, drift, if_static, first
+):
     monkeypatch.setattr(f"{ColorResidual.__module__}.color_drift", lambda views: drift)
     schedule = replace(TINY, levels=(Level(4, 1), Level(6, 1, weight_factors={"cycle": 2.0})))
     scale = {"cycle": 0.25}
@@ -140,9 +123,7 @@ def test_auto_learns_colours_that_drift_early_and_others_late(
     assert [stage.motion_loss.weights_at(level)["cycle"] for level in (0, 1)] == factors
 
 
-def test_its_rate_is_its_own_at_every_level(
-    rest: LoadedCheckpoint, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
-) -> None:
+def test_its_rate_is_its_own_at_every_level(rest, datamodule, trainer):
     stage, rates = stage_with(rest), []
     watch = LambdaCallback(
         on_train_batch_end=lambda *_: rates.append(
@@ -154,7 +135,7 @@ def test_its_rate_is_its_own_at_every_level(
     assert rates[0][1] == rates[-1][1] == pytest.approx(0.1)
 
 
-def test_a_checkpoint_keeps_the_colours(moving: DeVRFModel, tiny_scene: Scene) -> None:
+def test_a_checkpoint_keeps_the_colours(moving, tiny_scene):
     other = DeVRFModel.from_config(moving.config())
     other.load_stored_state(moving.stored_state())
     assert other.color_residual is not None and moving.color_residual is not None
@@ -166,7 +147,7 @@ def test_a_checkpoint_keeps_the_colours(moving: DeVRFModel, tiny_scene: Scene) -
     assert (Renderer(other).view(cameras, 0, 0.7, 1.0).color - before).abs().max() > 0.02
 
 
-def test_wrong_settings_are_told(rest: LoadedCheckpoint) -> None:
+def test_wrong_settings_are_told(rest):
     with pytest.raises(DevrfError, match="color_residual.side"):
         ColorResidual(side=1)
     with pytest.raises(DevrfError, match="flaw is no term of loss.deformation"):

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import pytest
 import torch
-from lightning import Trainer
 
 from devrf.data.batch import all_pixels
-from devrf.data.datamodule import SceneDataModule
 from devrf.engine.batches import gather_batch
 from devrf.geometry.box import Box
 from devrf.methods.devrf.architecture import Architecture
@@ -38,7 +34,7 @@ def forward_scene() -> Scene:
     return ProceduralForwardScene(**size, frames=2, supersample=1)()
 
 
-def test_specks_and_fog_do_not_count() -> None:
+def test_specks_and_fog_do_not_count():
     # 2000 rays that meet a wall at 0.6, one that meets a speck before it, and fog of 1 %.
     wall = torch.tensor([[-0.9, 0.6]]).repeat(2000, 1)
     weights = torch.tensor([[0.01, 0.99]]).repeat(2000, 1)
@@ -50,7 +46,7 @@ def test_specks_and_fog_do_not_count() -> None:
     assert visible_depths(wall.flatten(), weights.flatten(), ray) == pytest.approx((0.2, 0.6))
 
 
-def test_while_all_is_fog_hardly_anything_is_given_up() -> None:
+def test_while_all_is_fog_hardly_anything_is_given_up():
     depths = torch.linspace(-1, 1, 101).repeat(50)
     ends = visible_depths(
         depths, torch.full((5050,), 0.01), torch.arange(50).repeat_interleave(101)
@@ -61,7 +57,7 @@ def test_while_all_is_fog_hardly_anything_is_given_up() -> None:
     assert with_room((0.2, 0.6), BOX) == pytest.approx((0.1, 0.62))
 
 
-def test_a_cropped_field_is_the_same_where_it_still_is() -> None:
+def test_a_cropped_field_is_the_same_where_it_still_is():
     field = CanonicalField(
         BOX, SigmoidColor(), channels=3, voxels=31 * 21 * 21, alpha_init=1e-2, planes=21
     )
@@ -81,7 +77,7 @@ def test_a_cropped_field_is_the_same_where_it_still_is() -> None:
     torch.testing.assert_close(field.density.values[-1, :, :, 0], before[-1])
 
 
-def test_a_field_is_cropped_to_the_wall_that_it_shows(forward_scene: Scene) -> None:
+def test_a_field_is_cropped_to_the_wall_that_it_shows(forward_scene):
     architecture = Architecture(channels=4, width=16, frequencies=0, planes=33)
     field = architecture.radiance_field(forward_scene.bounds.box, 20 * 15 * 33, 20 * 15 * 33)
     with torch.no_grad():
@@ -105,12 +101,7 @@ def test_a_field_is_cropped_to_the_wall_that_it_shows(forward_scene: Scene) -> N
     torch.testing.assert_close(after.depth, before.depth, atol=0.02, rtol=0)
 
 
-def test_the_growing_grid_may_give_up_depths(
-    forward_scene: Scene,
-    datamodule: SceneDataModule,
-    trainer: Callable[..., Trainer],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_growing_grid_may_give_up_depths(forward_scene, datamodule, trainer, monkeypatch):
     asked, ends = [], iter([(-0.2, 0.6), (0.0, 0.6)])
     monkeypatch.setattr(
         depth_crop, "visible_depths", lambda *seen: asked.append(seen) or next(ends)

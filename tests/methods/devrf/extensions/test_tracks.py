@@ -25,7 +25,7 @@ from devrf.methods.devrf.extensions.tracks import (
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.sampling import RenderSettings
-from devrf.scenes.scene import OpticalFlow, Scene, Views
+from devrf.scenes.scene import OpticalFlow, Views
 
 SIDE, WIDTH, HEIGHT = 21, 30, 10
 RED, GREEN, BLUE, BLACK = (255, 0, 0), (0, 255, 0), (0, 0, 255), (0, 0, 0)
@@ -92,7 +92,7 @@ def x_of(column: float) -> float:
     return (column + 0.5 - WIDTH / 2) * 4 / 60
 
 
-def test_a_pixel_ends_where_its_color_is_met(model: DeVRFModel, views: Views) -> None:
+def test_a_pixel_ends_where_its_color_is_met(model, views):
     # A red pixel: one frame back the flow meets the blue band, two frames back the red one.
     views.pixels[3, ROW, MIDDLE] = torch.tensor(RED)
     leads(views, 3, MIDDLE, RIGHT)
@@ -109,9 +109,7 @@ def test_a_pixel_ends_where_its_color_is_met(model: DeVRFModel, views: Views) ->
     assert nearest.canonical[:, 0].tolist() == pytest.approx([x_of(RIGHT)], abs=0.02)
 
 
-def test_what_is_met_nowhere_or_cannot_be_followed_is_no_track(
-    model: DeVRFModel, views: Views
-) -> None:
+def test_what_is_met_nowhere_or_cannot_be_followed_is_no_track(model, views):
     assert views.flow is not None
     # Black is nowhere; the flow of the second ends, the third leaves the image, the fourth is met.
     for column, color in ((2, BLACK), (12, RED), (14, BLUE), (MIDDLE, GREEN)):
@@ -122,7 +120,7 @@ def test_what_is_met_nowhere_or_cannot_be_followed_is_no_track(
     assert met.pixel[:, 0].tolist() == [MIDDLE + 0.5]
 
 
-def test_points_are_those_that_had_moved_there(model: DeVRFModel, views: Views) -> None:
+def test_points_are_those_that_had_moved_there(model, views):
     # In frame 2 the whole sheet lies 0.2 further to the right.
     assert model.deformation is not None
     model.deformation.to_canonical[2, ..., 0] = -0.2
@@ -149,7 +147,7 @@ def shifted_ball(cameras: Cameras, radius: float = 0.4, count: int = 900) -> Tra
     return Tracks(points, camera, pixel)
 
 
-def test_three_views_of_a_shift_give_the_shift_and_the_way_back() -> None:
+def test_three_views_of_a_shift_give_the_shift_and_the_way_back():
     field = DeformationField(BOX, FrameClock((0.0, 0.5, 1.0)), voxels=10**3)
     cameras = three_cameras()
     tracks = shifted_ball(cameras)
@@ -163,7 +161,7 @@ def test_three_views_of_a_shift_give_the_shift_and_the_way_back() -> None:
     assert (back - tracks.canonical).norm(dim=1).median() < 0.03
 
 
-def test_without_tracks_the_frame_stays_where_the_one_before_is() -> None:
+def test_without_tracks_the_frame_stays_where_the_one_before_is():
     field = DeformationField(BOX, FrameClock((0.0, 0.5, 1.0)), voxels=4**3)
     field.to_canonical[1] = 0.25
     field.frames.copy_previous(2)
@@ -172,7 +170,7 @@ def test_without_tracks_the_frame_stays_where_the_one_before_is() -> None:
     assert torch.equal(field.to_canonical[2], field.to_canonical[1])
 
 
-def test_flow_starts_only_frames_whose_predecessor_was_learned(tiny_scene: Scene) -> None:
+def test_flow_starts_only_frames_whose_predecessor_was_learned(tiny_scene):
     # Of four frames number 2 first, then 1 and 3: flow leads to frame 1, not yet learned.
     schedule = DeformationSchedule((Level(5, 4, parallel_frames=2),), coarse_to_fine=False)
     phases = [schedule.phase(at, 4) for at in (0, 4)]
