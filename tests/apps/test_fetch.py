@@ -105,10 +105,7 @@ def test_the_scene_alone_is_unpacked_and_nothing_leaves_its_folder(tmp_path, kin
 
 @pytest.mark.parametrize(
     ("content", "said"),
-    [
-        (b"<html>not an archive</html>", "cannot be unpacked"),
-        (None, "holds no hotdog with"),
-    ],
+    [(b"<html>not an archive</html>", "cannot be unpacked"), (None, "holds no hotdog with")],
 )
 def test_another_file_than_expected_is_refused(tmp_path, content, said):
     archive = written(tmp_path, "zip", FILES)

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import pytest
 import torch
-from lightning import Trainer
 
-from devrf.checkpoints.checkpoint import LoadedCheckpoint
-from devrf.data.datamodule import SceneDataModule
 from devrf.engine.convergence import Convergence, converged
 from devrf.errors import DevrfError
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
@@ -28,15 +23,11 @@ SCHEDULE = DeformationSchedule(levels=(Level(4, 12), Level(6, 8)), rays=64)
         ([1.0, 0.9, 1.2], False),  # dear pixels, but the one before has gained
     ],
 )
-def test_by_hand(losses: list[float], done: bool) -> None:
+def test_by_hand(losses, done):
     assert converged(losses, min_rel_improvement=0.02) is done
 
 
-def test_a_frame_that_has_converged_is_left_if_asked(
-    rest: LoadedCheckpoint,
-    datamodule: SceneDataModule,
-    trainer: Callable[..., Trainer],
-) -> None:
+def test_a_frame_that_has_converged_is_left_if_asked(rest, datamodule, trainer):
     motion = MotionSettings(min_rel_improvement=1.0)
     stage = DeformationStage(rest, SCHEDULE, motion, iterations_per_step=2)
     trainer(max_epochs=1).fit(stage, datamodule=datamodule)
@@ -45,14 +36,14 @@ def test_a_frame_that_has_converged_is_left_if_asked(
     assert stage.iteration == stage.total_iterations == 60
 
 
-def test_a_gain_is_a_share() -> None:
+def test_a_gain_is_a_share():
     with pytest.raises(DevrfError, match="schedule.motion.min_rel_improvement"):
         MotionSettings(min_rel_improvement=0.0)
 
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-def test_losses_on_a_gpu_are_judged_one_step_late_and_go_on_so() -> None:
+def test_losses_on_a_gpu_are_judged_one_step_late_and_go_on_so():
     steps = [torch.tensor([loss], device="cuda") for loss in (1.0, 0.99, 0.985, 0.98)]
     watch = Convergence()
     assert [watch.converged(loss, 0.02) for loss in steps[:3]] == [False] * 3

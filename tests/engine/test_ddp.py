@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import socket
-from collections.abc import Callable
 from multiprocessing.connection import Connection
 from types import SimpleNamespace
 from typing import Any
@@ -14,7 +13,6 @@ import torch
 from torch import distributed
 
 from devrf.callbacks import PeriodicCheckpoint
-from devrf.data.datamodule import SceneDataModule
 from devrf.engine import ddp
 from devrf.engine.ddp import (
     assert_replicas_equal,
@@ -106,7 +104,7 @@ def found() -> list[dict[str, Any]]:
             process.kill()
 
 
-def test_two_processes(found: list[dict[str, Any]]) -> None:
+def test_two_processes(found):
     for each in found:
         # 7 rays in two shares, rounded up.
         assert (each["size"], each["rays"]) == (2, 4)
@@ -121,7 +119,7 @@ def test_two_processes(found: list[dict[str, Any]]) -> None:
         assert "different fields (other)" in each["differing"]
 
 
-def test_one_process_changes_nothing() -> None:
+def test_one_process_changes_nothing():
     parameter = torch.zeros(2, requires_grad=True)
     average_gradients([parameter])
     assert parameter.grad is None
@@ -133,12 +131,7 @@ def test_one_process_changes_nothing() -> None:
     assert_replicas_equal({"parameter": parameter})
 
 
-def test_each_process_and_step_draws_pixels_of_its_own(
-    canonical: Callable[..., CanonicalStage],
-    datamodule: SceneDataModule,
-    trainer: Callable[..., Any],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_each_process_and_step_draws_pixels_of_its_own(canonical, datamodule, trainer, monkeypatch):
     drawn = {}
     for number, iteration, seed in [(0, 0, 0), (1, 0, 0), (0, 10, 0), (0, 0, 1), (0, 0, 0)]:
         torch.manual_seed(seed)
@@ -155,9 +148,7 @@ def test_each_process_and_step_draws_pixels_of_its_own(
     assert len(set.union(*drawn.values())) == 4
 
 
-def test_a_strategy_that_cannot_follow_growing_grids_is_refused(
-    monkeypatch: pytest.MonkeyPatch, trainer: Callable[..., Any]
-) -> None:
+def test_a_strategy_that_cannot_follow_growing_grids_is_refused(monkeypatch, trainer):
     stage = CanonicalStage()
     stage.trainer = trainer()
     monkeypatch.setattr(type(stage.trainer), "world_size", 2)

@@ -31,7 +31,7 @@ def pair() -> tuple[Tensor, Tensor]:
     return torch.empty(*SHAPE, 3), torch.empty(*SHAPE, 3)
 
 
-def test_a_frame_is_read_changed_and_written_back(store: FrameStore) -> None:
+def test_a_frame_is_read_changed_and_written_back(store):
     (backward, forward), frame = both(store), pair()
     store.read(2, frame)
     assert torch.equal(frame[0], backward[2]) and torch.equal(frame[1], forward[2])
@@ -43,7 +43,7 @@ def test_a_frame_is_read_changed_and_written_back(store: FrameStore) -> None:
     assert torch.equal(store.to_time, forward)
 
 
-def test_a_frame_starts_from_the_one_before_it_in_both_directions(store: FrameStore) -> None:
+def test_a_frame_starts_from_the_one_before_it_in_both_directions(store):
     before = both(store)
     store.copy_previous(2)
     for now, was in zip(both(store), before, strict=True):
@@ -55,9 +55,7 @@ def test_a_frame_starts_from_the_one_before_it_in_both_directions(store: FrameSt
 
 
 @pytest.mark.parametrize("half", [False, True])
-def test_offloaded_frames_stay_as_they_are_and_are_read_in_single_precision(
-    store: FrameStore, half: bool
-) -> None:
+def test_offloaded_frames_stay_as_they_are_and_are_read_in_single_precision(store, half):
     exact, frame = both(store), pair()
     store.offload(on_host=True, half=half)
     dtype = torch.float16 if half else torch.float32
@@ -73,7 +71,7 @@ def test_offloaded_frames_stay_as_they_are_and_are_read_in_single_precision(
     assert store.to_time.shape == (4, 5, 5, 5, 3) and store.to_time.dtype == dtype
 
 
-def test_a_stored_state_of_another_shape_is_taken(store: FrameStore) -> None:
+def test_a_stored_state_of_another_shape_is_taken(store):
     other = FrameStore(2, (5, 5, 5))
     other.load_state_dict(store.state_dict())
     assert torch.equal(other.to_time, store.to_time)
@@ -87,9 +85,7 @@ PAPER = (160, 160, 160)
     ("gigabytes", "half", "parallel", "fits"),
     [(6, False, 1, False), (8, False, 1, True), (6, True, 1, True), (8, False, 3, False)],
 )
-def test_a_quarter_of_the_gpu_is_left(
-    gigabytes: int, half: bool, parallel: int, fits: bool
-) -> None:
+def test_a_quarter_of_the_gpu_is_left(gigabytes, half, parallel, fits):
     # 2 · 50 · 160³ displacements of 12 bytes: 4.9 GB, or 2.5 in half precision. Of a frame that is
     # learned 11 grids (values 3, gradients 2, Adam's 4, a copy 2): 0.54 GB.
     free = gigabytes * 10**9
@@ -99,7 +95,7 @@ def test_a_quarter_of_the_gpu_is_left(
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 @pytest.mark.parametrize("half", [False, True])
-def test_frames_on_the_host_are_page_locked_and_come_back_as_they_were(half: bool) -> None:
+def test_frames_on_the_host_are_page_locked_and_come_back_as_they_were(half):
     device = torch.device("cuda", 0)
     store = FrameStore(3, (4, 5, 6)).to(device)
     store.offload(on_host=True, half=half)

@@ -7,17 +7,14 @@ from __future__ import annotations
 
 import copy
 import logging
-from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
-from lightning import Trainer
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
-from devrf.data.datamodule import SceneDataModule
 from devrf.engine.stage import ScheduledStage
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
@@ -60,12 +57,7 @@ def short_lists(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("build", [canonical, moving])
-def test_lists_of_fixed_length_teach_what_exact_ones_do(
-    build: Callable[[LoadedCheckpoint], ScheduledStage],
-    rest: LoadedCheckpoint,
-    trainer: Callable[..., Trainer],
-    datamodule: SceneDataModule,
-) -> None:
+def test_lists_of_fixed_length_teach_what_exact_ones_do(build, rest, trainer, datamodule):
     def learn(kernels: Kind) -> ScheduledStage:
         torch.manual_seed(3)
         stage = build(rest)
@@ -98,11 +90,8 @@ class StandIn:
 
 
 def test_before_a_capture_lists_have_been_long_enough_for_every_view(
-    rest: LoadedCheckpoint,
-    trainer: Callable[..., Trainer],
-    datamodule: SceneDataModule,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    rest, trainer, datamodule, monkeypatch
+):
     """The views take turns: a list that is measured on one of them may be too short for another."""
     capturer, usual = StandIn(), DeformationStage.draw
 
@@ -123,7 +112,7 @@ def test_before_a_capture_lists_have_been_long_enough_for_every_view(
     assert stage.loop.num_captures == 1
 
 
-def test_work_is_captured_after_its_warm_up() -> None:
+def test_work_is_captured_after_its_warm_up():
     capturer = StandIn()
     repeated = GraphedStep(lambda: capturer.noted.append("work"), capturer)  # type: ignore[arg-type]
     for call in range(5):
@@ -133,9 +122,7 @@ def test_work_is_captured_after_its_warm_up() -> None:
     assert capturer.noted == [*["work"] * 3, "captured", *["work"] * 2]
 
 
-def test_work_that_cannot_be_captured_is_repeated_with_one_warning(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_work_that_cannot_be_captured_is_repeated_with_one_warning(caplog, monkeypatch):
     capturer, calls = StandIn(), []
 
     def capture(work: Work) -> Any:
@@ -156,7 +143,7 @@ def test_work_that_cannot_be_captured_is_repeated_with_one_warning(
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-def test_after_a_failed_capture_streams_and_memory_are_as_before() -> None:
+def test_after_a_failed_capture_streams_and_memory_are_as_before():
     device = torch.device("cuda", 0)
     present, values = torch.cuda.current_stream(device), torch.ones(8, device=device)
     step = GraphedStep(lambda: print(values.sum().item()), CudaGraphCapture(device))

@@ -6,7 +6,6 @@ import copy
 import logging
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,7 +14,6 @@ import torch
 from devrf.callbacks import PeriodicCheckpoint
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import Pixels
-from devrf.data.datamodule import SceneDataModule
 from devrf.engine.micro_batching import MicroBatching
 from devrf.engine.stage import ScheduledStage
 from devrf.errors import DevrfError
@@ -81,9 +79,7 @@ def assert_alike(one: ScheduledStage, other: ScheduledStage) -> None:
             torch.testing.assert_close(value, other.state_dict()[name], rtol=1e-3, atol=1e-4)
 
 
-def test_the_canonical_stage_learns_the_same_in_parts(
-    learn, memory_for, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_the_canonical_stage_learns_the_same_in_parts(learn, memory_for, caplog):
     whole = learn(canonical())
     calls = memory_for(8)
     with caplog.at_level(logging.WARNING, logger="devrf"):
@@ -96,8 +92,8 @@ def test_the_canonical_stage_learns_the_same_in_parts(
 
 
 def test_memory_that_runs_out_for_one_frame_changes_nothing_for_a_parallel_one(
-    learn, memory_for, rest: LoadedCheckpoint, four_frames: SceneDataModule
-) -> None:
+    learn, memory_for, rest, four_frames
+):
     whole = learn(moving(rest, TOGETHER), data=four_frames)
     # Four iterations of one frame, one of two frames; then the second of them does not fit.
     calls = memory_for(32, from_call=4 + 2 + 1)
@@ -108,8 +104,8 @@ def test_memory_that_runs_out_for_one_frame_changes_nothing_for_a_parallel_one(
 
 
 def test_a_frame_that_never_fits_ends_the_stage_saved(
-    learn, memory_for, rest: LoadedCheckpoint, four_frames: SceneDataModule, tmp_path: Path
-) -> None:
+    learn, memory_for, rest, four_frames, tmp_path
+):
     calls = memory_for(4, from_call=4 + 2 + 1)
     stage = moving(rest, TOGETHER)
     with pytest.raises(DevrfError, match=r"at iteration 5 of 8 \(frames 1, 3, ") as caught:
@@ -122,9 +118,7 @@ def test_a_frame_that_never_fits_ends_the_stage_saved(
     assert [path.name for path in tmp_path.iterdir()] == ["deformation-progress-5.ckpt"]
 
 
-def test_memory_that_runs_out_in_the_backward_pass_changes_nothing(
-    learn, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_memory_that_runs_out_in_the_backward_pass_changes_nothing(learn, monkeypatch):
     whole, failing = learn(canonical()), canonical()
     usual, calls = failing.manual_backward, [0]
 
@@ -140,7 +134,7 @@ def test_memory_that_runs_out_in_the_backward_pass_changes_nothing(
     assert_alike(failing, whole)
 
 
-def test_the_number_of_micro_batches_is_resumed(learn, memory_for, tmp_path: Path) -> None:
+def test_the_number_of_micro_batches_is_resumed(learn, memory_for, tmp_path):
     memory_for(32)
     saving = PeriodicCheckpoint(tmp_path, every_seconds=0, share=1.0)
     learn(canonical(), saving)
@@ -150,7 +144,7 @@ def test_the_number_of_micro_batches_is_resumed(learn, memory_for, tmp_path: Pat
     assert again.loop.micro_batching.count == 2 and set(calls) == {32}
 
 
-def test_one_of_several_processes_ends_with_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_of_several_processes_ends_with_an_error(monkeypatch):
     monkeypatch.setattr("devrf.engine.micro_batching.world_size", lambda: 2)
 
     def loss(pixels: Pixels) -> Any:
@@ -161,7 +155,7 @@ def test_one_of_several_processes_ends_with_an_error(monkeypatch: pytest.MonkeyP
         MicroBatching().gradients(loss, pixels, lambda total: None, lambda: None)
 
 
-def test_micro_batches_are_the_batch_in_order(rng: torch.Generator) -> None:
+def test_micro_batches_are_the_batch_in_order(rng):
     pixels = Pixels(
         torch.randint(6, (7,), generator=rng), torch.arange(7) * 5, torch.rand(7, 3, generator=rng)
     )

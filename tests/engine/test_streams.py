@@ -14,9 +14,7 @@ from lightning import Trainer
 from lightning.pytorch.callbacks import LambdaCallback
 from torch.profiler import ProfilerActivity, profile
 
-from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import Pixels
-from devrf.data.datamodule import SceneDataModule
 from devrf.engine.learner import ParallelBatch
 from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
@@ -71,7 +69,7 @@ def streams(monkeypatch: pytest.MonkeyPatch) -> Streams:
     return Streams(monkeypatch)
 
 
-def test_streams_fork_before_the_first_piece_and_join_after_the_last(streams: Streams) -> None:
+def test_streams_fork_before_the_first_piece_and_join_after_the_last(streams):
     parallel = StreamParallel()
     expected = [
         "stream 1 waits for present",
@@ -86,7 +84,7 @@ def test_streams_fork_before_the_first_piece_and_join_after_the_last(streams: St
     assert streams.noted == expected
 
 
-def test_on_a_cpu_and_under_a_profiler_pieces_run_one_by_one(streams: Streams) -> None:
+def test_on_a_cpu_and_under_a_profiler_pieces_run_one_by_one(streams):
     def pieces(count: int) -> list[Callable[[], str]]:
         return [streams.piece(str(k)) for k in range(count)]
 
@@ -111,11 +109,7 @@ class Alone(DeformationSchedule):
 TOGETHER = Alone(levels=(Level(5, 4, parallel_frames=2),), rays=64, coarse_to_fine=False)
 
 
-def test_a_frame_learns_in_parallel_what_it_learns_alone(
-    rest: LoadedCheckpoint,
-    four_frames: SceneDataModule,
-    trainer: Callable[..., Trainer],
-) -> None:
+def test_a_frame_learns_in_parallel_what_it_learns_alone(rest, four_frames, trainer):
     motion = MotionSettings(
         learning_rate=3e-3, unit="box", views="all", pixels="occupied", occupancy_every=3
     )
@@ -144,9 +138,7 @@ def test_a_frame_learns_in_parallel_what_it_learns_alone(
         assert learned[1].any() and not expected[1].any()
 
 
-def test_each_frame_has_a_copy_of_the_frame_before_it(
-    rest: LoadedCheckpoint, four_frames: SceneDataModule, trainer: Callable[..., Trainer]
-) -> None:
+def test_each_frame_has_a_copy_of_the_frame_before_it(rest, four_frames, trainer):
     schedule = DeformationSchedule(levels=(Level(4, 2), Level(5, 1, parallel_frames=2)), rays=64)
     stage, visited = DeformationStage(rest, schedule), []
 

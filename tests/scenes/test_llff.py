@@ -70,10 +70,7 @@ def test_a_world_point_falls_on_the_pixel_computed_by_hand(llff_folder):
 
 @pytest.mark.parametrize(
     ("inner", "focal", "center"),
-    [
-        ([64, 96, 80], (20, 20), (12, 8)),
-        ([[64], [96], [80], [72], [44], [36]], (20, 18), (11, 9)),
-    ],
+    [([64, 96, 80], (20, 20), (12, 8)), ([[64], [96], [80], [72], [44], [36]], (20, 18), (11, 9))],
 )
 def test_poses_without_intrinsics_take_them_from_their_own_file(llff_folder, inner, focal, center):
     rows = llff_folder.static_rows()
@@ -240,10 +237,7 @@ def test_a_fixed_camera_that_looks_elsewhere(llff_folder, message_of):
 
 @pytest.mark.parametrize(
     ("options", "said"),
-    [
-        ({"train_views": 3}, "the set has 2 views"),
-        ({"test_view": 4}, "none of the 3 views"),
-    ],
+    [({"train_views": 3}, "the set has 2 views"), ({"test_view": 4}, "none of the 3 views")],
 )
 def test_wrong_options(llff_folder, options, said, message_of):
     assert said in message_of(llff_folder.root, **options)

@@ -132,11 +132,7 @@ CAMERA = "camera/000004.json"
         ("metadata.json", lambda c: c[IDS[5]].pop("warp_id"), "image '000005' has no warp_id"),
         ("scene.json", lambda c: c.pop("near"), "near: is missing"),
         (CAMERA, lambda c: c.update(focal_length=0), "focal_length: should be greater than 0"),
-        (
-            CAMERA,
-            lambda c: c.update(orientation=[[1, 0, 0]] * 3),
-            "orientation or position",
-        ),
+        (CAMERA, lambda c: c.update(orientation=[[1, 0, 0]] * 3), "orientation or position"),
     ],
 )
 def test_wrong_values(folder, file, change, said, message_of):

@@ -139,11 +139,7 @@ def test_the_loss_weighs_what_counts_and_reports_it_unweighted(prediction):
 
 
 def seen(
-    batch: RayBatch,
-    ray: Tensor,
-    points: Tensor,
-    canonical: Tensor,
-    weight: Tensor,
+    batch: RayBatch, ray: Tensor, points: Tensor, canonical: Tensor, weight: Tensor
 ) -> VoxelOutput:
     """An output that holds what the motion terms look at."""
     rays = len(batch.rays)

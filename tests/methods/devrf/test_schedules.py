@@ -152,9 +152,7 @@ def test_a_further_level_goes_backward_through_the_frames():
 
 @given(
     st.lists(
-        st.tuples(st.integers(2, 99), st.integers(1, 9), st.integers(1, 15)),
-        min_size=1,
-        max_size=5,
+        st.tuples(st.integers(2, 99), st.integers(1, 9), st.integers(1, 15)), min_size=1, max_size=5
     ),
     st.integers(2, 12),
     st.booleans(),
