@@ -36,6 +36,7 @@ stage: pipeline
 seed: 0
 resume: true
 memory_check: true
+priors: all
 ckpt: null
 scene: robot
 method: devrf
