@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from devrf.data.datamodule import SceneDataModule
-from devrf.errors import DevrfError
 from devrf.scenes.procedural.filming import exact_flow
 from devrf.scenes.procedural.recipe import ProceduralScene, Recipe
 from devrf.scenes.scene import Scene
+from devrf.scenes.validation import scene_error
 
 Flow = Literal["exact", "none"]
 FLOWS = get_args(Flow)
@@ -34,7 +34,7 @@ class RenderedDataModule(SceneDataModule):
         self.recipe = recipe
         self.export = None if export is None else Path(export)
         if flow not in FLOWS:
-            raise DevrfError(f"data.flow: should be 'exact' or 'none', not {flow!r}")
+            raise scene_error("data.flow", f"should be 'exact' or 'none', not {flow!r}")
         self.flow = flow
 
     def load(self) -> Scene:

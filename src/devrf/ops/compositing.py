@@ -33,7 +33,7 @@ def composite(depth: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
         weights (S,) and end transmittance (R,), differentiable once in ``depth``.
     """
     if accelerated("compositing", depth):
-        return composite_segments(depth, _firsts(ray, rays))
+        return composite_segments(depth, firsts(ray, rays))
     weights, end = _Composite.apply(depth, ray, rays)  # type: ignore[no-untyped-call]
     return weights, end
 
@@ -118,8 +118,8 @@ def transmittances(depth: Tensor, ray: Tensor, rays: int) -> Tensor:
 
     Plain PyTorch on all devices: Triton's search computes it itself.
     """
-    first = _firsts(ray, rays)[:-1]
-    reached = _running_sum(depth)
+    first = firsts(ray, rays)[:-1]
+    reached = running_sum(depth)
     return torch.exp(reached[first[ray]] - reached[:-1]).to(depth.dtype)
 
 
@@ -149,9 +149,9 @@ def color_and_depth(
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, depth: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
-        edges = _firsts(ray, rays)
+        edges = firsts(ray, rays)
         first, last = edges[:-1], edges[1:]
-        reached = _running_sum(depth)
+        reached = running_sum(depth)
         transmittance = torch.exp(reached[first[ray]] - reached[:-1]).to(depth.dtype)
         weights = transmittance * -torch.expm1(-depth)
         end = torch.exp(reached[first] - reached[last]).to(depth.dtype)
@@ -162,13 +162,13 @@ class _Composite(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad_weights: Tensor, grad_end: Tensor) -> tuple[Tensor, None, None]:
         depth, ray, first, last, transmittance, weights, end = ctx.saved_tensors
-        shadowed = _running_sum(grad_weights * weights)
+        shadowed = running_sum(grad_weights * weights)
         behind = (shadowed[last][ray] - shadowed[1:]).to(depth.dtype)
         transmitted = grad_weights * transmittance * torch.exp(-depth)
         return transmitted - behind - (grad_end * end)[ray], None, None
 
 
-def _firsts(ray: Tensor, rays: int) -> Tensor:
+def firsts(ray: Tensor, rays: int) -> Tensor:
     """The first sample of every ray, and the number of samples (R + 1,)."""
     return torch.searchsorted(ray, torch.arange(rays + 1, device=ray.device))
 
@@ -179,7 +179,7 @@ def _rays_of(first: Tensor, samples: int) -> Tensor:
     return torch.searchsorted(first[1:].contiguous(), place, right=True)
 
 
-def _running_sum(values: Tensor) -> Tensor:
+def running_sum(values: Tensor) -> Tensor:
     """Sums (S + 1,) of all values before each place, over all rays.
 
     In double precision: a ray's own sum is the difference of two of these, which may be large.

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from devrf.ops.compositing import firsts, running_sum
 from devrf.ops.dispatch import accelerated
 
 # The order of terms and of their weights.
@@ -54,10 +55,9 @@ def distortion(weight: Tensor, distance: Tensor, ray: Tensor, rays: int) -> Tens
         ray: (K,) int64, ascending.
         rays: R.
     """
-    before = torch.stack([weight, weight * distance]).double()
-    sums = torch.nn.functional.pad(before.cumsum(dim=1), (1, 0))
-    first = torch.searchsorted(ray, torch.arange(rays, device=ray.device))[ray]
-    mass, reached = (sums[:, :-1] - sums[:, first]).to(weight.dtype)
+    first = firsts(ray, rays)[ray]
+    before = (running_sum(weight), running_sum(weight * distance))
+    mass, reached = ((sums[:-1] - sums[first]).to(weight.dtype) for sums in before)
     total: Tensor = (weight * (distance * mass - reached)).sum()
     return 2 * total / rays
 

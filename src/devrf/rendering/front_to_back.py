@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from devrf.geometry.rays import Rays
-from devrf.ops.compositing import color_and_depth, sum_by_ray, transmittances
+from devrf.ops.compositing import color_and_depth, firsts, sum_by_ray, transmittances
 from devrf.rendering.list_rendering import VoxelField
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import ColorChange, RenderedImage
@@ -70,18 +70,24 @@ def picture(
         distance = samples.distance.index_select(0, kept)
         seen = torch.cat([color, torch.stack([distance, torch.ones_like(distance)], 1)], 1)
         sums.index_add_(0, ray, weight[:, None] * seen)
-    ends = rays.ends()
-    if ends is not None:
-        every = torch.arange(len(rays), device=ends.device)
-        background = field.rgb(ends, rays.viewdirs, every)
-    image, depth = color_and_depth(sums[:, :3], sums[:, 3], sums[:, 4], left, background)
+    end_color = behind(rays, field, background)
+    image, depth = color_and_depth(sums[:, :3], sums[:, 3], sums[:, 4], left, end_color)
     return RenderedImage(image, depth, 1 - left)
+
+
+def behind(
+    rays: Rays, field: VoxelField, background: Tensor, precision: torch.dtype = torch.float32
+) -> Tensor:
+    """What rays end in: the ``background``, or the field's colours (R, 3) if it holds infinity."""
+    ends = rays.ends()
+    if ends is None:
+        return background
+    return field.rgb(ends, rays.viewdirs, torch.arange(len(rays), device=ends.device), precision)
 
 
 def _slabs(segments: Segments, left: Tensor) -> Iterator[Segments]:
     """The next segments of each ray, while ``left`` (R,), which changes, is what passes it."""
-    rays = torch.arange(len(left) + 1, device=left.device)
-    edges = torch.searchsorted(segments.ray, rays)
+    edges = firsts(segments.ray, len(left))
     following, last = edges[:-1], edges[1:]
     within = torch.arange(SLAB, device=left.device)
     while True:

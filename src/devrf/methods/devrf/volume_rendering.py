@@ -13,6 +13,7 @@ from torch import Tensor
 from devrf.geometry.rays import Rays
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.ops.compositing import color_and_depth, composite, sum_by_ray, transmittances
+from devrf.rendering.front_to_back import behind
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import ColorChange, VoxelOutput
 from devrf.rendering.sampling import STOP, RenderSettings, Samples, march
@@ -71,10 +72,7 @@ def render(
     with span("decoder"):
         residual = None if color_change is None else color_change(canonical)
         color = field.rgb(canonical, rays.viewdirs, samples.ray, precision, residual)
-        ends = rays.ends()
-        if ends is not None:
-            every = torch.arange(len(rays), device=ends.device)
-            background = field.rgb(ends, rays.viewdirs, every, precision)
+        background = behind(rays, field, background, precision)
     with span("compositing"):
         seen = sum_by_ray(weight[:, None] * color, samples.ray, len(rays))
         with torch.no_grad():

@@ -103,7 +103,7 @@ class Part:
 
     def distance_at(self, local: Sequence[Tensor], speed: float, time: float) -> Tensor:
         """Lower bound (M,) at ``time`` of points in its frame, which moves with it."""
-        if self.bend is self.twist is self.squash:
+        if {self.bend, self.twist, self.squash} == {STILL}:
             return self.distance(local)
         factor = math.exp(self.squash(speed, time))
         longest = max(factor, 1 / math.sqrt(factor))

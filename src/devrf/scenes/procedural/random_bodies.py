@@ -20,7 +20,7 @@ from torch import Tensor
 from devrf.scenes.procedural.assembled import STILL, Assembled, Part
 from devrf.scenes.procedural.motion import Swing
 from devrf.scenes.procedural.rigs import STUDIO
-from devrf.scenes.procedural.solids import Paint, Rgb, Xyz
+from devrf.scenes.procedural.solids import Material, Paint, Rgb, Xyz
 
 # Bodies that are drawn for a seed at most, and the share of points inside of other parts below
 # which one is taken at once.
@@ -30,7 +30,6 @@ TRIES, ENTERED = 12, 0.02
 COVERS, MOVES = (0.15, 0.7), (0.1, 0.8)
 # How round parts turn about themselves where texture slides.
 SPIN = Swing(1.5, 1.2, 0.0)
-BARS = 4
 TIMES = tuple(k / 12 for k in range(13))
 
 
@@ -59,16 +58,13 @@ def _drawn(draw: Random) -> list[Part]:
     """Four to nine parts."""
     style, count = draw.choice(("chain", "tree", "loop")), draw.randint(4, 9)
     parts = _loop(draw) if style == "loop" else []
+    bars = len(parts)
     while len(parts) < count:
         last = len(parts) - 1
         parent = last if style == "chain" or last < 0 else draw.randint(max(0, last - 3), last)
         parts.append(_carried(draw, parts, parent))
-    free = set(range(len(_loop_of(parts, style)), count)) - {part.parent for part in parts}
+    free = set(range(bars, count)) - {part.parent for part in parts}
     return [_soft(draw, part) if k in free else part for k, part in enumerate(parts)]
-
-
-def _loop_of(parts: Sequence[Part], style: str) -> Sequence[Part]:
-    return parts[:BARS] if style == "loop" else []
 
 
 def _loop(draw: Random) -> list[Part]:
@@ -171,7 +167,7 @@ def _entered(body: Assembled) -> float:
     axes = [part.base + share[:, None] * part.along * part.axes[:, 2] for part in body.parts]
     part = torch.arange(len(axes)).repeat_interleave(len(share))
     rest = torch.cat(axes).float()
-    material = type(body.outline())(rest, part)
+    material = Material(rest, part)
     before = body.distances(rest, 0.0) < 0
     inside = [
         (body.distances(body.forward(material, time), time) < 0) & ~before for time in TIMES[::3]
