@@ -50,14 +50,14 @@ def ray_stage() -> Callable[..., RayStage]:
 
 @pytest.fixture
 def learned_losses(ray_stage: Callable[..., RayStage], fit: Callable[..., RayStage]) -> Any:
-    """``learned_losses(model, **schedule)``: the loss at each Lightning step of a fitted stage."""
+    """``learned_losses(model, **schedule)``: a term at each Lightning step of a fitted stage."""
 
-    def learn(model: RayTrainable, **changes: Any) -> list[float]:
+    def learn(model: RayTrainable, term: str = "loss", **changes: Any) -> list[float]:
         found: list[float] = []
 
         class Note(Callback):
             def on_train_batch_end(self, *arguments: Any) -> None:
-                found.append(float(arguments[2]["loss"]))
+                found.append(float(arguments[2][term]))
 
         fit(ray_stage(model, **changes), Note())
         return found

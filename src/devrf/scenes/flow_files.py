@@ -158,8 +158,11 @@ def content_key(views: Views, method: str) -> str:
     return digest.hexdigest()
 
 
-def load_flow(path: Path, key: str) -> OpticalFlow | None:
-    """The flow stored at ``path``, or None when it has not the :func:`content_key` of images."""
+def load_flow(path: Path, key: str, shape: tuple[int, int, int]) -> OpticalFlow | None:
+    """The flow stored at ``path``, or None when there is none for these images.
+
+    It must carry their :func:`content_key` and have the ``shape`` (N, H, W).
+    """
     if not os.path.isfile(path):
         return None
     try:
@@ -168,7 +171,7 @@ def load_flow(path: Path, key: str) -> OpticalFlow | None:
     except DevrfError as error:
         log.warning("the flow is estimated again: %s", error)
         return None
-    if str(known) != key:
+    if str(known) != key or vectors.shape != (*shape, 2) or not np.isfinite(vectors).all():
         log.info("%s holds the flow of other images or of another method", path)
         return None
     return OpticalFlow(torch.from_numpy(vectors), torch.from_numpy(valid))

@@ -135,7 +135,7 @@ def estimate_flow(
         )
     key = content_key(views, f"{method} forward" if forward else method)
     if cache is not None:
-        stored = load_flow(cache, key)
+        stored = load_flow(cache, key, (len(views), views.height, views.width))
         if stored is not None:
             log.info("read estimated optical flow from %s", cache)
             return stored

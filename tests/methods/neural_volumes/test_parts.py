@@ -14,6 +14,7 @@ from devrf.methods.neural_volumes.model import NeuralVolumes
 from devrf.methods.neural_volumes.networks import (
     AffineMixWarp,
     ConvWarp,
+    TimeEncoder,
     doubling,
     identity_grid,
     rotation_matrices,
@@ -64,6 +65,18 @@ def test_a_doubled_volume_begins_without_a_checkerboard() -> None:
     made = layer(torch.randn(1, 3, 1, 1, 1).expand(1, 3, 4, 4, 4))
     inside = made[:, :, 2:-2, 2:-2, 2:-2]
     torch.testing.assert_close(inside, inside[:, :, :1, :1, :1].expand_as(inside))
+
+
+def test_the_encoder_halves_images_and_shrinks_codes() -> None:
+    encoder = TimeEncoder(
+        NeuralVolumesSettings(
+            encoder_views=2, encoder_size=(8, 16), encoder_channels=(4, 4), encoder_width=6, code=5
+        )
+    )
+    assert encoder.joined[0].in_features == 2 * 4 * 2 * 4
+    mean, log_deviation = encoder(torch.rand(3, 2, 3, 8, 16))
+    assert mean.shape == log_deviation.shape == (3, 5)
+    assert log_deviation.abs().max() < 0.1  # deviations begin next to 1
 
 
 def test_cameras_that_miss_a_frame_are_not_encoded(tiny_scene: Scene) -> None:

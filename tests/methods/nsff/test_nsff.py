@@ -30,8 +30,8 @@ def test_it_learns(
 ) -> None:
     model = NSFF(replace(tiny, sampling=sampling, blend=blend, hard_rays=0))
     loss, sizes = {"color": 1.0, "neighbours": 0.1}, {"iterations": 45, "iterations_per_step": 15}
-    losses = learned_losses(model, loss=loss, rays=64, **sizes)
-    assert len(losses) == 3 and losses[-1] < 0.8 * losses[0]
+    colors = learned_losses(model, "color", loss=loss, rays=64, **sizes)
+    assert len(colors) == 3 and colors[-1] < 0.8 * colors[0]
 
 
 def test_every_term_is_learned_from_and_finite(
