@@ -59,6 +59,18 @@ def test_a_stage_ends_with_its_seconds_and_its_whole_schedule(timed, share: floa
     )
 
 
+@pytest.mark.parametrize(
+    ("share", "by_rays", "rays"), [(0.4, True, 4), (0.4, False, 16), (3.0, True, 16)]
+)
+def test_batches_are_quartered_before_iterations_are_left_out(
+    timed, monkeypatch: pytest.MonkeyPatch, share: float, by_rays: bool, rays: int
+) -> None:
+    monkeypatch.setattr(DeformationStage, "cost_follows_rays", by_rays)
+    stage, seconds, _ = timed(share * WHOLE)
+    assert seconds == pytest.approx(share * WHOLE, rel=0.05)
+    assert stage.loop.rays == rays
+
+
 def test_too_little_time_is_refused_and_none_changes_nothing(timed) -> None:
     stage, seconds, visits = timed(None)
     assert (seconds, stage.skipped) == (pytest.approx(WHOLE), 0)

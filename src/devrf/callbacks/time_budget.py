@@ -18,6 +18,9 @@ iterations takes 6, with one of 0.5 it takes 36. Every phase keeps one iteration
   (grids that grow, a frame's occupancy and pixels). What an iteration of a phase costs beside one
   of another is the stage's own estimate (:meth:`~devrf.engine.learner.Learner.cost`): where it is
   wrong, levels get other shares of the time, but the end is where it should be.
+* Where the stride would be more than 1, batches are halved first, to a quarter at the least: more
+  iterations learn more than larger ones. What takes as long with fewer rays keeps its batches
+  (:attr:`~devrf.engine.learner.Learner.cost_follows_rays`), and so do lists of fixed length.
 * Of several processes rank 0's clock decides.
 * A progress file holds the seconds so far: a run that was interrupted goes on with those left. What
   it learns then is not bit for bit what it would have learned: a clock never gives the same twice.
@@ -42,7 +45,9 @@ log = logging.getLogger(__name__)
 # The most of the budget that a Lightning step may take, within which the stride is the same.
 STEP_SHARE = 0.01
 # The share of the budget after which it is checked that the rest suffices.
-TRIAL_SHARE = 0.1
+TRIAL_SHARE = 0.25
+# The least part of a batch that is drawn for want of time.
+LEAST_BATCH = 1 / 4
 # Added to the last strides, whose sum would else fall short of the end.
 ROUNDING = 1e-6
 # How much of an average the latest measurement is.
@@ -115,10 +120,13 @@ class TimeBudget(Callback):
             fitted = trainer.strategy.broadcast(self._fitted(pl_module))
             if isinstance(fitted, str):
                 raise DevrfError(fitted)
-            pl_module.stride, pl_module.iterations_per_step = fitted
+            pl_module.stride, pl_module.iterations_per_step, share = fitted
+            # An iteration takes about as long as its rays; it is measured again.
+            self._pace *= share / pl_module.loop.batch_share
+            pl_module.loop.batch_share = share
 
-    def _fitted(self, stage: ScheduledStage) -> tuple[float, int] | str:
-        """Stride and iterations of the coming step; why the budget is too short, if it is."""
+    def _fitted(self, stage: ScheduledStage) -> tuple[float, int, float] | str:
+        """Stride, iterations and share of batches from now on; or why the budget is too short."""
         assert self._pace is not None and stage.phase is not None
         pace, left = self._pace, self._budget - self._step_began
         later = [phase for phase in self._phases if phase.start > stage.iteration]
@@ -136,11 +144,14 @@ class TimeBudget(Callback):
         )
         # Out of time, what is left gets an iteration a phase.
         stride = whole / (left - entering) if left > entering else float(stage.total_iterations)
+        share, divisible = stage.loop.batch_share, stage.cost_follows_rays
+        if stride > 1 and share > LEAST_BATCH and divisible and not stage.loop.capacities:
+            stride, share = stride / 2, share / 2
         if not later:  # whole iterations are left: as many as end nearest to the budget
             iterations = max(1, round(left / (pace * stage.phase.cost)))
             stride = (stage.phase.stop - stage.position) / iterations + ROUNDING
         most = STEP_SHARE * self._budget / (pace * stage.phase.cost)
-        return stride, max(1, min(self._most_iterations, int(most)))
+        return stride, max(1, min(self._most_iterations, int(most))), share
 
     def _too_short(self, stage: ScheduledStage, least: float) -> str:
         assert self.seconds is not None
@@ -173,7 +184,8 @@ class TimeBudget(Callback):
             return
         assert isinstance(pl_module, ScheduledStage)
         log.info(
-            "%s: %d iterations for the %d of its schedule, in %.1f s of %.1f",
+            "%s: %d iterations for its %d, on %.0f%% of their rays, in %.1f s of %.1f",
             *(pl_module.name, pl_module.iterations_done, pl_module.iteration),
+            100 * pl_module.loop.batch_share,
             *(self._record.seconds, self._budget),
         )

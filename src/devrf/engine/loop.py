@@ -77,7 +77,7 @@ class Loop:
         num_captures: how many CUDA graphs have been captured.
         num_short_lists: how often a list of samples was found to have been too short, so that
             samples of the last rays were dropped.
-        rays: of a batch in this process.
+        batch_share: the part of a batch that is drawn; a time budget may halve it.
     """
 
     def __init__(self, graphs: Graphs = "auto") -> None:
@@ -86,13 +86,19 @@ class Loop:
         self.micro_batching = MicroBatching()
         self.metrics = MetricAccumulator()
         self.num_captures = self.num_short_lists = 0
-        self.rays, self.processes = 0, 1
+        self.batch_share = 1.0
+        self._rays, self.processes = 0, 1
         self._device = torch.device("cpu")
         # What losses are scaled by in the backward pass, which would fill one each time.
         self._one = torch.ones(())
         self._streams = StreamParallel()
         self._graphed: GraphedStep | None = None
         self._capture: CudaGraphCapture | None = None
+
+    @property
+    def rays(self) -> int:
+        """Rays of a batch in this process."""
+        return max(1, round(self._rays * self.batch_share))
 
     @property
     def capacities(self) -> list[SampleCapacity]:
@@ -116,7 +122,7 @@ class Loop:
             static_shape: whether all shapes must be independent of data.
         """
         self.release()
-        self.rays, self.processes = rays_per_rank(rays), world_size()
+        self._rays, self.processes = rays_per_rank(rays), world_size()
         self._device = parameters[0][0].device
         self._one = self._one.to(self._device)
         self.batches = [ParallelBatch(k, learned) for k, learned in enumerate(parameters)]

@@ -117,11 +117,13 @@ class RayTrainable(Renderable):
         protocols: the names of the protocols that it learns by; None: every one.
         priors: what it wants of a scene beside images and backward flow, where it can be had:
             ``forward_flow``.
+        cost_follows_rays: whether an iteration on fewer rays takes less time.
     """
 
     losses: ClassVar[tuple[str, ...]] = ("color",)
     protocols: ClassVar[tuple[str, ...] | None] = None
     priors: ClassVar[tuple[str, ...]] = ()
+    cost_follows_rays: ClassVar[bool] = True
 
     def check_protocol(self, protocol: str) -> None:
         """Refuse a protocol that the method cannot learn by.

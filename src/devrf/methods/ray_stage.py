@@ -13,7 +13,6 @@ from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import Pixels, RayBatch, concatenated
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.batches import FramePool, gather_batch
-from devrf.engine.ddp import rays_per_rank
 from devrf.engine.learner import ParallelBatch, Phase
 from devrf.engine.stage import ScheduledStage
 from devrf.errors import expect
@@ -109,10 +108,10 @@ class RayStage(ScheduledStage):
         if rest is not None:
             self.scene_model = rest.model
             self.earlier_records = rest.metadata.records
+        self.cost_follows_rays = self.scene_model.cost_follows_rays
         self.weights = counted_weights(loss, self.scene_model.losses, "ray_stage.loss")
         self.pools: list[FramePool] = []
         self._centres: list[FramePool] = []
-        self._rays = schedule.rays
 
     @property
     def total_iterations(self) -> int:
@@ -167,9 +166,9 @@ class RayStage(ScheduledStage):
         self.scene_model.learn_from(views, self.weights)
         groups = self.optimizer.param_groups
         fewer = self.schedule.rays_without_hull
-        self._rays = self.schedule.rays if fewer is None or self.scene_model.has_hull else fewer
+        rays = self.schedule.rays if fewer is None or self.scene_model.has_hull else fewer
         learned = [parameter for group in groups for parameter in group["params"]]
-        self.loop.bind(self._rays, [learned], self.optimizer, static_shape=False)
+        self.loop.bind(rays, [learned], self.optimizer, static_shape=False)
 
     def prepare(self) -> None:
         """Let the model follow the schedule."""
@@ -181,7 +180,7 @@ class RayStage(ScheduledStage):
         Images are numbered through, the static ones first. Last are those the model asks for.
         """
         with span("batch"):
-            rays = rays_per_rank(self._rays)
+            rays = self.loop.rays
             static = round(rays * self.static_share)
             pools = self._centres if self.iteration < self.schedule.centre_crop else self.pools
             counts = [static, rays - static] if len(pools) > 1 else [rays]

@@ -30,8 +30,10 @@ from devrf.system.graphs import CudaGraphCapture, GraphedStep
 LIKENESS = 0.15
 # Frames that a pixel is followed back at most; drift adds up, and memory holds so many occupancies.
 FARTHEST = 16
-# Tracks of a frame at most, chosen at random.
-MOST_TRACKS = 4096
+# Tracks of a frame at most, chosen at random, and optimiser steps of a fit to them.
+MOST_TRACKS, FIT_STEPS = 4096, 60
+# What a frame gets of these at least, under a time budget.
+LEAST_SHARE = 1 / 4
 # Weight of differences between neighbouring voxels' changes in a fit.
 SMOOTHNESS = 0.01
 
@@ -75,9 +77,12 @@ class StartAlongFlow(Extension):
         pool = all_pixels(views, images_of(views, frame))
         # A visit's first frame has its number: the visits before have learned as many.
         learned = phase.frames[0]
-        tracks = self._tracks.follow(frame, pool, stage.generator, learned=learned)
-        capturer = stage.loop.capturer()
-        start_from_tracks(field, frame, tracks, views.cameras, model.space, capturer=capturer)
+        # A time budget does less of everything, and no more of this.
+        share = max(1 / max(stage.stride, 1.0), LEAST_SHARE)
+        most, steps = round(share * MOST_TRACKS), round(share * FIT_STEPS)
+        tracks = self._tracks.follow(frame, pool, stage.generator, learned=learned, most=most)
+        fixed = views.cameras, model.space
+        start_from_tracks(field, frame, tracks, *fixed, steps, capturer=stage.loop.capturer())
         # Each process has followed pixels of its own.
         broadcast([field.to_canonical[frame], field.to_time[frame]])
 
@@ -132,6 +137,7 @@ class FlowTracks:
         generator: torch.Generator,
         *,
         learned: int,
+        most: int = MOST_TRACKS,
     ) -> Tracks:
         """Tracks Σ w_i q_i / Σ w_i to a frame.
 
@@ -140,13 +146,14 @@ class FlowTracks:
             pool: pixels of its images.
             generator: of the random choice, on the pool's device.
             learned: how many of the frames before it have been learned, or are at rest.
+            most: pixels at most, chosen at random.
         """
         views = self.views
         assert views.flow is not None
         valid = views.flow.valid.flatten()[pool.image.long() * self._area + pool.flat.long()]
         kept = valid.nonzero()[:, 0]
         order = torch.randperm(len(kept), device=kept.device, generator=generator)
-        kept = kept[order[:MOST_TRACKS]]
+        kept = kept[order[:most]]
         here, flat = pool.image[kept].long(), pool.flat[kept].long()
         now = gather_batch(views, here, flat, torch.ones(3, device=here.device))
         place, waiting = now.pixel, torch.arange(len(here), device=here.device)
@@ -220,7 +227,7 @@ def start_from_tracks(
     tracks: Tracks,
     cameras: Cameras,
     space: Space = WORLD,
-    steps: int = 60,
+    steps: int = FIT_STEPS,
     capturer: CudaGraphCapture | None = None,
 ) -> None:
     """Fit a frame's two slices, copied from the frame before, to the tracks.
