@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -15,6 +16,12 @@ from devrf.scenes.validation import scene_error
 
 Flow = Literal["exact", "none"]
 FLOWS = get_args(Flow)
+
+
+@lru_cache(maxsize=1)
+def rendered(recipe: Callable[[], Scene]) -> Scene:
+    """The recipe's scene; the jobs of a sweep over settings render it once."""
+    return recipe()
 
 
 class RenderedDataModule(SceneDataModule):
@@ -39,7 +46,7 @@ class RenderedDataModule(SceneDataModule):
 
     def load(self) -> Scene:
         """Render the scene."""
-        scene = self.recipe()
+        scene = rendered(self.recipe)
         if self.flow == "exact":
             return scene
         dynamic = replace(scene.dynamic, train=replace(scene.dynamic.train, flow=None))
