@@ -128,6 +128,20 @@ def test_the_average_is_over_scenes_that_a_configuration_was_run_on(table, ran):
     assert [block.title for block in table().blocks] == ["flower", "robot", "bush"]
 
 
+def test_gains_are_over_three_scenes_or_more_and_name_the_worst(table, ran):
+    found = {"robot": (30.0, 31.0), "flower": (33.0, 32.5), "bush": (27.0, 29.0)}
+    for scene, (base, full) in found.items():
+        ran(f"{scene}_base", scene, ablation="base", scores={"psnr": base}, seconds=(10, 20))
+        ran(f"{scene}_full", scene, scores={"psnr": full}, seconds=(10, 50))
+    # (1 − 0.5 + 2) / 3 = 0.83; twice the time in each.
+    assert table().gains.to_numpy().tolist() == [
+        ["Ours (base)", "30.00", "27.00", "+0.00", "+0.00 (bush)", "1.00×"],
+        [FULL, "30.83", "29.00", "+0.83", "-0.50 (flower)", "2.00×"],
+    ]
+    ran("room", "room", image_size=[24, 24])
+    assert table().gains.empty
+
+
 def test_published_rows_stand_below_runs_of_the_same_scene_and_data(table, ran):
     ran("a", "lego")
     ran("at_rest", "lego", at_rest=True)

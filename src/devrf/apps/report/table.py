@@ -125,6 +125,8 @@ class Table:
             ``views``, ``count`` and each column's title; NaN unless all runs of the row have the
             value.
         blocks: one for each scene, then the average if there is more than one.
+        gains: over three scenes or more, if they are alike: PSNR by label as text, its mean and its
+            least, and what it gains over the first row's; seconds as a multiple of that row's.
         notes: remarks on columns and rows, a sentence each.
     """
 
@@ -133,6 +135,7 @@ class Table:
     runs: pd.DataFrame
     rows: pd.DataFrame
     blocks: tuple[Block, ...]
+    gains: pd.DataFrame
     notes: tuple[str, ...]
 
     @property
@@ -174,18 +177,21 @@ def tabulate(collection: Collection, published_scenes: PublishedScenes = "matchi
         )
         paper = [theirs[scene]] if scene in theirs else []
         blocks.append(Block(scene, measured, _published(paper, columns)))
+    gains = pd.DataFrame()
     if len(ours) > 1:
         title = f"average over {len(ours)} scenes"
         paper = ours if set(ours) <= set(theirs) else []
         average = Block(title, _average(runs, rows, ours, columns), _published(paper, columns))
         blocks += [average] if len(average.measured) else []
+        if len(average.measured) > 1 and len(ours) > 2:
+            gains = _gains(rows.reset_index(), average.measured)
     notes = _notes(runs, collection.runs.loc[~scored, "folder"], again)
     left_out = [scene for scene in ours if scene in published().data and scene not in theirs]
     if left_out and published_scenes == "matching":
         notes.append(
             f"Of other data than the paper's rows, which are left out: {', '.join(left_out)}."
         )
-    return Table(collection, columns, runs, rows, tuple(blocks), tuple(notes))
+    return Table(collection, columns, runs, rows, tuple(blocks), gains, tuple(notes))
 
 
 def _is_of_published_data(run: Mapping[str, Any]) -> bool:
@@ -262,6 +268,24 @@ def _average(
     means = means.assign(counts=groups["count"].agg(set))[alike]
     devices = runs.loc[runs["label"].isin(means.index), "run.device"]
     return _cells(means, means[titles] * math.nan, columns, devices)
+
+
+def _gains(rows: pd.DataFrame, average: pd.DataFrame) -> pd.DataFrame:
+    """What the rows of an average gain over its first: see :class:`Table`."""
+    by_scene = rows[rows["label"].isin(average.index)].pivot(index="label", columns="scene")
+    psnr, seconds = (by_scene[title].reindex(average.index) for title in ("PSNR", "Time"))
+    gain, first = psnr - psnr.iloc[0], average["head", "name"].iloc[0]
+    least = zip(gain.min(axis=1), gain.idxmin(axis=1), strict=True)
+    return pd.DataFrame(
+        {
+            "": average["head", "name"],
+            "PSNR": psnr.mean(axis=1).map("{:.2f}".format),
+            "PSNR, least": psnr.min(axis=1).map("{:.2f}".format),
+            f"gain over {first}": gain.mean(axis=1).map("{:+.2f}".format),
+            "gain, least": [f"{value:+.2f} ({scene})" for value, scene in least],
+            "time": seconds.div(seconds.iloc[0]).mean(axis=1).map("{:.2f}×".format),
+        }
+    )
 
 
 def _published(scenes: list[str], columns: Sequence[Column]) -> pd.DataFrame:

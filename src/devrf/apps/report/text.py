@@ -115,6 +115,9 @@ def markdown(
         align = ["left"] * left + ["right"] * len(table.columns)
         cells = frame.to_markdown(index=False, disable_numparse=True, colalign=align)
         parts += [f"## {markdown_escaped(block.title)}", cells]
+    if len(table.gains):
+        cells = table.gains.map(markdown_escaped).to_markdown(index=False, disable_numparse=True)
+        parts += ["## Gains over all scenes", cells]
     for heading, lines in (
         ("", table.notes),
         ("## Failed", reasons(collection)),
@@ -134,6 +137,8 @@ def markdown(
 def plain(table: Table) -> str:
     """The tables, notes and failures, for a terminal; ¹ ² ³ mark the best."""
     parts = [_plain_block(table, block) + "\n" for block in table.blocks]
+    if len(table.gains):
+        parts.append(table.gains.to_string(index=False) + "\n")
     failed = [f"failed: {why}" for why in reasons(table.collection)]
     return "\n".join([*parts, *table.notes, *failed, *table.collection.skipped]).rstrip()
 
