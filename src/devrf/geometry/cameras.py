@@ -58,6 +58,11 @@ class Cameras:
         """(N, 3) unit viewing directions of the optical axes, in world space."""
         return -self.camera_to_world[:, :, 2]
 
+    def pixel_size(self, point: Tensor) -> float:
+        """The edge of a pixel at a ``point`` (3,), in world units: the median over the cameras."""
+        distance = (self.positions - point.to(self.positions)).norm(dim=1)
+        return float((distance / self.focal.mean(dim=1)).median())
+
     def rays(self, camera: Tensor, pixels: Tensor) -> Rays:
         """World-space rays through pixels.
 

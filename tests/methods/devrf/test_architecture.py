@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
 
 from devrf.errors import DevrfError
+from devrf.geometry.box import Box
+from devrf.geometry.cameras import Cameras
 from devrf.geometry.ndc import NormalizedDevice
-from devrf.methods.devrf.architecture import Architecture, fitted_to, resolved_planes
+from devrf.geometry.space import WORLD
+from devrf.methods.devrf.architecture import (
+    Architecture,
+    fitted_to,
+    resolved_planes,
+    resolved_voxels,
+)
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
@@ -66,6 +76,25 @@ def test_a_scene_seen_from_all_around_keeps_its_numbers(tiny_scene):
     assert fitted_to(tiny_scene, schedule, Architecture()) == (schedule, Architecture())
     with pytest.raises(DevrfError, match=r"field\.planes=7: planes are of forward-facing scenes"):
         fitted_to(tiny_scene, schedule, Architecture(planes=7))
+
+
+@pytest.mark.parametrize(
+    ("side", "finer", "voxels"),
+    [
+        (80, 2.0, 20 * 10 * 10),  # half a pixel of 4 / 40 = 0.1
+        (10, 2.0, 10**3),  # coarser than that as it is
+        (80, None, 80**3),
+        (80, 0.1, 8 * 2),  # whose first phase has half of them
+    ],
+)
+def test_a_scene_seen_from_all_around_gets_what_its_pixels_resolve(side, finer, voxels):
+    positions = torch.tensor([[4.0, 0, 0], [0, -4, 0], [0, 0, 9], [0, 0, 4], [0, 4, 0]])
+    cameras = Cameras.looking_at(positions, torch.zeros(5, 3), focal=40.0, width=30, height=30)
+    scene: Any = SimpleNamespace(space=WORLD, static=SimpleNamespace(train=None))
+    scene.static.train = SimpleNamespace(cameras=cameras)
+    schedule = CanonicalSchedule(side=side, upsample_at=(1000,), voxels_per_pixel=finer)
+    box = Box((-0.5, -0.25, -0.25), (0.5, 0.25, 0.25))
+    assert resolved_voxels(scene, schedule, box) == pytest.approx(voxels, abs=1)
 
 
 def test_planes_of_both_fields(forward_scene, fit, serve):

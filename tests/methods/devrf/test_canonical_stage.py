@@ -81,6 +81,19 @@ def test_the_whole_schedule_is_run_and_the_loss_falls(datamodule, trainer):
     assert sum(watch.loss[-2:]) / 2 < 0.6 * watch.loss[0]
 
 
+def test_coarse_and_few_pixels_make_a_coarse_grid_and_small_batches(fit):
+    resolved = replace(CARVED, side=64, voxels_per_pixel=1.0, rays=4096)
+    stages = [fit(CanonicalStage(replace(resolved, epochs=n), SMALL)) for n in (None, 2.0)]
+    assert stages[0].scene_model.canonical.base_voxels < 64**3 / 8
+    assert stages[0].resolution == stages[1].resolution
+    assert stages[0].resolution == stages[0].scene_model.canonical.box.grid_shape(
+        stages[0].scene_model.canonical.base_voxels
+    )
+    pixels = len(stages[1].pool)
+    drawn = [len(stage.draw(None).image) for stage in stages]
+    assert drawn == [4096, max(64, round(2 * pixels / 60))]
+
+
 def test_the_search_hands_over_to_a_radiance_field_with_room_for_motion(
     datamodule, tiny_scene, trainer
 ):

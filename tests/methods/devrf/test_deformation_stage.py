@@ -45,6 +45,23 @@ def test_a_scene_at_rest_has_no_motion_to_learn(rest, tiny_scene, serve, trainer
         trainer(max_steps=1).fit(DeformationStage(rest, SHORT), datamodule=module)
 
 
+@pytest.mark.parametrize("views", ["one", "all"])
+def test_a_visit_shows_its_pixels_as_often_as_said(rest, fit, views: Any):
+    drawn = []
+
+    class Watched(DeformationStage):
+        def draw(self, batch: Any) -> Any:
+            pixels = super().draw(batch)
+            assert self.phase is not None
+            drawn.append((self.phase.stop - self.phase.start, len(pixels.image)))
+            return pixels
+
+    schedule = DeformationSchedule(levels=(Level(4, 6),), rays=1500)
+    stage = fit(Watched(rest, schedule, MotionSettings(views=views, epochs=5.0)))
+    pixels = 2 * stage.views.height * stage.views.width  # of two views; the first visit has 12
+    assert set(drawn) == {(12, round(5 * pixels / 12)), (6, min(1500, round(5 * pixels / 6)))}
+
+
 def test_a_whole_schedule_sees_the_motion_better_than_the_rest_pose(
     rest, datamodule, tiny_scene, trainer
 ):

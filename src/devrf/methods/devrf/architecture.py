@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 
 import torch
@@ -14,6 +15,8 @@ from devrf.geometry.space import Space
 from devrf.methods.devrf.canonical_field import CanonicalField, ColorDecoder, SigmoidColor
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.scenes.scene import Scene
+
+log = logging.getLogger(__name__)
 
 # Parallax of a plane against the next, between the outermost static views: with less, the views
 # hardly tell two planes apart, while fog before the scene takes long to clear.
@@ -107,6 +110,24 @@ def fitted_to(
         schedule = replace(schedule, side=(across * down * planes) ** (1 / 3))
         architecture = replace(architecture, aspect=space.width / space.height)
     return schedule, architecture
+
+
+def resolved_voxels(scene: Scene, schedule: CanonicalSchedule, box: Box) -> int:
+    """Voxels of the finished grid over ``box``: of ``side``, or what the static views resolve.
+
+    See docs/method.md#resolution.
+    """
+    whole: int = round(schedule.side**3)
+    finer = schedule.voxels_per_pixel
+    if finer is None or not scene.space.is_linear or isinstance(scene.space, NormalizedDevice):
+        return whole
+    edge = scene.static.train.cameras.pixel_size(torch.tensor(box.middle)) / finer
+    least = 8 << len(schedule.upsample_at)  # as few as its first phase may have
+    resolved = min(whole, max(int(box.volume / edge**3), least))
+    if resolved < whole:
+        side, given = resolved ** (1 / 3), schedule.side
+        log.info("schedule.canonical.side: %.4g of %g is what the images resolve", side, given)
+    return resolved
 
 
 def resolved_planes(positions: Tensor, space: NormalizedDevice) -> int:

@@ -15,7 +15,7 @@ from devrf.geometry.space import Space
 LEAST = {
     **dict.fromkeys(("search_iterations", "dense_tv_iterations", "view_dependence_start"), 0),
     **dict.fromkeys(("unbounded_distortion", "density_drop"), 0),
-    **dict.fromkeys(("iterations", "decay_iterations", "rays", "min_views"), 1),
+    **dict.fromkeys(("iterations", "decay_iterations", "rays", "min_views", "epochs"), 1),
     **dict.fromkeys(("side", "search_side", "unbounded_initial_side", "occupancy_every"), 2),
 }
 
@@ -55,7 +55,9 @@ class CanonicalSchedule:
         rays: of a batch.
         min_views: cells that fewer training views have in the picture are empty from the start.
         dense_tv_iterations: so long the total variation smooths untouched voxels, too.
-        voxels_per_pixel: forward-facing, grid points for each pixel across; decides ``side``.
+        voxels_per_pixel: grid points for each pixel across. Forward-facing it decides ``side``;
+            else the grid is no finer (docs/method.md#resolution).
+        epochs: batches are smaller where all iterations would show each pixel more often.
         view_dependence_start: iteration from which colours depend on the viewing direction. None:
             0; in contracted space half of ``iterations``.
         unbounded_initial_side: of the grid in contracted space. None: as ``upsample_at`` says.
@@ -77,6 +79,7 @@ class CanonicalSchedule:
     min_views: int = 3
     dense_tv_iterations: int = 0
     voxels_per_pixel: float | None = None
+    epochs: float | None = None
     view_dependence_start: int | None = None
     unbounded_initial_side: float | None = 26
     unbounded_distortion: float = 0.01

@@ -14,7 +14,7 @@ from devrf.data.batch import PixelPool, Pixels
 from devrf.engine.batches import static_pool
 from devrf.engine.learner import ParallelBatch
 from devrf.errors import DevrfError
-from devrf.methods.devrf.architecture import Architecture, fitted_to
+from devrf.methods.devrf.architecture import Architecture, fitted_to, resolved_voxels
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.canonical_schedule import CanonicalPhase, CanonicalSchedule
 from devrf.methods.devrf.extensions.depth_crop import crop_to_visible
@@ -210,8 +210,10 @@ class CanonicalStage(VoxelStage):
             box = box.clipped(bounds.box)
         share = 100 * occupancy.share
         log.info("%.1f%% of the searched box may be occupied; fields live in %s", share, box)
-        base_voxels = round(self.schedule.side**3)
-        field = self.architecture.radiance_field(box, phase.voxels, base_voxels)
+        whole = round(self.schedule.side**3)
+        base_voxels = resolved_voxels(self.scene, self.schedule, box)
+        voxels = round(phase.voxels * base_voxels / whole)
+        field = self.architecture.radiance_field(box, voxels, base_voxels)
         if self.schedule.view_dependence_start:
             field.forget_directions()
         return field
@@ -292,8 +294,10 @@ class CanonicalStage(VoxelStage):
 
     def draw(self, batch: ParallelBatch) -> Pixels:
         """Random pixels of all images."""
-        assert self.pool is not None
-        return self.draw_pixels(self.pool)
+        assert self.pool is not None and self.phase is not None
+        schedule = self.schedule
+        epochs = None if self.phase.kind == "search" else schedule.epochs
+        return self.draw_pixels(self.pool, epochs and epochs * len(self.pool) / schedule.iterations)
 
     def loss(
         self, batch: ParallelBatch, views: Views, pixels: Pixels

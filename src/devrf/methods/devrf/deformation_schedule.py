@@ -111,15 +111,8 @@ class DeformationSchedule:
     planes: int | None = None
 
     @classmethod
-    def from_rows(
-        cls,
-        levels: Mapping[str, Level | None],
-        coarse_to_fine: bool = True,
-        decay: float = 10 ** (-1 / 4),
-        rays: int = 8192,
-        planes: int | None = None,
-    ) -> DeformationSchedule:
-        """The schedule of a config, whose levels are rows that are named ``1``, ``2`` and so on.
+    def from_rows(cls, levels: Mapping[str, Level | None], **settings: Any) -> DeformationSchedule:
+        """The schedule of a config, whose ``levels`` are rows named ``1``, ``2`` and so on.
 
         null leaves a row out: a schedule may have fewer levels than the one that it starts from.
 
@@ -136,7 +129,7 @@ class DeformationSchedule:
                     f"iterations, which row {number} has not; there are {', '.join(sorted(rows))}"
                 )
             numbered.append(Level(**row))
-        return cls(numbered, coarse_to_fine, decay, rays, planes)
+        return cls(numbered, **settings)
 
     def __post_init__(self) -> None:
         key = "schedule.deformation"

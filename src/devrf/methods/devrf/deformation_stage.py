@@ -223,8 +223,10 @@ class DeformationStage(MotionStage):
 
     def draw(self, batch: ParallelBatch) -> Pixels:
         """Random pixels of the batch's frame, of its views in turn or of all."""
-        pools = self.active[batch.number].pools
-        return self.draw_pixels(pools[self.turn % len(pools)])
+        pools, phase, epochs = self.active[batch.number].pools, self.phase, self.motion.epochs
+        assert phase is not None
+        most = epochs and epochs * sum(map(len, pools)) / (phase.stop - phase.start)
+        return self.draw_pixels(pools[self.turn % len(pools)], most)
 
     @property
     def view_cycle(self) -> int:

@@ -60,6 +60,7 @@ class MotionSettings:
         unit: ``world`` for world units; ``box`` for the longest edge of the fields' box.
         views: of the frame's views a batch shows ``one``, in turn, or ``all``.
         pixels: ``all``, or ``occupied``: of the alpha mask, and where rays hit the present field.
+        epochs: batches are smaller where a visit would show each pixel more often.
         occupancy_every: iterations between updates of the frame's occupancy.
         store: where frames are kept while one is learned; ``auto``: on the device if they fit.
         store_half: whether they are kept in half precision; ``auto``: on a GPU.
@@ -71,6 +72,7 @@ class MotionSettings:
     unit: Literal["world", "box"] = "world"
     views: Literal["one", "all"] = "one"
     pixels: Literal["all", "occupied"] = "all"
+    epochs: float | None = None
     occupancy_every: int = 25
     adam_state: Literal["fresh", "carried"] = "fresh"
     store: Literal["auto", "device", "host"] = "auto"
@@ -78,9 +80,10 @@ class MotionSettings:
     min_rel_improvement: float | None = None
 
     def __post_init__(self) -> None:
-        gain = self.min_rel_improvement
-        key = "schedule.motion.min_rel_improvement"
-        expect(gain is None or 0 < gain <= 1, key, "above 0, at most 1, or null", gain)
+        gain, epochs, key = self.min_rel_improvement, self.epochs, "schedule.motion"
+        expect(epochs is None or epochs > 0, f"{key}.epochs", "above 0, or null", epochs)
+        some = gain is None or 0 < gain <= 1
+        expect(some, f"{key}.min_rel_improvement", "above 0, at most 1, or null", gain)
 
     def stored_half(self, device: torch.device) -> bool:
         """Whether frames are kept in half precision while a stage learns on ``device``."""

@@ -27,6 +27,9 @@ from devrf.system.device import multiplies_bfloat16
 from devrf.system.graphs import Graphs
 from devrf.system.profiling import span
 
+# Rays of a batch at the least, however few pixels there are.
+FEWEST_RAYS = 64
+
 
 class VoxelStage(ScheduledStage):
     """A stage that learns voxel grids.
@@ -68,10 +71,13 @@ class VoxelStage(ScheduledStage):
         """Prepare the loop for batches of ``rays`` that teach these parameters each."""
         self.loop.bind(rays, parameters, self.optimizer, static_shape=self.static_shape)
 
-    def draw_pixels(self, pool: PixelPool) -> Pixels:
-        """A batch of random pixels of a pool."""
+    def draw_pixels(self, pool: PixelPool, most: float | None = None) -> Pixels:
+        """A batch of random pixels of a pool, ``most`` if lists may have any length."""
+        rays = self.loop.rays
+        if most is not None and not self.loop.capacities:
+            rays = min(rays, max(round(most), FEWEST_RAYS))
         with span("batch"):
-            image, flat = pool.draw(self.loop.rays, self.generator)
+            image, flat = pool.draw(rays, self.generator)
             return Pixels(image, flat, self.background(image))
 
     def render_pixels(
