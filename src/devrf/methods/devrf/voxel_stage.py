@@ -72,10 +72,10 @@ class VoxelStage(ScheduledStage):
         self.loop.bind(rays, parameters, self.optimizer, static_shape=self.static_shape)
 
     def draw_pixels(self, pool: PixelPool, most: float | None = None) -> Pixels:
-        """A batch of random pixels of a pool, ``most`` if lists may have any length."""
+        """Random pixels of a pool; ``most``, over all processes, if lists may have any length."""
         rays = self.loop.rays
         if most is not None and not self.loop.capacities:
-            rays = min(rays, max(round(most), FEWEST_RAYS))
+            rays = min(rays, max(round(most / self.loop.processes), FEWEST_RAYS))
         with span("batch"):
             image, flat = pool.draw(rays, self.generator)
             return Pixels(image, flat, self.background(image))

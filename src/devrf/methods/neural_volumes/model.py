@@ -42,7 +42,7 @@ class NeuralVolumes(PlacedModel):
 
     name: ClassVar[str] = "neural_volumes"
     losses: ClassVar[tuple[str, ...]] = ("color", "kl", "opacity_prior", "tv")
-    cost_follows_rays = False  # of a moment's volume, whatever looks at it
+    cost_follows_rays: ClassVar[bool] = False  # of a moment's volume, whatever looks at it
     protocols: ClassVar[tuple[str, ...] | None] = ("joint", "dynamic")
     settings_class = NeuralVolumesSettings
     settings: NeuralVolumesSettings
