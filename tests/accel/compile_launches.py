@@ -11,8 +11,11 @@ cubin by the assembler in Triton's wheel. Fails if a kernel was not compiled.
 from __future__ import annotations
 
 import inspect
+import re
+import subprocess
 import sys
 from importlib import import_module
+from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any
 
@@ -32,7 +35,7 @@ TWO_CASES = [*CASES["warped_depth"], *CASES["compositing"]]
 POINTERS = {
     torch.float32: "*fp32",
     torch.float64: "*fp64",
-    torch.float16: "*fp16",
+    torch.float16: "*bf16",  # the interpreter's half precision is another than a GPU's
     torch.int32: "*i32",
     torch.int64: "*i64",
     torch.uint8: "*u8",
@@ -73,6 +76,17 @@ def kernel_names() -> set[str]:
     return {name for module in modules for name in vars(module) if name.endswith("_kernel")}
 
 
+def registers(ptx: str, capability: int) -> tuple[int, int]:
+    """Registers of a thread, and the bytes that it spills, as the assembler reports them."""
+    assembler = Path(triton.backends.nvidia.__file__).parent / "bin" / "ptxas"
+    command = [assembler, "-v", f"--gpu-name=sm_{capability}", "-", "-o", "/dev/null"]
+    # Some instructions are those of one architecture alone, sm_90a.
+    command[2] += "a" if capability >= 90 else ""
+    done = subprocess.run(command, input=ptx, capture_output=True, text=True, check=True)
+    spilled = sum(map(int, re.findall(r"(\d+) bytes spill", done.stderr)))
+    return int(re.findall(r"Used (\d+) registers", done.stderr)[0]), spilled
+
+
 def main(extent: str, capabilities: list[int]) -> None:
     names = TWO if extent == "two" else kernel_names()
     JITFunction.run = record
@@ -90,6 +104,11 @@ def main(extent: str, capabilities: list[int]) -> None:
         for capability in capabilities:
             asm = triton.compile(source, GPUTarget("cuda", capability, 32), options).asm
             assert f".target sm_{capability}" in asm["ptx"] and asm["cubin"][:4] == b"\x7fELF"
+            used, spilled = registers(asm["ptx"], capability)
+            most = 128 if options.get("num_warps") == 1 else 255
+            told = f"{name} on sm_{capability}: {used} registers, {spilled} bytes spilled"
+            assert used <= most and not spilled, told
+            print(told)
         compiled.add(name)
     assert compiled == names, names - compiled
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-# Samples of a block, and units of the second layer that are computed at a time.
-BLOCK: tl.constexpr = tl.constexpr(64)
+# Samples of a block, of which 64 would spill, and units of the second layer computed at a time.
+BLOCK: tl.constexpr = tl.constexpr(32)
 SHARE: tl.constexpr = tl.constexpr(16)
 # The least side of a matrix that tensor cores multiply.
 LEAST = 16

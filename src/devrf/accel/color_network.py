@@ -82,7 +82,6 @@ class ListedColors(torch.autograd.Function):
             *(points, grid, axes, from_ray, ray, first, *layers, features, colors),
             *(len(points), rays),
             **ctx.sizes,
-            num_warps=8,
         )
         known = points, grid, axes, from_ray, ray, first, *layers
         ctx.save_for_backward(*known, features, colors, encoded, v1)
@@ -112,7 +111,6 @@ class ListedColors(torch.autograd.Function):
             NEEDS_GRID=adds,
             NEEDS_WEIGHTS=learns,
             **ctx.sizes,
-            num_warps=8,
         )
         if of_w1[2]:
             of_w1[0].add_(to_lower.t() @ features.to(to_lower.dtype))
