@@ -13,6 +13,7 @@ import torch
 from launches import Tracing
 from torch.profiler import profile
 
+from devrf.callbacks import Meter
 from devrf.engine.stage import ScheduledStage
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_stage import DeformationStage
@@ -26,7 +27,7 @@ TIMED = {
     "warm-up": (CudaGraphCapture, "warm_up"),
     "capture": (CudaGraphCapture, "capture"),
     "iterations": (ScheduledStage, "training_step"),
-    "logging": (ScheduledStage, "_log"),
+    "logging": (Meter, "on_train_batch_end"),
     "visits, canonical": (CanonicalStage, "enter"),
     "visits, deformation": (DeformationStage, "enter"),
     "packing": (ScheduledStage, "on_train_end"),

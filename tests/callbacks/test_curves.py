@@ -103,7 +103,7 @@ def test_the_curve_of_a_stage_has_every_step(learn, tmp_path, monkeypatch):
 
 def test_a_curve_goes_on_after_a_break_and_a_rollback(learn, tmp_path):
     class Keeping(TrainingCurve):
-        def on_train_end(self, trainer: Trainer, pl_module: Any) -> None: ...
+        def on_fit_end(self, trainer: Trainer, pl_module: Any) -> None: ...
 
     first = Keeping(tmp_path)
     stage = learn(Album(), first)

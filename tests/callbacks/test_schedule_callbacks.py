@@ -84,14 +84,16 @@ def test_progress_and_curves_name_the_frames_of_a_visit(rest, four_frames, train
     caplog.set_level(logging.INFO, logger="devrf")
     schedule = replace(DEFORMATION, coarse_to_fine=False, levels=(Level(6, 5, parallel_frames=2),))
     stage = DeformationStage(rest, schedule, iterations_per_step=100)
-    fitted = trainer(Progress(line_every_seconds=0.0), Meter(), max_epochs=1)
-    fitted.fit(stage, datamodule=four_frames)
+    meter = Meter()
+    trainer(Progress(line_every_seconds=0.0), meter, max_epochs=1).fit(
+        stage, datamodule=four_frames
+    )
     lines = [line for line in caplog.messages if line.startswith("dynamic ")]
     first, last = (line.split("  ") for line in lines)
     assert first[-2] == "frame 2" and re.fullmatch(r"about \d+ (s|min) left", first[-1])
     assert last[-1] == "frames 1, 3"  # nothing is left
     assert " dB" in lines[-1]
-    assert fitted.callback_metrics["dynamic/frame"] == 1
+    assert meter.row["dynamic/frame"] == 1
 
 
 def test_the_time_left_knows_that_finer_levels_take_longer(fit, canonical, caplog, monkeypatch):

@@ -127,7 +127,7 @@ def test_a_second_ctrl_c_ends_a_run_at_once(warm, command, tmp_path):
         "devrf: ended at once; run the same command again to go on"
     )
     left = {path.name for path in (tmp_path / "run" / "checkpoints").iterdir()}
-    assert left == {"canonical-progress-4.ckpt", "canonical-progress-8.ckpt"}
+    assert left == {"canonical-progress-6.ckpt", "canonical-progress-8.ckpt"}
 
 
 def test_a_signal_ends_a_sweep(warm, command, tmp_path):

@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from devrf.apps.records import peak_host_memory
 from devrf.apps.still import preview
 from devrf.apps.trackers import trackers
 from devrf.engine.stage import ScheduledStage
+from devrf.system.device import arriving
 
 log = logging.getLogger(__name__)
 
@@ -36,10 +38,23 @@ def batch_psnr(means: Mapping[str, Tensor]) -> Tensor | None:
 
 
 class Meter(Callback):
-    """Logs the batches' PSNR, learning rates, speed, resolution and memory beside the losses."""
+    """Logs losses, the batches' PSNR, learning rates, speed, resolution and memory.
+
+    A row is written when the next is due, or a progress file: a GPU goes on learning meanwhile.
+
+    Attributes:
+        row: the row that was written last.
+    """
 
     def __init__(self) -> None:
+        self.row: dict[str, float] = {}
         self._last = (0.0, 0)
+        self._write: Callable[[], None] | None = None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing; but a run that is resumed needs the rows before."""
+        self._flush()
+        return {}
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the clock."""
@@ -49,16 +64,16 @@ class Meter(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Log in the steps in which Lightning logs; nothing is read from the device."""
+        """Begin a row every ``log_every_n_steps`` steps; nothing waits for the device."""
         assert isinstance(pl_module, ScheduledStage)
         if not pl_module.logs(batch_idx):
             return
         now, done = time.perf_counter(), pl_module.iteration
         since, before = self._last
         self._last = (now, done)
-        values: dict[str, float | None] = {
+        values = {
             "iterations_per_second": (done - before) / (now - since),
-            "peak_host_gb": peak_host_memory(),
+            "peak_host_gb": peak_host_memory() or math.nan,
         }
         if pl_module.resolution:
             values["voxels"] = math.prod(pl_module.resolution)
@@ -68,12 +83,38 @@ class Meter(Callback):
             values["frame"] = pl_module.phase.frames[0]  # a column has one number
         if pl_module.device.type == "cuda":
             values["peak_gpu_gb"] = torch.cuda.max_memory_allocated(pl_module.device) / 2**30
-        psnr = batch_psnr(pl_module.logged if outputs else {})
-        if psnr is not None:
-            pl_module.log(f"{pl_module.capture}/psnr", psnr)
-        # Tensors on the host: Lightning would copy numbers to the device, and wait.
-        known = {name: torch.tensor(float(v)) for name, v in values.items() if v is not None}
-        pl_module.log_dict({f"{pl_module.capture}/{name}": v for name, v in known.items()})
+        means, psnr = outputs or {}, batch_psnr(outputs or {})
+        read = arriving(means if psnr is None else {**means, "psnr": psnr})
+        self._flush()
+        self._write = partial(self._log, trainer, pl_module.capture, done, values, read)
+
+    def _log(
+        self,
+        trainer: Trainer,
+        capture: str,
+        iteration: int,
+        values: dict[str, float],
+        read: Callable[[], dict[str, float]],
+    ) -> None:
+        known = {name: value for name, value in values.items() if value == value}
+        self.row = {f"{capture}/{name}": value for name, value in {**read(), **known}.items()}
+        for logger in trainer.loggers:
+            logger.log_metrics(self.row, iteration)
+
+    def _flush(self) -> None:
+        if self._write is not None:
+            self._write()
+            self._write = None
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Write the last row."""
+        self._flush()
+
+    def on_exception(
+        self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
+    ) -> None:
+        """Write the row that waits."""
+        self._flush()
 
 
 class Previews(Callback):
@@ -192,8 +233,8 @@ class TrainingCurve(Callback):
             self._points.append((iteration, value))
         self._unread = []
 
-    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Draw the curve."""
+    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Draw the curve; the stage's seconds have been taken."""
         assert isinstance(pl_module, ScheduledStage)
         self._read()
         if not self._points:

@@ -53,7 +53,7 @@ class LiveView(Callback):
         self._last = now
         seconds, done = now - self._began, pl_module.iteration
         pace = pl_module.cost(self._first, done) / seconds
-        line = in_one_line(pl_module.logged, pl_module, (done - self._first) / seconds, pace)
+        line = in_one_line(outputs or {}, pl_module, (done - self._first) / seconds, pace)
         self.session.controls.tell(f"**{pl_module.name}**: {line}")
         if self.seconds > self.share * (now - self._began):
             return

@@ -101,12 +101,8 @@ class PeriodicCheckpoint(Callback):
             stopping, due = self._agreed(trainer.is_global_zero, pl_module.device)
         if pl_module.iteration >= pl_module.total_iterations:
             return  # the stage is done: its checkpoint is next
-        # Lightning writes this step's row of the curves after this hook: a run that was killed in
-        # between and resumed from a file written now would lack the row.
-        every: int = trainer.log_every_n_steps  # type: ignore[attr-defined]
-        row_follows = every > 1 and (batch_idx + 1) % every == 0
         last = trainer.should_stop or 0 < trainer.max_steps <= trainer.global_step
-        if stopping or last or due and not row_follows:
+        if stopping or last or due:
             callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
             for guard in callbacks:
                 if isinstance(guard, DivergenceGuard):

@@ -69,7 +69,6 @@ class ScheduledStage(Learner):
         lr_scale: factor of the scheduled learning rates; below 1 after a rollback.
         abort_reason: why the stage ended before its schedule; None while it has not.
         loop: carries the iterations out.
-        logged: what was last logged by :meth:`training_step`: means () by name, on the host.
     """
 
     def __init__(self, iterations_per_step: int, graphs: Graphs = "auto") -> None:
@@ -89,7 +88,6 @@ class ScheduledStage(Learner):
         self.protocol: str | None = None
         self.lr_scale = 1.0
         self.abort_reason: str | None = None
-        self.logged: dict[str, Tensor] = {}
         # How far the last iteration went, and what it went less than its stride.
         self._advance, self._owed = 1, 0.0
         self._plain_background: Tensor | None = None
@@ -261,9 +259,6 @@ class ScheduledStage(Learner):
         self._reseed()
         if self.iteration >= self.total_iterations:
             self.trainer.should_stop = True
-        # Reading from a GPU waits for it: there only what is written is read.
-        if means and (self.device.type != "cuda" or self.logs(batch_idx)):
-            self._log(means)
         return means
 
     def _iterate(self, views: Any, stop: int) -> None:
@@ -298,16 +293,9 @@ class ScheduledStage(Learner):
         self._owed = min(position - self.iteration, max(self.stride, 1.0))
 
     def logs(self, batch_idx: int) -> bool:
-        """Whether loggers write the values of a step, which its last hook asks as well."""
+        """Whether a step's values are logged."""
         every: int = self.trainer.log_every_n_steps  # type: ignore[attr-defined]
         return self.trainer.should_stop or (every > 0 and (batch_idx + 1) % every == 0)
-
-    def _log(self, means: dict[str, Tensor]) -> None:
-        """Log a step's means, which one copy brings to the host: the only wait for the device."""
-        self.logged = dict(zip(means, torch.stack(list(means.values())).cpu(), strict=True))
-        named = {f"{self.capture}/{k}": value for k, value in self.logged.items()}
-        # A tensor on the host: Lightning would copy a number to the device, and wait.
-        self.log_dict({**named, "step": torch.tensor(float(self.iteration))})
 
     def _reseed(self) -> None:
         """Seed the generator for the next step, differently in each process."""
