@@ -87,6 +87,17 @@ def test_the_first_time_is_rolled_back(fit, canonical, caplog, what):
     assert not torch.equal(first, again)
 
 
+def test_iterations_that_a_budget_left_out_are_not_counted_again(fit, canonical):
+    done = []
+    for spoiled in ((), (14,)):
+        stage = canonical(**SHORT)
+        stage.stride = 2.0  # as under a time budget: half of the iterations are left out
+        fit(stage, Spoil("inf", *spoiled), DivergenceGuard(every_iterations=4))
+        assert stage.num_rollbacks == len(spoiled)
+        done.append(stage.iterations_done)
+    assert done[0] == done[1] > 0
+
+
 def test_the_second_time_ends_the_stage_in_its_last_good_state(fit, canonical, tmp_path):
     saving = PeriodicCheckpoint(tmp_path, every_seconds=0, share=1.0)
     spoil, guard = Spoil("nan", 3, 14, group=1), DivergenceGuard(every_iterations=4)

@@ -46,10 +46,14 @@ def filled(opacity: float, lowest: float, expected: float) -> bool:
 
 
 class Snapshot(NamedTuple):
-    """Copies of the optimiser's parameters, in its order, at an iteration of a phase."""
+    """Copies of the optimiser's parameters, in its order, at an iteration of a phase.
+
+    ``skipped`` iterations had been left out there.
+    """
 
     phase: Phase
     iteration: int
+    skipped: int
     values: tuple[Tensor, ...]
 
 
@@ -147,7 +151,7 @@ class DivergenceGuard(Callback):
         assert stage.phase is not None
         self._good = None  # its memory is free before the next takes as much
         values = tuple(value.detach().clone() for value in _trained(stage))
-        self._good = Snapshot(stage.phase, stage.iteration, values)
+        self._good = Snapshot(stage.phase, stage.iteration, stage.skipped, values)
 
     def _collapsed(
         self, stage: ScheduledStage, steps: Sequence[dict[str, float]], since: int
@@ -177,7 +181,7 @@ class DivergenceGuard(Callback):
         again, scale = stage.num_rollbacks > 0, stage.lr_scale
         for value, stored in zip(_trained(stage), good.values, strict=True):
             value.copy_(stored)
-        stage.rollback(good.iteration, self.rate_factor)
+        stage.rollback(good.iteration, good.skipped, self.rate_factor)
         self._checked = stage.iteration
         if again:
             stage.abort(

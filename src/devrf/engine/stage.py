@@ -154,16 +154,17 @@ class ScheduledStage(Learner):
         self.abort_reason = f"{self.name} stage: {why}"
         self.trainer.should_stop = True
 
-    def rollback(self, iteration: int, lr_scale: float) -> None:
+    def rollback(self, iteration: int, skipped: int, lr_scale: float) -> None:
         """Continue from an earlier iteration of the present phase, whose tensors are back in place.
 
         Adam's state starts afresh, and other pixels are drawn than the first time.
 
         Args:
             iteration: where to continue.
+            skipped: iterations that had been left out there.
             lr_scale: further factor of all learning rates from now on.
         """
-        self.iteration, self._owed = iteration, 0.0
+        self.iteration, self.skipped, self._owed = iteration, skipped, 0.0
         self.num_rollbacks += 1
         self.lr_scale *= lr_scale
         self.optimizer.forget()

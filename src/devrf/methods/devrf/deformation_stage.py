@@ -264,9 +264,9 @@ class DeformationStage(MotionStage):
         gain = self.motion.min_rel_improvement
         return gain is not None and self._convergence.converged(losses, gain)
 
-    def rollback(self, iteration: int, lr_scale: float) -> None:
+    def rollback(self, iteration: int, skipped: int, lr_scale: float) -> None:
         """Go on from an earlier iteration of the present frames, with an occupancy found anew."""
-        super().rollback(iteration, lr_scale)
+        super().rollback(iteration, skipped, lr_scale)
         self._convergence.reset()
         self._update_occupancy()
 
