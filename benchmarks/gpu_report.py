@@ -199,8 +199,11 @@ def frames(into: Path) -> Iterator[Row]:
         yield {"kernels": kind, "half": half, **row, "launches": len(on_device)}
 
 
-# Frames that have settled are left, which is looked at so often.
-SETTLES = "deformation.iterations_per_step=10"
+def as_schedule(name: str) -> list[str]:
+    """Another schedule; every ten iterations it leaves frames that have settled."""
+    return [f"schedule={name}", "deformation.iterations_per_step=10"] if GPU else []
+
+
 TENTH = shortened(0, 2000, 20) if GPU else []
 # Each with the minutes that it may take, in the order in which they tell most.
 STEPS: dict[str, tuple[float, Callable[[Path], Iterator[Row]]]] = {
@@ -223,22 +226,10 @@ STEPS: dict[str, tuple[float, Callable[[Path], Iterator[Row]]]] = {
         }.items()
     },
     "tests": (6, tests),
-    "fast": (
-        15,
-        partial(
-            learned,
-            name="fast",
-            overrides=["schedule=fast", SETTLES] if GPU else [],
-        ),
-    ),
-    "best": (
-        40,
-        partial(
-            learned,
-            name="best",
-            overrides=["schedule=best", SETTLES] if GPU else [],
-        ),
-    ),
+    **{
+        name: (minutes, partial(learned, name=name, overrides=as_schedule(name)))
+        for name, minutes in {"fast": 15.0, "best": 40.0}.items()
+    },
 }
 
 

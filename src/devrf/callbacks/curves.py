@@ -6,7 +6,6 @@ import logging
 import math
 import time
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,8 @@ from devrf.engine.stage import ScheduledStage
 from devrf.system.device import arriving
 
 log = logging.getLogger(__name__)
+
+Numbers = dict[str, float]
 
 # Steps whose values are read from the device at once.
 AT_ONCE = 200
@@ -47,9 +48,10 @@ class Meter(Callback):
     """
 
     def __init__(self) -> None:
-        self.row: dict[str, float] = {}
+        self.row: Numbers = {}
         self._last = (0.0, 0)
-        self._write: Callable[[], None] | None = None
+        # Of the row to come: its trainer, capture, iteration, numbers, and those on their way.
+        self._begun: tuple[Trainer, str, int, Numbers, Callable[[], Numbers]] | None = None
 
     def state_dict(self) -> dict[str, Any]:
         """Nothing; but a run that is resumed needs the rows before."""
@@ -66,15 +68,15 @@ class Meter(Callback):
     ) -> None:
         """Begin a row every ``log_every_n_steps`` steps; nothing waits for the device."""
         assert isinstance(pl_module, ScheduledStage)
-        if not pl_module.logs(batch_idx):
+        every: int = trainer.log_every_n_steps  # type: ignore[attr-defined]
+        if not (trainer.should_stop or (every > 0 and (batch_idx + 1) % every == 0)):
             return
         now, done = time.perf_counter(), pl_module.iteration
         since, before = self._last
         self._last = (now, done)
-        values = {
-            "iterations_per_second": (done - before) / (now - since),
-            "peak_host_gb": peak_host_memory() or math.nan,
-        }
+        values = {"iterations_per_second": (done - before) / (now - since)}
+        if (peak := peak_host_memory()) is not None:
+            values["peak_host_gb"] = peak
         if pl_module.resolution:
             values["voxels"] = math.prod(pl_module.resolution)
         for group in pl_module.optimizer.param_groups:
@@ -86,25 +88,17 @@ class Meter(Callback):
         means, psnr = outputs or {}, batch_psnr(outputs or {})
         read = arriving(means if psnr is None else {**means, "psnr": psnr})
         self._flush()
-        self._write = partial(self._log, trainer, pl_module.capture, done, values, read)
-
-    def _log(
-        self,
-        trainer: Trainer,
-        capture: str,
-        iteration: int,
-        values: dict[str, float],
-        read: Callable[[], dict[str, float]],
-    ) -> None:
-        known = {name: value for name, value in values.items() if value == value}
-        self.row = {f"{capture}/{name}": value for name, value in {**read(), **known}.items()}
-        for logger in trainer.loggers:
-            logger.log_metrics(self.row, iteration)
+        self._begun = trainer, pl_module.capture, done, values, read
 
     def _flush(self) -> None:
-        if self._write is not None:
-            self._write()
-            self._write = None
+        """Write the row that was begun."""
+        if self._begun is None:
+            return
+        trainer, capture, iteration, values, read = self._begun
+        self._begun = None
+        self.row = {f"{capture}/{name}": value for name, value in {**read(), **values}.items()}
+        for logger in trainer.loggers:
+            logger.log_metrics(self.row, iteration)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Write the last row."""

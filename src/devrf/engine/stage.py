@@ -293,11 +293,6 @@ class ScheduledStage(Learner):
         self.skipped += self._advance - 1
         self._owed = min(position - self.iteration, max(self.stride, 1.0))
 
-    def logs(self, batch_idx: int) -> bool:
-        """Whether a step's values are logged."""
-        every: int = self.trainer.log_every_n_steps  # type: ignore[attr-defined]
-        return self.trainer.should_stop or (every > 0 and (batch_idx + 1) % every == 0)
-
     def _reseed(self) -> None:
         """Seed the generator for the next step, differently in each process."""
         mixed = np.random.SeedSequence([self.seed, self.global_rank, self.turn, self.num_rollbacks])
