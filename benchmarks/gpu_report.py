@@ -183,13 +183,11 @@ def frames(into: Path) -> Iterator[Row]:
     """Frames a second at a new time and again at the same, and what a frame launches."""
     run = run_of(into, "paper")
     began, stored = time.perf_counter(), harness.learned_scene(run)
-    loaded = time.perf_counter() - began
-    model = stored.model.to_view(run.device)
-    yield {"seconds to load": loaded, "and to unpack": time.perf_counter() - began - loaded}
+    yield {"seconds to load and unpack": time.perf_counter() - began}
     views, background = run.scene.dynamic.test, background_value(run.scene.background)
     kinds: tuple[Kind, ...] = ("auto", "torch")
     for kind, half in product(kinds, (False, True)):
-        renderer = Renderer(model, half=half)
+        renderer = Renderer(stored.model, half=half)
         with using(kind):
             row = rendering.frames_a_second(renderer, views, min(5, len(views)), background)
             with profile() as profiled:

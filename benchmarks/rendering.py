@@ -28,7 +28,7 @@ def main() -> None:
     given = arguments.parse_args()
     with report_user_errors():
         run = open_run(given.overrides)
-        model = learned_scene(run).model.to_view(run.device)
+        model = learned_scene(run).model
         views, background = run.scene.dynamic.test, background_value(run.scene.background)
         ways = {"float32": Renderer(model)}
         if run.device.type == "cuda":

@@ -149,8 +149,10 @@ def save_checkpoint(trainer: Trainer, path: Path, *, weights_only: bool = True) 
     trainer.save_checkpoint(path, weights_only=weights_only)
 
 
-def load_checkpoint(path: Path, scene: Scene | None = None) -> LoadedCheckpoint:
-    """Read a learned scene, on the host, from a checkpoint of any stage; None takes any scene.
+def load_checkpoint(
+    path: Path, scene: Scene | None = None, device: torch.device | str = "cpu"
+) -> LoadedCheckpoint:
+    """Read a learned scene onto ``device`` from a checkpoint of any stage; None takes any scene.
 
     Raises:
         DevrfError: no such file, a damaged one, not a devrf checkpoint, one of another format, or
@@ -166,9 +168,11 @@ def load_checkpoint(path: Path, scene: Scene | None = None) -> LoadedCheckpoint:
     try:
         state = {k.removeprefix(MODEL): v for k, v in data["state_dict"].items() if MODEL in k}
         own_config = {k: v for k, v in metadata.model.items() if k != "_target_"}
-        model = model_class.from_config(own_config)
+        model = model_class.from_config(own_config).to(device)
         model.load_stored_state(state)
         viewpoints = Viewpoints.stored(data.get("viewpoints", {}))
+    except torch.OutOfMemoryError:
+        raise
     except (RuntimeError, LookupError, ValueError, TypeError, AttributeError):
         raise DevrfError(f"{path}: its fields do not fit its description; train again") from None
     return LoadedCheckpoint(metadata, model, viewpoints)

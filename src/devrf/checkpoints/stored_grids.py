@@ -24,7 +24,7 @@ Packed = dict[str, Any]
 
 
 def pack(grids: Tensor, keep: Tensor, *, smooth: bool) -> Packed:
-    """Store grids in about 2·C bytes a kept voxel.
+    """Store grids in about 2·C bytes a kept voxel; one after another where ``keep`` is.
 
     Args:
         grids: (N, X, Y, Z, C) of finite values.
@@ -33,24 +33,25 @@ def pack(grids: Tensor, keep: Tensor, *, smooth: bool) -> Packed:
             grid point; False, each channel's mean over the voxels that are left out.
 
     Returns:
-        Tensors and numbers by name, for :func:`unpack`.
+        Tensors on the host and numbers, by name, for :func:`unpack`.
 
     Raises:
         ValueError: a value that half precision cannot hold.
     """
-    if float(grids.abs().amax()) > torch.finfo(torch.float16).max:
-        raise ValueError("a value of the grids is too large for half precision")
     thin = _thinned(grids.shape[1:4])
     details, elsewhere = [], []
-    for n, grid in enumerate(grids):
+    for n, stored in enumerate(grids):
+        grid = stored.to(keep.device, torch.float32)
+        if float(grid.abs().amax()) > torch.finfo(torch.float16).max:
+            raise ValueError("a value of the grids is too large for half precision")
         kept_voxels = keep[min(n, len(keep) - 1)]
-        details.append(grid[kept_voxels].half())
+        details.append(grid[kept_voxels].half().cpu())
         if smooth:
-            elsewhere.append(resample(grid, thin).half())
+            elsewhere.append(resample(grid, thin).half().cpu())
         else:
             left_out = grid[~kept_voxels]
             mean = left_out.mean(dim=0) if len(left_out) else grid.new_zeros(grid.shape[-1])
-            elsewhere.append(mean.half())
+            elsewhere.append(mean.half().cpu())
     return {
         "shape": list(grids.shape[1:4]),
         "keep": torch.stack([pack_bits(mask) for mask in keep]),
@@ -59,21 +60,23 @@ def pack(grids: Tensor, keep: Tensor, *, smooth: bool) -> Packed:
     }
 
 
-def unpack(packed: Packed) -> Tensor:
-    """The grids (N, X, Y, Z, C) in single precision that :func:`pack` stored.
+def unpack(
+    packed: Packed, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
+) -> Tensor:
+    """The grids (N, X, Y, Z, C) that :func:`pack` stored, one after another on ``device``.
 
     Raises:
         RuntimeError | ValueError: the parts do not fit together.
     """
     x, y, z = (int(points) for points in packed["shape"])
-    shape, elsewhere = (x, y, z), packed["elsewhere"].float()
-    keep = [unpack_bits(bits, shape) for bits in packed["keep"]]
+    shape, elsewhere = (x, y, z), packed["elsewhere"].to(device, torch.float32)
+    keep = [unpack_bits(bits, shape, device) for bits in packed["keep"]]
     keep = keep * len(elsewhere) if len(keep) == 1 else keep
-    details = packed["kept"].split([int(mask.sum()) for mask in keep])
-    grids: Tensor = elsewhere.new_empty(len(elsewhere), *shape, elsewhere.shape[-1])
+    details = packed["kept"].to(device, dtype).split([int(mask.sum()) for mask in keep])
+    grids: Tensor = elsewhere.new_empty(len(elsewhere), *shape, elsewhere.shape[-1], dtype=dtype)
     for grid, rest, mask, detail in zip(grids, elsewhere, keep, details, strict=True):
         grid.copy_(rest if rest.ndim == 1 else resample(rest, shape))
-        grid[mask] = detail.float()
+        grid[mask] = detail
     return grids
 
 
@@ -83,16 +86,18 @@ def packed(grids: Tensor, keep: Tensor, *, smooth: bool, many: bool = True) -> P
     Unless there are ``many``, what comes back is the one grid (X, Y, Z, C).
     """
     try:
-        return {**pack(grids.cpu(), keep.cpu(), smooth=smooth), "many": many}
+        return {**pack(grids, keep, smooth=smooth), "many": many}
     except ValueError:
         return grids if many else grids[0]
 
 
-def unpacked(value: Any) -> Any:
-    """What :func:`packed` was given; anything else as it is."""
+def unpacked(
+    value: Any, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
+) -> Any:
+    """What :func:`packed` was given, on ``device``; anything else as it is."""
     if not isinstance(value, dict) or "kept" not in value:
         return value
-    grids = unpack(value)
+    grids = unpack(value, device, dtype)
     return grids if value["many"] else grids[0]
 
 

@@ -273,12 +273,12 @@ class RunContext:
         It has to be of the ``scene``; None takes any.
         """
         path = self.checkpoint(name)
-        loaded = load_checkpoint(path, scene)
+        loaded = load_checkpoint(path, scene, self.device)
         if self.config.ckpt is None and loaded.metadata.stage in self.learning_stages:
             below = self.protocol[loaded.metadata.stage].builds_on
             rest = loaded.metadata.training_config.get(OWN_REST)
             base = None if below is None else self.own_checkpoint(below)
             if rest and base is not None and base.is_file() and digest_of(base) != rest:
                 log.info("%s: left out, it belongs to another %s.ckpt than the run's", path, below)
-                return load_checkpoint(base, scene)
+                return load_checkpoint(base, scene, self.device)
         return loaded

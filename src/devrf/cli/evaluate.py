@@ -41,7 +41,7 @@ def evaluate(run: RunContext) -> list[Path]:
     if standing is not None and run.config.ckpt is None:
         raise DevrfError(f"{standing}, stage=evaluate ckpt=FILE scores that file as it stands")
     loaded = run.load(scene=run.scene)
-    model, metadata, scene = loaded.model.to_view(run.device), loaded.metadata, run.scene
+    model, metadata, scene = loaded.model, loaded.metadata, run.scene
     suite = run.evaluation.suite(run.device)
     # The stage that learns the scene at rest.
     rest = next((step.name for step in run.protocol.steps if step.capture == "static"), None)

@@ -106,7 +106,7 @@ def _learned(run: RunContext) -> tuple[Renderable, Viewpoints]:
     if viewpoints is None or any(re.match(r"[+~]*data\W", text) for text in changed):
         check_scene(run.checkpoint(), stored.metadata, run.scene)
         viewpoints = Viewpoints.of(run.scene)
-    return stored.model.to_view(run.device), viewpoints
+    return stored.model, viewpoints
 
 
 def _with_images(run: RunContext, without: str) -> Scene | None:

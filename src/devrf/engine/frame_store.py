@@ -178,6 +178,11 @@ class FrameStore(nn.Module):
             moved = self._empty(frames.shape, torch.float16 if half else torch.float32)
             setattr(self, name, moved.copy_(frames))
 
+    def take(self, to_canonical: Tensor, to_time: Tensor) -> None:
+        """Hold these (T, X, Y, Z, 3) where they are; on the host they stay there."""
+        self.to_canonical, self.to_time = to_canonical, to_time
+        self.on_host = to_time.device != self.here.device
+
     def keep(
         self,
         store: Literal["auto", "device", "host"],

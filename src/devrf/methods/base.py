@@ -11,7 +11,7 @@ from __future__ import annotations
 import fnmatch
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -76,10 +76,6 @@ class Renderable(nn.Module, ABC):
         The identity at time 0. None: the method knows only the way back, from x to q, or none.
         """
         return None
-
-    def to_view(self, device: torch.device) -> Self:
-        """The model on ``device``, to be looked at; what only some times need may come later."""
-        return self.to(device)
 
     @property
     def device(self) -> torch.device:

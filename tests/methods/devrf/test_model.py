@@ -93,15 +93,16 @@ def test_a_model_built_from_its_config_takes_its_state(model, space):
         assert torch.equal(picture(other, rays, time).color, picture(model, rays, time).color)
 
 
-def test_to_be_viewed_frames_stay_where_they_are_until_they_are_looked_at(model):
-    assert model.deformation is not None
-    resting = model.deformation.to_canonical
-    before = model.deformation.warp(torch.full((1, 3), 0.1), 0.75)
-    moved = model.to_view(torch.device("cpu"))
-    moved.to(torch.float64)  # as another device would: everything but the frames follows
-    assert moved.deformation is not None and moved.deformation.to_canonical is resting
-    assert moved.canonical.density.values.dtype == torch.float64
-    assert torch.equal(moved.float().deformation.warp(torch.full((1, 3), 0.1), 0.75), before)
+def test_loaded_displacements_stay_in_half_precision_and_are_read_in_single(model):
+    other = DeVRFModel.from_config(model.config())
+    other.load_stored_state(model.stored_state())
+    for frames in (other.deformation.to_canonical, other.deformation.to_time):
+        assert frames.dtype == torch.float16
+    points = torch.full((1, 3), 0.1)
+    for time in (0.25, 0.6):  # at a frame, and between two
+        assert other.deformation.blended(time).dtype == torch.float32
+        before, after = model.deformation.warp(points, time), other.deformation.warp(points, time)
+        torch.testing.assert_close(after, before, atol=1e-3, rtol=0)
 
 
 def test_a_voxel_has_the_initial_opacity_where_something_may_be(cube):

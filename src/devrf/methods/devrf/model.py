@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import pkgutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from devrf.checkpoints.stored_grids import packed, unpacked
-from devrf.engine.frame_store import FrameField
+from devrf.engine.frame_store import NAMES, FrameField, fits_on_device
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.space import WORLD, Space, space_config, space_from
@@ -146,12 +146,6 @@ class DeVRFModel(Renderable):
             return lambda points: points
         return torch.no_grad()(partial(self.deformation.unwarp, time=time))
 
-    def to_view(self, device: torch.device) -> Self:
-        """The model on ``device``; displacements follow when their frame is looked at."""
-        if self.deformation is not None and not self.deformation.to_canonical.is_cuda:
-            self.deformation.frames.on_host = True
-        return self.to(device)
-
     @property
     def moves(self) -> bool:
         """Whether there is a deformation field."""
@@ -198,10 +192,31 @@ class DeVRFModel(Renderable):
     def load_stored_state(self, state: Mapping[str, Any]) -> None:
         """Take what :meth:`stored_state` gave, or a full state.
 
+        Displacements stay in half precision, on the model's device if they fit there.
+
         Raises:
             RuntimeError | KeyError | ValueError: it does not fit, or a packed grid lacks a part.
         """
-        self.load_state_dict({name: unpacked(value) for name, value in state.items()})
+        full = dict(state)
+        if self.deformation is not None:
+            names = [f"deformation.frames.{name}" for name in NAMES]
+            frames = [full[name] for name in names]
+            place = frames_place(self.device, frames)
+            frames = [unpacked(value, place, torch.float16) for value in frames]
+            self.deformation.frames.take(*frames)
+            full |= zip(names, frames, strict=True)
+        self.load_state_dict({name: unpacked(v, self.device) for name, v in full.items()})
+
+
+def frames_place(device: torch.device, packed_frames: Sequence[Any]) -> torch.device:
+    """Where the frames of both directions are unpacked: on ``device`` or on the host."""
+    backward = packed_frames[0]
+    if device.type != "cuda" or torch.is_tensor(backward):
+        return torch.device("cpu")
+    free, _ = torch.cuda.mem_get_info(device)
+    frames, (x, y, z) = len(backward["elsewhere"]), backward["shape"]
+    fits = fits_on_device(free, frames, (x, y, z), half=True, parallel=0)
+    return device if fits else torch.device("cpu")
 
 
 def _class_at(path: str | None, box: Box, clock: FrameClock) -> ColorField | None:
