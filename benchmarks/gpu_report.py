@@ -67,10 +67,10 @@ def shortened(search: int, fine: int, frame: int) -> list[str]:
     return given if GPU else [*given, *sides, *TINY]
 
 
-def run_of(into: Path, name: str, *overrides: str) -> RunContext:
-    """A run of ``experiment=paper_inward`` on the report's scene, in a folder of its own."""
+def run_of(into: Path, name: str, *overrides: str, experiment: str = "paper_inward") -> RunContext:
+    """A run of an experiment on the report's scene, in a folder of its own."""
     root = (into / "root.txt").read_text() if (into / "root.txt").exists() else into / "scene"
-    common = ["experiment=paper_inward", f"data.root={root}", f"hydra.run.dir={into / name}"]
+    common = [f"experiment={experiment}", f"data.root={root}", f"hydra.run.dir={into / name}"]
     device = ["memory_check=false"] if GPU else ["trainer=cpu", *shortened(0, 40, 2)]
     return harness.open_run([*common, *device, *overrides])
 
@@ -145,10 +145,12 @@ def operations(into: Path, block: int | None = None) -> Iterator[Row]:
         yield from timed_kernels(work, found, DEVICE)
 
 
-def learned(into: Path, name: str, overrides: Sequence[str] = ()) -> Iterator[Row]:
+def learned(
+    into: Path, name: str, overrides: Sequence[str] = (), experiment: str = "paper_inward"
+) -> Iterator[Row]:
     """Learn both stages: seconds, milliseconds by resolution, memory, PSNR on held-out views."""
     for stage in ("canonical", "deformation", "evaluate"):
-        run = run_of(into, name, *overrides, f"stage={stage}")
+        run = run_of(into, name, *overrides, f"stage={stage}", experiment=experiment)
         began = time.perf_counter()
         with Stopwatch(DEVICE) as watch:
             run_stage(run.config, run.folder)
@@ -197,11 +199,6 @@ def frames(into: Path) -> Iterator[Row]:
         yield {"kernels": kind, "half": half, **row, "launches": len(on_device)}
 
 
-def as_schedule(name: str) -> list[str]:
-    """Another schedule; every ten iterations it leaves frames that have settled."""
-    return [f"schedule={name}", "deformation.iterations_per_step=10"] if GPU else []
-
-
 TENTH = shortened(0, 2000, 20) if GPU else []
 # Each with the minutes that it may take, in the order in which they tell most.
 STEPS: dict[str, tuple[float, Callable[[Path], Iterator[Row]]]] = {
@@ -225,7 +222,7 @@ STEPS: dict[str, tuple[float, Callable[[Path], Iterator[Row]]]] = {
     },
     "tests": (6, tests),
     **{
-        name: (minutes, partial(learned, name=name, overrides=as_schedule(name)))
+        name: (minutes, partial(learned, name=name, experiment=f"{name}_inward"))
         for name, minutes in {"fast": 15.0, "best": 40.0}.items()
     },
 }

@@ -69,7 +69,8 @@ class TrainingRecord(Callback):
             "peak_gpu_gb": allocated,
             "peak_reserved_gb": reserved,
             "num_rollbacks": pl_module.num_rollbacks,
-            "kernels": self._kernels,
+            # Without lists of fixed length, as in contracted space, PyTorch runs the hot path.
+            "kernels": self._kernels if pl_module.loop.capacities else "torch",
             "startup_seconds": round(self._startup, 2),
             "graph_captures": pl_module.loop.num_captures,
             "short_lists": pl_module.loop.num_short_lists,
