@@ -25,17 +25,14 @@ from devrf.checkpoints.checkpoint_file import read_checkpoint_file
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.stage import ScheduledStage
 from devrf.errors import DevrfError
-from devrf.geometry.clock import FrameClock
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
-from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.extension import Extension
 from devrf.methods.devrf.extensions.color_residual import ColorResidual
 from devrf.methods.devrf.extensions.priors import Elastic
-from devrf.methods.devrf.extensions.refinement import RefinementSchedule, RefinementStage
 from devrf.methods.devrf.extensions.tracks import StartAlongFlow
 from devrf.methods.devrf.settings import MotionSettings
 
@@ -58,13 +55,13 @@ MOVING = DeformationSchedule(levels=(Level(4, 6), Level(6, 4)), rays=64)
 OFTEN = MotionSettings(2e-3, unit="box", views="all", pixels="occupied", occupancy_every=3)
 # Four frames. Level 0 in 0–15; level 1: frame 2 in 16–21, frames 1 and 3 in 22–27.
 TOGETHER = DeformationSchedule(levels=(Level(4, 4), Level(6, 6, parallel_frames=2)), rays=64)
-# Then once more, backward: frames 1 and 3 in 28–31, frame 2 in 32–35.
-BACKWARD = replace(
+# Then once more: frame 2 in 28–31, frames 1 and 3 in 32–35.
+AGAIN = replace(
     TOGETHER,
     levels=(
         Level(4, 4),
         Level(6, 6, parallel_frames=2),
-        Level(6, 4, parallel_frames=2, order="backward"),
+        Level(6, 4, parallel_frames=2),
     ),
 )
 
@@ -197,23 +194,10 @@ def test_colours_that_change_go_on_exactly(learn, rest, four_frames):
 
 
 def test_a_second_sweep_with_the_elastic_prior_goes_on_exactly(learn, rest, four_frames):
-    build = deformation(rest, BACKWARD, ROUNDED, PRIORS, elastic=Elastic())
+    build = deformation(rest, AGAIN, ROUNDED, PRIORS, elastic=Elastic())
     # At a look at the occupancy, at the end of a level, mid-visit.
     whole = learn(build, data=four_frames)
     assert_same(learn(build, 20, 28, 34, data=four_frames), whole)
-
-
-def test_the_refinement_goes_on_exactly(learn, rest):
-    moving = DeformationField(rest.model.box, FrameClock((0.0, 0.5, 1.0)), voxels=4**3)
-    rest.model.deformation = moving
-
-    def build() -> ScheduledStage:
-        schedule = RefinementSchedule(6, rays=64)
-        return RefinementStage(copy.deepcopy(rest), schedule, iterations_per_step=1)
-
-    whole = learn(build)
-    assert_same(learn(build, 3), whole)
-    assert whole["iteration"] == 6
 
 
 def test_only_what_is_to_be_gone_on_from_holds_the_way_there(

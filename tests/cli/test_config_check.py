@@ -87,8 +87,8 @@ def test_a_part_may_take_anything():
         ({"sizes__inner__size": "big"}, "sizes.inner.size: expected a valid integer, not 'big'"),
         ({"loss__fine__color": "high"}, "loss.fine.color: expected a valid number, not 'high'"),
         (
-            {"schedule": {"deformation": {"_target_": f"{__name__}.Inner", "order": 1}}},
-            "schedule.deformation.order: renamed; write schedule.deformation.levels.N.order=",
+            {"schedule": {"deformation": {"_target_": f"{__name__}.Inner", "sides": 1}}},
+            "schedule.deformation.sides: renamed; write schedule.deformation.levels.N.side=",
         ),
         ({"seed": None}, "seed: expected a valid integer, not None"),
         ({"outer__root": "${nowhere}"}, "nowhere"),

@@ -178,7 +178,6 @@ def test_the_stages_named_are_those_there_are():
         "pipeline",
         "canonical",
         "deformation",
-        "refinement",
         "joint",
         "dynamic",
     } | {*TAKEN}

@@ -25,7 +25,6 @@ QUICK = [f"schedule.deformation.levels.{number}.iterations=1" for number in (1, 
         ("color_residual", ["~schedule.extensions.color_residual"]),
         ("tracks", ["~schedule.extensions.tracks"]),
         ("priors", ["~schedule.extensions.elastic", "~schedule.extensions.bending"]),
-        ("refinement", ["~refinement", "~schedule.refinement", "~loss.refinement"]),
     ],
 )
 def test_without_it_the_motion_is_learned(

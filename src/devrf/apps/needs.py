@@ -157,9 +157,7 @@ def needs_of_devrf(
         f"schedule.deformation.levels.{last_level}.side": frame * (held + LEARNED * active),
         "schedule.deformation.rays": active * moving.rays * COLOURED * ray,
     }
-    refined = {**in_motion, grid: LEARNED * values}
     return {
         "canonical": StageNeeds(at_rest, values),
         "deformation": StageNeeds(in_motion, values + frames * frame),
-        "refinement": StageNeeds(refined, values + frames * frame),
     }

@@ -65,26 +65,19 @@ def scores_by_section(
 
     ``static`` and ``dynamic``, as ``frames`` has, stand under the names of their stages, too.
     ``rest`` is the stage that learned the scene at rest. If one stage learned all (None), its
-    training stands in the dynamic section, where there is one. Seconds and iterations of that
-    section are of all stages but ``rest``: of the refinement, too.
+    training stands in the dynamic section, where there is one.
     """
 
-    def training(*stages: str) -> dict[str, Any]:
-        records: list[dict[str, Any]] = [{**metadata.records.get(stage, {})} for stage in stages]
-        figures: dict[str, Any] = {name: records[-1].get(name) for name in TRAINING}
-        if len(records) > 1 and all(record.get("seconds") for record in records):
-            seconds, done = (sum(r[name] for r in records) for name in ("seconds", "iterations"))
-            figures |= {"seconds": round(seconds, 2), "iterations": done}
-            figures["iterations_per_second"] = round(done / seconds, 2)
-        return figures
+    def training(stage: str) -> dict[str, Any]:
+        record = metadata.records.get(stage, {})
+        return {name: record.get(name) for name in TRAINING}
 
     static: dict[str, Any] = mean_scores(frames["static"])
     sections, last = {"static": static}, metadata.stage
     if rest is not None or "dynamic" not in frames:
         sections["static"] = sections[rest or last] = static | training(rest or last)
     if "dynamic" in frames:
-        learned = [name for name in metadata.records if name != rest] or [last]
-        sections["dynamic"] = dynamic_scores(frames["dynamic"], clock) | training(*learned)
+        sections["dynamic"] = dynamic_scores(frames["dynamic"], clock) | training(last)
         if rest is not None:
             sections[last] = sections["dynamic"]
     sections["dynamic" if "dynamic" in frames else "static"]["checkpoint_mb"] = checkpoint_mb

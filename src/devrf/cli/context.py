@@ -98,13 +98,8 @@ class RunContext:
 
     @property
     def learning_stages(self) -> tuple[str, ...]:
-        """Names of the protocol's stages, in their order; of optional ones, if they iterate."""
-        return tuple(
-            step.name
-            for step in self.protocol.steps
-            if not step.optional
-            or OmegaConf.select(self.config, f"{step.name}.schedule.iterations")
-        )
+        """Names of the protocol's stages, in their order."""
+        return tuple(step.name for step in self.protocol.steps)
 
     @property
     def stages_with_images(self) -> tuple[str, ...]:

@@ -22,7 +22,6 @@ class ProtocolStage:
         frozen: parts of the method that stay as they are; ``canonical*`` is every part whose name
             begins so.
         builds_on: the stage whose result is taken up; None begins afresh.
-        optional: whether only methods learn by it that have a stage of its name, with iterations.
     """
 
     name: str
@@ -30,7 +29,6 @@ class ProtocolStage:
     iterations: float = 1.0
     frozen: Sequence[str] = ()
     builds_on: str | None = None
-    optional: bool = False
 
     def __post_init__(self) -> None:
         key, captures = f"protocol.stages.{self.name}", get_args(CaptureChoice)

@@ -103,37 +103,29 @@ def test_total_variation_alone_smooths_both_directions(rest, datamodule, trainer
     torch.testing.assert_close(mean[0], expected)
 
 
-def test_each_level_has_its_weights_and_rates(rest, datamodule, trainer):
-    second = Level(
-        6, 2, lr_factor=0.5, lr_final_factor=0.01, weight_factors={"elastic": 3, "tv": 0}
-    )
-    schedule = DeformationSchedule((Level(4, 2, weight_factors={"elastic": 0}), second), rays=16)
-    loss = {"render": 1, "elastic": 0.2, "tv": 1}
+def test_each_level_has_its_rates_and_its_factor_of_all_terms_but_render(rest, datamodule, trainer):
+    second = Level(6, 2, lr_factor=0.5, lr_final_factor=0.01, other_terms=0.25)
+    schedule = DeformationSchedule((Level(4, 2, other_terms=0), second), rays=16)
+    loss = {"render": 1, "elastic": 0.2, "tv": 128 * 16}
     motion = MotionSettings(learning_rate=0.01)
     stage = DeformationStage(
         rest, schedule, motion, loss, extensions={"e": Elastic()}, iterations_per_step=1
     )
-    elastic, smoothing, rates = {}, {}, {0: [], 1: []}
+    weights, smoothing, rates = {}, {}, {0: [], 1: []}
 
     def note(trainer: Trainer, stage: DeformationStage, *_: Any) -> None:
         level, group = stage.phase.level, stage.optimizer.param_groups[0]
-        elastic[level], smoothing[level] = stage.weights.get("elastic", 0.0), group["smoothing"]
+        weights[level], smoothing[level] = stage.weights, group["smoothing"]
         rates[level].append(group["lr"])
 
     watch = LambdaCallback(on_train_batch_end=note)
     trainer(watch, max_epochs=1).fit(stage, datamodule=datamodule)
-    assert elastic == {0: 0.0, 1: pytest.approx(0.6)}
-    assert smoothing[0] > 0 and smoothing[1] == 0
+    assert weights == {0: {"render": 1}, 1: {"render": 1, "elastic": pytest.approx(0.05)}}
+    assert smoothing == {0: 0, 1: pytest.approx(max(stage.field.shape) / 6 / 4)}
     assert set(rates[0]) == {0.01}
     # Frame 1 has four iterations, frame 2 two; within each the rate falls towards a hundredth.
     falls = [0.005 * 0.01**share for share in (0, 1 / 4, 1 / 2, 3 / 4, 0, 1 / 2)]
     assert rates[1] == pytest.approx(falls)
-
-
-def test_factors_are_those_of_terms(rest):
-    schedule = DeformationSchedule((Level(4, 2, weight_factors={"elastik": 1}),))
-    with pytest.raises(DevrfError, match="1.weight_factors: elastik"):
-        DeformationStage(rest, schedule)
 
 
 def test_the_flow_of_a_moving_camera_neither_starts_nor_teaches_a_frame(

@@ -125,31 +125,6 @@ def test_frames_of_two_stretches_are_visited_together():
     assert (schedule.max_parallel_frames(0, 14), schedule.max_parallel_frames(1, 14)) == (1, 2)
 
 
-def test_a_further_level_goes_backward_through_the_frames():
-    schedule = DeformationSchedule(
-        (
-            Level(4, 6),
-            Level(6, 4, order="backward"),
-            Level(6, 2, order="backward", parallel_frames=2),
-        )
-    )
-    assert course(schedule, 5) == [
-        (0, (1,), 0, 12),
-        *((0, (k,), 6 * k, 6 * k + 6) for k in (2, 3, 4)),
-        # Frame 0's share goes to the frame that is visited first.
-        (1, (4,), 30, 38),
-        (1, (3,), 38, 42),
-        (1, (2,), 42, 46),
-        (1, (1,), 46, 50),
-        # Frames 0 to 2 and 3 to 4.
-        (2, (2,), 50, 52),
-        (2, (1, 4), 52, 54),
-        (2, (3,), 54, 56),
-    ]
-    phases = deformation_phases(schedule, 5)
-    assert not any(p.has_previous for p in phases[4:])
-
-
 @given(
     st.lists(
         st.tuples(st.integers(2, 99), st.integers(1, 9), st.integers(1, 15)), min_size=1, max_size=5
@@ -190,11 +165,8 @@ def test_deformation_phases_tile_every_schedule(levels, frames, coarse_to_fine, 
         (lambda: CanonicalSchedule(rays=0), "canonical.rays"),
         (lambda: DeformationSchedule(levels=()), "deformation.levels: expected at least one"),
         (lambda: DeformationSchedule(with_level(5, iterations=0)), "levels.5.iterations"),
+        (lambda: DeformationSchedule(with_level(2, other_terms=-1)), "levels.2.other_terms"),
         (lambda: DeformationSchedule(with_level(1, parallel_frames=2)), "levels.1.parallel_frames"),
-        (
-            lambda: DeformationSchedule(with_level(2, weight_factors={"tv": -1})),
-            "weight_factors.tv",
-        ),
     ],
 )
 def test_a_wrong_schedule_is_an_error(build, key):
@@ -204,12 +176,12 @@ def test_a_wrong_schedule_is_an_error(build, key):
 
 def test_rows_of_a_config_are_levels_in_the_order_of_their_numbers():
     rows: dict[str, Any] = {
-        "2": {"side": 6, "iterations": 4, "order": "backward"},
+        "2": {"side": 6, "iterations": 4, "parallel_frames": 2},
         "1": {"side": 4, "iterations": 6},
         "3": None,
     }
     schedule = DeformationSchedule.from_rows(rows, rays=64)
-    assert schedule == DeformationSchedule([Level(4, 6), Level(6, 4, order="backward")], rays=64)
+    assert schedule == DeformationSchedule([Level(4, 6), Level(6, 4, parallel_frames=2)], rays=64)
     for wrong in ({"1": None}, {"2": {"side": 6}}):
         with pytest.raises(DevrfError, match="expected rows 1 to"):
             DeformationSchedule.from_rows({**rows, **wrong})

@@ -23,23 +23,19 @@ METHODS = {
     "nsff": "NSFF",
     "neural_volumes": "Neural Volumes",
 }
-# As the paper's tables call them, in their order; then what experiment=quality_table adds up.
+# As the paper's tables call them, in their order; then the rows of experiment=quality_table.
 ABLATIONS = {
+    "cpu_small": "Ours, small",
     "base": "Ours (base)",
     "c2f": "Ours w/ c2f",
     "c2f_tv": "Ours w/ c2f, tv",
     "c2f_tv_cycle": "Ours w/ c2f, tv, cycle",
     "full": "Ours w/ c2f, tv, cycle, flow",
-    "paper_terms": "Ours, the paper's terms",
-    "along_flow": "+ start along flow",
-    "changing_colors": "+ changing colours",
-    "elastic": "+ elastic motion",
-    "more_sweeps": "+ two more sweeps",
-    "finishing": "+ a finishing level",
-    "refinement": "+ refinement",
-    "shading": "+ shading",
-    "tracks": "+ start along tracks",
-    "best": "+ finer field at rest",
+    "without_elastic": "Ours w/o elastic prior",
+    "without_bending": "Ours w/o bending prior",
+    "without_masks": "Ours w/o masks' loss",
+    "without_shading": "Ours w/o shading",
+    "without_finishing": "Ours w/o finishing level",
 }
 CHOICES, SETTINGS = "run.choices.", "run.settings."
 IGNORED = {"objective", "seed", "stage", "method"}

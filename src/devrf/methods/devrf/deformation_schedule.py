@@ -5,18 +5,16 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import accumulate, pairwise
-from typing import Any, Literal, get_args
+from typing import Any
 
 from devrf.engine.learner import Phase
 from devrf.errors import DevrfError, expect
 
 # Motion grids of this side take Adam about as long as a batch of rays takes; estimated.
 FINE_SIDE = 160
-# In time, from a visit of a level to the next.
-Order = Literal["forward", "backward"]
 
 
 @dataclass(frozen=True)
@@ -29,19 +27,17 @@ class Level:
         lr_factor: of the learning rate; None: the schedule's ``decay`` to the power of how often
             the side has changed.
         lr_final_factor: what the learning rate falls to in a visit, exponentially.
-        order: of the frames, in time; ``forward`` at the coarsest level.
+        other_terms: factor of the weights of all terms of ``loss.deformation`` but ``render``.
         parallel_frames: K, how many frames may be learned in parallel; 1 at the coarsest level,
             where a frame starts from the one before it.
-        weight_factors: of the weights of ``loss.deformation``, by the term's name; else 1.
     """
 
     side: int
     iterations: int
     lr_factor: float | None = None
     lr_final_factor: float = 1.0
-    order: Order = "forward"
+    other_terms: float = 1.0
     parallel_frames: int = 1
-    weight_factors: Mapping[str, float] = field(default_factory=dict)
 
 
 PAPER_LEVELS = (Level(10, 200), Level(20, 100), Level(40, 100), Level(80, 50), Level(160, 50))
@@ -59,7 +55,6 @@ class DeformationPhase(Phase):
         init_from_previous: whether the frame starts from the result of the frame before it.
         has_previous: whether the frames before these have been learned at this level, or are at
             rest.
-        backward: whether the frames after these are visited before them.
     """
 
     level: int
@@ -68,7 +63,6 @@ class DeformationPhase(Phase):
     lr_final_factor: float
     init_from_previous: bool
     has_previous: bool
-    backward: bool
 
     @property
     def cost(self) -> float:
@@ -92,7 +86,6 @@ class DeformationSchedule:
     L = max(2, ⌈T / K⌉) frames, so that neighbours are never learned together. Visit j, 0 ≤ j < L,
     is to the j-th frame of every stretch: j, j + L, j + 2L, … without frame 0. An iteration is one
     optimiser step on all of them, each with a batch of its own: a level takes share · L of them.
-    A level whose order is ``backward`` makes the same visits from the last to the first.
 
     Attributes:
         levels: coarse to fine.
@@ -142,13 +135,12 @@ class DeformationSchedule:
             _check_level(f"{key}.levels.{number}", level)
         first, last = self.levels[0], self.levels[-1]
         together = first.parallel_frames if self.coarse_to_fine else 1
-        why = "at the first level, where a frame starts from the one before it"
-        expect(together == 1, f"{key}.levels.1.parallel_frames", f"1 {why}", together)
-        expect(first.order == "forward", f"{key}.levels.1.order", f"forward {why}", first.order)
+        expected = "1 at the first level, where a frame starts from the one before it"
+        expect(together == 1, f"{key}.levels.1.parallel_frames", expected, together)
         if not self.coarse_to_fine:
             iterations = sum(level.iterations for level in self.levels)
-            finest = replace(last, order=first.order, parallel_frames=first.parallel_frames)
-            finest = replace(finest, iterations=iterations, lr_factor=None)
+            finest = replace(last, iterations=iterations, parallel_frames=first.parallel_frames)
+            finest = replace(finest, lr_factor=None)
             object.__setattr__(self, "levels", (finest,))
 
     def grid(self, level: int) -> tuple[int, int | None]:
@@ -189,10 +181,10 @@ class DeformationSchedule:
         begins = [0, *self.growths(frames)]
         level = bisect_right(begins, iteration) - 1
         begin, row, stretch = begins[level], self.levels[level], self._stretch(level, frames)
-        visits, backward = _visits(frames, stretch), row.order == "backward"
+        visits = _visits(frames, stretch)
         unvisited = stretch - len(visits)  # the first visit takes the share of frame 0 alone, too
         visit = min(max((iteration - begin) // row.iterations - unvisited, 0), len(visits) - 1)
-        visited = tuple(visits[-1 - visit if backward else visit])
+        visited = tuple(visits[visit])
         return DeformationPhase(
             kind=f"level {level + 1}",
             start=begin + (unvisited + visit if visit else 0) * row.iterations,
@@ -203,8 +195,7 @@ class DeformationSchedule:
             learning_rate_factor=self.learning_rate_factor(level),
             lr_final_factor=row.lr_final_factor,
             init_from_previous=level == 0 and visit > 0,
-            has_previous=not backward and (visit > 0 or visited == (1,)),
-            backward=backward,
+            has_previous=visit > 0 or visited == (1,),
         )
 
 
@@ -221,10 +212,7 @@ def _check_level(key: str, level: Level) -> None:
     for name, least in (("side", 2), ("iterations", 1), ("parallel_frames", 1)):
         value = getattr(level, name)
         expect(value >= least, f"{key}.{name}", f"at least {least}", value)
+    expect(level.other_terms >= 0, f"{key}.other_terms", "at least 0", level.other_terms)
     for name in ("lr_factor", "lr_final_factor"):
         factor = getattr(level, name)
         expect(factor is None or factor > 0, f"{key}.{name}", "more than 0", factor)
-    known = level.order in get_args(Order)
-    expect(known, f"{key}.order", "forward or backward", level.order)
-    for term, weight in level.weight_factors.items():
-        expect(weight >= 0, f"{key}.weight_factors.{term}", "at least 0", weight)

@@ -117,10 +117,10 @@ class MotionLoss:
         Args:
             loss: weights by the terms' names; ``tv`` is the total variation of both fields.
             extensions: add terms, weights and factors.
-            schedule: has the levels' factors.
+            schedule: has a factor for each level, of all terms in ``loss`` but ``render``.
 
         Raises:
-            DevrfError: a weight, or a factor of the schedule or an extension, is of no term.
+            DevrfError: a weight, or a factor of an extension, is of no term.
         """
         self.terms: dict[str, MotionTerm] = dict(MOTION_TERMS)
         weights = {name: weight for name, weight in loss.items() if name != "tv"}
@@ -129,19 +129,16 @@ class MotionLoss:
             weights |= extension.weights
         self._tv = loss.get("tv", 0.0)
         self._extensions, self._schedule = extensions, schedule
+        self._others = loss.keys() - {"render"}
         self._check_factors()
         self._whole = counted_weights(weights, self.terms, "loss.deformation")
 
     def _check_factors(self) -> None:
-        factors = [("schedule.extensions", each.scaled_terms) for each in self._extensions]
-        for number, level in enumerate(self._schedule.levels, 1):
-            key = f"schedule.deformation.levels.{number}.weight_factors"
-            factors.append((key, level.weight_factors.keys() - {"tv"}))
         terms = ", ".join(sorted(self.terms))
-        for key, names in factors:
-            for name in sorted(set(names) - self.terms.keys()):
+        for extension in self._extensions:
+            for name in sorted(set(extension.scaled_terms) - self.terms.keys()):
                 problem = f"{name} is no term of loss.deformation; the terms are {terms}"
-                raise DevrfError(f"{key}: {problem}")
+                raise DevrfError(f"schedule.extensions: {problem}")
 
     def leave_out(self, term: str) -> bool:
         """Let a term count no more; whether it did."""
@@ -154,10 +151,10 @@ class MotionLoss:
 
     def _factor(self, term: str, level: int) -> float:
         factors = (extension.weight_factor(term, level) for extension in self._extensions)
-        of_level = self._schedule.levels[level].weight_factors
-        return math.prod(factors, start=of_level.get(term, 1.0))
+        of_level = self._schedule.levels[level].other_terms if term in self._others else 1.0
+        return math.prod(factors, start=of_level)
 
     def smoothing(self, level: int, shape: tuple[int, int, int]) -> float:
         """The optimiser's weight of the total variation of grids of ``shape`` at ``level``."""
-        weight = self._tv * self._schedule.levels[level].weight_factors.get("tv", 1.0)
+        weight = self._tv * self._schedule.levels[level].other_terms
         return total_variation_weight(weight, max(shape), self._schedule.rays)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from functools import partial
 from typing import Literal
 
@@ -62,12 +62,9 @@ class ResidualField(ColorField, StoredShape):
         return partial(look_up, grid, box=self.box)
 
     @torch.no_grad()
-    def copy_neighbours(self, frames: Sequence[int], *, after: bool = False) -> None:
-        """Initialise ``frames``, from 1 on, from the frames before them, or ``after`` them."""
-        for frame in frames:
-            neighbour = frame + (1 if after else -1)
-            if neighbour < len(self.values):
-                self.values[frame] = self.values[neighbour]
+    def copy_previous(self, frame: int) -> None:
+        """Initialise ``frame``, from 1 on, from the frame before it."""
+        self.values[frame] = self.values[frame - 1]
 
 
 class ColorResidual(Extension):
@@ -184,7 +181,7 @@ class ColorResidual(Extension):
         """At the first level that learns it, start a frame from the one visited before it."""
         field = stage.scene_model.color_residual
         if isinstance(field, ResidualField) and phase.level == self._first:
-            field.copy_neighbours([frame], after=phase.backward)
+            field.copy_previous(frame)
 
     def color_change(self, frame: ActiveFrame) -> ColorChange | None:
         """q → A_t(q), as learned so far."""
