@@ -144,6 +144,24 @@ def test_a_finished_checkpoint_is_small_and_shows_the_same(model):
     )
 
 
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_grids_are_packed_and_unpacked_alike_on_a_gpu(model):
+    stored, device = model.stored_state(), torch.device("cuda", 0)
+    there = DeVRFModel.from_config(model.config()).to(device)
+    there.load_stored_state(stored)
+    again, here = there.stored_state(), DeVRFModel.from_config(model.config())
+    here.load_stored_state(stored)
+    for name, value in here.state_dict().items():
+        if torch.is_tensor(value):
+            found = there.state_dict()[name]
+            assert found.is_cuda and found.dtype == value.dtype
+            torch.testing.assert_close(found.cpu(), value, atol=1e-3, rtol=1e-3)
+    for name, value in stored.items():
+        if isinstance(value, dict) and "kept" in value:
+            assert torch.equal(again[name]["keep"], value["keep"])
+
+
 def test_what_half_precision_cannot_hold_stays_as_it_is(model):
     with torch.no_grad():
         model.canonical.density.values[5, 5, 5] = 1e5
