@@ -139,8 +139,8 @@ class DeformationSchedule:
         expect(together == 1, f"{key}.levels.1.parallel_frames", expected, together)
         if not self.coarse_to_fine:
             iterations = sum(level.iterations for level in self.levels)
-            finest = replace(last, iterations=iterations, parallel_frames=first.parallel_frames)
-            finest = replace(finest, lr_factor=None)
+            parallel = first.parallel_frames
+            finest = replace(last, iterations=iterations, parallel_frames=parallel, lr_factor=None)
             object.__setattr__(self, "levels", (finest,))
 
     def grid(self, level: int) -> tuple[int, int | None]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pkgutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import partial
 from typing import Any, ClassVar
@@ -192,7 +192,8 @@ class DeVRFModel(Renderable):
     def load_stored_state(self, state: Mapping[str, Any]) -> None:
         """Take what :meth:`stored_state` gave, or a full state.
 
-        Displacements stay in half precision, on the model's device if they fit there.
+        Packed displacements stay in half precision, on the model's device if they fit there. Those
+        that are not packed are held as they are, without a copy.
 
         Raises:
             RuntimeError | KeyError | ValueError: it does not fit, or a packed grid lacks a part.
@@ -201,16 +202,15 @@ class DeVRFModel(Renderable):
         if self.deformation is not None:
             names = [f"deformation.frames.{name}" for name in NAMES]
             frames = [full[name] for name in names]
-            place = frames_place(self.device, frames)
+            place = _place_of_frames(frames[0], self.device)
             frames = [unpacked(value, place, torch.float16) for value in frames]
             self.deformation.frames.take(*frames)
             full |= zip(names, frames, strict=True)
         self.load_state_dict({name: unpacked(v, self.device) for name, v in full.items()})
 
 
-def frames_place(device: torch.device, packed_frames: Sequence[Any]) -> torch.device:
-    """Where the frames of both directions are unpacked: on ``device`` or on the host."""
-    backward = packed_frames[0]
+def _place_of_frames(backward: Any, device: torch.device) -> torch.device:
+    """Where both directions are unpacked, one of them given: on ``device`` or on the host."""
     if device.type != "cuda" or torch.is_tensor(backward):
         return torch.device("cpu")
     free, _ = torch.cuda.mem_get_info(device)

@@ -107,7 +107,7 @@ def test_auto_learns_colours_that_drift_early_and_others_late(
     rest, datamodule, trainer, monkeypatch, drift, if_static, first
 ):
     monkeypatch.setattr(f"{ColorResidual.__module__}.color_drift", lambda views: drift)
-    schedule = replace(TINY, levels=(Level(4, 1), Level(6, 1)))
+    schedule = replace(TINY, levels=(Level(4, 1), Level(6, 1, other_terms=2.0)))
     scale = {"cycle": 0.25}
     given = {"start_level_static_color": if_static, "loss_scale_if_color_drift": scale}
     stage = stage_with(rest, schedule, {"render": 1.0, "cycle": 1.0}, learn="auto", **given)
@@ -119,8 +119,8 @@ def test_auto_learns_colours_that_drift_early_and_others_late(
     learned = [NAME in extension.frame_fields(stage, level) for level in (0, 1)]
     assert learned == [first is not None and level >= first for level in (0, 1)]
     # Where colours drift, terms count less from the level on that learns them.
-    factor = 0.25 if first == 0 else 1.0
-    assert [stage.motion_loss.weights_at(level)["cycle"] for level in (0, 1)] == [factor] * 2
+    factors = [0.25, 0.5] if first == 0 else [1.0, 2.0]
+    assert [stage.motion_loss.weights_at(level)["cycle"] for level in (0, 1)] == factors
 
 
 def test_its_rate_is_its_own_at_every_level(rest, datamodule, trainer):
