@@ -1,12 +1,13 @@
-"""Kernel launches of an iteration of each stage, and the bytes that they move, without a GPU.
+"""Kernel launches of an iteration of each stage and of a picture, and the bytes that they move.
 
-Traces a steady iteration of DeVRF at the paper's sizes, as a GPU would carry it out without CUDA
-graphs, on tensors that have shapes and no memory: Triton's kernels and static shapes, the colour
-network in bfloat16. An operation of PyTorch counts as one launch unless it only makes a view or
-takes memory; libraries may launch more. Each tensor that a launch reads or writes counts as moved
-once, of a table that is looked up in the rows that are fetched. Held are images, fields, moments
-and, in the deformation stage, all frames at rest in half precision; taken is what an iteration
-needs at once beside that.
+Traces, without a GPU, a steady iteration of DeVRF at the paper's sizes, and a film's picture at a
+time that is known and at a new one, as a GPU would carry them out without CUDA graphs: on tensors
+that have shapes and no memory, with Triton's kernels and static shapes, the colour network in
+reduced precision. An operation of PyTorch counts as one launch unless it only makes a view or takes
+memory; libraries may launch more. Each tensor that a launch reads or writes counts as moved once,
+of a table that is looked up in the rows that are fetched. Held are images, fields, moments and, of
+what moves, all frames at rest in half precision; taken is what an iteration needs at once beside
+that.
 """
 
 from __future__ import annotations
@@ -47,6 +48,7 @@ from devrf.methods.devrf.model import DeVRFModel
 from devrf.ops.adam import GridAdam
 from devrf.ops.dispatch import using
 from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.renderer import Renderer
 from devrf.rendering.sampling import RenderSettings
 from devrf.scenes.scene import OpticalFlow, Views
 
@@ -67,6 +69,8 @@ SILENT = {
     "aten::set_",
     "aten::resize_",
 }
+# What reads a number back; and what is read: a picture's samples, some ten of each pixel.
+WAITED_FOR, LISTED = "aten::_local_scalar_dense", 10 * PIXELS**2
 # What reads the rows of a table that an index names, and what adds to them.
 LOOKED_UP = {"aten::index", "aten::index_select", "aten::gather", "aten::embedding"}
 ADDED_TO = {"aten::index_add_", "aten::index_put_", "aten::scatter_", "aten::scatter_add_"}
@@ -82,6 +86,7 @@ class Count:
         torch: launches of PyTorch's operations, by name.
         triton: launches of Triton's kernels, by name.
         moved: bytes that they read and write.
+        waits: how often the host waits for a number.
         held: bytes of tensors before the iteration.
         taken: the most bytes that it takes at once on top of them.
     """
@@ -89,6 +94,7 @@ class Count:
     torch: Counter[str] = field(default_factory=Counter)
     triton: Counter[str] = field(default_factory=Counter)
     moved: int = 0
+    waits: int = 0
     held: int = 0
     taken: int = 0
 
@@ -108,8 +114,11 @@ class Tracing(TorchDispatchMode):  # type: ignore[no-untyped-call]
         self._living: dict[int, int] = {}
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        result = func(*args, **(kwargs or {}))
         name = func.name().split(".")[0]
+        if name == WAITED_FOR:
+            self.count.waits += 1
+            return LISTED
+        result = func(*args, **(kwargs or {}))
         for tensor in _tensors(result):
             self._note(tensor.untyped_storage())
         if not (func.is_view or name in SILENT or name.startswith("profiler::")):
@@ -284,12 +293,29 @@ STAGES: dict[str, Callable[[], ScheduledStage]] = {
     "canonical": canonical,
     "deformation": deformation,
 }
+PICTURES = {"picture, known time": 0.5, "picture, new time": 0.3}
+
+
+def picture(time: float) -> Count:
+    """The launches of a film's picture at ``time``, one at 0.5 having been rendered."""
+    scene, clock = model(), FrameClock(tuple(k / FRAMES for k in range(FRAMES)))
+    with META:
+        voxels = scene.canonical.voxels
+        scene.deformation = DeformationField(scene.box, clock, voxels=voxels)
+        scene.deformation.frames.offload(on_host=False, half=True)
+    cameras, renderer = views(1, 1, flow=False).cameras, Renderer(scene, half=True)
+    for shown in (0.5, time):
+        with tracing() as trace:
+            renderer.view(cameras, 0, shown, 1.0)
+    return trace.count
 
 
 def traced(name: str) -> Count:
-    """The launches of a steady iteration of a stage."""
+    """The launches of a steady iteration of a stage, or of a picture."""
     os.environ["TRITON_INTERPRET"] = "1"  # lets kernels be chosen for tensors of no GPU
     with using("triton"):
+        if name in PICTURES:
+            return picture(PICTURES[name])
         stage = STAGES[name]()
         optimizer = cast(LightningOptimizer, stage.optimizer)
         images = stage.trainer.datamodule.training_views(stage.capture, META)  # type: ignore[attr-defined]
@@ -300,19 +326,20 @@ def traced(name: str) -> Count:
 
 
 def main() -> None:
-    """Print the counts of both stages."""
+    """Print the counts."""
     arguments = parser(__doc__, overrides=False)
     arguments.add_argument("--names", action="store_true", help="print the launches by name")
     given = arguments.parse_args()
     rows = []
-    for name in STAGES:
+    for name in (*STAGES, *PICTURES):
         count = traced(name)
         rows.append(
             {
-                "stage": name,
+                "of": name,
                 "launches": count.launches,
                 "of PyTorch": count.torch.total(),
                 "of Triton": count.triton.total(),
+                "waits": count.waits,
                 "MB moved": count.moved / 1e6,
                 "GB held": count.held / 1e9,
                 "GB taken": count.taken / 1e9,

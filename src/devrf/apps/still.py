@@ -50,7 +50,7 @@ class StillSettings:
     view: Literal["held_out"] | int = "held_out"
     time: float = 0.5
     height: int | None = None
-    half: bool = False
+    half: bool = True
 
     def __post_init__(self) -> None:
         expect(0 <= self.time <= 1, "still.time", "0 to 1", self.time)

@@ -35,7 +35,7 @@ class VideoSettings:
     orbit_elevation: float | None = None
     height: int | None = None
     max_seconds: float | None = None
-    half: bool = False
+    half: bool = True
     path: str | None = None
     time: float = 0.5
 

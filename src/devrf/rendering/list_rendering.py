@@ -98,7 +98,7 @@ def render_static(
     density = field.raw_density
     with span("sampling"):
         scene = rays, field, occupancy, settings, slices, slice_weight
-        packed = search(*scene, capacity=capacity.visible, wait=False)
+        packed = search(*scene, capacity=capacity.visible)
     with span("density"):
         canonical, tau = warped_depth(
             packed.points,
@@ -182,7 +182,7 @@ class ListRenderer:
         weight, left = composite_segments(tau, packed.first)
         chosen = select_listed(packed, canonical, weight, len(packed.ray))
         used = int(chosen.total)
-        precision = torch.float16 if self.half and tau.is_cuda else torch.float32
+        precision = torch.float16 if self.half and tau.device.type != "cpu" else torch.float32
         points, ray = chosen.canonical[:used], chosen.ray[:used]
         residual = None if color_change is None else color_change(points)
         color = field.rgb(points, rays.viewdirs, ray, precision, residual, chosen.first)
@@ -194,7 +194,7 @@ class ListRenderer:
         """The samples that can be seen, in lists without padding."""
         scene = rays, self.field, occupancy, self.settings, slices
         while True:
-            packed = search(*scene, capacity=self._capacity, wait=True)
+            packed = search(*scene, capacity=self._capacity)
             total = int(packed.total)
             if total <= self._capacity:
                 return packed.head(total)
@@ -210,20 +210,14 @@ def search(
     slice_weight: float = 0.0,
     *,
     capacity: int,
-    wait: bool,
 ) -> PackedSamples:
     """What of R rays can be seen, as :func:`~devrf.ops.search.find_samples` gives it.
 
-    Arguments as for :func:`render_static`. The lists have ``capacity`` places. ``wait`` counts the
-    samples of the longest ray, which waits for the device; else an upper bound is used.
+    Arguments as for :func:`render_static`. The lists have ``capacity`` places.
     """
     step = field.step_length(settings.step)
     limits = {"step": step, "near": settings.near, "far": settings.far}
     entry, count = steps_in_box(rays.origins, rays.directions, box=field.box, **limits)
-    if wait:
-        longest = int(count.amax()) if len(rays) else 0
-    else:
-        longest = most_steps(field.box, **limits)
     threshold = settings.alpha_threshold
     return find_samples(
         rays.origins,
@@ -235,7 +229,7 @@ def search(
         slices,
         slice_weight,
         step=step,
-        longest=longest,
+        longest=most_steps(field.box, **limits),
         capacity=capacity,
         mask_box=occupancy.box,
         box=field.box,

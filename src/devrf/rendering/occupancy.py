@@ -15,12 +15,11 @@ class Occupancy(nn.Module):
 
     Attributes:
         mask: (X, Y, Z) bool, True where something may be.
-        vicinity: the mask dilated by ``REACH`` grid points, to test segments of a ray at once.
         box: the box of the mask; outside it everything is empty.
     """
 
     mask: Tensor
-    vicinity: Tensor
+    _vicinity: Tensor | None
 
     # Grid points by which the vicinity exceeds the mask.
     REACH = 2
@@ -29,12 +28,19 @@ class Occupancy(nn.Module):
         super().__init__()
         self.box = box
         self.register_buffer("mask", mask)
-        self.register_buffer("vicinity", dilate(mask, self.REACH), persistent=False)
+        self.register_buffer("_vicinity", None, persistent=False)
 
     @staticmethod
     def full(shape: tuple[int, int, int], box: Box) -> Occupancy:
         """A mask that is True in the whole box."""
         return Occupancy(torch.ones(shape, dtype=torch.bool), box)
+
+    @property
+    def vicinity(self) -> Tensor:
+        """The mask dilated by ``REACH`` grid points, to test segments of a ray at once."""
+        if self._vicinity is None:  # lists are made without it
+            self._vicinity = dilate(self.mask, self.REACH)
+        return self._vicinity
 
     @property
     def reach(self) -> float:
@@ -78,13 +84,13 @@ class Occupancy(nn.Module):
     def replace(self, mask: Tensor, box: Box | None = None) -> None:
         """Replace the mask by one of any shape, and the box if one is given."""
         self.mask = mask
-        self.vicinity = dilate(mask, self.REACH)
+        self._vicinity = None
         self.box = box or self.box
 
     def refill(self, other: Occupancy) -> None:
         """Copy another occupancy of the same shape and box into the same memory."""
         self.mask.copy_(other.mask)
-        self.vicinity.copy_(other.vicinity)
+        self._vicinity = other._vicinity
 
     def _load_from_state_dict(
         self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any

@@ -52,7 +52,9 @@ class RenderedImage:
 
     @staticmethod
     def joined(parts: Sequence[RenderedImage]) -> RenderedImage:
-        """The rays of several parts, one part after another."""
+        """The rays of one part or more, one part after another."""
+        if len(parts) == 1:
+            return parts[0]
         return RenderedImage(
             torch.cat([part.color for part in parts]),
             torch.cat([part.depth for part in parts]),

@@ -18,6 +18,8 @@ MOST = {"canonical": 40, "deformation": 39}
 MOST_MEGABYTES = {"canonical": 1500, "deformation": 1220}
 MOST_GIGABYTES = {"canonical": 1.2, "deformation": 1.25}
 FRAMES_AT_REST = {"canonical": 0.0, "deformation": 50 * 2 * 160**3 * 6 / 1e9}
+# A film's pictures: at a time whose displacements are known, and at a new one.
+PICTURES = {"picture, known time": 30, "picture, new time": 77}
 
 
 @pytest.fixture
@@ -36,3 +38,10 @@ def test_an_iteration_launches_no_more_than_it_did(launches: Any, stage: str) ->
     # frame on its way, this stays below 2 GB (docs/performance.md#memory).
     assert 0 < count.taken / 1e9 < 0.15
     assert (count.held + count.taken) / 1e9 - FRAMES_AT_REST[stage] <= MOST_GIGABYTES[stage]
+
+
+@pytest.mark.parametrize("picture", PICTURES)
+def test_a_picture_launches_no_more_than_it_did(launches: Any, picture: str) -> None:
+    count = launches.traced(picture)
+    assert 0 < count.triton.total() < count.launches <= PICTURES[picture]
+    assert count.waits == 2  # for the numbers of samples listed, and coloured
