@@ -111,7 +111,7 @@ def test_options_are_checked_before_anything_is_read():
 @pytest.mark.parametrize("facing", ["inward", "forward"])
 def test_a_scene_written_to_disk_is_read_with_its_flow(facing, tiny_scene, tmp_path):
     numbers = {"width": 24, "height": 16, "static_views": 7, "train_views": 2, "frames": 2}
-    toy = ProceduralDataModule("toy", recipe=ProceduralForwardScene, supersample=1, **numbers)
+    toy = ProceduralDataModule(recipe=ProceduralForwardScene, supersample=1, **numbers)
     scene = tiny_scene if facing == "inward" else toy.scene
     assert scene.kind == facing
     export(scene, tmp_path / "toy")

@@ -169,16 +169,16 @@ def test_every_ablation_is_in_a_table(composed):
     for table, scenes in (
         ("ablation_table", ("data.shape", "robot,flower")),
         ("quality_table", ("data.scene_seed", "0,1,2,3,4,5,6,7,8,9")),
+        ("quality_table_forward", ("data.scene_seed", "0,1,2,3,4,5")),
     ):
         composed(f"experiment={table}")
         hydra = HydraConfig.get()
         assert hydra.mode.name == "MULTIRUN"
         assert scenes in hydra.sweeper.params.items()
         tables.append(hydra.sweeper.params["ablation"].split(","))
-    published, ours = tables
+    published, inward, forward = tables
     # A report has a name for each, in this order; gains are over the first.
-    assert ["cpu_small", *published, *ours[2:]] == list(ABLATIONS) and ours[:2] == [
-        "cpu_small",
-        "full",
-    ]
+    assert inward[:2] == ["cpu_small", "full"] and forward[:2] == ["quick_forward", "full"]
+    bases, parts = ["cpu_small", "quick_forward"], [*inward[2:], *forward[2:]]
+    assert list(dict.fromkeys([*bases, *published, *parts])) == list(ABLATIONS)
     assert sorted(ABLATIONS) == sorted(NAMES["ablation"])

@@ -24,6 +24,7 @@ from devrf.scenes.procedural import (
     Shape,
     moved,
 )
+from devrf.scenes.procedural.assembled import Assembled
 from devrf.scenes.procedural.filming import Filming, extent
 from devrf.scenes.procedural.march import HIT
 from devrf.scenes.procedural.plush import BASE
@@ -37,7 +38,13 @@ from devrf.scenes.scene import Scene, Views
 SMALL = {"width": 28, "height": 20, "train_views": 2, "frames": 3, "supersample": 1}
 INWARD = ProceduralScene(static_views=3, static_test_views=1, **SMALL)
 FORWARD = ProceduralForwardScene(static_views=8, **SMALL)
-RECIPES = {"robot": INWARD, "flower": replace(INWARD, shape="flower"), "plush": FORWARD}
+HUNG = replace(FORWARD, shape="random", scene_seed=2)
+RECIPES = {
+    "robot": INWARD,
+    "flower": replace(INWARD, shape="flower"),
+    "plush": FORWARD,
+    "random": HUNG,
+}
 Built = tuple[Any, Scene]
 
 
@@ -174,8 +181,9 @@ def test_frames_may_be_left_to_the_held_out_camera() -> None:
     assert not torch.equal(train.flow.vectors[2:4], every.flow.vectors[4:6])
 
 
-def test_every_ray_meets_something_beyond_the_bound_of_the_published_layout() -> None:
-    for views in all_views(rendered("plush")[1]):
+@pytest.mark.parametrize("name", ["plush", "random"])
+def test_every_ray_meets_something_beyond_the_bound_of_the_published_layout(name: str) -> None:
+    for views in all_views(rendered(name)[1]):
         assert views.depth is not None and bool(views.depth.isfinite().all())
         assert int(views.pixels.amax(dim=-1).min()) > 0
         for k in range(len(views)):
@@ -192,10 +200,10 @@ def test_the_static_cameras_are_centred_and_face_the_scene() -> None:
 
 # Between them these have every kind of part and every way to move.
 ALONE = [Robot(), Flower(2.0), random_body(3, 1.0, True), random_body(5)]
-SHAPES = [*ALONE, Surrounded(Plush(2.0), Backdrop())]
+SHAPES = [*ALONE, Surrounded(Plush(2.0), Backdrop()), HUNG.filmed()]
 NAMES = ["robot", "flower", "random", "loop"]
 each_alone = pytest.mark.parametrize("shape", ALONE, ids=NAMES)
-each_shape = pytest.mark.parametrize("shape", SHAPES, ids=[*NAMES, "plush"])
+each_shape = pytest.mark.parametrize("shape", SHAPES, ids=[*NAMES, "plush", "hung"])
 
 
 @cache
@@ -259,6 +267,20 @@ def test_a_random_body_has_the_size_and_the_motion_that_are_said(seed: int) -> N
     same, other = random_body.__wrapped__(seed), random_body(seed + 1)
     torch.testing.assert_close(same.outline().rest, outline.rest)
     assert len(other.parts) != len(body.parts) or other.parts[0].paint != body.parts[0].paint
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_hung_body_touches_neither_wall_nor_floor(seed: int) -> None:
+    hung = replace(HUNG, scene_seed=seed).filmed()
+    assert isinstance(hung, Surrounded) and hung.surroundings.parts == 2
+    body = hung.shape
+    assert isinstance(body, Assembled) and hung.reach is not None
+    where = extent(body)
+    assert where.motion.low[1] > FLOOR and where.motion.low[2] > WALL
+    outline = body.outline()
+    for time in (0.0, 0.4, 1.0):
+        away = body.forward(outline, time) - torch.tensor(hung.center)
+        assert float(away.norm(dim=1).max()) < hung.reach
 
 
 @pytest.mark.parametrize("time", [0.0, 0.5, 1.0])

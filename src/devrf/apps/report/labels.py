@@ -23,9 +23,11 @@ METHODS = {
     "nsff": "NSFF",
     "neural_volumes": "Neural Volumes",
 }
-# As the paper's tables call them, in their order; then the rows of experiment=quality_table.
+# As the paper's tables call them, in their order; then the rows of experiment=quality_table, for
+# inward- and for forward-facing scenes.
 ABLATIONS = {
     "cpu_small": "Ours, small",
+    "quick_forward": "Ours, quick",
     "base": "Ours (base)",
     "c2f": "Ours w/ c2f",
     "c2f_tv": "Ours w/ c2f, tv",
@@ -36,6 +38,8 @@ ABLATIONS = {
     "without_masks": "Ours w/o masks' loss",
     "without_shading": "Ours w/o shading",
     "without_finishing": "Ours w/o finishing level",
+    "without_crop": "Ours w/o crop",
+    "without_last_level": "Ours w/o last level",
 }
 CHOICES, SETTINGS = "run.choices.", "run.settings."
 IGNORED = {"objective", "seed", "stage", "method"}

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from devrf.scenes.procedural.assembled import STILL, Assembled, Part
+from devrf.scenes.procedural.filming import extent
 from devrf.scenes.procedural.motion import Swing
 from devrf.scenes.procedural.rigs import STUDIO
 from devrf.scenes.procedural.solids import Material, Paint, Rgb, Xyz
@@ -52,6 +53,14 @@ def random_body(seed: int, speed: float = 1.0, sliding: bool = False) -> Assembl
     spins = (SPIN if sliding and is_round else STILL for is_round in round_parts)
     parts = (replace(part, spin=spin) for part, spin in zip(best.parts, spins, strict=True))
     return Assembled(tuple(parts), speed)
+
+
+def placed(body: Assembled, center: Xyz, reach: float) -> Assembled:
+    """The body about ``center``, made so small that it stays within ``reach`` of it."""
+    size = min(1.0, reach / extent(body).reach)
+    parts = (_scaled(part, size, 1.0) for part in body.parts)
+    there = torch.tensor(center, dtype=torch.float64)
+    return replace(body, parts=tuple(replace(part, base=part.base + there) for part in parts))
 
 
 def _drawn(draw: Random) -> list[Part]:

@@ -16,7 +16,7 @@ from devrf.scenes.bounds import forward_bounds, reference_space
 from devrf.scenes.procedural.filming import Filming, extent
 from devrf.scenes.procedural.flower import Flower
 from devrf.scenes.procedural.plush import Plush
-from devrf.scenes.procedural.random_bodies import random_body
+from devrf.scenes.procedural.random_bodies import placed, random_body
 from devrf.scenes.procedural.rigs import (
     HAND_HELD,
     STUDIO,
@@ -39,6 +39,7 @@ Frames = Annotated[int, Field(strict=True, ge=2, le=10_000)]
 # Further than at speed 2 the flower folds into itself, the robot goes through its own body and the
 # toy is squashed to pieces.
 Speed = Annotated[float, Field(strict=True, ge=0, le=2)]
+SceneSeed = Annotated[int, Field(strict=True, ge=0)]
 Texture = Literal["soft", "fine"]
 
 
@@ -131,7 +132,7 @@ class ProceduralScene(Recipe):
 
     shape: Literal["robot", "flower", "random"] = "robot"
     _: KW_ONLY
-    scene_seed: Annotated[int, Field(strict=True, ge=0)] = 0
+    scene_seed: SceneSeed = 0
     sliding: bool = False
     static_test_views: Count = 8
     surroundings: Literal["none", "room"] = "none"
@@ -187,24 +188,31 @@ _REACH = 9.0
 # One static view in so many is held out, the first one included, as readers of LLFF do.
 HOLDOUT = 8
 NEAR = 1.0
+# Where a random body hangs, and the radius of a ball that it does not leave: it touches neither
+# wall nor floor.
+_HANGS, _STAYS_WITHIN = (0.0, 0.0, -2.6), 1.1
 
 
 @dataclass(frozen=True)
 class ProceduralForwardScene(Recipe):
-    """A soft toy on a pedestal before a painted wall, seen from one side.
+    """A soft toy on a pedestal, or a random body, before a painted wall, seen from one side.
 
     The world is the one that :class:`devrf.scenes.formats.llff.LlffReader` makes: the static
     cameras' average pose is the identity, and nothing is nearer to a camera than 1/0.75. Besides
     ``static_views`` to learn from there are held-out ones, one in eight of all.
 
     Attributes:
-        name: the scene's name.
+        shape: ``plush`` (the toy) or ``random``.
+        scene_seed: which random body.
+        sliding: whether its round parts spin, so that texture slides over a still silhouette.
         texture: how wall and floor are painted: ``soft``, or ``fine`` for images of about 240
             pixels or more, in which it has waves of five to twelve pixels.
     """
 
-    name: str = "plush"
+    shape: Literal["plush", "random"] = "plush"
     _: KW_ONLY
+    scene_seed: SceneSeed = 0
+    sliding: bool = False
     texture: Texture = "soft"
     height: Side = 72
     static_views: Count = 20
@@ -226,8 +234,14 @@ class ProceduralForwardScene(Recipe):
         space = reference_space(static, NEAR)
         source = "all that the cameras see (procedural scene)"
         bounds = forward_bounds([at_rest.train, moving.train], space, source)
-        return Scene(self.name, "forward", at_rest, moving, bounds, "white", space)
+        name = "plush" if self.shape == "plush" else "random_forward"
+        return Scene(name, "forward", at_rest, moving, bounds, "white", space)
 
     def filmed(self) -> Shape:
-        """The toy and its stage."""
-        return Surrounded(Plush(self.speed), Backdrop(weave=self.texture == "fine"))
+        """The moving shape and its stage."""
+        weave = self.texture == "fine"
+        if self.shape == "plush":
+            return Surrounded(Plush(self.speed), Backdrop(weave))
+        body = random_body(self.scene_seed, self.speed, self.sliding)
+        hung = placed(body, _HANGS, _STAYS_WITHIN)
+        return Surrounded(hung, Backdrop(weave, pedestal=False), _STAYS_WITHIN, _HANGS)

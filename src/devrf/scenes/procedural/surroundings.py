@@ -27,13 +27,14 @@ class Surrounded:
     """A :class:`~devrf.scenes.procedural.solids.Shape` among still surroundings.
 
     The first parts are those of the surroundings; the shape's own follow. ``reach`` is the radius
-    of a ball about the origin that holds the moving shape at all times, world units; None: its
+    of a ball about ``center`` that holds the moving shape at all times, world units; None: its
     distance is cheap enough everywhere.
     """
 
     shape: Shape
     surroundings: Backdrop | Room
     reach: float | None = None
+    center: Xyz = (0.0, 0.0, 0.0)
 
     def distance(self, points: Tensor, time: float) -> Tensor:
         """The smaller of the shape's distance bound and the surroundings' (M,).
@@ -43,7 +44,7 @@ class Surrounded:
         still = self.surroundings.distances(points).amin(dim=0)
         if self.reach is None:
             return torch.minimum(still, self.shape.distance(points, time))
-        ball = points.norm(dim=-1) - self.reach
+        ball = (points - points.new_tensor(self.center)).norm(dim=-1) - self.reach
         near = (ball < 0.1 * self.reach).nonzero().squeeze(-1)
         ball[near] = self.shape.distance(points[near], time)
         return torch.minimum(still, ball)
@@ -120,18 +121,25 @@ class Backdrop:
 
     Attributes:
         weave: whether the paint is fine, for images of about 240 pixels or more; else soft.
+        pedestal: whether there is one.
     """
 
     weave: bool = False
+    pedestal: bool = True
 
-    parts: ClassVar[int] = 3
+    @property
+    def parts(self) -> int:
+        """How many there are."""
+        return _PEDESTAL + self.pedestal
 
     def distances(self, points: Tensor) -> Tensor:
-        """Distances (3, M) to wall, floor and pedestal."""
+        """Distances (K, M) to wall, floor and pedestal."""
         x, y, z = points.unbind(-1)
-        a, b, c = _CENTER
-        pedestal = rounded_box(x - a, y - b, z - c, _HALF, _ROUNDING)
-        return torch.stack([z - WALL, y - FLOOR, pedestal])
+        faces = [z - WALL, y - FLOOR]
+        if self.pedestal:
+            a, b, c = _CENTER
+            faces.append(rounded_box(x - a, y - b, z - c, _HALF, _ROUNDING))
+        return torch.stack(faces)
 
     def color(self, material: Material) -> Tensor:
         """The paint (M, 3): the pedestal stands out from the floor."""
