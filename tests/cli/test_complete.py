@@ -136,6 +136,10 @@ def scenes(tmp_path_factory) -> Path:
         ("experiment=paper", "experiment=paper_inward"),
         ("experiment=cpu_small,best_small", "experiment=cpu_small,best_small"),
         ("experiment=quickstart data=lego", "experiment=quickstart data=lego"),
+        (
+            "experiment=best schedule.deformation.levels.6.parallel_frames=2",
+            "experiment=best_inward ++schedule.deformation.levels.6.parallel_frames=2",
+        ),
         # The reader.
         ("data.root=walker", "data=auto data.root=walker"),
         ("+data.root=walker seed=1", "data=auto +data.root=walker seed=1"),

@@ -4,6 +4,7 @@
 * A run that is named (``ckpt=``, ``hydra.run.dir=``, ``hydra.sweep.dir=``) brings the overrides
   that it was learned with. What is typed comes after them: only that differs.
 * ``experiment=NAME`` is taken in its form for the scene: ``best_small_forward``, ``paper_lego``.
+* A key of a level is added where the schedule's files do not name it.
 * A scene's folder without a reader gets ``data=auto``: the reader that fits its files.
 """
 
@@ -37,6 +38,7 @@ KEY_VALUE = re.compile(r"(\+{0,2}([\w./@-]+)=)(.*)", re.DOTALL)
 
 # Readers of the embedded scenes, and what an experiment's form for them is called after.
 EMBEDDED = {"procedural": ["embedded", "inward"], "procedural_forward": ["forward"]}
+LEVELS = "schedule.deformation.levels."
 # What conf/data/auto.yaml names, and keys that are not passed on with its options.
 AUTOMATIC = "devrf.data.recorded.recognised_datamodule"
 NOT_PASSED = ("_target_", "reader", "flow_cache")
@@ -60,7 +62,8 @@ def completed(arguments: Sequence[str]) -> list[str]:
     if not typed:
         return words
     before = of_named_run(typed, multirun)
-    texts = _in_form(texts, before)
+    # A level that only the chosen schedule has need not name every key.
+    texts = [f"++{text}" if text.startswith(LEVELS) else text for text in _in_form(texts, before)]
     both = parsed([*before, *texts])
     experiments = values(both, "experiment")
     if values(both, "data.root") and not any(override.key_or_group == "data" for override in both):
