@@ -62,5 +62,5 @@ def test_groups_resolvers_and_choices_are_there(tmp_path: Path) -> None:
     config = json.loads(done.stdout)
     assert config["scene"]["_target_"] == "devrf.data.recorded.InwardFacingDataModule"
     assert config["schedule"]["canonical"]["side"] == 160
-    assert config["loss"]["deformation"]["elastic"] > 0  # loss=best, a row and not a file
+    assert config["loss"]["deformation"]["elastic"] == 0.05  # a row, not a file
     assert (config["run"], config["label"]) == ("theirs-base", "suzanne")
