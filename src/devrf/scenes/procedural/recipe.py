@@ -39,7 +39,6 @@ Frames = Annotated[int, Field(strict=True, ge=2, le=10_000)]
 # Further than at speed 2 the flower folds into itself, the robot goes through its own body and the
 # toy is squashed to pieces.
 Speed = Annotated[float, Field(strict=True, ge=0, le=2)]
-SceneSeed = Annotated[int, Field(strict=True, ge=0)]
 Texture = Literal["soft", "fine"]
 
 
@@ -71,6 +70,8 @@ class Recipe(Options, ABC):
         speed: scales how far everything moves; 0 is still.
         supersample: n × n rays a pixel.
         light: share of the lamp in the lighting, 0 … 1: how much motion changes the colours.
+        scene_seed: of ``shape`` ``random``: which body.
+        sliding: whether its round parts spin, so that texture slides over a still silhouette.
         novel_times_every: n: every n-th frame is seen by the held-out camera alone, the last
             frame excepted; None: all frames are learned from.
 
@@ -87,6 +88,8 @@ class Recipe(Options, ABC):
     speed: Speed = 1.0
     supersample: Annotated[int, Field(strict=True, ge=1, le=16)] = 2
     light: Annotated[float, Field(strict=True, ge=0, le=1)] = 0.2
+    scene_seed: Annotated[int, Field(strict=True, ge=0)] = 0
+    sliding: bool = False
     novel_times_every: Annotated[int, Field(strict=True, ge=2)] | None = None
 
     @model_validator(mode="after")
@@ -121,8 +124,6 @@ class ProceduralScene(Recipe):
 
     Attributes:
         shape: ``robot`` (rigid parts, large fast motion), ``flower`` (non-rigid), or ``random``.
-        scene_seed: which random body.
-        sliding: whether its round parts spin, so that texture slides over a still silhouette.
         static_test_views: held-out views of the scene at rest.
         surroundings: ``none``: the images have alpha masks; ``room``: the object stands in a
             furnished room, filmed from inside it, and the images have none.
@@ -132,8 +133,6 @@ class ProceduralScene(Recipe):
 
     shape: Literal["robot", "flower", "random"] = "robot"
     _: KW_ONLY
-    scene_seed: SceneSeed = 0
-    sliding: bool = False
     static_test_views: Count = 8
     surroundings: Literal["none", "room"] = "none"
     texture: Texture = "soft"
@@ -203,16 +202,12 @@ class ProceduralForwardScene(Recipe):
 
     Attributes:
         shape: ``plush`` (the toy) or ``random``.
-        scene_seed: which random body.
-        sliding: whether its round parts spin, so that texture slides over a still silhouette.
         texture: how wall and floor are painted: ``soft``, or ``fine`` for images of about 240
             pixels or more, in which it has waves of five to twelve pixels.
     """
 
     shape: Literal["plush", "random"] = "plush"
     _: KW_ONLY
-    scene_seed: SceneSeed = 0
-    sliding: bool = False
     texture: Texture = "soft"
     height: Side = 72
     static_views: Count = 20
