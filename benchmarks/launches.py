@@ -21,7 +21,7 @@ import weakref
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -45,7 +45,7 @@ from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.ops.adam import GridAdam
+from devrf.methods.devrf.voxel_stage import field_optimizer
 from devrf.ops.dispatch import using
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.renderer import Renderer
@@ -240,11 +240,7 @@ def canonical() -> ScheduledStage:
     images = views(AT_REST, 1, flow=False)
     _attach(stage, images)
     stage.scene_model = model()
-    field = stage.scene_model.canonical
-    stage.optimizer = GridAdam(
-        {"params": list(field.get_submodule(name).parameters()), "lr": rate, "base_lr": rate}
-        for name, rate in asdict(stage.rates).items()
-    )
+    stage.optimizer = field_optimizer(stage.scene_model.canonical, stage.rates)
     stage.iteration = int(LATE * stage.total_iterations)
     stage.phase = stage.phase_at(stage.iteration)
     stage.pool = all_pixels(images, torch.arange(len(images), device=META))

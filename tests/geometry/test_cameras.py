@@ -68,7 +68,10 @@ def test_projection_undoes_rays(scattered, rng):
 def test_image_rays_go_through_the_pixel_grid_and_project_into_undoes_them(scattered):
     # Row by row, x first.
     assert scattered.pixel_grid()[[0, 1, 30]].tolist() == [[0.5, 0.5], [1.5, 0.5], [0.5, 1.5]]
-    rays = scattered.image_rays(3)
+    rays, camera = scattered.image_rays(3), torch.full((len(scattered.pixel_grid()),), 3)
+    same = scattered.rays(camera, scattered.pixel_grid())
+    torch.testing.assert_close(rays.directions, same.directions)
+    assert torch.equal(rays.origins, same.origins)
     pixel, depth = scattered.project_into(3, rays.origins + 2 * rays.directions)
     torch.testing.assert_close(pixel, scattered.pixel_grid(), atol=1e-4, rtol=0)
     torch.testing.assert_close(depth, 2 * rays.directions @ scattered.forwards[3])

@@ -99,7 +99,7 @@ class RunContext:
     @property
     def learning_stages(self) -> tuple[str, ...]:
         """Names of the protocol's stages, in their order."""
-        return tuple(step.name for step in self.protocol.steps)
+        return tuple(self.protocol.stages)
 
     @property
     def stages_with_images(self) -> tuple[str, ...]:
