@@ -42,11 +42,17 @@ def test_training_views_move_to_the_device_once_for_each_capture(tiny_scene, ser
 
 
 @pytest.mark.parametrize(
-    ("capture", "images", "held_out"), [("static", (8,), 2), ("both", (8, 6), 3)]
+    ("names", "scored", "images", "held_out"),
+    [
+        (("static",), "static", (8,), 2),
+        (("static", "dynamic"), "dynamic", (8, 6), 3),
+        (("at_rest",), "static", (10,), 2),
+    ],
 )
-def test_a_stage_is_served_what_it_learns_from(tiny_scene, serve, capture, images, held_out):
+def test_a_stage_is_served_what_it_learns_from(tiny_scene, serve, names, scored, images, held_out):
     module, cpu = serve(tiny_scene), torch.device("cpu")
-    learner: Any = SimpleNamespace(lightning_module=SimpleNamespace(capture=capture))
+    stage = SimpleNamespace(images=names, scored_capture=scored)
+    learner: Any = SimpleNamespace(lightning_module=stage)
     module.trainer = learner
     served = module.transfer_batch_to_device(None, cpu, 0)
     views = served if isinstance(served, tuple) else (served,)
@@ -54,6 +60,35 @@ def test_a_stage_is_served_what_it_learns_from(tiny_scene, serve, capture, image
     assert all(one.frames is not None for one in views)
     assert len(module.test_dataloader()) == held_out
     assert module.transfer_batch_to_device(1, cpu, 0) == 1
+
+
+def test_the_first_frames_of_fixed_cameras_show_the_scene_at_rest(tiny_scene):
+    static, moving = tiny_scene.static.train, tiny_scene.dynamic.train
+    at_rest = tiny_scene.at_rest
+    first = moving[(moving.times == 0).nonzero()[:, 0]]
+    assert at_rest.names == static.names + first.names and len(first) == 2
+    assert torch.equal(at_rest.pixels, torch.cat([static.pixels, first.pixels]))
+    poses = [views.cameras.camera_to_world for views in (static, first)]
+    assert torch.equal(at_rest.cameras.camera_to_world, torch.cat(poses))
+    assert at_rest.frames is not None and not at_rest.frames.any()
+    assert at_rest.valid_mask is None and at_rest.flow is None
+    # Static views that are first frames of all cameras count once.
+    same = replace(tiny_scene, static=replace(tiny_scene.static, train=first))
+    assert same.at_rest.names == first.names
+
+
+@pytest.mark.parametrize("case", ["size", "one camera", "masks"])
+def test_first_frames_that_differ_are_left_out(tiny_scene, case):
+    moving = tiny_scene.dynamic.train
+    if case == "size":
+        cameras = moving.cameras.resized(12, 9)
+        moving = replace(moving, pixels=moving.pixels[:, ::2, ::2], cameras=cameras, flow=None)
+    elif case == "one camera":
+        moving = replace(moving, view=torch.arange(len(moving)))
+    else:
+        moving = replace(moving, valid_mask=moving.pixels[..., 0] > 0)
+    scene = replace(tiny_scene, dynamic=replace(tiny_scene.dynamic, train=moving))
+    assert scene.at_rest is scene.static.train
 
 
 def test_the_training_loader_never_ends(tiny_scene, serve):

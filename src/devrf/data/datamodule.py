@@ -11,14 +11,14 @@ from lightning import LightningDataModule
 from torch.utils.data import DataLoader, Dataset, IterableDataset
 
 from devrf.data.priors import Priors, without_priors
-from devrf.scenes.scene import CaptureName, Scene, Views
+from devrf.scenes.scene import ImagesName, Scene, Views
 
 
 class SceneDataModule(LightningDataModule, ABC):
     """Serves a scene to the stages.
 
-    A training batch is the whole set of training views of the capture that the stage asks for
-    (its attribute ``capture``: ``static``, ``dynamic`` or ``both``), moved to the device once. The
+    A training batch is the whole set of training views that the stage learns from (its attribute
+    ``images``: ``static``, ``dynamic``, both, or ``at_rest``), moved to the device once. The
     stage draws its rays from it on the device, under its own schedule: no pixel crosses from the
     host during training. A test batch is the position of one held-out image.
     """
@@ -31,7 +31,7 @@ class SceneDataModule(LightningDataModule, ABC):
     def __init__(self) -> None:
         super().__init__()
         self._scene: Scene | None = None
-        self._on_device: dict[tuple[CaptureName, torch.device], Views] = {}
+        self._on_device: dict[tuple[ImagesName, torch.device], Views] = {}
 
     @abstractmethod
     def load(self) -> Scene:
@@ -70,7 +70,9 @@ class SceneDataModule(LightningDataModule, ABC):
 
     def test_dataloader(self) -> DataLoader[Any]:
         """A loader of the positions of the held-out images, one at a time."""
-        held_out = self.scene.capture(self._captures[-1]).test
+        assert self.trainer is not None
+        stage: Any = self.trainer.lightning_module
+        held_out = self.scene.capture(stage.scored_capture).test
         return DataLoader(_Positions(len(held_out)), batch_size=None)
 
     def transfer_batch_to_device(
@@ -79,28 +81,29 @@ class SceneDataModule(LightningDataModule, ABC):
         """The training views on ``device``; the positions of a test batch pass through.
 
         Returns:
-            :class:`Views`, or a tuple of those of both captures, the static first.
+            :class:`Views`, or a tuple of them.
         """
         if batch is not None:
             return batch
-        views = tuple(self.training_views(capture, device) for capture in self._captures)
+        views = tuple(self.training_views(images, device) for images in self._images)
         return views if len(views) > 1 else views[0]
 
-    def training_views(self, capture: CaptureName, device: torch.device) -> Views:
-        """The training views of ``capture`` on ``device``, moved there at the first call."""
-        key = (capture, device)
+    def training_views(self, images: ImagesName, device: torch.device) -> Views:
+        """The training views called ``images`` on ``device``, moved there at the first call."""
+        key = (images, device)
         if key not in self._on_device:
-            needed = set(self._captures) if self.trainer is not None else {capture}
+            needed = set(self._images) if self.trainer is not None else {images}
             self._on_device = {k: v for k, v in self._on_device.items() if k[0] in needed}
-            self._on_device[key] = self.scene.capture(capture).train.to(device)
+            self._on_device[key] = self.scene.training_views(images).to(device)
         return self._on_device[key]
 
     @property
-    def _captures(self) -> tuple[CaptureName, ...]:
+    def _images(self) -> tuple[ImagesName, ...]:
         """What the trainer's stage learns from."""
         assert self.trainer is not None
-        capture = self.trainer.lightning_module.capture
-        return ("static", "dynamic") if capture == "both" else (capture,)  # type: ignore[return-value]
+        stage: Any = self.trainer.lightning_module
+        images: tuple[ImagesName, ...] = stage.images
+        return images
 
 
 class _SameBatch(IterableDataset[None]):

@@ -19,7 +19,7 @@ from devrf.data.batch import Pixels
 from devrf.ops.adam import GridAdam
 from devrf.rendering.sample_capacity import SampleCapacity
 from devrf.rendering.view import Viewable
-from devrf.scenes.scene import CaptureName, Scene, Views
+from devrf.scenes.scene import CaptureName, ImagesName, Scene, Views
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,12 +197,17 @@ class Learner(LightningModule, ABC):
         scene: Scene = self.trainer.datamodule.scene  # type: ignore[attr-defined]
         return scene
 
-    def training_views(self, capture: CaptureName) -> Views:
-        """The training views of a capture, on the stage's device."""
+    def training_views(self, images: ImagesName) -> Views:
+        """The training views called so, on the stage's device."""
         views: Views = self.trainer.datamodule.training_views(  # type: ignore[attr-defined]
-            capture, self.device
+            images, self.device
         )
         return views
+
+    @property
+    def images(self) -> tuple[ImagesName, ...]:
+        """What is learned from: the training views of these names."""
+        return ("static", "dynamic") if self.capture == "both" else (self.capture,)
 
     @property
     def scored_capture(self) -> CaptureName:

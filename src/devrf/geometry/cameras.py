@@ -48,6 +48,16 @@ class Cameras:
             center=self.center[index],
         )
 
+    def joined(self, *others: Cameras) -> Cameras:
+        """These cameras and ``others``, of the same image size."""
+        every = (self, *others)
+        return replace(
+            self,
+            camera_to_world=torch.cat([cameras.camera_to_world for cameras in every]),
+            focal=torch.cat([cameras.focal for cameras in every]),
+            center=torch.cat([cameras.center for cameras in every]),
+        )
+
     @property
     def positions(self) -> Tensor:
         """(N, 3) camera centres in world units."""

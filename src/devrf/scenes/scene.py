@@ -17,6 +17,8 @@ from devrf.geometry.space import WORLD, Space
 
 Background = Literal["white", "black", "random"]
 CaptureName = Literal["static", "dynamic"]
+# What is learned from: the images of a capture, or all of the scene at rest (Scene.at_rest).
+ImagesName = Literal["static", "dynamic", "at_rest"]
 
 
 @dataclass(frozen=True)
@@ -207,9 +209,41 @@ class Scene:
             pair = numbered[id(capture.train)], numbered[id(capture.test)]
             object.__setattr__(self, name, Capture(*pair))
 
+    @property
+    def at_rest(self) -> Views:
+        """The static training views and the first frames of the dynamic ones, at time 0.
+
+        The static ones alone where the others are of another size or by a moving camera, or where
+        either alone have masks. An image from the place of a static one is left out.
+        """
+        static, moving = self.static.train, self.dynamic.train
+        alike = static.pixels.shape[1:] == moving.pixels.shape[1:]
+        masked = [views.valid_mask is not None for views in (static, moving)]
+        if not alike or moving.by_moving_camera or masked[0] != masked[1]:
+            return static
+        assert static.frames is not None and moving.frames is not None
+        first = moving[(moving.frames == 0).nonzero()[:, 0]]
+        here, there = (views.cameras.camera_to_world.flatten(1) for views in (first, static))
+        first = first[(torch.cdist(here, there) > 0).all(dim=1).nonzero()[:, 0]]
+        assert first.frames is not None
+        valid = [v.valid_mask for v in (static, first) if v.valid_mask is not None]
+        return Views(
+            pixels=torch.cat([static.pixels, first.pixels]),
+            cameras=static.cameras.joined(first.cameras),
+            times=torch.cat([static.times, torch.zeros_like(first.times)]),
+            view=torch.arange(len(static) + len(first)),
+            names=static.names + first.names,
+            valid_mask=torch.cat(valid) if valid else None,
+            frames=torch.cat([static.frames, first.frames]),
+        )
+
     def capture(self, name: CaptureName) -> Capture:
         """The capture called ``static`` or ``dynamic``."""
         return self.static if name == "static" else self.dynamic
+
+    def training_views(self, name: ImagesName) -> Views:
+        """The training views of a capture, or those :attr:`at_rest`."""
+        return self.at_rest if name == "at_rest" else self.capture(name).train
 
     @property
     def captures(self) -> dict[CaptureName, Capture]:

@@ -81,6 +81,14 @@ def test_the_whole_schedule_is_run_and_the_loss_falls(datamodule, trainer):
     assert sum(watch.loss[-2:]) / 2 < 0.6 * watch.loss[0]
 
 
+def test_the_dynamic_views_first_frames_are_learned_from_if_asked_for(fit):
+    images = []
+    for first_frames in (False, True):
+        stage = fit(CanonicalStage(replace(CARVED, first_frames=first_frames), SMALL))
+        images.append(stage.pool.image.unique().tolist())
+    assert images == [list(range(8)), list(range(10))]
+
+
 def test_coarse_and_few_pixels_make_a_coarse_grid_and_small_batches(fit):
     resolved = replace(CARVED, side=64, voxels_per_pixel=1.0, rays=4096)
     stages = [fit(CanonicalStage(replace(resolved, epochs=n), SMALL)) for n in (None, 2.0)]
@@ -152,12 +160,15 @@ def test_no_matter_is_possible_where_too_few_cameras_look(tiny_scene):
     bounds = replace(tiny_scene.bounds, box=Box((-3.0, -3.0, -3.0), (3.0, 3.0, 3.0)))
     scene = replace(tiny_scene, bounds=bounds)
     points = bounds.box.grid_points((12, 12, 12), torch.zeros(()))
-    seen = view_count(scene.static.train.cameras, points)
+    views = scene.static.train
+    seen = view_count(views.cameras, points)
     assert 0 < (seen < 3).float().mean() < 1
-    apart = {n: possibly_occupied(scene, (12, 12, 12), carve=False, min_views=n) for n in (1, 3)}
+    apart = {
+        n: possibly_occupied(scene, views, (12, 12, 12), carve=False, min_views=n) for n in (1, 3)
+    }
     assert torch.equal(apart[3], apart[1] & (seen >= 3))
     # A capture of fewer views than that is kept whole.
-    everywhere = possibly_occupied(scene, (12, 12, 12), carve=False, min_views=1000)
+    everywhere = possibly_occupied(scene, views, (12, 12, 12), carve=False, min_views=1000)
     assert torch.equal(everywhere, apart[1])
 
 

@@ -62,6 +62,7 @@ class CanonicalSchedule:
             0; in contracted space half of ``iterations``.
         unbounded_initial_side: of the grid in contracted space. None: as ``upsample_at`` says.
         unbounded_distortion: weight of the distortion loss there, from that iteration on.
+        first_frames: learn from the dynamic views' first frames, too: they show it at rest.
         crop: forward-facing, whether the grid gives up empty depths (docs/method.md#crop).
     """
 
@@ -83,6 +84,7 @@ class CanonicalSchedule:
     view_dependence_start: int | None = None
     unbounded_initial_side: float | None = 26
     unbounded_distortion: float = 0.01
+    first_frames: bool = False
     crop: bool = False
     phases: tuple[CanonicalPhase, ...] = field(init=False, repr=False)
 

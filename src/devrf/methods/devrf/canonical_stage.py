@@ -32,7 +32,7 @@ from devrf.methods.weighted_loss import counted_weights
 from devrf.ops.photometric import distortion
 from devrf.rendering.occupancy import Occupancy, bounding_box, dilate
 from devrf.rendering.sampling import RenderSettings
-from devrf.scenes.scene import CaptureName, Views
+from devrf.scenes.scene import CaptureName, ImagesName, Views
 from devrf.system.graphs import Graphs
 from devrf.system.profiling import span
 
@@ -91,6 +91,11 @@ class CanonicalStage(VoxelStage):
         return self.schedule.total
 
     @property
+    def images(self) -> tuple[ImagesName, ...]:
+        """The static views, with the dynamic ones' first frames if the schedule says so."""
+        return ("at_rest" if self.schedule.first_frames else "static",)
+
+    @property
     def resolution(self) -> tuple[int, ...]:
         """Present shape of the density and feature grids."""
         return self.scene_model.canonical.density.shape
@@ -116,6 +121,7 @@ class CanonicalStage(VoxelStage):
         first = schedule.phase(0)
         possible = possibly_occupied(
             self.scene,
+            self.scene.training_views(self.images[0]),
             box.grid_shape(schedule.search_side**3),
             carve=schedule.visual_hull_init,
             min_views=schedule.min_views,
@@ -162,7 +168,7 @@ class CanonicalStage(VoxelStage):
         assert self.phase is not None
         model, searching = self.scene_model, self.phase.kind == "search"
         occupancy = None if searching else model.occupancy
-        self.pool = static_pool(self.scene.static.train, model, occupancy)
+        self.pool = static_pool(self.training_views(self.images[0]), model, occupancy)
         if not len(self.pool):
             raise DevrfError(
                 f"the field has become empty by iteration {self.iteration}: check data.background, "
@@ -175,7 +181,7 @@ class CanonicalStage(VoxelStage):
         self._forget_hidden()
         if self.schedule.crop:
             assert self.pool is not None
-            views = self.training_views(self.capture)
+            views = self.training_views(self.images[0])
             crop_to_visible(self.scene_model, self.scene, views, self.pool)
         # Cropping leaves a share of the voxels that the field was built for.
         kept = field.base_voxels / round(self.schedule.side**3)
@@ -256,7 +262,7 @@ class CanonicalStage(VoxelStage):
         per_voxel_lr = None
         if searching:
             points = field.box.grid_points(shape, field.density.values)
-            cameras = self.scene.static.train.cameras.to(self.device)
+            cameras = self.training_views(self.images[0]).cameras
             seen = view_count_weight(cameras, self.scene.space.to_world(points))
             per_voxel_lr = seen[..., None]
         for group, grid in ((0, field.density), (1, field.color)):

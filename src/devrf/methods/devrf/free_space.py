@@ -7,12 +7,13 @@ from torch import Tensor
 
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
-from devrf.scenes.scene import Scene
+from devrf.scenes.scene import Scene, Views
 from devrf.scenes.silhouettes import visual_hull
 
 
 def possibly_occupied(
     scene: Scene,
+    views: Views,
     shape: tuple[int, int, int],
     *,
     carve: bool,
@@ -21,12 +22,12 @@ def possibly_occupied(
 ) -> Tensor:
     """Where something can be at rest: (X, Y, Z) bool on the host, on a grid over the scene's box.
 
-    Not nearer to a camera than its near plane, and not where fewer than ``min_views`` cameras look,
-    if there are so many: fog would explain their images. ``carve`` leaves nothing outside the
-    visual hull, if the images have alpha masks and all show the rest state, and the box is not
-    unbounded. It is found on ``device``; None: on the host.
+    Not nearer to a camera of ``views`` than its near plane, and not where fewer than ``min_views``
+    of them look, if there are so many: fog would explain their images. ``carve`` leaves nothing
+    outside the visual hull, if the images have alpha masks and all show the rest state, and the box
+    is not unbounded. It is found on ``device``; None: on the host.
     """
-    views, box, space = scene.static.train, scene.bounds.box, scene.space
+    box, space = scene.bounds.box, scene.space
     cameras = views.cameras if device is None else views.cameras.to(device)
     possible = torch.ones(shape, dtype=torch.bool, device=device)
     points = space.to_world(box.grid_points(shape, cameras.focal))

@@ -13,7 +13,13 @@ from devrf.errors import expect
 Precision = Literal["auto", "float32", "bfloat16"]
 
 SEARCH_LOSS = {"color": 1.0, "per_sample_color": 0.1, "entropy": 0.01}
-FINE_LOSS = {"color": 1.0, "per_sample_color": 0.01, "entropy": 0.001}
+FINE_LOSS = {
+    "color": 1.0,
+    "per_sample_color": 0.01,
+    "entropy": 0.001,
+    "alpha_mask": 0.0,
+    "tv": 0.0,
+}
 DEFORMATION_LOSS = {
     "render": 1.0,
     "cycle": 100.0,

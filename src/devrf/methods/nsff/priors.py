@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from devrf.data.batch import PixelPool, RayBatch, wanted_pixels
-from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import Space
 from devrf.methods.nsff.fields import FORWARD
 from devrf.scenes.optical_flow import frame_pairs
@@ -36,14 +35,8 @@ class ImagePriors:
             space: the fields' space.
         """
         self._views, self._space = tuple(views), space
-        all_cameras = [view_set.cameras for view_set in views]
-        self.cameras = Cameras(
-            torch.cat([view_set.camera_to_world for view_set in all_cameras]),
-            torch.cat([view_set.focal for view_set in all_cameras]),
-            torch.cat([view_set.center for view_set in all_cameras]),
-            all_cameras[0].width,
-            all_cameras[0].height,
-        )
+        first, *others = (view_set.cameras for view_set in views)
+        self.cameras = first.joined(*others)
         self.neighbour = torch.arange(len(self.cameras))[:, None].repeat(1, 2)
         # The number of each capture's first image.
         self._offsets = [sum(map(len, views[:k])) for k in range(len(views))]
