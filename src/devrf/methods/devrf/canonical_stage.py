@@ -118,10 +118,13 @@ class CanonicalStage(VoxelStage):
         if self.schedule.side != asked.side:
             log.info("schedule.canonical.side: %g is %.4g here", asked.side, self.schedule.side)
         schedule, box = self.schedule, self.scene.bounds.box
+        views = self.scene.training_views(self.images[0])
+        if schedule.first_frames and self.scene.moves and views is self.scene.static.train:
+            log.info("first frames of the dynamic views are not learned from: see Scene.at_rest")
         first = schedule.phase(0)
         possible = possibly_occupied(
             self.scene,
-            self.scene.training_views(self.images[0]),
+            views,
             box.grid_shape(schedule.search_side**3),
             carve=schedule.visual_hull_init,
             min_views=schedule.min_views,
