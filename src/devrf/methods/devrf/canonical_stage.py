@@ -120,7 +120,10 @@ class CanonicalStage(VoxelStage):
         schedule, box = self.schedule, self.scene.bounds.box
         views = self.scene.training_views(self.images[0])
         if schedule.first_frames and self.scene.moves and views is self.scene.static.train:
-            log.info("first frames of the dynamic views are not learned from: see Scene.at_rest")
+            log.info(
+                "schedule.canonical.first_frames: left out, since the dynamic views differ from the "
+                "static ones in size or masks, or are by one camera that moves"
+            )
         first = schedule.phase(0)
         possible = possibly_occupied(
             self.scene,
