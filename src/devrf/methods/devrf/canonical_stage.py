@@ -121,7 +121,7 @@ class CanonicalStage(VoxelStage):
         views = self.scene.training_views(self.images[0])
         if schedule.first_frames and self.scene.moves and views is self.scene.static.train:
             log.info(
-                "schedule.canonical.first_frames: left out, since the dynamic views differ from the "
+                "schedule.canonical.first_frames: left out: the dynamic views differ from the "
                 "static ones in size or masks, or are by one camera that moves"
             )
         first = schedule.phase(0)
