@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping
 import torch
 from torch import Tensor
 
-from devrf.errors import DevrfError
+from devrf.errors import DevrfError, expect
 
 
 def counted_weights(
@@ -21,7 +21,7 @@ def counted_weights(
         key: the config key of the weights, for messages.
 
     Raises:
-        DevrfError: there is no such term, or none counts.
+        DevrfError: there is no such term, a weight is negative, or none counts.
     """
     counted = {name: weight for name, weight in weights.items() if weight}
     for name in sorted(map(str, counted)):
@@ -29,6 +29,7 @@ def counted_weights(
             raise DevrfError(
                 f"{key}: unknown term {name!r}; the terms are {', '.join(sorted(known))}"
             )
+        expect(counted[name] > 0, f"{key}.{name}", "at least 0", counted[name])
     if not counted:
         raise DevrfError(f"{key}: every weight is zero; at least one term must count")
     return counted

@@ -136,6 +136,8 @@ def test_the_loss_weighs_what_counts_and_reports_it_unweighted(prediction):
     assert batch_loss(without, PHOTOMETRIC_TERMS, weights)[1].keys() == {"alpha_mask", "opacity"}
     with pytest.raises(DevrfError, match="loss.fine: unknown term 'colour'.*alpha_mask, color"):
         counted_weights({"colour": 1.0}, PHOTOMETRIC_TERMS, "loss.fine")
+    with pytest.raises(DevrfError, match="loss.fine.color: .*at least 0, not -1"):
+        counted_weights({"color": -1.0}, PHOTOMETRIC_TERMS, "loss.fine")
 
 
 def seen(

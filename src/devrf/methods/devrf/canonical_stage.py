@@ -13,7 +13,7 @@ from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import PixelPool, Pixels
 from devrf.engine.batches import static_pool
 from devrf.engine.learner import ParallelBatch
-from devrf.errors import DevrfError
+from devrf.errors import DevrfError, expect
 from devrf.methods.devrf.architecture import Architecture, fitted_to, resolved_voxels
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.canonical_schedule import CanonicalPhase, CanonicalSchedule
@@ -81,7 +81,8 @@ class CanonicalStage(VoxelStage):
         self.weights, self.tv = {}, {}
         for kind, given in (("search", search_loss), ("fine", fine_loss)):
             weights = dict(given)
-            self.tv[kind] = weights.pop("tv", 0.0)
+            tv = self.tv[kind] = weights.pop("tv", 0.0)
+            expect(tv >= 0, f"loss.{kind}.tv", "at least 0", tv)
             self.weights[kind] = counted_weights(weights, PHOTOMETRIC_TERMS, f"loss.{kind}")
         self.pool: PixelPool | None = None
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from devrf.data.flow import previous_images
 from devrf.engine.active_frames import ActiveFrame, ActiveFrames
 from devrf.engine.frame_store import FrameField
-from devrf.errors import DevrfError
+from devrf.errors import DevrfError, expect
 from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
 from devrf.methods.devrf.losses import MOTION_TERMS, MotionPrediction, total_variation_weight
 from devrf.methods.devrf.voxel_stage import VoxelStage
@@ -128,6 +128,7 @@ class MotionLoss:
             self.terms |= extension.terms
             weights |= extension.weights
         self._tv = loss.get("tv", 0.0)
+        expect(self._tv >= 0, "loss.deformation.tv", "at least 0", self._tv)
         self._extensions, self._schedule = extensions, schedule
         self._others = loss.keys() - {"render"}
         self._check_factors()
