@@ -70,9 +70,7 @@ class SceneDataModule(LightningDataModule, ABC):
 
     def test_dataloader(self) -> DataLoader[Any]:
         """A loader of the positions of the held-out images, one at a time."""
-        assert self.trainer is not None
-        stage: Any = self.trainer.lightning_module
-        held_out = self.scene.capture(stage.scored_capture).test
+        held_out = self.scene.capture(self._stage.scored_capture).test
         return DataLoader(_Positions(len(held_out)), batch_size=None)
 
     def transfer_batch_to_device(
@@ -85,25 +83,23 @@ class SceneDataModule(LightningDataModule, ABC):
         """
         if batch is not None:
             return batch
-        views = tuple(self.training_views(images, device) for images in self._images)
+        views = tuple(self.training_views(images, device) for images in self._stage.images)
         return views if len(views) > 1 else views[0]
 
     def training_views(self, images: ImagesName, device: torch.device) -> Views:
         """The training views called ``images`` on ``device``, moved there at the first call."""
         key = (images, device)
         if key not in self._on_device:
-            needed = set(self._images) if self.trainer is not None else {images}
+            needed = set(self._stage.images) if self.trainer is not None else {images}
             self._on_device = {k: v for k, v in self._on_device.items() if k[0] in needed}
             self._on_device[key] = self.scene.training_views(images).to(device)
         return self._on_device[key]
 
     @property
-    def _images(self) -> tuple[ImagesName, ...]:
-        """What the trainer's stage learns from."""
+    def _stage(self) -> Any:
+        """The stage that the trainer carries out."""
         assert self.trainer is not None
-        stage: Any = self.trainer.lightning_module
-        images: tuple[ImagesName, ...] = stage.images
-        return images
+        return self.trainer.lightning_module
 
 
 class _SameBatch(IterableDataset[None]):

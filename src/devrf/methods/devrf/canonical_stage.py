@@ -13,7 +13,7 @@ from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import PixelPool, Pixels
 from devrf.engine.batches import static_pool
 from devrf.engine.learner import ParallelBatch
-from devrf.errors import DevrfError, expect
+from devrf.errors import DevrfError
 from devrf.methods.devrf.architecture import Architecture, fitted_to, resolved_voxels
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.canonical_schedule import CanonicalPhase, CanonicalSchedule
@@ -22,6 +22,7 @@ from devrf.methods.devrf.free_space import possibly_occupied, view_count_weight
 from devrf.methods.devrf.losses import (
     PHOTOMETRIC_TERMS,
     Prediction,
+    apart_from_total_variation,
     batch_loss,
     total_variation_weight,
 )
@@ -80,10 +81,9 @@ class CanonicalStage(VoxelStage):
         self.sampling = sampling or Sampling()
         self.weights, self.tv = {}, {}
         for kind, given in (("search", search_loss), ("fine", fine_loss)):
-            weights = dict(given)
-            tv = self.tv[kind] = weights.pop("tv", 0.0)
-            expect(tv >= 0, f"loss.{kind}.tv", "at least 0", tv)
-            self.weights[kind] = counted_weights(weights, PHOTOMETRIC_TERMS, f"loss.{kind}")
+            key = f"loss.{kind}"
+            weights, self.tv[kind] = apart_from_total_variation(given, key)
+            self.weights[kind] = counted_weights(weights, PHOTOMETRIC_TERMS, key)
         self.pool: PixelPool | None = None
 
     @property
@@ -175,7 +175,7 @@ class CanonicalStage(VoxelStage):
         assert self.phase is not None
         model, searching = self.scene_model, self.phase.kind == "search"
         occupancy = None if searching else model.occupancy
-        self.pool = static_pool(self.training_views(self.images[0]), model, occupancy)
+        self.pool = static_pool(self.views, model, occupancy)
         if not len(self.pool):
             raise DevrfError(
                 f"the field has become empty by iteration {self.iteration}: check data.background, "
@@ -188,8 +188,7 @@ class CanonicalStage(VoxelStage):
         self._forget_hidden()
         if self.schedule.crop:
             assert self.pool is not None
-            views = self.training_views(self.images[0])
-            crop_to_visible(self.scene_model, self.scene, views, self.pool)
+            crop_to_visible(self.scene_model, self.scene, self.views, self.pool)
         # Cropping leaves a share of the voxels that the field was built for.
         kept = field.base_voxels / round(self.schedule.side**3)
         field.resize(round(phase.voxels * kept))
@@ -269,8 +268,7 @@ class CanonicalStage(VoxelStage):
         per_voxel_lr = None
         if searching:
             points = field.box.grid_points(shape, field.density.values)
-            cameras = self.training_views(self.images[0]).cameras
-            seen = view_count_weight(cameras, self.scene.space.to_world(points))
+            seen = view_count_weight(self.views.cameras, self.scene.space.to_world(points))
             per_voxel_lr = seen[..., None]
         for group, grid in ((0, field.density), (1, field.color)):
             self.optimizer.replace(

@@ -15,13 +15,18 @@ from torch import Tensor
 from devrf.data.flow import previous_images
 from devrf.engine.active_frames import ActiveFrame, ActiveFrames
 from devrf.engine.frame_store import FrameField
-from devrf.errors import DevrfError, expect
+from devrf.errors import DevrfError
 from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
-from devrf.methods.devrf.losses import MOTION_TERMS, MotionPrediction, total_variation_weight
+from devrf.methods.devrf.losses import (
+    MOTION_TERMS,
+    MotionPrediction,
+    apart_from_total_variation,
+    total_variation_weight,
+)
 from devrf.methods.devrf.voxel_stage import VoxelStage
 from devrf.methods.weighted_loss import counted_weights
 from devrf.rendering.output import ColorChange
-from devrf.scenes.scene import CaptureName, Views
+from devrf.scenes.scene import CaptureName
 
 # An unweighted loss term: prediction → ().
 MotionTerm = Callable[[MotionPrediction], Tensor]
@@ -40,11 +45,6 @@ class MotionStage(VoxelStage):
     capture: CaptureName = "dynamic"
     weights: dict[str, float]
     active: ActiveFrames
-
-    @property
-    def views(self) -> Views:
-        """The dynamic training views, on the stage's device."""
-        return self.training_views("dynamic")
 
     @cached_property
     def previous_images(self) -> Tensor:
@@ -123,12 +123,10 @@ class MotionLoss:
             DevrfError: a weight, or a factor of an extension, is of no term.
         """
         self.terms: dict[str, MotionTerm] = dict(MOTION_TERMS)
-        weights = {name: weight for name, weight in loss.items() if name != "tv"}
+        weights, self._tv = apart_from_total_variation(loss, "loss.deformation")
         for extension in extensions:
             self.terms |= extension.terms
             weights |= extension.weights
-        self._tv = loss.get("tv", 0.0)
-        expect(self._tv >= 0, "loss.deformation.tv", "at least 0", self._tv)
         self._extensions, self._schedule = extensions, schedule
         self._others = loss.keys() - {"render"}
         self._check_factors()

@@ -9,6 +9,7 @@ from typing import Literal, TypeVar
 from torch import Tensor
 
 from devrf.data.batch import RayBatch
+from devrf.errors import expect
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.ndc import NormalizedDevice
@@ -130,6 +131,20 @@ def induced_flow(
     """
     position, _ = cameras.project(camera, space.to_world(unwarp_previous(canonical)))
     return position - pixel
+
+
+def apart_from_total_variation(
+    loss: Mapping[str, float], key: str
+) -> tuple[dict[str, float], float]:
+    """The weights of a loss's other terms by name, and ω of its total variation ``tv``.
+
+    Raises:
+        DevrfError: ω, of config key ``key``.tv, is negative.
+    """
+    weights = dict(loss)
+    weight = weights.pop("tv", 0.0)
+    expect(weight >= 0, f"{key}.tv", "at least 0", weight)
+    return weights, weight
 
 
 def total_variation_weight(weight: float, side: int, rays: int) -> float:

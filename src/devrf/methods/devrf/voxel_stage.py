@@ -63,6 +63,12 @@ class VoxelStage(ScheduledStage):
         return self.scene_model.deformation
 
     @property
+    def views(self) -> Views:
+        """The images that are learned from, on the stage's device."""
+        (images,) = self.images
+        return self.training_views(images)
+
+    @property
     def static_shape(self) -> bool:
         """Whether batches are rendered in lists of fixed length."""
         return in_lists(self.scene_model.space, self.scene_model.canonical)

@@ -37,8 +37,8 @@ def crop_to_visible(model: DeVRFModel, scene: Scene, views: Views, pool: PixelPo
     Args:
         model: the scene at rest as learned so far; its field is changed.
         scene: gives space and cameras.
-        views: the static training views, on the model's device.
-        pool: the pixels of ``views`` that the field is learned from.
+        views: what the field is learned from, on the model's device.
+        pool: the pixels of ``views`` that are drawn from.
     """
     space, field = scene.space, model.canonical
     if not isinstance(space, NormalizedDevice):
