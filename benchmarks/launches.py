@@ -244,6 +244,8 @@ def canonical() -> ScheduledStage:
     stage.iteration = int(LATE * stage.total_iterations)
     stage.phase = stage.phase_at(stage.iteration)
     stage.pool = all_pixels(images, torch.arange(len(images), device=META))
+    # Where samples may be is not known here: gradients are counted as read everywhere.
+    stage._look_for_gradients = lambda: None  # type: ignore[method-assign]
     stage.setup_optimizer()
     return stage
 

@@ -70,6 +70,19 @@ def test_the_rate_of_each_voxel_is_scaled(rng: torch.Generator, skip_zero: bool)
     torch.testing.assert_close(moved, factors * run(GridAdam([plain], lr=0.1), plain, grads))
 
 
+def test_outside_the_rows_no_gradient_is_read(rng: torch.Generator) -> None:
+    grads, rows = gradients(rng, 3), torch.tensor([1, 4, 11], dtype=torch.int32)
+    inside = torch.zeros(12, 1, dtype=torch.bool).index_fill_(0, rows.long(), True).view(2, 3, 2, 1)
+    ours, theirs = (torch.zeros(SHAPE, dtype=torch.float64, requires_grad=True) for _ in range(2))
+    some = GridAdam([{"params": [ours], "skip_zero": True, "rows": rows}])
+    every = GridAdam([{"params": [theirs], "skip_zero": True}])
+    run(every, theirs, [grad * inside for grad in grads])
+    assert torch.equal(run(some, ours, grads), theirs) and ours.any()
+    restored = GridAdam([{"params": [ours], "skip_zero": True}])
+    restored.load_state_dict(some.state_dict())
+    assert torch.equal(restored.param_groups[0]["rows"], rows)
+
+
 def test_a_parameter_without_gradient_is_not_moved_and_the_closure_is_called() -> None:
     parameter = torch.ones(1, 1, 1, 1, requires_grad=True)
     other = torch.ones(1, 1, 1, 1, requires_grad=True)

@@ -2,7 +2,7 @@
 
 Each number is read and written once: value, gradient and two moments in, value and two moments
 out. Gradients are zeroed only where they were not zero; with ``SKIP_ZERO`` the moments, too, are
-read and written only there.
+read and written only there, and with ``ROWS`` only these rows are looked at.
 """
 
 from __future__ import annotations
@@ -28,17 +28,21 @@ def adam_step(
     values: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, rule: Any, *, clear: bool
 ) -> None:
     """As devrf.ops.adam_step.adam_step."""
-    length, factors = values.numel(), rule.per_voxel_lr
+    factors, rows = rule.per_voxel_lr, rule.rows
+    channels = 1 if factors is None and rows is None else values.shape[-1]
+    length = values.numel() if rows is None else len(rows) * channels
     launch(
         adam_kernel,
         blocks(length, LARGEST),
         *(values, gradient, mean, square),
-        *(values if factors is None else factors.contiguous(), rule.rate, rule.step),
+        values if factors is None else factors.contiguous(),
+        *(values if rows is None else rows, rule.rate, rule.step),
         *(length, *_numbers(rule)),
         PER_VOXEL_LR=factors is not None,
+        ROWS=rows is not None,
         SKIP_ZERO=rule.skip_zero,
         CLEAR=clear,
-        CHANNELS=1 if factors is None else values.shape[-1],
+        CHANNELS=channels,
         WIDE=_is_wide(values),
         BLOCK=LARGEST,
     )
@@ -175,6 +179,7 @@ def adam_kernel(
     mean,
     square,
     per_voxel_lr,
+    rows,
     rate,
     step,
     length,
@@ -184,6 +189,7 @@ def adam_kernel(
     decay2,
     eps,
     PER_VOXEL_LR: tl.constexpr,
+    ROWS: tl.constexpr,
     SKIP_ZERO: tl.constexpr,
     CLEAR: tl.constexpr,
     CHANNELS: tl.constexpr,
@@ -194,6 +200,9 @@ def adam_kernel(
     program = tl.program_id(0).to(tl.int64) if WIDE else tl.program_id(0)
     at = program * BLOCK + tl.arange(0, BLOCK)
     mask = at < length
+    if ROWS:
+        row = tl.load(rows + at // CHANNELS, mask=mask, other=0)
+        at = (row.to(tl.int64) if WIDE else row) * CHANNELS + at % CHANNELS
     g = tl.load(gradient + at, mask=mask, other=0.0)
     touched = mask & (g != 0.0)
     active = touched if SKIP_ZERO else mask

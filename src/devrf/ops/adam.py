@@ -20,6 +20,7 @@ class GridAdam(torch.optim.Optimizer):
     * ``skip_zero``: an entry whose gradient is exactly zero keeps its value *and its moments*:
       momentum does not move a voxel that no sample of this batch touched. Its gradient stays in the
       same memory: to make one anew takes longer than to clear the few rows that were touched.
+    * ``rows``: None, or the voxels (K,) outside which no gradient of these grids is read.
     * ``per_voxel_lr``: None, or a tensor (X, Y, Z, 1) of factors of the learning rate.
     * ``smoothing``: weight of the total variation of each grid, whose gradient is added to that
       of the backward pass; ``along_z`` times as much between neighbours along z.
@@ -46,6 +47,7 @@ class GridAdam(torch.optim.Optimizer):
             "eps": eps,
             "skip_zero": False,
             "per_voxel_lr": None,
+            "rows": None,
             "smoothing": 0.0,
             "along_z": 1.0,
             "touched_only": False,
@@ -102,7 +104,8 @@ class GridAdam(torch.optim.Optimizer):
             torch._foreach_add_(steps, 1)
         for number, (group, parameters) in enumerate(zip(self.param_groups, learned, strict=True)):
             rate = group["lr"] if isinstance(group["lr"], Tensor) else self._rates.get(number)
-            options = {name: group[name] for name in ("betas", "eps", "skip_zero", "per_voxel_lr")}
+            names = "betas", "eps", "skip_zero", "per_voxel_lr", "rows"
+            options = {name: group[name] for name in names}
             taken = [self._tensors_of(parameter) for parameter in parameters]
             if not taken:
                 continue
@@ -179,8 +182,10 @@ class GridAdam(torch.optim.Optimizer):
             # torch has converted it to the parameter's type.
             state["steps"] = state["steps"].double()
         for group in self.param_groups:
-            if group["per_voxel_lr"] is not None:
-                group["per_voxel_lr"] = group["per_voxel_lr"].to(group["params"][0].device)
+            group.setdefault("rows", None)  # all of them, as before there was a choice
+            for name in ("per_voxel_lr", "rows"):
+                if group[name] is not None:
+                    group[name] = group[name].to(group["params"][0].device)
 
     def replace(self, group: int, parameters: Sequence[Tensor], **settings: Any) -> None:
         """Give a group other parameters, such as a resized grid, with zero moments.
@@ -188,12 +193,13 @@ class GridAdam(torch.optim.Optimizer):
         Args:
             group: its index.
             parameters: the new parameters.
-            settings: further settings of the group; ``per_voxel_lr`` is None unless given.
+            settings: further settings of the group; ``per_voxel_lr`` and ``rows`` are None unless
+                given.
         """
         for old in self.param_groups[group]["params"]:
             self.state.pop(old, None)
         self.param_groups[group]["params"] = list(parameters)
-        self.param_groups[group].update({"per_voxel_lr": None, **settings})
+        self.param_groups[group].update({"per_voxel_lr": None, "rows": None, **settings})
         self.make_gradients()
 
     def forget(self) -> None:

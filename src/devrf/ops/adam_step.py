@@ -27,6 +27,8 @@ class AdamRule:
         eps: added to the root of the square.
         skip_zero: an entry whose gradient is exactly zero keeps its value *and its moments*.
         per_voxel_lr: None, or factors (X, Y, Z, 1) of the learning rate.
+        rows: None, or with ``skip_zero`` the voxels (K,), int32 and ascending, outside which no
+            gradient is read: it must be zero there.
     """
 
     rate: Tensor
@@ -35,6 +37,7 @@ class AdamRule:
     eps: float = 1e-8
     skip_zero: bool = False
     per_voxel_lr: Tensor | None = None
+    rows: Tensor | None = None
 
 
 def adam_step(
@@ -157,8 +160,10 @@ def _step_touched(
     beta1, beta2 = rule.betas
     channels = values.shape[-1]
     gradients = grad.view(-1, channels)
-    rows = _touched_rows(gradients)
-    g = gradients.index_select(0, rows)
+    looked_at = gradients if rule.rows is None else gradients.index_select(0, rule.rows)
+    rows = _touched_rows(looked_at)
+    g = looked_at.index_select(0, rows)
+    rows = rows if rule.rows is None else rule.rows.index_select(0, rows).long()
     touched = g != 0
     means, squares = mean.view(-1, channels), square.view(-1, channels)
     m, s = means.index_select(0, rows), squares.index_select(0, rows)

@@ -248,13 +248,13 @@ def motion_terms(draw: Draw) -> Results:
 def adam_and_variation(draw: Draw) -> Results:
     """Steps with and without the options; total variation everywhere and where touched."""
     results: list[Tensor] = []
-    for skip_zero in (False, True):
+    some = torch.tensor([0, 7, 8, 31, 59], dtype=torch.int32, device=draw.device)
+    for skip_zero, rows in ((False, None), (True, None), (True, some)):
         grid, gradient = 2 * draw(4, 3, 5, 3), draw(4, 3, 5, 3).clamp(min=0)
         add_total_variation_gradient(grid, gradient, 0.3, along_z=0.5, touched_only=skip_zero)
         factors = draw(4, 3, 5, 1).abs() if skip_zero else None
-        rule = AdamRule(
-            draw(1)[0].abs(), 2 + draw(1)[0].abs(), (0.9, 0.99), 1e-8, skip_zero, factors
-        )
+        rate, step = draw(1)[0].abs(), 2 + draw(1)[0].abs()
+        rule = AdamRule(rate, step, (0.9, 0.99), 1e-8, skip_zero, factors, rows)
         moments = draw(4, 3, 5, 3), draw(4, 3, 5, 3).square() + 0.1
         results.append(gradient.clone())
         adam_step(grid, gradient, *moments, rule)

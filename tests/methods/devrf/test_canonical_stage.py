@@ -197,6 +197,27 @@ def test_a_grown_grid_is_thinned_and_gets_a_new_optimiser(fit):
     assert grown[2:] == [(0, 0), (1.5, 7)]  # what the decoder's weights and biases have
 
 
+@pytest.mark.parametrize("tv", [0.0, 1e-3])
+def test_all_gradients_lie_where_the_optimiser_looks_for_them(fit, tv):
+    looked_at: list[float] = []
+
+    class Watched(CanonicalStage):
+        def prepare(self) -> None:
+            super().prepare()
+            density, color = self.optimizer.param_groups[:2]
+            assert density["rows"] is color["rows"]
+            if (rows := color["rows"]) is not None:
+                looked_at.append(len(rows) / self.scene_model.canonical.density.values.numel())
+            for values in (*density["params"], *color["params"]):
+                assert values.grad is None or not values.grad.any()
+
+    schedule = replace(CARVED, iterations=30, occupancy_every=8, dense_tv_iterations=10)
+    fit(Watched(schedule, SMALL, fine_loss={"color": 1.0, "tv": tv}))
+    # Total variation reaches all voxels in the first ten iterations.
+    assert len(looked_at) == (20 if tv else 30)
+    assert 0 < looked_at[-1] < looked_at[0] < 1
+
+
 def test_the_total_variation_reaches_all_voxels_until_the_schedule_says_so(datamodule, trainer):
     schedule = CanonicalSchedule(0, 8, True, 40, 8, (), rays=16, dense_tv_iterations=20)
     stage = CanonicalStage(schedule, SMALL, fine_loss={"color": 1.0, "tv": 1e-3})

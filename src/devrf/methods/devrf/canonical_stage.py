@@ -280,12 +280,24 @@ class CanonicalStage(VoxelStage):
                 along_z=along_z,
                 touched_only=not self.schedule.smooths_all(self.iteration),
             )
+        self._look_for_gradients()
         decoder, groups = list(field.decoder.parameters()), self.optimizer.param_groups
         learns_them = [id(p) for p in decoder] == [id(p) for p in groups[2]["params"]]
         if self.schedule.restart_at_growth or not learns_them:
             self.optimizer.replace(2, decoder)
         learned = [p for group in groups for p in group["params"]]
         self.bind(rays, [learned])
+
+    def _look_for_gradients(self) -> None:
+        """Have the optimiser read gradients only where samples may be, unless all are smoothed."""
+        field, occupancy = self.scene_model.canonical, self.scene_model.occupancy
+        groups = self.optimizer.param_groups[:2]
+        reached = None
+        if groups[0]["skip_zero"] and (groups[0]["touched_only"] or not groups[0]["smoothing"]):
+            near = occupancy.points_near(field.density.shape, field.box)
+            reached = near.view(-1).nonzero()[:, 0].int()
+        for group in groups:
+            group["rows"] = reached
 
     def prepare(self) -> None:
         """At the schedule's iterations renew the occupancy, smooth less, and learn directions."""
@@ -299,6 +311,8 @@ class CanonicalStage(VoxelStage):
         changed = renews or touched_only != groups[0]["touched_only"]
         for group in groups:
             group["touched_only"] = touched_only
+        if changed:
+            self._look_for_gradients()
         learns = schedule.learns_directions(self.iteration)
         if self.scene_model.canonical.learn_directions(learns) or changed:
             self.loop.recapture()
