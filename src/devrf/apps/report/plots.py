@@ -54,7 +54,8 @@ MARKERS = dict(zip(NAMES, "s^vDPX", strict=True))
 VARIANT = r"-2 ?stage$|-dynamic$| \(base\)$| w/ .*$"
 # Seconds to label on an axis: of these multiples the first that there is room for.
 UNITS = (0.01, 0.1, 1, 10, 60, 600, 3600, 36000, 360000, math.inf)
-MULTIPLES, MOST_TICKS = ((1, 1.5, 2, 3, 4, 6), (1, 2, 5), (1, 3), (1,)), 6
+MULTIPLES = (1, 1.5, 2, 3, 4, 6), (1, 2, 3, 4, 6), (1, 2, 5), (1, 3), (1,)
+MOST_TICKS = 5
 
 
 class Plot(NamedTuple):
