@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 
 from devrf.apps.fetch import catalogue
 from devrf.apps.report.labels import ABLATIONS
+from devrf.cli.complete import completed
 from devrf.cli.config import config_folder, group_choices
 from devrf.cli.config_check import check_config
 from devrf.cli.context import RunContext
@@ -125,6 +126,12 @@ def test_a_table_compares_rows_that_there_are(composed, table):
     if table != "views_study":  # 12 of the peers, and DeVRF or its five ablations
         assert len(swept.comparison.split(",")) == {"published_table": 17}.get(table, 13)
     assert {*swept.get("data", "procedural").split(",")} <= {*NAMES["data"]}
+
+
+@pytest.mark.parametrize("row", ["devrf", "dnerf", "hypernerf_two_stage", "nsff_dynamic"])
+def test_rows_of_the_table_compose_for_forward_facing_scenes(composed, row):
+    typed = "experiment=comparison_table", "data=procedural_forward", f"comparison={row}"
+    check_config(composed(*completed(typed)))
 
 
 @pytest.mark.parametrize("page", sorted({scene.collection.page for scene in catalogue()}))
