@@ -16,6 +16,7 @@ from harness import parser, report
 
 # isort: split
 import gc
+import math
 import os
 import weakref
 from collections import Counter
@@ -25,6 +26,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
+from unittest.mock import patch
 
 import torch
 from lightning import Trainer
@@ -49,6 +51,7 @@ from devrf.methods.devrf.voxel_stage import field_optimizer
 from devrf.ops.dispatch import using
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.renderer import Renderer
+from devrf.rendering.sample_capacity import SampleCapacity
 from devrf.rendering.sampling import RenderSettings
 from devrf.scenes.scene import OpticalFlow, Views
 
@@ -69,7 +72,7 @@ SILENT = {
     "aten::set_",
     "aten::resize_",
 }
-# What reads a number back; and what is read: a picture's samples, some ten of each pixel.
+# What reads a number back; and a picture's samples, visible and coloured: some ten of each pixel.
 WAITED_FOR, LISTED = "aten::_local_scalar_dense", 10 * PIXELS**2
 # What reads the rows of a table that an index names, and what adds to them.
 LOOKED_UP = {"aten::index", "aten::index_select", "aten::gather", "aten::embedding"}
@@ -302,9 +305,15 @@ def picture(time: float) -> Count:
         scene.deformation = DeformationField(scene.box, clock, voxels=voxels)
         scene.deformation.frames.offload(on_host=False, half=True)
     cameras, renderer = views(1, 1, flow=False).cameras, Renderer(scene, half=True)
-    for shown in (0.5, time):
-        with tracing() as trace:
-            renderer.view(cameras, 0, shown, 1.0)
+
+    def suffices(capacity: SampleCapacity) -> bool:
+        trace.count.waits += 1
+        return not capacity._set_lengths(LISTED, LISTED, waste=math.inf)
+
+    with patch.object(SampleCapacity, "suffices", suffices):
+        for shown in (0.5, time):  # lists are long enough for the second
+            with tracing() as trace:
+                renderer.view(cameras, 0, shown, 1.0)
     return trace.count
 
 

@@ -269,9 +269,15 @@ def test_lists_grow_once_and_stay(moving, tiny_scene, searches, same):
     rays = tiny_scene.dynamic.test.cameras.image_rays(0)
     renderer = ListRenderer(moving.canonical, moving.settings)
     first = renderer.picture(rays, moving.occupancy, None, WHITE)
-    assert searches[0] == 0 and searches[1] > 0 and len(searches) == 2
+    known = list(searches)
+    assert known[0] < known[1] == known[2] and len(known) == 3  # then it knows what is coloured
     same(renderer.picture(rays, moving.occupancy, None, WHITE), first)
-    assert searches[2:] == searches[1:2]
+    assert searches == [*known, known[-1]]
+    few = rays[: len(rays) // 4]
+    renderer.picture(few, moving.occupancy, None, WHITE)
+    assert searches[-1] < known[-1]
+    renderer.picture(few, moving.occupancy, None, WHITE)
+    assert searches[-1] == searches[-2]
 
 
 def test_rays_that_meet_nothing(moving):

@@ -7,7 +7,7 @@ never waits for the device, and can be captured in a CUDA graph.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, dataclass
 from typing import NamedTuple
 
 import torch
@@ -64,11 +64,6 @@ class PackedSamples:
     def overflow(self) -> Tensor:
         """() bool, whether any samples were dropped."""
         return (self.total > len(self.ray)) | (self.steps > self.longest).any()
-
-    def head(self, count: int) -> PackedSamples:
-        """The first ``count`` places of the lists, which hold all samples."""
-        names = "ray", "distance", "points", "significant"
-        return replace(self, **{name: getattr(self, name)[:count] for name in names})
 
 
 class ListedSubset(NamedTuple):

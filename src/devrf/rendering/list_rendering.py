@@ -25,9 +25,6 @@ from devrf.rendering.sample_capacity import SampleCapacity
 from devrf.rendering.sampling import STOP, RenderSettings, Samples, most_steps
 from devrf.system.profiling import span
 
-# Lists are made this much longer than the present picture needs.
-SPARE = 1.25
-
 
 class VoxelField(Protocol):
     """A voxel radiance field, as it is rendered without its stages."""
@@ -147,7 +144,8 @@ class ListRenderer:
 
     def __init__(self, field: VoxelField, settings: RenderSettings, *, half: bool = False) -> None:
         self.field, self.settings, self.half = field, settings, half
-        self._capacity = 0
+        # By the bits of the number of rays: where memory runs out, fewer rays get shorter lists.
+        self._capacities: dict[int, SampleCapacity] = {}
 
     @torch.no_grad()
     def picture(
@@ -158,7 +156,7 @@ class ListRenderer:
         background: Tensor,
         color_change: ColorChange | None = None,
     ) -> RenderedImage:
-        """What rays see.
+        """What rays see. The host waits once, at the end, to know that the lists were long enough.
 
         Args:
             rays: R rays in the field's space.
@@ -168,37 +166,18 @@ class ListRenderer:
             background: (3,) or (R, 3) RGB.
             color_change: q → A_t(q), added to the colours' logits; None: nothing is.
         """
-        field = self.field
-        slices = () if displacement is None else (displacement,)
-        packed = self._search(rays, occupancy, slices)
-        canonical, tau = warped_depth(
-            packed.points,
-            field.raw_density,
-            slices,
-            box=field.box,
-            shift=field.shift,
-            delta=field.step_in_base_voxels(self.settings.step),
-        )
-        weight, left = composite_segments(tau, packed.first)
-        chosen = select_listed(packed, canonical, weight, len(packed.ray))
-        used = int(chosen.total)
-        precision = torch.float16 if self.half and tau.device.type != "cpu" else torch.float32
-        points, ray = chosen.canonical[:used], chosen.ray[:used]
-        residual = None if color_change is None else color_change(points)
-        color = field.rgb(points, rays.viewdirs, ray, precision, residual, chosen.first)
-        listed = chosen.weight[:used], color, chosen.distance[:used], chosen.first
-        image, depth = composite_colors(*listed, left, background)
-        return RenderedImage(color=image, depth=depth, opacity=1 - left)
-
-    def _search(self, rays: Rays, occupancy: Occupancy, slices: Sequence[Tensor]) -> PackedSamples:
-        """The samples that can be seen, in lists without padding."""
-        scene = rays, self.field, occupancy, self.settings, slices
+        if not len(rays):  # padding would repeat one
+            nothing = rays.origins[:, 0]
+            return RenderedImage(rays.origins, nothing, nothing)
+        size, device = len(rays).bit_length(), rays.origins.device
+        capacity = self._capacities.setdefault(size, SampleCapacity(0, device))
+        precision = torch.float16 if self.half and device.type != "cpu" else torch.float32
+        scene = rays, self.field, occupancy, self.settings, background
+        moved = (() if displacement is None else (displacement,)), 0.0
         while True:
-            packed = search(*scene, capacity=self._capacity)
-            total = int(packed.total)
-            if total <= self._capacity:
-                return packed.head(total)
-            self._capacity = int(SPARE * total)
+            seen = render_static(*scene, *moved, capacity, precision, color_change)
+            if capacity.suffices():
+                return RenderedImage(seen.color, seen.depth, opacity=1 - seen.transmittance)
 
 
 def search(

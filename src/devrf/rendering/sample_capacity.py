@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 
 import torch
 from torch import Tensor
@@ -53,6 +54,12 @@ class SampleCapacity:
         self._asked = False
         return self._fit(visible, significant, waste=1)
 
+    def suffices(self) -> bool:
+        """Wait for the recorded numbers; lists that were too short are lengthened, for a retry."""
+        visible, significant = self._needed.tolist()
+        self._needed.zero_()
+        return not self._set_lengths(visible, significant, waste=math.inf)
+
     def poll(self) -> bool:
         """As :meth:`measure`, without waiting: recorded numbers take effect at a later call."""
         if not self._asked:
@@ -71,15 +78,18 @@ class SampleCapacity:
         return self._fit(visible, significant, waste=self.WASTE)
 
     def _fit(self, visible: int, significant: int, waste: float) -> bool:
-        before = self.visible, self.significant
         if visible > self.visible or significant > self.significant:
             if not self.num_short:
                 log.info(
                     "a batch had %d samples, %d of them to be coloured, for %d and %d places: "
                     "samples of the last rays were dropped, and the lists grow",
-                    *(visible, significant, *before),
+                    *(visible, significant, self.visible, self.significant),
                 )
             self.num_short += 1
+        return self._set_lengths(visible, significant, waste)
+
+    def _set_lengths(self, visible: int, significant: int, waste: float) -> bool:
+        before = self.visible, self.significant
         self.visible = self._length(self.visible, visible, waste)
         self.significant = min(self._length(self.significant, significant, waste), self.visible)
         return before != (self.visible, self.significant)

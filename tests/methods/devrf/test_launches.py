@@ -19,7 +19,7 @@ MOST_MEGABYTES = {"canonical": 1500, "deformation": 1220}
 MOST_GIGABYTES = {"canonical": 1.2, "deformation": 1.25}
 FRAMES_AT_REST = {"canonical": 0.0, "deformation": 50 * 2 * 160**3 * 6 / 1e9}
 # A film's pictures: at a time whose displacements are known, and at a new one.
-PICTURES = {"picture, known time": 30, "picture, new time": 77}
+PICTURES = {"picture, known time": 33, "picture, new time": 80}
 
 
 @pytest.fixture
@@ -44,4 +44,4 @@ def test_an_iteration_launches_no_more_than_it_did(launches: Any, stage: str) ->
 def test_a_picture_launches_no_more_than_it_did(launches: Any, picture: str) -> None:
     count = launches.traced(picture)
     assert 0 < count.triton.total() < count.launches <= PICTURES[picture]
-    assert count.waits == 2  # for the numbers of samples listed, and coloured
+    assert count.waits == 1  # after all, to know that the lists were long enough
