@@ -132,6 +132,20 @@ def scenes(tmp_path_factory) -> Path:
         ("data.root=hook method=dnerf", "data=auto data.root=hook method=dnerf protocol=dynamic"),
         ("data.root=hook method=devrf", "data=auto data.root=hook method=devrf"),
         ("data.root=wall method=dnerf", "data=auto data.root=wall method=dnerf"),
+        # Where no experiment says how DeVRF learns, the scene's facing does.
+        ("data.root=wall method=devrf", "data=auto data.root=wall method=devrf facing=forward"),
+        (
+            "experiment=comparison_table data.root=phone",
+            "data=auto experiment=comparison_table data.root=phone facing=forward",
+        ),
+        (
+            "experiment=comparison_table data.root=walker",
+            "data=auto experiment=comparison_table data.root=walker",
+        ),
+        (
+            "experiment=quickstart data.root=wall",
+            "data=auto experiment=quickstart_forward data.root=wall",
+        ),
         ("experiment=best_small", "experiment=best_small"),
         ("experiment=paper", "experiment=paper_inward"),
         ("experiment=cpu_small,best_small", "experiment=cpu_small,best_small"),
@@ -143,7 +157,10 @@ def scenes(tmp_path_factory) -> Path:
         # The reader.
         ("data.root=walker", "data=auto data.root=walker"),
         ("+data.root=walker seed=1", "data=auto +data.root=walker seed=1"),
-        ("data.root=x experiment=peer_small", "data=auto data.root=x experiment=peer_small"),
+        (
+            "data.root=walker experiment=peer_small",
+            "data=auto data.root=walker experiment=peer_small",
+        ),
         ("data.root=x experiment=nonsense", "data=auto data.root=x experiment=nonsense"),
         ("data.root=walker data=nerfstudio", "data.root=walker data=nerfstudio"),
     ],
@@ -158,6 +175,13 @@ def test_a_sweep_over_scenes_that_need_different_forms_is_refused(devrf, scenes)
     outcome = devrf("-m", "experiment=best_small", roots)
     assert outcome.status == 2 and outcome.err.count("\n") == 1
     assert "experiment=best_small and experiment=best_small_forward" in outcome.err
+
+
+def test_methods_are_compared_on_scenes_of_one_facing(devrf, scenes):
+    roots = f"data.root={scenes}/walker,{scenes}/wall"
+    outcome = devrf("experiment=comparison_table", roots)
+    assert outcome.status == 2 and outcome.err.startswith("devrf: data.root: DeVRF has other")
+    assert outcome.err.count("\n") == 1
 
 
 def test_data_auto_has_the_options_of_all_readers():

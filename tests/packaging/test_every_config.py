@@ -131,7 +131,21 @@ def test_a_table_compares_rows_that_there_are(composed, table):
 @pytest.mark.parametrize("row", ["devrf", "dnerf", "hypernerf_two_stage", "nsff_dynamic"])
 def test_rows_of_the_table_compose_for_forward_facing_scenes(composed, row):
     typed = "experiment=comparison_table", "data=procedural_forward", f"comparison={row}"
-    check_config(composed(*completed(typed)))
+    config = composed(*completed(typed))
+    check_config(config)
+    if row == "devrf":
+        usual = composed("experiment=quickstart_forward")
+        for group in ("field", "schedule", "sampling", "loss"):
+            assert config[group] == usual[group], group
+
+
+@pytest.mark.parametrize(("facing", "planes"), [("inward", None), ("forward", 128)])
+def test_the_settings_of_a_facing(composed, facing, planes):
+    paper = composed("comparison=devrf_paper", "data=colmap", "data.root=x", f"facing={facing}")
+    usual = composed("data=colmap", "data.root=x", f"facing={facing}")
+    assert paper.field.planes == planes
+    assert usual.field.planes == (planes and 48)
+    assert usual.loss.fine.tv == paper.loss.fine.tv == (1e-5 if planes else 0)
 
 
 @pytest.mark.parametrize("page", sorted({scene.collection.page for scene in catalogue()}))

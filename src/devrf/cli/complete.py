@@ -4,6 +4,7 @@
 * A run that is named (``ckpt=``, ``hydra.run.dir=``, ``hydra.sweep.dir=``) brings the overrides
   that it was learned with. What is typed comes after them: only that differs.
 * ``experiment=NAME`` is taken in its form for the scene: ``best_small_forward``, ``paper_lego``.
+* Where nothing chooses a schedule, ``facing=forward`` says what the scene's files do.
 * A key of a level is added where the schedule's files do not name it.
 * A scene's folder without a reader gets ``data=auto``: the reader that fits its files.
 """
@@ -67,7 +68,8 @@ def completed(arguments: Sequence[str]) -> list[str]:
     both = parsed([*before, *texts])
     experiments = values(both, "experiment")
     if values(both, "data.root") and not any(override.key_or_group == "data" for override in both):
-        if not any(map(_reads_files, experiments)):
+        readers = {reader_of(_chosen_by(name, "data") or "procedural") for name in experiments}
+        if readers <= {*EMBEDDED}:
             before.append("data=auto")
         elif len(experiments) > 1:
             # Hydra composes a sweep once without what is swept: these keys are unknown there.
@@ -105,8 +107,9 @@ def _in_form(texts: list[str], before: Sequence[str]) -> list[str]:
     of ``best_small`` with an embedded scene ``best_small_embedded``. Of a sweep over scenes with
     settings of their own, ``experiment=paper data=lego,plant``, it is one over such experiments,
     which name their data. Without an experiment a forward-facing scene from disk has
-    ``best_small_forward``; other methods learn D-NeRF's kind of scene by ``protocol=dynamic``. What
-    a named run was learned with has its form already, and its scene may be gone.
+    ``best_small_forward``, in a comparison the settings of ``facing=forward``; other methods learn
+    D-NeRF's kind of scene by ``protocol=dynamic``. What a named run was learned with has its form
+    already, and its scene may be gone.
 
     Raises:
         DevrfError: a sweep's scenes need different forms.
@@ -118,7 +121,10 @@ def _in_form(texts: list[str], before: Sequence[str]) -> list[str]:
     default = fresh and not names and not chosen & {"method", "comparison", "field", "schedule"}
     peer = fresh and value(both, "method") not in (None, "devrf")
     formed = any(other.startswith(f"{name}_") for name in names for other in known)
-    if not (default or peer or formed):
+    scheduled = chosen & {"facing", "schedule"} or any(_chosen_by(n, "schedule") for n in names)
+    readable = set(names) <= known and not any("${" in root for root in roots)
+    by_facing = fresh and readable and not (default or peer or formed or scheduled)
+    if not (default or peer or formed or by_facing):
         return texts
     from devrf.data.kind import ONE_CAMERA, kind_of  # loads torch
 
@@ -129,6 +135,14 @@ def _in_form(texts: list[str], before: Sequence[str]) -> list[str]:
     ]
     if peer and not chosen & {"protocol", "comparison"} and all(ONE_CAMERA in k for k in scenes):
         texts = [*texts, "protocol=dynamic"]
+    faced = {kinds[-1] for kinds in scenes if by_facing}
+    if len(faced) > 1:
+        raise DevrfError(
+            "data.root: DeVRF has other settings for forward-facing scenes than for inward-facing "
+            "ones; sweep over the scenes of each apart"
+        )
+    if faced == {"forward"}:
+        texts = [*texts, "facing=forward"]
     if not names:
         forward = default and all("forward" in kinds for kinds in scenes)
         return [*texts, "experiment=best_small_forward"] if forward else texts
@@ -150,13 +164,14 @@ def _in_form(texts: list[str], before: Sequence[str]) -> list[str]:
     return [form if text.startswith("experiment=") else text for text in texts]
 
 
-def _reads_files(experiment: str) -> bool:
-    """Whether an experiment chooses a reader of files itself."""
+def _chosen_by(experiment: str, group: str) -> str | None:
+    """The option of a group that an experiment chooses, if it does."""
     defaults = defaults_of("experiment", experiment)
     for entry in defaults:
-        if not isinstance(entry, str) and "override /data" in entry:
-            return reader_of(entry["override /data"]) not in EMBEDDED
-    return any(_reads_files(entry) for entry in defaults if isinstance(entry, str))
+        if not isinstance(entry, str) and f"override /{group}" in entry:
+            return str(entry[f"override /{group}"])
+    below = (_chosen_by(entry, group) for entry in defaults if isinstance(entry, str))
+    return next((option for option in below if option), None)
 
 
 def with_recognised_data(config: DictConfig) -> DictConfig:

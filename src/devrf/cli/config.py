@@ -104,9 +104,10 @@ def reader_of(option: str) -> str:
     return reader_of(below[0]) if below else option
 
 
-def facing(option: str) -> str:
-    """Whether the scenes of ``data=OPTION`` are ``forward`` or ``inward``, as far as known."""
-    return "forward" if "forward" in reader_of(option) else "inward"
+def by_facing(facing: str, option: str, inward: str = "inward", forward: str = "forward") -> str:
+    """The choice for a scene that is ``facing``; ``auto``: for those of ``data=OPTION``."""
+    known = reader_of(option) if facing == "auto" else facing
+    return forward if "forward" in known else inward
 
 
 def scene_name(data: Any) -> str:
@@ -181,7 +182,8 @@ def register_config() -> None:
 
     Each row of a file in ``conf/rows`` is a choice of the group that the file is named after.
     """
-    for word in (facing, scene_name, run_name, run_folder, config_record, job_folder, tracked_name):
+    words = by_facing, scene_name, run_name, run_folder, config_record, job_folder, tracked_name
+    for word in words:
         OmegaConf.register_new_resolver(f"devrf.{word.__name__}", word, replace=True)
     store = ConfigStore.instance()
     # Hydra copies its sources, the store among them, for each group that --help lists.
