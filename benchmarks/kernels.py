@@ -180,7 +180,10 @@ def operations(side: int, rays: int, device: torch.device) -> Mapping[str, Calla
         **{f"listed_colors {name}": colors_in(kind) for name, kind in precisions.items()},
         "motion_sum": with_gradients(motion, slices, points[:colored], depth[:colored]),
         "photometric_sum": with_gradients(photometric, colors[:rays], left, colors[:colored]),
-        "composite_segments": with_gradients(lambda tau: composite_segments(tau, first)[0], depth),
+        # Weights that differ: their sum alone hardly depends on what opaque rays pass.
+        "composite_segments": with_gradients(
+            lambda tau: composite_segments(tau, first)[0] * points[:, 0], depth
+        ),
         "composite_colors": with_gradients(
             lambda weights, colors: composite_colors(weights, colors, depth, first, left, left[:3])[
                 0
