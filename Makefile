@@ -5,7 +5,8 @@
 # make gpu-check    install into .venv and check what this machine's GPU does, in minutes;
 #                   with INSTALL_FIRST=no by $(PYTHON) and the packages that it has
 # make fuzz         what is too long for make test: the readers' fuzz tests with 100 000 inputs
-#                   (make test has 60), every launch of the kernels compiled for two GPUs
+#                   (make test has 60), every launch of the kernels compiled for four GPUs, and
+#                   whole runs on a GPU that is not there
 # make format       format the code and mend what the linter can
 # make shell        a shell in which .venv is active
 # make clean        remove .venv and everything that tools leave behind
