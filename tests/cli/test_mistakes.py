@@ -15,6 +15,10 @@ from devrf.cli.run import STEPS as TAKEN
 # Arguments, and what the one line must name.
 MISTAKES = {
     "misspelt key": (["data.widht=3"], "data.widht: no such key; did you mean data.width?"),
+    "key of other scenes": (
+        ["data=inward", "data.root=scene", "data.scene_seed=3"],
+        "data.scene_seed: no such key; it belongs to data=procedural, procedural_forward",
+    ),
     "appended unknown root key": (["+sede=3"], "sede: no such key; did you mean seed?"),
     "forward-facing field of an inward-facing scene": (
         ["field=forward_small", "stage=canonical"],

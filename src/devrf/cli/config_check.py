@@ -16,6 +16,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 
+from devrf.cli.config import config_folder
 from devrf.errors import DevrfError, did_you_mean
 
 # Keys outside the parts.
@@ -160,7 +161,11 @@ def unknown_key(where: str, known: Iterable[object]) -> DevrfError:
             return DevrfError(f"{where}: renamed; write {new}{where.removeprefix(old)}=VALUE")
     name = where.rpartition(".")[2]
     meant = did_you_mean(name, (k for k in known if k != "**"), where[: -len(name)])
-    return DevrfError(f"{where}: no such key{meant or '; --cfg job shows every key there is'}")
+    group = where.removesuffix(f".{name}")
+    files = sorted((config_folder() / group).glob("*.yaml"))
+    having = ", ".join(path.stem for path in files if name in OmegaConf.load(path))
+    instead = f"it belongs to {group}={having}" if having else "--cfg job shows every key there is"
+    return DevrfError(f"{where}: no such key{meant or f'; {instead}'}")
 
 
 def unfit(value: object, hint: Any) -> str:
