@@ -26,7 +26,7 @@ def main() -> None:
     print_row("modules beside the folders", SOURCE.glob("*.py"))
     print_row("all of src/devrf", sources)
     print_row("tests", (REPOSITORY / "tests").rglob("*.py"))
-    print_row("conf, YAML", (REPOSITORY / "conf").rglob("*.yaml"))
+    print_row("conf, YAML", (REPOSITORY / "conf").rglob("*.y*ml"))
 
     print("\nThe longest files")
     for path in sorted(sources, key=num_lines, reverse=True)[:10]:

@@ -124,7 +124,7 @@ def quick_composition() -> Iterator[None]:
     known: dict[tuple[str, str], ConfigResult] = {}
     files_of_sweeps = {
         file.stem
-        for file in config_folder().rglob("*.yaml")
+        for file in config_folder().rglob("*.y*ml")
         if "mode: MULTIRUN" in file.read_text()
     }
 

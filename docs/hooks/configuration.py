@@ -38,7 +38,7 @@ def reference() -> str:
         str(path.relative_to(ROWS).with_suffix(""))
         if path.is_relative_to(ROWS)
         else str(path.parent.relative_to(CONF))
-        for path in CONF.glob("*/**/*.yaml")
+        for path in CONF.glob("*/**/*.y*ml")
     }
     ordered = sorted(
         groups.difference(INTERNAL),
@@ -68,7 +68,7 @@ def keys_of_a_run(config: str) -> str:
 
 def section(group: str, default: str) -> str:
     """One group: a row for each choice, then its files as they are."""
-    table = ROWS / f"{group}.yaml"
+    table = ROWS / f"{group}.yml"
     files = sorted((CONF / group).glob("*.yaml"))
     choices = {path.stem: header(path) for path in files}
     if table.is_file():

@@ -101,7 +101,7 @@ def dotted(value: object, prefix: str = "") -> Iterator[str]:
 def test_generated_tables_hold_every_choice():
     hook = load_hook("configuration")
     page = hook.reference()
-    for path in sorted(hook.CONF.glob("*/**/*.yaml")):
+    for path in sorted(hook.CONF.glob("*/**/*.y*ml")):
         assert hook.header(path), f"{path} does not begin with a comment that says what it is"
     for group, names in group_choices().items():
         assert group in hook.INTERNAL or all(f"`{name}`" in page for name in names)

@@ -69,7 +69,7 @@ def environment(tmp_path_factory, wheel) -> Path:
 
 def test_the_wheel_has_code_configs_plugin_and_licence(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
-    configs = {p.relative_to(config_folder()) for p in config_folder().rglob("*.yaml")}
+    configs = {p.relative_to(config_folder()) for p in config_folder().rglob("*.y*ml")}
     assert {f"devrf/conf/{path.as_posix()}" for path in configs} <= names
     assert "devrf/__main__.py" in names and "devrf/py.typed" in names
     assert "devrf/apps/report/published.toml" in names

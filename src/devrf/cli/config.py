@@ -51,8 +51,8 @@ def config_folder() -> Path:
 
 @cache
 def rows(group: str) -> DictConfig:
-    """The choices of a group that are rows of one file, ``conf/rows/GROUP.yaml``, by name."""
-    path = config_folder() / "rows" / f"{group}.yaml"
+    """The choices of a group that are rows of one file, ``conf/rows/GROUP.yml``, by name."""
+    path = config_folder() / "rows" / f"{group}.yml"
     return OmegaConf.load(path) if path.is_file() else OmegaConf.create()  # type: ignore[return-value]
 
 
@@ -60,13 +60,18 @@ def group_choices() -> dict[str, list[str]]:
     """The names that each ``group=NAME`` takes: its files, and its rows."""
     names: dict[str, list[str]] = {}
     for path in sorted(config_folder().glob("*/**/*.yaml")):
-        place = path.relative_to(config_folder())
-        if place.parts[0] == "rows":
-            group = place.relative_to("rows").with_suffix("").as_posix()
-            names.setdefault(group, []).extend(map(str, rows(group)))
-        else:
-            names.setdefault(place.parent.as_posix(), []).append(path.stem)
+        place = path.parent.relative_to(config_folder())
+        names.setdefault(place.as_posix(), []).append(path.stem)
+    for group in groups_of_rows():
+        names.setdefault(group, []).extend(map(str, rows(group)))
     return names
+
+
+def groups_of_rows() -> list[str]:
+    """The groups whose choices are rows of a file; Hydra, which lists ``*.yaml``, sees none."""
+    folder = config_folder() / "rows"
+    files = sorted(folder.rglob("*.yml"))
+    return [path.relative_to(folder).with_suffix("").as_posix() for path in files]
 
 
 def without_form(name: str) -> str:
@@ -188,10 +193,9 @@ def register_config() -> None:
     store = ConfigStore.instance()
     # Hydra copies its sources, the store among them, for each group that --help lists.
     store.__deepcopy__ = lambda memo: ConfigStore.instance()  # type: ignore[attr-defined]
-    folder = config_folder() / "rows"
-    for path in sorted(folder.rglob("*.yaml")):
-        group = path.relative_to(folder).with_suffix("").as_posix()
-        at_root = path.read_text("utf-8").startswith("# @package _global_")
+    for group in groups_of_rows():
+        text = (config_folder() / "rows" / f"{group}.yml").read_text("utf-8")
+        at_root = text.startswith("# @package _global_")
         for name, row in rows(group).items():
             package = "_global_" if at_root else None
             store.store(str(name), row, group, package, "devrf")
