@@ -16,7 +16,6 @@ from harness import parser, report
 
 # isort: split
 import gc
-import math
 import os
 import weakref
 from collections import Counter
@@ -308,7 +307,7 @@ def picture(time: float) -> Count:
 
     def suffices(capacity: SampleCapacity) -> bool:
         trace.count.waits += 1
-        return not capacity._set_lengths(LISTED, LISTED, waste=math.inf)
+        return not capacity._set_lengths(LISTED, LISTED, capacity.WASTE)
 
     with patch.object(SampleCapacity, "suffices", suffices):
         for shown in (0.5, time):  # lists are long enough for the second

@@ -3,7 +3,8 @@
 Tensors of the device say that they are on it, and are computed on the CPU. What a GPU refuses is
 refused: an operation on tensors of both devices, numbers drawn by the other device's generator,
 a tensor of the device as a NumPy array; and, while a captured graph is replayed, whatever waits
-for the device, copies from or to the host, or draws numbers. Triton's kernels run in its
+for the device, copies from or to the host, or draws numbers. A replay runs the Python code again:
+numbers and addresses that a real graph freezes may change unseen. Triton's kernels run in its
 interpreter (``TRITON_INTERPRET=1``), which knows no bfloat16: the device is one without it.
 
 ``LD_PRELOAD`` has to name the library made of ``stand_in_device.cpp``, which tells torch about the
@@ -67,6 +68,7 @@ class OnDevice(Tensor):
         return self.on_host.data_ptr()
 
     def tolist(self) -> Any:
+        waits("tolist")
         return self.on_host.tolist()
 
     def numpy(self, *args: Any, **kwargs: Any) -> Any:
@@ -115,7 +117,7 @@ def computed(func: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
             isinstance(index, Tensor) and index.dtype in (torch.bool, torch.uint8)
             for index in flags
         )
-        crosses = name in ("copy_", "_to_copy") and bool(theirs or to.type == "cpu")
+        crosses = name in MIXING and bool(any(t.dim() for t in theirs) or to.type == "cpu")
         if name in WAITING or sized or crosses:
             raise RuntimeError(f"{name}: not while a graph is replayed")
     elif replaying and to.type == "cuda" and tensors:
@@ -153,6 +155,12 @@ class Generator(torch.Generator):
         return generators[self._cdata]
 
 
+def waits(name: str) -> None:
+    """Refuse what waits for the device while a graph is replayed."""
+    if replaying:
+        raise RuntimeError(f"{name}: not while a graph is replayed")
+
+
 def captured(self: CudaGraphCapture, work: Any) -> Any:
     """A graph whose replay runs the work."""
 
@@ -178,7 +186,7 @@ def device() -> Iterator[None]:
     gib = 2**30
     nothing = dict.fromkeys(("memory_reserved", "memory_allocated"), lambda *_: 0)
     nothing |= dict.fromkeys(("max_memory_allocated", "max_memory_reserved"), lambda *_: 0)
-    does_nothing = ("synchronize", "empty_cache", "set_stream", "set_device", "manual_seed_all")
+    does_nothing = ("empty_cache", "set_stream", "set_device", "manual_seed_all")
     does_nothing += ("manual_seed", "reset_peak_memory_stats", "init", "_lazy_init")
     pretended: dict[str, Any] = {
         **nothing,
@@ -186,6 +194,7 @@ def device() -> Iterator[None]:
         **dict.fromkeys(("stream", "device", "device_of"), lambda *_: nullcontext()),
         **dict.fromkeys(("is_available", "is_initialized"), lambda: True),
         **dict.fromkeys(("Stream", "Event", "current_stream"), MagicMock()),
+        "synchronize": lambda *_: waits("synchronize"),
         "device_count": lambda: 1,
         "current_device": lambda: 0,
         "is_bf16_supported": lambda *_, **__: False,

@@ -17,6 +17,8 @@ import pytest
 import torch
 from torch.utils.cpp_extension import include_paths
 
+from devrf.checkpoints.checkpoint import load_checkpoint
+
 HERE = Path(__file__).parent
 TINY = (
     "data=procedural data.width=12 data.height=12 data.static_views=3 data.frames=3 "
@@ -73,5 +75,17 @@ def test_kernels_and_graphs_learn_on_the_device_what_plain_pytorch_does(
         there = fast["run"]["execution"][stage]
         assert there["kernels"] == "triton" and there["graph_captures"] > 0, stage
         assert plain["run"]["execution"][stage]["kernels"] == "torch"
-    for part in ("static", "dynamic"):
-        assert fast[part]["psnr"] == pytest.approx(plain[part]["psnr"], abs=0.2), part
+    expected, learned = (fields(tmp_path / kernels) for kernels in ("torch", "triton"))
+    for name, values in expected.items():
+        off = (learned[name] - values).abs().mean()
+        assert off <= 0.02 * values.abs().mean() + 1e-6, name
+    assert expected["displacement"].abs().mean() > 1e-3  # in a box of two units
+
+
+def fields(folder: Path) -> dict[str, torch.Tensor]:
+    """What a run has learned: the field at rest, and how it is bent at the last frame."""
+    model: Any = load_checkpoint(folder / "checkpoints/deformation.ckpt").model
+    rest = model.canonical
+    fields = {"density": rest.density.values, "color": rest.color.values}
+    fields |= {f"decoder.{name}": value for name, value in rest.decoder.state_dict().items()}
+    return fields | {"displacement": model.deformation.blended(1.0)}

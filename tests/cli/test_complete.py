@@ -133,6 +133,14 @@ def scenes(tmp_path_factory) -> Path:
         ("data.root=hook method=devrf", "data=auto data.root=hook method=devrf"),
         ("data.root=wall method=dnerf", "data=auto data.root=wall method=dnerf"),
         # Where no experiment says how DeVRF learns, the scene's facing does.
+        ("data.root=wall facing=inward", "data=auto data.root=wall facing=inward"),
+        (
+            "data.root=wall facing=auto schedule=quick",
+            "data=auto data.root=wall schedule=quick facing=forward",
+        ),
+        ("data=forward data.root=wall method=devrf", "data=forward data.root=wall method=devrf"),
+        ("data.root=wall,walker method=nsff", "data=auto data.root=wall,walker method=nsff"),
+        ("stage=report data.root=x", "data=auto stage=report data.root=x"),
         ("data.root=wall method=devrf", "data=auto data.root=wall method=devrf facing=forward"),
         (
             "experiment=comparison_table data.root=phone",
@@ -177,9 +185,9 @@ def test_a_sweep_over_scenes_that_need_different_forms_is_refused(devrf, scenes)
     assert "experiment=best_small and experiment=best_small_forward" in outcome.err
 
 
-def test_methods_are_compared_on_scenes_of_one_facing(devrf, scenes):
-    roots = f"data.root={scenes}/walker,{scenes}/wall"
-    outcome = devrf("experiment=comparison_table", roots)
+@pytest.mark.parametrize("typed", [["experiment=comparison_table"], ["-m"]])
+def test_devrf_learns_scenes_of_one_facing_in_a_sweep(devrf, scenes, typed):
+    outcome = devrf(*typed, f"data.root={scenes}/walker,{scenes}/wall")
     assert outcome.status == 2 and outcome.err.startswith("devrf: data.root: DeVRF has other")
     assert outcome.err.count("\n") == 1
 

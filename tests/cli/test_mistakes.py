@@ -15,6 +15,7 @@ from devrf.cli.run import STEPS as TAKEN
 # Arguments, and what the one line must name.
 MISTAKES = {
     "misspelt key": (["data.widht=3"], "data.widht: no such key; did you mean data.width?"),
+    "no choice of a group": (["method=null"], "method=null: choose one of devrf, dnerf, "),
     "key of other scenes": (
         ["data=inward", "data.root=scene", "data.scene_seed=3"],
         "data.scene_seed: no such key; it belongs to data=procedural, procedural_forward",

@@ -273,6 +273,11 @@ def test_lists_grow_once_and_stay(moving, tiny_scene, searches, same):
     assert known[0] < known[1] == known[2] and len(known) == 3  # then it knows what is coloured
     same(renderer.picture(rays, moving.occupancy, None, WHITE), first)
     assert searches == [*known, known[-1]]
+    # Much too long ones are shortened for the next picture.
+    up = torch.tensor([[0.0, 0.0, 1.0]]).expand(len(rays), 3)
+    renderer.picture(Rays(50 + 0 * up, up, up), moving.occupancy, None, WHITE)
+    same(renderer.picture(rays, moving.occupancy, None, WHITE), first)
+    assert searches[len(known) + 1 :] == [known[-1], *known]
     few = rays[: len(rays) // 4]
     renderer.picture(few, moving.occupancy, None, WHITE)
     assert searches[-1] < known[-1]

@@ -8,6 +8,7 @@ import logging
 import shutil
 import tomllib
 import zipfile
+import zlib
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -281,7 +282,7 @@ def _unpacked(scene: PublishedScene, work: Path) -> Path:
     try:
         with zipfile.ZipFile(archive) as packed:
             packed.extractall(place)  # what would be written elsewhere is written there
-    except (zipfile.BadZipFile, EOFError) as error:
+    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
         raise DevrfError(
             f"{archive}: cannot be unpacked ({error}); remove it, and the same command fetches it "
             "again"

@@ -21,6 +21,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
+from devrf.cli.config import by_facing as by_name
 from devrf.cli.config import config_folder, defaults_of, group_choices, overrides, reader_of
 from devrf.cli.messages import in_quotes
 from devrf.cli.restore_config import of_named_run, parsed, value, values
@@ -37,6 +38,9 @@ PATHS = {
 SHORTHAND = {f"viewer={value}": f"viewer.training={value}" for value in ("true", "false")}
 KEY_VALUE = re.compile(r"(\+{0,2}([\w./@-]+)=)(.*)", re.DOTALL)
 
+# Stages that look at no scene; and what beside an experiment says how one is learned.
+READ_NO_SCENE = {"report", "fetch", "capture", "selfcheck"}
+OF_A_FORM = {"method", "comparison", "facing", "field", "schedule"}
 # Readers of the embedded scenes, and what an experiment's form for them is called after.
 EMBEDDED = {"procedural": ["embedded", "inward"], "procedural_forward": ["forward"]}
 LEVELS = "schedule.deformation.levels."
@@ -49,8 +53,8 @@ def completed(arguments: Sequence[str]) -> list[str]:
     """The command line that Hydra composes for what was typed, without the program's name.
 
     Raises:
-        DevrfError: a scene's folder cannot be recognised, or an experiment has no one form for all
-            scenes of a sweep.
+        DevrfError: a scene's folder cannot be recognised, an experiment has no one form for all
+            scenes of a sweep, or a group's choice is null.
     """
     multirun = not {"-m", "--multirun"}.isdisjoint(arguments)
     words = [quoted_path(SHORTHAND.get(word.lower(), word), multirun) for word in arguments]
@@ -62,6 +66,12 @@ def completed(arguments: Sequence[str]) -> list[str]:
         return words
     if not typed:
         return words
+    for override in typed:
+        options = group_choices().get(override.key_or_group, ())
+        if options and override.value() is None and not override.is_delete():
+            raise DevrfError(
+                f"{override.input_line}: choose one of {', '.join(options)}, or leave it out"
+            )
     before = of_named_run(typed, multirun)
     # A level that only the chosen schedule has need not name every key.
     texts = [f"++{text}" if text.startswith(LEVELS) else text for text in _in_form(texts, before)]
@@ -116,14 +126,17 @@ def _in_form(texts: list[str], before: Sequence[str]) -> list[str]:
     """
     both = parsed([*before, *texts])
     names, known = values(parsed(texts), "experiment"), set(group_choices()["experiment"])
-    roots, chosen = values(both, "data.root"), {override.key_or_group for override in both}
-    fresh = bool(roots) and not before
-    default = fresh and not names and not chosen & {"method", "comparison", "field", "schedule"}
+    chosen = {o.key_or_group for o in both if (o.key_or_group, o.value()) != ("facing", "auto")}
+    roots, stage = values(both, "data.root"), value(both, "stage")
+    fresh = bool(roots) and not before and stage not in READ_NO_SCENE
+    default = fresh and not names and not chosen & OF_A_FORM
     peer = fresh and value(both, "method") not in (None, "devrf")
     formed = any(other.startswith(f"{name}_") for name in names for other in known)
-    scheduled = chosen & {"facing", "schedule"} or any(_chosen_by(n, "schedule") for n in names)
+    scheduled = "facing" in chosen or any(_chosen_by(name, "schedule") for name in names)
     readable = set(names) <= known and not any("${" in root for root in roots)
-    by_facing = fresh and readable and not (default or peer or formed or scheduled)
+    methods = values(both, "comparison") or values(both, "method") or ["devrf"]
+    ours = any(method.startswith("devrf") for method in methods)
+    by_facing = fresh and readable and ours and not (formed or scheduled)
     if not (default or peer or formed or by_facing):
         return texts
     from devrf.data.kind import ONE_CAMERA, kind_of  # loads torch
@@ -135,17 +148,20 @@ def _in_form(texts: list[str], before: Sequence[str]) -> list[str]:
     ]
     if peer and not chosen & {"protocol", "comparison"} and all(ONE_CAMERA in k for k in scenes):
         texts = [*texts, "protocol=dynamic"]
-    faced = {kinds[-1] for kinds in scenes if by_facing}
-    if len(faced) > 1:
+    faced = {kinds[-1] for kinds in scenes}
+    # Whether files tell what the options of `data` do not.
+    untold = by_facing and any(by_name("auto", kinds[0]) != kinds[-1] for kinds in scenes)
+    if untold and len(faced) > 1:
         raise DevrfError(
             "data.root: DeVRF has other settings for forward-facing scenes than for inward-facing "
             "ones; sweep over the scenes of each apart"
         )
-    if faced == {"forward"}:
-        texts = [*texts, "facing=forward"]
+    if default:
+        return [*texts, "experiment=best_small_forward"] if faced == {"forward"} else texts
+    if untold:
+        texts = [*(text for text in texts if text != "facing=auto"), "facing=forward"]
     if not names:
-        forward = default and all("forward" in kinds for kinds in scenes)
-        return [*texts, "experiment=best_small_forward"] if forward else texts
+        return texts
     # The most specific form; the name itself where it has none.
     forms = [
         [next((f"{n}_{kind}" for kind in kinds if f"{n}_{kind}" in known), n) for n in names]

@@ -131,7 +131,8 @@ def scene_folder_name(scene: str) -> str:
 def run_name(experiment: str | None, ablation: str | None, method: str, protocol: str) -> str:
     """The run's folder name: the experiment, and what else was chosen beside the usual.
 
-    Without an experiment the config is that of ``experiment=quickstart``: they are one run.
+    Without an experiment the config is that of ``experiment=quickstart``, or of its form for the
+    scene: they are one run.
     """
     parts = [experiment or "quickstart"]
     if ablation not in (None, "full"):

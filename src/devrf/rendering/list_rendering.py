@@ -170,13 +170,15 @@ class ListRenderer:
             nothing = rays.origins[:, 0]
             return RenderedImage(rays.origins, nothing, nothing)
         size, device = len(rays).bit_length(), rays.origins.device
-        capacity = self._capacities.setdefault(size, SampleCapacity(0, device))
+        if (capacity := self._capacities.pop(size, None)) is None:
+            capacity = SampleCapacity(0, device)
         precision = torch.float16 if self.half and device.type != "cpu" else torch.float32
         scene = rays, self.field, occupancy, self.settings, background
         moved = (() if displacement is None else (displacement,)), 0.0
         while True:
             seen = render_static(*scene, *moved, capacity, precision, color_change)
             if capacity.suffices():
+                self._capacities[size] = capacity  # begun anew where memory ran out before
                 return RenderedImage(seen.color, seen.depth, opacity=1 - seen.transmittance)
 
 

@@ -55,10 +55,13 @@ class SampleCapacity:
         return self._fit(visible, significant, waste=1)
 
     def suffices(self) -> bool:
-        """Wait for the recorded numbers; lists that were too short are lengthened, for a retry."""
+        """Wait for the recorded numbers; False if a list was too short: it is longer now."""
         visible, significant = self._needed.tolist()
         self._needed.zero_()
-        return not self._set_lengths(visible, significant, waste=math.inf)
+        enough: bool = visible <= self.visible and significant <= self.significant
+        # Of a list that was too short the significant samples are not all known.
+        self._set_lengths(visible, significant, self.WASTE if enough else math.inf)
+        return enough
 
     def poll(self) -> bool:
         """As :meth:`measure`, without waiting: recorded numbers take effect at a later call."""
