@@ -202,7 +202,9 @@ def device() -> Iterator[None]:
         "get_device_capability": lambda *_: (7, 5),
         "get_device_name": lambda *_: "a device that is not there",
         "mem_get_info": lambda *_: (16 * gib, 16 * gib),
-        "cudart": MagicMock(),
+        "cudart": lambda: SimpleNamespace(
+            cudaHostRegister=lambda *_: 0, cudaHostUnregister=lambda *_: 0
+        ),
         "get_rng_state": lambda *_: default.get_state(),
         "set_rng_state": lambda state, *_: default.set_state(state),
         "get_rng_state_all": lambda: [default.get_state()],

@@ -21,15 +21,16 @@ from devrf.checkpoints.checkpoint import load_checkpoint
 
 HERE = Path(__file__).parent
 TINY = (
-    "data=procedural data.width=12 data.height=12 data.static_views=3 data.frames=3 "
-    "data.static_test_views=1 video.frames=2 video.height=16 "
+    "experiment=paper_inward data=procedural data.width=12 data.height=12 data.static_views=3 "
+    "data.frames=3 data.static_test_views=1 video.frames=2 video.height=16 "
     "schedule.canonical.visual_hull_init=true schedule.canonical.search_iterations=0 "
     "schedule.canonical.iterations=12 schedule.canonical.upsample_at=[6] "
     "schedule.canonical.side=10 schedule.canonical.search_side=8 schedule.canonical.rays=24 "
     "schedule.deformation.rays=24 schedule.deformation.levels.1.side=4 "
     "schedule.deformation.levels.1.iterations=6 schedule.deformation.levels.2.side=8 "
     "schedule.deformation.levels.2.iterations=6 schedule.deformation.levels.2.parallel_frames=2 "
-    "schedule.deformation.levels.3=null"
+    "schedule.deformation.levels.3=null schedule.deformation.levels.4=null "
+    "schedule.deformation.levels.5=null schedule.canonical.density_drop=0"
 ).split()
 pytestmark = [
     pytest.mark.skipif(os.environ.get("DEVRF_ALL_LAUNCHES") != "1", reason="takes minutes"),
@@ -79,7 +80,7 @@ def test_kernels_and_graphs_learn_on_the_device_what_plain_pytorch_does(
     for name, values in expected.items():
         off = (learned[name] - values).abs().mean()
         assert off <= 0.02 * values.abs().mean() + 1e-6, name
-    assert expected["displacement"].abs().mean() > 1e-3  # in a box of two units
+    assert expected["displacement"].abs().mean() > 2e-4  # what is compared is no rounding
 
 
 def fields(folder: Path) -> dict[str, torch.Tensor]:

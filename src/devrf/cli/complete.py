@@ -21,8 +21,14 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
-from devrf.cli.config import by_facing as by_name
-from devrf.cli.config import config_folder, defaults_of, group_choices, overrides, reader_of
+from devrf.cli.config import (
+    by_facing,
+    config_folder,
+    defaults_of,
+    group_choices,
+    overrides,
+    reader_of,
+)
 from devrf.cli.messages import in_quotes
 from devrf.cli.restore_config import of_named_run, parsed, value, values
 from devrf.errors import DevrfError
@@ -136,8 +142,8 @@ def _in_form(texts: list[str], before: Sequence[str]) -> list[str]:
     readable = set(names) <= known and not any("${" in root for root in roots)
     methods = values(both, "comparison") or values(both, "method") or ["devrf"]
     ours = any(method.startswith("devrf") for method in methods)
-    by_facing = fresh and readable and ours and not (formed or scheduled)
-    if not (default or peer or formed or by_facing):
+    facing_counts = fresh and readable and ours and not (formed or scheduled)
+    if not (default or peer or formed or facing_counts):
         return texts
     from devrf.data.kind import ONE_CAMERA, kind_of  # loads torch
 
@@ -150,7 +156,8 @@ def _in_form(texts: list[str], before: Sequence[str]) -> list[str]:
         texts = [*texts, "protocol=dynamic"]
     faced = {kinds[-1] for kinds in scenes}
     # Whether files tell what the options of `data` do not.
-    untold = by_facing and any(by_name("auto", kinds[0]) != kinds[-1] for kinds in scenes)
+    differs = any(by_facing("auto", option) != kinds[-1] for option, *kinds in scenes)
+    untold = facing_counts and differs
     if untold and len(faced) > 1:
         raise DevrfError(
             "data.root: DeVRF has other settings for forward-facing scenes than for inward-facing "
