@@ -18,10 +18,12 @@ from itertools import product
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from devrf.cli.config import (
+    APART,
     by_facing,
     config_folder,
     defaults_of,
@@ -44,8 +46,7 @@ PATHS = {
 SHORTHAND = {f"viewer={value}": f"viewer.training={value}" for value in ("true", "false")}
 KEY_VALUE = re.compile(r"(\+{0,2}([\w./@-]+)=)(.*)", re.DOTALL)
 
-# Stages that look at no scene; and what beside an experiment says how one is learned.
-READ_NO_SCENE = {"report", "fetch", "capture", "selfcheck"}
+# What beside an experiment says how a scene is learned.
 OF_A_FORM = {"method", "comparison", "facing", "field", "schedule"}
 # Readers of the embedded scenes, and what an experiment's form for them is called after.
 EMBEDDED = {"procedural": ["embedded", "inward"], "procedural_forward": ["forward"]}
@@ -73,8 +74,8 @@ def completed(arguments: Sequence[str]) -> list[str]:
     if not typed:
         return words
     for override in typed:
-        options = group_choices().get(override.key_or_group, ())
-        if options and override.value() is None and not override.is_delete():
+        group, is_null = override.key_or_group, override.value() is None
+        if is_null and not override.is_delete() and (options := group_choices().get(group)):
             raise DevrfError(
                 f"{override.input_line}: choose one of {', '.join(options)}, or leave it out"
             )
@@ -134,15 +135,13 @@ def _in_form(texts: list[str], before: Sequence[str]) -> list[str]:
     names, known = values(parsed(texts), "experiment"), set(group_choices()["experiment"])
     chosen = {o.key_or_group for o in both if (o.key_or_group, o.value()) != ("facing", "auto")}
     roots, stage = values(both, "data.root"), value(both, "stage")
-    fresh = bool(roots) and not before and stage not in READ_NO_SCENE
+    fresh = bool(roots) and not before and stage not in APART
     default = fresh and not names and not chosen & OF_A_FORM
     peer = fresh and value(both, "method") not in (None, "devrf")
     formed = any(other.startswith(f"{name}_") for name in names for other in known)
-    scheduled = "facing" in chosen or any(_chosen_by(name, "schedule") for name in names)
     readable = set(names) <= known and not any("${" in root for root in roots)
-    methods = values(both, "comparison") or values(both, "method") or ["devrf"]
-    ours = any(method.startswith("devrf") for method in methods)
-    facing_counts = fresh and readable and ours and not (formed or scheduled)
+    by_scene = fresh and readable and not formed and "facing" not in chosen
+    facing_counts = by_scene and _learns_by_default(both, names)
     if not (default or peer or formed or facing_counts):
         return texts
     from devrf.data.kind import ONE_CAMERA, kind_of  # loads torch
@@ -185,6 +184,13 @@ def _in_form(texts: list[str], before: Sequence[str]) -> list[str]:
         )
     form = f"experiment={','.join(forms[0])}"
     return [form if text.startswith("experiment=") else text for text in texts]
+
+
+def _learns_by_default(both: Sequence[Override], experiments: Sequence[str]) -> bool:
+    """Whether DeVRF learns, and no experiment says how: its settings are those of the facing."""
+    methods = values(both, "comparison") or values(both, "method") or ["devrf"]
+    ours = any(method.startswith("devrf") for method in methods)
+    return ours and not any(_chosen_by(name, "schedule") for name in experiments)
 
 
 def _chosen_by(experiment: str, group: str) -> str | None:

@@ -18,11 +18,10 @@ from devrf.apps.settings import ReportSettings
 from devrf.errors import did_you_mean
 
 PIPELINE = "pipeline"
+# Stages for which the run's scene need not be right.
+APART = ("report", "fetch", "capture", "selfcheck")
 # Stages that learn nothing; the protocol's stages come beside these.
-STEPS = (
-    *("prepare", "inspect", "evaluate", "render", "still", "view", "export"),
-    *("report", "fetch", "capture", "selfcheck"),
-)
+STEPS = ("prepare", "inspect", "evaluate", "render", "still", "view", "export", *APART)
 # Of these, what uses a checkpoint.
 OF_A_CHECKPOINT = ("evaluate", "render", "still", "view", "export")
 # What users of other programs write, by what it is here.

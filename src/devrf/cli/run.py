@@ -20,7 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from devrf.apps.render import camera_path
 from devrf.apps.settings import ViewerSettings
-from devrf.cli.config import OF_A_CHECKPOINT, in_search, in_sweep, meant_stage
+from devrf.cli.config import APART, OF_A_CHECKPOINT, in_search, in_sweep, meant_stage
 from devrf.cli.context import RunContext
 from devrf.cli.evaluate import evaluate
 from devrf.cli.memory import compare
@@ -53,8 +53,6 @@ STEPS: dict[str, Step] = {
     )
 }
 AFTER_LEARNING = ("evaluate", "render")
-# Steps for which the run's scene and stages need not be right.
-APART = {"report", "fetch", "capture", "selfcheck"}
 # What a run's folder may hold that a person looks at first, and what to try next.
 RESULTS = ("metrics.json", "images", "videos", "checkpoints")
 NEXT = ("stage=still still.time=0.35 still.height=400", "stage=view")
@@ -190,7 +188,7 @@ def _check(run: RunContext, learning: Names, steps: Names) -> None:
             f"ckpt: stage={config.stage} starts from nothing; with ckpt=PATH give a stage that "
             "builds on another, stage=evaluate, render, still, view or export"
         )
-    if not learning and not APART.isdisjoint(steps):
+    if not learning and not set(APART).isdisjoint(steps):
         return
     _ = run.datamodule
     for name in run.learning_stages:

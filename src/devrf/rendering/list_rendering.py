@@ -144,7 +144,7 @@ class ListRenderer:
 
     def __init__(self, field: VoxelField, settings: RenderSettings, *, half: bool = False) -> None:
         self.field, self.settings, self.half = field, settings, half
-        # By the bits of the number of rays: where memory runs out, fewer rays get shorter lists.
+        # By the bits of the number of rays: a picture's last chunk has fewer, and shorter lists.
         self._capacities: dict[int, SampleCapacity] = {}
 
     @torch.no_grad()
