@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import psutil
 import pytest
 import torch
 from lightning import Trainer
 
 from devrf.checkpoints.checkpoint import load_checkpoint, save_checkpoint
-from devrf.checkpoints.checkpoint_file import read_checkpoint_file, write_checkpoint_file
+from devrf.checkpoints.checkpoint_file import (
+    _digest,
+    _header,
+    read_checkpoint_file,
+    write_checkpoint_file,
+)
 from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
@@ -21,6 +29,7 @@ from devrf.methods.devrf.model import DeVRFModel
 from devrf.metrics.image import psnr
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
+from devrf.system.memory import own_memory
 
 
 @pytest.fixture
@@ -114,6 +123,61 @@ def test_a_checkpoint_that_contradicts_itself_is_refused(canonical, change):
     refusal(edit(canonical, change))
 
 
-def test_a_file_may_not_choose_which_code_is_run(canonical):
-    path = edit(canonical, lambda data: data["devrf"]["model"].update(_target_="os.system"))
-    assert "which is not known here" in refusal(path)
+GRID = "scene_model.canonical.density.values"
+
+
+def of_frames(data: dict[str, Any]) -> None:
+    """Says that all of 2^20 frames have the few bits of one."""
+    data["state_dict"][GRID].update(elsewhere=torch.zeros(2**20, 1).half(), shape=[8, 2**17, 1])
+
+
+HUGE: dict[str, Callable[[dict[str, Any]], object]] = {
+    "wide layers": lambda data: data["devrf"]["model"]["architecture"].update(width=2**14),
+    "too many units": lambda data: data["devrf"]["model"]["architecture"].update(width=10**9),
+    "fine steps": lambda data: data["devrf"]["model"]["settings"].update(step=1e-9),
+    "steps that are no number": lambda data: data["devrf"]["model"]["settings"].update(
+        step=math.nan
+    ),
+    "a grid of many voxels": lambda data: data["state_dict"][GRID].update(shape=[10**4] * 3),
+    "many frames": of_frames,
+    "a large image": lambda data: data["viewpoints"]["held_out"].update(width=10**6, height=10**6),
+    "a scene that is no name": lambda data: data["devrf"].update(scene=["robot"]),
+    "records that are none": lambda data: data["devrf"].update(records=[1]),
+}
+
+
+@pytest.mark.parametrize("change", HUGE.values(), ids=list(HUGE))
+def test_a_small_file_does_not_fill_memory(canonical, change):
+    before = own_memory()
+    refusal(edit(canonical, change))
+    assert own_memory() - before < 200e6
+
+
+def test_grids_that_memory_cannot_hold_are_refused_before_they_are_unpacked(canonical, monkeypatch):
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=10_000_000))
+
+    def longer(data: dict[str, Any]) -> None:
+        keep = torch.zeros(1, 2**21, dtype=torch.uint8)  # 2 MB of bits: 64 MB of numbers
+        data["state_dict"][GRID].update(shape=[2**24, 1, 1], keep=keep)
+
+    assert "would take 0.07 GB of memory, and 0.01 GB are free" in refusal(edit(canonical, longer))
+
+
+def test_damage_that_has_the_right_checksum_is_one_line(tmp_path):
+    path = tmp_path / "deep.ckpt"
+    for nested in (
+        "[" * 10**6,
+        '{"dict": [[{"dict": []}, 1]]}',
+        '{"tensor": [1]}',
+        '{"x": 1, "y": 2}',
+    ):
+        path.write_bytes(_header(nested, {}, _digest(nested, {})))
+        assert "damaged" in refusal(path)
+
+
+@pytest.mark.parametrize(
+    "path", ["os.system", "torch.nn.Linear", "devrf.methods.devrf.model.partial", ""]
+)
+def test_a_file_names_no_class_but_one_that_is_stored(canonical, path):
+    change = edit(canonical, lambda data: data["devrf"]["model"].update({"class": path}))
+    assert f"was learned by {path}, which is not known here" in refusal(change)

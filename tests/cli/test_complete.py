@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-import shutil
 import subprocess
 from pathlib import Path
 
@@ -14,13 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from devrf.checkpoints.checkpoint_file import read_checkpoint_file, write_checkpoint_file
 from devrf.cli.complete import PATHS, completed
 from devrf.cli.config import config_folder
 from devrf.cli.main import candidates
 from devrf.cli.messages import in_quotes
-from devrf.cli.restore_config import recorded
-from devrf.cli.run import STEPS
 from devrf.scenes.export import export
 from devrf.scenes.formats import LAYOUTS
 from devrf.scenes.procedural import ProceduralForwardScene, ProceduralScene
@@ -246,113 +242,6 @@ def test_mistakes_in_a_recognised_scene(devrf, tmp_path, scenes, arguments, said
     said = said.format(root=scenes / "walker")
     assert done.status == 2 and done.err.startswith(f"devrf: {said}"), done.err
     assert len(done.err.splitlines()) == 1 and not (tmp_path / "outputs").exists()
-
-
-# A run that knows itself
-
-
-@pytest.fixture
-def run(trained, tmp_path) -> Path:
-    """A copy of the checkpoints of a whole tiny run, in a run's folder."""
-    shutil.copytree(trained[0] / "checkpoints", tmp_path / "run" / "checkpoints")
-    return tmp_path / "run"
-
-
-@pytest.fixture
-def learned_by(run):
-    """``learned_by(*command)``: the run, as if that command had learned it."""
-
-    def write(*command: str, name: str = "deformation.ckpt") -> Path:
-        content = read_checkpoint_file(run / "checkpoints" / "deformation.ckpt")
-        content["devrf"]["command"] = list(command) or None
-        write_checkpoint_file(run / "checkpoints" / name, content)
-        return run / "checkpoints" / name
-
-    return write
-
-
-def config(folder: Path):
-    return OmegaConf.load(folder / ".hydra" / "config.yaml")
-
-
-def test_in_a_folder_nothing_has_to_be_typed_again(devrf, tiny, run):
-    outcome = devrf("stage=deformation", "hydra.run.dir=run")
-    assert (outcome.status, outcome.err) == (0, "")
-    assert f"run: as it was learned, with {tiny[0]}" in outcome.out
-    assert "deformation: learned already" in outcome.out
-    assert (config(run).data.width, config(run).schedule.canonical.iterations) == (24, 6)
-
-
-def test_what_is_typed_differs(devrf, run):
-    assert devrf("stage=still", "hydra.run.dir=run", "video.frames=2").status == 0
-    assert (config(run).video.frames, config(run).data.frames) == (2, 3)
-    outcome = devrf("hydra.run.dir=run", "loss.fine.color=2")
-    assert outcome.status == 2 and outcome.err.startswith("devrf: loss.fine.color: ")
-
-
-def test_what_is_made_of_a_checkpoint_goes_to_its_run(devrf, run, tmp_path):
-    last, first = (run / "checkpoints" / f"{stage}.ckpt" for stage in ("deformation", "canonical"))
-    assert devrf("stage=evaluate", f"ckpt={last}", "evaluation.metrics=[]").status == 0
-    assert "deformation" in json.loads((run / "metrics.json").read_text())
-    # An earlier stage does not replace the scores of the whole.
-    assert devrf("stage=evaluate", f"ckpt={first}", "evaluation.metrics=[]").status == 0
-    assert "deformation" in json.loads((run / "metrics.json").read_text())
-    assert "deformation" not in json.loads((run / "canonical" / "metrics.json").read_text())
-    alone = shutil.copy(last, tmp_path / "my copy.ckpt")
-    assert devrf("stage=still", f"ckpt='{alone}'").status == 0
-    assert list((tmp_path / "outputs" / "robot" / "my copy" / "images").iterdir())
-
-
-def test_the_jobs_of_a_sweep_go_on(devrf, tiny, tmp_path, monkeypatch):
-    monkeypatch.setitem(STEPS, "inspect", lambda run: None)
-    there = "hydra.sweep.dir=sweep"
-    assert devrf("-m", *tiny, there, "stage=inspect", "seed=0,1").status == 0
-    outcome = devrf("stage=inspect", there)
-    assert (outcome.status, outcome.err) == (0, "")
-    found = [config(tmp_path / "sweep" / f"{k}_robot_seed_{k}") for k in (0, 1)]
-    assert [(one.seed, one.data.width) for one in found] == [(0, 24), (1, 24)]
-
-
-def test_a_job_of_an_experiment_that_sweeps_does_not_start_its_sweep(devrf, run, learned_by, tiny):
-    learned_by("experiment=ablation_table", *tiny[:-1])
-    assert devrf("stage=still", "hydra.run.dir=run").status == 0
-    assert (run / "images").is_dir()
-
-
-def test_a_command_is_recorded_without_what_is_of_that_command_alone(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "a b").mkdir()
-    typed = ["stage=render", "trainer=cpu", "data.root='a b'", "+x=1", "~y", "still.time=1"]
-    typed += ["ckpt=c", "seed=2", "video.path=spiral", "hydra/launcher=joblib"]
-    kept = [f'data.root="{tmp_path}/a b"', "+x=1", "~y", "seed=2", "video.path=spiral"]
-    assert recorded(typed) == recorded(kept) == kept
-
-
-def test_a_checkpoint_does_not_choose_which_code_is_run(run, learned_by):
-    learned_by("data._target_=os.getcwd", "+hydra.callbacks.x={_target_:os.getcwd}", "seed=1")
-    typed = [f"hydra.run.dir={run}", "stage=still"]
-    assert completed(typed) == ["seed=1", "hydra.mode=RUN", *typed]
-
-
-def test_checkpoints_of_a_sweep_share_what_they_have_in_common(learned_by):
-    one = learned_by("data.frames=5", "seed=5")
-    other = learned_by("data.frames=5", "seed=4", name="other.ckpt")
-    typed = ["-m", "stage=still", f"ckpt={one},{other}"]
-    shared = ["data.frames=5", "hydra.sweeper.params=null"]
-    assert completed(typed) == ["-m", *shared, *typed[1:]]
-
-
-def test_another_option_of_a_group_begins_from_its_own_values(run, learned_by):
-    learned_by("experiment=cpu_small", "data.root=gone")
-    assert completed([f"hydra.run.dir={run}"])[:1] == ["experiment=cpu_small"]
-    learned_by("data=inward", "data.downscale=2", "seed=1", "field.width=8")
-    there = [f"hydra.run.dir={run}", "stage=inspect"]
-    kept = ["seed=1", "field.width=8", "hydra.mode=RUN"]
-    assert completed([*there, "data=forward"]) == [*kept, *there, "data=forward"]
-    assert completed([*there, "data=inward"])[:2] == ["data.downscale=2", "seed=1"]
-    # Another method has other settings.
-    kept = ["data=inward", "data.downscale=2", "seed=1", "hydra.mode=RUN"]
-    assert completed([*there, "method=dnerf"]) == [*kept, *there, "method=dnerf"]
 
 
 # In the shell

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
-import sys
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,22 +11,31 @@ from typing import Any
 import torch
 from lightning import Trainer
 from lightning.fabric.plugins import CheckpointIO
+from pydantic import TypeAdapter, ValidationError
 
 from devrf.checkpoints.checkpoint_file import (
     read_checkpoint_file,
     read_description,
     write_checkpoint_file,
 )
+from devrf.checkpoints.stored_class import StoredClass, stored_class
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
 from devrf.scenes.scene import Background, Scene
+from devrf.system.memory import OutOfMemoryError
 
 # The stage's attribute that holds the model: what its entries of a state begin with.
 MODEL = "scene_model."
 # Keys of a training config for the digest of the canonical checkpoint that is built on: the run's
 # own, or a given one.
 OWN_REST, GIVEN_REST = "checkpoints/canonical.ckpt", "ckpt"
+# A whole number in a model's config (layers, units, samples of a ray) is at most this.
+LARGEST = 2**14
+# A model has no more values than its file, but for grids of few voxels that take the stored shape.
+UNSTORED = 2**16
+# Pixels of the largest image.
+PIXELS = 2**28
 # What training took: by name, numbers, and words that say how it ran.
 TrainingFigures = dict[str, float | str | None]
 
@@ -40,14 +48,15 @@ class CheckpointMetadata:
         scene: the scene's name.
         fingerprint: the scene's cameras, times and image sizes, hashed.
         stage: the stage that wrote it.
-        model: the model's class (``_target_``) and its config.
+        model: the path of the model's class (``class``) and its config.
         protocol: which data trained which part; None outside a composed run.
         records: what training took, by stage.
         training_config: the settings that decided what was learned, by config key; empty for a
             stage that was not trained from a config.
         earlier_configs: the same of the stages that this one builds on, by name.
-        command: the overrides of the command that learned it, without those that say only what to
-            do; None where none did.
+        choices: the options of config groups that the command chose which learned it, by group;
+            without groups that say only what to do.
+        settings: what that command set beside them, by config key: plain values.
         complete: whether the stage has gone through its whole schedule.
         moves: whether the scene was seen at more than one time; None in a file of before.
     """
@@ -60,9 +69,13 @@ class CheckpointMetadata:
     records: dict[str, TrainingFigures] = field(default_factory=dict)
     training_config: dict[str, Any] = field(default_factory=dict)
     earlier_configs: dict[str, dict[str, Any]] = field(default_factory=dict)
-    command: list[str] | None = None
+    choices: dict[str, str] = field(default_factory=dict)
+    settings: dict[str, Any] = field(default_factory=dict)
     complete: bool = True
     moves: bool | None = None
+
+
+_METADATA = TypeAdapter(CheckpointMetadata)
 
 
 @dataclass(frozen=True)
@@ -98,6 +111,8 @@ class Viewpoints:
         if "clock" not in entry:
             return None
         cameras = {name: Cameras(**entry[name]) for name in ("static", "dynamic", "held_out")}
+        if any(not 0 < camera.width * camera.height <= PIXELS for camera in cameras.values()):
+            raise ValueError("an image of a size that cannot be")
         return cls(**{**entry, **cameras, "clock": FrameClock(**entry["clock"])})
 
 
@@ -167,15 +182,45 @@ def load_checkpoint(
     model_class = _model_class(path, metadata)
     try:
         state = {k.removeprefix(MODEL): v for k, v in data["state_dict"].items() if MODEL in k}
-        own_config = {k: v for k, v in metadata.model.items() if k != "_target_"}
-        model = model_class.from_config(own_config).to(device)
+        model = _outlined(model_class, metadata.model, state).to(device)
         model.load_stored_state(state)
         viewpoints = Viewpoints.stored(data.get("viewpoints", {}))
     except torch.OutOfMemoryError:
         raise
-    except (RuntimeError, LookupError, ValueError, TypeError, AttributeError):
+    except OutOfMemoryError as shortage:
+        raise OutOfMemoryError(f"{path}: {shortage}") from None
+    except (DevrfError, RuntimeError, LookupError, ValueError, TypeError, AttributeError):
         raise DevrfError(f"{path}: its fields do not fit its description; train again") from None
     return LoadedCheckpoint(metadata, model, viewpoints)
+
+
+def _outlined(model_class: Any, description: Mapping[str, Any], state: Mapping[str, Any]) -> Any:
+    """The model that a checkpoint describes, before it takes its state.
+
+    Raises:
+        ValueError: it would have more values than the file, or numbers that no model has.
+    """
+    config = {key: value for key, value in description.items() if key != "class"}
+    if any(isinstance(value, int) and abs(value) > LARGEST for value in _leaves(config)):
+        raise ValueError("a number that is too large")
+    with torch.device("meta"):  # takes no memory
+        outline = model_class.from_config(config)
+    values = sum(tensor.numel() for tensor in (*outline.parameters(), *outline.buffers()))
+    stored = sum(value.numel() for value in _leaves(state) if isinstance(value, torch.Tensor))
+    if values > stored + UNSTORED:
+        raise ValueError("more values than are stored")
+    return model_class.from_config(config)
+
+
+def _leaves(value: Any) -> Iterator[Any]:
+    """What nested data holds that is no mapping, list or tuple."""
+    if isinstance(value, Mapping):
+        value = list(value.values())
+    if not isinstance(value, list | tuple):
+        yield value
+        return
+    for item in value:
+        yield from _leaves(item)
 
 
 def check_scene(path: Path, metadata: CheckpointMetadata, scene: Scene) -> None:
@@ -224,23 +269,21 @@ def metadata_in(path: Path, data: dict[str, Any]) -> CheckpointMetadata:
     if not isinstance(data, dict) or not isinstance(data.get("devrf"), dict):
         raise DevrfError(f"{path}: not a devrf checkpoint; set ckpt to one that devrf wrote")
     try:
+        _METADATA.validate_python(data["devrf"])
         return CheckpointMetadata(**data["devrf"])
-    except TypeError as error:
+    except (TypeError, ValidationError) as error:
+        why = f"{error}".splitlines()[0]
         raise DevrfError(
-            f"{path}: its description lacks or has an unknown entry ({error}); train again"
+            f"{path}: its description lacks an entry, or has a wrong one ({why}); train again"
         ) from None
 
 
 def _model_class(path: Path, metadata: CheckpointMetadata) -> Any:
-    """The model's class; a file may not choose which other code is run."""
-    module, _, name = str(metadata.model.get("_target_")).rpartition(".")
-    if module.startswith("devrf.methods."):
-        with suppress(ModuleNotFoundError):
-            importlib.import_module(module)
-    model_class = getattr(sys.modules.get(module), name, None)
-    if not (isinstance(model_class, type) and hasattr(model_class, "from_config")):
+    """The model's class."""
+    try:
+        return stored_class(metadata.model.get("class"), StoredClass)
+    except LookupError as error:
         raise DevrfError(
-            f"{path}: was learned by {module}.{name}, which is not known here; import the "
-            "module of its method first"
-        )
-    return model_class
+            f"{path}: was learned by {error.args[0]}, which is not known here; install or import "
+            "the method first"
+        ) from None

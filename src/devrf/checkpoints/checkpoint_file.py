@@ -22,8 +22,9 @@ from torch import Tensor
 
 from devrf.errors import DevrfError
 from devrf.system.files import atomic_write
+from devrf.system.memory import need_memory
 
-FORMAT = "4"
+FORMAT = "5"
 UNKNOWN = "0" * 64  # in the digest's place until it is known
 # The names of safetensors.
 DTYPES = {getattr(torch, f"float{bits}"): f"F{bits}" for bits in (16, 32, 64)}
@@ -64,6 +65,7 @@ def read_checkpoint_file(path: Path) -> dict[str, Any]:
         DevrfError: the file is damaged, of another format, or not devrf's.
     """
     metadata = _metadata(path)
+    need_memory(path.stat().st_size, f"{path}: it")
     with safe_open(path, "pt") as file:
         # The library maps the file into memory: a copy does not change with it.
         tensors = {name: file.get_tensor(name).clone() for name in file.keys()}
@@ -73,8 +75,7 @@ def read_checkpoint_file(path: Path) -> dict[str, Any]:
             f"{path}: damaged: altered since it was written (its checksum does not match); take a "
             "copy that is whole, or train again"
         )
-    content: dict[str, Any] = _unflatten(json.loads(metadata["nested"]), tensors)
-    return content
+    return _content(path, metadata, tensors)
 
 
 def read_description(path: Path) -> dict[str, Any]:
@@ -85,12 +86,7 @@ def read_description(path: Path) -> dict[str, Any]:
     Raises:
         DevrfError: the file does not begin as devrf's of this format.
     """
-    nested = _metadata(path)["nested"]
-    try:
-        content: dict[str, Any] = _unflatten(json.loads(nested), defaultdict(lambda: None))
-    except (LookupError, ValueError):
-        raise DevrfError(f"{path}: damaged; take a copy that is whole, or train again") from None
-    return content
+    return _content(path, _metadata(path), defaultdict(lambda: None))
 
 
 def digest_of(path: Path) -> str:
@@ -119,6 +115,14 @@ def _metadata(path: Path) -> dict[str, str]:
             "the version that wrote it, or train again"
         )
     return metadata
+
+
+def _content(path: Path, metadata: Mapping[str, str], tensors: Mapping[str, Any]) -> dict[str, Any]:
+    try:
+        content: dict[str, Any] = _unflatten(json.loads(metadata["nested"]), tensors)
+    except (LookupError, ValueError, TypeError, RecursionError):
+        raise DevrfError(f"{path}: damaged; take a copy that is whole, or train again") from None
+    return content
 
 
 def _header(nested: str, tensors: Mapping[str, Tensor], digest: str) -> bytes:

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from devrf.ops.trilinear import resample
+from devrf.system.memory import need_memory
 
 # Grid points of the detailed grid to one of the thinned-out grid.
 THINNING = 4
@@ -67,9 +68,14 @@ def unpack(
 
     Raises:
         RuntimeError | ValueError: the parts do not fit together.
+        OutOfMemoryError: the grids take more than is free.
     """
     x, y, z = (int(points) for points in packed["shape"])
+    if not 0 < x * y * z <= 8 * packed["keep"][0].numel():
+        raise ValueError("a mask of fewer voxels than the grid has")
     shape, elsewhere = (x, y, z), packed["elsewhere"].to(device, torch.float32)
+    values = len(elsewhere) * x * y * z * elsewhere.shape[-1]
+    need_memory(values * dtype.itemsize, "its fields", device)
     keep = [unpack_bits(bits, shape, device) for bits in packed["keep"]]
     keep = keep * len(elsewhere) if len(keep) == 1 else keep
     details = packed["kept"].to(device, dtype).split([int(mask.sum()) for mask in keep])

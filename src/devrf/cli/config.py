@@ -124,7 +124,7 @@ def scene_name(data: Any) -> str:
 
 def scene_folder_name(scene: str) -> str:
     """A scene's name as a folder may be called."""
-    return re.sub(r"[^\w.-]+", "_", scene) or "scene"
+    return re.sub(r"[^\w.-]+", "_", scene).lstrip(".") or "scene"
 
 
 def run_name(experiment: str | None, ablation: str | None, method: str, protocol: str) -> str:

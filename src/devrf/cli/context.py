@@ -28,6 +28,7 @@ from devrf.checkpoints.checkpoint import (
 from devrf.checkpoints.checkpoint_file import digest_of
 from devrf.checkpoints.progress import progress_files
 from devrf.cli.config import PIPELINE
+from devrf.cli.restore_config import Command
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.ddp import ManualDDP
 from devrf.engine.stage import ScheduledStage
@@ -54,6 +55,7 @@ class RunContext:
 
     def __init__(self, config: DictConfig, folder: Path) -> None:
         self.config = config
+        self._composed = config.copy()
         self.folder = folder
         self.step_began = time.perf_counter()
         self.chooses_size = False
@@ -68,6 +70,11 @@ class RunContext:
     def step_seconds(self) -> float:
         """Wall clock since the step before ended; of the first step, since the run began."""
         return round(time.perf_counter() - self.step_began, 2)
+
+    @cached_property
+    def command(self) -> Command:
+        """What this run is learned with, as it was composed."""
+        return Command.of(self._composed)
 
     @cached_property
     def datamodule(self) -> SceneDataModule:

@@ -18,7 +18,7 @@ from devrf.apps.records import (
 )
 from devrf.apps.still import write_contact_sheet
 from devrf.checkpoints.checkpoint_file import digest_of
-from devrf.cli.config import choices, overrides
+from devrf.cli.config import choices
 from devrf.cli.context import RunContext
 from devrf.cli.resume import unfinished
 from devrf.errors import DevrfError
@@ -56,7 +56,7 @@ def evaluate(run: RunContext) -> list[Path]:
     at_rest = {} if scene.moves else {"at_rest": True}
     ran = {
         **provenance(model.size, run.device),
-        **{"choices": choices(), "overrides": overrides(), "seed": run.config.seed},
+        **{"choices": choices(), "overrides": run.command.texts, "seed": run.config.seed},
         **learning_record(metadata, run.stages_with_images),
         **data_record(scene),
         "checkpoint": digest_of(run.checkpoint(metadata.stage)),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 from contextlib import closing
 from pathlib import Path
 
@@ -19,9 +18,8 @@ from devrf.apps.still import still as rendered
 from devrf.apps.video import VideoSettings
 from devrf.apps.video_file import write_pictures
 from devrf.checkpoints.checkpoint import Viewpoints, check_scene, metadata_of
-from devrf.cli.config import overrides
 from devrf.cli.context import RunContext
-from devrf.cli.restore_config import recorded
+from devrf.cli.restore_config import Command
 from devrf.cli.resume import unfinished
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
@@ -102,8 +100,8 @@ def _learned(run: RunContext) -> tuple[Renderable, Viewpoints]:
         log.warning("shown as far as it is learned: %s", standing)
     stored = run.load()
     viewpoints = stored.viewpoints
-    changed = {*recorded(overrides())} ^ {*(stored.metadata.command or ())}
-    if viewpoints is None or any(re.match(r"[+~]*data\W", text) for text in changed):
+    learned_with = Command(stored.metadata.choices, stored.metadata.settings)
+    if viewpoints is None or run.command.within("data") != learned_with.within("data"):
         check_scene(run.checkpoint(), stored.metadata, run.scene)
         viewpoints = Viewpoints.of(run.scene)
     return stored.model, viewpoints

@@ -1,39 +1,199 @@
-"""A run that knows itself: a later command begins from the overrides that it was learned with.
+"""A run that knows itself: a later command begins from what it was learned with.
 
-Each checkpoint holds the overrides of the command that learned it. They come before what is typed:
-only what is typed differs.
+A checkpoint holds the options of config groups that were chosen, and what was set beside them, as
+plain values. A later command chooses the same options by their names, and Hydra merges the rest,
+as a config file of values alone, beneath what is typed: only that differs. So nothing that a file
+says is read as an override, as an interpolation or as code.
 """
 
 from __future__ import annotations
 
+import json
 import logging
 import re
-from collections.abc import Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
-from hydra.errors import HydraException
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
-from devrf.cli.config import OF_A_CHECKPOINT, scene_folder_name
+from devrf.cli.config import (
+    OF_A_CHECKPOINT,
+    choices,
+    config_folder,
+    overrides,
+    scene_folder_name,
+)
 from devrf.cli.messages import in_quotes
 from devrf.errors import DevrfError
 
 log = logging.getLogger(__name__)
 
-# Overrides that say what to do with a run, on which machine, and what to log, not what the run is.
+# What says what to do with a run, on which machine, and what to log, not what the run is.
 OF_A_COMMAND = {"stage", "ckpt", "resume", "memory_check", "objective", "hparams_search"}
 OF_A_COMMAND |= {"hydra", "report", "still", "export", "trainer", "logger", "callbacks", "kernels"}
-OF_A_COMMAND |= {"viewer"}
-# Names code to be run, which a checkpoint, perhaps a stranger's, may not choose.
-CODE = "_target_"
+OF_A_COMMAND |= {"viewer", "fetch", "capture", "selfcheck", "scene", "defaults"}
+# Where a command writes.
+PLACES = {"data.export", "data.flow_cache"}
+# Of another method's run these are taken over.
+OF_A_SCENE = {"data", "facing", "seed"}
+# Keys by which Hydra builds a part.
+CODE = {"_target_", "_partial_", "_convert_", "_recursive_", "_args_"}
+# An option's name leads to no other folder than its group's; a key is a path of plain names.
+OPTION = re.compile(r"[\w-]+", re.ASCII)
+GROUP = re.compile(r"\+?[\w-]+(/[\w-]+)*(@[\w.-]+)?", re.ASCII)
+KEY = re.compile(r"[\w-]+(\.[\w-]+)*", re.ASCII)
 # Values that are relative to the folder in which they were typed.
 RELATIVE = {"data.root", "evaluation.lpips_weights", "video.path"}
+# Where Hydra finds the settings: a group below hydra/ is none of the run's own choices.
+RESTORED = "hydra/restored"
 
 # Where the present command's settings come from, until a log is there to say so.
 _source: list[str] = []
+# The folder of the present command's restored settings.
+_folder: list[TemporaryDirectory[str]] = []
+
+
+@dataclass(frozen=True)
+class Command:
+    """What a run was learned with, without what says only what to do.
+
+    Attributes:
+        choices: the options of config groups that were chosen, by group; ``+`` before a group
+            that the defaults do not have.
+        settings: what was set beside them, by config key: None, numbers, text, and lists and
+            mappings of these.
+    """
+
+    choices: dict[str, str] = field(default_factory=dict)
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, config: DictConfig) -> Command:
+        """What the present command chose and set; nothing outside Hydra.
+
+        Code that was typed (``_target_``), and keys that were removed, are not kept.
+        """
+        if not HydraConfig.initialized():
+            return cls()
+        chosen = {}
+        for override in parsed(overrides()):
+            key, option = override.get_key_element(), override.value()
+            if key.lstrip("+") in choices() and option and not override.is_delete():
+                chosen["+" * override.is_add() + key.lstrip("+")] = str(option)
+        # Those alone, to compare with.
+        where = [text for text in HydraConfig.get().overrides.hydra if "hydra.searchpath" in text]
+        app = GlobalHydra.instance().is_initialized()  # not in another process of a sweep
+        with (
+            nullcontext()
+            if app
+            else initialize_config_dir(str(config_folder()), version_base="1.3")
+        ):
+            alone = compose("config", [*where, *(f"{key}={chosen[key]}" for key in chosen)])
+        changed = _changed(OmegaConf.to_container(config), OmegaConf.to_container(alone), "")
+        settings = {key: _plain_at(config, key) for key in changed if KEY.fullmatch(key)}
+        return cls(
+            choices={key: option for key, option in chosen.items() if not _of_a_command(key)},
+            settings={key: value for key, value in settings.items() if _is_plain(value)},
+        )
+
+    @classmethod
+    def checked(cls, path: Path, chosen: Mapping[str, str], settings: Mapping[str, Any]) -> Command:
+        """What the file at ``path`` says, if these are names of options and plain values.
+
+        Raises:
+            DevrfError: something else is among them.
+        """
+        for group, option in chosen.items():
+            if not (GROUP.fullmatch(group) and OPTION.fullmatch(option)) or _of_a_command(group):
+                raise DevrfError(f"{path}: {group}={option} is no option of a learned run")
+        for key, value in settings.items():
+            if isinstance(value, Mapping):
+                cls.checked(path, {}, {f"{key}.{name}": below for name, below in value.items()})
+            elif not KEY.fullmatch(key) or _of_a_command(key) or not _is_plain(value):
+                raise DevrfError(f"{path}: {key} is no setting of a learned run")
+        return cls({**chosen}, {**settings})
+
+    def __and__(self, other: Command) -> Command:
+        """What both have in common."""
+        return Command(
+            {key: value for key, value in self.choices.items() if other.choices.get(key) == value},
+            {k: v for k, v in self.settings.items() if other.settings.get(k, CODE) == v},
+        )
+
+    def within(self, *roots: str) -> Command:
+        """Of it, what is below keys that begin with ``roots``."""
+        return Command(
+            {key: value for key, value in self.choices.items() if _root(key) in roots},
+            {key: value for key, value in self.settings.items() if _root(key) in roots},
+        )
+
+    def beneath(self, typed: Sequence[Override]) -> Command:
+        """What stays beneath what is typed.
+
+        Another option of a group begins from its own values. Another method takes over the scene
+        and the seed alone.
+        """
+        keys = {override.key_or_group for override in typed}
+        before = {key.lstrip("+"): value for key, value in self.choices.items()}
+        other = tuple(f"{k}." for k in keys if value(typed, k) != before.get(k))
+        method = value(typed, "method")
+        stay = self
+        if method not in (None, before.get("method", "devrf")):
+            stay = self.within(*OF_A_SCENE)
+        return Command(
+            {k: v for k, v in stay.choices.items() if k.lstrip("+") not in keys},
+            {k: v for k, v in stay.settings.items() if k not in keys and not k.startswith(other)},
+        )
+
+    @property
+    def texts(self) -> list[str]:
+        """It as it may be typed, for people."""
+        said = {k: v if isinstance(v, str) else json.dumps(v) for k, v in self.settings.items()}
+        return [f"{key}={value}" for key, value in (self.choices | said).items()]
+
+
+def _changed(now: Any, before: Any, path: str) -> Iterator[str]:
+    """The keys of values in one config that are not those in another; of lists the whole."""
+    for key, value in now.items():
+        old, where = before.get(key, CODE), f"{path}{key}"
+        if _of_a_command(where):
+            continue
+        if isinstance(value, Mapping) and isinstance(old, Mapping):
+            if value.get("_target_") == old.get("_target_"):
+                yield from _changed(value, old, f"{where}.")
+        elif value != old:
+            yield where
+
+
+def _plain_at(config: DictConfig, key: str) -> Any:
+    """A value of a config, resolved; a path absolute where it exists."""
+    value = OmegaConf.select(config, key)
+    if OmegaConf.is_config(value):
+        return OmegaConf.to_container(value, resolve=True)
+    if key in RELATIVE and isinstance(value, str) and Path(value).expanduser().exists():
+        return str(Path(value).expanduser().absolute())
+    return str(value) if isinstance(value, Path) else value
+
+
+def _is_plain(value: object) -> bool:
+    """Whether a value is data: no code, nothing that refers to something else or is missing."""
+    if isinstance(value, Mapping):
+        names = all(isinstance(k, str) and KEY.fullmatch(k) and k not in CODE for k in value)
+        return names and all(map(_is_plain, value.values()))
+    if isinstance(value, list):
+        return all(map(_is_plain, value))
+    if isinstance(value, str):
+        return "${" not in value and value != "???"
+    return value is None or isinstance(value, bool | int | float)
 
 
 def parsed(overrides: Iterable[str]) -> list[Override]:
@@ -62,29 +222,14 @@ def value(overrides: Sequence[Override], key: str) -> str | None:
     return texts[0] if len(texts) == 1 else None
 
 
-def recorded(overrides: Iterable[str]) -> list[str]:
-    """What a checkpoint keeps of a command's overrides; paths of files are made absolute.
-
-    What it keeps of these again is the same.
-
-    Raises:
-        HydraException: an override is not understood.
-    """
-    lasting = []
-    for override in parsed(overrides):
-        key, text = override.key_or_group, str(override.input_line)
-        if _root(key) in OF_A_COMMAND or CODE in text:
-            continue
-        path = None if override.is_delete() else override.value()
-        if key in RELATIVE and isinstance(path, str) and Path(path).expanduser().exists():
-            text = f"{key}={in_quotes(str(Path(path).expanduser().absolute()))}"
-        lasting.append(text)
-    return lasting
+def _of_a_command(key: str) -> bool:
+    """Whether a key or group says only what to do, or builds a part."""
+    return _root(key) in OF_A_COMMAND or key in PLACES or bool(CODE & {*key.split(".")})
 
 
 def _root(key: str) -> str:
     """The first part of a key: ``data`` of ``data.root``."""
-    return re.split("[./]", key)[0]
+    return re.split("[./@]", key.lstrip("+"))[0]
 
 
 def log_source() -> None:
@@ -94,7 +239,11 @@ def log_source() -> None:
 
 
 def of_named_run(typed: Sequence[Override], multirun: bool) -> list[str]:
-    """The overrides that the run was learned with which the command names, and its folder."""
+    """The overrides that take over what the run was learned with which the command names.
+
+    Raises:
+        DevrfError: a checkpoint says what is no option or plain value.
+    """
     _source.clear()
     checkpoints = [Path(path) for path in values(typed, "ckpt")]
     folder, sweep = value(typed, "hydra.run.dir"), value(typed, "hydra.sweep.dir")
@@ -109,18 +258,18 @@ def of_named_run(typed: Sequence[Override], multirun: bool) -> list[str]:
         source = folder
         if (last := latest_checkpoint(Path(folder))) is not None:
             checkpoints = [last]
-    commands = [_command(path) for path in checkpoints if path.is_file()]
-    if not commands or len(commands) < len(checkpoints):
+    if not checkpoints or not all(path.is_file() for path in checkpoints):
         return []  # a file that is missing is reported by the step that loads it
-    if None in commands:
-        _source.append(
-            f"{checkpoints[commands.index(None)]}: does not say how it was learned; data and "
-            "settings are those typed, and the defaults"
-        )
-        return []
-    known = [command or [] for command in commands]
-    shared = [text for text in known[0] if all(text in command for command in known)]
-    put = _beside(typed, shared, source)
+    commands = [command_of(path) for path in checkpoints]
+    for path, command in zip(checkpoints, commands, strict=True):
+        if command is None or command == Command():
+            said = "does not say how it was learned; data and settings are those typed, and the"
+            _source.append(f"{path}: {said} defaults")
+            return []
+    shared = commands[0] or Command()
+    for other in commands[1:]:
+        shared &= other or Command()
+    put = _put(shared.beneath(typed), typed, source, multirun=multirun)
     if multirun:
         # The sweep is the one that is typed, not that of an experiment.
         return put if values(typed, "hparams_search") else [*put, "hydra.sweeper.params=null"]
@@ -130,34 +279,58 @@ def of_named_run(typed: Sequence[Override], multirun: bool) -> list[str]:
     return put
 
 
+def _put(command: Command, typed: Sequence[Override], source: str, *, multirun: bool) -> list[str]:
+    """The overrides that take over a command; its settings go into a config file of values."""
+    if command == Command():
+        return []
+    _source.append(f"{source}: as it was learned, with {' '.join(command.texts)}")
+    put = [f"{group}={option}" for group, option in command.choices.items()]
+    if command.settings:
+        if multirun:  # other machines may take its jobs
+            Path("outputs").mkdir(exist_ok=True)
+        place = TemporaryDirectory(dir="outputs" if multirun else None, prefix=".restored-")
+        _folder[:] = [place]  # until the command ends
+        file = Path(place.name, RESTORED, "run.yaml")
+        file.parent.mkdir(parents=True)
+        content = OmegaConf.create()
+        for key, setting in command.settings.items():
+            OmegaConf.update(content, key, setting, force_add=True)
+        file.write_text(f"# @package _global_\n{OmegaConf.to_yaml(content)}", encoding="utf-8")
+        paths = [f"file://{Path(place.name).absolute()}"]
+        for override in typed:  # Hydra takes the first list of folders
+            if override.key_or_group == "hydra.searchpath":
+                paths += override.value()  # type: ignore[arg-type]
+        put += [f"hydra.searchpath=[{','.join(map(in_quotes, paths))}]", f"+{RESTORED}=run"]
+    return put
+
+
 def _of_sweep(typed: Sequence[Override], folder: Path) -> list[str]:
-    """What the sweep in ``hydra.sweep.dir`` was started with, unless another is typed."""
+    """What the sweep in ``hydra.sweep.dir`` was started with, unless another is typed.
+
+    Raises:
+        DevrfError: its record holds more than names of options and plain values.
+    """
     record = folder / "multirun.yaml"
     if any(override.is_sweep_override() for override in typed) or not record.is_file():
         return []
     begun = OmegaConf.select(OmegaConf.load(record), "hydra.overrides.task") or []
-    return [*_beside(typed, recorded(begun), str(folder)), "hydra.mode=MULTIRUN"]
-
-
-def _beside(typed: Sequence[Override], command: Sequence[str], source: str) -> list[str]:
-    """The recorded overrides that stay beside what is typed.
-
-    Another option of a group begins from its own values. Another method takes over data and seed.
-    """
-    before = parsed(command)
-    keys = {override.key_or_group for override in typed if not override.is_add()}
-    changed = tuple(f"{k}." for k in keys if values(typed, k) != values(before, k))
-    method = value(typed, "method")
-    other = method not in (None, value(before, "method") or "devrf")
+    keys = {override.key_or_group for override in typed}
     stay = []
-    for override in before:
+    for override in parsed(OmegaConf.to_container(begun)):  # type: ignore[arg-type]
         key = override.key_or_group
-        replaced = key.startswith(changed) or (key in keys and not override.is_add())
-        if not replaced and (not other or _root(key) in ("data", "seed")):
-            stay.append(str(override.input_line))
+        if _of_a_command(key) or key in keys or override.is_delete():
+            continue
+        swept = override.sweep_iterator() if override.is_sweep_override() else ()
+        each = [parsed([f"{key}={text}"])[0].value() for text in swept] or [override.value()]
+        for one in each:
+            if "." in key:
+                Command.checked(record, {}, {key: one})
+            elif isinstance(one, str):
+                Command.checked(record, {key: one}, {})
+        stay.append(str(override.input_line))
     if stay:
-        _source.append(f"{source}: as it was learned, with {' '.join(stay)}")
-    return stay
+        _source.append(f"{folder}: as it was learned, with {' '.join(stay)}")
+    return [*stay, "hydra.mode=MULTIRUN"]
 
 
 def _folder_for(checkpoint: Path) -> Path:
@@ -176,12 +349,16 @@ def _folder_for(checkpoint: Path) -> Path:
     return Path("outputs") / scene_folder_name(metadata_of(checkpoint).scene) / checkpoint.stem
 
 
-def _command(checkpoint: Path) -> list[str] | None:
-    """The command that a checkpoint was learned with; None where it is not known."""
+def command_of(checkpoint: Path) -> Command | None:
+    """The command that a checkpoint was learned with; None where it cannot be read.
+
+    Raises:
+        DevrfError: it says what is no option or plain value.
+    """
     from devrf.checkpoints.checkpoint import metadata_of  # loads torch
 
-    # A damaged file is reported when the whole of it is read.
-    with suppress(DevrfError, OSError, HydraException):
-        command = metadata_of(checkpoint).command
-        return None if command is None else recorded(command)
-    return None
+    try:
+        metadata = metadata_of(checkpoint)
+    except (DevrfError, OSError):  # reported when the whole of it is read
+        return None
+    return Command.checked(checkpoint, metadata.choices, metadata.settings)

@@ -15,9 +15,7 @@ from devrf.callbacks import PeriodicCheckpoint, StopOnSignal, TrainingRecord
 from devrf.callbacks.csv_logger import ResumableCSVLogger
 from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, save_checkpoint
 from devrf.checkpoints.progress import progress_files
-from devrf.cli.config import overrides
 from devrf.cli.context import RunContext
-from devrf.cli.restore_config import recorded
 from devrf.cli.resume import ResumePoint, beginning, remove_progress
 from devrf.engine.stage import ScheduledStage
 from devrf.errors import DevrfError
@@ -46,7 +44,8 @@ def learn(run: RunContext, name: str) -> None:
         stage.earlier_configs = {**before.earlier_configs, below: before.training_config}
     stage.protocol = run.protocol.name
     stage.time_share = run.protocol.time_share(name, run.stages_with_images)
-    stage.command = recorded(overrides())
+    stage.choices = run.command.choices
+    stage.settings = run.command.settings
     _fit(run, stage, begin)
 
 

@@ -26,6 +26,7 @@ from devrf.checkpoints.checkpoint import (
     metadata_in,
 )
 from devrf.checkpoints.progress import rng_state, set_rng_state
+from devrf.checkpoints.stored_class import class_path
 from devrf.data.batch import background_color
 from devrf.engine.ddp import assert_replicas_equal, broadcast, check_strategy
 from devrf.engine.learner import Learner
@@ -63,7 +64,8 @@ class ScheduledStage(Learner):
         training_config: the settings that decide what is learned, by config key; empty for a
             stage that was not built from a config.
         earlier_configs: the same of the stages that this one builds on, by name.
-        command: the overrides of the command that learns, for its checkpoints, if there is one.
+        choices: the options of config groups that the command chose which learns, by group.
+        settings: what that command set beside them, by config key.
         protocol: the name of the protocol that the stage is a part of, if any.
         num_rollbacks: how often training diverged and was rolled back.
         lr_scale: factor of the scheduled learning rates; below 1 after a rollback.
@@ -84,7 +86,8 @@ class ScheduledStage(Learner):
         self.generator = torch.Generator()
         self.training_config: dict[str, Any] = {}
         self.earlier_configs: dict[str, dict[str, Any]] = {}
-        self.command: list[str] | None = None
+        self.choices: dict[str, str] = {}
+        self.settings: dict[str, Any] = {}
         self.protocol: str | None = None
         self.lr_scale = 1.0
         self.abort_reason: str | None = None
@@ -134,17 +137,17 @@ class ScheduledStage(Learner):
     def metadata(self) -> CheckpointMetadata:
         """The metadata of a checkpoint of this stage."""
         model = self.scene_model
-        target = f"{type(model).__module__}.{type(model).__qualname__}"
         return CheckpointMetadata(
             scene=self.scene.name,
             fingerprint=self.scene.fingerprint,
             stage=self.name,
-            model={"_target_": target, **model.config()},
+            model={"class": class_path(type(model)), **model.config()},
             protocol=self.protocol,
             records={**self.earlier_records, self.name: self.record},
             training_config=self.training_config,
             earlier_configs=self.earlier_configs,
-            command=self.command,
+            choices=self.choices,
+            settings=self.settings,
             complete=self.iteration >= self.total_iterations,
             moves=self.scene.moves,
         )

@@ -16,6 +16,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from devrf.checkpoints.stored_class import StoredClass
 from devrf.data.batch import RayBatch
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
@@ -26,7 +27,7 @@ from devrf.rendering.view import SurfaceField, View
 from devrf.scenes.scene import Scene, Views
 
 
-class Renderable(nn.Module, ABC):
+class Renderable(StoredClass, nn.Module, ABC):
     """A scene, learned by some method, to be rendered from any view at any time.
 
     Attributes:

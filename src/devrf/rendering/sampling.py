@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from devrf.errors import expect
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 from devrf.ops.pixel_rays import steps_between
@@ -14,6 +15,8 @@ from devrf.rendering.occupancy import Occupancy
 
 # A ray ends where its transmittance is less: what is behind cannot be seen.
 STOP = 1e-4
+# The least distance between samples, in voxels: with less a ray fills memory and shows no more.
+FINEST = 0.05
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,9 @@ class RenderSettings:
     alpha_threshold: float
     near: float
     far: float
+
+    def __post_init__(self) -> None:
+        expect(self.step >= FINEST, "sampling.step", f"at least {FINEST}", self.step)
 
 
 @dataclass(frozen=True)

@@ -53,6 +53,19 @@ def free_host_memory(root: Path = Path("/")) -> int:
     return min([available, *_left_by_groups(root)])
 
 
+def need_memory(size: int, what: str, device: torch.device | str = "cpu") -> None:
+    """Refuse what would take ``size`` bytes on ``device`` where fewer are free.
+
+    Raises:
+        OutOfMemoryError: ``what`` takes more.
+    """
+    if size > (free := free_memory(torch.device(device))):
+        raise OutOfMemoryError(
+            f"{what} would take {size / 1e9:.2f} GB of memory, and {free / 1e9:.2f} GB are free; "
+            "free some of it, or use a larger machine"
+        )
+
+
 def own_memory() -> int:
     """Bytes of memory that this process holds."""
     return int(psutil.Process().memory_info().rss)

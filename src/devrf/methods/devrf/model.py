@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pkgutil
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import partial
@@ -11,6 +10,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from devrf.checkpoints.stored_class import StoredClass, class_path, stored_class
 from devrf.checkpoints.stored_grids import packed, unpacked
 from devrf.engine.frame_store import NAMES, FrameField, fits_on_device
 from devrf.geometry.box import Box
@@ -29,7 +29,7 @@ from devrf.rendering.output import ColorChange
 from devrf.rendering.sampling import RenderSettings
 
 
-class ColorField(FrameField):
+class ColorField(StoredClass, FrameField):
     """A field of frames that changes colours; an extension brings it."""
 
     def at(self, time: float) -> ColorChange | None:
@@ -84,15 +84,14 @@ class DeVRFModel(Renderable):
 
     def config(self) -> dict[str, Any]:
         """Sizes, sampling, space, and which fields there are."""
-        kind = type(self.color_residual)
-        path = None if self.color_residual is None else f"{kind.__module__}:{kind.__qualname__}"
+        residual = self.color_residual
         return {
             "architecture": asdict(self.architecture),
             "settings": asdict(self.settings),
             "space": space_config(self.space),
             "radiance": isinstance(self.canonical.decoder, ColorDecoder),
             "deforms": self.moves,
-            "color_residual": path,
+            "color_residual": None if residual is None else class_path(type(residual)),
         }
 
     @classmethod
@@ -101,7 +100,10 @@ class DeVRFModel(Renderable):
         box = Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
         build = Architecture(**config["architecture"])
         # A stage that was stopped in its search has no colour network yet.
-        radiance, clock = config["radiance"], FrameClock((0.0, 1.0))
+        radiance = config["radiance"]
+        clock = FrameClock((0.0, 1.0))
+        path = config["color_residual"]
+        residual: Callable[..., ColorField] | None = path and stored_class(path, ColorField)
         return cls(
             build,
             build.radiance_field(box, 8, 8) if radiance else build.search_field(box, 8),
@@ -109,7 +111,7 @@ class DeVRFModel(Renderable):
             RenderSettings(**config["settings"]),
             DeformationField(box, clock, voxels=8) if config["deforms"] else None,
             space_from(config["space"]),
-            _class_at(config["color_residual"], box, clock),
+            residual and residual(box, clock, voxels=8),
         )
 
     def warp(self, time: float) -> Warp | None:
@@ -217,13 +219,3 @@ def _place_of_frames(backward: Any, device: torch.device) -> torch.device:
     frames, (x, y, z) = len(backward["elsewhere"]), backward["shape"]
     fits = fits_on_device(free, frames, (x, y, z), half=True, parallel=0)
     return device if fits else torch.device("cpu")
-
-
-def _class_at(path: str | None, box: Box, clock: FrameClock) -> ColorField | None:
-    """A field of a few voxels of the class at ``path``; a checkpoint names those of devrf only."""
-    if path is None:
-        return None
-    if not path.startswith("devrf.methods."):
-        raise ValueError(path)
-    field: ColorField = pkgutil.resolve_name(path)(box, clock, voxels=8)
-    return field

@@ -10,6 +10,9 @@ from devrf.errors import expect
 Initialisation = Literal["uniform", "glorot"]
 Precision = Literal["auto", "float32", "bfloat16"]
 
+# Samples of a ray, at most.
+SAMPLES = 1024
+
 
 class CheckedSettings:
     """Settings of a method that refuse what cannot be."""
@@ -28,6 +31,11 @@ class CheckedSettings:
         """Refuse settings that are less; raises as :meth:`check`."""
         for name in names:
             self.check(name, getattr(self, name) >= minimum, f"at least {minimum}")
+
+    def check_samples(self, *names: str) -> None:
+        """Refuse numbers of a ray's samples that are none, or fill memory; raises likewise."""
+        for name in names:
+            self.check(name, 2 <= getattr(self, name) <= SAMPLES, f"2 to {SAMPLES}")
 
 
 @dataclass(frozen=True)
@@ -66,7 +74,8 @@ class PlacedSettings(CheckedSettings):
     empty_from: float | None = 0.25
 
     def __post_init__(self) -> None:
-        self.check_least(2, "width", "depth", "steps", "occupancy_side")
+        self.check_least(2, "width", "depth", "occupancy_side")
+        self.check_samples("steps")
         share = self.empty_from
         self.check("empty_from", share is None or 0 <= share <= 1, "0 to 1, or null")
 
@@ -91,7 +100,7 @@ class FieldSettings(PlacedSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.check_least(2, "coarse", "fine")
+        self.check_samples("coarse", "fine")
         possible = self.sampling == "hierarchical" or not self.separate_coarse
         self.check(
             "separate_coarse", possible, "false, as sampling=occupancy has no coarse samples"

@@ -54,8 +54,9 @@ class NeuralVolumesSettings(CheckedSettings):
     def __post_init__(self) -> None:
         self.check_least(1, "code", "encoder_views", "encoder_width", "maps")
         self.check_least(2, "occupancy_side", "warp_side")
-        for name in ("density_scale", "step", "warp_scale"):
+        for name in ("density_scale", "warp_scale"):
             self.check(name, getattr(self, name) > 0, "more than 0")
+        self.check("step", self.step >= 1 / 512, "at least 1/512")
         for name in ("encoder_channels", "template_channels", "warp_channels"):
             channels = getattr(self, name)
             self.check(name, channels and min(channels) >= 1, "one or more numbers above 0")

@@ -74,6 +74,6 @@ class NSFFSettings(PlacedSettings):
         super().__post_init__()
         if isinstance(self.warmup, dict):  # as a checkpoint has it
             object.__setattr__(self, "warmup", Warmup(**self.warmup))
-        self.check_least(2, "samples")
+        self.check_samples("samples")
         self.check_least(0, "hard_rays", "density_noise")
         self.check("flow_reach", self.flow_reach is None or self.flow_reach > 0, "more than 0")

@@ -1,0 +1,253 @@
+"""A run that knows itself: a later command takes over what it was learned with, and no code."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig, OmegaConf
+
+from devrf.checkpoints.checkpoint_file import read_checkpoint_file, write_checkpoint_file
+from devrf.cli.complete import completed
+from devrf.cli.config import config_folder
+from devrf.cli.restore_config import Command
+from devrf.cli.run import STEPS
+from devrf.errors import DevrfError
+
+
+@pytest.fixture
+def run(trained, tmp_path) -> Path:
+    """A copy of the checkpoints of a whole tiny run, in a run's folder."""
+    shutil.copytree(trained[0] / "checkpoints", tmp_path / "run" / "checkpoints")
+    return tmp_path / "run"
+
+
+@pytest.fixture
+def edited(run) -> Callable[..., Path]:
+    """``edited(change)``: the run's last checkpoint, valid in form, after ``change(content)``."""
+
+    def write(change: Callable[[dict], object], name: str = "deformation.ckpt") -> Path:
+        content = read_checkpoint_file(run / "checkpoints" / "deformation.ckpt")
+        change(content["devrf"])
+        write_checkpoint_file(run / "checkpoints" / name, content)
+        return run / "checkpoints" / name
+
+    return write
+
+
+@pytest.fixture
+def learned_by(edited) -> Callable[..., Path]:
+    """``learned_by(choices, settings)``: the run, as if a command with these had learned it."""
+
+    def write(choices: dict, settings: dict, name: str = "deformation.ckpt") -> Path:
+        return edited(lambda entry: entry.update(choices=choices, settings=settings), name)
+
+    return write
+
+
+def config(folder: Path) -> DictConfig:
+    return OmegaConf.load(folder / ".hydra" / "config.yaml")
+
+
+def composed(typed: list[str]) -> DictConfig:
+    """What Hydra composes of what was typed, completed."""
+    words = [word for word in completed(typed) if word != "-m"]
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        return compose("config", words, return_hydra_config=True)
+
+
+def test_in_a_folder_nothing_has_to_be_typed_again(devrf, tiny, run):
+    outcome = devrf("stage=deformation", "hydra.run.dir=run")
+    assert (outcome.status, outcome.err) == (0, "")
+    assert "run: as it was learned, with field=small " in outcome.out
+    assert "deformation: learned already" in outcome.out
+    assert (config(run).data.width, config(run).schedule.canonical.iterations) == (24, 6)
+
+
+def test_what_is_typed_differs(devrf, run):
+    assert devrf("stage=still", "hydra.run.dir=run", "video.frames=2").status == 0
+    assert (config(run).video.frames, config(run).data.frames) == (2, 3)
+    outcome = devrf("hydra.run.dir=run", "loss.fine.color=2")
+    assert outcome.status == 2 and outcome.err.startswith("devrf: loss.fine.color: ")
+    outcome = devrf("hydra.run.dir=run", "data.widht=2")
+    assert outcome.status == 2
+    assert outcome.err.startswith("devrf: data.widht: no such key; did you mean data.width")
+
+
+def test_what_is_made_of_a_checkpoint_goes_to_its_run(devrf, run, tmp_path):
+    last, first = (run / "checkpoints" / f"{stage}.ckpt" for stage in ("deformation", "canonical"))
+    assert devrf("stage=evaluate", f"ckpt={last}", "evaluation.metrics=[]").status == 0
+    assert "deformation" in json.loads((run / "metrics.json").read_text())
+    # An earlier stage does not replace the scores of the whole.
+    assert devrf("stage=evaluate", f"ckpt={first}", "evaluation.metrics=[]").status == 0
+    assert "deformation" in json.loads((run / "metrics.json").read_text())
+    assert "deformation" not in json.loads((run / "canonical" / "metrics.json").read_text())
+    alone = shutil.copy(last, tmp_path / "my copy.ckpt")
+    assert devrf("stage=still", f"ckpt='{alone}'").status == 0
+    assert list((tmp_path / "outputs" / "robot" / "my copy" / "images").iterdir())
+
+
+def test_the_jobs_of_a_sweep_go_on(devrf, tiny, tmp_path, monkeypatch):
+    monkeypatch.setitem(STEPS, "inspect", lambda run: None)
+    there = "hydra.sweep.dir=sweep"
+    assert devrf("-m", *tiny, there, "stage=inspect", "seed=0,1").status == 0
+    outcome = devrf("stage=inspect", there)
+    assert (outcome.status, outcome.err) == (0, "")
+    found = [config(tmp_path / "sweep" / f"{k}_robot_seed_{k}") for k in (0, 1)]
+    assert [(one.seed, one.data.width) for one in found] == [(0, 24), (1, 24)]
+
+
+def test_a_job_of_an_experiment_that_sweeps_does_not_start_its_sweep(devrf, run, edited):
+    edited(lambda entry: entry["choices"].update(experiment="ablation_table"))
+    assert devrf("stage=still", "hydra.run.dir=run").status == 0
+    assert (run / "images").is_dir()
+
+
+def test_a_motion_learned_on_a_checkpoint_knows_the_whole_of_it(devrf, run, tmp_path):
+    base = run / "checkpoints" / "canonical.ckpt"
+    again = ("stage=deformation", f"ckpt={base}", "hydra.run.dir=other", "seed=3")
+    assert devrf(*again).status == 0
+    learned = read_checkpoint_file(tmp_path / "other" / "checkpoints" / "deformation.ckpt")
+    first = read_checkpoint_file(base)["devrf"]
+    assert learned["devrf"]["choices"] == first["choices"] == {"field": "small"}
+    assert learned["devrf"]["settings"] == {**first["settings"], "seed": 3}
+
+
+def test_what_a_checkpoint_keeps_of_a_command_is_plain(devrf, tiny, tmp_path, monkeypatch):
+    (tmp_path / "a b").mkdir()
+    kept: list[Command] = []
+    monkeypatch.setitem(STEPS, "inspect", lambda run: kept.append(run.command))
+    typed = ("data=inward", "data.root='a b'", "data.downscale=${seed}", "experiment=cpu_small")
+    of_the_command = (
+        "stage=inspect",
+        "still.time=1",
+        "logger=csv",
+        "+callbacks.x=1",
+        "~video.name",
+    )
+    outcome = devrf(*typed, *of_the_command, "seed=2", "hydra.run.dir=run")
+    assert kept == [
+        Command(
+            {"data": "inward", "experiment": "cpu_small"},
+            {"data.root": str(tmp_path / "a b"), "data.downscale": 2, "seed": 2},
+        )
+    ], outcome.err
+
+
+def test_checkpoints_of_a_sweep_share_what_they_have_in_common(learned_by, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    one = learned_by({"field": "small"}, {"data.frames": 5, "seed": 5})
+    other = learned_by({"field": "small"}, {"data.frames": 5, "seed": 4}, name="other.ckpt")
+    found = composed(["-m", "stage=still", f"ckpt='{one},{other}'"])
+    assert found.hydra.sweeper.params is None
+    words = completed(["-m", "stage=still", f"ckpt={one},{other}"])
+    assert words[:2] == ["-m", "field=small"]
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        found = compose("config", [word for word in words[1:] if "ckpt=" not in word])
+    assert (found.data.frames, found.seed) == (5, 0)
+
+
+def test_another_option_of_a_group_begins_from_its_own_values(run, learned_by):
+    there = [f"hydra.run.dir={run}", "stage=inspect"]
+    settings = {"data.root": "gone", "data.downscale": 2, "seed": 1, "field.width": 8}
+    learned_by({"data": "inward", "experiment": "cpu_small"}, settings)
+    found = composed(there)
+    assert (found.data.root, found.data.downscale, found.seed) == ("gone", 2, 1)
+    assert found.field.width == 8 and found.hydra.runtime.choices.experiment == "cpu_small"
+    found = composed([*there, "data=colmap", "data.root=here"])
+    assert (found.data.root, found.seed, found.field.width) == ("here", 1, 8)
+    assert found.data.downscale != 2
+    # Another method has other settings.
+    found = composed([*there, "method=dnerf"])
+    assert (found.data.downscale, found.seed) == (2, 1)
+    assert "field" not in found or found.field.width != 8
+
+
+# What is no choice and no plain value is refused, whatever the file says
+
+CODE = {"_target_": "sympy.sympify", "a": "__import__('os').system('touch PWNED')"}
+# The word is put together of two settings once the text is read as a mapping.
+TEXT = '${oc.decode:"{${aa}${bb}: sympy.sympify, a: 1}"}'
+HOSTILE = {
+    "a word that is put together": (
+        {},
+        {"aa": "_tar", "bb": "get_", "canonical": TEXT},
+    ),
+    "an interpolation": ({}, {"data.root": "${oc.env:HOME}"}),
+    "an interpolation in a list": ({}, {"schedule.canonical.upsample_at": [1, ["${seed}"]]}),
+    "a part": ({}, {"canonical": CODE}),
+    "a part within": ({}, {"schedule": {"canonical": {"x": [CODE]}}}),
+    "the key of a part": ({}, {"canonical._target_": "sympy.sympify"}),
+    "a path as a choice": ({"data": "../../../../evil"}, {}),
+    "a folder within a group": ({"data": "more/evil"}, {}),
+    "a group of Hydra's": ({"hydra/launcher": "joblib"}, {}),
+    "Hydra's own settings": ({}, {"hydra.searchpath": ["file:///evil"]}),
+    "a logger": ({"logger": "wandb"}, {}),
+    "a callback": ({}, {"callbacks.x": {"y": 1}}),
+    "a list of defaults": ({}, {"defaults": ["/evil"]}),
+    "an option that writes more": ({"data": "inward seed=1"}, {}),
+    "a key that writes more": ({}, {"data.root=x +a": 1}),
+    "a place to write to": ({}, {"data": {"flow_cache": "/elsewhere"}}),
+}
+
+
+@pytest.mark.parametrize(("choices", "settings"), HOSTILE.values(), ids=list(HOSTILE))
+def test_a_checkpoint_holds_names_of_options_and_plain_values(run, learned_by, choices, settings):
+    evil = learned_by(choices, settings)
+    for named in (f"hydra.run.dir={run}", f"ckpt={evil}"):
+        with pytest.raises(DevrfError, match=f"^{evil}: "):
+            completed(["stage=still", named])
+
+
+@pytest.mark.parametrize("name", ["a word that is put together", "a path as a choice", "a part"])
+def test_a_checkpoint_that_chooses_code_is_one_line(devrf, run, learned_by, tmp_path, name):
+    (tmp_path / "evil.yaml").write_text(json.dumps(CODE))
+    learned_by(*HOSTILE[name])
+    outcome = devrf("stage=still", "hydra.run.dir=run")
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert outcome.err.startswith("devrf: run/checkpoints/deformation.ckpt: ")
+    assert not list(tmp_path.rglob("PWNED")) and not (run / "images").exists()
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        *("os.system", "sympy.sympify", "torch.nn.Linear", "devrf.methods.devrf.model.partial"),
+        *("devrf.methods.devrf.extensions.tracks.StartAlongFlow", "evil.Model", "..x", "", None),
+    ],
+)
+@pytest.mark.parametrize("key", ["class", "color_residual"])
+def test_a_checkpoint_names_no_class_but_a_method_s(
+    devrf, edited, tmp_path, monkeypatch, path, key
+):
+    (tmp_path / "evil.py").write_text("open('PWNED', 'w')\nclass Model: from_config = print")
+    monkeypatch.syspath_prepend(tmp_path)
+    if key == "class" or path:
+        evil = edited(lambda entry: entry["model"].update({key: path}))
+        outcome = devrf("stage=still", f"ckpt={evil}")
+        assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert not list(tmp_path.rglob("PWNED"))
+
+
+@pytest.mark.parametrize(
+    "task",
+    [
+        ["+aa=_tar", "+bb=get_", "canonical='${oc.env:HOME}'"],
+        ["data=../../evil,inward"],
+        ["+canonical.x={_target_:sympy.sympify}"],
+        ["field.width=1,${seed}"],
+    ],
+)
+def test_the_record_of_a_sweep_chooses_no_code(devrf, tmp_path, task):
+    (tmp_path / "sweep").mkdir()
+    record = OmegaConf.create({"hydra": {"overrides": {"task": ["seed=0,1"]}}})
+    record.hydra.overrides.task += [text.replace("${", "\\${") for text in task]
+    OmegaConf.save(record, tmp_path / "sweep" / "multirun.yaml")
+    outcome = devrf("stage=inspect", "hydra.sweep.dir=sweep")
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert outcome.err.startswith("devrf: sweep/multirun.yaml: ")
+    assert not list(tmp_path.rglob("PWNED"))
