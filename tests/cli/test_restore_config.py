@@ -126,8 +126,8 @@ def test_what_a_checkpoint_keeps_of_a_command_is_plain(devrf, tiny, tmp_path, mo
         "stage=inspect",
         "still.time=1",
         "logger=csv",
-        "+callbacks.x=1",
-        "~video.name",
+        "viewer.port=5",
+        "~callbacks.training_curve",
     )
     outcome = devrf(*typed, *of_the_command, "seed=2", "hydra.run.dir=run")
     assert kept == [
