@@ -26,15 +26,59 @@ def free_port():
         return int(probe.getsockname()[1])
 
 
+def page_camera(**said):
+    """A page's camera as viser holds it, with some of it as the page ``said``."""
+    usual = {"wxyz": (1, 0, 0, 0), "position": (0, 0, 3), "fov": 1.0}
+    return SimpleNamespace(**(usual | {"image_width": 300, "image_height": 200} | said))
+
+
 def test_a_camera_of_the_browser_by_hand_and_back():
     # OpenCV's camera that looks along z with y down is OpenGL's turned about x by half a turn.
-    camera = SimpleNamespace(wxyz=(1.0, 0, 0, 0), position=(1.0, 2, 3), fov=math.pi / 2)
-    keyframe = from_browser(camera, 0.3, 2.0)
+    camera = page_camera(wxyz=(1.0, 0, 0, 0), position=(1.0, 2, 3), fov=math.pi / 2)
+    keyframe, aspect = from_browser(camera, 0.3, 2.0)
+    assert aspect == 1.5
     assert keyframe.camera_to_world.tolist() == [[1, 0, 0, 1], [0, -1, 0, 2], [0, 0, -1, 3]]
     assert (keyframe.fov, keyframe.time, keyframe.seconds) == (pytest.approx(90.0), 0.3, 2.0)
     wxyz, position, fov = in_browser(keyframe)
     assert wxyz.tolist() == [1, 0, 0, 0] and position.tolist() == [1, 2, 3]
     assert fov == pytest.approx(math.pi / 2)
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        *({"image_width": width} for width in (0, -300, math.nan, math.inf, "wide", None)),
+        *({"image_height": height} for height in (0, -200, math.nan, math.inf)),
+        *({"fov": angle} for angle in (math.nan, math.inf, "wide")),
+        *({"position": place} for place in ((0, math.nan, 0), (math.inf, 0, 0), (0, 1e300, 0))),
+        *({"wxyz": turn} for turn in ((math.nan, 0, 0, 0), (1, 0, math.inf, 0))),
+        *({"position": place} for place in ((0, 0), (), ("a", "b", "c"), None)),
+    ],
+)
+def test_a_page_that_cannot_be_rendered_is_refused(said):
+    with pytest.raises(DevrfError, match="^the page has no area, or its camera no pose"):
+        from_browser(page_camera(**said), 0.0)
+
+
+@pytest.mark.parametrize(
+    ("said", "fov", "aspect"),
+    [
+        ({"fov": 0.0}, 1.0, 1.5),
+        ({"fov": -1.0}, 1.0, 1.5),
+        ({"fov": math.pi}, 179.0, 1.5),
+        ({"fov": 1e6}, 179.0, 1.5),
+        ({"image_width": 10**6}, math.degrees(1.0), 10.0),
+        ({"image_height": 10**6}, math.degrees(1.0), 0.1),
+        ({"wxyz": (0, 0, 0, 0)}, math.degrees(1.0), 1.5),
+        ({"position": (1e9, 0, 0)}, math.degrees(1.0), 1.5),
+    ],
+)
+def test_a_page_that_says_too_much_is_brought_within_limits(drawing, said, fov, aspect):
+    keyframe, seen_aspect = from_browser(page_camera(**said), 0.7)
+    assert keyframe.fov == pytest.approx(fov) and seen_aspect == pytest.approx(aspect)
+    for beside in (False, True):
+        frame = drawn(drawing, Shot(keyframe, seen_aspect, beside_rest=beside), 4)
+        assert frame.pixels.shape[0] == 4 and frame.pixels.shape[1] <= 40
 
 
 # Frames: as the renderer's images, in blocks.
@@ -198,6 +242,26 @@ def test_browsers_are_served_in_turn_while_time_runs():
     assert [key for key, _, _ in screen.shown] == [*"abcabc"]
 
 
+def test_a_frame_that_fails_is_not_tried_again_and_costs_the_others_nothing():
+    screen = Screen()
+    draw = screen.draw
+
+    def failing(shot, height):
+        if shot is FIRST:
+            raise ValueError(height)
+        return draw(shot, height)
+
+    screen.draw = failing
+    screen.scheduler.ask("a", FIRST)
+    screen.scheduler.ask("b", SECOND)
+    with pytest.raises(ValueError, match="^20$"):
+        screen.scheduler.render_next(0)
+    screen.render()
+    assert [rows for _, _, rows in screen.shown] == [20, 60, 100]
+    screen.scheduler.ask("a", SECOND)  # it has moved on
+    assert screen.scheduler.render_next(0) and screen.shown[-1][0] == "a"
+
+
 def test_nothing_is_shown_to_who_has_left_or_once_it_is_stopped():
     screen = Screen()
     screen.between = lambda rows: screen.scheduler.drop("a")
@@ -255,9 +319,8 @@ def test_keyframes_are_collected_saved_loaded_and_flown_through(
         controls.left(3)
         assert not controls._crop.value
         panel, told = session.paths, list[str]()
-        camera = SimpleNamespace(wxyz=(1, 0, 0, 0), position=(0, 0, 3), fov=1.0, aspect=1.5)
         client = SimpleNamespace(
-            camera=camera, add_notification=lambda title, text, **_: told.append(text)
+            camera=page_camera(), add_notification=lambda title, text, **_: told.append(text)
         )
         event = SimpleNamespace(client=client)
         panel._answer(panel._save)(event)
@@ -283,6 +346,45 @@ def test_keyframes_are_collected_saved_loaded_and_flown_through(
         session._fly(panel.path())
         session.step(0.0)
         assert len(session._frusta._handles) == 10
+    finally:
+        session.close()
+
+
+def test_controls_say_what_they_offer_whatever_a_page_sends(learned, tiny_scene, tmp_path):
+    pytest.importorskip("viser", reason="the viewer's extra is not installed")
+    from devrf.apps.viewer.controls import set_value
+    from devrf.apps.viewer.session import Session
+    from devrf.checkpoints.checkpoint import Viewpoints
+
+    settings = ViewerSettings(port=free_port(), height=16)
+    session = Session(settings, Viewpoints.of(tiny_scene), tiny_scene, tmp_path)
+    try:
+        at_rest = Drawing(Renderer(learned[0].scene_model), 1.0)
+        session.present(at_rest)
+        controls, panel = session.controls, session.paths
+        event = SimpleNamespace(client=SimpleNamespace(camera=page_camera()))
+        for sent, time in ((math.nan, 0.0), (-5.0, 0.0), (math.inf, 1.0), (0.25, 0.25)):
+            set_value(controls._time, sent)
+            controls._time_set(event)
+            assert controls.playback.time == time
+        for sent, speed in (("nan", 0.1), ("1e300", 0.1), ("words", 0.1), ("2", 2.0)):
+            set_value(controls._speed, sent)
+            controls._pace_set(event)
+            assert controls.playback.speed == speed
+        box = learned[0].scene_model.box
+        set_value(controls._channel, "motion")  # a scene at rest has none
+        set_value(controls._crop, True)
+        set_value(controls._sides[0], (900, -900))
+        shot = controls.shot(page_camera(), box, with_depth=False)
+        assert shot.channel == "color"
+        assert shot.crop.low == pytest.approx(box.low) and shot.crop.high == pytest.approx(box.high)
+        drawn(at_rest, shot, 16)
+        for sent, seconds in ((math.nan, 0.05), (1e300, 600), (2.0, 2.0)):
+            panel._take(())
+            set_value(panel._gap, sent)
+            for _ in range(2):
+                panel._answer(panel._add)(event)
+            assert panel.keyframes[1].seconds == seconds
     finally:
         session.close()
 

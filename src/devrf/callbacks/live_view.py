@@ -21,7 +21,8 @@ PAUSE = 0.2
 class LiveView(Callback):
     """Renders a picture for those who watch, between iterations, as seldom as a share allows.
 
-    Nothing is rendered while nobody has the page open, and learning is the same with and without.
+    Nothing is rendered while nobody has the page open. Learning is the same with and without, and
+    no error of the viewer ends it.
 
     Attributes:
         seconds: what the pictures of the present stage have taken.
@@ -38,9 +39,10 @@ class LiveView(Callback):
         assert isinstance(pl_module, ScheduledStage)
         self.seconds, self._began = 0.0, time.perf_counter()
         self._first = pl_module.iteration
-        self._drawing = Drawing(_renderer(pl_module), background_value(pl_module.scene.background))
-        self.session.present(self._drawing)
-        self.session.controls.tell(f"**{pl_module.name}** begins")
+        with self.session.surviving():
+            background = background_value(pl_module.scene.background)
+            self.session.present(Drawing(_renderer(pl_module), background))
+            self.session.controls.tell(f"**{pl_module.name}** begins")
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -51,18 +53,21 @@ class LiveView(Callback):
         if scheduler is None or not scheduler.watched or now - self._last < PAUSE:
             return
         self._last = now
-        seconds, done = now - self._began, pl_module.iteration
-        pace = pl_module.cost(self._first, done) / seconds
-        line = in_one_line(outputs or {}, pl_module, (done - self._first) / seconds, pace)
-        self.session.controls.tell(f"**{pl_module.name}**: {line}")
+        controls = self.session.controls
+        with self.session.surviving():
+            seconds, done = now - self._began, pl_module.iteration
+            pace = pl_module.cost(self._first, done) / seconds
+            line = in_one_line(outputs or {}, pl_module, (done - self._first) / seconds, pace)
+            controls.tell(f"**{pl_module.name}**: {line}")
         if self.seconds > self.share * (now - self._began):
             return
-        self._drawing.renderer = _renderer(pl_module)
-        frames = () if pl_module.phase is None else pl_module.phase.frames
-        clock = pl_module.scene.clock
-        self.session.controls.follow(clock.times[frames[-1]] if frames else None)
-        self.session.refresh()
-        self.session.step(0.0)
+        with self.session.surviving():
+            scheduler.drawing.renderer = _renderer(pl_module)
+            frames = () if pl_module.phase is None else pl_module.phase.frames
+            clock = pl_module.scene.clock
+            controls.follow(clock.times[frames[-1]] if frames else None)
+            self.session.refresh()
+            self.session.step(0.0)
         self._last = time.perf_counter()
         self.seconds += self._last - now
 
@@ -70,10 +75,12 @@ class LiveView(Callback):
         """Say that the stage has ended."""
         assert isinstance(pl_module, ScheduledStage)
         done, total = pl_module.iteration, pl_module.total_iterations
-        self.session.controls.tell(
-            f"**{pl_module.name}** has ended after {done} of {total} iterations. The picture stays "
-            "as it is until another stage begins; `stage=view` shows a run that has ended."
-        )
+        with self.session.surviving():
+            self.session.controls.tell(
+                f"**{pl_module.name}** has ended after {done} of {total} iterations. The picture "
+                "stays as it is until another stage begins; `stage=view` shows a run that has "
+                "ended."
+            )
 
 
 def _renderer(stage: ScheduledStage) -> Renderer:

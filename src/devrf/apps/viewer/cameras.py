@@ -15,10 +15,12 @@ from torch import Tensor
 
 from devrf.apps.images import evenly, scaled, to_bytes
 from devrf.apps.keyframes import Keyframe, keyframes_of
+from devrf.errors import DevrfError
 from devrf.evaluation.held_out import truth_image
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.bounds import nearest_point
 from devrf.scenes.scene import Scene, Views
+from devrf.scenes.validation import in_reach
 
 if TYPE_CHECKING:
     import viser
@@ -30,15 +32,39 @@ ROWS, MAX_FRUSTA = 96, 60
 # A frustum is as deep as its neighbour is far, within these shares of the distance of the scene.
 MIN_DEPTH, MAX_DEPTH = 0.03, 0.12
 COLOR, THICKNESS = (40, 110, 170), 1.5
+# The angles of view in degrees, and windows (width over height), that are rendered as they are.
+FOVS, ASPECTS = (1.0, 179.0), (0.1, 10.0)
 
 
-def from_browser(camera: viser.CameraHandle, time: float, seconds: float = 0.0) -> Keyframe:
-    """The camera that a page is looked at from, at a time of the scene, as a keyframe."""
-    wxyz = torch.tensor([list(camera.wxyz)], dtype=torch.float64)
-    turned = quaternion_to_rotation_matrix(wxyz)[0] * wxyz.new_tensor(FLIP)
-    position = wxyz.new_tensor(list(camera.position))
-    pose = torch.cat([turned, position[:, None]], dim=1).float()
-    return Keyframe(pose, math.degrees(camera.fov), time, seconds)
+def within(value: float, limits: tuple[float, float]) -> float:
+    """``value``, or the limit that it is beyond; the lower one for NaN."""
+    low, high = limits
+    return min(high, max(low, value))
+
+
+def from_browser(
+    camera: viser.CameraHandle, time: float, seconds: float = 0.0
+) -> tuple[Keyframe, float]:
+    """The camera that a page is looked at from, at a time of the scene, and its aspect.
+
+    A page may say anything: the angle of view and the aspect are brought within limits.
+
+    Raises:
+        DevrfError: the window has no area, as that of a collapsed tab, or the camera no pose.
+    """
+    try:
+        pose = [*camera.wxyz, *camera.position]
+        others = [camera.fov, camera.image_width, camera.image_height]
+        numbers = torch.tensor([*pose, *others], dtype=torch.float64)
+    except (TypeError, ValueError):
+        numbers = torch.empty(0)
+    if len(numbers) != 10 or not bool(in_reach(numbers)) or bool((numbers[8:] <= 0).any()):
+        raise DevrfError("the page has no area, or its camera no pose that can be computed with")
+    turned = quaternion_to_rotation_matrix(numbers[None, :4])[0] * numbers.new_tensor(FLIP)
+    camera_to_world = torch.cat([turned, numbers[4:7, None]], dim=1).float()
+    fov, width, height = numbers[7:].tolist()
+    keyframe = Keyframe(camera_to_world, within(math.degrees(fov), FOVS), time, seconds)
+    return keyframe, within(width / height, ASPECTS)
 
 
 def in_browser(keyframe: Keyframe) -> tuple[np.ndarray, np.ndarray, float]:

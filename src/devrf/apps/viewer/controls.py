@@ -9,7 +9,7 @@ from typing import Any
 
 import viser
 
-from devrf.apps.viewer.cameras import from_browser
+from devrf.apps.viewer.cameras import from_browser, within
 from devrf.apps.viewer.drawing import Drawing, Shot
 from devrf.geometry.box import Box
 
@@ -51,6 +51,16 @@ class Playback:
 def set_value(control: Any, value: object) -> None:
     """Set what a control of the page shows; its type takes it for read-only."""
     control.value = value
+
+
+def number_of(control: Any) -> float:
+    """The number that a control shows, within its limits: a page may send any."""
+    return within(control.value, (control.min, control.max))
+
+
+def choice_of(control: Any) -> Any:
+    """What is chosen of a control's options; the first, where a page has sent something else."""
+    return control.value if control.value in control.options else control.options[0]
 
 
 class Controls:
@@ -128,10 +138,17 @@ class Controls:
         """What a page's camera is to show; the crop is a part of the ``box``.
 
         ``with_depth``: whether something beside frusta is drawn into the scene.
+
+        Raises:
+            DevrfError: the page's camera cannot be rendered.
         """
         crop = None
         if self._crop.value:
-            shares = [[share / 100 for share in slider.value] for slider in self._sides]
+            ends = min, max
+            shares = [
+                [within(end(slider.value), (0, 100)) / 100 for end in ends]
+                for slider in self._sides
+            ]
             corners = list(zip(box.low, box.size, shares, strict=True))
             crop = Box.of(
                 [low + size * first for low, size, (first, _) in corners],
@@ -139,8 +156,8 @@ class Controls:
             )
         with_depth = with_depth or self.dynamic.value or self.static.value
         beside = self._rest.value and self._rest.visible
-        keyframe = from_browser(camera, self.playback.time)
-        return Shot(keyframe, camera.aspect, self._channel.value, beside, crop, with_depth)
+        keyframe, aspect = from_browser(camera, self.playback.time)
+        return Shot(keyframe, aspect, choice_of(self._channel), beside, crop, with_depth)
 
     def show_status(self, text: str) -> None:
         """Show a line below the choice of channels."""
@@ -180,7 +197,7 @@ class Controls:
         if event.client is None:  # set by this program
             return
         set_value(self._follow, False)
-        self._change(lambda now: replace(now, time=float(self._time.value)))
+        self._change(lambda now: replace(now, time=number_of(self._time)))
         self._changed()
 
     def _play_pressed(self, _: object) -> None:
@@ -189,5 +206,5 @@ class Controls:
         self._changed()
 
     def _pace_set(self, _: object) -> None:
-        loop, speed = bool(self._loop.value), float(self._speed.value)
+        loop, speed = bool(self._loop.value), float(choice_of(self._speed))
         self._change(lambda now: replace(now, loop=loop, speed=speed))

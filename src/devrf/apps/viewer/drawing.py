@@ -228,14 +228,18 @@ class RenderScheduler:
         full, coarse, aspect = self._height, request.rows == 0, request.shot.aspect
         rows = FINER * request.rows or self.drawing.height_within(self._move_seconds, aspect, full)
         rows = full if rows > NEARLY * full else rows
-        for frame in self.drawing.draw(request.shot, rows):
-            if frame is not None:
-                request.rows = rows
-                if key in self._requests:
-                    self._show(key, frame)
-                    return True
-            elif self._stop.is_set() or (not coarse and self._overtaken(key, request)):
-                return False
+        try:
+            for frame in self.drawing.draw(request.shot, rows):
+                if frame is not None:
+                    request.rows = rows
+                    if key in self._requests:
+                        self._show(key, frame)
+                        return True
+                elif self._stop.is_set() or (not coarse and self._overtaken(key, request)):
+                    return False
+        except Exception:
+            request.rows = full  # it is not tried again: the other browsers' turn comes
+            raise
         return False
 
     def _most_urgent(self) -> tuple[Hashable, _Request] | None:

@@ -24,7 +24,7 @@ from devrf.apps.keyframes import (
 )
 from devrf.apps.video import VideoSettings
 from devrf.apps.viewer.cameras import distance_ahead, from_browser
-from devrf.apps.viewer.controls import set_value
+from devrf.apps.viewer.controls import choice_of, number_of, set_value
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.rendering.view import Viewable
@@ -109,7 +109,7 @@ class PathPanel:
             self._presets = tuple(presets)
             self._preset: Any = gui.add_dropdown("path", self._presets, hint="a path that is known")
             self._button(
-                "Take this path", lambda _: self._take(presets[self._preset.value](time()))
+                "Take this path", lambda _: self._take(presets[choice_of(self._preset)](time()))
             )
             self._button("Fly through", lambda _: fly(self.path()))
             self._name = gui.add_text("name", "path")
@@ -136,7 +136,7 @@ class PathPanel:
         """
         if len(self.keyframes) < 2:
             raise DevrfError("a path needs two keyframes; add the camera at two places or times")
-        return CameraPath(self.keyframes, float(self._aspect.value), float(self._fps.value))
+        return CameraPath(self.keyframes, number_of(self._aspect), number_of(self._fps))
 
     def _button(self, label: str, act: Act, icon: viser.IconName | None = None) -> None:
         self._server.gui.add_button(label, icon=icon).on_click(self._answer(act))
@@ -162,8 +162,8 @@ class PathPanel:
         if event.client is None:
             return
         last = self.keyframes[-1:]
-        seconds = last[0].seconds + float(self._gap.value) if last else 0.0
-        added = from_browser(event.client.camera, self._time(), seconds)
+        seconds = last[0].seconds + number_of(self._gap) if last else 0.0
+        added, _ = from_browser(event.client.camera, self._time(), seconds)
         self.keyframes = (*self.keyframes, added)
 
     def _take(self, keyframes: tuple[Keyframe, ...]) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import torch
@@ -19,6 +20,7 @@ from devrf.apps.viewer.drawing import Drawing, Frame, RenderScheduler
 from devrf.apps.viewer.paths import PathPanel, known_paths
 from devrf.apps.viewer.server import open_server, quiet
 from devrf.checkpoints.checkpoint import Viewpoints
+from devrf.errors import DevrfError
 from devrf.rendering.view import Viewable
 from devrf.scenes.scene import Scene
 
@@ -60,6 +62,7 @@ class Session:
         self._stop = threading.Event()
         self._flight: tuple[CameraPath, float] | None = None
         self._ticked = time.monotonic()
+        self._failures: set[str] = set()
         self.server = open_server(settings)
         self.controls = Controls(self.server, self.refresh)
         learned = [] if ckpt is None else [f"ckpt={Path(ckpt).resolve()}"]
@@ -92,8 +95,21 @@ class Session:
         """Render what is asked for until :meth:`stop`, from the calling thread."""
         log.info("the scene is at %s; Ctrl-C ends the viewer", self.settings.address)
         while not self._stop.is_set():
-            self.step(TICK)
+            with self.surviving():
+                self.step(TICK)
         log.info("the viewer has ended")
+
+    @contextmanager
+    def surviving(self) -> Iterator[None]:
+        """A block whose errors end neither viewer nor learning; the first of a kind is logged."""
+        try:
+            yield
+        except Exception as error:
+            kind = type(error).__name__
+            if kind not in self._failures:
+                self._failures.add(kind)
+                reason = str(error).partition("\n")[0]
+                log.warning("viewer: %s: %s; it goes on, and says this once", kind, reason)
 
     def stop(self) -> None:
         """End :meth:`serve`, within the time of a block of rays."""
@@ -123,11 +139,15 @@ class Session:
         self._show_cameras()
 
     def _ask(self, client: viser.ClientHandle) -> None:
-        if self.scheduler is None or not client.camera.image_height:
+        if self.scheduler is None:
             return
         box = self._model.space.inner(self._model.box)
-        shot = self.controls.shot(client.camera, box, with_depth=self.paths.drawn)
-        self.scheduler.ask(client.client_id, shot)
+        try:
+            shot = self.controls.shot(client.camera, box, with_depth=self.paths.drawn)
+        except DevrfError:  # there is nothing to render for such a page
+            self.scheduler.drop(client.client_id)
+        else:
+            self.scheduler.ask(client.client_id, shot)
 
     @property
     def _model(self) -> Viewable:
@@ -186,7 +206,8 @@ class Session:
         self.controls.set_time(keyframe.time)
         wxyz, position, fov = in_browser(keyframe)
         for client in self.server.get_clients().values():
-            with client.atomic():
+            # A page may say of its camera what viser does not move.
+            with self.surviving(), client.atomic():
                 client.camera.position = position
                 client.camera.wxyz = wxyz
                 client.camera.fov = fov
