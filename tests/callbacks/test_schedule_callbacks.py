@@ -60,13 +60,21 @@ def test_deformation_rates_and_phases_are_the_schedules_at_every_step(fit, rest)
     assert stage.resolution == stage.field.box.grid_shape(6**3)
 
 
-def test_without_the_upscaling_callback_a_stage_says_what_is_missing(
-    canonical, datamodule, trainer
+@pytest.mark.parametrize(
+    ("left_out", "said"),
+    [
+        (0, r"^CanonicalStage: .*iteration 0.*GridUpscaling"),
+        (1, r"^CanonicalStage: the learning rates .*LearningRateDecay"),
+    ],
+)
+def test_without_a_callback_of_the_schedule_a_stage_says_what_is_missing(
+    canonical, datamodule, trainer, left_out, said
 ):
-    bare = trainer(max_steps=1)
-    bare.callbacks.pop(0)  # type: ignore[attr-defined]
-    with pytest.raises(DevrfError, match="CanonicalStage.*iteration 0.*GridUpscaling"):
-        bare.fit(canonical(), datamodule=datamodule)
+    bare, stage = trainer(max_steps=1), canonical()
+    bare.callbacks.pop(left_out)  # type: ignore[attr-defined]
+    with pytest.raises(DevrfError, match=said):
+        bare.fit(stage, datamodule=datamodule)
+    assert stage.iteration == 0
 
 
 def test_the_record_says_what_training_took(fit, canonical):

@@ -26,6 +26,11 @@ class GridUpscaling(Callback):
 class LearningRateDecay(Callback):
     """Scales every learning rate by the schedule's factor, before each optimiser step."""
 
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Tell the stage, which refuses to learn at rates that nobody sets."""
+        assert isinstance(pl_module, ScheduledStage)
+        pl_module.has_scheduled_rates = True
+
     def on_before_optimizer_step(
         self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer
     ) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 from lightning import LightningModule, Trainer
 
-from devrf.callbacks.schedule import GridUpscaling
+from devrf.callbacks.schedule import GridUpscaling, LearningRateDecay
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.stage import ScheduledStage
 from devrf.methods.devrf.canonical_stage import CanonicalStage
@@ -52,7 +52,7 @@ def seconds_to_learn(
     """
     assert isinstance(stage, CanonicalStage)
     trial = Trial()
-    trainer(callbacks=[trial], logger=False).fit(stage, datamodule=datamodule)
+    trainer(callbacks=[trial, LearningRateDecay()], logger=False).fit(stage, datamodule=datamodule)
     end, frames = stage.total_iterations, len(datamodule.scene.clock)
     batches = moving.total(frames) * moving.rays / stage.schedule.rays if frames > 1 else 0
     return (stage.cost(0, end) + batches * stage.phase_at(end).cost) / trial.pace

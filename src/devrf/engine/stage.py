@@ -69,6 +69,7 @@ class ScheduledStage(Learner):
         protocol: the name of the protocol that the stage is a part of, if any.
         num_rollbacks: how often training diverged and was rolled back.
         lr_scale: factor of the scheduled learning rates; below 1 after a rollback.
+        has_scheduled_rates: whether a ``LearningRateDecay`` sets the learning rates.
         abort_reason: why the stage ended before its schedule; None while it has not.
         loop: carries the iterations out.
     """
@@ -90,6 +91,7 @@ class ScheduledStage(Learner):
         self.settings: dict[str, Any] = {}
         self.protocol: str | None = None
         self.lr_scale = 1.0
+        self.has_scheduled_rates = False
         self.abort_reason: str | None = None
         # How far the last iteration went, and what it went less than its stride.
         self._advance, self._owed = 1, 0.0
@@ -249,6 +251,11 @@ class ScheduledStage(Learner):
             raise DevrfError(
                 f"{type(self).__name__}: the phase of iteration {self.iteration} was not "
                 "entered: add devrf.callbacks.GridUpscaling to the trainer's callbacks"
+            )
+        if not self.has_scheduled_rates:
+            raise DevrfError(
+                f"{type(self).__name__}: the learning rates of its schedule are not set: add "
+                "devrf.callbacks.LearningRateDecay to the trainer's callbacks"
             )
         assert self.phase is not None
         before, stop = self.iterations_done, min(self.phase.stop, self.total_iterations)
