@@ -231,7 +231,7 @@ class TrainingCurve(Callback):
         """Draw the curve; the stage's seconds have been taken."""
         assert isinstance(pl_module, ScheduledStage)
         self._read()
-        if not self._points:
+        if not self._points or trainer.fast_dev_run:  # type: ignore[attr-defined]
             return
         # Only this hook draws with matplotlib.
         from devrf.apps.report.plots import write_training_curve

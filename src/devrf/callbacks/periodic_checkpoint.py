@@ -1,4 +1,4 @@
-"""Writes progress files at intervals, and when a signal asks the stage to stop.
+"""Writes progress files at intervals, and where a stage ends before its schedule.
 
 Lightning's ModelCheckpoint does less: it bounds no share of the time, ends the training on a full
 disk, and may write what has diverged.
@@ -72,15 +72,15 @@ class PeriodicCheckpoint(Callback):
         self._asked = True
 
     def left_at(self, stage: ScheduledStage) -> str:
-        """Where a signal has ended the run, in one line."""
+        """Where a stage has ended, and whether it can go on from there, in words."""
         done, total = stage.iteration, stage.total_iterations
-        where = f"interrupted at iteration {done} of {total} of the {stage.name} stage"
-        if done < total and self.saved != done:
+        where = f"iteration {done} of {total} of the {stage.name} stage"
+        if done < total and done != (self.saved or 0):
             last = "there is none" if self.saved is None else f"the last is of {self.saved}"
             where += f" (its progress could not be written; {last})"
-        return f"{where}; run the same command again to go on"
+        return where
 
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the clock, and remove half-written files of a process that was killed."""
         assert isinstance(pl_module, ScheduledStage)
         self._failing = False
@@ -94,23 +94,23 @@ class PeriodicCheckpoint(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Write a file if one is due, if this step is the last, or if the stage is to stop."""
+        """Write a file if one is due, or if the stage is to stop."""
         assert isinstance(pl_module, ScheduledStage)
         stopping, due = self._asked, time.monotonic() >= self._due
         if trainer.world_size > 1:  # what one process is asked, all must do
             stopping, due = self._agreed(trainer.is_global_zero, pl_module.device)
         if pl_module.iteration >= pl_module.total_iterations:
             return  # the stage is done: its checkpoint is next
-        last = trainer.should_stop or 0 < trainer.max_steps <= trainer.global_step
-        if stopping or last or due:
-            callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
-            for guard in callbacks:
-                if isinstance(guard, DivergenceGuard):
-                    guard.check(pl_module)  # rolls back first: a diverged state is never written
-            if trainer.is_global_zero:
-                self._write(trainer, pl_module)
+        if stopping or due:
+            self._write(trainer, pl_module)
         if stopping:
             self._asked, trainer.should_stop = False, True
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Write a file where something else has ended the stage before its schedule."""
+        assert isinstance(pl_module, ScheduledStage)
+        if self.saved != pl_module.iteration < pl_module.total_iterations:
+            self._write(trainer, pl_module)
 
     def _agreed(self, leads: bool, device: torch.device) -> tuple[bool, bool]:
         """Whether any process was asked to stop, and whether rank 0's next file is due.
@@ -124,6 +124,12 @@ class PeriodicCheckpoint(Callback):
         return bool(stopping), bool(due)
 
     def _write(self, trainer: Trainer, stage: ScheduledStage) -> None:
+        callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+        for guard in callbacks:
+            if isinstance(guard, DivergenceGuard):
+                guard.check(stage)  # rolls back first: a diverged state is never written
+        if not trainer.is_global_zero or trainer.fast_dev_run:  # type: ignore[attr-defined]
+            return
         began, path = time.monotonic(), progress_file(self.folder, stage.name, stage.iteration)
         try:
             save_checkpoint(trainer, path, weights_only=False)

@@ -51,6 +51,7 @@ class RunContext:
         folder: gets ``checkpoints/<stage>.ckpt``, ``metrics.json``, ``frames.csv``, ``images/`` and
             ``videos/``, next to Hydra's config and log.
         chooses_size: whether the images' size is left to this run.
+        tried: what the stages of a trial came to, by name.
     """
 
     def __init__(self, config: DictConfig, folder: Path) -> None:
@@ -59,12 +60,18 @@ class RunContext:
         self.folder = folder
         self.step_began = time.perf_counter()
         self.chooses_size = False
+        self.tried: dict[str, LoadedCheckpoint] = {}
 
     @property
     def place(self) -> Path:
         """The folder as a command names it: relative, where it is below the working folder."""
         inside = self.folder.is_relative_to(Path.cwd())
         return self.folder.relative_to(Path.cwd()) if inside else self.folder
+
+    @property
+    def is_trial(self) -> bool:
+        """Whether ``trainer.fast_dev_run`` asks for a step of each stage, with nothing kept."""
+        return bool(self.config.trainer.get("fast_dev_run"))
 
     @property
     def step_seconds(self) -> float:
@@ -177,11 +184,11 @@ class RunContext:
 
     @cached_property
     def logger(self) -> Any:
-        """The logger of all steps, False in other processes than rank 0.
+        """The logger of all steps, False in a trial and in other processes than rank 0.
 
         Giving a tracker the config begins its run: use it once the config has been checked.
         """
-        if not self.leads:
+        if not self.leads or self.is_trial:
             return False
         logger = instantiate(self.config.logger)
         for tracker in trackers([logger]):

@@ -61,6 +61,7 @@ NEXT = ("stage=still still.time=0.35 still.height=400", "stage=view")
 for _name in ("lightning.pytorch", "lightning.fabric"):
     logging.getLogger(_name).setLevel(logging.WARNING)
 _IGNORED = "many workers|LeafSpec|GPU available but not used|Experiment logs directory"
+_IGNORED += "|callbacks used to create the checkpoint"  # a resumed run may be watched otherwise
 warnings.filterwarnings("ignore", message=f".*({_IGNORED})")
 
 
@@ -93,6 +94,8 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
     """
     run = RunContext(config, folder)
     learning, steps = plan(config.stage, run.learning_stages)
+    if learning and run.is_trial:
+        steps = ()  # nothing of it is worth a score or a video
     with shortage_in_words(config.stage, run.device, None):  # of networks that are too wide
         _check(run, learning, steps)
     ended = False
@@ -125,7 +128,7 @@ def _prepare_to_learn(run: RunContext, requested: Names, steps: Names) -> None:
         needed, shortage, _ = compare(run, names)
     if shortage is not None:
         raise DevrfError(f"{shortage}, or try all the same with memory_check=false")
-    if not resume:
+    if not resume and not run.is_trial:
         below = run.protocol[learning[0]].builds_on
         archive_previous(run.folder, *([] if below is None else [run.own_checkpoint(below)]))
     if needed is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import signal
+from typing import Any
 
 from hydra.utils import instantiate
 from lightning import Trainer
@@ -24,18 +25,23 @@ from devrf.system.process import Interrupted
 
 log = logging.getLogger(__name__)
 
+# What may end learning before its schedule: keys of the trainer, and their values that do not.
+LIMITS: dict[str, Any] = {"max_epochs": 1, "max_steps": -1}
+LIMITS |= dict.fromkeys(("max_time", "limit_train_batches", "overfit_batches"))
+
 
 def learn(run: RunContext, name: str) -> None:
     """Learn a stage of the protocol, or the rest of it."""
-    begin = run.strategy.broadcast(beginning(run, name) if run.leads else None)
-    assert begin is not None
+    begin = ResumePoint({})  # of a trial
+    if not run.is_trial:
+        begin = run.strategy.broadcast(beginning(run, name) if run.leads else begin)
     if begin.finished:
         return
     build, below = run.stage_builder(name), run.protocol[name].builds_on
     if below is None:
         stage = build()
     else:
-        rest = run.load(below, run.scene)
+        rest = run.tried.get(below) or run.load(below, run.scene)
         before = rest.metadata
         if before.stage != below:
             needed = f"stage={name} needs a checkpoint of the {below} stage"
@@ -77,11 +83,26 @@ def _fit(run: RunContext, stage: ScheduledStage, begin: ResumePoint) -> None:
         trainer.fit(stage, datamodule=run.datamodule, ckpt_path=path)
         strategy = trainer.strategy
         stopping = strategy.reduce_boolean_decision(stop.number is not None, all=False)
-        if run.leads and (not stopping or stage.iteration >= stage.total_iterations):
+        finished = stage.iteration >= stage.total_iterations
+        if run.leads and finished and not run.is_trial:
             _keep(run, trainer, stage)
         strategy.barrier("the checkpoint is written")
+    where = saving.left_at(stage)
     if stopping:
-        raise Interrupted(stop.number or signal.SIGTERM, saving.left_at(stage))
+        again = "run the same command again to go on"
+        raise Interrupted(stop.number or signal.SIGTERM, f"interrupted at {where}; {again}")
+    if run.is_trial:
+        run.tried[stage.name] = stage.result()
+        if run.leads:
+            tried, total = stage.iteration, stage.total_iterations
+            log.info("%s: a trial, %d of %d iterations; nothing is kept", stage.name, tried, total)
+    elif not finished:
+        asked = run.config.trainer
+        limits = [f"trainer.{k}={asked[k]}" for k, v in LIMITS.items() if asked.get(k, v) != v]
+        raise DevrfError(
+            f"{', '.join(limits) or 'callbacks'}: learning has ended at {where}; the same command "
+            "without it goes on"
+        )
 
 
 def _keep(run: RunContext, trainer: Trainer, stage: ScheduledStage) -> None:
@@ -100,6 +121,5 @@ def _keep(run: RunContext, trainer: Trainer, stage: ScheduledStage) -> None:
             f"{error.filename or path}: {error.strerror}; {stays}make it possible to write there, "
             "and run the same command again"
         ) from error
-    if stage.iteration >= stage.total_iterations:
-        remove_progress(path.parent, stage.name)
+    remove_progress(path.parent, stage.name)
     log.info("%s: %s; written to %s", stage.name, in_words(stage.record), path)

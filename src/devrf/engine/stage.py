@@ -20,6 +20,7 @@ from torch import Tensor
 from devrf.checkpoints.checkpoint import (
     MODEL,
     CheckpointMetadata,
+    LoadedCheckpoint,
     TrainingFigures,
     Viewpoints,
     check_scene,
@@ -154,6 +155,10 @@ class ScheduledStage(Learner):
             moves=self.scene.moves,
         )
 
+    def result(self) -> LoadedCheckpoint:
+        """What a stage that builds on this one takes."""
+        return LoadedCheckpoint(self.metadata(), self.scene_model)
+
     def abort(self, why: str) -> None:
         """End the stage after the present step; the fit then raises an error that says ``why``."""
         self.abort_reason = f"{self.name} stage: {why}"
@@ -219,6 +224,12 @@ class ScheduledStage(Learner):
             )
         for name in POSITION:
             setattr(self, name, progress[name])
+        # A schedule is one epoch of a loader that never ends: what ended it there (max_time,
+        # limit_train_batches, fast_dev_run) has not ended it here.
+        fit = checkpoint["loops"]["fit_loop"]
+        for epochs in ("total", "current"):
+            fit["epoch_progress"][epochs].update(processed=0, completed=0)
+        fit["epoch_loop.batch_progress"]["is_last_batch"] = False
         self.loop.micro_batching.count = progress["micro_batches"]
         self.phase = None if progress["phase"] is None else self.phase_at(progress["phase"])
 

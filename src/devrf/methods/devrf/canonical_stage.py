@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import PixelPool, Pixels
 from devrf.engine.batches import static_pool
 from devrf.engine.learner import ParallelBatch
@@ -359,7 +358,3 @@ class CanonicalStage(VoxelStage):
         if fine and self.schedule.search_iterations:
             box = self.scene_model.canonical.box
             self.scene_model.canonical = self.architecture.radiance_field(box, 8, 8)
-
-    def result(self) -> LoadedCheckpoint:
-        """What the deformation stage builds on."""
-        return LoadedCheckpoint(self.metadata(), self.scene_model)
