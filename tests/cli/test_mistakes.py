@@ -30,7 +30,7 @@ MISTAKES = {
         ["protocol=joint"],
         "protocol: method=devrf does not learn by protocol=joint",
     ),
-    "seed out of range": (["seed=-1"], "seed: expected 0 to"),
+    "seed out of range": (["seed=-1"], "seed: expected greater than or equal to 0, not -1"),
     "a level without a side": (
         ["schedule.deformation.levels.4={iterations:2}", "schedule.deformation.levels.3=null"],
         "schedule.deformation.levels: expected rows 1 to 3 with side and iterations",

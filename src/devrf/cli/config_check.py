@@ -11,10 +11,12 @@ from collections.abc import Iterable, Mapping
 from dataclasses import is_dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, cast, get_args, get_origin, get_type_hints
 
+from annotated_types import Ge, Lt
 from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
+from typing_extensions import TypedDict
 
 from devrf.cli.config import config_folder
 from devrf.errors import DevrfError, did_you_mean
@@ -24,7 +26,7 @@ ROOT: dict[str, Any] = {
     "stage": str,
     "method": str,
     "profile": str | None,
-    "seed": int,
+    "seed": Annotated[int, Ge(0), Lt(2**32)],
     "resume": bool,
     "memory_check": bool,
     "priors": Literal["all", "none"],
@@ -35,36 +37,14 @@ ROOT: dict[str, Any] = {
     "graphs": Literal["auto", "off"],
     "decoder_precision": Literal["auto", "float32", "bfloat16"],
 }
-# Keys that were renamed, and their new names; what is below them has kept its name.
-RENAMED = {
-    "capture.mattes": "capture.alpha_masks",
-    "capture.moments": "capture.max_timesteps",
-    "schedule.deformation.sides": "schedule.deformation.levels.N.side",
-    "schedule.deformation.iterations_per_frame": "schedule.deformation.levels.N.iterations",
-    "schedule.deformation.parallel_frames": "schedule.deformation.levels.N.parallel_frames",
-    "schedule.deformation.rates": "schedule.deformation.levels.N.lr_factor",
-    "schedule.deformation.fall": "schedule.deformation.levels.N.lr_final_factor",
-    "schedule.canonical.carve": "schedule.canonical.visual_hull_init",
-    "schedule.canonical.contracted_start": "schedule.canonical.unbounded_initial_side",
-    "schedule.canonical.directions_from": "schedule.canonical.view_dependence_start",
-    "schedule.canonical.doublings": "schedule.canonical.upsample_at",
-    "schedule.canonical.least_views": "schedule.canonical.min_views",
-    "schedule.motion.moments": "schedule.motion.adam_state",
-    "schedule.motion.start": "schedule.extensions.tracks.init_from",
-    "schedule.appearance": "schedule.extensions.color_residual",
-    "loss.deformation.matte": "loss.deformation.alpha_mask",
-    "loss.fine.matte": "loss.fine.alpha_mask",
-    "ray_stage.schedule.moments": "ray_stage.schedule.times_per_batch",
-    "ray_stage.model.settings.warmup.least_frames": "ray_stage.model.settings.warmup.min_frames",
-    "ray_stage.model.settings.warmup.most_frames": "ray_stage.model.settings.warmup.max_frames",
-    "callbacks.health": "callbacks.divergence_guard",
-    "callbacks.saving": "callbacks.checkpoint",
-    "callbacks.curve": "callbacks.training_curve",
-}
 # What cannot be loaded ends the command with one line; Hydra would log it before.
 logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)
 # Hydra's own keys in a part's config.
 RESERVED = {"_target_", "_partial_", "_convert_", "_recursive_", "_args_"}
+# What pydantic calls a key that does not exist; and what is left to the part itself: a type that
+# no config value has, and what a row of settings lacks.
+UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
+LEFT = ("needs_python_object", "is_instance_of", "missing", "missing_argument")
 REFERENCE = re.compile(r"\$\{([\w.]+)\}")
 
 Node = Mapping[Any, Any]
@@ -81,38 +61,33 @@ def check_config(config: DictConfig) -> None:
         raise DevrfError(f"{key}: required; give {key}={value}")
     raw: Any = OmegaConf.to_container(config)
     resolved: Any = OmegaConf.to_container(config, resolve=True)
-    for key, hint in ROOT.items():
-        _check_value(key, resolved.get(key), hint)
-    if not 0 <= resolved["seed"] < 2**32:
-        raise DevrfError(f"seed: expected 0 to {2**32 - 1}, not {resolved['seed']}")
+    _check_values(ROOT, {key: resolved.get(key) for key in ROOT}, {}, "")
     # A value outside any part counts as read when some part refers to it: ${loss.search}.
     _check_node(raw, resolved, "", {*ROOT, *REFERENCE.findall(OmegaConf.to_yaml(config))})
 
 
 def _check_node(raw: Node, resolved: Node, path: str, read: set[str]) -> None:
     """Check a part by its signature; of another node the parts below, and that values are read."""
-    settings = _settings(resolved, path) if "_target_" in raw else None
-    for key in (key for key in raw if key not in RESERVED):
-        where, raw_value, value = f"{path}{key}", raw[key], resolved[key]
-        if settings is not None and key not in settings and "**" not in settings:
-            raise unknown_key(where, settings)
-        if isinstance(raw_value, Mapping) and (settings is None or "_target_" in raw_value):
-            _check_node(raw_value, value, f"{where}.", read)
-        elif settings is None:
-            if value is not None and not any(f"{where}.".startswith(f"{ref}.") for ref in read):
+    keys = [str(key) for key in raw if key not in RESERVED]
+    is_part = "_target_" in raw
+    for key in keys:
+        where, value = f"{path}{key}", resolved[key]
+        if isinstance(raw[key], Mapping) and (not is_part or "_target_" in raw[key]):
+            _check_node(raw[key], value, f"{where}.", read)
+        elif not is_part and value is not None:
+            if not any(f"{where}.".startswith(f"{ref}.") for ref in read):
                 below = (ref.removeprefix(path) for ref in read if ref.startswith(path))
-                known = {*map(str, raw), *(name.split(".")[0] for name in below)}
-                raise unknown_key(where, known - {str(key)})
-        elif not (isinstance(value, Mapping) and "_target_" in value):
-            hint, default = settings.get(key, (Any, None))
-            # The key to name is the one where the user sets the value.
-            reference = REFERENCE.fullmatch(raw_value) if isinstance(raw_value, str) else None
-            if value != default:
-                _check_value(reference.group(1) if reference else where, value, hint)
+                known = {*keys, *(name.split(".")[0] for name in below)}
+                raise unknown_key(where, known - {key})
+    if is_part:
+        # The key to name is the one where the user sets the value.
+        texts = {key: raw[key] for key in keys if isinstance(raw[key], str)}
+        set_at = {key: at[1] for key, text in texts.items() if (at := REFERENCE.fullmatch(text))}
+        _check_values(_settings(resolved, path), {key: resolved[key] for key in keys}, set_at, path)
 
 
-def _settings(part: Node, path: str) -> dict[str, tuple[Any, Any]]:
-    """Type and default of each key of a part, by name; ``**`` if it takes any name."""
+def _settings(part: Node, path: str) -> dict[str, Any]:
+    """The type of each key of a part, by name; ``**`` if it takes any name."""
     settings = _parameters(str(part["_target_"]), path)
     for below in part.values():
         if "**" in settings and isinstance(below, Mapping) and below.get("_partial_"):
@@ -122,10 +97,10 @@ def _settings(part: Node, path: str) -> dict[str, tuple[Any, Any]]:
     return settings
 
 
-def _parameters(target: str, path: str) -> dict[str, tuple[Any, Any]]:
+def _parameters(target: str, path: str) -> dict[str, Any]:
     try:
         part = get_object(target)
-        parameters = inspect.signature(part).parameters
+        parameters = inspect.signature(part).parameters.values()
     except Exception as error:
         raise DevrfError(f"{path}_target_: cannot load {target!r} ({error})") from None
     try:
@@ -134,31 +109,59 @@ def _parameters(target: str, path: str) -> dict[str, tuple[Any, Any]]:
         hints = get_type_hints(part.__init__ if own_init else part)
     except (NameError, TypeError):  # names imported only for a type checker
         hints = {}
-    return {
-        "**" if p.kind is p.VAR_KEYWORD else p.name: (hints.get(p.name, Any), p.default)
-        for p in parameters.values()
+    # Whatever the type, a part takes what it has by itself.
+    types = {p.name: hints.get(p.name, Any) for p in parameters}
+    types |= {p.name: types[p.name] | None for p in parameters if p.default is None}
+    return {"**" if p.kind is p.VAR_KEYWORD else p.name: types[p.name] for p in parameters}
+
+
+def _check_values(hints: Node, values: Node, set_at: Mapping[str, str], path: str) -> None:
+    """Check values by the types of their keys, as JSON: a list is any sequence, text is a path.
+
+    Args:
+        hints: a type by key; ``**`` if there may be others.
+        values: by key; parts among them are checked apart.
+        set_at: the keys that are named in their place.
+        path: where they are: ``schedule.``, or empty.
+
+    Raises:
+        DevrfError: a value does not fit, or there is no such key.
+    """
+    # Imported here: --help is answered before it has loaded.
+    from pydantic import ConfigDict, TypeAdapter, ValidationError
+
+    parts = {
+        key for key, value in values.items() if isinstance(value, Mapping) and "_target_" in value
     }
-
-
-def _check_value(where: str, value: object, hint: Any) -> None:
-    row = next((kind for kind in (hint, *get_args(hint)) if is_dataclass(kind)), None)
-    by_name = get_origin(hint) in (dict, Mapping)
-    if isinstance(value, Mapping) and (by_name or row is not None):
-        hints = dict.fromkeys(value, get_args(hint)[1]) if by_name else get_type_hints(row)
-        for key, entry in value.items():
-            if key not in hints:
-                raise unknown_key(f"{where}.{key}", hints)
-            _check_value(f"{where}.{key}", entry, hints[key])
-    elif expected := unfit(value, hint):
-        meant = did_you_mean(value, choices_of(hint), f"{where}=")
-        raise DevrfError(f"{where}: expected {expected}, not {value!r}{meant}")
+    fields = {key: hint for key, hint in hints.items() if key != "**"}
+    settings = cast(Any, TypedDict)("settings", fields, total=False)
+    settings.__pydantic_config__ = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
+    known = {key: value for key, value in values.items() if "**" not in hints or key in fields}
+    plain = {key: None if key in parts else value for key, value in known.items()}
+    try:
+        TypeAdapter(settings).validate_json(json.dumps(plain, default=str), strict=True)
+    except ValidationError as error:
+        issues = sorted(error.errors(), key=lambda issue: issue["type"] not in UNKNOWN)
+        for issue in issues:
+            key, *below = map(str, issue["loc"])
+            if issue["type"] in LEFT or (key in parts and issue["type"] not in UNKNOWN):
+                continue
+            where, value, hint = set_at.get(key, f"{path}{key}"), plain[key], hints.get(key)
+            for name in below:
+                if isinstance(value, Mapping) and name in value:
+                    where, value = f"{where}.{name}", value[name]
+            if issue["type"] in UNKNOWN:
+                rows = (kind for kind in (hint, *get_args(hint)) if is_dataclass(kind))
+                raise unknown_key(where, next(map(get_type_hints, rows), hints)) from None
+            alike = (other for other in issues if str(other["loc"][0]) == key)
+            wanted = (other["msg"].removeprefix("Input should be ") for other in alike)
+            expected = " or ".join(dict.fromkeys(wanted))
+            meant = did_you_mean(value, choices_of(hint), f"{where}=")
+            raise DevrfError(f"{where}: expected {expected}, not {value!r}{meant}") from None
 
 
 def unknown_key(where: str, known: Iterable[object]) -> DevrfError:
     """The error for a key that does not exist, with the closest one that does."""
-    for old, new in RENAMED.items():
-        if f"{where}.".startswith(f"{old}."):
-            return DevrfError(f"{where}: renamed; write {new}{where.removeprefix(old)}=VALUE")
     name = where.rpartition(".")[2]
     meant = did_you_mean(name, (k for k in known if k != "**"), where[: -len(name)])
     group = where.removesuffix(f".{name}")
@@ -166,29 +169,6 @@ def unknown_key(where: str, known: Iterable[object]) -> DevrfError:
     having = ", ".join(path.stem for path in files if name in OmegaConf.load(path))
     instead = f"it belongs to {group}={having}" if having else "--cfg job shows every key there is"
     return DevrfError(f"{where}: no such key{meant or f'; {instead}'}")
-
-
-def unfit(value: object, hint: Any) -> str:
-    """What a parameter annotated ``hint`` takes instead of ``value``; empty where that fits.
-
-    Text counts as a path, a list as any sequence, a whole number as a number. A type that no config
-    value has takes any.
-    """
-    # Imported here: --help is answered before it has loaded.
-    from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
-
-    try:
-        adapter = TypeAdapter(hint, config=ConfigDict(arbitrary_types_allowed=True))
-        # As JSON: of Python objects, strictly, text would be no path and a list no tuple.
-        adapter.validate_json(json.dumps(value, default=str), strict=True)
-    except PydanticUserError:  # a hint that pydantic does not know
-        return ""
-    except ValidationError as error:
-        if any(issue["type"] == "needs_python_object" for issue in error.errors()):
-            return ""
-        wanted = (issue["msg"].removeprefix("Input should be ") for issue in error.errors())
-        return " or ".join(dict.fromkeys(wanted))
-    return ""
 
 
 def choices_of(hint: Any) -> tuple[object, ...]:
@@ -210,7 +190,7 @@ def choices_at(config: DictConfig, key: str) -> tuple[object, ...]:
     if not isinstance(part, DictConfig) or "_target_" not in part:
         return ()
     node: Any = OmegaConf.to_container(part)
-    return choices_of(_settings(node, f"{parent}.").get(name, (None,))[0])
+    return choices_of(_settings(node, f"{parent}.").get(name))
 
 
 def check_extras(config: DictConfig) -> None:
