@@ -1,14 +1,16 @@
-"""What the documentation names exists: tests, files, links, anchors, commands, keys."""
+"""What documentation and workflows name exists: tests, files, links, anchors, commands, keys."""
 
 from __future__ import annotations
 
 import importlib.util
 import re
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+import yaml
 from omegaconf import OmegaConf
 
 from devrf.cli.complete import completed
@@ -18,12 +20,18 @@ from devrf.cli.config_check import check_config
 REPOSITORY = Path(__file__).parents[2]
 PAGES = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md"]
 PAGES += sorted((REPOSITORY / "docs").rglob("*.md"))
+# What continuous integration runs; a source distribution has none of it.
+SCRIPTS = [*sorted((REPOSITORY / ".github/workflows").glob("*.yml")), REPOSITORY / ".ci/run"]
+SCRIPTS = [script for script in SCRIPTS if script.is_file()]
 
 SPAN = re.compile(r"`([^`\n]+)`")
 TEST = re.compile(r"(tests/[\w/]+\.py)(?:::(\w+))?")
 LINK = re.compile(r"\]\((?!https?:)([^)#\s]+)")
 EQUATION = re.compile(r"\\\((.+?)\\\)|\\\[(.+?)\\\]", re.S)
-COMMAND = re.compile(r"python -m devrf ((?:-m )?[\w./]+=[^\s`]+(?: [\w./]+=[^\s`]+)*)")
+# `python -m devrf`, or the installed program: VENV/bin/devrf.
+ARGUMENT = r"'?[\w./]+=[^\s`]+"
+COMMAND = re.compile(rf"(?:python -m |/bin/)devrf\"? ((?:-m )?{ARGUMENT}(?: {ARGUMENT})*)")
+MAKE = re.compile(r"(?:^ *|[`&;] ?)make ((?:[a-z-]+ ?)+)", re.MULTILINE)
 GROUPS = "callbacks|data|evaluation|export|field|sampling|schedule|still|video|viewer"
 KEY = re.compile(rf"([a-z_]+(?:\.[a-z_]+)+)=|^((?:{GROUPS})(?:\.[a-z_]+)+)$")
 ROOTS = ("src/", "conf/", "tests/", "docs/", "notebooks/", "benchmarks/")
@@ -34,11 +42,20 @@ CHOICES += ["logger=wandb", "method=nerfies", "method=nsff", "method=hypernerf"]
 CHOICES += ["method=dnerf", "method=neural_volumes"]
 
 
+def shell(file: Path) -> str:
+    """A file's text; of a workflow what its steps run. A command is on one line."""
+    text = file.read_text()
+    if file.suffix == ".yml":
+        jobs = yaml.safe_load(text)["jobs"].values()
+        text = "\n".join(step.get("run", "") for job in jobs for step in job["steps"])
+    return re.sub(r"\\\n\s*", "", text)
+
+
 def commands() -> list[str]:
     """Those without a placeholder to fill in; of several that choose and set the same, one."""
     different: dict[frozenset[str], str] = {}
-    for page in PAGES:
-        for command in COMMAND.findall(page.read_text()):
+    for file in [*PAGES, *SCRIPTS]:
+        for command in COMMAND.findall(shell(file)):
             if not re.search("NAME|CHOICE|PROTOCOL|hparams_search", command):
                 words = (re.sub(r"(.*\..*)=.*", r"\1", word) for word in command.split())
                 different.setdefault(frozenset(words), command)
@@ -76,10 +93,17 @@ def test_commands_compose(command, composed, tmp_path, monkeypatch):
     (tmp_path / "scene").mkdir()
     (tmp_path / "scene" / "transforms_train.json").touch()  # so that a layout is recognised
     # Of the values of a sweep, the first.
-    words = [word if "[" in word else word.split(",")[0] for word in command.split()]
+    words = [word if "[" in word else word.split(",")[0] for word in shlex.split(command)]
     paths = r"=(PATH|FOLDER|…|mine|scenes/fox)$"
     words = [re.sub(paths, "=scene", word) for word in words if word != "-m"]
     check_config(composed(*completed(words)))
+
+
+@pytest.mark.parametrize("file", [*SCRIPTS, *PAGES[:2]], ids=lambda file: file.name)
+def test_targets_of_make_exist(file):
+    known = re.findall(r"^([a-z-]+):", (REPOSITORY / "Makefile").read_text(), re.MULTILINE)
+    typed = [name for names in MAKE.findall(shell(file)) for name in names.split()]
+    assert not set(typed) - set(known)
 
 
 def test_keys_exist(composed):
