@@ -16,6 +16,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import devrf  # noqa: F401 - before Lightning: an unusable torchvision ends no test
+
 # Before torch, which loads Triton: Triton decides then whether its interpreter runs kernels.
 # TRITON_INTERPRET=0 in the environment runs the tests of the kernels on a GPU instead.
 os.environ.setdefault("TRITON_INTERPRET", "1")

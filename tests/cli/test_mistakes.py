@@ -132,16 +132,23 @@ def test_as_a_process_of_its_own(python, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_torchvision_for_another_torch_is_one_line(python, tmp_path, monkeypatch):
+def test_a_torchvision_for_another_torch_ends_only_what_needs_it(
+    devrf, python, tmp_path, tiny, tiny_data, monkeypatch
+):
     (tmp_path / "torchvision").mkdir()
     fault = 'raise RuntimeError("operator torchvision::nms does not exist")'
     (tmp_path / "torchvision" / "__init__.py").write_text(fault)
+    # As pip leaves it: the version of what is installed is known.
+    (tmp_path / "torchvision-0.29.dist-info").mkdir()
+    record = "Metadata-Version: 2.1\nName: torchvision\nVersion: 0.29\n"
+    (tmp_path / "torchvision-0.29.dist-info" / "METADATA").write_text(record)
+    assert devrf(*tiny_data, "stage=prepare", "data.export=scene").status == 0
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    for typed in ("stage=inspect", "hydra.run.dir=run"):
-        done = python(tmp_path, "-m", "devrf", typed)
-        assert (done.status, done.out) == (2, "") and done.err.count("\n") == 1, done.err
-        assert done.err.startswith("devrf: torchvision: ")
-        assert "pip install --upgrade torch torchvision" in done.err
+    done = python(tmp_path, "-m", "devrf", *tiny, "stage=canonical", "hydra.run.dir=run")
+    assert (done.status, done.err) == (0, "")
+    done = python(tmp_path, "-m", "devrf", "stage=inspect", "data.root=scene", "data.flow=raft")
+    assert done.status == 2 and done.err.count("\n") == 1, done.err
+    assert done.err.startswith("devrf: data.flow=raft: torchvision cannot be imported (operator ")
 
 
 def test_a_fault_of_the_program_keeps_its_traceback(devrf, monkeypatch):

@@ -27,10 +27,6 @@ PLUGINS = {
     "hydra/sweeper": ("optuna",),
     "hydra/sweeper/sampler": ("tpe",),
 }
-MISMATCH = (
-    "torchvision: it was built for another torch; run pip install --upgrade torch torchvision, or "
-    "pip uninstall torchvision: only data.flow=raft needs it"
-)
 
 
 @contextmanager
@@ -62,19 +58,13 @@ def as_own_errors() -> Iterator[None]:
 
 def is_user_error(error: Exception) -> bool:
     """Whether the user can correct it: input, config, or a disk that refuses."""
-    if _own_error(error) is not None or _mismatch(error):
+    if _own_error(error) is not None:
         return True
     if isinstance(error, OSError) and not isinstance(error, HydraException):
         return error.errno in REFUSED
     # Another error in a constructor of devrf is a fault of the program.
     ours = "Error in call to target 'devrf." in str(error)
     return isinstance(error, HydraException | OmegaConfBaseException) and not ours
-
-
-def _mismatch(error: BaseException) -> bool:
-    """Whether an error comes from importing a torchvision that was built for another torch."""
-    cause = error.__cause__ or error.__context__
-    return "operator torchvision::" in str(error) or (cause is not None and _mismatch(cause))
 
 
 def _own_error(error: BaseException | None) -> DevrfError | None:
@@ -85,9 +75,7 @@ def _own_error(error: BaseException | None) -> DevrfError | None:
 def one_line(error: BaseException) -> str:
     """The error's message on one line that begins with the key or file at fault."""
     known_error = _own_error(error)
-    if _mismatch(error):
-        text = MISMATCH
-    elif known_error is not None:
+    if known_error is not None:
         text = str(known_error)
     elif isinstance(error, MissingConfigException):
         text = _missing_option(error)
