@@ -105,9 +105,8 @@ class SmallScene:
         # Imported here: every command loads this module, and an extension may be taken out.
         from devrf.methods.devrf.extensions.tracks import StartAlongFlow
 
-        along = {"tracks": StartAlongFlow("flow")}
-        rest = copy.deepcopy(self.canonical)
-        return DeformationStage(rest, self.in_motion, settings, extensions=along, **how)
+        how |= {"flow_mean": "rays", "extensions": {"tracks": StartAlongFlow("flow")}}
+        return DeformationStage(copy.deepcopy(self.canonical), self.in_motion, settings, **how)
 
     def learn(
         self,

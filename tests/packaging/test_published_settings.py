@@ -12,6 +12,7 @@ from devrf.geometry.box import Box
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.deformation_schedule import PAPER_LEVELS
+from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.settings import (
     DEFORMATION_LOSS,
     FINE_LOSS,
@@ -78,7 +79,8 @@ def test_loss_weights(paper):
     }
 
 
-def test_the_code_defaults_to_the_paper(paper):
+def test_the_code_defaults_to_the_paper(paper, rest):
+    assert DeformationStage(rest).flow_mean == paper.deformation.flow_mean == "samples"
     assert instantiate(paper.field) == Architecture()
     assert instantiate(paper.sampling) == Sampling()
     assert instantiate(paper.schedule.rates) == CanonicalRates()

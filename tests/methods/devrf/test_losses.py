@@ -211,12 +211,13 @@ def test_flow_by_hand(by_hand):
     # Through image 0's lens both samples of ray 0 lie on its pixel. Moved back by 0.2 along x
     # they shift by −10·0.2/2 = −1 and −10·0.2/4 = −0.5 pixels, with none along y.
     # Against (−1, 0.5): 0.5 and 1.0, weighted by 0.5 and 0.25; one valid ray; ray 1 is masked.
-    assert flow(by_hand).item() == pytest.approx(0.5, abs=1e-5)
+    by_rays = replace(by_hand, flow_mean="rays")
+    assert flow(by_rays).item() == pytest.approx(0.5, abs=1e-5)
     # As a mean over both components of the two samples on the ray whose flow is valid.
     assert flow(replace(by_hand, flow_mean="samples")).item() == pytest.approx(0.125, abs=1e-6)
     both = replace(by_hand.batch, flow_valid=torch.tensor([True, True]))
     # Ray 1: −10·0.2/2 = −1 along x, against (9, 9): 10 + 9, weight 1; now two rays.
-    assert flow(replace(by_hand, batch=both)).item() == pytest.approx((0.5 + 19) / 2, abs=1e-4)
+    assert flow(replace(by_rays, batch=both)).item() == pytest.approx((0.5 + 19) / 2, abs=1e-4)
 
 
 def test_without_observed_flow_or_samples_nothing_is_learned(by_hand):

@@ -47,7 +47,7 @@ class DeformationStage(MotionStage):
         schedule: DeformationSchedule | None = None,
         motion: MotionSettings | None = None,
         loss: Mapping[str, float] = DEFORMATION_LOSS,
-        flow_mean: FlowMean = "rays",
+        flow_mean: FlowMean = "samples",
         extensions: Mapping[str, Extension] | None = None,
         iterations_per_step: int = 10,
         graphs: Graphs = "auto",

@@ -78,7 +78,7 @@ class MotionPrediction(Prediction):
     forward_slice: Tensor
     box: Box
     space: Space = WORLD
-    flow_mean: FlowMean = "rays"
+    flow_mean: FlowMean = "samples"
 
 
 def cycle(prediction: MotionPrediction) -> Tensor:
