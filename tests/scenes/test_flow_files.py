@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +52,13 @@ def test_masked_nan_and_infinite_vectors_are_invalid_and_zero(tmp_path):
     read, valid = read_flow_file(tmp_path / "f.npz", width=5, height=3)
     assert {tuple(p) for p in np.argwhere(~valid)} == {(0, 0), (1, 2), (2, 4)}
     assert (read[~valid] == 0).all() and (read[valid] == 1).all()
+
+
+def test_a_member_that_is_no_array_is_named(tmp_path):
+    with zipfile.ZipFile(tmp_path / "001_bwd.npz", "w") as archive:
+        archive.writestr("flow", "text")
+    with pytest.raises(DevrfError, match='001_bwd.npz: "flow" has shape '):
+        read_flow_file(tmp_path / "001_bwd.npz", width=6, height=4)
 
 
 def test_wrong_arrays_are_named(tmp_path):

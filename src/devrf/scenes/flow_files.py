@@ -46,7 +46,8 @@ def read_flow_file(
         DevrfError: not an npz, an array is missing, or an array is of another size.
     """
     with decoding(path, "npz", REMEDY), np.load(path, allow_pickle=False) as archive:
-        arrays = {name: archive[name] for name in ("flow", "mask") if name in archive}
+        # A member that is no array comes as bytes.
+        arrays = {n: np.asarray(archive[n]) for n in ("flow", "mask") if n in archive}
     for name, shape in (("flow", (height, width, 2)), ("mask", (height, width))):
         found = arrays.get(name, np.empty(0, "O"))
         if found.shape != shape or found.dtype.kind not in "bfiu":
