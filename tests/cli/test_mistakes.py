@@ -50,6 +50,14 @@ MISTAKES = {
         ["trainer.devices=2"],
         "trainer.devices: 2 processes need trainer=ddp",
     ),
+    "gradients of several batches": (
+        ["+trainer.accumulate_grad_batches=2"],
+        "trainer.accumulate_grad_batches: stages take optimiser steps of their own",
+    ),
+    "clipped gradients": (
+        ["+trainer.gradient_clip_val=1.0"],
+        "trainer.gradient_clip_val: stages take optimiser steps of their own",
+    ),
     "scoring before training": (["stage=evaluate"], "canonical.ckpt: no such checkpoint"),
     "missing checkpoint": (["stage=render", "ckpt=no.ckpt"], "no.ckpt: no such checkpoint"),
     "checkpoint where none is used": (["ckpt=no.ckpt"], "ckpt: stage=pipeline starts from nothing"),
@@ -129,6 +137,15 @@ def test_as_a_process_of_its_own(python, tmp_path):
     done = python(tmp_path, "-m", "devrf", "data.widht=3")
     expected = "devrf: data.widht: no such key; did you mean data.width?\n"
     assert (done.status, done.err) == (2, expected)
+    assert not list(tmp_path.iterdir())
+
+
+def test_jobs_of_slurm_where_there_is_none(devrf, tmp_path, tiny, monkeypatch):
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    outcome = devrf("-m", "hydra/launcher=slurm", *tiny, "seed=0,1", "stage=canonical")
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert outcome.err.startswith("devrf: hydra/launcher: no srun and no sbatch here; ")
     assert not list(tmp_path.iterdir())
 
 

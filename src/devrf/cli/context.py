@@ -225,9 +225,19 @@ class RunContext:
         """The configured trainer's strategy: its device, rank and number of processes.
 
         Raises:
-            DevrfError: several processes without ``trainer=ddp``.
+            DevrfError: several processes without ``trainer=ddp``, or what only Lightning's own
+                optimiser steps have.
         """
         trainer: Trainer = instantiate(self.config.trainer, logger=False)
+        own = "stages take optimiser steps of their own; leave it out"
+        if trainer.accumulate_grad_batches != 1:
+            rays = "schedule.canonical.rays, schedule.deformation.rays or ray_stage.schedule.rays"
+            raise DevrfError(f"trainer.accumulate_grad_batches: {own}; {rays} sizes batches")
+        if trainer.gradient_clip_val:
+            raise DevrfError(
+                f"trainer.gradient_clip_val: {own}; where a loss diverges, "
+                "callbacks.divergence_guard lowers the learning rates"
+            )
         if trainer.world_size > 1 and not isinstance(trainer.strategy, ManualDDP):
             raise DevrfError(
                 f"trainer.devices: {trainer.world_size} processes need trainer=ddp; give both"

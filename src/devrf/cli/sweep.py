@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
+from shutil import which
 from typing import TYPE_CHECKING, Any
 
 from hydra.experimental.callback import Callback
@@ -17,7 +18,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from devrf.cli.config import choices, overrides
-from devrf.cli.messages import is_user_error, one_line
+from devrf.cli.messages import is_user_error, one_line, report_user_errors
 from devrf.errors import DevrfError
 from devrf.system.files import remove_if_only, write_json
 from devrf.system.folder_lock import PLACE
@@ -100,7 +101,14 @@ class SweepMonitor(Callback):
     started: SweepMonitor | None = None
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Note what the sweep's folder holds before the first job."""
+        """Note what the sweep's folder holds before the first job; refuse SLURM where it is not."""
+        with report_user_errors():
+            missing = [name for name in ("srun", "sbatch") if which(name) is None]
+            if config.hydra.launcher._target_.endswith(".SlurmLauncher") and missing:
+                raise DevrfError(
+                    f"hydra/launcher: no {' and no '.join(missing)} here; type the command where "
+                    "SLURM takes jobs, or leave hydra/launcher out"
+                )
         self.folder = Path(config.hydra.sweep.dir)
         self.was_there = self.folder.exists()
         self.earlier = self._records()
