@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import signal
 from pathlib import Path
 
 import pytest
@@ -147,6 +148,32 @@ def test_jobs_of_slurm_where_there_is_none(devrf, tmp_path, tiny, monkeypatch):
     assert outcome.status == 2 and outcome.err.count("\n") == 1
     assert outcome.err.startswith("devrf: hydra/launcher: no srun and no sbatch here; ")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("argument", ["--help", "--version"])
+def test_output_that_nobody_reads_ends_it_quietly(python, tmp_path, argument):
+    script = (
+        "import os, subprocess, sys\n"
+        "read, write = os.pipe()\n"
+        "os.close(read)\n"
+        f"command = [sys.executable, '-m', 'devrf', '{argument}']\n"
+        "sys.exit(subprocess.run(command, stdout=write).returncode)\n"
+    )
+    done = python(tmp_path, "-c", script)
+    assert (done.status, done.err) == (128 + signal.SIGPIPE, "")
+
+
+def test_names_with_other_letters_where_the_locale_has_but_ascii(
+    python, tmp_path, tiny_data, monkeypatch
+):
+    for name, value in (("LC_ALL", "C"), ("PYTHONUTF8", "0"), ("PYTHONCOERCECLOCALE", "0")):
+        monkeypatch.setenv(name, value)
+    typed = *tiny_data, "stage=prepare", "data.export=szöne", "hydra.run.dir=läufe"
+    done = python(tmp_path, "-m", "devrf", *typed)
+    assert (done.status, done.err) == (0, "")
+    assert {path.name for path in tmp_path.iterdir()} == {"läufe", "szöne"}
+    assert "szöne" in done.out
+    assert "szöne" in (tmp_path / "läufe" / "run.log").read_text("utf-8")
 
 
 def test_a_torchvision_for_another_torch_ends_only_what_needs_it(

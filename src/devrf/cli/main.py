@@ -26,7 +26,15 @@ from devrf.cli.restore_config import log_source
 from devrf.cli.run_folder import working_in
 from devrf.cli.sweep import forget_failure, name_failures, record_failure
 from devrf.errors import DevrfError
-from devrf.system.process import Interrupted, end_at_once, handle_signals, importing, tune_for_cpu
+from devrf.system.process import (
+    Interrupted,
+    end_at_once,
+    handle_signals,
+    importing,
+    quiet_if_unread,
+    tune_for_cpu,
+    use_utf8,
+)
 
 # Without `=` among the shell's word breaks the whole of KEY=VALUE is one word. Other commands of
 # Python are left to the shell's own completion of files.
@@ -48,13 +56,15 @@ complete -o nospace -o bashdefault -o default -F _devrf_complete devrf python py
 register_config()
 
 
+@quiet_if_unread()
 def entry() -> None:
     """Run the application.
 
     A mistake in the input ends it with one line and status 2, a sweep of which jobs failed with
     their names and status 3, a signal with one line and 128 plus its number: 130 for Ctrl-C,
-    143 for SIGTERM.
+    143 for SIGTERM, 141 for output that nobody reads.
     """
+    use_utf8()
     # Hydra would print a traceback of its own and exit with 1 if it were not told to raise.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     if (answer := _answer_at_once(sys.argv[1:])) is not None:

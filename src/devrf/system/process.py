@@ -63,6 +63,42 @@ def importing() -> Iterator[None]:
             gc.enable()
 
 
+def use_utf8() -> None:
+    """Begin the program again in Python's UTF-8 mode, where file names may only be ASCII.
+
+    Under such a locale Python chooses that mode itself, unless it is told not to. Names with other
+    letters could neither be typed nor written to files.
+    """
+    if sys.getfilesystemencoding() == "ascii" and os.environ.get("PYTHONUTF8") != "1":
+        os.environ["PYTHONUTF8"] = "1"  # for processes that this one starts, too
+        os.execv(sys.executable, [sys.executable, "-X", "utf8", *sys.orig_argv[1:]])
+
+
+@contextmanager
+def quiet_if_unread() -> Iterator[None]:
+    """When nobody reads any more what is printed (``| head -1``), end as SIGPIPE ends a program.
+
+    Python ignores that signal, for sockets that are closed send it, too.
+    """
+    try:
+        yield
+        sys.stdout.flush()
+    except BrokenPipeError:
+        if _is_read():  # it was another pipe: a fault
+            raise
+        # Or Python complains when it flushes at the end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(128 + signal.SIGPIPE)
+
+
+def _is_read() -> bool:
+    try:
+        print(flush=True)
+    except BrokenPipeError:
+        return False
+    return True
+
+
 def forget_peak_memory() -> None:
     """Restart the system's measurement of this process's peak memory (Linux only)."""
     with suppress(OSError):
