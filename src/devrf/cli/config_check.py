@@ -151,8 +151,11 @@ def _check_values(hints: Node, values: Node, set_at: Mapping[str, str], path: st
                 if isinstance(value, Mapping) and name in value:
                     where, value = f"{where}.{name}", value[name]
             if issue["type"] in UNKNOWN:
-                rows = (kind for kind in (hint, *get_args(hint)) if is_dataclass(kind))
-                raise unknown_key(where, next(map(get_type_hints, rows), hints)) from None
+                within = [hint]  # and all types that it is made of
+                for kind in within:
+                    within.extend(get_args(kind))
+                rows = (get_type_hints(kind) for kind in within if is_dataclass(kind))
+                raise unknown_key(where, next(rows, hints)) from None
             alike = (other for other in issues if str(other["loc"][0]) == key)
             wanted = (other["msg"].removeprefix("Input should be ") for other in alike)
             expected = " or ".join(dict.fromkeys(wanted))
