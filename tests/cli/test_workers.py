@@ -19,7 +19,7 @@ import hashlib, json, os, signal
 from pathlib import Path
 import torch
 from lightning import Callback
-from devrf.callbacks import Meter
+from devrf.callbacks import Meter, TrainingCurve
 from devrf.errors import DevrfError
 
 
@@ -36,6 +36,14 @@ class Witness(Callback):
         path = self.folder / f"{stage.capture}-{trainer.global_rank}.json"
         words = {"fields": seen, "metrics": metrics, "seed": stage.generator.initial_seed()}
         path.write_text(json.dumps(words))
+
+
+class Curve(TrainingCurve):
+    """Draws the picture of each process in a folder of its own."""
+
+    def setup(self, trainer, pl_module, stage):
+        super().setup(trainer, pl_module, stage)
+        self.folder = self.folder / str(trainer.global_rank)
 
 
 class Trip(Callback):
@@ -65,13 +73,15 @@ def pair(devrf_in, tiny, often, tmp_path_factory, modules):
     """The folder of a run in two processes, left after 4 iterations, and how it went on."""
     folder = tmp_path_factory.mktemp("pair")
     arguments = (
-        *(word for word in tiny if word != "trainer=cpu"),
+        *(word for word in tiny if word not in ("trainer=cpu", "~callbacks.training_curve")),
         *(*TWO, *often),
         "hydra.run.dir=run",
         "evaluation.metrics=[]",
         "video.frames=1",
         "+callbacks.witness._target_=witnesses.Witness",
         f"+callbacks.witness.folder={folder}",
+        "callbacks.training_curve._target_=witnesses.Curve",
+        f"callbacks.training_curve.folder={folder}/curves",
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(modules))
@@ -92,6 +102,11 @@ def test_it_goes_on_ends_well_and_one_process_speaks(pair):
     assert "canonical: goes on at iteration 4" in done.out
     left = {path.name for path in (folder / "run" / "checkpoints").glob("*.ckpt")}
     assert left == {"canonical.ckpt", "deformation.ckpt"}
+
+
+def test_one_process_draws_the_curve_of_a_resumed_stage(pair):
+    drawn = {str(path.relative_to(pair[0] / "curves")) for path in pair[0].glob("curves/**/*.png")}
+    assert drawn == {"0/training_canonical.png", "0/training_deformation.png"}
 
 
 @pytest.mark.parametrize("capture", ["static", "dynamic"])

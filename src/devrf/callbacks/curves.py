@@ -228,10 +228,12 @@ class TrainingCurve(Callback):
         self._unread = []
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Draw the curve; the stage's seconds have been taken."""
+        """Draw the curve, in one process; the stage's seconds have been taken."""
         assert isinstance(pl_module, ScheduledStage)
         self._read()
-        if not self._points or trainer.fast_dev_run:  # type: ignore[attr-defined]
+        # A resumed run gives every process the points so far.
+        leads = trainer.is_global_zero
+        if not self._points or not leads or trainer.fast_dev_run:  # type: ignore[attr-defined]
             return
         # Only this hook draws with matplotlib.
         from devrf.apps.report.plots import write_training_curve
