@@ -88,7 +88,9 @@ def tensor_bytes(value: object) -> int:
     if isinstance(value, Tensor):
         return value.nbytes
     if is_dataclass(value):
-        return tensor_bytes(getattr(value, field.name) for field in fields(value))
+        # Without the names of images, which may be many.
+        parts = (field.name for field in fields(value) if field.name != "names")
+        return tensor_bytes(getattr(value, part) for part in parts)
     if isinstance(value, Iterable) and not isinstance(value, str):
         return sum(map(tensor_bytes, value))
     return 0

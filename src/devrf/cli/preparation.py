@@ -13,6 +13,7 @@ from rich.filesize import decimal
 
 from devrf.apps.capture.pipeline import scene_from_footage
 from devrf.apps.fetch import FetchSettings, fetched, published_scene
+from devrf.apps.inspection.advice import image_sets
 from devrf.apps.inspection.report import inspection_text, show
 from devrf.apps.needs import needs_table
 from devrf.apps.settings import CaptureSettings
@@ -81,6 +82,8 @@ def inspect(run: RunContext) -> None:
     # Only this step draws with matplotlib.
     from devrf.apps.inspection.picture import write_inspection_picture
 
+    count = len({name for views in image_sets(run.scene).values() for name in views.names})
+    log.info("looks at %d images: cameras, masks, times, and what a run will need", count)
     _, shortage, _ = compare(run, run.stages_with_images or run.learning_stages)
     table = needs_table(run.scene, needs(run, run.config, run.scene))
     rows = [(name, decimal(round(size))) for name, size in table]

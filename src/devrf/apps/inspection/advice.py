@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
@@ -21,6 +22,8 @@ WIDEST_GAP = 120.0
 # Two cameras are the same when their axes differ by less than this (radians, about), and their
 # positions by less than this share of the distance to the scene.
 SAME = 1e-4
+# Cameras are ordered by their positions along this direction.
+LINE = torch.tensor([1.0, 2**0.5, 3**0.5], dtype=torch.float64)
 # An image whose values all lie within this of one another, of 255, shows nothing.
 FLAT = 2
 # A pixel is in the alpha mask above this, of 255.
@@ -88,13 +91,23 @@ def _held_out(scene: Scene) -> Iterator[Advice]:
 
 def _twins(test: Views, train: Views, middle: Tensor) -> list[str]:
     """Names of the test views that have the camera and the time of a training view."""
-    reach = float((train.cameras.positions - middle).norm(dim=1).mean())
+    reach = max(float((train.cameras.positions - middle).norm(dim=1).mean()), 1e-9)
     poses = train.cameras.camera_to_world
+
+    def along(views: Views) -> Tensor:
+        return views.cameras.positions.double() @ LINE / reach + views.times
+
+    # Only what is near along a line of places and times may be the same: few are compared.
+    order = along(train).argsort()
+    near = 2 * (SAME * float(LINE.norm()) + FrameClock.TOLERANCE)
+    places = torch.stack([along(test) - near, along(test) + near], dim=1)
+    ends = torch.searchsorted(along(train)[order], places)
     names = []
-    for k, pose in enumerate(test.cameras.camera_to_world):
-        turned = (poses[:, :, :3] - pose[:, :3]).abs().amax(dim=(1, 2))
-        moved = (poses[:, :, 3] - pose[:, 3]).norm(dim=1) / max(reach, 1e-9)
-        apart = (train.times - test.times[k]).abs()
+    for k, (start, stop) in enumerate(ends.tolist()):
+        pose, some = test.cameras.camera_to_world[k], order[start:stop]
+        turned = (poses[some, :, :3] - pose[:, :3]).abs().amax(dim=(1, 2))
+        moved = (poses[some, :, 3] - pose[:, 3]).norm(dim=1) / reach
+        apart = (train.times[some] - test.times[k]).abs()
         if bool(((turned < SAME) & (moved < SAME) & (apart <= FrameClock.TOLERANCE)).any()):
             names.append(test.names[k])
     return names
@@ -138,14 +151,28 @@ def _images(scene: Scene) -> Iterator[Advice]:
     """Problems of single images; sets may share files, and each is named once."""
     points = box_points(scene, scene.bounds.box, (9, 9, 9))
 
-    def away(views: Views, k: int) -> bool:
-        return float(views.cameras.project_into(k, points[4, 4, 4:5])[1]) <= 0
+    def project(views: Views, images: Tensor, some: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels (K, M, 2) and depths (K, M) of ``some`` points (M, 3) in K images."""
+        repeated = some.repeat(len(images), 1)
+        pixels, depth = views.cameras.project(images.repeat_interleave(len(some)), repeated)
+        return pixels.view(len(images), -1, 2), depth.view(len(images), -1)
 
-    def beside(views: Views, k: int) -> bool:
-        pixels, depth = views.cameras.project_into(k, points.reshape(-1, 3))
+    def sees(views: Views, images: Tensor, some: Tensor) -> Tensor:
+        """(K,) bool: whether any of the points is in the picture."""
+        pixels, depth = project(views, images, some)
         size = pixels.new_tensor([views.width, views.height])
-        visible = (depth > 0) & ((pixels >= 0) & (pixels <= size)).all(dim=1)
-        return not away(views, k) and not bool(visible.any())
+        return ((depth > 0) & ((pixels >= 0) & (pixels <= size)).all(dim=2)).any(dim=1)
+
+    def away(views: Views) -> list[bool]:
+        middle = points[4, 4, 4:5]
+        return (project(views, torch.arange(len(views)), middle)[1][:, 0] <= 0).tolist()
+
+    def beside(views: Views) -> list[bool]:
+        coarse, whole = points[::4, ::4, ::4].reshape(-1, 3), points.reshape(-1, 3)
+        seen = sees(views, torch.arange(len(views)), coarse) | torch.tensor(away(views))
+        for k in (~seen).nonzero()[:, 0]:
+            seen[k] = sees(views, k[None], whole)[0]
+        return (~seen).tolist()
 
     pose = "check the pose (camera-to-world, x right, y up, looking along -z), or set data.box"
     for test, problem, remedy in (
@@ -165,8 +192,13 @@ def _images(scene: Scene) -> Iterator[Advice]:
             "(mogrify -auto-orient); else take the orientation out (exiftool -Orientation=)",
         ),
     ):
-        sets = image_sets(scene).values()
-        names = [views.names[k] for views in sets for k in range(len(views)) if test(views, k)]
+        sets = {id(views): views for views in image_sets(scene).values()}.values()
+        names = [
+            name
+            for views in sets
+            for name, bad in zip(views.names, test(views), strict=True)
+            if bad
+        ]
         if names:
             yield Advice(listed(list(dict.fromkeys(names))), problem, remedy)
 
@@ -177,20 +209,23 @@ def _valid_pixels(views: Views, k: int) -> Tensor:
     return pixels.flatten(0, 1) if views.valid_mask is None else pixels[views.valid_mask[k]]
 
 
-def _is_flat(views: Views, k: int) -> bool:
-    # With alpha a subject of one colour still has an outline.
-    if views.has_alpha:
-        return False
-    low, high = _valid_pixels(views, k).int().aminmax(dim=0)
-    return int((high - low).max()) <= FLAT
+def _is_flat(views: Views) -> Iterator[bool]:
+    for k in range(len(views)):
+        if views.has_alpha:  # a subject of one colour still has an outline
+            yield False
+        else:
+            low, high = _valid_pixels(views, k).aminmax(dim=0)  # uint8: low is the less
+            yield int((high - low).max()) <= FLAT
 
 
-def _is_empty(views: Views, k: int) -> bool:
-    return views.has_alpha and int(_valid_pixels(views, k)[:, 3].max()) <= OPAQUE
+def _is_empty(views: Views) -> Iterator[bool]:
+    for k in range(len(views)):
+        yield views.has_alpha and int(_valid_pixels(views, k)[:, 3].max()) <= OPAQUE
 
 
-def _is_ambiguous(views: Views, k: int) -> bool:
-    return views.ambiguous_orientation is not None and bool(views.ambiguous_orientation[k])
+def _is_ambiguous(views: Views) -> list[bool]:
+    ambiguous = views.ambiguous_orientation
+    return [False] * len(views) if ambiguous is None else ambiguous.tolist()
 
 
 def _alpha(scene: Scene) -> Iterator[Advice]:
@@ -240,9 +275,13 @@ def _times(scene: Scene) -> Iterator[Advice]:
     numbers = set(views.view.tolist())
     if len(numbers) == len(views):
         return  # a moving camera: each image is a view of its own
-    frames, fewer = clock.frames_of(views.times), []
-    for frame in sorted(set(frames.tolist())):
-        if missing := sorted(numbers - set(views.view[frames == frame].tolist())):
+    seen, fewer = defaultdict[int, set[int]](set), []
+    for frame, number in zip(
+        clock.frames_of(views.times).tolist(), views.view.tolist(), strict=True
+    ):
+        seen[frame].add(number)
+    for frame in sorted(seen):
+        if missing := sorted(numbers - seen[frame]):
             without = ", ".join(map(str, missing))
             fewer.append(f"time {clock.times[frame]:.3g} without view {without}")
     if fewer:

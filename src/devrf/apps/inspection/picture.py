@@ -30,6 +30,8 @@ WIDTH, CAMERAS, HEADING, CAPTION = 16.0, 7.2, 0.55, 0.45
 TALLEST = 2.8
 COLUMNS = 6
 MOST_VIEWS = 4
+# Cameras whose distance to the next one is measured.
+MEASURED = 500
 STYLE: dict[Any, Any] = {
     "font.size": 13,
     "text.color": "0.15",
@@ -285,6 +287,7 @@ def _camera_size(scene: Scene) -> float:
     """Height of the drawn pyramids, world units: visible, and less than neighbours are apart."""
     positions = scene.static.train.cameras.positions
     distance = max(float((positions - box_middle(scene)).norm(dim=1).mean()), 1e-6)
-    between = torch.cdist(positions, positions).fill_diagonal_(math.inf)
-    apart = float(between.amin(dim=1).median()) if len(positions) > 1 else distance
+    between = torch.cdist(positions[evenly(len(positions), MEASURED)], positions)
+    # The nearest is the camera itself.
+    apart = float(between.kthvalue(2, dim=1).values.median()) if len(positions) > 1 else distance
     return min(0.13 * distance, max(0.8 * apart, 0.05 * distance))
