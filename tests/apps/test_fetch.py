@@ -101,3 +101,28 @@ def test_another_file_than_expected_is_refused(tmp_path, content, said):
         archive.write_bytes(content)
     with pytest.raises(DevrfError, match=said):
         _unpacked(lego("hotdog"), tmp_path)
+
+
+def test_an_archive_that_expands_beyond_what_scenes_do_is_removed(tmp_path):
+    # 100 MB of zeros in 100 kB.
+    archive = tmp_path / "work" / "files" / "archive"
+    archive.parent.mkdir(parents=True)
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as packed:
+        packed.writestr("lego/transforms_train.json", "{}")
+        packed.writestr("lego/train/r_0.png", bytes(100_000_000))
+    with pytest.raises(
+        DevrfError, match=r"9\d\.\d kB would unpack to 100\.0 MB, more than 20 times"
+    ):
+        _unpacked(lego(), tmp_path / "work")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_file_in_an_archive_that_holds_more_than_is_said_is_not_unpacked(tmp_path):
+    archive = written(tmp_path, {"lego/transforms_train.json": b"{}", "lego/a.png": bytes(5000)})
+    content = bytearray(archive.read_bytes())
+    for place in (content.find(b"lego/a.png") - 30 + 22, content.rfind(b"lego/a.png") - 46 + 24):
+        assert content[place : place + 4] == (5000).to_bytes(4, "little")
+        content[place : place + 4] = (10).to_bytes(4, "little")
+    archive.write_bytes(content)
+    with pytest.raises(DevrfError, match="cannot be unpacked"):
+        _unpacked(lego(), tmp_path)

@@ -16,6 +16,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from rich.console import Console
+from rich.filesize import decimal
 from rich.progress import track
 
 from devrf.errors import DevrfError, did_you_mean
@@ -43,6 +44,8 @@ OWN = Path(__file__).with_name("catalogue.toml")
 # Beside the data: where they are from, when, and their checksums.
 RECORD = "fetched.json"
 ARCHIVE = "archive"
+# Images hardly expand, and camera files by ten times or so; a small archive may by more.
+MOST_EXPANSION, SMALL = 20, 2**26
 # The file by which a scene's folder is known, by the layout that reads it.
 MARKERS = {
     "inward": "transforms_train.json",
@@ -275,12 +278,30 @@ def _digest(files: dict[str, Path]) -> str:
     return hashlib.sha256(lines.encode()).hexdigest()
 
 
+def _check_size(packed: zipfile.ZipFile, archive: Path, work: Path) -> None:
+    """Check that an archive holds no more than images and camera files of its size may hold.
+
+    Python unpacks no more of a file than the archive says that it holds.
+
+    Raises:
+        DevrfError: it would expand far beyond that; ``work`` is removed, and the archive with it.
+    """
+    size, whole = archive.stat().st_size, sum(file.file_size for file in packed.infolist())
+    if whole > max(MOST_EXPANSION * size, SMALL):
+        shutil.rmtree(work, ignore_errors=True)
+        raise DevrfError(
+            f"{archive}: {decimal(size)} would unpack to {decimal(whole)}, more than "
+            f"{MOST_EXPANSION} times as much; it was removed: ask who published it"
+        )
+
+
 def _unpacked(scene: PublishedScene, work: Path) -> Path:
     """The folder of the archive that holds the scene's marker, without the folders around it."""
     archive, place = work / "files" / ARCHIVE, work / "unpacked"
     shutil.rmtree(place, ignore_errors=True)
     try:
         with zipfile.ZipFile(archive) as packed:
+            _check_size(packed, archive, work)
             packed.extractall(place)  # what would be written elsewhere is written there
     except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
         raise DevrfError(
