@@ -138,6 +138,24 @@ def test_a_later_command_continues_the_run(watched):
     assert "static/loss" in first.history and "static/loss" not in second.history
 
 
+@pytest.mark.parametrize(
+    ("mode", "asked", "recorded"),
+    [("disabled", "true", 0), ("offline", "false", 1), ("dryrun", "false", 1)],
+)
+def test_the_environment_says_whether_wandb_records(
+    devrf, tmp_path, tiny, monkeypatch, mode, asked, recorded
+):
+    pytest.importorskip("wandb")
+    monkeypatch.setenv("WANDB_MODE", mode)
+    monkeypatch.setenv("WANDB_API_KEY", "0" * 40)
+    monkeypatch.setenv("WANDB_BASE_URL", "http://127.0.0.1:9")  # nobody answers there
+    options = ("stage=canonical", "logger=wandb", f"logger.offline={asked}", "hydra.run.dir=run")
+    done = devrf(*tiny, *options)
+    assert (done.status, os.environ["WANDB_MODE"]) == (0, mode), done.err
+    assert len(offline_runs(tmp_path / "run")) == recorded
+    assert not list(tmp_path.glob("run/wandb/run-*"))
+
+
 def test_jobs_of_a_sweep_are_grouped_and_named(devrf, tmp_path, tiny, monkeypatch):
     pytest.importorskip("wandb")
     monkeypatch.delenv("WANDB_MODE", raising=False)

@@ -87,6 +87,8 @@ class TensorBoardTracker(TensorBoardLogger):
             self._experiment.close()
 
 
+# Values of WANDB_MODE with which nothing leaves the machine.
+OFFLINE = ("offline", "dryrun", "disabled")
 # The longest name that wandb takes.
 LONGEST_NAME = 128
 
@@ -111,8 +113,10 @@ class WandbTracker(WandbLogger):
 
         wandb works in ``wandb/`` below the run's folder. ``group`` is the sweep that it is a job
         of; ``entity`` None the account that is logged in. Offline, ``wandb sync`` sends it later.
+        ``WANDB_MODE`` in the environment goes before ``offline``.
         """
-        if offline:
+        given = os.environ.get("WANDB_MODE")
+        if offline if not given else given in OFFLINE:
             # Read when wandb is first imported. It reports on itself even when offline.
             os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
         super().__init__(
@@ -122,7 +126,8 @@ class WandbTracker(WandbLogger):
             group=group,
             tags=list(tags),
             entity=entity,
-            offline=offline,
+            # Not as Lightning's `offline`, which changes WANDB_MODE.
+            mode=None if given else "offline" if offline else "online",
         )
         # wandb ignores it and warns where it is given.
         self._wandb_init.pop("anonymous", None)
