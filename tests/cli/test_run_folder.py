@@ -114,6 +114,14 @@ def test_a_mistake_leaves_nothing(folder, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_mistake_of_a_worker_leaves_the_folder_to_rank_0(folder, monkeypatch):
+    monkeypatch.setenv("RANK", "1")
+    config = OmegaConf.create({"stage": "canonical", "trainer": {"strategy": {}}})
+    with pytest.raises(DevrfError), working_in(folder, config, "hydra.run.dir"):
+        raise DevrfError("trainer.devices: wrong")
+    assert (folder / ".hydra" / "config.yaml").is_file()
+
+
 def test_other_folders_stay(folder, tmp_path, tmp_path_factory, monkeypatch):
     (folder.parent / "paper").mkdir()
     fail(folder, DevrfError("data.root: wrong"))

@@ -6,10 +6,15 @@ import csv
 import json
 import multiprocessing
 import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 from torch.multiprocessing import ProcessRaisedException
 
+import devrf as package
 from devrf.engine import workers
 
 TWO = ("trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2")
@@ -166,3 +171,72 @@ def test_a_fault_of_another_process_keeps_its_traceback():
     said = "Traceback …\n  File witnesses.py\nZeroDivisionError: ours\n"
     kept = workers._failure(ProcessRaisedException(said, 0, 1))
     assert isinstance(kept, RuntimeError) and str(kept) == said
+
+
+def nodes(folders, commands, environments, modules):
+    """What two commands, begun together, came to: exit status, stdout, stderr of each."""
+    source = os.pathsep.join([str(Path(package.__file__).parents[1]), str(modules)])
+    common = {**os.environ, "PYTHONPATH": source, "OMP_NUM_THREADS": "1", "HYDRA_FULL_ERROR": "0"}
+    begun = [
+        subprocess.Popen(
+            [sys.executable, *command],
+            cwd=folder,
+            env={**common, **own},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for folder, command, own in zip(folders, commands, environments, strict=True)
+    ]
+    said = [process.communicate(timeout=120) for process in begun]
+    return [(process.returncode, *words) for process, words in zip(begun, said, strict=True)]
+
+
+def test_two_nodes_of_torchrun_learn_what_two_processes_of_one_command_learn(
+    devrf, tiny, modules, monkeypatch, tmp_path
+):
+    monkeypatch.syspath_prepend(str(modules))
+    common = (*(word for word in tiny if word != "trainer=cpu"), "stage=canonical", "trainer=ddp")
+    common += ("trainer.accelerator=cpu", "+callbacks.witness._target_=witnesses.Witness")
+    fields = {}
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        own = (f"hydra.run.dir={name}/run", f"+callbacks.witness.folder={tmp_path / name}")
+        if name == "one":
+            assert devrf(*common, *own, "trainer.devices=2").status == 0
+        else:
+            with socket.socket() as free:
+                free.bind(("127.0.0.1", 0))
+                port = free.getsockname()[1]
+            agent = ("torch.distributed.run", "--nnodes=2", "--nproc-per-node=1")
+            agent += ("--master-addr=127.0.0.1", f"--master-port={port}")
+            devices = ("trainer.devices=1", "trainer.num_nodes=2")
+            learn = ("-m", "devrf", *common, *own, *devices)
+            commands = [("-m", *agent, f"--node-rank={rank}", *learn) for rank in (0, 1)]
+            first, second = nodes([tmp_path] * 2, commands, [{}, {}], modules)
+            assert (first[0], second) == (0, (0, "", "")), first
+            assert first[1].count("canonical: seconds") == 1
+        written = [json.loads((tmp_path / name / f"static-{k}.json").read_text()) for k in (0, 1)]
+        fields[name] = written[0]["fields"]
+        assert written[1]["fields"] == fields[name]
+    assert fields["one"] == fields["two"]
+
+
+def test_tasks_of_slurm_without_a_common_folder_end_with_a_line_each(tiny, modules, tmp_path):
+    # What srun sets in the tasks of two nodes.
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    job = {"SLURM_JOB_ID": "1", "SLURM_JOB_NAME": "devrf", "SLURM_NTASKS": "2"}
+    job |= {"SLURM_NNODES": "2", "SLURM_NTASKS_PER_NODE": "1", "SLURM_LOCALID": "0"}
+    job |= {"SLURM_NODELIST": "127.0.0.1", "MASTER_PORT": str(port)}
+    tasks = [{**job, "SLURM_PROCID": str(k), "SLURM_NODEID": str(k)} for k in (0, 1)]
+    command = ("-m", "devrf", *(word for word in tiny if word != "trainer=cpu"), "trainer=ddp")
+    command += ("trainer.accelerator=cpu", "trainer.devices=1", "trainer.num_nodes=2")
+    folders = [tmp_path / "first", tmp_path / "second"]
+    for folder in folders:
+        folder.mkdir()
+    ended = nodes(folders, [(*command, "hydra.run.dir=run")] * 2, tasks, modules)
+    for folder, (status, _, complaint) in zip(folders, ended, strict=True):
+        assert status == 2 and complaint.count("\n") == 1
+        assert complaint.startswith(f"devrf: {folder / 'run'}: not there on every node; give")

@@ -37,6 +37,7 @@ from devrf.engine.workers import launch_workers
 from devrf.errors import DevrfError
 from devrf.evaluation.objective import check_objective, objective
 from devrf.ops.dispatch import using
+from devrf.system.folder_lock import PLACE
 from devrf.system.memory import shortage_in_words
 
 log = logging.getLogger(__name__)
@@ -166,6 +167,12 @@ def _learn(run: RunContext, learning: Names) -> None:
         plain = OmegaConf.to_container(run.config, resolve=True)
         together = launch_workers(strategy, learn_beside, (plain, run.folder))
     with together, as_own_errors():
+        # Rank 0 has made it. Checkpoints that a later stage or a resumed one needs are read by all.
+        if not strategy.reduce_boolean_decision((run.folder / PLACE).is_dir()):
+            raise DevrfError(
+                f"{run.folder}: not there on every node; give hydra.run.dir=FOLDER in a file "
+                "system that all nodes share"
+            )
         for name in run.learnable(learning):
             _take(run, name, partial(learn, name=name))
             # What a stage's trainer holds in circles would count as the next stage's memory.

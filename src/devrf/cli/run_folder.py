@@ -65,15 +65,17 @@ class RunFolderLock(Callback):
 def working_in(folder: Path, config: DictConfig, key: str) -> Iterator[None]:
     """While the block lasts, no other process works in a run's folder.
 
-    A folder that holds no results is removed if the block ends in a user error; that of a sweep's
-    job stays, for the record of its failure. ``key`` is the setting that chooses another folder.
+    A folder that holds no results is removed if the block ends in a user error, but not by a worker:
+    rank 0 works there. That of a sweep's job stays, for the record of its failure. ``key`` is the
+    setting that chooses another folder.
 
     Raises:
         DevrfError: another process works there.
     """
     if _locks(config):
         lock_folder(folder, key)
-    was_new = not in_sweep() and holds_at_most(folder, AT_FIRST)
+    alone = not in_sweep() and not _is_worker(config)
+    was_new = alone and holds_at_most(folder, AT_FIRST)
     try:
         yield
     except Exception as error:
@@ -90,9 +92,13 @@ def _locks(config: DictConfig) -> bool:
     A report and the viewer only read, but for a camera path that is written at once; stage=fetch
     locks where it writes.
     """
-    worker = any(os.environ.get(name, "0") != "0" for name in RANKS)
-    together = worker and config.trainer.get("strategy") is not None
-    return config.stage not in ("report", "fetch", "view") and not together
+    return config.stage not in ("report", "fetch", "view") and not _is_worker(config)
+
+
+def _is_worker(config: DictConfig) -> bool:
+    """Whether a launcher started this process to learn together with rank 0."""
+    ranked = any(os.environ.get(name, "0") != "0" for name in RANKS)
+    return ranked and config.trainer.get("strategy") is not None
 
 
 def archive_previous(folder: Path, *needed: Path) -> None:
