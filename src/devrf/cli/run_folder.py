@@ -65,9 +65,9 @@ class RunFolderLock(Callback):
 def working_in(folder: Path, config: DictConfig, key: str) -> Iterator[None]:
     """While the block lasts, no other process works in a run's folder.
 
-    A folder that holds no results is removed if the block ends in a user error, but not by a worker:
-    rank 0 works there. That of a sweep's job stays, for the record of its failure. ``key`` is the
-    setting that chooses another folder.
+    A folder that holds no results is removed if the block ends in a user error, but not by a
+    worker: rank 0 works there. That of a sweep's job stays, for the record of its failure. ``key``
+    is the setting that chooses another folder.
 
     Raises:
         DevrfError: another process works there.
