@@ -205,6 +205,6 @@ def test_a_run_learns_the_same_with_the_viewer_beside(devrf, tmp_path, tiny, por
         assert (outcome.status, outcome.err) == (0, "")
         assert (f"http://127.0.0.1:{port}" in outcome.out) == bool(more)
         loaded = load_checkpoint(tmp_path / folder / "checkpoints" / "canonical.ckpt")
-        assert "viewer" not in " ".join([*loaded.metadata.choices, *loaded.metadata.settings])
+        assert "viewer" not in " ".join(loaded.metadata.command)
         found.append(loaded.model.canonical.density.values)
     assert found[0].equal(found[1])

@@ -14,7 +14,6 @@ from omegaconf import DictConfig, OmegaConf
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file, write_checkpoint_file
 from devrf.cli.complete import completed
 from devrf.cli.config import config_folder
-from devrf.cli.restore_config import Command
 from devrf.cli.run import STEPS
 from devrf.errors import DevrfError
 
@@ -44,7 +43,8 @@ def learned_by(edited) -> Callable[..., Path]:
     """``learned_by(choices, settings)``: the run, as if a command with these had learned it."""
 
     def write(choices: dict, settings: dict, name: str = "deformation.ckpt") -> Path:
-        return edited(lambda entry: entry.update(choices=choices, settings=settings), name)
+        command = {f"/{group}": option for group, option in choices.items()} | settings
+        return edited(lambda entry: entry.update(command=command), name)
 
     return write
 
@@ -102,7 +102,7 @@ def test_the_jobs_of_a_sweep_go_on(devrf, tiny, tmp_path, monkeypatch):
 
 
 def test_a_job_of_an_experiment_that_sweeps_does_not_start_its_sweep(devrf, run, edited):
-    edited(lambda entry: entry["choices"].update(experiment="ablation_table"))
+    edited(lambda entry: entry["command"].update({"/experiment": "ablation_table"}))
     assert devrf("stage=still", "hydra.run.dir=run").status == 0
     assert (run / "images").is_dir()
 
@@ -113,13 +113,13 @@ def test_a_motion_learned_on_a_checkpoint_knows_the_whole_of_it(devrf, run, tmp_
     assert devrf(*again).status == 0
     learned = read_checkpoint_file(tmp_path / "other" / "checkpoints" / "deformation.ckpt")
     first = read_checkpoint_file(base)["devrf"]
-    assert learned["devrf"]["choices"] == first["choices"] == {"field": "small"}
-    assert learned["devrf"]["settings"] == {**first["settings"], "seed": 3}
+    assert first["command"]["/field"] == "small" and first["command"]["data.width"] == 24
+    assert learned["devrf"]["command"] == {**first["command"], "seed": 3}
 
 
 def test_what_a_checkpoint_keeps_of_a_command_is_plain(devrf, tiny, tmp_path, monkeypatch):
     (tmp_path / "a b").mkdir()
-    kept: list[Command] = []
+    kept: list[dict] = []
     monkeypatch.setitem(STEPS, "inspect", lambda run: kept.append(run.command))
     typed = ("data=inward", "data.root='a b'", "data.downscale=${seed}", "experiment=cpu_small")
     of_the_command = (
@@ -131,10 +131,10 @@ def test_what_a_checkpoint_keeps_of_a_command_is_plain(devrf, tiny, tmp_path, mo
     )
     outcome = devrf(*typed, *of_the_command, "seed=2", "hydra.run.dir=run")
     assert kept == [
-        Command(
-            {"data": "inward", "experiment": "cpu_small"},
-            {"data.root": str(tmp_path / "a b"), "data.downscale": 2, "seed": 2},
-        )
+        {
+            **{"/data": "inward", "/experiment": "cpu_small", "seed": 2},
+            **{"data.root": str(tmp_path / "a b"), "data.downscale": 2},
+        }
     ], outcome.err
 
 

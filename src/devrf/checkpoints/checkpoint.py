@@ -54,9 +54,8 @@ class CheckpointMetadata:
         training_config: the settings that decided what was learned, by config key; empty for a
             stage that was not trained from a config.
         earlier_configs: the same of the stages that this one builds on, by name.
-        choices: the options of config groups that the command chose which learned it, by group;
-            without groups that say only what to do.
-        settings: what that command set beside them, by config key: plain values.
+        command: what the command chose and set that learned it, but for what says only what to do:
+            the options of config groups by ``/group``, plain values by config key.
         complete: whether the stage has gone through its whole schedule.
         moves: whether the scene was seen at more than one time; None in a file of before.
     """
@@ -69,8 +68,7 @@ class CheckpointMetadata:
     records: dict[str, TrainingFigures] = field(default_factory=dict)
     training_config: dict[str, Any] = field(default_factory=dict)
     earlier_configs: dict[str, dict[str, Any]] = field(default_factory=dict)
-    choices: dict[str, str] = field(default_factory=dict)
-    settings: dict[str, Any] = field(default_factory=dict)
+    command: dict[str, Any] = field(default_factory=dict)
     complete: bool = True
     moves: bool | None = None
 

@@ -28,7 +28,7 @@ from devrf.checkpoints.checkpoint import (
 from devrf.checkpoints.checkpoint_file import digest_of
 from devrf.checkpoints.progress import progress_files
 from devrf.cli.config import PIPELINE
-from devrf.cli.restore_config import Command
+from devrf.cli.restore_config import present_command
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.ddp import ManualDDP
 from devrf.engine.stage import ScheduledStage
@@ -79,9 +79,9 @@ class RunContext:
         return round(time.perf_counter() - self.step_began, 2)
 
     @cached_property
-    def command(self) -> Command:
+    def command(self) -> dict[str, Any]:
         """What this run is learned with, as it was composed."""
-        return Command.of(self._composed)
+        return present_command(self._composed)
 
     @cached_property
     def datamodule(self) -> SceneDataModule:

@@ -20,6 +20,7 @@ from devrf.apps.still import write_contact_sheet
 from devrf.checkpoints.checkpoint_file import digest_of
 from devrf.cli.config import choices
 from devrf.cli.context import RunContext
+from devrf.cli.restore_config import as_typed
 from devrf.cli.resume import unfinished
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import HeldOutView, score_all
@@ -56,7 +57,7 @@ def evaluate(run: RunContext) -> list[Path]:
     at_rest = {} if scene.moves else {"at_rest": True}
     ran = {
         **provenance(model.size, run.device),
-        **{"choices": choices(), "overrides": run.command.texts, "seed": run.config.seed},
+        **{"choices": choices(), "overrides": as_typed(run.command), "seed": run.config.seed},
         **learning_record(metadata, run.stages_with_images),
         **data_record(scene),
         "checkpoint": digest_of(run.checkpoint(metadata.stage)),

@@ -19,7 +19,7 @@ from devrf.apps.video import VideoSettings
 from devrf.apps.video_file import write_pictures
 from devrf.checkpoints.checkpoint import Viewpoints, check_scene, metadata_of
 from devrf.cli.context import RunContext
-from devrf.cli.restore_config import Command
+from devrf.cli.restore_config import root
 from devrf.cli.resume import unfinished
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
@@ -100,8 +100,9 @@ def _learned(run: RunContext) -> tuple[Renderable, Viewpoints]:
         log.warning("shown as far as it is learned: %s", standing)
     stored = run.load()
     viewpoints = stored.viewpoints
-    learned_with = Command(stored.metadata.choices, stored.metadata.settings)
-    if viewpoints is None or run.command.within("data") != learned_with.within("data"):
+    commands = (run.command, stored.metadata.command)
+    now, before = ({k: v for k, v in c.items() if root(k) == "data"} for c in commands)
+    if viewpoints is None or now != before:
         check_scene(run.checkpoint(), stored.metadata, run.scene)
         viewpoints = Viewpoints.of(run.scene)
     return stored.model, viewpoints

@@ -1,9 +1,9 @@
 """A run that knows itself: a later command begins from what it was learned with.
 
-A checkpoint holds the options of config groups that were chosen, and what was set beside them, as
-plain values. A later command chooses the same options by their names, and Hydra merges the rest,
-as a config file of values alone, beneath what is typed: only that differs. So nothing that a file
-says is read as an override, as an interpolation or as code.
+A checkpoint holds the options of config groups that were chosen, by ``/group``, and what was set
+beside them, by config key, as plain values. A later command chooses the same options by name, and
+Hydra merges the rest, as a config file of values alone, beneath what is typed: only that differs.
+So nothing that a file says is read as an override, as an interpolation or as code.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import logging
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -49,12 +48,15 @@ OF_A_SCENE = {"data", "facing", "seed"}
 CODE = {"_target_", "_partial_", "_convert_", "_recursive_", "_args_"}
 # An option's name leads to no other folder than its group's; a key is a path of plain names.
 OPTION = re.compile(r"[\w-]+", re.ASCII)
-GROUP = re.compile(r"\+?[\w-]+(/[\w-]+)*(@[\w.-]+)?", re.ASCII)
+GROUP = re.compile(r"/[\w-]+(/[\w-]+)*", re.ASCII)
 KEY = re.compile(r"[\w-]+(\.[\w-]+)*", re.ASCII)
 # Values that are relative to the folder in which they were typed.
 RELATIVE = {"data.root", "evaluation.lpips_weights", "video.path"}
 # Where Hydra finds the settings: a group below hydra/ is none of the run's own choices.
 RESTORED = "hydra/restored"
+
+# Options by /group, values by key.
+Command = dict[str, Any]
 
 # Where the present command's settings come from, until a log is there to say so.
 _source: list[str] = []
@@ -62,103 +64,28 @@ _source: list[str] = []
 _folder: list[TemporaryDirectory[str]] = []
 
 
-@dataclass(frozen=True)
-class Command:
-    """What a run was learned with, without what says only what to do.
+def present_command(config: DictConfig) -> Command:
+    """What the present command chose and set, but for what says only what to do.
 
-    Attributes:
-        choices: the options of config groups that were chosen, by group; ``+`` before a group
-            that the defaults do not have.
-        settings: what was set beside them, by config key: None, numbers, text, and lists and
-            mappings of these.
+    Code that was typed (``_target_``), and keys that were removed, are not kept. Empty outside
+    Hydra.
     """
-
-    choices: dict[str, str] = field(default_factory=dict)
-    settings: dict[str, Any] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, config: DictConfig) -> Command:
-        """What the present command chose and set; nothing outside Hydra.
-
-        Code that was typed (``_target_``), and keys that were removed, are not kept.
-        """
-        if not HydraConfig.initialized():
-            return cls()
-        chosen = {}
-        for override in parsed(overrides()):
-            key, option = override.get_key_element(), override.value()
-            if key.lstrip("+") in choices() and option and not override.is_delete():
-                chosen["+" * override.is_add() + key.lstrip("+")] = str(option)
-        # Those alone, to compare with.
-        where = [text for text in HydraConfig.get().overrides.hydra if "hydra.searchpath" in text]
-        app = GlobalHydra.instance().is_initialized()  # not in another process of a sweep
-        with (
-            nullcontext()
-            if app
-            else initialize_config_dir(str(config_folder()), version_base="1.3")
-        ):
-            alone = compose("config", [*where, *(f"{key}={chosen[key]}" for key in chosen)])
-        changed = _changed(OmegaConf.to_container(config), OmegaConf.to_container(alone), "")
-        settings = {key: _plain_at(config, key) for key in changed if KEY.fullmatch(key)}
-        return cls(
-            choices={key: option for key, option in chosen.items() if not _of_a_command(key)},
-            settings={key: value for key, value in settings.items() if _is_plain(value)},
-        )
-
-    @classmethod
-    def checked(cls, path: Path, chosen: Mapping[str, str], settings: Mapping[str, Any]) -> Command:
-        """What the file at ``path`` says, if these are names of options and plain values.
-
-        Raises:
-            DevrfError: something else is among them.
-        """
-        for group, option in chosen.items():
-            if not (GROUP.fullmatch(group) and OPTION.fullmatch(option)) or _of_a_command(group):
-                raise DevrfError(f"{path}: {group}={option} is no option of a learned run")
-        for key, value in settings.items():
-            if isinstance(value, Mapping):
-                cls.checked(path, {}, {f"{key}.{name}": below for name, below in value.items()})
-            elif not KEY.fullmatch(key) or _of_a_command(key) or not _is_plain(value):
-                raise DevrfError(f"{path}: {key} is no setting of a learned run")
-        return cls({**chosen}, {**settings})
-
-    def __and__(self, other: Command) -> Command:
-        """What both have in common."""
-        return Command(
-            {key: value for key, value in self.choices.items() if other.choices.get(key) == value},
-            {k: v for k, v in self.settings.items() if other.settings.get(k, CODE) == v},
-        )
-
-    def within(self, *roots: str) -> Command:
-        """Of it, what is below keys that begin with ``roots``."""
-        return Command(
-            {key: value for key, value in self.choices.items() if _root(key) in roots},
-            {key: value for key, value in self.settings.items() if _root(key) in roots},
-        )
-
-    def beneath(self, typed: Sequence[Override]) -> Command:
-        """What stays beneath what is typed.
-
-        Another option of a group begins from its own values. Another method takes over the scene
-        and the seed alone.
-        """
-        keys = {override.key_or_group for override in typed}
-        before = {key.lstrip("+"): value for key, value in self.choices.items()}
-        other = tuple(f"{k}." for k in keys if value(typed, k) != before.get(k))
-        method = value(typed, "method")
-        stay = self
-        if method not in (None, before.get("method", "devrf")):
-            stay = self.within(*OF_A_SCENE)
-        return Command(
-            {k: v for k, v in stay.choices.items() if k.lstrip("+") not in keys},
-            {k: v for k, v in stay.settings.items() if k not in keys and not k.startswith(other)},
-        )
-
-    @property
-    def texts(self) -> list[str]:
-        """It as it may be typed, for people."""
-        said = {k: v if isinstance(v, str) else json.dumps(v) for k, v in self.settings.items()}
-        return [f"{key}={value}" for key, value in (self.choices | said).items()]
+    if not HydraConfig.initialized():
+        return {}
+    known = [override for override in parsed(overrides()) if override.key_or_group in choices()]
+    typed = [override for override in known if not override.is_delete()]
+    chosen = {f"/{o.key_or_group}": o.value() for o in typed if o.value() and not o.is_add()}
+    # Those alone, to compare with.
+    found_in = [text for text in HydraConfig.get().overrides.hydra if "hydra.searchpath" in text]
+    app = GlobalHydra.instance().is_initialized()  # not in another process of a sweep
+    with nullcontext() if app else initialize_config_dir(str(config_folder()), version_base="1.3"):
+        alone = compose("config", [*found_in, *(str(o.input_line) for o in typed)])
+    changed = _changed(OmegaConf.to_container(config), OmegaConf.to_container(alone), "")
+    settings = {key: _plain_at(config, key) for key in changed if KEY.fullmatch(key)}
+    return {
+        **{group: option for group, option in chosen.items() if not _of_a_command(group)},
+        **{key: value for key, value in settings.items() if _is_plain(value)},
+    }
 
 
 def _changed(now: Any, before: Any, path: str) -> Iterator[str]:
@@ -181,7 +108,25 @@ def _plain_at(config: DictConfig, key: str) -> Any:
         return OmegaConf.to_container(value, resolve=True)
     if key in RELATIVE and isinstance(value, str) and Path(value).expanduser().exists():
         return str(Path(value).expanduser().absolute())
-    return str(value) if isinstance(value, Path) else value
+    return value
+
+
+def checked(path: Path, command: Mapping[str, Any]) -> Command:
+    """What the file at ``path`` says, if these are names of options and plain values.
+
+    Raises:
+        DevrfError: something else is among them.
+    """
+    for key, value in command.items():
+        if isinstance(value, Mapping):
+            checked(path, {f"{key}.{name}": below for name, below in value.items()})
+        elif GROUP.fullmatch(key):
+            known = isinstance(value, str) and OPTION.fullmatch(value) is not None
+        else:
+            known = KEY.fullmatch(key) is not None and _is_plain(value)
+        if not isinstance(value, Mapping) and (not known or _of_a_command(key)):
+            raise DevrfError(f"{path}: {key}={value} is no option or setting of a learned run")
+    return {**command}
 
 
 def _is_plain(value: object) -> bool:
@@ -194,6 +139,22 @@ def _is_plain(value: object) -> bool:
     if isinstance(value, str):
         return "${" not in value and value != "???"
     return value is None or isinstance(value, bool | int | float)
+
+
+def _of_a_command(key: str) -> bool:
+    """Whether a key or group says only what to do, or builds a part."""
+    return root(key) in OF_A_COMMAND or key in PLACES or bool(CODE & {*key.split(".")})
+
+
+def root(key: str) -> str:
+    """The first part of a key or group: ``data`` of ``data.root``."""
+    return re.split("[./]", key.lstrip("/"))[0]
+
+
+def as_typed(command: Mapping[str, Any]) -> list[str]:
+    """It as it may be typed, for people."""
+    said = {k: v if isinstance(v, str) else json.dumps(v) for k, v in command.items()}
+    return [f"{key.lstrip('/')}={value}" for key, value in said.items()]
 
 
 def parsed(overrides: Iterable[str]) -> list[Override]:
@@ -220,16 +181,6 @@ def value(overrides: Sequence[Override], key: str) -> str | None:
     """The last value of ``key``; None where there is none, or several."""
     texts = values(overrides, key)
     return texts[0] if len(texts) == 1 else None
-
-
-def _of_a_command(key: str) -> bool:
-    """Whether a key or group says only what to do, or builds a part."""
-    return _root(key) in OF_A_COMMAND or key in PLACES or bool(CODE & {*key.split(".")})
-
-
-def _root(key: str) -> str:
-    """The first part of a key: ``data`` of ``data.root``."""
-    return re.split("[./@]", key.lstrip("+"))[0]
 
 
 def log_source() -> None:
@@ -260,16 +211,14 @@ def of_named_run(typed: Sequence[Override], multirun: bool) -> list[str]:
             checkpoints = [last]
     if not checkpoints or not all(path.is_file() for path in checkpoints):
         return []  # a file that is missing is reported by the step that loads it
-    commands = [command_of(path) for path in checkpoints]
-    for path, command in zip(checkpoints, commands, strict=True):
-        if command is None or command == Command():
-            said = "does not say how it was learned; data and settings are those typed, and the"
-            _source.append(f"{path}: {said} defaults")
-            return []
-    shared = commands[0] or Command()
-    for other in commands[1:]:
-        shared &= other or Command()
-    put = _put(shared.beneath(typed), typed, source, multirun=multirun)
+    commands = [_command_of(path) for path in checkpoints]
+    if {} in commands:
+        said = "does not say how it was learned; data and settings are those typed, and the"
+        _source.append(f"{checkpoints[commands.index({})]}: {said} defaults")
+        return []
+    first = commands[0]
+    shared = {k: first[k] for k in first if all(c.get(k, CODE) == first[k] for c in commands)}
+    put = _put(beneath(typed, shared), typed, source, multirun=multirun)
     if multirun:
         # The sweep is the one that is typed, not that of an experiment.
         return put if values(typed, "hparams_search") else [*put, "hydra.sweeper.params=null"]
@@ -279,23 +228,42 @@ def of_named_run(typed: Sequence[Override], multirun: bool) -> list[str]:
     return put
 
 
+def beneath(typed: Sequence[Override], command: Command) -> Command:
+    """What stays beneath what is typed.
+
+    Another option of a group begins from its own values. Another method takes over the scene
+    and the seed alone.
+    """
+    keys = {override.key_or_group for override in typed}
+    other = tuple(f"{k}." for k in keys if value(typed, k) != command.get(f"/{k}"))
+    method = value(typed, "method")
+    another = method not in (None, command.get("/method", "devrf"))
+    return {
+        key: setting
+        for key, setting in command.items()
+        if key.lstrip("/") not in keys and not key.startswith(other)
+        if not another or root(key) in OF_A_SCENE
+    }
+
+
 def _put(command: Command, typed: Sequence[Override], source: str, *, multirun: bool) -> list[str]:
     """The overrides that take over a command; its settings go into a config file of values."""
-    if command == Command():
+    if not command:
         return []
-    _source.append(f"{source}: as it was learned, with {' '.join(command.texts)}")
-    put = [f"{group}={option}" for group, option in command.choices.items()]
-    if command.settings:
+    _source.append(f"{source}: as it was learned, with {' '.join(as_typed(command))}")
+    put = [f"{key[1:]}={option}" for key, option in command.items() if key[0] == "/"]
+    settings = OmegaConf.create()
+    for key, setting in command.items():
+        if key[0] != "/":
+            OmegaConf.update(settings, key, setting, force_add=True)
+    if settings:
         if multirun:  # other machines may take its jobs
             Path("outputs").mkdir(exist_ok=True)
         place = TemporaryDirectory(dir="outputs" if multirun else None, prefix=".restored-")
         _folder[:] = [place]  # until the command ends
         file = Path(place.name, RESTORED, "run.yaml")
         file.parent.mkdir(parents=True)
-        content = OmegaConf.create()
-        for key, setting in command.settings.items():
-            OmegaConf.update(content, key, setting, force_add=True)
-        file.write_text(f"# @package _global_\n{OmegaConf.to_yaml(content)}", encoding="utf-8")
+        file.write_text(f"# @package _global_\n{OmegaConf.to_yaml(settings)}", encoding="utf-8")
         paths = [f"file://{Path(place.name).absolute()}"]
         for override in typed:  # Hydra takes the first list of folders
             if override.key_or_group == "hydra.searchpath":
@@ -313,20 +281,17 @@ def _of_sweep(typed: Sequence[Override], folder: Path) -> list[str]:
     record = folder / "multirun.yaml"
     if any(override.is_sweep_override() for override in typed) or not record.is_file():
         return []
-    begun = OmegaConf.select(OmegaConf.load(record), "hydra.overrides.task") or []
+    begun: Any = OmegaConf.select(OmegaConf.load(record), "hydra.overrides.task") or []
     keys = {override.key_or_group for override in typed}
     stay = []
-    for override in parsed(OmegaConf.to_container(begun)):  # type: ignore[arg-type]
+    for override in parsed(list(begun)):
         key = override.key_or_group
         if _of_a_command(key) or key in keys or override.is_delete():
             continue
         swept = override.sweep_iterator() if override.is_sweep_override() else ()
-        each = [parsed([f"{key}={text}"])[0].value() for text in swept] or [override.value()]
-        for one in each:
-            if "." in key:
-                Command.checked(record, {}, {key: one})
-            elif isinstance(one, str):
-                Command.checked(record, {key: one}, {})
+        for one in [parsed([f"{key}={text}"])[0].value() for text in swept] or [override.value()]:
+            is_option = "." not in key and isinstance(one, str)
+            checked(record, {f"/{key}" if is_option else key: one})
         stay.append(str(override.input_line))
     if stay:
         _source.append(f"{folder}: as it was learned, with {' '.join(stay)}")
@@ -349,16 +314,12 @@ def _folder_for(checkpoint: Path) -> Path:
     return Path("outputs") / scene_folder_name(metadata_of(checkpoint).scene) / checkpoint.stem
 
 
-def command_of(checkpoint: Path) -> Command | None:
-    """The command that a checkpoint was learned with; None where it cannot be read.
+def _command_of(checkpoint: Path) -> Command:
+    """The command that a checkpoint was learned with; empty where it does not say.
 
     Raises:
-        DevrfError: it says what is no option or plain value.
+        DevrfError: the file is none of devrf's, or says what is no option or plain value.
     """
     from devrf.checkpoints.checkpoint import metadata_of  # loads torch
 
-    try:
-        metadata = metadata_of(checkpoint)
-    except (DevrfError, OSError):  # reported when the whole of it is read
-        return None
-    return Command.checked(checkpoint, metadata.choices, metadata.settings)
+    return checked(checkpoint, metadata_of(checkpoint).command)

@@ -50,8 +50,7 @@ def learn(run: RunContext, name: str) -> None:
         stage.earlier_configs = {**before.earlier_configs, below: before.training_config}
     stage.protocol = run.protocol.name
     stage.time_share = run.protocol.time_share(name, run.stages_with_images)
-    stage.choices = run.command.choices
-    stage.settings = run.command.settings
+    stage.command = run.command
     _fit(run, stage, begin)
 
 

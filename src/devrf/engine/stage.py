@@ -65,8 +65,7 @@ class ScheduledStage(Learner):
         training_config: the settings that decide what is learned, by config key; empty for a
             stage that was not built from a config.
         earlier_configs: the same of the stages that this one builds on, by name.
-        choices: the options of config groups that the command chose which learns, by group.
-        settings: what that command set beside them, by config key.
+        command: what the command chose and set that learns, as its checkpoints hold it.
         protocol: the name of the protocol that the stage is a part of, if any.
         num_rollbacks: how often training diverged and was rolled back.
         lr_scale: factor of the scheduled learning rates; below 1 after a rollback.
@@ -88,8 +87,7 @@ class ScheduledStage(Learner):
         self.generator = torch.Generator()
         self.training_config: dict[str, Any] = {}
         self.earlier_configs: dict[str, dict[str, Any]] = {}
-        self.choices: dict[str, str] = {}
-        self.settings: dict[str, Any] = {}
+        self.command: dict[str, Any] = {}
         self.protocol: str | None = None
         self.lr_scale = 1.0
         self.has_scheduled_rates = False
@@ -149,8 +147,7 @@ class ScheduledStage(Learner):
             records={**self.earlier_records, self.name: self.record},
             training_config=self.training_config,
             earlier_configs=self.earlier_configs,
-            choices=self.choices,
-            settings=self.settings,
+            command=self.command,
             complete=self.iteration >= self.total_iterations,
             moves=self.scene.moves,
         )
