@@ -40,7 +40,7 @@ def levels(*rows: tuple[int, int]) -> list[str]:
 # What is learned: half of the images' size, for some hundred iterations.
 LEARNED = {
     "forward": (
-        *("experiment=quickstart_forward", "schedule.canonical.upsample_at=[60,120]"),
+        *("experiment=quickstart", "schedule.canonical.upsample_at=[60,120]"),
         "schedule.canonical.iterations=300",
         *levels((8, 16), (16, 10)),
     ),

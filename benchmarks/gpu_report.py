@@ -67,7 +67,7 @@ def shortened(search: int, fine: int, frame: int) -> list[str]:
     return given if GPU else [*given, *sides, *TINY]
 
 
-def run_of(into: Path, name: str, *overrides: str, experiment: str = "paper_inward") -> RunContext:
+def run_of(into: Path, name: str, *overrides: str, experiment: str = "paper") -> RunContext:
     """A run of an experiment on the report's scene, in a folder of its own."""
     root = (into / "root.txt").read_text() if (into / "root.txt").exists() else into / "scene"
     common = [f"experiment={experiment}", f"data.root={root}", f"hydra.run.dir={into / name}"]
@@ -146,7 +146,7 @@ def operations(into: Path, block: int | None = None) -> Iterator[Row]:
 
 
 def learned(
-    into: Path, name: str, overrides: Sequence[str] = (), experiment: str = "paper_inward"
+    into: Path, name: str, overrides: Sequence[str] = (), experiment: str = "paper"
 ) -> Iterator[Row]:
     """Learn both stages: seconds, milliseconds by resolution, memory, PSNR on held-out views."""
     for stage in ("canonical", "deformation", "evaluate"):
@@ -222,7 +222,7 @@ STEPS: dict[str, tuple[float, Callable[[Path], Iterator[Row]]]] = {
     },
     "tests": (6, tests),
     **{
-        name: (minutes, partial(learned, name=name, experiment=f"{name}_inward"))
+        name: (minutes, partial(learned, name=name, experiment=name))
         for name, minutes in {"fast": 15.0, "best": 40.0}.items()
     },
 }

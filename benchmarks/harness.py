@@ -25,6 +25,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf, open_dict, read_write
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
+from devrf.cli.complete import completed
 from devrf.cli.config import config_folder, register_config
 from devrf.cli.config_check import check_config
 from devrf.cli.context import RunContext
@@ -52,8 +53,9 @@ def open_run(overrides: Sequence[str]) -> RunContext:
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     register_config()
+    typed = completed(overrides)
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
-        config = compose("config", overrides=list(overrides), return_hydra_config=True)
+        config = compose("config", overrides=typed, return_hydra_config=True)
     HydraConfig.instance().set_config(config)
     folder = Path(config.hydra.run.dir)
     with read_write(config.hydra), open_dict(config.hydra):

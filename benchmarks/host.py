@@ -30,7 +30,7 @@ from devrf.methods.devrf.voxel_stage import VoxelStage
 from devrf.system.graphs import GraphedStep
 
 TINY = (
-    "experiment=paper_inward data=procedural data.width=16 data.height=16 data.static_views=4 "
+    "experiment=paper data=procedural data.width=16 data.height=16 data.static_views=4 "
     "data.frames=8 data.static_test_views=1 video.frames=1 trainer=cpu logger=csv "
     "decoder_precision=float32 schedule.canonical.side=8 schedule.canonical.search_side=8 "
     "schedule.canonical.search_iterations=0 schedule.canonical.visual_hull_init=true "

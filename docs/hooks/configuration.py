@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import html
 import re
-from collections.abc import Iterable
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
 CONF = Path(__file__).parents[2] / "conf"
-# Groups whose choices are the rows of one file.
-ROWS = CONF / "rows"
-ROW = re.compile(r"((?:^#.*\n)*)^(\w+):", re.MULTILINE)
 MARKER = "<!-- generated: conf -->"
 # How the command line itself looks; a run sets none of these.
 INTERNAL = ("hydra/help", "hydra/job_logging", "hydra/hydra_logging")
@@ -34,12 +30,7 @@ def reference() -> str:
     """The keys of config.yaml, then every group: choices, what each says, the files."""
     config = (CONF / "config.yaml").read_text()
     defaults = dict(DEFAULT.findall(config))
-    groups = {
-        str(path.relative_to(ROWS).with_suffix(""))
-        if path.is_relative_to(ROWS)
-        else str(path.parent.relative_to(CONF))
-        for path in CONF.glob("*/**/*.y*ml")
-    }
+    groups = {str(path.parent.relative_to(CONF)) for path in CONF.glob("*/**/*.yaml")}
     ordered = sorted(
         groups.difference(INTERNAL),
         key=lambda group: ([*defaults, group].index(group), group),
@@ -68,13 +59,7 @@ def keys_of_a_run(config: str) -> str:
 
 def section(group: str, default: str) -> str:
     """One group: a row for each choice, then its files as they are."""
-    table = ROWS / f"{group}.yml"
     files = sorted((CONF / group).glob("*.yaml"))
-    choices = {path.stem: header(path) for path in files}
-    if table.is_file():
-        files.append(table)
-        rows = ROW.findall(table.read_text().partition("\n\n")[2])
-        choices |= {name: words(comment.splitlines()) for comment, name in rows}
     lines = [
         f"## {group} {{ #{group.replace('/', '-')} }}",
         "",
@@ -82,10 +67,9 @@ def section(group: str, default: str) -> str:
         "|---|---|",
     ]
     listing = []
-    for name, comment in choices.items():
-        usual = " (default)" if name == default else ""
-        lines.append(f"| `{name}`{usual} | {prose(comment)} |")
     for path in files:
+        usual = " (default)" if path.stem == default else ""
+        lines.append(f"| `{path.stem}`{usual} | {prose(header(path))} |")
         source = "\n".join(f"    {line}".rstrip() for line in path.read_text().splitlines())
         listing.append(f'    ```yaml title="{path.relative_to(CONF.parent)}"\n{source}\n    ```\n')
     return "\n".join([*lines, "", f'??? note "The files of `{group}`"', "", *listing])
@@ -94,13 +78,8 @@ def section(group: str, default: str) -> str:
 def header(path: Path) -> str:
     """The comment that a file begins with."""
     lines = path.read_text().splitlines()
-    return words(takewhile(lambda line: line.startswith("#"), lines))
-
-
-def words(comment: Iterable[str]) -> str:
-    """The text of a comment's lines."""
-    said = (line.removeprefix("#").strip() for line in comment if "# @package" not in line)
-    return " ".join(said)
+    comment = takewhile(lambda line: line.startswith("#"), lines)
+    return " ".join(line.removeprefix("#").strip() for line in comment if "@package" not in line)
 
 
 def prose(comment: str) -> str:

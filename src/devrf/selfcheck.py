@@ -161,7 +161,7 @@ def short(schedule: CanonicalSchedule, iterations: int) -> CanonicalSchedule:
 
 
 def small_scene(device: torch.device, seed: int = 0) -> SmallScene:
-    """The scene for a device: a GPU learns what ``experiment=paper_inward`` does, for a moment.
+    """The scene for a device: a GPU learns what ``experiment=paper`` does, for a moment.
 
     Grids, batches, networks and levels are the paper's; images are small, iterations are few, and
     coarse geometry begins with the visual hull, because it has no time to be found. Frames of one

@@ -21,7 +21,7 @@ from devrf.checkpoints.checkpoint import load_checkpoint
 
 HERE = Path(__file__).parent
 TINY = (
-    "experiment=paper_inward data=procedural data.width=12 data.height=12 data.static_views=3 "
+    "experiment=paper data=procedural data.width=12 data.height=12 data.static_views=3 "
     "data.frames=3 data.static_test_views=1 video.frames=2 video.height=16 "
     "schedule.canonical.visual_hull_init=true schedule.canonical.search_iterations=0 "
     "schedule.canonical.iterations=12 schedule.canonical.upsample_at=[6] "

@@ -44,7 +44,7 @@ FACING = (
     "data.supersample=1",
 )
 SHORT = (
-    "field=small",
+    "field=small_inward",
     "field.width=16",
     "schedule.canonical.iterations=6",
     "schedule.canonical.side=16",

@@ -1,4 +1,4 @@
-"""What was typed is completed: paths, the run that is named, the experiment's form, the reader."""
+"""What was typed is completed: paths, the run that is named, what the scene's files say."""
 
 from __future__ import annotations
 
@@ -14,11 +14,9 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from devrf.cli.complete import PATHS, completed
-from devrf.cli.config import config_folder
 from devrf.cli.main import candidates
 from devrf.cli.messages import in_quotes
 from devrf.scenes.export import export
-from devrf.scenes.formats import LAYOUTS
 from devrf.scenes.procedural import ProceduralForwardScene, ProceduralScene
 
 PARSER = OverridesParser.create()
@@ -70,7 +68,7 @@ def test_the_keys_of_paths_exist(devrf):
         assert any(name in node for node in nodes), key
 
 
-# The form of an experiment, and the reader of a scene
+# What the files of a scene say
 
 
 @pytest.fixture(scope="module")
@@ -97,106 +95,61 @@ def scenes(tmp_path_factory) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("typed", "meant"),
+    ("typed", "told"),
     [
-        ("experiment=paper data=lego", "experiment=paper_lego data=lego"),
-        ("experiment=paper_lego data.root=x", "experiment=paper_lego data.root=x"),
-        ("data=inward experiment=paper seed=1", "data=inward experiment=paper_inward seed=1"),
-        ("experiment=paper data=colmap", "experiment=paper_inward data=colmap"),
-        ("-m experiment=paper data=lego,plant", "-m experiment=paper_lego,paper_plant"),
-        (
-            "-m experiment=paper_lego,paper_plant data.root=x seed=1",
-            "-m experiment=paper_lego,paper_plant ++data.root=x seed=1",
-        ),
-        ("experiment=fast data=rabbit", "experiment=fast_forward data=rabbit"),
-        ("experiment=best data=neural_3d_video", "experiment=best_forward data=neural_3d_video"),
-        ("experiment=best_small data=flower", "experiment=best_small_embedded data=flower"),
-        ("experiment=best_small data=inward", "experiment=best_small data=inward"),
-        (
-            "experiment=best_small data=procedural_forward",
-            "experiment=best_small_forward data=procedural_forward",
-        ),
-        ("experiment=best_small data.root=walker", "experiment=best_small data.root=walker"),
-        ("experiment=best_small data.root=wall", "experiment=best_small_forward data.root=wall"),
-        ("experiment=paper data.root=wall", "experiment=paper_forward data.root=wall"),
-        ("experiment=cpu_small data.root=walker", "experiment=cpu_small data.root=walker"),
-        ("experiment=cpu_small data.root=wall", "experiment=cpu_small_forward data.root=wall"),
-        ("experiment=cpu_small data=flower", "experiment=cpu_small_embedded data=flower"),
-        # What a folder's files say counts, not the reader alone.
-        ("experiment=best data.root=phone", "experiment=best_forward data.root=phone"),
-        ("data.root=phone seed=1", "data.root=phone seed=1 experiment=best_small_forward"),
-        ("data.root=hook method=dnerf", "data=auto data.root=hook method=dnerf protocol=dynamic"),
-        ("data.root=hook method=devrf", "data=auto data.root=hook method=devrf"),
-        ("data.root=wall method=dnerf", "data=auto data.root=wall method=dnerf"),
-        # Where no experiment says how DeVRF learns, the scene's facing does.
-        ("data.root=wall facing=inward", "data=auto data.root=wall facing=inward"),
-        (
-            "data.root=wall facing=auto schedule=quick",
-            "data=auto data.root=wall schedule=quick facing=forward",
-        ),
-        ("data=forward data.root=wall method=devrf", "data=forward data.root=wall method=devrf"),
-        ("data.root=wall,walker method=nsff", "data=auto data.root=wall,walker method=nsff"),
-        ("stage=report data.root=x", "data=auto stage=report data.root=x"),
-        ("data.root=wall method=devrf", "data=auto data.root=wall method=devrf facing=forward"),
-        (
-            "experiment=comparison_table data.root=phone",
-            "data=auto experiment=comparison_table data.root=phone facing=forward",
-        ),
-        (
-            "experiment=comparison_table data.root=walker",
-            "data=auto experiment=comparison_table data.root=walker",
-        ),
-        (
-            "experiment=quickstart data.root=wall",
-            "data=auto experiment=quickstart_forward data.root=wall",
-        ),
-        ("experiment=best_small", "experiment=best_small"),
-        ("experiment=paper", "experiment=paper_inward"),
-        ("experiment=cpu_small,best_small", "experiment=cpu_small,best_small"),
-        ("experiment=quickstart data=lego", "experiment=quickstart data=lego"),
-        (
-            "experiment=best schedule.deformation.levels.6.parallel_frames=2",
-            "experiment=best_inward ++schedule.deformation.levels.6.parallel_frames=2",
-        ),
-        # The reader.
-        ("data.root=walker", "data=auto data.root=walker"),
-        ("+data.root=walker seed=1", "data=auto +data.root=walker seed=1"),
-        (
-            "data.root=walker experiment=peer_small",
-            "data=auto data.root=walker experiment=peer_small",
-        ),
-        ("data.root=x experiment=nonsense", "data=auto data.root=x experiment=nonsense"),
-        ("data.root=walker data=nerfstudio", "data.root=walker data=nerfstudio"),
+        # The reader, and what its own config says of the scene.
+        ("data.root=walker", "data=inward"),
+        ("+data.root=walker seed=1", "data=inward"),
+        ("data.root=wall", "data=forward"),
+        ("experiment=paper data.root=wall", "data=forward"),
+        ("-m experiment=cpu_small,best_small data.root=walker", "data=inward"),
+        ("-m data.root=walker,hook", "data=inward"),
+        ("data.root=walker experiment=nonsense", "data=inward"),
+        # What is typed, or an experiment chooses, is not told again.
+        ("data.root=walker data=nerfstudio", ""),
+        ("data=lego data.root=x", ""),
+        ("experiment=published_table data.root=wall", ""),
+        ("experiment=published_table data.root=${data.name}", ""),
+        ("data=colmap", ""),
+        ("experiment=paper", ""),
+        ("stage=report data.root=x", ""),
+        # What only the files say.
+        ("data.root=phone seed=1", "data=nerfstudio facing=forward"),
+        ("data=nerfstudio data.root=phone", "facing=forward"),
+        ("data.root=phone facing=inward", "data=nerfstudio"),
+        ("data.root=phone data.space=world", "data=nerfstudio"),
+        ("data=colmap data.root=gone data.space=ndc", "facing=forward"),
+        ("experiment=comparison_table data.root=phone", "data=nerfstudio facing=forward"),
+        # One camera that moves, and a method that can learn from it alone.
+        ("data.root=hook method=dnerf", "data=inward protocol=dynamic"),
+        ("data.root=hook method=dnerf protocol=joint", "data=inward"),
+        ("data.root=hook comparison=dnerf", "data=inward"),
+        ("data.root=hook method=devrf", "data=inward"),
+        ("data.root=walker method=dnerf", "data=inward"),
     ],
 )
-def test_the_form_for_the_scene_and_its_reader(scenes, monkeypatch, typed, meant):
+def test_what_the_files_of_a_scene_say_comes_after_what_was_typed(scenes, monkeypatch, typed, told):
     monkeypatch.chdir(scenes)
-    assert completed(typed.split()) == meant.split()
+    assert completed(typed.split()) == [*typed.split(), *told.split()]
 
 
-def test_a_sweep_over_scenes_that_need_different_forms_is_refused(devrf, scenes):
-    roots = f"data.root={scenes}/walker,{scenes}/wall"
-    outcome = devrf("-m", "experiment=best_small", roots)
+def test_what_the_files_say_is_said_in_one_line(devrf, scenes, short):
+    done = devrf(f"data.root={scenes}/phone", *short, "stage=inspect")
+    line = f"{scenes}/phone: the layout of nerfstudio, instant-ngp (data=nerfstudio facing=forward)"
+    assert done.out.splitlines().count(line) == 1
+
+
+@pytest.mark.parametrize(
+    ("other", "needed"),
+    [
+        ("wall", "data=inward and data=forward"),
+        ("hook", "data=inward and data=inward protocol=dynamic"),
+    ],
+)
+def test_a_sweep_over_scenes_that_need_different_options_is_refused(devrf, scenes, other, needed):
+    outcome = devrf("-m", "method=dnerf", f"data.root={scenes}/walker,{scenes}/{other}")
     assert outcome.status == 2 and outcome.err.count("\n") == 1
-    assert "experiment=best_small and experiment=best_small_forward" in outcome.err
-
-
-@pytest.mark.parametrize("typed", [["experiment=comparison_table"], ["-m"]])
-def test_devrf_learns_scenes_of_one_facing_in_a_sweep(devrf, scenes, typed):
-    outcome = devrf(*typed, f"data.root={scenes}/walker,{scenes}/wall")
-    assert outcome.status == 2 and outcome.err.startswith("devrf: data.root: DeVRF has other")
-    assert outcome.err.count("\n") == 1
-
-
-def test_data_auto_has_the_options_of_all_readers():
-    auto = OmegaConf.load(config_folder() / "data" / "auto.yaml")
-    options = set()
-    for choice in {layout.choice for layout in LAYOUTS}:
-        options |= set(OmegaConf.load(config_folder() / "data" / f"{choice}.yaml"))
-    assert set(auto) == options - {"reader"}
-    # null stands for the reader's own default.
-    own = options - {"_target_", "reader", "root", "flow_cache"}
-    assert all(auto._get_node(key)._value() is None for key in own)
+    assert outcome.err.startswith(f"devrf: data.root: the scenes need {needed}; sweep over")
 
 
 def test_the_options_of_the_reader_reach_it(devrf, tmp_path, scenes, short):
@@ -212,24 +165,19 @@ def test_the_options_of_the_reader_reach_it(devrf, tmp_path, scenes, short):
     assert "canonical: learned already" in again.out
 
 
-def test_each_job_of_a_sweep_has_the_reader_of_its_scene(devrf, tmp_path, scenes, short):
-    (still := tmp_path / "still").mkdir()
-    content = json.loads((scenes / "walker/static/transforms_train.json").read_text())
-    (still / "images").symlink_to(scenes / "walker/static/train")
-    for frame in content["frames"]:
-        frame["file_path"] = f"images/{Path(frame['file_path']).name}"
-    (still / "transforms.json").write_text(json.dumps(content))
-    sweep = ("experiment=cpu_small", f"data.root={scenes}/walker,{still}", "hydra.sweep.dir=s")
+def test_a_sweep_over_scenes_of_one_layout_has_their_reader(devrf, tmp_path, scenes, short):
+    shutil.copytree(scenes / "walker", tmp_path / "a, b=c")
+    roots = f"data.root={scenes}/walker,'{tmp_path}/a, b=c'"
+    sweep = ("experiment=cpu_small", roots, "hydra.sweep.dir=s")
     done = devrf("-m", *sweep, "stage=inspect", *short)
     assert (done.status, done.err) == (0, "")
-    assert {path.name for path in (tmp_path / "s").glob("*_*")} == {"0_walker", "1_still"}
-    assert "(data=inward)" in done.out and "(data=nerfstudio)" in done.out
+    assert {path.name for path in (tmp_path / "s").glob("*_*")} == {"0_walker", "1_a_b_c"}
 
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["data.test_view=2"], "data.test_view: {root} is read by data=inward, which takes root, "),
+        (["data.holdout=2"], "data.holdout: no such key; it belongs to data=colmap, dycheck, "),
         (["data.downscael=2"], "data.downscael: no such key; did you mean data.downscale?"),
         (["data.root=empty"], "empty: no known layout ("),
         (["data.root=nowhere", "experiment=best_small"], "nowhere: no such folder"),
@@ -259,7 +207,7 @@ def test_mistakes_in_a_recognised_scene(devrf, tmp_path, scenes, arguments, said
             "export.content=auto export.content=surface export.content=points",
         ),
         ("devrf data.root=~/x data.flow=d", "data.flow=auto data.flow=files data.flow=dis"),
-        ("devrf experiment=paper_l", "experiment=paper_lego"),
+        ("devrf for_scene=paper_l", "for_scene=paper_lego"),
         ("devrf data=inward data.bound", "data.bound_scale="),
     ],
 )

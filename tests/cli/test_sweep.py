@@ -50,7 +50,7 @@ def test_a_mistake_in_one_job_is_recorded_and_the_others_go_on(devrf, tmp_path, 
     found = failure(job)
     assert found["scene"] == "robot" and found["seed"] == 7 and found["mistake"] is True
     assert found["error"].startswith("data.frames: ")
-    assert found["choices"]["schedule"] == "quick" and "data.frames=1" in found["overrides"]
+    assert found["choices"]["schedule"] == "quick_inward" and "data.frames=1" in found["overrides"]
     assert found["date"].endswith("+00:00")
     assert (job / ".hydra" / "config.yaml").is_file()
     assert (other / "checkpoints" / "canonical.ckpt").is_file()

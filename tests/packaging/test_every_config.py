@@ -12,7 +12,6 @@ from omegaconf import OmegaConf
 
 from devrf.apps.fetch import catalogue
 from devrf.apps.report.labels import ABLATIONS
-from devrf.cli.complete import completed
 from devrf.cli.config import config_folder, group_choices
 from devrf.cli.config_check import check_config
 from devrf.cli.context import RunContext
@@ -42,7 +41,7 @@ def rooted(composed, folder, *overrides):
 
 
 # What is learned is not DeVRF's two stages, or it is no choice by itself, or in every config.
-OTHERS = ("method", "comparison=", "hydra/", "schedule/", "protocol=", "profile=")
+OTHERS = ("method", "comparison=", "hydra/", "protocol=", "profile=", "for_scene=", "source=")
 CHOSEN = [
     name for name in CHOICES if not name.startswith(OTHERS) and name.split("=")[1] != "default"
 ]
@@ -84,7 +83,7 @@ def test_it_composes_and_builds(composed, tmp_path, choice):
 @pytest.mark.parametrize("method", NAMES["method"])
 def test_a_method_learns_by_the_protocols_that_it_has_stages_for(composed, tmp_path, method):
     for profile in ("fast", "small"):
-        config = composed(f"method={method}", f"profile={profile}")
+        config = composed(f"method={method}", f"profile={method}_{profile}")
         check_config(config)
         if "ray_stage" in config:
             instantiate(config.ray_stage.model.settings, _convert_="all")
@@ -106,7 +105,7 @@ def test_a_method_learns_by_the_protocols_that_it_has_stages_for(composed, tmp_p
 
 @pytest.mark.parametrize("row", NAMES["comparison"])
 def test_a_row_of_the_tables_is_a_method_and_a_protocol_that_it_learns_by(composed, tmp_path, row):
-    config = composed(f"comparison={row}", "profile=small")
+    config = composed(f"comparison={row}", "experiment=peer_small")
     check_config(config)
     run = RunContext(config, tmp_path)
     name = "devrf" if row.startswith("devrf_paper") else row
@@ -130,11 +129,11 @@ def test_a_table_compares_rows_that_there_are(composed, table):
 
 @pytest.mark.parametrize("row", ["devrf", "dnerf", "hypernerf_two_stage", "nsff_dynamic"])
 def test_rows_of_the_table_compose_for_forward_facing_scenes(composed, row):
-    typed = "experiment=comparison_table", "data=procedural_forward", f"comparison={row}"
-    config = composed(*completed(typed))
+    scene = "data=procedural_forward"
+    config = composed("experiment=comparison_table", scene, f"comparison={row}")
     check_config(config)
     if row == "devrf":
-        usual = composed("experiment=quickstart_forward")
+        usual = composed("experiment=quickstart", scene)
         for group in ("field", "schedule", "sampling", "loss"):
             assert config[group] == usual[group], group
 
@@ -190,9 +189,9 @@ def test_every_ablation_is_in_a_table(composed):
     for table, scenes in (
         ("ablation_table", ("data.shape", "robot,flower")),
         ("quality_table", ("data.scene_seed", "0,1,2,3,4,5,6,7,8,9")),
-        ("quality_table_forward", ("data.scene_seed", "0,1,2,3,4,5")),
+        ("quality_table data=procedural_forward", ("data.scene_seed", "0,1,2,3,4,5")),
     ):
-        composed(f"experiment={table}")
+        composed(*f"experiment={table}".split())
         hydra = HydraConfig.get()
         assert hydra.mode.name == "MULTIRUN"
         assert scenes in hydra.sweeper.params.items()

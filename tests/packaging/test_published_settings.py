@@ -1,4 +1,4 @@
-"""``experiment=paper…`` is the published schedule of each scene, to the number.
+"""``experiment=paper`` is the published schedule of each scene, to the number.
 
 Sources: the supplementary material, section A; per scene the authors' configuration.
 """
@@ -28,7 +28,7 @@ ROOT = "data.root=scene"
 @pytest.fixture
 def paper(composed):
     """The composed experiment."""
-    return composed("experiment=paper_inward", ROOT)
+    return composed("experiment=paper", "data=inward", ROOT)
 
 
 def test_canonical_schedule(paper):
@@ -105,7 +105,7 @@ def test_the_code_defaults_to_the_paper(paper, rest):
     ],
 )
 def test_the_rows_of_the_ablation_tables(composed, ablation, off):
-    config = composed("experiment=paper_inward", ROOT, f"ablation={ablation}")
+    config = composed("experiment=paper", "data=inward", ROOT, f"ablation={ablation}")
     without = {name for name, weight in config.loss.deformation.items() if not weight}
     assert without == off | {"elastic", "bending", "alpha_mask"}
     assert config.schedule.deformation.coarse_to_fine is (ablation != "base")
@@ -114,8 +114,8 @@ def test_the_rows_of_the_ablation_tables(composed, ablation, off):
 @pytest.mark.parametrize("scene", ["lego", "flower_360"])  # the others are alike
 def test_the_inward_scenes_have_the_papers_schedule_and_the_authors_bound_scale(composed, scene):
     config, general = (
-        composed(f"experiment=paper_{scene}", ROOT),
-        composed("experiment=paper_inward", ROOT),
+        composed("experiment=paper", f"data={scene}", ROOT),
+        composed("experiment=paper", "data=inward", ROOT),
     )
     assert (config.data.name, config.data.bound_scale, config.data.space) == (scene, 1.2, "world")
     for part in ("field", "schedule", "sampling", "loss"):
@@ -142,7 +142,7 @@ def test_the_inward_scenes_have_the_papers_schedule_and_the_authors_bound_scale(
 def test_each_forward_scene_has_its_published_schedule(
     composed, scene, frames, sides, growths, total, factor, finest
 ):
-    config = composed(f"experiment=paper_{scene}", ROOT)
+    config = composed("experiment=paper", f"data={scene}", ROOT)
     schedule = instantiate(config.schedule.deformation, _convert_="all")
     assert (config.data.name, [level.side for level in schedule.levels]) == (scene, sides)
     assert (schedule.growths(frames), schedule.total(frames)) == (growths, total)
@@ -164,6 +164,6 @@ def test_each_forward_scene_has_its_published_schedule(
 def test_a_job_of_the_published_table_is_the_scenes_own_experiment(composed, scene, row):
     job = composed("experiment=published_table", f"comparison={row}", f"data={scene}", ROOT)
     ablation = f"ablation={row.removeprefix('devrf_paper').removeprefix('_') or 'full'}"
-    own = composed(f"experiment=paper_{scene}", ROOT, ablation)
+    own = composed("experiment=paper", f"data={scene}", ROOT, ablation)
     for part in ("data", "field", "schedule", "sampling", "loss", "protocol"):
         assert job[part] == own[part]

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from devrf.data.kind import kind_of
+from devrf.data.kind import faces_forward
 from devrf.geometry.cameras import Distortion
 from devrf.scenes.formats.colmap import ColmapReader
 from devrf.scenes.lens import Lens
@@ -98,12 +98,12 @@ def test_cameras_on_one_side_make_a_forward_facing_scene(tmp_path, ring_cameras,
     write_sparse(tmp_path / "sparse", ring, names, POINTS)  # not sparse/0
     scene = ColmapReader(tmp_path, downscale=1).read()
     assert scene.kind == "forward" and (len(scene.static.train), len(scene.static.test)) == (5, 1)
-    assert kind_of("auto", tmp_path, None) == ["colmap", "forward"]
+    assert faces_forward("colmap", tmp_path, None)
     # The nearest point is at 1/0.75 of the near plane.
     depths = (-normalised(read_model(tmp_path / "sparse")).points[:, 2]).numpy()
     assert depths.min() == pytest.approx(4 / 3, rel=0.1)
     around = ColmapReader(tmp_path, downscale=1, space="contracted").read()
-    assert around.kind == "inward" and kind_of("auto", tmp_path, "world") == ["colmap", "inward"]
+    assert around.kind == "inward" and not faces_forward("colmap", tmp_path, "world")
 
 
 def test_smaller_images_are_used_where_they_are(folder):

@@ -67,10 +67,10 @@ def test_what_each_layout_lacks_is_said_in_one_line(tmp_path: Path) -> None:
     assert "mp4" not in line  # what lacks more than another is left out
 
 
-def test_an_incomplete_model_is_left_alone_and_said(tmp_path: Path, caplog) -> None:
-    caplog.set_level("INFO")
-    assert recognise(touch(tmp_path, ["poses_bounds.npy", *MODEL[:2]])).choice == "forward"
-    assert "its sparse/ is incomplete, no sparse/**/points3D.*: left alone" in caplog.text
+def test_an_incomplete_model_is_left_alone_and_said(tmp_path: Path) -> None:
+    layout = recognise(touch(tmp_path, ["poses_bounds.npy", *MODEL[:2]]))
+    assert layout.choice == "forward"
+    assert "its sparse/ is incomplete, no sparse/**/points3D.*: left alone" in layout.remark
 
 
 @pytest.mark.parametrize(

@@ -3,37 +3,31 @@
 * Paths get the quotes that Hydra's grammar needs, and ``~`` is filled in.
 * A run that is named (``ckpt=``, ``hydra.run.dir=``, ``hydra.sweep.dir=``) brings the overrides
   that it was learned with. What is typed comes after them: only that differs.
-* ``experiment=NAME`` is taken in its form for the scene: ``best_small_forward``, ``paper_lego``.
-* Where nothing chooses a schedule, ``facing=forward`` says what the scene's files do.
-* A key of a level is added where the schedule's files do not name it.
-* A scene's folder without a reader gets ``data=auto``: the reader that fits its files.
+* A scene's folder brings what its files say and nothing else has said: ``data=``, ``facing=``, and
+  for other methods than DeVRF ``protocol=dynamic`` if one camera filmed it.
 """
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from itertools import product
-from typing import Any
 
-from hydra.core.hydra_config import HydraConfig
+from hydra import initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf, open_dict, read_write
+from hydra.types import RunMode
 
-from devrf.cli.config import (
-    APART,
-    by_facing,
-    config_folder,
-    defaults_of,
-    group_choices,
-    overrides,
-    reader_of,
-)
+from devrf.cli.config import APART, config_folder, group_choices
 from devrf.cli.messages import in_quotes
 from devrf.cli.restore_config import of_named_run, parsed, value, values
 from devrf.errors import DevrfError
+
+log = logging.getLogger(__name__)
 
 # Keys whose values are files or folders.
 PATHS = {
@@ -46,23 +40,18 @@ PATHS = {
 SHORTHAND = {f"viewer={value}": f"viewer.training={value}" for value in ("true", "false")}
 KEY_VALUE = re.compile(r"(\+{0,2}([\w./@-]+)=)(.*)", re.DOTALL)
 
-# What beside an experiment says how a scene is learned.
-OF_A_FORM = {"method", "comparison", "facing", "field", "schedule"}
-# Readers of the embedded scenes, and what an experiment's form for them is called after.
-EMBEDDED = {"procedural": ["embedded", "inward"], "procedural_forward": ["forward"]}
-LEVELS = "schedule.deformation.levels."
-# What conf/data/auto.yaml names, and keys that are not passed on with its options.
-AUTOMATIC = "devrf.data.recorded.recognised_datamodule"
-NOT_PASSED = ("_target_", "reader", "flow_cache")
+# What the present command's scene has told, until a log is there to say so.
+_told: list[str] = []
 
 
 def completed(arguments: Sequence[str]) -> list[str]:
     """The command line that Hydra composes for what was typed, without the program's name.
 
     Raises:
-        DevrfError: a scene's folder cannot be recognised, an experiment has no one form for all
-            scenes of a sweep, or a group's choice is null.
+        DevrfError: a scene's folder cannot be recognised, the scenes of a sweep need different
+            options, or a group's choice is null.
     """
+    _told.clear()
     multirun = not {"-m", "--multirun"}.isdisjoint(arguments)
     words = [quoted_path(SHORTHAND.get(word.lower(), word), multirun) for word in arguments]
     at = [k for k, w in enumerate(words) if w[:1] != "-" and ("=" in w or w[:1] == "~")]
@@ -80,17 +69,7 @@ def completed(arguments: Sequence[str]) -> list[str]:
                 f"{override.input_line}: choose one of {', '.join(options)}, or leave it out"
             )
     before = of_named_run(typed, multirun)
-    # A level that only the chosen schedule has need not name every key.
-    texts = [f"++{text}" if text.startswith(LEVELS) else text for text in _in_form(texts, before)]
-    both = parsed([*before, *texts])
-    experiments = values(both, "experiment")
-    if values(both, "data.root") and not any(override.key_or_group == "data" for override in both):
-        readers = {reader_of(_chosen_by(name, "data") or "procedural") for name in experiments}
-        if readers <= {*EMBEDDED}:
-            before.append("data=auto")
-        elif len(experiments) > 1:
-            # Hydra composes a sweep once without what is swept: these keys are unknown there.
-            texts = [f"++{text}" if text.startswith("data.") else text for text in texts]
+    texts += _told_by_files(values(typed, "data.root"), parsed([*before, *texts]))
     # Hydra takes all overrides from one place.
     after = [words[k] for k in range(at[0], len(words)) if k not in at]
     return [*words[: at[0]], *before, *texts, *after]
@@ -117,127 +96,61 @@ def quoted_path(argument: str, multirun: bool) -> str:
     return argument if read == path else parts[1] + in_quotes(path)
 
 
-def _in_form(texts: list[str], before: Sequence[str]) -> list[str]:
-    """The typed overrides, with ``experiment=NAME`` in its form for the scene.
+def log_told() -> None:
+    """Say what the scene's files have told."""
+    for line in _told:
+        log.info("%s", line)
 
-    Of ``paper`` with ``data=lego`` that is ``paper_lego``, else ``paper_inward``, else ``paper``;
-    of ``best_small`` with an embedded scene ``best_small_embedded``. Of a sweep over scenes with
-    settings of their own, ``experiment=paper data=lego,plant``, it is one over such experiments,
-    which name their data. Without an experiment a forward-facing scene from disk has
-    ``best_small_forward``, in a comparison the settings of ``facing=forward``; other methods learn
-    D-NeRF's kind of scene by ``protocol=dynamic``. What a named run was learned with has its form
-    already, and its scene may be gone.
+
+def _told_by_files(roots: Sequence[str], overrides: Sequence[Override]) -> list[str]:
+    """What the files of the scenes in ``roots`` say that no override says.
 
     Raises:
-        DevrfError: a sweep's scenes need different forms.
+        DevrfError: a layout is unknown, or the scenes need different options.
     """
-    both = parsed([*before, *texts])
-    names, known = values(parsed(texts), "experiment"), set(group_choices()["experiment"])
-    chosen = {o.key_or_group for o in both if (o.key_or_group, o.value()) != ("facing", "auto")}
-    roots, stage = values(both, "data.root"), value(both, "stage")
-    fresh = bool(roots) and not before and stage not in APART
-    default = fresh and not names and not chosen & OF_A_FORM
-    peer = fresh and value(both, "method") not in (None, "devrf")
-    formed = any(other.startswith(f"{name}_") for name in names for other in known)
-    readable = set(names) <= known and not any("${" in root for root in roots)
-    by_scene = fresh and readable and not formed and "facing" not in chosen
-    facing_counts = by_scene and _learns_by_default(both, names)
-    if not (default or peer or formed or facing_counts):
-        return texts
-    from devrf.data.kind import ONE_CAMERA, kind_of  # loads torch
-
-    options, space = values(both, "data") or ["auto"], value(both, "data.space")
-    scenes = [
-        [option, *(EMBEDDED.get(reader_of(option)) or kind_of(reader_of(option), root, space))]
-        for option, root in product(options, roots or ([] if "auto" in options else [""]))
-    ]
-    if peer and not chosen & {"protocol", "comparison"} and all(ONE_CAMERA in k for k in scenes):
-        texts = [*texts, "protocol=dynamic"]
-    faced = {kinds[-1] for kinds in scenes}
-    # Whether files tell what the options of `data` do not.
-    differs = any(by_facing("auto", option) != kinds[-1] for option, *kinds in scenes)
-    untold = facing_counts and differs
-    if untold and len(faced) > 1:
-        raise DevrfError(
-            "data.root: DeVRF has other settings for forward-facing scenes than for inward-facing "
-            "ones; sweep over the scenes of each apart"
-        )
-    if default:
-        return [*texts, "experiment=best_small_forward"] if faced == {"forward"} else texts
-    if untold:
-        texts = [*(text for text in texts if text != "facing=auto"), "facing=forward"]
-    if not names:
-        return texts
-    # The most specific form; the name itself where it has none.
-    forms = [
-        [next((f"{n}_{kind}" for kind in kinds if f"{n}_{kind}" in known), n) for n in names]
-        for kinds in scenes or [["inward"]]
-    ]
-    if len(scenes) > 1 and forms == [[f"{names[0]}_{kinds[0]}"] for kinds in scenes]:
-        forms = [[form for row in forms for form in row]]
-        texts = [text for text in texts if not text.startswith("data=")]
-    if any(form != forms[0] for form in forms):
-        needed = dict.fromkeys(form for row in forms for form in row)
-        raise DevrfError(
-            f"experiment={','.join(names)}: these scenes need different forms of it; sweep over "
-            f"the scenes of each apart, with experiment={' and experiment='.join(needed)}"
-        )
-    form = f"experiment={','.join(forms[0])}"
-    return [form if text.startswith("experiment=") else text for text in texts]
+    if not roots or value(overrides, "stage") in APART or any("${" in root for root in roots):
+        return []
+    options: Sequence[str | None] = values(overrides, "data")
+    options = options or _of_experiments(values(overrides, "experiment")) or [None]
+    words = [_told_by_scene(option, root, overrides) for option, root in product(options, roots)]
+    if any(other != words[0] for other in words):
+        needed = " and ".join(dict.fromkeys(" ".join(other) or "neither" for other in words))
+        raise DevrfError(f"data.root: the scenes need {needed}; sweep over those of each apart")
+    return words[0]
 
 
-def _learns_by_default(both: Sequence[Override], experiments: Sequence[str]) -> bool:
-    """Whether DeVRF learns, and no experiment says how: its settings are those of the facing."""
-    methods = values(both, "comparison") or values(both, "method") or ["devrf"]
-    ours = any(method.startswith("devrf") for method in methods)
-    return ours and not any(_chosen_by(name, "schedule") for name in experiments)
-
-
-def _chosen_by(experiment: str, group: str) -> str | None:
-    """The option of a group that an experiment chooses, if it does."""
-    defaults = defaults_of("experiment", experiment)
-    for entry in defaults:
-        if not isinstance(entry, str) and f"override /{group}" in entry:
-            return str(entry[f"override /{group}"])
-    below = (_chosen_by(entry, group) for entry in defaults if isinstance(entry, str))
-    return next((option for option in below if option), None)
-
-
-def with_recognised_data(config: DictConfig) -> DictConfig:
-    """The config with the reader that fits the scene's files in place of ``data=auto``.
-
-    Options that are null have the reader's own defaults.
-
-    Raises:
-        DevrfError: the layout is unknown, or its reader has no such option.
-    """
-    data = config.data
-    unread = config.stage == "report" or OmegaConf.is_missing(data, "root")
-    if unread or data.get("_target_") != AUTOMATIC:
-        return config
-    # Imported here: --help and a misspelt key are answered before numpy and torch have loaded.
+def _told_by_scene(option: str | None, root: str, overrides: Sequence[Override]) -> list[str]:
+    """What the files of the scene in ``root`` say, which ``data=option`` reads, if it is known."""
+    # Imported here: they load torch.
+    from devrf.data.kind import by_one_camera, faces_forward
     from devrf.scenes.formats import recognise
 
-    layout = recognise(data.root)
-    chosen_data = OmegaConf.load(config_folder() / "data" / f"{layout.choice}.yaml")
-    assert isinstance(chosen_data, DictConfig)
-    raw: Any = OmegaConf.to_container(data)
-    user_options = {k: v for k, v in raw.items() if v is not None and k not in NOT_PASSED}
-    # As a list: a DictConfig does not "contain" what is required and not given.
-    known = [str(name) for name in chosen_data if name not in NOT_PASSED]
-    for key in user_options:
-        if key not in known:
-            raise DevrfError(
-                f"data.{key}: {data.root} is read by data={layout.choice}, which takes "
-                f"{', '.join(known)}"
-            )
-    with open_dict(config):
-        config.data = OmegaConf.merge(chosen_data, user_options, {"flow_cache": raw["flow_cache"]})
-    if HydraConfig.initialized():
-        hydra: Any = HydraConfig.get()
-        typed = [text for text in overrides() if not re.match(r"data(=auto|\.\w+=null)$", text)]
-        with open_dict(hydra), read_write(hydra):
-            # As if it had been typed: reports compare choices, later commands need no folder.
-            hydra.runtime.choices.data = layout.choice
-            hydra.overrides.task = [*typed, f"data={layout.choice}"]
-    return config
+    words, why, remark = [], "its cameras", ""
+    if option is None:
+        layout = recognise(root)
+        option, why, remark = layout.choice, f"the layout of {layout.name}", layout.remark
+        words.append(f"data={option}")
+    space = value(overrides, "data.space")
+    if not values(overrides, "facing") and faces_forward(option, root, space):
+        words.append("facing=forward")
+    known = any(values(overrides, key) for key in ("protocol", "comparison"))
+    peer = value(overrides, "method") not in (None, "devrf")
+    if peer and not known and by_one_camera(option, root):
+        words.append("protocol=dynamic")
+    if words:
+        _told.append(f"{root}: {why} ({' '.join(words)}){remark}")
+    return words
+
+
+def _of_experiments(names: Sequence[str]) -> list[str]:
+    """The options of ``data`` that experiments choose."""
+    chosen: list[str | list[str] | None] = []
+    if not names:
+        return []
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        loader = GlobalHydra.instance().config_loader()
+        for name in names:
+            with suppress(HydraException):  # reported when Hydra composes it
+                found = loader.compute_defaults_list("config", [f"experiment={name}"], RunMode.RUN)
+                chosen.append(found.overrides.override_choices.get("data"))
+    return [str(option) for option in chosen if option is not None]

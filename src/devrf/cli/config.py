@@ -1,4 +1,4 @@
-"""The configuration: folder, rows and resolvers, the stages' names, and the present Hydra job."""
+"""The configuration: folder and resolvers, the stages' names, and the present Hydra job."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
 from devrf.apps.settings import ReportSettings
 from devrf.errors import did_you_mean
@@ -48,35 +47,13 @@ def config_folder() -> Path:
     return installed if installed.is_dir() else Path(__file__).resolve().parents[3] / "conf"
 
 
-@cache
-def rows(group: str) -> DictConfig:
-    """The choices of a group that are rows of one file, ``conf/rows/GROUP.yml``, by name."""
-    path = config_folder() / "rows" / f"{group}.yml"
-    return OmegaConf.load(path) if path.is_file() else OmegaConf.create()  # type: ignore[return-value]
-
-
 def group_choices() -> dict[str, list[str]]:
-    """The names that each ``group=NAME`` takes: its files, and its rows."""
+    """The names that each ``group=NAME`` takes."""
     names: dict[str, list[str]] = {}
     for path in sorted(config_folder().glob("*/**/*.yaml")):
         place = path.parent.relative_to(config_folder())
         names.setdefault(place.as_posix(), []).append(path.stem)
-    for group in groups_of_rows():
-        names.setdefault(group, []).extend(map(str, rows(group)))
     return names
-
-
-def groups_of_rows() -> list[str]:
-    """The groups whose choices are rows of a file; Hydra, which lists ``*.yaml``, sees none."""
-    folder = config_folder() / "rows"
-    files = sorted(folder.rglob("*.yml"))
-    return [path.relative_to(folder).with_suffix("").as_posix() for path in files]
-
-
-def without_form(name: str) -> str:
-    """The experiment that is typed for a form of it: ``best_forward``, ``paper_lego``."""
-    ends = ("inward", "forward", "embedded", *group_choices()["data"])
-    return next((name.removesuffix(f"_{e}") for e in ends if name.endswith(f"_{e}")), name)
 
 
 def known_stages() -> list[str]:
@@ -95,25 +72,6 @@ def meant_stage(word: str) -> str:
     return did_you_mean(word, known_stages(), "stage=")
 
 
-def defaults_of(group: str, option: str) -> list[Any]:
-    """The defaults list of a group's option; empty where there is none."""
-    path = config_folder() / group / f"{option}.yaml"
-    content: Any = OmegaConf.load(path) if path.is_file() else rows(group).get(option, {})
-    return list(content.get("defaults", []))
-
-
-def reader_of(option: str) -> str:
-    """The reader that an option of ``data`` goes back to: ``inward`` of ``lego``."""
-    below = [entry for entry in defaults_of("data", option) if isinstance(entry, str)]
-    return reader_of(below[0]) if below else option
-
-
-def by_facing(facing: str, option: str, inward: str = "inward", forward: str = "forward") -> str:
-    """The choice for a scene that is ``facing``; ``auto``: for those of ``data=OPTION``."""
-    known = reader_of(option) if facing == "auto" else facing
-    return forward if "forward" in known else inward
-
-
 def scene_name(data: Any) -> str:
     """A scene's name for folders and tables: ``name``, else ``shape``, else the folder's name."""
     if OmegaConf.is_missing(data, "root"):
@@ -127,31 +85,26 @@ def scene_folder_name(scene: str) -> str:
     return re.sub(r"[^\w.-]+", "_", scene).lstrip(".") or "scene"
 
 
-def run_name(experiment: str | None, ablation: str | None, method: str, protocol: str) -> str:
-    """The run's folder name: the experiment, and what else was chosen beside the usual.
+def run_folder(stage: str, report: Any, capture: Any, scene: str, choices: Any) -> str:
+    """A run's folder; of a report, where it is written.
 
-    Without an experiment the config is that of ``experiment=quickstart``, or of its form for the
-    scene: they are one run.
+    It is named after scene and experiment, and what else is chosen beside the usual. Without an
+    experiment DeVRF learns as by ``experiment=quickstart``: they are one run.
     """
-    parts = [experiment or "quickstart"]
-    if ablation not in (None, "full"):
-        parts.append(str(ablation))
-    if (method, protocol) != ("devrf", "two_stage"):
-        parts += [method, protocol]
-    return "-".join(parts)
-
-
-def run_folder(stage: str, report: Any, capture: Any, scene: str, name: str) -> str:
-    """A run's folder: by scene and experiment; of a report, where it is written."""
     if stage in ("fetch", "selfcheck"):
         return f"outputs/{stage}"
     if stage == "capture":
         return f"outputs/{scene_folder_name(Path(str(capture.into or 'scene')).name)}/capture"
-    if stage != "report":
-        return f"outputs/{scene}/{name}"
-    # A misspelt folder is not created: the step reports that there is none.
-    runs = report.runs if Path(report.runs).is_dir() else "outputs"
-    return str(ReportSettings(runs, report.into).folder)
+    if stage == "report":
+        # A misspelt folder is not created: the step reports that there is none.
+        runs = report.runs if Path(report.runs).is_dir() else "outputs"
+        return str(ReportSettings(runs, report.into).folder)
+    parts = [choices.experiment or "quickstart"]
+    if choices.ablation not in (None, "full"):
+        parts.append(choices.ablation)
+    if (choices.method, choices.protocol) != ("devrf", "two_stage"):
+        parts += [choices.method, choices.protocol]
+    return f"outputs/{scene}/{'-'.join(parts)}"
 
 
 def config_record(stage: str) -> str | None:
@@ -183,22 +136,9 @@ def tracked_name(folder: str, otherwise: str | None) -> str | None:
 
 @cache  # for the whole process
 def register_config() -> None:
-    """Make the resolvers ``${devrf.scene_name:…}`` … and the rows known to Hydra.
-
-    Each row of a file in ``conf/rows`` is a choice of the group that the file is named after.
-    """
-    words = by_facing, scene_name, run_name, run_folder, config_record, job_folder, tracked_name
-    for word in words:
+    """Make the resolvers ``${devrf.scene_name:…}`` … known to Hydra."""
+    for word in (scene_name, run_folder, config_record, job_folder, tracked_name):
         OmegaConf.register_new_resolver(f"devrf.{word.__name__}", word, replace=True)
-    store = ConfigStore.instance()
-    # Hydra copies its sources, the store among them, for each group that --help lists.
-    store.__deepcopy__ = lambda memo: ConfigStore.instance()  # type: ignore[attr-defined]
-    for group in groups_of_rows():
-        text = (config_folder() / "rows" / f"{group}.yml").read_text("utf-8")
-        at_root = text.startswith("# @package _global_")
-        for name, row in rows(group).items():
-            package = "_global_" if at_root else None
-            store.store(str(name), row, group, package, "devrf")
 
 
 def choices() -> dict[str, str | None]:

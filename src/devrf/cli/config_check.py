@@ -25,7 +25,6 @@ from devrf.errors import DevrfError, did_you_mean
 ROOT: dict[str, Any] = {
     "stage": str,
     "method": str,
-    "profile": str | None,
     "seed": Annotated[int, Ge(0), Lt(2**32)],
     "resume": bool,
     "memory_check": bool,

@@ -18,7 +18,7 @@ from omegaconf import DictConfig
 
 import devrf
 from devrf.apps.fetch import catalogue
-from devrf.cli.complete import completed, quoted_path, with_recognised_data
+from devrf.cli.complete import completed, log_told, quoted_path
 from devrf.cli.config import config_folder, in_sweep, known_stages, register_config
 from devrf.cli.config_check import ROOT, check_config, check_extras, choices_at, choices_of
 from devrf.cli.messages import report_user_errors
@@ -92,7 +92,7 @@ def run(config: DictConfig) -> float | None:
     guard = record_failure(config, folder) if in_sweep() else report_user_errors()
     with guard, working_in(folder, config, key):
         log_source()
-        config = with_recognised_data(config)
+        log_told()
         check_config(config)
         check_extras(config)
         # Imported here: --help and a misspelt key are answered before torch has loaded.

@@ -13,7 +13,7 @@ from pathlib import Path
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf.errors import OmegaConfBaseException
 
-from devrf.cli.config import group_choices, meant_stage, without_form
+from devrf.cli.config import group_choices, meant_stage
 from devrf.cli.config_check import unknown_key
 from devrf.errors import DevrfError, did_you_mean
 from devrf.system.files import REFUSED
@@ -110,11 +110,9 @@ def _missing_option(error: MissingConfigException) -> str:
     if option in PLUGINS.get(group, ()):
         return f'{group}={option}: not installed; pip install "devrf[sweeps]"'
     if error.options:
-        known = list(error.options)
-        if group == "experiment":
-            known = list(dict.fromkeys(map(without_form, known)))
-        meant = did_you_mean(option, known, f"{group}=")
-        return f"{group}={option}: no such option; choose one of {', '.join(known)}{meant}"
+        meant = did_you_mean(option, error.options, f"{group}=")
+        known = ", ".join(error.options)
+        return f"{group}={option}: no such option; choose one of {known}{meant}"
     return _of_hydra(error)
 
 

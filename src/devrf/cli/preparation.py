@@ -18,7 +18,7 @@ from devrf.apps.inspection.report import inspection_text, show
 from devrf.apps.needs import needs_table
 from devrf.apps.settings import CaptureSettings
 from devrf.callbacks.trial import seconds_to_learn
-from devrf.cli.complete import completed, with_recognised_data
+from devrf.cli.complete import completed
 from devrf.cli.context import RunContext
 from devrf.cli.memory import compare, needs
 from devrf.engine.ddp import ManualDDP
@@ -50,7 +50,7 @@ def capture(run: RunContext) -> None:
     settings: CaptureSettings = instantiate(run.config.capture, _convert_="all")
     folder = scene_from_footage(settings)
     words = [f"data.root={folder}"]
-    config = with_recognised_data(compose("config", completed(words)))
+    config = compose("config", completed(words))
     captured = RunContext(config, run.folder)
     inspect(captured)
     _, _, change = compare(captured, captured.stages_with_images)

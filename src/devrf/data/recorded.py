@@ -10,7 +10,7 @@ from typing import Any
 from devrf.data.datamodule import SceneDataModule
 from devrf.data.flow import with_flow, with_forward_flow
 from devrf.errors import DevrfError
-from devrf.scenes.formats import check_choice, recognise
+from devrf.scenes.formats import check_choice
 from devrf.scenes.formats.blender import BlenderReader
 from devrf.scenes.formats.colmap import ColmapReader
 from devrf.scenes.formats.dycheck import DycheckReader
@@ -102,17 +102,3 @@ class ForwardFacingDataModule(RecordedDataModule):
     ) -> None:
         """Say where the scene is and how to read it; see :class:`LlffReader`."""
         super().__init__(reader, *where, **options)
-
-
-def recognised_datamodule(root: str | Path, **options: Any) -> RecordedDataModule:
-    """The datamodule that reads the scene in the folder ``root``.
-
-    Args:
-        root: the scene's folder.
-        options: of its reader; those that are None have the reader's own defaults.
-
-    Raises:
-        DevrfError: the layout is unknown, or its reader has no such option.
-    """
-    reader_options = {name: value for name, value in options.items() if value is not None}
-    return RecordedDataModule(READERS[recognise(root).choice], root, **reader_options)

@@ -40,7 +40,7 @@ WORK, IMAGES = "capture", "images"
 
 
 def scene_from_footage(settings: CaptureSettings) -> Path:
-    """Make a scene of footage, or go on with it; its folder, which ``data=auto`` reads.
+    """Make a scene of footage, or go on with it; its folder.
 
     Raises:
         DevrfError: the footage cannot be read, aligned or reconstructed; the line says what to

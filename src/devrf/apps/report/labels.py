@@ -173,9 +173,9 @@ def _names(runs: pd.DataFrame) -> dict[str, pd.Series]:
     names = {}
     for group in NAMED:
         options = _options(runs, group)
-        # The form of an experiment for its scene: paper_lego is what experiment=paper is there.
-        both = zip(options, runs["scene"], strict=True)
-        options = pd.Series([o.removesuffix(f"_{scene}") for o, scene in both], runs.index)
+        if group == "profile":  # dnerf_small: a size of that method
+            both = zip(options, runs["method"], strict=True)
+            options = pd.Series([o.removeprefix(f"{m}_") for o, m in both], runs.index)
         if group == "experiment":
             usual = options.eq("") & runs["method"].eq(DEFAULT_METHOD)
             options = options.mask(usual, DEFAULT_EXPERIMENT)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import shlex
 from dataclasses import dataclass, replace
@@ -11,8 +10,6 @@ from pathlib import Path
 from devrf.scenes.files import entries, scene_folder
 from devrf.scenes.images import SUFFIXES
 from devrf.scenes.validation import scene_error
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -23,11 +20,13 @@ class KnownLayout:
         choice: the option of ``data=`` whose reader reads it.
         name: whose layout it is.
         files: what has to be there, relative to the scene's folder; ``*`` stands for any text.
+        remark: what else a folder of this layout holds; else empty.
     """
 
     choice: str
     name: str
     files: tuple[str, ...]
+    remark: str = ""
 
     def missing(self, root: Path) -> list[str]:
         """Those of ``files`` that are not in ``root``."""
@@ -65,8 +64,7 @@ def recognise(root: str | Path) -> KnownLayout:
     also = f"; it would fit data={' and data='.join(others)} too" if others else ""
     if COLMAP not in fitting and os.path.isdir(folder / "sparse"):
         also += f"; its sparse/ is incomplete, no {', '.join(COLMAP.missing(folder))}: left alone"
-    log.info("%s: the layout of %s (data=%s)%s", folder, chosen.name, chosen.choice, also)
-    return chosen
+    return replace(chosen, remark=also)
 
 
 def check_choice(root: str | Path, choice: str) -> None:
