@@ -1,4 +1,4 @@
-"""Another Hydra application composes devrf's groups, and pays for no torch until it builds."""
+"""An installed devrf leaves other Hydra programs alone; those that name its groups have them."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import devrf
+from devrf.cli.config import config_folder
 
 APP = """
 import json
@@ -26,41 +28,50 @@ def main(config):
 
 main()
 """
-CONFIG = """
-defaults:
-  - _self_
-  - data@scene: procedural
-  - schedule: paper_inward
-  - loss: best
-  - local: mine
-run: ${devrf.run_name:${local.name},base,devrf,two_stage}
-label: ${devrf.scene_name:${scene}}
-hydra:
-  output_subdir: null
-  run:
-    dir: .
-"""
+RUN = "hydra: {output_subdir: null, run: {dir: .}}"
 
 
-def test_groups_resolvers_and_choices_are_there(tmp_path: Path) -> None:
-    (tmp_path / "configs" / "local").mkdir(parents=True)
-    (tmp_path / "app.py").write_text(APP)
-    (tmp_path / "configs" / "app.yaml").write_text(CONFIG)
-    (tmp_path / "configs" / "local" / "mine.yaml").write_text("name: theirs\n")
+def run(folder: Path, files: dict[str, str], *typed: str) -> dict[str, Any]:
+    """What a small program of its own, with these files in ``configs/``, composes."""
+    for name, content in {"app.yaml": f"{RUN}\n", **files}.items():
+        (folder / "configs" / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / "configs" / name).write_text(content)
+    (folder / "app.py").write_text(APP)
     source = str(Path(devrf.__file__).parents[1])
-    path = os.pathsep.join(filter(None, [source, os.environ.get("PYTHONPATH")]))
+    path = os.pathsep.join(filter(None, [os.environ.get("PYTHONPATH"), source]))
     done = subprocess.run(
-        [sys.executable, "app.py", "data@scene=inward", "scene.root=/scenes/suzanne"],
-        cwd=tmp_path,
+        [sys.executable, "app.py", *typed],
+        cwd=folder,
         text=True,
         capture_output=True,
         env={**os.environ, "PYTHONPATH": path},
         timeout=60,
         check=False,
     )
-    assert done.returncode == 0, done.stderr
-    config = json.loads(done.stdout)
+    assert (done.returncode, done.stderr) == (0, "")
+    config: dict[str, Any] = json.loads(done.stdout)
+    return config
+
+
+def test_groups_of_the_same_names_are_another_programs_own(tmp_path: Path) -> None:
+    files = {
+        "app.yaml": f"defaults: [_self_, loss: forward, field: x, experiment: null]\n{RUN}\n",
+        "loss/forward.yaml": "weight: 1\n",
+        "field/x.yaml": "width: 2\n",
+        "experiment/y.yaml": "# @package _global_\ndefaults: [override /loss: other]\nseed: 3\n",
+        "loss/other.yaml": "defaults: [forward]\nbias: 4\n",
+    }
+    composed = {"loss": {"weight": 1, "bias": 4}, "field": {"width": 2}, "seed": 3}
+    assert run(tmp_path, files, "experiment=y") == composed
+
+
+def test_a_program_that_names_the_folder_has_devrfs_groups(tmp_path: Path) -> None:
+    app = "defaults:\n  - _self_\n  - data@scene: inward\n  - schedule: paper_inward\n"
+    app += f"  - loss: best_inward\n  - local: mine\n{RUN}\n"
+    app = app.replace("run: {", f'searchpath: ["file://{config_folder()}"], run: {{')
+    files = {"app.yaml": app, "local/mine.yaml": "name: theirs\n"}
+    config = run(tmp_path, files, "scene.root=/scenes/suzanne")
     assert config["scene"]["_target_"] == "devrf.data.recorded.InwardFacingDataModule"
     assert config["schedule"]["canonical"]["side"] == 160
-    assert config["loss"]["deformation"]["elastic"] == 0.05  # a row, not a file
-    assert (config["run"], config["label"]) == ("theirs-base", "suzanne")
+    assert config["loss"]["deformation"]["elastic"] == 0.05
+    assert config["local"] == {"name": "theirs"}

@@ -67,17 +67,14 @@ def environment(tmp_path_factory, wheel) -> Path:
     return folder
 
 
-def test_the_wheel_has_code_configs_plugin_and_licence(wheel):
+def test_the_wheel_has_code_configs_and_licence(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     configs = {p.relative_to(config_folder()) for p in config_folder().rglob("*.y*ml")}
     assert {f"devrf/conf/{path.as_posix()}" for path in configs} <= names
     assert "devrf/__main__.py" in names and "devrf/py.typed" in names
     assert "devrf/apps/report/published.toml" in names
-    assert "hydra_plugins/devrf_searchpath/__init__.py" in names
-    # Other packages share the namespace.
-    assert "hydra_plugins/__init__.py" not in names
     assert [name for name in names if name.endswith("licenses/LICENSE")]
-    assert {name.split("/")[0].split("-")[0] for name in names} == {"devrf", "hydra_plugins"}
+    assert {name.split("/")[0].split("-")[0] for name in names} == {"devrf"}
 
 
 def test_the_source_distribution_has_what_a_build_needs(built):
