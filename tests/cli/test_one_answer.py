@@ -1,0 +1,38 @@
+"""Hydra's own ``compose()`` and the command line give the same config, whatever is chosen."""
+
+from __future__ import annotations
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from devrf.cli.config import config_folder, group_choices, register_config
+
+NAMES = group_choices()
+EMBEDDED = {"procedural", "flower", "procedural_forward"}
+FORWARD = {"forward", "neural_3d_video", "pig_toy", "plant", "rabbit", "procedural_forward"}
+
+
+@pytest.mark.parametrize("data", NAMES["data"])
+def test_python_and_the_command_line_compose_the_same(devrf, data):
+    register_config()
+    scene = [f"data={data}", *([] if data in EMBEDDED else ["data.root=scene"])]
+    for experiment in [None, *NAMES["experiment"]]:
+        typed = [*scene, *([f"experiment={experiment}"] if experiment else [])]
+        with initialize_config_dir(str(config_folder()), version_base="1.3"):
+            composed = OmegaConf.to_yaml(compose("config", typed))
+        said = devrf(*typed, "--cfg", "job")
+        assert (said.status, said.out.strip(), said.err) == (0, composed.strip(), ""), typed
+
+
+@pytest.mark.parametrize("data", NAMES["data"])
+def test_data_chooses_the_facing(data):
+    register_config()
+    facing = "forward" if data in FORWARD else "inward"
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        whole = compose("config", [f"data={data}"], return_hydra_config=True)
+        typed = compose("config", [f"data={data}", "facing=inward"], return_hydra_config=True)
+    chosen = whole.hydra.runtime.choices
+    assert (chosen.facing, chosen.loss) == (facing, facing)
+    assert (chosen.field, chosen.schedule) == (f"small_{facing}", f"quick_{facing}")
+    assert typed.hydra.runtime.choices.schedule == "quick_inward"
