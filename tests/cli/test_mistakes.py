@@ -21,6 +21,10 @@ MISTAKES = {
         ["data=inward", "data.root=scene", "data.scene_seed=3"],
         "data.scene_seed: no such key; it belongs to data=procedural, procedural_forward",
     ),
+    "folder of a scene that is rendered": (
+        ["data.root=${oc.env:HOME}"],
+        "data.root: no such key; it belongs to data=colmap, dycheck, forward, inward, ",
+    ),
     "appended unknown root key": (["+sede=3"], "sede: no such key; did you mean seed?"),
     "forward-facing field of an inward-facing scene": (
         ["field=small_forward", "stage=canonical"],

@@ -95,3 +95,15 @@ def test_an_installed_devrf_learns_a_scene_from_any_folder(environment, tmp_path
     done = run(environment / "bin" / "devrf", *arguments, folder=tmp_path)
     assert done.stderr == ""
     assert (tmp_path / "run" / "checkpoints" / "canonical.ckpt").is_file()
+
+
+def test_another_program_names_the_installed_groups(environment, tmp_path):
+    (tmp_path / "app.yaml").write_text(
+        "defaults: [_self_, loss: best_inward]\nhydra: {searchpath: ['pkg://devrf.conf']}\n"
+    )
+    script = (
+        "from hydra import compose, initialize_config_dir as folder\n"
+        f"with folder({str(tmp_path)!r}, version_base='1.3'): print(compose('app'))"
+    )
+    done = run(environment / "bin" / "python", "-c", script, folder=tmp_path)
+    assert "'elastic': 0.05" in done.stdout and done.stderr == ""

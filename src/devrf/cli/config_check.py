@@ -168,7 +168,8 @@ def unknown_key(where: str, known: Iterable[object]) -> DevrfError:
     meant = did_you_mean(name, (k for k in known if k != "**"), where[: -len(name)])
     group = where.removesuffix(f".{name}")
     files = sorted((config_folder() / group).glob("*.yaml"))
-    having = ", ".join(path.stem for path in files if name in OmegaConf.load(path))
+    # As a list: a DictConfig does not "contain" what is required and not given.
+    having = ", ".join(path.stem for path in files if name in list(OmegaConf.load(path)))
     instead = f"it belongs to {group}={having}" if having else "--cfg job shows every key there is"
     return DevrfError(f"{where}: no such key{meant or f'; {instead}'}")
 

@@ -1,0 +1,1 @@
+"""The configuration; a package, so that Hydra finds ``pkg://devrf.conf``."""
