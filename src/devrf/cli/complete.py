@@ -15,16 +15,18 @@ import re
 from collections.abc import Sequence
 from contextlib import suppress
 from itertools import product
+from pathlib import Path
 
 from hydra import initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from hydra.types import RunMode
+from omegaconf import OmegaConf
 
 from devrf.cli.config import APART, config_folder, group_choices
 from devrf.cli.messages import in_quotes
-from devrf.cli.restore_config import of_named_run, parsed, value, values
+from devrf.cli.restore_config import differing, of_named_run, parsed, value, values
 from devrf.errors import DevrfError
 
 log = logging.getLogger(__name__)
@@ -137,9 +139,29 @@ def _told_by_scene(option: str | None, root: str, overrides: Sequence[Override])
     peer = value(overrides, "method") not in (None, "devrf")
     if peer and not known and by_one_camera(option, root):
         words.append("protocol=dynamic")
+    if said := _published(root, overrides):
+        _told.append(said)
     if words:
         _told.append(f"{root}: {why} ({' '.join(words)}){remark}")
     return words
+
+
+def _published(root: str, overrides: Sequence[Override]) -> str | None:
+    """What ``data=NAME`` would set where experiment=paper reads that scene by its folder alone."""
+    from devrf.scenes.formats import recognise
+
+    name = Path(root).expanduser().resolve().name.lower().replace("-", "_")
+    own, paper = (config_folder() / f"{p}{name}.yaml" for p in ("data/", "for_scene/paper_"))
+    wanted = values(overrides, "experiment") == ["paper"] and name not in values(overrides, "data")
+    if not wanted or not paper.is_file() or not recognise(root).name.startswith("DeVRF"):
+        return None
+    (reader,) = OmegaConf.load(own).defaults
+    usual = OmegaConf.create({"data": OmegaConf.load(own.with_stem(reader))})
+    scene = OmegaConf.merge({"data": OmegaConf.load(own)}, OmegaConf.load(paper))
+    typed = {"data.name", "data.defaults", *(override.key_or_group for override in overrides)}
+    keys = (key for key in differing(scene, usual) if key not in typed)
+    sets = ", ".join(f"{key}={OmegaConf.select(scene, key)}" for key in keys)
+    return f"{root}: one of DeVRF's scenes; data={name} would set {sets}" if sets else None
 
 
 def _of_experiments(names: Sequence[str]) -> list[str]:

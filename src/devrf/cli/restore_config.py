@@ -80,7 +80,7 @@ def present_command(config: DictConfig) -> Command:
     app = GlobalHydra.instance().is_initialized()  # not in another process of a sweep
     with nullcontext() if app else initialize_config_dir(str(config_folder()), version_base="1.3"):
         alone = compose("config", [*found_in, *(str(o.input_line) for o in typed)])
-    changed = _changed(OmegaConf.to_container(config), OmegaConf.to_container(alone), "")
+    changed = differing(OmegaConf.to_container(config), OmegaConf.to_container(alone))
     settings = {key: _plain_at(config, key) for key in changed if KEY.fullmatch(key)}
     return {
         **{group: option for group, option in chosen.items() if not _of_a_command(group)},
@@ -88,15 +88,16 @@ def present_command(config: DictConfig) -> Command:
     }
 
 
-def _changed(now: Any, before: Any, path: str) -> Iterator[str]:
-    """The keys of values in one config that are not those in another; of lists the whole."""
+def differing(now: Any, before: Any, path: str = "") -> Iterator[str]:
+    """The keys of values in one config that another has not; of lists the whole, of code none."""
     for key, value in now.items():
         old, where = before.get(key, CODE), f"{path}{key}"
         if _of_a_command(where):
             continue
-        if isinstance(value, Mapping) and isinstance(old, Mapping):
+        if isinstance(value, Mapping):
+            old = old if isinstance(old, Mapping) else {}
             if value.get("_target_") == old.get("_target_"):
-                yield from _changed(value, old, f"{where}.")
+                yield from differing(value, old, f"{where}.")
         elif value != old:
             yield where
 

@@ -26,7 +26,6 @@ from devrf.cli.evaluate import evaluate
 from devrf.cli.memory import compare
 from devrf.cli.messages import as_own_errors
 from devrf.cli.preparation import capture, fetch, inspect, prepare, say_next, selfcheck
-from devrf.cli.published_scene import suggest_published_scene
 from devrf.cli.render import export, render, still, view
 from devrf.cli.resume import done, note_done, unfinished
 from devrf.cli.run_folder import archive_previous
@@ -119,7 +118,6 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
 
 def _prepare_to_learn(run: RunContext, requested: Names, steps: Names) -> None:
     """Look at scene, memory and what earlier commands left, before anything is learned."""
-    suggest_published_scene(run.config)
     learning = run.learnable(requested)
     if learning != requested:
         left = ", ".join(learning + steps)
