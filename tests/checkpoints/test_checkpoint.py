@@ -160,7 +160,7 @@ def test_grids_that_memory_cannot_hold_are_refused_before_they_are_unpacked(cano
         keep = torch.zeros(1, 2**21, dtype=torch.uint8)  # 2 MB of bits: 64 MB of numbers
         data["state_dict"][GRID].update(shape=[2**24, 1, 1], keep=keep)
 
-    assert "would take 0.07 GB of memory, and 0.01 GB are free" in refusal(edit(canonical, longer))
+    assert "would take 0.13 GB of memory, and 0.01 GB are free" in refusal(edit(canonical, longer))
 
 
 def test_damage_that_has_the_right_checksum_is_one_line(tmp_path):

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from itertools import cycle
+
 import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from devrf.cli.complete import completed
 from devrf.cli.config import config_folder, group_choices, register_config
 
 NAMES = group_choices()
@@ -14,15 +17,22 @@ FORWARD = {"forward", "neural_3d_video", "pig_toy", "plant", "rabbit", "procedur
 
 
 @pytest.mark.parametrize("data", NAMES["data"])
-def test_python_and_the_command_line_compose_the_same(devrf, data):
+def test_the_command_line_adds_nothing_to_what_is_typed(data):
+    scene = [f"data={data}", *([] if data in EMBEDDED else ["data.root=scene"])]
+    for experiment in NAMES["experiment"]:
+        typed = [*scene, f"experiment={experiment}"]
+        assert completed(typed) == typed
+
+
+@pytest.mark.parametrize(("data", "experiment"), [*zip(NAMES["data"], cycle(NAMES["experiment"]))])
+def test_python_and_the_command_line_compose_the_same(devrf, data, experiment):
     register_config()
     scene = [f"data={data}", *([] if data in EMBEDDED else ["data.root=scene"])]
-    for experiment in [None, *NAMES["experiment"]]:
-        typed = [*scene, *([f"experiment={experiment}"] if experiment else [])]
-        with initialize_config_dir(str(config_folder()), version_base="1.3"):
-            composed = OmegaConf.to_yaml(compose("config", typed))
-        said = devrf(*typed, "--cfg", "job")
-        assert (said.status, said.out.strip(), said.err) == (0, composed.strip(), ""), typed
+    typed = [*scene, f"experiment={experiment}"]
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        composed = OmegaConf.to_yaml(compose("config", typed))
+    said = devrf(*typed, "--cfg", "job")
+    assert (said.status, said.out.strip(), said.err) == (0, composed.strip(), "")
 
 
 @pytest.mark.parametrize("data", NAMES["data"])

@@ -18,9 +18,9 @@ def test_what_the_scenes_own_choice_sets(devrf, tmp_path, tiny_data, short):
         assert outcome.status == 0, outcome.err
         return [line.removeprefix(SET) for line in outcome.out.splitlines() if "DeVRF's" in line]
 
-    differing = "data.downscale=2, data.bound_scale=1.2, data.space=world"
-    assert said("experiment=paper") == [differing]
-    assert said("experiment=paper", "data=inward", "data.downscale=2") == [differing[18:]]
+    assert said("experiment=paper") == ["data.bound_scale=1.2, data.downscale=2, data.space=world"]
+    typed = ("experiment=paper", "data=inward", "data.downscale=2")
+    assert said(*typed) == ["data.bound_scale=1.2, data.space=world"]
     assert said("experiment=paper", "data=lego") == said() == []
     # NeRF-synthetic has a scene of that name, too.
     (tmp_path / "lego").rename(tmp_path / "devrf")

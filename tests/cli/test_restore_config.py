@@ -63,7 +63,7 @@ def composed(typed: list[str]) -> DictConfig:
 def test_in_a_folder_nothing_has_to_be_typed_again(devrf, tiny, run):
     outcome = devrf("stage=deformation", "hydra.run.dir=run")
     assert (outcome.status, outcome.err) == (0, "")
-    assert "run: as it was learned, with field=small " in outcome.out
+    assert "run: as it was learned, with field=small" in outcome.out
     assert "deformation: learned already" in outcome.out
     assert (config(run).data.width, config(run).schedule.canonical.iterations) == (24, 6)
 
@@ -113,7 +113,7 @@ def test_a_motion_learned_on_a_checkpoint_knows_the_whole_of_it(devrf, run, tmp_
     assert devrf(*again).status == 0
     learned = read_checkpoint_file(tmp_path / "other" / "checkpoints" / "deformation.ckpt")
     first = read_checkpoint_file(base)["devrf"]
-    assert first["command"]["/field"] == "small" and first["command"]["data.width"] == 24
+    assert first["command"]["/field"] == "small_inward" and first["command"]["data.width"] == 24
     assert learned["devrf"]["command"] == {**first["command"], "seed": 3}
 
 
@@ -140,12 +140,12 @@ def test_what_a_checkpoint_keeps_of_a_command_is_plain(devrf, tiny, tmp_path, mo
 
 def test_checkpoints_of_a_sweep_share_what_they_have_in_common(learned_by, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    one = learned_by({"field": "small"}, {"data.frames": 5, "seed": 5})
-    other = learned_by({"field": "small"}, {"data.frames": 5, "seed": 4}, name="other.ckpt")
+    one = learned_by({"field": "small_inward"}, {"data.frames": 5, "seed": 5})
+    other = learned_by({"field": "small_inward"}, {"data.frames": 5, "seed": 4}, name="other.ckpt")
     found = composed(["-m", "stage=still", f"ckpt='{one},{other}'"])
     assert found.hydra.sweeper.params is None
     words = completed(["-m", "stage=still", f"ckpt={one},{other}"])
-    assert words[:2] == ["-m", "field=small"]
+    assert words[:2] == ["-m", "field=small_inward"]
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         found = compose("config", [word for word in words[1:] if "ckpt=" not in word])
     assert (found.data.frames, found.seed) == (5, 0)
@@ -172,6 +172,16 @@ def test_another_option_of_a_group_begins_from_its_own_values(run, learned_by):
 CODE = {"_target_": "sympy.sympify", "a": "__import__('os').system('touch PWNED')"}
 # The word is put together of two settings once the text is read as a mapping.
 TEXT = '${oc.decode:"{${aa}${bb}: sympy.sympify, a: 1}"}'
+
+
+def nested(depth: int) -> object:
+    """Lists within lists."""
+    value: object = 1
+    for _ in range(depth):
+        value = [value]
+    return value
+
+
 HOSTILE = {
     "a word that is put together": (
         {},
@@ -191,6 +201,11 @@ HOSTILE = {
     "a list of defaults": ({}, {"defaults": ["/evil"]}),
     "an option that writes more": ({"data": "inward seed=1"}, {}),
     "a key that writes more": ({}, {"data.root=x +a": 1}),
+    "a nest": ({}, {"data.name": nested(40)}),
+    "a section that is no mapping": ({}, {"data": 3}),
+    "an option that is none": ({"data": "null"}, {}),
+    "a package": ({"data@callbacks.x": "procedural"}, {}),
+    "a line of its own": ({}, {"data.name": "x\necho"}),
     "a place to write to": ({}, {"data": {"flow_cache": "/elsewhere"}}),
 }
 
@@ -233,21 +248,58 @@ def test_a_checkpoint_names_no_class_but_a_method_s(
     assert not list(tmp_path.rglob("PWNED"))
 
 
-@pytest.mark.parametrize(
-    "task",
-    [
-        ["+aa=_tar", "+bb=get_", "canonical='${oc.env:HOME}'"],
-        ["data=../../evil,inward"],
-        ["+canonical.x={_target_:sympy.sympify}"],
-        ["field.width=1,${seed}"],
-    ],
-)
-def test_the_record_of_a_sweep_chooses_no_code(devrf, tmp_path, task):
-    (tmp_path / "sweep").mkdir()
-    record = OmegaConf.create({"hydra": {"overrides": {"task": ["seed=0,1"]}}})
-    record.hydra.overrides.task += [text.replace("${", "\\${") for text in task]
-    OmegaConf.save(record, tmp_path / "sweep" / "multirun.yaml")
-    outcome = devrf("stage=inspect", "hydra.sweep.dir=sweep")
-    assert outcome.status == 2 and outcome.err.count("\n") == 1
-    assert outcome.err.startswith("devrf: sweep/multirun.yaml: ")
-    assert not list(tmp_path.rglob("PWNED"))
+RECORDS = {
+    "an interpolation": ["+aa=_tar", "+bb=get_", "canonical.x='${oc.env:HOME}'"],
+    "a path as an option": ["data=../../evil,inward"],
+    "a list of options": ["protocol=[two_stage,../../evil]"],
+    "a part": ["+canonical.x={_target_:sympy.sympify}"],
+    "a part of a group": ["++data={shape:{_target_:sympy.sympify}}"],
+    "a part at the root": ["++canonical={_target_:sympy.sympify}"],
+    "a part among values": ["seed=1,{_target_:sympy.sympify}"],
+    "an option elsewhere": ["data@callbacks.x=procedural"],
+    "an interpolation among values": ["field.width=1,${seed}"],
+    "no text": [5],
+}
+
+
+@pytest.mark.parametrize("task", RECORDS.values(), ids=list(RECORDS))
+def test_the_record_of_a_sweep_chooses_no_code(tmp_path, task):
+    record = tmp_path / "multirun.yaml"
+    record.write_text(json.dumps({"hydra": {"overrides": {"task": ["seed=0,1", *task]}}}))
+    with pytest.raises(DevrfError, match=f"^{record}: "):
+        completed(["stage=inspect", f"hydra.sweep.dir={tmp_path}"])
+
+
+def test_the_record_of_a_sweep_does_not_unfold(tmp_path):
+    """Each line refers ten times to the one before: 10^9 words in 460 bytes."""
+    lines = [f"a{k}: &a{k} [{','.join([f'*a{k - 1}'] * 10)}]" for k in range(1, 9)]
+    (tmp_path / "multirun.yaml").write_text("\n".join(["a0: &a0 [x]", *lines, "hydra: *a8"]))
+    with pytest.raises(DevrfError, match="not the record of a sweep"):
+        completed(["stage=inspect", f"hydra.sweep.dir={tmp_path}"])
+
+
+def test_a_sweep_goes_on_with_all_kinds_of_values(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    task = ["experiment=quickstart,cpu_small", "schedule.canonical.upsample_at=[1],[2,3]", "seed=2"]
+    record = {"hydra": {"overrides": {"task": [*task, "+data.name='a, b'", "trainer=cpu"]}}}
+    (tmp_path / "multirun.yaml").write_text(json.dumps(record))
+    typed = [f"hydra.sweep.dir={tmp_path}", "stage=inspect"]
+    *rest, first, second, mode, last, stage = completed(typed)
+    assert (first, second) == (
+        'experiment="quickstart","cpu_small"',
+        f"{task[1]}".replace(",3", ", 3"),
+    )
+    assert (mode, [last, stage]) == ("hydra.mode=MULTIRUN", typed)
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        found = compose("config", rest)
+    assert (found.seed, found.data.name) == (2, "a, b")
+
+
+@pytest.mark.parametrize("name", ["run.log", ".hydra", ".devrf"])
+def test_nothing_is_written_through_a_link(devrf, run, tmp_path, name):
+    (tmp_path / "else").mkdir()
+    (run / name).symlink_to(tmp_path / "else")
+    outcome = devrf("stage=still", "hydra.run.dir=run")
+    assert (outcome.status, outcome.out) == (2, "")
+    assert outcome.err == f"devrf: run/{name}: a link; remove it: devrf writes there\n"
+    assert not list((tmp_path / "else").iterdir())

@@ -19,14 +19,12 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, Validati
 from torch import Tensor
 
 from devrf.apps.camera_paths import PRESETS, WAYS
+from devrf.apps.video import MAX_FRAMES
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.files import Number, Positive, read_json
 from devrf.scenes.validation import first_error, in_reach, is_rotation, scene_error
 from devrf.system.files import write_json
-
-# More frames than this are a mistake in the file: an hour at 25 a second.
-MAX_FRAMES = 90_000
 
 
 @dataclass(frozen=True)

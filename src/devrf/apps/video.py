@@ -19,6 +19,8 @@ from devrf.scenes.scene import Background, Views
 
 # Upper bound of the bytes of a pixel in a video: measured on images of 400 pixels and less.
 PIXEL = 0.2
+# More frames than this are a mistake: an hour at 25 a second.
+MAX_FRAMES = 90_000
 # H.264 has blocks of so many pixels.
 MIN_HEIGHT = 16
 # What rendering is to take decides first the height, down to so many rows, then the frames.
@@ -42,6 +44,12 @@ class VideoSettings:
     def __post_init__(self) -> None:
         height, max_seconds = self.height, self.max_seconds
         expect(0 <= self.time <= 1, "video.time", "0 to 1", self.time)
+        expect(0 < self.frames <= MAX_FRAMES, "video.frames", f"1 to {MAX_FRAMES}", self.frames)
+        expect(0 < self.fps <= 1000, "video.fps", "more than 0, at most 1000", self.fps)
+        orbit = math.isfinite(self.orbit_turns) and math.isfinite(self.orbit_elevation or 0)
+        expect(
+            orbit, "video.orbit_turns", "a number, as of video.orbit_elevation", self.orbit_turns
+        )
         high_enough = height is None or height >= MIN_HEIGHT
         expect(high_enough, "video.height", f"at least {MIN_HEIGHT}", height)
         expect(

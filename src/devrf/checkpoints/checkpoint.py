@@ -32,10 +32,13 @@ MODEL = "scene_model."
 OWN_REST, GIVEN_REST = "checkpoints/canonical.ckpt", "ckpt"
 # A whole number in a model's config (layers, units, samples of a ray) is at most this.
 LARGEST = 2**14
+# What is raised where parts of a file contradict each other.
+UNFIT: tuple[type[Exception], ...] = (DevrfError, RuntimeError, LookupError, ValueError)
+UNFIT += (TypeError, AttributeError, ArithmeticError)
 # A model has no more values than its file, but for grids of few voxels that take the stored shape.
 UNSTORED = 2**16
-# Pixels of the largest image.
-PIXELS = 2**28
+# Pixels along the side of an image, at most; and how much longer one side is than the other.
+SIDE, ASPECT = 2**14, 16
 # What training took: by name, numbers, and words that say how it ran.
 TrainingFigures = dict[str, float | str | None]
 
@@ -74,6 +77,7 @@ class CheckpointMetadata:
 
 
 _METADATA = TypeAdapter(CheckpointMetadata)
+_PROGRESS = TypeAdapter(dict[str, str | int])
 
 
 @dataclass(frozen=True)
@@ -109,8 +113,11 @@ class Viewpoints:
         if "clock" not in entry:
             return None
         cameras = {name: Cameras(**entry[name]) for name in ("static", "dynamic", "held_out")}
-        if any(not 0 < camera.width * camera.height <= PIXELS for camera in cameras.values()):
-            raise ValueError("an image of a size that cannot be")
+        for camera in cameras.values():
+            camera.check()
+            sides = sorted((camera.width, camera.height))
+            if not 0 < sides[0] <= sides[1] <= min(SIDE, ASPECT * sides[0]):
+                raise ValueError("an image of a size that cannot be")
         return cls(**{**entry, **cameras, "clock": FrameClock(**entry["clock"])})
 
 
@@ -187,7 +194,7 @@ def load_checkpoint(
         raise
     except OutOfMemoryError as shortage:
         raise OutOfMemoryError(f"{path}: {shortage}") from None
-    except (DevrfError, RuntimeError, LookupError, ValueError, TypeError, AttributeError):
+    except UNFIT:
         raise DevrfError(f"{path}: its fields do not fit its description; train again") from None
     return LoadedCheckpoint(metadata, model, viewpoints)
 
@@ -204,7 +211,8 @@ def _outlined(model_class: Any, description: Mapping[str, Any], state: Mapping[s
     with torch.device("meta"):  # takes no memory
         outline = model_class.from_config(config)
     values = sum(tensor.numel() for tensor in (*outline.parameters(), *outline.buffers()))
-    stored = sum(value.numel() for value in _leaves(state) if isinstance(value, torch.Tensor))
+    tensors = {id(value): value for value in _leaves(state) if isinstance(value, torch.Tensor)}
+    stored = sum(tensor.numel() for tensor in tensors.values())
     if values > stored + UNSTORED:
         raise ValueError("more values than are stored")
     return model_class.from_config(config)
@@ -268,8 +276,22 @@ def metadata_in(path: Path, data: dict[str, Any]) -> CheckpointMetadata:
         raise DevrfError(f"{path}: not a devrf checkpoint; set ckpt to one that devrf wrote")
     try:
         _METADATA.validate_python(data["devrf"])
-        return CheckpointMetadata(**data["devrf"])
-    except (TypeError, ValidationError) as error:
+        metadata = CheckpointMetadata(**data["devrf"])
+        progress = data.get("progress")
+        if progress is not None:
+            _PROGRESS.validate_python(
+                {name: progress[name] for name in ("stage", "iteration", "total")}
+            )
+        said = (
+            metadata.scene,
+            metadata.stage,
+            str(metadata.protocol),
+            str(progress and progress["stage"]),
+        )
+        if not all(text.isprintable() for text in said):
+            raise TypeError("a name that cannot be printed")
+        return metadata
+    except (LookupError, TypeError, ValidationError) as error:
         why = f"{error}".splitlines()[0]
         raise DevrfError(
             f"{path}: its description lacks an entry, or has a wrong one ({why}); train again"

@@ -75,7 +75,7 @@ def unpack(
         raise ValueError("a mask of fewer voxels than the grid has")
     shape, elsewhere = (x, y, z), packed["elsewhere"].to(device, torch.float32)
     values = len(elsewhere) * x * y * z * elsewhere.shape[-1]
-    need_memory(values * dtype.itemsize, "its fields", device)
+    need_memory(2 * values * dtype.itemsize, "its fields", device)  # a module copies them
     keep = [unpack_bits(bits, shape, device) for bits in packed["keep"]]
     keep = keep * len(elsewhere) if len(keep) == 1 else keep
     details = packed["kept"].to(device, dtype).split([int(mask.sum()) for mask in keep])

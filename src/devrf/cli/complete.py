@@ -157,6 +157,7 @@ def _published(root: str, overrides: Sequence[Override]) -> str | None:
         return None
     (reader,) = OmegaConf.load(own).defaults
     usual = OmegaConf.create({"data": OmegaConf.load(own.with_stem(reader))})
+    del usual.data["_target_"]  # the scene's choice inherits it
     scene = OmegaConf.merge({"data": OmegaConf.load(own)}, OmegaConf.load(paper))
     typed = {"data.name", "data.defaults", *(override.key_or_group for override in overrides)}
     keys = (key for key in differing(scene, usual) if key not in typed)

@@ -8,13 +8,14 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
 from devrf.apps.settings import ReportSettings
-from devrf.errors import did_you_mean
+from devrf.errors import DevrfError, did_you_mean
 
 PIPELINE = "pipeline"
 # Stages for which the run's scene need not be right.
@@ -118,8 +119,7 @@ def config_record(stage: str) -> str | None:
 def job_folder(number: int, scene: str, sweep: str, overrides: Sequence[str], params: Any) -> str:
     """The folder of a sweep's job: number, scene, and what else is varied: ``0_robot_tv_0.5``."""
     record = Path(sweep) / "multirun.yaml"  # some searches write none; they name their params
-    task = OmegaConf.load(record).hydra.overrides.task if record.is_file() else []
-    typed: Any = OmegaConf.to_container(OmegaConf.create(task))  # a value may refer to the job's
+    typed = overrides_in(record) if record.is_file() else []
     varied = dict.fromkeys(params or (), True)
     for override in OverridesParser.create().parse_overrides(typed):
         varied[override.get_key_element()] = override.is_sweep_override()
@@ -127,6 +127,22 @@ def job_folder(number: int, scene: str, sweep: str, overrides: Sequence[str], pa
     values = [override.partition("=") for override in overrides]
     words = [f"{key.rpartition('.')[2]}_{value}" for key, _, value in values if varied.get(key)]
     return scene_folder_name("_".join([str(number), scene, *words]))[:150]
+
+
+def overrides_in(record: Path) -> list[str]:
+    """The overrides in a sweep's record, ``multirun.yaml``.
+
+    Raises:
+        DevrfError: it is none.
+    """
+    try:  # as plain YAML: OmegaConf would copy what it refers to
+        content = yaml.safe_load(record.read_text("utf-8"))
+        texts = content["hydra"]["overrides"]["task"]
+        if all(isinstance(text, str) for text in texts):
+            return [*texts]
+    except (yaml.YAMLError, LookupError, TypeError, ValueError, RecursionError):
+        pass
+    raise DevrfError(f"{record}: not the record of a sweep; type the sweep again")
 
 
 def tracked_name(folder: str, otherwise: str | None) -> str | None:

@@ -22,13 +22,16 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from devrf.cli.config import (
     OF_A_CHECKPOINT,
     choices,
     config_folder,
+    group_choices,
     overrides,
+    overrides_in,
     scene_folder_name,
 )
 from devrf.cli.messages import in_quotes
@@ -46,10 +49,12 @@ PLACES = {"data.export", "data.flow_cache"}
 OF_A_SCENE = {"data", "facing", "seed"}
 # Keys by which Hydra builds a part.
 CODE = {"_target_", "_partial_", "_convert_", "_recursive_", "_args_"}
+# What is set without a section.
+ALONE = {"seed", "priors", "deterministic", "graphs", "decoder_precision"}
 # An option's name leads to no other folder than its group's; a key is a path of plain names.
-OPTION = re.compile(r"[\w-]+", re.ASCII)
+OPTION = re.compile(r"(?!null$)[\w-]+", re.ASCII | re.IGNORECASE)
 GROUP = re.compile(r"/[\w-]+(/[\w-]+)*", re.ASCII)
-KEY = re.compile(r"[\w-]+(\.[\w-]+)*", re.ASCII)
+KEY = re.compile(r"[\w-]+(\.[\w-]+){0,16}", re.ASCII)
 # Values that are relative to the folder in which they were typed.
 RELATIVE = {"data.root", "evaluation.lpips_weights", "video.path"}
 # Where Hydra finds the settings: a group below hydra/ is none of the run's own choices.
@@ -119,26 +124,28 @@ def checked(path: Path, command: Mapping[str, Any]) -> Command:
         DevrfError: something else is among them.
     """
     for key, value in command.items():
-        if isinstance(value, Mapping):
-            checked(path, {f"{key}.{name}": below for name, below in value.items()})
-        elif GROUP.fullmatch(key):
+        if GROUP.fullmatch(key):
             known = isinstance(value, str) and OPTION.fullmatch(value) is not None
         else:
             known = KEY.fullmatch(key) is not None and _is_plain(value)
-        if not isinstance(value, Mapping) and (not known or _of_a_command(key)):
-            raise DevrfError(f"{path}: {key}={value} is no option or setting of a learned run")
+            known = known and ("." in key or key in ALONE)
+        if not known or _of_a_command(key):
+            said = f"{key}={value}"[:80]
+            raise DevrfError(f"{path}: {said!r} is no option or setting of a learned run")
+        if isinstance(value, Mapping):
+            checked(path, {f"{key}.{name}": below for name, below in value.items()})
     return {**command}
 
 
-def _is_plain(value: object) -> bool:
+def _is_plain(value: object, depth: int = 16) -> bool:
     """Whether a value is data: no code, nothing that refers to something else or is missing."""
     if isinstance(value, Mapping):
         names = all(isinstance(k, str) and KEY.fullmatch(k) and k not in CODE for k in value)
-        return names and all(map(_is_plain, value.values()))
+        return names and _is_plain(list(value.values()), depth)
     if isinstance(value, list):
-        return all(map(_is_plain, value))
+        return depth > 0 and all(_is_plain(item, depth - 1) for item in value)
     if isinstance(value, str):
-        return "${" not in value and value != "???"
+        return "${" not in value and value != "???" and value.isprintable() and len(value) < 5000
     return value is None or isinstance(value, bool | int | float)
 
 
@@ -282,21 +289,30 @@ def _of_sweep(typed: Sequence[Override], folder: Path) -> list[str]:
     record = folder / "multirun.yaml"
     if any(override.is_sweep_override() for override in typed) or not record.is_file():
         return []
-    begun: Any = OmegaConf.select(OmegaConf.load(record), "hydra.overrides.task") or []
-    keys = {override.key_or_group for override in typed}
-    stay = []
-    for override in parsed(list(begun)):
-        key = override.key_or_group
-        if _of_a_command(key) or key in keys or override.is_delete():
+    groups = group_choices()
+    swept: list[str] = []
+    command: Command = {}
+    for override in parsed(overrides_in(record)):
+        key = override.get_key_element().lstrip("+")
+        if _of_a_command(key) or override.is_delete():
             continue
-        swept = override.sweep_iterator() if override.is_sweep_override() else ()
-        for one in [parsed([f"{key}={text}"])[0].value() for text in swept] or [override.value()]:
-            is_option = "." not in key and isinstance(one, str)
-            checked(record, {f"/{key}" if is_option else key: one})
-        stay.append(str(override.input_line))
-    if stay:
-        _source.append(f"{folder}: as it was learned, with {' '.join(stay)}")
-    return [*stay, "hydra.mode=MULTIRUN"]
+        name = f"/{key}" if key in groups else key
+        if not override.is_sweep_override():
+            command |= checked(record, {name: override.value()})
+            continue
+        try:
+            texts = [parsed([f"{key}={text}"])[0].value() for text in override.sweep_iterator()]
+        except HydraException:
+            raise DevrfError(f"{record}: {key} has several mappings; type the sweep") from None
+        for text in texts:
+            checked(record, {name: text})
+        if not values(typed, key):
+            said = (
+                in_quotes(text) if isinstance(text, str) else json.dumps(text) for text in texts
+            )
+            swept.append(f"{key}={','.join(said)}")
+    put = _put(beneath(typed, command), typed, str(folder), multirun=True)
+    return [*put, *swept, "hydra.mode=MULTIRUN"]
 
 
 def _folder_for(checkpoint: Path) -> Path:

@@ -213,7 +213,7 @@ def _made_with(run: RunContext, step: str) -> dict[str, Any] | None:
 
 
 def _notes(folder: Path) -> list[dict[str, Any]]:
-    with suppress(OSError, ValueError, LookupError):
+    with suppress(OSError, ValueError, LookupError, TypeError):
         notes: list[dict[str, Any]] = json.loads((folder / PLACE / NOTE).read_text())["notes"]
-        return notes
+        return [note for note in notes if {*note} >= {"with", "files"}]
     return []

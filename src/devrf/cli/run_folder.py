@@ -17,6 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from devrf.cli.config import in_sweep
 from devrf.cli.messages import is_user_error, report_user_errors
+from devrf.errors import DevrfError
 from devrf.system.files import close_logs, holds_at_most, make_folder, remove_if_only
 from devrf.system.folder_lock import PLACE, lock_folder, release_folder
 
@@ -24,6 +25,8 @@ log = logging.getLogger(__name__)
 
 # Made in the folder before the config is checked.
 AT_FIRST = {".hydra", PLACE}
+# What is written by names that are known, and might lead elsewhere.
+APPENDED = ("run.log", ".hydra", PLACE)
 # Environment variables in which torchrun and SLURM number the processes that they start.
 RANKS = ("RANK", "SLURM_PROCID")
 
@@ -48,6 +51,9 @@ class RunFolderLock(Callback):
             hydra.cfg = before
         with report_user_errors():
             make_folder(folder)  # as Hydra does next, with a traceback where it cannot
+            for name in APPENDED:
+                if (folder / name).is_symlink():
+                    raise DevrfError(f"{folder / name}: a link; remove it: devrf writes there")
             if _locks(config):
                 lock_folder(folder, "hydra.run.dir")
 

@@ -36,6 +36,21 @@ class Cameras:
     width: int
     height: int
 
+    def check(self) -> None:
+        """Check what was read from a file.
+
+        Raises:
+            ValueError: shapes that do not agree, or numbers that no camera has.
+        """
+        count = len(self.camera_to_world)
+        tensors = (self.camera_to_world, self.focal, self.center)
+        shapes = [tuple(tensor.shape) for tensor in tensors]
+        if shapes != [(count, 3, 4), (count, 2), (count, 2)] or not count:
+            raise ValueError(f"cameras of the shapes {shapes}")
+        finite = all(t.is_floating_point() and bool(t.isfinite().all()) for t in tensors)
+        if not finite or not bool((self.focal > 0).all()):
+            raise ValueError("a camera that is not finite, or sees nothing")
+
     def __len__(self) -> int:
         return self.camera_to_world.shape[0]
 

@@ -47,6 +47,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
     make_folder(path.parent)
     # The suffix stays last: writers choose the format by it.
     partial = path.with_name(f".partial-{path.name}")
+    partial.unlink(missing_ok=True)  # it may be a link
     try:
         yield partial
         with partial.open("rb+") as file:

@@ -209,6 +209,9 @@ class DeVRFModel(Renderable):
             self.deformation.frames.take(*frames)
             full |= zip(names, frames, strict=True)
         self.load_state_dict({name: unpacked(v, self.device) for name, v in full.items()})
+        field = self.canonical
+        if field.grid_shape(field.voxels) != shape_of(field.density.values):
+            raise ValueError("a grid of another size than its description says")
 
 
 def _place_of_frames(backward: Any, device: torch.device) -> torch.device:
