@@ -14,10 +14,11 @@ import torch
 
 from devrf.apps.capture.pipeline import scene_from_footage
 from devrf.apps.settings import CaptureSettings
-from devrf.data.recorded import recognised_datamodule
+from devrf.data.recorded import RecordedDataModule
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
+from devrf.scenes.formats.nerfstudio import NerfstudioReader
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
@@ -98,7 +99,7 @@ def capture(footage, structure, tmp_path):
         walk, views = footage
         usual = {"static": walk, "views": views, "offsets": [0, 0, 0]}
         scene_from_footage(CaptureSettings(into=tmp_path / "scene", **{**usual, **settings}))
-        return recognised_datamodule(tmp_path / "scene", flow="none").scene
+        return RecordedDataModule(NerfstudioReader, tmp_path / "scene", flow="none").scene
 
     return run
 
