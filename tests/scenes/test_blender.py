@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 import shutil
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import imageio.v3 as iio
@@ -114,6 +116,58 @@ def test_single_folder_learns_the_static_scene_from_early_images(single_folder, 
     assert scene.bounds.motion is None  # never two cameras at one time
     whole = BlenderReader(single_folder).read()
     assert len(whole.static.train) == 8 and len(whole.static.test) == 3
+
+
+def shifted(content: dict[str, Any], meters: float) -> None:
+    for frame in content["frames"]:
+        frame["transform_matrix"][2][3] += meters
+
+
+def with_val(folder: Path) -> Path:
+    """The test split of a folder once more, as its validation split."""
+    shutil.copy(folder / "transforms_test.json", folder / "transforms_val.json")
+    return folder / "transforms_val.json"
+
+
+def test_the_validation_split_is_read_where_it_is_asked_for(scene_folder):
+    plain = BlenderReader(scene_folder.root).read()
+    val = with_val(scene_folder.dynamic)
+    scene_folder.edit(val, lambda content: shifted(content, 0.25))
+    assert BlenderReader(scene_folder.root).read().dynamic.validation is None
+    scene = BlenderReader(scene_folder.root, validation=True, downscale=2).read()
+    validation = scene.dynamic.validation
+    assert validation is not None and validation.pixels.shape == (3, 12, 16, 4)
+    assert validation.times.tolist() == [0, 0.5, 1]
+    moved = validation.cameras.positions - scene.dynamic.test.cameras.positions
+    torch.testing.assert_close(moved, torch.tensor([[0.0, 0.0, 0.25]] * 3))
+    assert scene.static.validation is None
+    # The scene is the same one.
+    same = BlenderReader(scene_folder.root, validation=True).read()
+    assert (same.fingerprint, same.bounds) == (plain.fingerprint, plain.bounds)
+    thinned = BlenderReader(scene_folder.root, validation=True, frames=2).read().dynamic.validation
+    assert thinned is not None and thinned.times.tolist() == [0, 1]
+
+
+def test_of_a_scene_at_rest_the_static_validation_split_is_read(scene_folder):
+    shutil.rmtree(scene_folder.dynamic)
+    scene_folder.edit(with_val(scene_folder.static), lambda content: shifted(content, 0.25))
+    scene = BlenderReader(scene_folder.root, validation=True).read()
+    assert not scene.moves and scene.dynamic.validation is not None
+    assert scene.dynamic.validation.times.tolist() == [0, 0]
+
+
+def test_images_that_are_learned_from_or_tested_on_are_no_validation(scene_folder):
+    val = with_val(scene_folder.dynamic)
+    assert BlenderReader(scene_folder.root, validation=True).read().dynamic.validation is None
+    train = json.loads((scene_folder.dynamic / "transforms_train.json").read_text())["frames"]
+    new = {**train[0], "time": 0.25}
+    scene_folder.edit(val, lambda content: content["frames"].extend([train[3], new]))
+    validation = BlenderReader(scene_folder.root, validation=True).read().dynamic.validation
+    assert validation is not None and validation.times.tolist() == [0.25]
+    # Without a test split it is held out in its place.
+    (scene_folder.dynamic / "transforms_test.json").unlink()
+    scene = BlenderReader(scene_folder.root, validation=True).read()
+    assert len(scene.dynamic.test) == 5 and scene.dynamic.validation is None
 
 
 NAN = float("nan")

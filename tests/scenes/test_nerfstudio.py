@@ -97,6 +97,40 @@ def test_listed_splits(moving, lists, train, test, balls):
     assert scene.dynamic.test.names == tuple(n[2:] for n in listed(*test))
 
 
+def test_the_validation_list_beside_a_test_list(moving, balls):
+    lists = {"val_filenames": listed(1, 3), "test_filenames": listed(3, 5)}
+    balls.edit(moving, lambda c: c.update(lists))
+    assert NerfstudioReader(moving).read().dynamic.validation is None
+    scene = NerfstudioReader(moving, validation=True).read()
+    assert scene.dynamic.validation is not None
+    # An image of both lists is a test image.
+    assert scene.dynamic.validation.names == tuple(n[2:] for n in listed(1))
+    assert scene.fingerprint == NerfstudioReader(moving).read().fingerprint
+    balls.edit(moving, lambda c: c.pop("test_filenames"))
+    scene = NerfstudioReader(moving, validation=True).read()
+    assert len(scene.dynamic.test) == 2 and scene.dynamic.validation is None
+
+
+def test_validation_views_are_in_the_world_of_the_others(tmp_path, balls):
+    # Cameras that look along −z from z = 1 to 2, the world turned by a quarter about x.
+    content = balls.write(tmp_path / "scene", None)
+    for i, frame in enumerate(content["frames"]):
+        pose = [[1, 0, 0, 0.1 * i], [0, 0, -1, -1 - i / 8], [0, 1, 0, 0], [0, 0, 0, 1]]
+        frame["transform_matrix"] = pose
+    content |= {"val_filenames": listed(4), "test_filenames": listed(8)}
+    (tmp_path / "scene/transforms.json").write_text(json.dumps(content))
+    options = {"space": "ndc", "near": 0.7, "validation": True}
+    scene = NerfstudioReader(tmp_path / "scene", **options).read()
+    assert scene.kind == "forward" and scene.dynamic.validation is not None
+    (known,) = scene.dynamic.validation.cameras.camera_to_world
+    first = scene.dynamic.train.cameras.camera_to_world[0]
+    # Four steps of 0.1 to the right of the first camera, and of 1/8 backwards.
+    torch.testing.assert_close(known[:, :3], torch.eye(3), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        known[:, 3] - first[:, 3], torch.tensor([0.4, 0.0, 0.5]), atol=1e-6, rtol=0
+    )
+
+
 def test_images_at_time_zero_are_the_static_set(tmp_path, balls_are_where_they_project, balls):
     # Ten images around the scene at rest; then two fixed cameras (of ten poses) at later times.
     later = [0.5] * 2 + [1.0] * 2
@@ -116,6 +150,13 @@ def test_images_at_time_zero_are_the_static_set(tmp_path, balls_are_where_they_p
     assert train.view.tolist() == [0, 1, 0, 0, 1]
     assert scene.dynamic.test.names == (listed(11)[0][2:],)
     assert scene.clock.times == (0.0, 0.5, 1.0)
+    # Validation views are of the scene in motion.
+    balls.edit(tmp_path / "scene", lambda c: c.update(val_filenames=listed(7, 13)))
+    validation = NerfstudioReader(tmp_path / "scene", validation=True).read().dynamic.validation
+    assert validation is not None and validation.names == (listed(13)[0][2:],)
+    balls.edit(tmp_path / "scene", lambda c: c.update(val_filenames=listed(7)))
+    at_rest_alone = NerfstudioReader(tmp_path / "scene", validation=True).read()
+    assert at_rest_alone.dynamic.validation is None
 
 
 def test_two_folders(tmp_path, balls_are_where_they_project, balls):
@@ -129,6 +170,10 @@ def test_two_folders(tmp_path, balls_are_where_they_project, balls):
     balls_are_where_they_project(scene.dynamic.train)
     thinned = NerfstudioReader(root, holdout=6, frames=2, train_views=1).read()
     assert thinned.dynamic.train.times.tolist() == [0.0, 1.0]
+    lists = {"val_filenames": listed(3), "test_filenames": listed(4)}
+    balls.edit(root / "dynamic", lambda c: c.update(lists))
+    validation = NerfstudioReader(root, validation=True).read().dynamic.validation
+    assert validation is not None and validation.names == ("dynamic/images/r_003.png",)
 
 
 @pytest.mark.parametrize(

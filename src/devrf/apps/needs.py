@@ -18,7 +18,7 @@ from devrf.methods.base import RayTrainable
 from devrf.methods.devrf.architecture import fitted_to
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
-from devrf.scenes.scene import Capture, Scene
+from devrf.scenes.scene import Scene
 
 # Python and its libraries on the host; measured, as is what the C library keeps of freed memory.
 PROGRAM, FRAGMENTATION = 600_000_000, 1.3
@@ -57,7 +57,7 @@ def smaller(scene: Scene, by: float) -> Scene:
         return of_views[:, : int(of_views.shape[1] / by), : int(of_views.shape[2] / by)]
 
     captures = [
-        Capture(capture.train.mapped(corner), capture.test.mapped(corner))
+        capture.mapped(lambda views: views.mapped(corner))
         for capture in (scene.static, scene.dynamic)
     ]
     space = scene.space

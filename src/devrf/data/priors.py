@@ -9,7 +9,7 @@ import torch
 
 from devrf.data.batch import background_color
 from devrf.scenes.bounds import FALLBACK_BOUND_SCALE
-from devrf.scenes.scene import Background, Capture, Scene, Views
+from devrf.scenes.scene import Background, Scene, Views
 
 Priors = Literal["all", "none"]
 
@@ -25,7 +25,7 @@ def without_priors(scene: Scene) -> Scene:
     scale = max(scene.bounds.scale, FALLBACK_BOUND_SCALE)
     bounds = replace(scene.bounds, motion=None, scale=scale, source="priors=none")
     static, dynamic = (
-        Capture(_bare(capture.train, plain), capture.test)
+        replace(capture, train=_bare(capture.train, plain))
         for capture in (scene.static, scene.dynamic)
     )
     return replace(scene, static=static, dynamic=dynamic, bounds=bounds, background=plain)

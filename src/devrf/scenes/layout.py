@@ -37,12 +37,14 @@ class Layout:
         static_test: held-out images of the scene at rest.
         dynamic_train: images of the scene in motion; of a scene at rest ``static_train`` itself.
         dynamic_test: held-out images of the scene in motion.
+        validation: images as those of ``dynamic_test``, by which settings are chosen, or None.
     """
 
     static_train: Split
     static_test: Split
     dynamic_train: Split
     dynamic_test: Split
+    validation: Split | None = None
 
     @property
     def moves(self) -> bool:
@@ -54,6 +56,22 @@ class Layout:
         transforms, first = self.static_train.transforms, int(self.static_train.index[0])
         width, height = image_size(transforms.images[first], transforms.intrinsics[first].size)
         return width // factor, height // factor
+
+    def with_validation(self, transforms: Transforms) -> Layout:
+        """The layout with a validation split, of the images that are not learned from or tested on.
+
+        An image with the pose and the time of such a one is that image under another name.
+        """
+        if not transforms.images:
+            return self
+        split = in_motion(transforms) if self.moves else at_one_moment(transforms)
+        own, *others = (
+            torch.cat([s.transforms.poses.flatten(1), s.times[:, None]], dim=1)
+            for s in (split, self.dynamic_train, self.dynamic_test)
+        )
+        used = torch.cat(others)
+        split = split.where(torch.stack([(used != image).any(dim=1).all() for image in own]))
+        return replace(self, validation=split) if len(split.index) else self
 
 
 def static_alone(train: Transforms, test: Transforms, why: str) -> Layout:
@@ -116,17 +134,21 @@ def fewer(layout: Layout, train_views: int | None, frames: int | None) -> tuple[
                     f"{layout.static_train.transforms.file} show one moment; leave it null",
                 )
         return layout, False
-    train, test = first_views(layout.dynamic_train, train_views), layout.dynamic_test
+    train = first_views(layout.dynamic_train, train_views)
     if len(distinct_times(train.used_times)) < 2:
         raise scene_error(
             train.transforms.file, "all dynamic images have one time; give each frame its own"
         )
     kept = None if frames is None else evenly_spread(train.used_times, frames)
-    if kept is not None:
-        train, same = at_times(train, kept), at_times(test, kept)
+    if kept is None:
+        return replace(layout, dynamic_train=train), False
+    splits = {"dynamic_train": at_times(train, kept)}
+    for name in ("dynamic_test", "validation"):
+        split = getattr(layout, name)
         # Held-out times of their own (D-NeRF) need not meet the kept ones: then all stay.
-        test = same if len(same.index) else test
-    return replace(layout, dynamic_train=train, dynamic_test=test), kept is not None
+        if split is not None and len((same := at_times(split, kept)).index):
+            splits[name] = same
+    return replace(layout, **splits), True
 
 
 def load_layout(
@@ -154,7 +176,9 @@ def load_layout(
         twin = next((v for s, v in loaded if _same_images(s, split)), None)
         loaded.append((split, twin or load_views(split, root, by, masks)))
     a, b, c, d = (views for _, views in loaded)
-    return Capture(a, b), Capture(c, d)
+    held_back = layout.validation
+    validation = None if held_back is None else load_views(held_back, root, moving, masks)
+    return Capture(a, b), Capture(c, d, validation)
 
 
 def _same_images(a: Split, b: Split) -> bool:

@@ -62,6 +62,8 @@ class SceneReader(Options, ABC):
             on them, ``dis`` and ``raft`` estimate it, ``none`` does without.
         flow_cache: an ``.npz`` that keeps estimated flow; None estimates it every time.
         frames: keep so many times, evenly spread, first and last included; None: all.
+        validation: whether the layout's validation split is read, too, where it has one beside the
+            test split (Blender's, nerfstudio's).
 
     Raises:
         DevrfError: an option is wrong; the message names it.
@@ -75,6 +77,7 @@ class SceneReader(Options, ABC):
     flow: FlowSource = "auto"
     flow_cache: str | Path | None = None
     frames: SeveralFrames | None = None
+    validation: bool = False
 
     factor: ClassVar[int] = 1
 

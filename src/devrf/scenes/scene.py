@@ -134,10 +134,18 @@ class Capture:
     Attributes:
         train: what the fields are learned from.
         test: held-out views, never seen in training.
+        validation: held-out views by which settings are chosen, none of them in ``test``; None
+            where they were not asked for, or there are none.
     """
 
     train: Views
     test: Views
+    validation: Views | None = None
+
+    def mapped(self, change: Callable[[Views], Views]) -> Capture:
+        """The capture with ``change`` made to all of its views."""
+        validation = None if self.validation is None else change(self.validation)
+        return Capture(change(self.train), change(self.test), validation)
 
 
 @dataclass(frozen=True)
@@ -183,7 +191,7 @@ class Scene:
         kind: ``inward`` (cameras around the scene) or ``forward`` (cameras before it, NDC).
         static: many views of the scene at rest (t = 0).
         dynamic: a few fixed views of the scene as it deforms; of a scene that is always at rest the
-            static capture itself.
+            static capture itself. It alone has validation views.
         bounds: where the scene is.
         background: what is behind the alpha mask.
         space: the space that the fields live in, and in which ``bounds`` are given.
@@ -199,15 +207,15 @@ class Scene:
 
     def __post_init__(self) -> None:
         clock, numbered = self.clock, dict[int, Views]()
+
+        def with_frames(views: Views) -> Views:
+            # A moving camera's images may be both captures: they stay one.
+            if id(views) not in numbered:
+                numbered[id(views)] = replace(views, frames=clock.frames_of(views.times))
+            return numbered[id(views)]
+
         for name in ("static", "dynamic"):
-            capture: Capture = getattr(self, name)
-            for views in (capture.train, capture.test):
-                # A moving camera's images may be both captures: they stay one.
-                if id(views) not in numbered:
-                    frames = clock.frames_of(views.times)
-                    numbered[id(views)] = replace(views, frames=frames)
-            pair = numbered[id(capture.train)], numbered[id(capture.test)]
-            object.__setattr__(self, name, Capture(*pair))
+            object.__setattr__(self, name, getattr(self, name).mapped(with_frames))
 
     @property
     def at_rest(self) -> Views:

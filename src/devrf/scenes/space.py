@@ -134,14 +134,14 @@ def centred(static: Capture, dynamic: Capture) -> tuple[Capture, Capture]:
     both = (static.train, static.test)
     frame = average_pose(torch.cat([v.cameras.camera_to_world.double() for v in both]))
     moved: dict[int, Views] = {}
-    for views in (*both, dynamic.train, dynamic.test):
+
+    def in_frame(views: Views) -> Views:
         if id(views) not in moved:  # captures that share images go on sharing them
             poses = relative_to(frame, views.cameras.camera_to_world.double()).float()
             moved[id(views)] = replace(views, cameras=replace(views.cameras, camera_to_world=poses))
-    first, second = (
-        Capture(moved[id(one.train)], moved[id(one.test)]) for one in (static, dynamic)
-    )
-    return first, second
+        return moved[id(views)]
+
+    return static.mapped(in_frame), dynamic.mapped(in_frame)
 
 
 def dynamic_only(scene: Scene) -> Scene:

@@ -112,7 +112,7 @@ class Transforms:
     bounds: SceneBounds | None = None
 
     def __getitem__(self, index: Sequence[int]) -> Transforms:
-        """The images at the positions ``index``, at least one, in that order."""
+        """The images at the positions ``index``, in that order."""
         return replace(
             self,
             intrinsics=tuple(self.intrinsics[i] for i in index),

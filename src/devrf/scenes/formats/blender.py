@@ -30,7 +30,7 @@ class BlenderReader(InwardReader):
     Two layouts: ``static/``, next to ``dynamic_<V>views/`` unless the scene is at rest; or the
     JSON files in ``root`` itself: with times (D-NeRF) the static capture is taken from the training
     images, without them (NeRF-synthetic) the scene is at rest. Without ``transforms_test.json``
-    ``transforms_val.json`` is held out.
+    ``transforms_val.json`` is held out; beside it, it is the validation split.
 
     Attributes:
         dynamic: which ``dynamic_*views`` folder, where there are several.
@@ -72,6 +72,10 @@ class BlenderReader(InwardReader):
             motion = _train_and_test(moving, root, self.missing)
             layout = Layout(*map(at_rest, rest), *map(in_motion, motion))
             flow_folder = moving / "train_flow"
+        test = layout.dynamic_test.transforms.file
+        val = test.with_name("transforms_val.json")
+        if self.validation and val != test and os.path.isfile(val):
+            layout = layout.with_validation(read_transforms(val, root, missing=self.missing)[1])
         return *fewer(layout, self.train_views, self.frames), flow_folder
 
     def _flow(

@@ -36,8 +36,8 @@ class NerfstudioReader(PosedReader):
     The file may lie in ``root``, with a ``time`` in [0, 1] on every frame, or in ``root/static``
     and, with times, in ``root/dynamic``. Without times, or without ``root/dynamic``, the scene is
     at rest. Cameras may stand still or move. Held-out images are those in ``test_filenames`` (else
-    ``val_filenames``), else every ``holdout``-th. Images are undistorted; the world is that of the
-    file's poses.
+    ``val_filenames``), else every ``holdout``-th; beside ``test_filenames``, ``val_filenames`` are
+    the validation split. Images are undistorted; the world is that of the file's poses.
 
     A frame's ``mask_path`` is a grey image of the size of the image or of its camera, black where
     pixels are left out.
@@ -76,21 +76,27 @@ class NerfstudioReader(PosedReader):
 
 def _layout(root: Path, options: NerfstudioReader) -> Layout:
     if os.path.isfile(root / FILE):
-        train, test = _train_and_test(root / FILE, root, options)
-        return _one_file(train, test, options.static_until)
+        train, test, validation = _splits(root / FILE, root, options)
+        layout = _one_file(train, test, options.static_until)
+        if layout.static_train.transforms is not layout.dynamic_train.transforms:
+            validation = validation[_seen_moving(validation)]
+        return layout.with_validation(validation)
     still, moving = root / "static" / FILE, root / "dynamic" / FILE
-    rest = _train_and_test(still, root, options)
+    train, test, validation = _splits(still, root, options)
     if not os.path.isfile(moving):
-        return static_alone(*rest, f"there is no dynamic/{FILE}")
-    motion = _train_and_test(moving, root, options)
-    if motion[0].times is None:
+        layout = static_alone(train, test, f"there is no dynamic/{FILE}")
+        return layout.with_validation(validation)
+    rest = at_rest(train), at_rest(test)
+    train, test, validation = _splits(moving, root, options)
+    if train.times is None:
         raise scene_error(moving, 'its frames have no "time"; give every frame its time in [0, 1]')
-    return Layout(at_rest(rest[0]), at_rest(rest[1]), in_motion(motion[0]), in_motion(motion[1]))
+    return Layout(*rest, in_motion(train), in_motion(test)).with_validation(validation)
 
 
-def _train_and_test(
+def _splits(
     file: Path, root: Path, options: NerfstudioReader
-) -> tuple[Transforms, Transforms]:
+) -> tuple[Transforms, Transforms, Transforms]:
+    """The images of a file to learn from, to test on, and in its validation list, if asked for."""
     listing, transforms = read_transforms(
         file, root, masked=options.masks != "none", missing=options.missing
     )
@@ -112,7 +118,8 @@ def _train_and_test(
             f"{len(train)} images to learn from, {len(test)} held out, "
             f"{len(set(train) & set(test))} of them both; correct train_filenames, test_filenames",
         )
-    return transforms[train], transforms[test]
+    validation = listed["val"] if options.validation else []
+    return transforms[train], transforms[test], transforms[validation]
 
 
 def _listed(names: list[str] | None, split: str, transforms: Transforms, root: Path) -> list[int]:
