@@ -17,6 +17,8 @@ from devrf.apps.records import (
     mean_scores,
     provenance,
     scores_by_section,
+    shown_sections,
+    tracked_scores,
     write_frames,
 )
 from devrf.checkpoints.checkpoint import CheckpointMetadata
@@ -74,6 +76,13 @@ def test_times_that_no_training_view_has_are_scored_apart():
 def test_numbers_are_rounded_for_people():
     values = {"psnr": 33.42981, "lpips": None, "iterations": 123456, "seconds": 12345.678}
     assert in_words(values) == "psnr 33.43, iterations 123456, seconds 12346"
+
+
+def test_validation_scores_are_no_test_scores():
+    sections = {"dynamic": {"psnr": 20.0}, "validation": {"psnr": 21.0, "images": 3}}
+    expected = {"test/dynamic/psnr": 20.0, "validation/psnr": 21.0, "validation/images": 3}
+    assert tracked_scores(sections) == expected
+    assert shown_sections(sections) == sections
 
 
 def test_frames_read_back(tmp_path):

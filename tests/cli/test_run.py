@@ -216,18 +216,26 @@ def test_the_objective_is_looked_up():
         **{"dynamic.psnr": 20.0, "static.psnr": 30.0, "static.lpips": None},
         # DeVRF's sections have the names of its stages, too.
         **{"deformation.psnr": 20.0, "canonical.psnr": 30.0},
+        # Without a validation split the test views decide.
+        "validation.psnr": 20.0,
     }.items():
         check_objective(key, ["lpips"])
         assert objective(key, found) == value
     # Where nothing moves the rest state is judged.
     assert objective("dynamic.psnr", {"static": {"psnr": 30.0}}) == 30.0
+    assert objective("validation.psnr", {"static": {"psnr": 30.0}}) == 30.0
     assert objective("dynamic.rest_pose_psnr", {"static": {"psnr": 30.0}}) is None
+    assert objective("validation.psnr", {**found, "validation": {"psnr": 10.0}}) == 10.0
 
 
 @pytest.mark.parametrize(
     ("key", "said"),
     [
-        ("run.seed", "objective: expected static.NAME or dynamic.NAME, not 'run.seed'"),
+        (
+            "run.seed",
+            "objective: expected static.NAME, dynamic.NAME or validation.NAME, not 'run.seed'",
+        ),
+        ("validation.seconds", "objective: validation has no 'seconds'"),
         ("deformation.flow_error", "objective: deformation has no 'flow_error'"),
         ("static.rest_pose_psnr", "objective: static has no 'rest_pose_psnr'"),
     ],
@@ -236,6 +244,60 @@ def test_any_other_objective_is_an_error(key, said):
     with pytest.raises(DevrfError) as caught:
         check_objective(key, ["lpips"])
     assert str(caught.value).startswith(said)
+
+
+@pytest.fixture(scope="module")
+def with_validation(tmp_path_factory) -> Path:
+    """A moving scene whose validation split is of other views than its test split."""
+    root = tmp_path_factory.mktemp("judged") / "robot"
+    sizes = {"width": 24, "height": 18, "static_views": 6, "static_test_views": 2}
+    export(ProceduralScene(shape="robot", train_views=2, frames=3, supersample=1, **sizes)(), root)
+    file = root / "dynamic_2views" / "transforms_val.json"
+    content = json.loads(file.read_text())
+    for frame in content["frames"]:
+        frame["transform_matrix"][0][3] += 0.5
+    file.write_text(json.dumps(content))
+    return root
+
+
+def test_validation_views_are_scored_where_the_objective_is_theirs(
+    devrf, tmp_path, short, with_validation
+):
+    where = ("data=inward", f"data.root={with_validation}", "hydra.run.dir=run")
+    command = (*where, *short, NO_METRICS, "video.frames=1")
+    by_test = devrf(*command)
+    assert (by_test.status, by_test.err) == (0, "")
+    before, run = metrics(tmp_path / "run"), tmp_path / "run"
+    assert "validation" not in before
+    # A run that was scored already is scored again, and no more than that is done again.
+    asked = devrf(*command, "objective=validation.psnr")
+    assert (asked.status, asked.err) == (0, "")
+    assert "deformation: learned already" in asked.out and "render: done already" in asked.out
+    found = metrics(run)
+    assert set(found["validation"]) == {"psnr", "ssim", "images"}
+    assert found["validation"]["images"] == 3
+    assert found["validation"]["psnr"] != found["dynamic"]["psnr"]
+    # Neither the scene nor its test scores are others for it.
+    assert found["run"]["fingerprint"] == before["run"]["fingerprint"]
+    for section in ("static", "dynamic"):
+        assert found[section] == before[section]
+    assert "validation: psnr" in asked.out and "validation split" not in asked.out
+    with (run / "frames.csv").open(newline="") as file:
+        assert {row["capture"] for row in csv.DictReader(file)} == {"static", "dynamic"}
+    again = devrf(*command, "objective=validation.ssim")
+    assert "evaluate: done already" in again.out
+    report = devrf("stage=report", "report.runs=run")
+    assert report.status == 0 and f"{found['dynamic']['psnr']:.2f}" in report.out
+    assert f"{found['validation']['psnr']:.2f}" not in report.out
+
+
+def test_without_a_validation_split_one_line_says_so(devrf, tmp_path, tiny):
+    command = (*tiny, "hydra.run.dir=run", NO_METRICS, "video.frames=1")
+    done = devrf(*command, "objective=validation.psnr")
+    assert (done.status, done.err) == (0, "")
+    (said,) = [line for line in done.out.splitlines() if "no validation split" in line]
+    assert said.endswith("robot: no validation split; the test views decide the objective")
+    assert "validation" not in metrics(tmp_path / "run")
 
 
 # A scene at rest

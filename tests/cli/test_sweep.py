@@ -13,6 +13,7 @@ import yaml
 from hydra.core.config_store import ConfigStore
 
 from devrf.cli.context import RunContext
+from devrf.scenes.export import export
 
 LEARN = ("stage=canonical", "hydra.sweep.dir=sweep")
 SEARCH = ("hparams_search=loss_weights", "hydra.sweeper.n_trials=2")
@@ -130,6 +131,25 @@ def test_a_search_maximises_the_objective(devrf, tmp_path, tiny):
     assert said["best_value"] == best["deformation"]["psnr"]
     for name, value in said["best_params"].items():
         assert f"{name}={value}" in best["run"]["overrides"]
+
+
+@installed("hydra_optuna_sweeper")
+def test_a_search_maximises_the_validation_views(devrf, tmp_path, short, tiny_scene):
+    root = tmp_path / "scene"
+    export(tiny_scene, root)
+    # The images of the held-out view at three times: two to choose by, one to test on.
+    for split, places in (("val", [0, 1]), ("test", [2])):
+        file = root / "dynamic_2views" / f"transforms_{split}.json"
+        content = json.loads(file.read_text())
+        content["frames"] = [content["frames"][place] for place in places]
+        file.write_text(json.dumps(content))
+    given = ("data=inward", f"data.root={root}", "video.frames=1", "evaluation.metrics=[]")
+    assert devrf("-m", *given, *short, *SEARCH, "hydra.sweep.dir=sweep").status == 0
+    found = [json.loads(path.read_text()) for path in tmp_path.glob("sweep/*/metrics.json")]
+    assert [metrics["validation"]["images"] for metrics in found] == [2, 2]
+    said = yaml.safe_load((tmp_path / "sweep" / "optimization_results.yaml").read_text())
+    assert said["best_value"] == max(metrics["validation"]["psnr"] for metrics in found)
+    assert said["best_value"] not in [metrics["dynamic"]["psnr"] for metrics in found]
 
 
 @installed("hydra_optuna_sweeper")

@@ -18,7 +18,7 @@ import torch
 import devrf
 from devrf.checkpoints.checkpoint import GIVEN_REST, OWN_REST, CheckpointMetadata
 from devrf.evaluation.held_out import HeldOutView
-from devrf.evaluation.objective import TRAINING
+from devrf.evaluation.objective import TRAINING, VALIDATION
 from devrf.geometry.clock import FrameClock
 from devrf.scenes.scene import Scene
 from devrf.system.files import atomic_write
@@ -85,8 +85,9 @@ def scores_by_section(
 
 
 def shown_sections(sections: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """The scores of each capture without those of some times, which are sections of their own."""
-    captures = {name: sections[name] for name in ("static", "dynamic") if name in sections}
+    """The scores of each set without those of some times, which are sections of their own."""
+    names = ("static", "dynamic", VALIDATION)
+    captures = {name: sections[name] for name in names if name in sections}
     of_times = {key: row[key] for row in captures.values() for key in OF_TIMES if key in row}
     return {
         name: {key: value for key, value in row.items() if key not in OF_TIMES}
@@ -95,9 +96,9 @@ def shown_sections(sections: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[
 
 
 def tracked_scores(sections: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
-    """Scores by trackers' names, ``test/dynamic/psnr``; those of training curves have no test."""
+    """Scores by trackers' names: ``test/dynamic/psnr``, ``validation/psnr``, unlike any curve's."""
     return {
-        f"test/{section}/{key}": value
+        f"{'' if section == VALIDATION else 'test/'}{section}/{key}": value
         for section, row in sections.items()
         for key, value in row.items()
         if value is not None and key not in OF_TIMES

@@ -33,6 +33,7 @@ from devrf.data.datamodule import SceneDataModule
 from devrf.engine.ddp import ManualDDP
 from devrf.engine.stage import ScheduledStage
 from devrf.errors import DevrfError
+from devrf.evaluation.objective import VALIDATION
 from devrf.evaluation.suite import Evaluation
 from devrf.methods.protocol import Protocol
 from devrf.scenes.scene import Scene
@@ -94,6 +95,7 @@ class RunContext:
             self.chooses_size = SIZE not in known
         built: SceneDataModule = instantiate(data)
         built.priors = self.config.priors
+        built.validation = self.config.objective.startswith(f"{VALIDATION}.")
         return built
 
     @property

@@ -10,6 +10,7 @@ from devrf.apps.records import (
     frame_rows,
     in_words,
     learning_record,
+    mean_scores,
     provenance,
     scores_by_section,
     shown_sections,
@@ -24,6 +25,7 @@ from devrf.cli.restore_config import as_typed
 from devrf.cli.resume import unfinished
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import HeldOutView, score_all
+from devrf.evaluation.objective import VALIDATION
 from devrf.evaluation.suite import MetricSuite
 from devrf.methods.base import Renderable
 from devrf.scenes.scene import CaptureName
@@ -51,6 +53,13 @@ def evaluate(run: RunContext) -> list[Path]:
         frames["dynamic"] = _score(run, model, "dynamic", suite)
     size = round(run.checkpoint(metadata.stage).stat().st_size / 1e6, 3)
     sections = scores_by_section(frames, scene.clock, metadata, rest, size)
+    if run.datamodule.validation and {*frames} == {*scene.captures}:
+        views = scene.dynamic.validation
+        if views is None:
+            log.info("%s: no validation split; the test views decide the objective", scene.name)
+        else:
+            scored = score_all(model, views, scene.background, suite, "validation images")
+            sections[VALIDATION] = {**mean_scores(scored), "images": len(scored)}
     write_frames(run.folder / "frames.csv", frames)
     protocol = metadata.protocol or run.protocol.name
     head = {"scene": scene.name, "method": model.name, "protocol": protocol}

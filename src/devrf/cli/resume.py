@@ -205,7 +205,9 @@ def _made_with(run: RunContext, step: str) -> dict[str, Any] | None:
     data = {k: v for k, v in config["data"].items() if k not in ("flow_cache", "export")}
     if data.get("root") is not None:
         data["root"] = str(Path(data["root"]).resolve())
-    made = {"checkpoint": checkpoint, "version": devrf.__version__, "data": data}
+    made: dict[str, Any] = {"checkpoint": checkpoint, "version": devrf.__version__, "data": data}
+    if step == "evaluate" and run.datamodule.validation:
+        made["validation"] = True
     keyframes = Path(str(config["video"]["path"]))
     if step == "render" and keyframes.is_file():
         made["keyframes"] = sha256(keyframes.read_bytes()).hexdigest()

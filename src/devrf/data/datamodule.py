@@ -27,6 +27,8 @@ class SceneDataModule(LightningDataModule, ABC):
     downscale = 1
     # Whether methods are told what the scene tells beside its images.
     priors: Priors = "all"
+    # Whether validation views are served, too, where the scene has any.
+    validation = False
 
     def __init__(self) -> None:
         super().__init__()

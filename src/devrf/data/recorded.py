@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +52,8 @@ class RecordedDataModule(SceneDataModule):
 
     def load(self) -> Scene:
         """Read the scene, and estimate its optical flow if that is asked for."""
+        if self.validation:
+            self.reader = replace(self.reader, validation=True)
         try:
             scene = self.reader.read()
         except DevrfError:

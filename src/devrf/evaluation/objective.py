@@ -11,9 +11,12 @@ from devrf.errors import DevrfError, did_you_mean
 TRAINING = ("seconds", "iterations", "iterations_per_second", "peak_gpu_gb", "num_rollbacks")
 # Numbers of both sections of metrics.json, and of the dynamic one. Their second names are those of
 # DeVRF's stages.
-OF_BOTH = ("psnr", "ssim", *TRAINING, "checkpoint_mb")
+SCORES = ("psnr", "ssim")
+OF_BOTH = (*SCORES, *TRAINING, "checkpoint_mb")
 OF_MOTION = ("rest_pose_psnr",)
 STATIC, DYNAMIC = ("static", "canonical"), ("dynamic", "deformation")
+# The section that metrics.json has only where the objective is one of its numbers.
+VALIDATION = "validation"
 
 
 def check_objective(key: str, metrics: Sequence[str]) -> None:
@@ -23,9 +26,11 @@ def check_objective(key: str, metrics: Sequence[str]) -> None:
         DevrfError: it will not.
     """
     section, _, name = key.partition(".")
-    if section not in (*STATIC, *DYNAMIC):
-        raise DevrfError(f"objective: expected static.NAME or dynamic.NAME, not {key!r}")
-    known = [*OF_BOTH, *metrics, *(OF_MOTION if section in DYNAMIC else ())]
+    if section not in (*STATIC, *DYNAMIC, VALIDATION):
+        expected = "static.NAME, dynamic.NAME or validation.NAME"
+        raise DevrfError(f"objective: expected {expected}, not {key!r}")
+    recorded = SCORES if section == VALIDATION else OF_BOTH
+    known = [*recorded, *metrics, *(OF_MOTION if section in DYNAMIC else ())]
     if name not in known:
         raise DevrfError(
             f"objective: {section} has no {name!r}; choose from {', '.join(known)}"
@@ -36,9 +41,9 @@ def check_objective(key: str, metrics: Sequence[str]) -> None:
 def objective(key: str, metrics: Mapping[str, Any]) -> float | None:
     """The number ``key`` of metrics.json; None where it could not be measured.
 
-    The static section stands in for a missing dynamic one.
+    The dynamic section stands in for a missing validation one, the static for a missing dynamic.
     """
     section, _, name = key.partition(".")
-    section = "static" if section in STATIC else "dynamic"
-    value: float | None = metrics.get(section, metrics["static"]).get(name)
+    dynamic = metrics["static"] if section in STATIC else metrics.get("dynamic", metrics["static"])
+    value: float | None = metrics.get(section, dynamic).get(name)
     return value
