@@ -18,6 +18,8 @@ from devrf.apps.settings import ReportSettings
 from devrf.errors import DevrfError, did_you_mean
 
 PIPELINE = "pipeline"
+# What the folder of a named run's settings begins with.
+RESTORED = ".restored-"
 # Stages for which the run's scene need not be right.
 APART = ("report", "fetch", "capture", "selfcheck")
 # Stages that learn nothing; the protocol's stages come beside these.
@@ -155,6 +157,18 @@ def register_config() -> None:
     """Make the resolvers ``${devrf.scene_name:…}`` … known to Hydra."""
     for word in (scene_name, run_folder, config_record, job_folder, tracked_name):
         OmegaConf.register_new_resolver(f"devrf.{word.__name__}", word, replace=True)
+
+
+def search_path() -> list[str]:
+    """The present command's own folders of configs, as they are typed."""
+    words, folders = [], []
+    for source in HydraConfig.get().runtime.config_sources if HydraConfig.initialized() else ():
+        if source.provider == "command-line":
+            words += ["--config-dir", source.path]
+        elif source.provider == "hydra.searchpath in command-line":
+            folders.append(f"{source.schema}://{source.path}")
+    typed = [folder for folder in folders if RESTORED not in folder]
+    return [*words, f"hydra.searchpath=[{','.join(typed)}]"] if typed else words
 
 
 def choices() -> dict[str, str | None]:

@@ -27,6 +27,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from devrf.cli.config import (
     OF_A_CHECKPOINT,
+    RESTORED,
     choices,
     config_folder,
     group_choices,
@@ -58,7 +59,7 @@ KEY = re.compile(r"[\w-]+(\.[\w-]+){0,16}", re.ASCII)
 # Values that are relative to the folder in which they were typed.
 RELATIVE = {"data.root", "evaluation.lpips_weights", "video.path"}
 # Where Hydra finds the settings: a group below hydra/ is none of the run's own choices.
-RESTORED = "hydra/restored"
+GROUP_OF_SETTINGS = "hydra/restored"
 
 # Options by /group, values by key.
 Command = dict[str, Any]
@@ -267,16 +268,19 @@ def _put(command: Command, typed: Sequence[Override], source: str, *, multirun: 
     if settings:
         if multirun:  # other machines may take its jobs
             Path("outputs").mkdir(exist_ok=True)
-        place = TemporaryDirectory(dir="outputs" if multirun else None, prefix=".restored-")
+        place = TemporaryDirectory(dir="outputs" if multirun else None, prefix=RESTORED)
         _folder[:] = [place]  # until the command ends
-        file = Path(place.name, RESTORED, "run.yaml")
+        file = Path(place.name, GROUP_OF_SETTINGS, "run.yaml")
         file.parent.mkdir(parents=True)
         file.write_text(f"# @package _global_\n{OmegaConf.to_yaml(settings)}", encoding="utf-8")
         paths = [f"file://{Path(place.name).absolute()}"]
         for override in typed:  # Hydra takes the first list of folders
             if override.key_or_group == "hydra.searchpath":
                 paths += override.value()  # type: ignore[arg-type]
-        put += [f"hydra.searchpath=[{','.join(map(in_quotes, paths))}]", f"+{RESTORED}=run"]
+        put += [
+            f"hydra.searchpath=[{','.join(map(in_quotes, paths))}]",
+            f"+{GROUP_OF_SETTINGS}=run",
+        ]
     return put
 
 

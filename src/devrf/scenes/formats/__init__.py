@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 from dataclasses import dataclass, replace
+from importlib.metadata import entry_points
 from pathlib import Path
 
 from devrf.scenes.files import entries, scene_folder
@@ -92,8 +93,9 @@ def _fitting(root: str | Path) -> tuple[Path, list[KnownLayout]]:
 
 
 def _layouts(folder: Path) -> list[KnownLayout]:
-    """The layouts that a folder has, that of the first choice first."""
-    return [layout for layout in LAYOUTS if not layout.missing(folder)]
+    """The layouts that a folder has, that of the first choice first; installed packages' before."""
+    installed = [point.load() for point in entry_points(group="devrf.layouts")]
+    return [layout for layout in (*installed, *LAYOUTS) if not layout.missing(folder)]
 
 
 def _of_no_layout(folder: Path) -> str:
