@@ -113,6 +113,8 @@ class Viewpoints:
         if "clock" not in entry:
             return None
         cameras = {name: Cameras(**entry[name]) for name in ("static", "dynamic", "held_out")}
+        if not len(cameras["static"]) or not len(cameras["held_out"]):
+            raise ValueError("no camera")
         for camera in cameras.values():
             camera.check()
             sides = sorted((camera.width, camera.height))

@@ -166,7 +166,8 @@ def _learn(run: RunContext, learning: Names) -> None:
         together = launch_workers(strategy, learn_beside, (plain, run.folder))
     with together, as_own_errors():
         # Rank 0 has made it. Checkpoints that a later stage or a resumed one needs are read by all.
-        if not strategy.reduce_boolean_decision((run.folder / PLACE).is_dir()):
+        there = (run.folder / PLACE).is_dir()
+        if isinstance(strategy, ManualDDP) and not strategy.reduce_boolean_decision(there):
             raise DevrfError(
                 f"{run.folder}: not there on every node; give hydra.run.dir=FOLDER in a file "
                 "system that all nodes share"

@@ -45,7 +45,7 @@ class Cameras:
         count = len(self.camera_to_world)
         tensors = (self.camera_to_world, self.focal, self.center)
         shapes = [tuple(tensor.shape) for tensor in tensors]
-        if shapes != [(count, 3, 4), (count, 2), (count, 2)] or not count:
+        if shapes != [(count, 3, 4), (count, 2), (count, 2)]:
             raise ValueError(f"cameras of the shapes {shapes}")
         finite = all(t.is_floating_point() and bool(t.isfinite().all()) for t in tensors)
         if not finite or not bool((self.focal > 0).all()):

@@ -16,7 +16,7 @@ from devrf.rendering.occupancy import Occupancy
 # A ray ends where its transmittance is less: what is behind cannot be seen.
 STOP = 1e-4
 # The least distance between samples, in voxels: with less a ray fills memory and shows no more.
-FINEST = 0.05
+FINEST = 0.01
 
 
 @dataclass(frozen=True)
