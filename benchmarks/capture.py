@@ -27,7 +27,6 @@ from filming import SCENES, Filmed
 from torch import Tensor
 
 from devrf.apps.capture.pipeline import scene_from_footage
-from devrf.cli.run import run_stage
 from devrf.system.files import write_json
 
 
@@ -133,11 +132,10 @@ def learned(scene: str, root: Path, run: Path) -> dict[str, float]:
     began = time.perf_counter()
     settings = [*LEARNED[scene], *ALL, f"data.root={root}", f"hydra.run.dir={run}", "resume=false"]
     opened = harness.open_run(settings)
-    run.mkdir(parents=True, exist_ok=True)
     for stage in (*opened.learning_stages, "evaluate"):
         config = opened.config.copy()
         config.stage = stage
-        run_stage(config, run)
+        harness.run_stage(config, run)
     metrics = json.loads((run / "metrics.json").read_text())
     found = {"PSNR": metrics["dynamic"]["psnr"], "PSNR at rest": metrics["static"]["psnr"]}
     return found | {"learn s": time.perf_counter() - began}

@@ -33,7 +33,6 @@ from torch.profiler import profile
 
 from devrf import selfcheck
 from devrf.cli.context import RunContext
-from devrf.cli.run import run_stage
 from devrf.evaluation.held_out import background_value
 from devrf.ops import color_network
 from devrf.ops.dispatch import Kind, reaches, using
@@ -111,7 +110,7 @@ def scene(into: Path) -> Iterator[Row]:
     began = time.perf_counter()
     where = [f"data.export={into / 'scene'}", f"hydra.run.dir={into / 'make'}"]
     run = harness.open_run([*SCENE, "stage=prepare", *where])
-    run_stage(run.config, run.folder)
+    harness.run_stage(run.config, run.folder)
     yield {"seconds": time.perf_counter() - began, "views": run.scene.static.train.pixels.shape}
 
 
@@ -153,7 +152,7 @@ def learned(
         run = run_of(into, name, *overrides, f"stage={stage}", experiment=experiment)
         began = time.perf_counter()
         with Stopwatch(DEVICE) as watch:
-            run_stage(run.config, run.folder)
+            harness.run_stage(run.config, run.folder)
         seconds = time.perf_counter() - began
         peaks = torch.cuda.max_memory_allocated(), torch.cuda.max_memory_reserved()
         yield {"stage": stage, "all seconds": seconds, "bytes allocated, reserved": peaks}

@@ -22,14 +22,15 @@ import pandas as pd
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import OmegaConf, open_dict, read_write
+from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
+from devrf.cli import run as command
 from devrf.cli.complete import completed
 from devrf.cli.config import config_folder, register_config
 from devrf.cli.config_check import check_config
 from devrf.cli.context import RunContext
-from devrf.cli.run import run_stage
+from devrf.cli.run_folder import working_in
 from devrf.errors import DevrfError
 from devrf.ops.dispatch import using
 
@@ -76,9 +77,14 @@ def learned_scene(run: RunContext) -> LoadedCheckpoint:
             if not run.own_checkpoint(stage).exists():
                 config = run.config.copy()
                 config.stage = stage
-                run.folder.mkdir(parents=True, exist_ok=True)
                 run_stage(config, run.folder)
     return run.load()
+
+
+def run_stage(config: DictConfig, folder: Path) -> None:
+    """Take ``config.stage`` in a run's folder, in which no other process works meanwhile."""
+    with working_in(folder, config, "hydra.run.dir"):
+        command.run_stage(config, folder)
 
 
 def implementation(run: RunContext) -> AbstractContextManager[None]:

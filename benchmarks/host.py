@@ -22,7 +22,6 @@ from unittest.mock import patch
 
 import torch
 
-from devrf.cli.run import run_stage
 from devrf.engine.stage import ScheduledStage
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_stage import DeformationStage
@@ -97,11 +96,10 @@ def rows(folder: Path, iterations: int) -> Iterator[dict[str, Any]]:
             steps = [f"{key}.iterations_per_step={count}" for key in ("canonical", "deformation")]
             into = f"hydra.run.dir={folder / str(count)}"
             run = harness.open_run([*TINY, *lasts, *steps, f"stage={stage}", into])
-            run.folder.mkdir(parents=True, exist_ok=True)
             clock = Clock()
             with ExitStack() as stack:
                 clock.replaces(stack)
-                run_stage(run.config, run.folder)
+                harness.run_stage(run.config, run.folder)
             yield {
                 "stage": stage,
                 "iterations a step": count,
