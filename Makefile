@@ -5,8 +5,7 @@
 # make gpu-check    install into .venv and check what this machine's GPU does, in minutes;
 #                   with INSTALL_FIRST=no by $(PYTHON) and the packages that it has
 # make fuzz         what is too long for make test: the readers' fuzz tests with 100 000 inputs
-#                   (make test has 60), every launch of the kernels compiled for four GPUs, and
-#                   whole runs on a GPU that is not there
+#                   (make test has 60)
 # make format       format the code and mend what the linter can
 # make shell        a shell in which .venv is active
 # make clean        remove .venv and everything that tools leave behind
@@ -50,7 +49,7 @@ gpu-check: $(if $(filter no,$(INSTALL_FIRST)),,$(VENV)/.installed)
 	$(if $(filter no,$(INSTALL_FIRST)),PYTHONPATH=src:$(PYTHONPATH) $(PYTHON),$(BIN)/python) -m devrf stage=selfcheck
 
 fuzz: $(VENV)/.installed-dev
-	DEVRF_FUZZ_INPUTS=100000 DEVRF_ALL_LAUNCHES=1 $(PYTEST) tests/scenes/test_damaged_files.py tests/accel
+	DEVRF_FUZZ_INPUTS=100000 $(PYTEST) tests/scenes/test_damaged_files.py
 
 format: $(VENV)/.installed-dev
 	$(BIN)/ruff check --fix .

@@ -19,23 +19,18 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
-from importlib import import_module
 from importlib.metadata import distributions
-from itertools import product
 from pathlib import Path
 
-import kernels
 import rendering
 import torch
 import training
-from instruments import Row, Stopwatch, launched, timed_kernels
+from instruments import Row, Stopwatch
 from torch.profiler import profile
 
 from devrf import selfcheck
 from devrf.cli.context import RunContext
 from devrf.evaluation.held_out import background_value
-from devrf.ops import color_network
-from devrf.ops.dispatch import Kind, reaches, using
 from devrf.rendering.renderer import Renderer
 from devrf.system.device import wait
 from devrf.system.files import write_json
@@ -93,16 +88,15 @@ def said(command: list[str]) -> str:
 
 
 def checks(into: Path) -> Iterator[Row]:
-    """The self-check: a verdict for each kernel, capture, resume and picture."""
+    """The self-check: a verdict for each capture, resume and picture."""
     for name, verdict, figures in selfcheck.run_checks(DEVICE, 0):
         yield {"check": name, "verdict": verdict, "figures": figures}
 
 
 def tests(into: Path) -> Iterator[Row]:
-    """``pytest -m gpu`` of the kernels and graphs, where pytest is installed."""
-    command = ["env", "TRITON_INTERPRET=0", sys.executable, "-m", "pytest", "-q", "-m", "gpu"]
-    folders = (str(HERE.parents[1] / "tests" / name) for name in ("accel", "engine"))
-    yield {"tests": said([*command, "-p", "no:cacheprovider", *folders]).splitlines()[-60:]}
+    """``pytest -m gpu``, where pytest is installed."""
+    command = [sys.executable, "-m", "pytest", "-q", "-m", "gpu", "-p", "no:cacheprovider"]
+    yield {"tests": said([*command, str(HERE.parents[1] / "tests")]).splitlines()[-60:]}
 
 
 def scene(into: Path) -> Iterator[Row]:
@@ -112,36 +106,6 @@ def scene(into: Path) -> Iterator[Row]:
     run = harness.open_run([*SCENE, "stage=prepare", *where])
     harness.run_stage(run.config, run.folder)
     yield {"seconds": time.perf_counter() - began, "views": run.scene.static.train.pixels.shape}
-
-
-def operations(into: Path, block: int | None = None) -> Iterator[Row]:
-    """Each operation at the paper's size in both implementations, and what its kernels take.
-
-    With ``block`` the colour network alone, in blocks of so many samples, and ``decode`` beside it.
-    """
-    both = reaches(DEVICE)
-    if block is not None and both:
-        for name in ("color_layers", "color_network"):
-            module = import_module(f"devrf.accel.{name}")
-            module.BLOCK = type(module.BLOCK)(block)  # type: ignore[attr-defined]
-    side, rays, seconds = (160, 8192, 0.5) if GPU else (6, 4, 0.01)
-    for name, work in kernels.operations(side, rays, DEVICE).items():
-        if block is not None and not name.startswith("listed_colors"):
-            continue
-        found: dict[str, Row] = {}
-        row: Row = {"operation": name, "torch ms": kernels.milliseconds(work, "torch", seconds)}
-        if both:
-            with launched(found), using("triton"):
-                work()
-            row["triton ms"] = kernels.milliseconds(work, "triton", seconds)
-            row["off"] = kernels.difference(work)
-            if block is not None:
-                fused = color_network.WIDEST.copy()
-                color_network.WIDEST.clear()
-                row["decode ms"] = kernels.milliseconds(work, "triton", seconds)
-                color_network.WIDEST.update(fused)
-        yield row
-        yield from timed_kernels(work, found, DEVICE)
 
 
 def learned(
@@ -174,9 +138,8 @@ def parts(into: Path) -> Iterator[Row]:
 
     training.parts = noted
     stored, seconds = harness.learned_scene(run), 1.0 if GPU else 0.01
-    with harness.implementation(run):
-        for rows in (training.canonical_rows, training.deformation_rows):
-            yield from rows(run, stored, seconds)
+    for rows in (training.canonical_rows, training.deformation_rows):
+        yield from rows(run, stored, seconds)
     (into / "profile.txt").write_text("\n\n".join(tables))
 
 
@@ -186,16 +149,13 @@ def frames(into: Path) -> Iterator[Row]:
     began, stored = time.perf_counter(), harness.learned_scene(run)
     yield {"seconds to load and unpack": time.perf_counter() - began}
     views, background = run.scene.dynamic.test, background_value(run.scene.background)
-    kinds: tuple[Kind, ...] = ("auto", "torch")
-    for kind, half in product(kinds, (False, True)):
-        renderer = Renderer(stored.model, half=half)
-        with using(kind):
-            row = rendering.frames_a_second(renderer, views, min(5, len(views)), background)
-            with profile() as profiled:
-                renderer.view(views.cameras, 0, float(views.times[-1]), background)
-                wait(DEVICE)
-        on_device = [event for event in profiled.events() if event.device_type.name == "CUDA"]
-        yield {"kernels": kind, "half": half, **row, "launches": len(on_device)}
+    renderer = Renderer(stored.model)
+    row = rendering.frames_a_second(renderer, views, min(5, len(views)), background)
+    with profile() as profiled:
+        renderer.view(views.cameras, 0, float(views.times[-1]), background)
+        wait(DEVICE)
+    on_device = [event for event in profiled.events() if event.device_type.name == "CUDA"]
+    yield {**row, "launches": len(on_device)}
 
 
 TENTH = shortened(0, 2000, 20) if GPU else []
@@ -205,10 +165,8 @@ STEPS: dict[str, tuple[float, Callable[[Path], Iterator[Row]]]] = {
     "checks": (6, checks),
     "scene": (8, scene),
     "paper": (15, partial(learned, name="paper")),
-    "operations": (6, operations),
     "frames": (5, frames),
     "parts": (5, parts),
-    **{f"color-{size}": (2, partial(operations, block=size)) for size in (32, 64, 128)},
     **{
         name: (6, partial(learned, name=name, overrides=[*TENTH, *overrides]))
         for name, overrides in {
@@ -216,7 +174,6 @@ STEPS: dict[str, tuple[float, Callable[[Path], Iterator[Row]]]] = {
             "10-a-step": [f"{key}.iterations_per_step=10" for key in ("canonical", "deformation")],
             "frames-on-device": ["schedule.motion.store=device"],
             "without-graphs": ["graphs=off"],
-            "in-pytorch": ["kernels=torch"],
         }.items()
     },
     "tests": (6, tests),

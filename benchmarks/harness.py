@@ -14,7 +14,6 @@ import json
 import logging
 import platform
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +31,6 @@ from devrf.cli.config_check import check_config
 from devrf.cli.context import RunContext
 from devrf.cli.run_folder import working_in
 from devrf.errors import DevrfError
-from devrf.ops.dispatch import using
 
 
 def parser(description: str | None, *, overrides: bool = True) -> argparse.ArgumentParser:
@@ -85,11 +83,6 @@ def run_stage(config: DictConfig, folder: Path) -> None:
     """Take ``config.stage`` in a run's folder, in which no other process works meanwhile."""
     with working_in(folder, config, "hydra.run.dir"):
         command.run_stage(config, folder)
-
-
-def implementation(run: RunContext) -> AbstractContextManager[None]:
-    """A context with the run's ``kernels=``."""
-    return using(run.config.kernels)
 
 
 def report(rows: Sequence[dict[str, Any]], into: Path, device: torch.device, **about: Any) -> None:

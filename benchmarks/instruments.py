@@ -1,23 +1,19 @@
-"""Notes what a run does while it does it: launches of kernels, and seconds by what they go to."""
+"""Notes what a run does while it does it: seconds by what they go to."""
 
 from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from statistics import median
 from typing import Any
 
 import torch
-from launches import Tracing
-from torch.profiler import profile
 
 from devrf.callbacks import Meter
 from devrf.engine.stage import ScheduledStage
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.ops.dispatch import using
 from devrf.system.device import wait
 from devrf.system.graphs import CudaGraphCapture
 
@@ -34,47 +30,6 @@ TIMED = {
 }
 # Every so many replays of a graph are timed on the device.
 SAMPLED = 20
-
-
-@contextmanager
-def launched(found: dict[str, Row]) -> Iterator[None]:
-    """Note in ``found`` what each kernel takes, by its name and constants, and the MB it moves."""
-    from devrf.accel import blocks
-
-    usual, counted = blocks.run, Tracing()
-
-    def run(kernel: Any, programs: int, *args: Any, **constants: Any) -> None:
-        before, began = counted.count.moved, time.perf_counter()
-        handle = kernel[(programs,)](*args, **constants, enable_fp_fusion=True)
-        first = 1000 * (time.perf_counter() - began)  # compiles, unless it is in Triton's cache
-        counted.run(kernel, programs, *args, **constants)
-        name = kernel.fn.__name__
-        row = found.setdefault(f"{name} {constants}", {"kernel": name, "first ms": first})
-        row |= {"constants": str(constants), "MB": (counted.count.moved - before) / 1e6}
-        row |= {key: getattr(handle, key, None) for key in ("n_regs", "n_spills")}
-
-    blocks.run = run
-    try:
-        yield
-    finally:
-        blocks.run = usual
-
-
-def timed_kernels(
-    work: Callable[[], object], found: dict[str, Row], device: torch.device
-) -> Iterator[Row]:
-    """The rows of :func:`launched`, with microseconds by the profiler, and GB/s."""
-    if not found:
-        return
-    with profile() as profiled, using("triton"):
-        for _ in range(10):
-            work()
-        wait(device)
-    spent = {event.key: event.device_time_total / 10 for event in profiled.key_averages()}
-    for row in found.values():
-        row["us"] = spent.get(row["kernel"])
-        row["GB/s"] = 1000 * row["MB"] / row["us"] if row["us"] else None
-        yield row
 
 
 class Stopwatch:

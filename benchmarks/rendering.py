@@ -6,7 +6,7 @@ renders faster than a film in which each frame has another time.
 
 from __future__ import annotations
 
-from harness import implementation, learned_scene, open_run, parser, report
+from harness import learned_scene, open_run, parser, report
 
 # isort: split
 from statistics import median
@@ -33,11 +33,10 @@ def main() -> None:
         ways = {"float32": Renderer(model)}
         if run.device.type == "cuda":
             ways["float16 decoder"] = Renderer(model, half=True)
-        with implementation(run):
-            rows = [
-                {"decoder": name, **frames_a_second(renderer, views, given.views, background)}
-                for name, renderer in ways.items()
-            ]
+        rows = [
+            {"decoder": name, **frames_a_second(renderer, views, given.views, background)}
+            for name, renderer in ways.items()
+        ]
         into = given.json or run.folder / "benchmark_rendering.json"
         report(rows, into, run.device, scene=run.scene.name, overrides=given.overrides)
 
@@ -56,7 +55,7 @@ def frames_a_second(
             globals={"renderer": renderer, "camera": camera},
             num_threads=threads,
         )
-        renderer.view(*camera)  # compiles kernels
+        renderer.view(*camera)
         renderer.at.cache_clear()
         first.append(timer.timeit(1).median)
         again.append(timer.timeit(3).median)

@@ -6,7 +6,7 @@ the end of training; the run's checkpoints are not changed.
 
 from __future__ import annotations
 
-from harness import implementation, learned_scene, open_run, parser, report
+from harness import learned_scene, open_run, parser, report
 
 # isort: split
 import copy
@@ -47,9 +47,8 @@ def main() -> None:
     with report_user_errors():
         run = open_run(given.overrides)
         stored = learned_scene(run)
-        with implementation(run):
-            rows = canonical_rows(run, stored, given.seconds)
-            rows += deformation_rows(run, stored, given.seconds)
+        rows = canonical_rows(run, stored, given.seconds)
+        rows += deformation_rows(run, stored, given.seconds)
         into = given.json or run.folder / "benchmark_training.json"
         report(rows, into, run.device, scene=run.scene.name, overrides=given.overrides)
 

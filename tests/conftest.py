@@ -6,10 +6,8 @@ import copy
 import gc
 import json
 import logging
-import os
 import re
 import signal
-import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -18,9 +16,6 @@ from typing import Any
 
 import devrf  # noqa: F401 - before Lightning: an unusable torchvision ends no test
 
-# Before torch, which loads Triton: Triton decides then whether its interpreter runs kernels.
-# TRITON_INTERPRET=0 in the environment runs the tests of the kernels on a GPU instead.
-os.environ.setdefault("TRITON_INTERPRET", "1")
 # A shell without job control starts what is in the background with SIGINT ignored, and so would
 # be every command that a test starts.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
@@ -75,42 +70,6 @@ def single_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
-
-
-@pytest.fixture(scope="session", autouse=True)
-def quick_interpreter() -> Iterator[None]:
-    """Triton's interpreter, in a quarter of its time.
-
-    It prepares its language anew for each call of a function within a kernel, though the kernel
-    has, or for functions of its own the first call; it lists the types of numbers each time it
-    looks one up; and it looks for overflow wherever numbers are added, which places in small grids
-    cannot come to.
-    """
-    interpreter = sys.modules.get("triton.runtime.interpreter")
-    if interpreter is None:
-        yield
-        return
-    function, builder = interpreter.InterpretedFunction, interpreter.interpreter_builder
-    usual, type_of = function.__call__, interpreter._get_np_dtype
-    prepared: set[Any] = set()
-    types: dict[str, Any] = {}
-
-    def call(self: Any, *args: Any, **constants: Any) -> Any:
-        if self.fn.__module__.startswith("triton.") and self.fn not in prepared:
-            prepared.add(self.fn)
-            return usual(self, *args, **constants)
-        return self.rewrite()(*args, **constants)
-
-    def known_type(asked: Any) -> Any:
-        if asked.name not in types:
-            types[asked.name] = type_of(asked)
-        return types[asked.name]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(function, "__call__", call)
-        patch.setattr(interpreter, "_get_np_dtype", known_type)
-        patch.setattr(builder, "options", replace(builder.options, sanitize_overflow=False))
-        yield
 
 
 @pytest.fixture(scope="session", autouse=True)

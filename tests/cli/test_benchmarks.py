@@ -70,11 +70,6 @@ def test_rendering_learns_first_what_no_checkpoint_has(benchmark, tmp_path, tiny
     assert (tmp_path / "run" / "checkpoints" / "deformation.ckpt").exists()
 
 
-def test_every_operation(benchmark):
-    found = benchmark("kernels", "--side=6", "--rays=4", "--seconds=0.01")
-    assert len(found["rows"]) == 12 and all(row["torch ms"] > 0 for row in found["rows"])
-
-
 def test_the_report_of_a_gpu_records_what_fails_and_goes_on(monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(FOLDER)
     report = importlib.import_module("gpu_report")

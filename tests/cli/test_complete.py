@@ -201,7 +201,7 @@ def test_mistakes_in_a_recognised_scene(devrf, tmp_path, scenes, arguments, said
     [
         ("devrf seed=1 stage=fe", "stage=fetch"),
         ("devrf stage=fetch scene=", "scene=fox"),
-        ("devrf kernels=", "kernels=triton"),
+        ("devrf decoder_precision=f", "decoder_precision=float32"),
         ("devrf resume=", "resume=true resume=false"),
         (
             "devrf export.content=",

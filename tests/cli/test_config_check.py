@@ -41,7 +41,6 @@ ckpt: null
 scene: robot
 method: devrf
 objective: dynamic.psnr
-kernels: auto
 graphs: auto
 decoder_precision: auto
 sizes: {{inner: {{_target_: {__name__}.Inner, size: 2}}}}

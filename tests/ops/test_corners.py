@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from devrf.geometry.box import Box
-from devrf.ops.corners import axes_of, to_grid
+from devrf.ops.corners import to_grid
 
 BOX = Box((-1.1, 0.3, -0.7), (0.9, 2.2, 1.3))
 SHAPE = (7, 160, 33)
@@ -16,13 +16,6 @@ SHAPE = (7, 160, 33)
 def test_is_what_the_box_says_to_the_bit(rng: torch.Generator, dtype: torch.dtype) -> None:
     points = torch.randn(500, 3, generator=rng, dtype=dtype)
     assert torch.equal(to_grid(points, BOX, SHAPE), BOX.to_grid(points, SHAPE))
-    # The kernels are given these numbers, and work in float32.
-    single = points.float()
-    low, scale, number = axes_of(BOX, torch.empty(SHAPE)).view(3, 3)
-    assert torch.equal((single - low) * scale, BOX.to_grid(single, SHAPE))
-    assert number.tolist() == list(SHAPE)
-    # Without a box positions are in units of the grid.
-    assert axes_of(None, torch.empty(2, 3, 4, 5)).tolist() == [0, 0, 0, 1, 1, 1, 2, 3, 4]
 
 
 def test_corners_by_hand() -> None:

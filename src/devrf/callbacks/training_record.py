@@ -10,7 +10,6 @@ from lightning import Callback, LightningModule, Trainer
 
 from devrf.callbacks.curves import Previews
 from devrf.engine.stage import ScheduledStage
-from devrf.ops.dispatch import triton_runs
 from devrf.system.device import wait
 
 
@@ -21,22 +20,16 @@ class TrainingRecord(Callback):
         self._stage: ScheduledStage | None = None
         self._seconds_before = 0.0
         self._peaks_before: tuple[float, float] | None = None
-        self._startup = 0.0
-        self._kernels = "torch"
         self._device: torch.device | None = None
         self._previews: list[Previews] = []
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Check and compile the kernels before the stage is set up, which starts the clock."""
+        """Note the stage, and what its clock leaves out."""
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
         self._previews = [other for other in callbacks if isinstance(other, Previews)]
         assert isinstance(pl_module, ScheduledStage)
         self._stage = pl_module
         self._device = trainer.strategy.root_device
-        before = time.perf_counter()
-        if triton_runs(torch.zeros(1, device=self._device)):
-            self._kernels = "triton"
-        self._startup = time.perf_counter() - before
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the memory's high-water mark; the clock runs since the stage's own setup."""
@@ -69,9 +62,6 @@ class TrainingRecord(Callback):
             "peak_gpu_gb": allocated,
             "peak_reserved_gb": reserved,
             "num_rollbacks": pl_module.num_rollbacks,
-            # Without lists of fixed length, as in contracted space, PyTorch runs the hot path.
-            "kernels": self._kernels if pl_module.loop.capacities else "torch",
-            "startup_seconds": round(self._startup, 2),
             "graph_captures": pl_module.loop.num_captures,
             "short_lists": pl_module.loop.num_short_lists,
         }

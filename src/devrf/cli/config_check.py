@@ -32,7 +32,6 @@ ROOT: dict[str, Any] = {
     "ckpt": str | Path | None,
     "objective": str,
     "scene": str,
-    "kernels": Literal["auto", "torch", "triton"],
     "graphs": Literal["auto", "off"],
     "decoder_precision": Literal["auto", "float32", "bfloat16"],
 }

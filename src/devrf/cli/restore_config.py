@@ -42,7 +42,7 @@ log = logging.getLogger(__name__)
 
 # What says what to do with a run, on which machine, and what to log, not what the run is.
 OF_A_COMMAND = {"stage", "ckpt", "resume", "memory_check", "objective", "hparams_search"}
-OF_A_COMMAND |= {"hydra", "report", "still", "export", "trainer", "logger", "callbacks", "kernels"}
+OF_A_COMMAND |= {"hydra", "report", "still", "export", "trainer", "logger", "callbacks"}
 OF_A_COMMAND |= {"viewer", "fetch", "capture", "selfcheck", "scene", "defaults"}
 # Where a command writes.
 PLACES = {"data.export", "data.flow_cache"}

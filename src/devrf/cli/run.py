@@ -35,7 +35,6 @@ from devrf.engine.ddp import ManualDDP
 from devrf.engine.workers import launch_workers
 from devrf.errors import DevrfError
 from devrf.evaluation.objective import check_objective, objective
-from devrf.ops.dispatch import using
 from devrf.system.folder_lock import PLACE
 from devrf.system.memory import shortage_in_words
 
@@ -184,7 +183,7 @@ def _take(run: RunContext, name: str, step: Step) -> None:
     seed_everything(run.config.seed, verbose=False)
     rays = f"schedule.{name}.rays"
     known = OmegaConf.select(run.config, rays) is not None
-    with using(run.config.kernels), shortage_in_words(name, run.device, rays if known else None):
+    with shortage_in_words(name, run.device, rays if known else None):
         files = step(run)
     note_done(run, name, files)
     run.step_began = time.perf_counter()

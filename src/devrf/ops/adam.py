@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from devrf.ops.adam_step import AdamRule, adam_steps, add_total_variation_gradient
+from devrf.ops.adam_step import AdamRule, adam_step, add_total_variation_gradient
 
 
 class GridAdam(torch.optim.Optimizer):
@@ -114,9 +114,10 @@ class GridAdam(torch.optim.Optimizer):
                 how = {name: group[name] for name in ("along_z", "touched_only")}
                 for values, gradient, *_ in taken:
                     add_total_variation_gradient(values, gradient, group["smoothing"], **how)
-            rules = [AdamRule(rate, step, **options) for *_, step in taken]
             kept = self._keeps(group)
-            adam_steps([four for *four, _ in taken], rules, clear=kept)
+            for values, gradient, mean, square, step in taken:
+                rule = AdamRule(rate, step, **options)
+                adam_step(values, gradient, mean, square, rule, clear=kept)
             for parameter in () if kept else parameters:
                 parameter.grad = None
 

@@ -7,13 +7,10 @@ present values.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-
-from devrf.ops.dispatch import accelerated
 
 
 @dataclass(frozen=True)
@@ -62,41 +59,12 @@ def adam_step(
         rule: the settings.
         clear: whether to set the gradient to zero afterwards.
     """
-    tensors = (values, gradient, mean, square)
-    contiguous = all(tensor.is_contiguous() for tensor in tensors)
-    if contiguous and (kernels := accelerated("adam", *tensors)):
-        kernels.adam_step(*tensors, rule, clear=clear)
-        return
     if rule.skip_zero:
         _step_touched(values, gradient, mean, square, rule, clear)
         return
     _step(values, gradient, mean, square, rule)
     if clear:
         gradient.zero_()
-
-
-def adam_steps(
-    tensors: Sequence[Sequence[Tensor]], rules: Sequence[AdamRule], *, clear: bool = True
-) -> None:
-    """As :func:`adam_step` for each of several tensors, whose rules differ in ``step`` alone.
-
-    Triton steps a network's weights in a single launch, unless a rule has options, or gradients are
-    made anew at each step: their addresses are kept.
-
-    Args:
-        tensors: values, gradient and both moments of each.
-        rules: the settings of each.
-        clear: whether to set the gradients to zero afterwards.
-    """
-    every = [tensor for four in tensors for tensor in four]
-    weights = all(tensor.dim() < 3 and tensor.is_contiguous() for tensor in every)
-    plain = all(not rule.skip_zero and rule.per_voxel_lr is None for rule in rules)
-    several = len(tensors) > 1 and weights and plain and clear
-    if several and (kernels := accelerated("adam", *every)):
-        kernels.adam_steps(tensors, rules)
-        return
-    for (values, gradient, mean, square), rule in zip(tensors, rules, strict=True):
-        adam_step(values, gradient, mean, square, rule, clear=clear)
 
 
 def add_total_variation_gradient(
@@ -121,10 +89,6 @@ def add_total_variation_gradient(
         along_z: further factor between neighbours along z.
         touched_only: add only to entries that are not zero.
     """
-    contiguous = grid.is_contiguous() and gradient.is_contiguous()
-    if contiguous and (kernels := accelerated("adam", grid, gradient)):
-        kernels.add_total_variation_gradient(grid, gradient, weight, along_z, touched_only)
-        return
     into = torch.zeros_like(gradient) if touched_only else gradient
     for axis in range(3):
         after, before = _neighbours(grid, axis)

@@ -1,7 +1,6 @@
 """The colour network: interpolated features and viewing directions → RGB.
 
-See docs/method.md#colour. In one pass over listed samples where Triton runs, without what lies
-between its layers: the backward pass computes that once more.
+See docs/method.md#colour.
 """
 
 from __future__ import annotations
@@ -12,13 +11,6 @@ import torch
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 from torch.nn.functional import linear
-
-from devrf.ops.corners import Corners, axes_of, shape_of, to_grid
-from devrf.ops.dispatch import accelerated
-from devrf.ops.trilinear import interpolate, kept_gradient
-
-# The widest hidden layers that a program's registers have room for.
-WIDEST = {torch.float32: 32, torch.bfloat16: 128, torch.float16: 128}
 
 
 class ColorNetwork(NamedTuple):
@@ -43,44 +35,6 @@ class ColorNetwork(NamedTuple):
     output_weight: Tensor
     output_bias: Tensor
     octaves: Tensor
-
-
-def listed_colors(
-    grid: Tensor,
-    points: Tensor,
-    box: Corners,
-    viewdirs: Tensor,
-    ray: Tensor,
-    first: Tensor,
-    network: ColorNetwork,
-    precision: torch.dtype = torch.float32,
-) -> Tensor:
-    """RGB (S, 3) in [0, 1] of samples in a list of fixed length; anything finite in its padding.
-
-    Gradients of the grid and of the network that exist already are added to in place.
-
-    Args:
-        grid: (X, Y, Z, C) features.
-        points: (S, 3) positions in the box's units.
-        box: the box of the grid.
-        viewdirs: (R, 3) unit directions of the rays, in world space.
-        ray: (S,) int64, the ray of each sample.
-        first: (R + 1,) where each ray's samples begin; places from first[R] on are padding.
-        network: the network; what of it needs no gradient gets none.
-        precision: as for :func:`decode`.
-    """
-    # Triton's interpreter, the one that runs on a CPU, cannot multiply bfloat16.
-    multiplied = precision != torch.bfloat16 or points.device.type != "cpu"
-    learned = grid, *network[:7]
-    suits = multiplied and len(network.hidden_bias) <= WIDEST.get(precision, 0)
-    if suits and (kernels := accelerated("color_network", points, viewdirs, *learned)):
-        known = points, grid, axes_of(box, grid), viewdirs, network.octaves, ray, first
-        accumulated = [kept_gradient(leaf) for leaf in learned]
-        colors: Tensor = kernels.listed_colors(*known, precision, accumulated, *network[:7])
-        return colors
-    coords = to_grid(points, box, shape_of(grid))
-    features = interpolate(grid, coords, gradient=kept_gradient(grid))
-    return decode(features, viewdirs, ray, network, precision)
 
 
 def decode(

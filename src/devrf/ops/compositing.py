@@ -15,8 +15,6 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from devrf.ops.dispatch import accelerated
-
 
 def composite(depth: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
     """Weights of samples, and each ray's transmittance behind them (Max 1995).
@@ -32,8 +30,6 @@ def composite(depth: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
     Returns:
         weights (S,) and end transmittance (R,), differentiable once in ``depth``.
     """
-    if accelerated("compositing", depth):
-        return composite_segments(depth, firsts(ray, rays))
     weights, end = _Composite.apply(depth, ray, rays)  # type: ignore[no-untyped-call]
     return weights, end
 
@@ -50,9 +46,6 @@ def composite_segments(depth: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
         weights (S,), zero in the padding, and end transmittance (R,), differentiable once in
         ``depth``.
     """
-    if kernels := accelerated("compositing", depth):
-        weights, end = kernels.composite_segments(depth, first)
-        return weights, end
     rays = len(first) - 1
     ray = _rays_of(first, len(depth))
     # Padding forms one more ray, of zero depth.
@@ -63,8 +56,6 @@ def composite_segments(depth: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
 
 def sum_segments(weights: Tensor, values: Tensor, first: Tensor) -> Tensor:
     """Sums (R, C) of ``w_i · c_i`` over each ray's samples, without the padding.
-
-    Plain PyTorch on all devices: :func:`composite_colors` has a kernel of its own.
 
     Args:
         weights: (S,) w.
@@ -100,12 +91,6 @@ def composite_colors(
         Colour (R, 3), differentiable once in ``weights``, ``colors`` and ``transmittance``, and
         depth (R,), which is not differentiable.
     """
-    floats = weights, colors, distance, transmittance, background
-    if kernels := accelerated("compositing", *floats):
-        image, depth = kernels.composite_colors(
-            weights, colors, distance, first, transmittance, background
-        )
-        return image, depth
     weighted_color = sum_segments(weights, colors, first)
     with torch.no_grad():
         along = torch.stack([distance, torch.ones_like(distance)], dim=1)
@@ -114,10 +99,7 @@ def composite_colors(
 
 
 def transmittances(depth: Tensor, ray: Tensor, rays: int) -> Tensor:
-    """Transmittance T_i (S,) before each sample; arguments as for :func:`composite`.
-
-    Plain PyTorch on all devices: Triton's search computes it itself.
-    """
+    """Transmittance T_i (S,) before each sample; arguments as for :func:`composite`."""
     first = firsts(ray, rays)[:-1]
     reached = running_sum(depth)
     return torch.exp(reached[first[ray]] - reached[:-1]).to(depth.dtype)
@@ -126,7 +108,7 @@ def transmittances(depth: Tensor, ray: Tensor, rays: int) -> Tensor:
 def sum_by_ray(values: Tensor, ray: Tensor, rays: int) -> Tensor:
     """Sums (R, C) or (R,) of per-sample ``values`` (S, C) or (S,) over each ray.
 
-    Plain PyTorch on all devices: it is a single kernel. ``ray`` need not ascend.
+    ``ray`` need not ascend.
     """
     return values.new_zeros((rays, *values.shape[1:])).index_add(0, ray, values)
 

@@ -38,18 +38,6 @@ def to_grid(points: Tensor, box: Corners, shape: Shape) -> Tensor:
     return (points - low) * scale
 
 
-def axes_of(box: Corners | None, grid: Tensor) -> Tensor:
-    """What kernels know of a grid (X, Y, Z) or (X, Y, Z, C) that fills a box, float32 (9,).
-
-    For x, y, z the low corner, then the grid points per unit of length, then their number. Without
-    a box positions are in units of the grid.
-    """
-    x, y, z = shape_of(grid)
-    if box is None:
-        return _axes((0.0, 0.0, 0.0), (x - 1.0, y - 1.0, z - 1.0), (x, y, z), grid.device)
-    return _axes(box.low, box.high, (x, y, z), grid.device)
-
-
 def shape_of(grid: Tensor) -> Shape:
     """Grid points along x, y, z of a grid (X, Y, Z) or (X, Y, Z, C)."""
     x, y, z = grid.shape[:3]
@@ -66,10 +54,3 @@ def _on_device(
         corner, points = torch.tensor(low, dtype=dtype), torch.tensor(shape, dtype=dtype)
         scale = (points - 1) / (torch.tensor(high, dtype=dtype) - corner)
         return corner.to(device), scale.to(device)
-
-
-@cache
-def _axes(low: Triple, high: Triple, shape: Shape, device: torch.device) -> Tensor:
-    corner, scale = _on_device(low, high, shape, torch.float32, torch.device("cpu"))
-    with torch.inference_mode(False):
-        return torch.cat([corner, scale, torch.tensor(shape, dtype=torch.float32)]).to(device)

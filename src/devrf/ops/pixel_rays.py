@@ -1,7 +1,7 @@
 """From drawn pixels to their rays and what the images show there; and a ray's steps in a box.
 
-Each in one launch where Triton runs. :func:`devrf.engine.batches.gather_batch` is made of the
-first; the second gives what :func:`devrf.rendering.sampling.steps_through` gives.
+:func:`devrf.engine.batches.gather_batch` is made of the first; the second gives what
+:func:`devrf.rendering.sampling.steps_through` gives.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from devrf.ops.corners import Corners
-from devrf.ops.dispatch import accelerated
 
 
 class GatheredPixels(NamedTuple):
@@ -70,14 +69,6 @@ def gather_pixels(
         frames: (N,) int64, of the images.
         flow: vectors (N, H, W, 2) and whether they are valid (N, H, W), or None.
     """
-    large = [pixels, *(flow or ())]
-    contiguous = all(table.is_contiguous() for table in large)
-    if contiguous and (kernels := accelerated("pixel_rays", poses, focal, center, times)):
-        return GatheredPixels(
-            *kernels.gather_pixels(
-                image, flat, pixels, poses, focal, center, background, times, frames, flow
-            )
-        )
     _, height, width, channels = pixels.shape
     pixel = torch.stack([flat % width, flat // width], dim=-1) + 0.5
     row = image * (height * width) + flat
@@ -113,11 +104,6 @@ def steps_in_box(
         near: distance before which nothing is sampled.
         far: distance behind which nothing is sampled.
     """
-    entry: Tensor
-    if kernels := accelerated("pixel_rays", origins, directions):
-        corners, limits = (box.low, box.high), (step, near, far)
-        entry, count = kernels.steps_in_box(origins, directions, corners, limits)
-        return entry, count
     low, high = (origins.new_tensor(corner) for corner in (box.low, box.high))
     d = torch.where(directions.abs() < 1e-9, torch.full_like(directions, 1e-9), directions)
     to_low, to_high = (low - origins) / d, (high - origins) / d

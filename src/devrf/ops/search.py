@@ -7,7 +7,7 @@ never waits for the device, and can be captured in a CUDA graph.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -15,8 +15,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from devrf.ops.compositing import transmittances
-from devrf.ops.corners import Corners, axes_of, shape_of, to_grid
-from devrf.ops.dispatch import accelerated
+from devrf.ops.corners import Corners, shape_of, to_grid
 from devrf.ops.warped_depth import warped_depth
 
 
@@ -118,7 +117,7 @@ def find_samples(
     A sample is kept if the grid point nearest to it is occupied, its opacity is no less than
     ``thresholds.alpha``, and the transmittance before it, over the samples in front of it that
     pass both tests, is no less than ``thresholds.stop``. It is significant if also its weight is
-    no less than ``thresholds.weight``. Without gradients; Triton does not wait for the device.
+    no less than ``thresholds.weight``. Without gradients.
 
     Args:
         origins: (R, 3) of rays in the box's units.
@@ -142,14 +141,6 @@ def find_samples(
     Returns:
         The samples; ``overflow`` is True if ``capacity`` or ``longest`` was too small.
     """
-    if kernels := accelerated("search", origins, directions, entry, density, *slices):
-        grids = axes_of(box, slices[0] if slices else density), axes_of(box, density)
-        numbers = step, weight, shift, delta, *astuple(thresholds)
-        ray, distance, points, significant, first, total = kernels.find_samples(
-            *((origins, directions, entry, count), mask, density, slices),
-            *((axes_of(mask_box, mask), *grids), numbers, longest, capacity),
-        )
-        return PackedSamples(ray, distance, points, significant, first, total, count, longest)
     rays = len(origins)
     samples = count.clamp(max=longest)
     ray = torch.repeat_interleave(samples)
@@ -205,10 +196,6 @@ def select_listed(
         The new list, differentiable once in ``canonical`` and ``weight``.
     """
     rays = len(packed.first) - 1
-    floats = packed.distance, packed.points, canonical, weight
-    if capacity <= len(packed.ray) and (kernels := accelerated("selection", *floats)):
-        listed = packed.ray, packed.distance, packed.points, packed.significant, packed.first
-        return ListedSubset(*kernels.select_listed(canonical, weight, listed, capacity))
     if capacity > len(packed.ray):
         raise ValueError(f"{capacity} of {len(packed.ray)} samples cannot be selected")
     flags, running = packed.significant, pad(packed.significant.cumsum(0), (1, 0))

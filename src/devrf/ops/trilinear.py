@@ -14,8 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import embedding_bag
 
-from devrf.ops.corners import Shape, axes_of, shape_of
-from devrf.ops.dispatch import accelerated
+from devrf.ops.corners import Shape, shape_of
 
 Pair = tuple[Tensor, Tensor]
 
@@ -37,11 +36,7 @@ def interpolate(grid: Tensor, coords: Tensor, *, gradient: Tensor | None = None)
     Returns:
         (M, C), differentiable once in ``grid`` and ``coords``.
     """
-    values: Tensor
-    if kernels := accelerated("trilinear", grid, coords):
-        values = kernels.interpolate(grid, coords, axes_of(None, grid), gradient)
-        return values
-    values = _Interpolate.apply(grid, coords, gradient)  # type: ignore[no-untyped-call]
+    values: Tensor = _Interpolate.apply(grid, coords, gradient)  # type: ignore[no-untyped-call]
     return values
 
 

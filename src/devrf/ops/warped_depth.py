@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from devrf.errors import DevrfError
-from devrf.ops.corners import Corners, axes_of, shape_of, to_grid
-from devrf.ops.dispatch import accelerated
+from devrf.ops.corners import Corners, shape_of, to_grid
 from devrf.ops.trilinear import interpolate
 
 
@@ -54,13 +53,6 @@ def warped_depth(
         shapes = ", ".join(str(tuple(frame.shape)) for frame in slices)
         raise DevrfError(f"warp: expected at most two slices of one shape, not {shapes}")
     into: list[Tensor | None] = [*slice_gradients] or [None] * len(slices)
-    q: Tensor
-    tau: Tensor
-    if kernels := accelerated("warped_depth", points, density, *slices):
-        axes = axes_of(box, slices[0] if slices else density), axes_of(box, density)
-        numbers, accumulated = (weight, shift, delta), (density_gradient, *into)
-        q, tau = kernels.warped_depth(points.detach(), axes, numbers, accumulated, density, *slices)
-        return q, tau
     q = points = points.detach()
     if slices:
         coords = to_grid(points, box, shape_of(slices[0]))

@@ -1,7 +1,6 @@
 """Renders on lists of fixed length, so that nothing waits for the device.
 
-Gives what :func:`devrf.methods.devrf.volume_rendering.render` gives. CUDA graphs need it, and
-Triton's kernels make it fast; their plain PyTorch twins give the same, more slowly.
+Gives what :func:`devrf.methods.devrf.volume_rendering.render` gives. CUDA graphs need it.
 """
 
 from __future__ import annotations
@@ -57,7 +56,6 @@ class VoxelField(Protocol):
         ray: Tensor,
         precision: torch.dtype = torch.float32,
         residual: Tensor | None = None,
-        first: Tensor | None = None,
     ) -> Tensor:
         """RGB (S, 3) at ``points`` (S, 3) on rays ``ray`` (S,) with ``viewdirs`` (R, 3)."""
 
@@ -119,7 +117,7 @@ def render_static(
         canonical, weight = chosen.canonical, chosen.weight
     with span("decoder"):
         residual = None if color_change is None else color_change(canonical)
-        color = field.rgb(canonical, rays.viewdirs, samples.ray, precision, residual, chosen.first)
+        color = field.rgb(canonical, rays.viewdirs, samples.ray, precision, residual)
     with span("compositing"):
         listed = weight, color, samples.distance, chosen.first
         image, depth = composite_colors(*listed, transmittance, background)

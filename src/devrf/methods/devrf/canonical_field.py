@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from devrf.checkpoints.stored_grids import StoredShape
 from devrf.geometry.box import Box
-from devrf.ops.color_network import ColorNetwork, decode, listed_colors
+from devrf.ops.color_network import ColorNetwork, decode
 from devrf.ops.corners import shape_of, to_grid
 from devrf.ops.trilinear import interpolate, kept_gradient, resample
 
@@ -223,16 +223,11 @@ class CanonicalField(nn.Module):
         ray: Tensor,
         precision: torch.dtype = torch.float32,
         residual: Tensor | None = None,
-        first: Tensor | None = None,
     ) -> Tensor:
         """RGB (S, 3) at ``points`` (S, 3) on rays ``ray`` (S,) with ``viewdirs`` (R, 3).
 
-        ``residual`` (S, 3) is added before the sigmoid. With ``first`` (R + 1,), where each ray's
-        samples begin, the samples may end in padding, whose colours mean nothing.
+        ``residual`` (S, 3) is added before the sigmoid.
         """
-        if first is not None and residual is None and isinstance(self.decoder, ColorDecoder):
-            looked_up = self.color.values, points, self.box, viewdirs, ray, first
-            return listed_colors(*looked_up, self.decoder.network, precision)
         features = self.color(points, self.box)
         color: Tensor = self.decoder(features, viewdirs, ray, precision, residual)
         return color

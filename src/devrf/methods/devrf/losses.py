@@ -12,20 +12,15 @@ from devrf.data.batch import RayBatch
 from devrf.errors import expect
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
-from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.space import WORLD, Space
-from devrf.methods.devrf.deformation_field import GridWarp
 from devrf.methods.devrf.volume_rendering import Warp
 from devrf.methods.weighted_loss import visibility, weighted_sum
-from devrf.ops.dispatch import triton_runs
-from devrf.ops.motion import ListedSamples, SeenEarlier, cycle_error, flow_error, motion_sum
+from devrf.ops.motion import cycle_error, flow_error
 from devrf.ops.photometric import (
-    TERMS,
     alpha_mask_error,
     background_entropy,
     color_error,
     per_sample_color,
-    photometric_sum,
 )
 from devrf.rendering.output import VoxelOutput
 
@@ -170,83 +165,5 @@ def batch_loss(
     weights: Mapping[str, float],
 ) -> Weighted:
     """Σ weight · term () over ``weights``; each term's value and how much rays hit, detached."""
-    sums = _sums_by_kernels(prediction, weights)
-    known = {name for _, values in sums for name in values}
-    others = {name: terms[name](prediction) for name in weights if name not in known}
-    if others:
-        sums.append(weighted_sum(others, weights))
-    total, values = sums[0]
-    for further_total, further in sums[1:]:
-        total, values = total + further_total, values | further
-    if "opacity" not in values:
-        values |= visibility(prediction.output.transmittance, prediction.batch.alpha)
-    return total, values
-
-
-def _sums_by_kernels(prediction: Prediction, weights: Mapping[str, float]) -> list[Weighted]:
-    """What kernels sum: terms of this file, where Triton runs and lists have a fixed length."""
-    output = prediction.output
-    if output.first is None or not triton_runs(output.color, output.sample_color):
-        return []
-    sums = [_photometric_sum(prediction, output.first, weights)]
-    if isinstance(prediction, MotionPrediction) and not {"cycle", "flow"}.isdisjoint(weights):
-        sums.append(_motion_sum(prediction, weights))
-    return sums
-
-
-def _photometric_sum(
-    prediction: Prediction, first: Tensor, weights: Mapping[str, float]
-) -> Weighted:
-    """The photometric terms of lists in which ray r begins at ``first[r]``, in one kernel."""
-    output, batch = prediction.output, prediction.batch
-    # The colour's error through a warp is called render.
-    names = ["render" if term == "color" and "render" in weights else term for term in TERMS]
-    computed = photometric_sum(
-        output.color,
-        output.transmittance,
-        output.weight,
-        output.sample_color,
-        first,
-        batch.color,
-        batch.alpha,
-        [weights.get(name, 0.0) for name in names],
-    )
-    each = zip(names, computed.terms.unbind(), strict=True)
-    values = {name: value for name, value in each if name in weights}
-    values["opacity"] = computed.opacity
-    if computed.coverage is not None:
-        values["coverage"] = computed.coverage
-    return computed.total, values
-
-
-def _motion_sum(prediction: MotionPrediction, weights: Mapping[str, float]) -> Weighted:
-    """Cycle and flow in one kernel; lists of fixed length are warped by one grid of each frame."""
-    output, batch, cameras = prediction.output, prediction.batch, prediction.cameras
-    samples, space, before = output.samples, prediction.space, prediction.unwarp_previous
-    assert samples.present is not None and isinstance(before, GridWarp)
-    seen = None
-    if "flow" in weights and batch.flow is not None and batch.flow_valid is not None:
-        seen = SeenEarlier(
-            batch.flow,
-            batch.flow_valid,
-            batch.pixel,
-            batch.image,
-            prediction.previous_image,
-            cameras.camera_to_world,
-            cameras.focal,
-            cameras.center,
-        )
-    computed = motion_sum(
-        ListedSamples(
-            samples.points, output.canonical, output.weight, samples.ray, samples.present
-        ),
-        prediction.forward_slice,
-        before.slices[0],
-        seen,
-        (weights.get("cycle", 0.0), weights.get("flow", 0.0)),
-        box=prediction.box,
-        over_samples=prediction.flow_mean == "samples",
-        ndc=(*space.slopes, space.near) if isinstance(space, NormalizedDevice) else None,
-    )
-    values = zip(("cycle", "flow"), computed.terms.unbind(), strict=True)
-    return computed.total, {name: value for name, value in values if name in weights}
+    total, values = weighted_sum({name: terms[name](prediction) for name in weights}, weights)
+    return total, values | visibility(prediction.output.transmittance, prediction.batch.alpha)

@@ -23,7 +23,6 @@ from devrf.methods.devrf.deformation_field import DeformationField, deformed_occ
 from devrf.methods.devrf.view import CanonicalSurface, DeVRFView
 from devrf.methods.devrf.volume_rendering import Warp
 from devrf.ops.corners import shape_of
-from devrf.rendering.list_rendering import ListRenderer
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import ColorChange
 from devrf.rendering.sampling import RenderSettings
@@ -70,7 +69,6 @@ class DeVRFModel(Renderable):
         self.deformation = deformation
         self.color_residual = color_residual
         self.space = space
-        self._lists: dict[bool, ListRenderer] = {}
 
     @property
     def box(self) -> Box:  # type: ignore[override]
@@ -132,11 +130,15 @@ class DeVRFModel(Renderable):
 
     def at(self, time: float, *, half: bool = False) -> DeVRFView:
         """The scene at ``time``: its occupancy and its displacements, ready."""
-        present, lists = (self.canonical, self.settings), self._lists.get(half)
-        if lists is None or (lists.field, lists.settings) != present:
-            lists = self._lists[half] = ListRenderer(*present, half=half)
-        fields = self.canonical, self.occupancy, self.settings, self.deformation, self.space
-        return DeVRFView(*fields, time, lists, self.color_change(time))
+        return DeVRFView(
+            self.canonical,
+            self.occupancy,
+            self.settings,
+            self.deformation,
+            self.space,
+            time,
+            self.color_change(time),
+        )
 
     def surface(self) -> CanonicalSurface:
         """The canonical field."""

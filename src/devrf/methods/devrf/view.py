@@ -16,28 +16,18 @@ from devrf.methods.devrf.deformation_field import DeformationField, GridWarp, de
 from devrf.methods.devrf.losses import induced_flow
 from devrf.methods.devrf.volume_rendering import render
 from devrf.ops.compositing import sum_by_ray
-from devrf.ops.dispatch import triton_runs
 from devrf.ops.trilinear import resample
 from devrf.rendering.front_to_back import picture
-from devrf.rendering.list_rendering import ListRenderer
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import ColorChange, RenderedImage
 from devrf.rendering.sampling import RenderSettings
 
 # Rays at once: on a CPU what its caches hold (in unbounded scenes a ray has tens of samples to
 # colour), on a GPU what keeps it busy and fits.
-ON_CPU, UNBOUNDED_ON_CPU, ON_GPU, IN_LISTS = 8192, 4096, 2**15, 2**18
+ON_CPU, UNBOUNDED_ON_CPU, ON_GPU = 8192, 4096, 2**15
 # Samples of unbounded scenes' pictures are so much further apart than while they are learned: what
 # is far away is blurred over many voxels. Their PSNR stays, and a fifth of the time is saved.
 UNBOUNDED_STEP = 1.5
-
-
-def in_lists(space: Space, field: CanonicalField) -> bool:
-    """Whether rays are rendered in lists of fixed length: where Triton runs.
-
-    Its kernels take straight rays, which contracted space does not have.
-    """
-    return space.is_linear and triton_runs(field.density.values)
 
 
 @dataclass
@@ -51,7 +41,6 @@ class DeVRFView:
         motion: how the scene moves; None: it is at rest at every time.
         space: the space that the fields live in.
         time: t in [0, 1].
-        lists: renders in lists of fixed length, where their kernels run.
         color_change: what is added to the colours' logits at that time; None: nothing.
         at_rest: whether the warp of this time is the identity.
         displacement: Δ_b(·, t) (X, Y, Z, 3) over the deformation field's box; None at rest.
@@ -63,7 +52,6 @@ class DeVRFView:
     motion: DeformationField | None
     space: Space
     time: float
-    lists: ListRenderer
     color_change: ColorChange | None = None
     at_rest: bool = field(init=False)
     displacement: Tensor | None = field(init=False, default=None)
@@ -90,8 +78,6 @@ class DeVRFView:
     @property
     def chunk(self) -> int:
         """Rays that are best rendered at once."""
-        if in_lists(self.space, self.canonical):
-            return IN_LISTS
         if self.canonical.density.values.is_cuda:
             return ON_GPU
         return ON_CPU if self.space.is_linear else UNBOUNDED_ON_CPU
@@ -99,15 +85,18 @@ class DeVRFView:
     @torch.no_grad()
     def render(self, rays: Rays, background: Tensor) -> RenderedImage:
         """What R rays in the fields' space see."""
-        occupancy, color_change = self.occupancy, self.color_change
-        if in_lists(self.space, self.canonical):
-            shown = self.displacement, background, color_change
-            return self.lists.picture(rays, occupancy, *shown)
         settings = self.settings
         if not self.space.is_linear:
             settings = replace(settings, step=UNBOUNDED_STEP * settings.step)
-        scene = self.canonical, occupancy, settings, background, self._warp
-        return picture(rays, *scene, color_change)
+        return picture(
+            rays,
+            self.canonical,
+            self.occupancy,
+            settings,
+            background,
+            self._warp,
+            self.color_change,
+        )
 
     @torch.no_grad()
     def induced_flow(

@@ -15,7 +15,6 @@ from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.deformation_field import DeformationField, GridWarp
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import CanonicalRates, Precision
-from devrf.methods.devrf.view import in_lists
 from devrf.methods.devrf.volume_rendering import render
 from devrf.ops.adam import GridAdam
 from devrf.rendering.list_rendering import render_static
@@ -71,7 +70,7 @@ class VoxelStage(ScheduledStage):
     @property
     def static_shape(self) -> bool:
         """Whether batches are rendered in lists of fixed length."""
-        return in_lists(self.scene_model.space, self.scene_model.canonical)
+        return False
 
     def bind(self, rays: int, parameters: Sequence[Sequence[Tensor]]) -> None:
         """Prepare the loop for batches of ``rays`` that teach these parameters each."""

@@ -134,8 +134,7 @@ def graphs(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     monkeypatch.setattr(VoxelStage, "static_shape", lambda self, density: True)
     monkeypatch.setattr(SampleCapacity, "GRAIN", 64)
     monkeypatch.setattr(selfcheck, "require_gpu", lambda scene, reason: None)
-    # Lists of fixed length learn the same in PyTorch.
-    monkeypatch.setattr(selfcheck, "FAST", selfcheck.Variant("torch", "auto"))
+    monkeypatch.setattr(selfcheck, "FAST", selfcheck.Variant("auto"))
     return monkeypatch
 
 
@@ -152,6 +151,6 @@ def test_every_resolution_is_captured(scene, graphs):
 
 def test_pictures_are_compared(scene, graphs):
     assert rendering(scene).startswith("0 off")
-    graphs.setattr(selfcheck, "PICTURES", [(True, -1.0)])
-    with pytest.raises(DevrfError, match="half=True"):
+    graphs.setattr(selfcheck, "PICTURE_LIMIT", -1.0)
+    with pytest.raises(DevrfError, match="off the CPU's picture"):
         rendering(scene)
