@@ -88,7 +88,7 @@ def said(command: list[str]) -> str:
 
 
 def checks(into: Path) -> Iterator[Row]:
-    """The self-check: a verdict for each capture, resume and picture."""
+    """The self-check: a verdict for each resume and picture."""
     for name, verdict, figures in selfcheck.run_checks(DEVICE, 0):
         yield {"check": name, "verdict": verdict, "figures": figures}
 
@@ -173,7 +173,6 @@ STEPS: dict[str, tuple[float, Callable[[Path], Iterator[Row]]]] = {
             "as-it-is": [],
             "10-a-step": [f"{key}.iterations_per_step=10" for key in ("canonical", "deformation")],
             "frames-on-device": ["schedule.motion.store=device"],
-            "without-graphs": ["graphs=off"],
         }.items()
     },
     "tests": (6, tests),

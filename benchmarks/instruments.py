@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from collections.abc import Iterator
-from statistics import median
 from typing import Any
 
 import torch
@@ -15,25 +14,20 @@ from devrf.engine.stage import ScheduledStage
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.system.device import wait
-from devrf.system.graphs import CudaGraphCapture
 
 Row = dict[str, Any]
 # Methods that are timed, with what is nested in them, by what their seconds go to.
 TIMED = {
-    "warm-up": (CudaGraphCapture, "warm_up"),
-    "capture": (CudaGraphCapture, "capture"),
     "iterations": (ScheduledStage, "training_step"),
     "logging": (Meter, "on_train_batch_end"),
     "visits, canonical": (CanonicalStage, "enter"),
     "visits, deformation": (DeformationStage, "enter"),
     "packing": (ScheduledStage, "on_train_end"),
 }
-# Every so many replays of a graph are timed on the device.
-SAMPLED = 20
 
 
 class Stopwatch:
-    """Within its context, times what stages do; on a GPU also graphs on the device.
+    """Within its context, times what stages do.
 
     Attributes:
         stage: the stage that was learned last.
@@ -43,14 +37,13 @@ class Stopwatch:
         self.stage: ScheduledStage | None = None
         self._device, self._usual = device, dict[tuple[type, str], Any]()
         self._seconds: dict[str, float] = defaultdict(float)
-        # By resolution: seconds, iterations, and events around replays of graphs.
-        self._levels: dict[tuple[int, ...], list[Any]] = {}
-        self._since, self._iteration, self._replays = time.perf_counter(), 0, 0
+        # By resolution: seconds and iterations.
+        self._levels: dict[tuple[int, ...], tuple[float, int]] = {}
+        self._since, self._iteration = time.perf_counter(), 0
 
     def __enter__(self) -> Stopwatch:
         for label, (owner, name) in TIMED.items():
             self._replace(owner, name, self._timed(label, getattr(owner, name)))
-        self._replace(torch.cuda.CUDAGraph, "replay", self._sampled(torch.cuda.CUDAGraph.replay))
         self._since = time.perf_counter()
         return self
 
@@ -62,17 +55,13 @@ class Stopwatch:
 
     def rows(self) -> Iterator[Row]:
         """Seconds by what they went to; then milliseconds of an iteration by resolution."""
-        loop = self.stage.loop if self.stage is not None else None
-        counts = {key: getattr(loop, key, 0) for key in ("num_captures", "num_short_lists")}
-        yield {"seconds": dict(self._seconds), **counts, "replays": self._replays}
-        for shape, (seconds, iterations, events) in self._levels.items():
-            device = [begin.elapsed_time(end) for begin, end in events]
-            row = {
+        yield {"seconds": dict(self._seconds)}
+        for shape, (seconds, iterations) in self._levels.items():
+            yield {
                 "grid": shape,
                 "iterations": iterations,
                 "ms": 1000 * seconds / max(iterations, 1),
             }
-            yield row | {"replay ms on the device": median(device) if device else None}
 
     def _replace(self, owner: type, name: str, function: Any) -> None:
         self._usual[owner, name] = getattr(owner, name)
@@ -97,25 +86,8 @@ class Stopwatch:
         stage = self.stage
         assert stage is not None
         wait(self._device)
-        level = self._levels.setdefault(tuple(stage.resolution), [0.0, 0, []])
-        level[0] += time.perf_counter() - self._since
-        level[1] += stage.iteration - self._iteration
+        shape = tuple(stage.resolution)
+        seconds, iterations = self._levels.get(shape, (0.0, 0))
+        seconds += time.perf_counter() - self._since
+        self._levels[shape] = seconds, iterations + stage.iteration - self._iteration
         self._since, self._iteration = time.perf_counter(), stage.iteration
-
-    def _sampled(self, usual: Any) -> Any:
-        def replay(graph: Any) -> None:
-            self._replays += 1
-            if self._replays % SAMPLED or self.stage is None:
-                usual(graph)
-                return
-            begin, end = (
-                torch.cuda.Event(enable_timing=True)  # type: ignore[no-untyped-call]
-                for _ in range(2)
-            )
-            begin.record()
-            usual(graph)
-            end.record()
-            shape = tuple(self.stage.resolution)
-            self._levels.setdefault(shape, [0.0, 0, []])[2].append((begin, end))
-
-        return replay

@@ -157,7 +157,7 @@ def measure_phase(stage: ScheduledStage, phase: Phase, views: Any, seconds: floa
             raise DevrfError(stage.abort_reason)
 
     cuda = stage.device.type == "cuda"
-    for _ in range(3):  # compiles kernels, adapts capacities, captures the graph
+    for _ in range(3):  # the first are slower
         step()
     if cuda:
         torch.cuda.reset_peak_memory_stats(stage.device)

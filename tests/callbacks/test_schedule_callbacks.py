@@ -81,8 +81,6 @@ def test_the_record_says_what_training_took(fit, canonical):
     stage = fit(canonical(), TrainingRecord())
     assert stage.record["iterations"] == 12
     assert stage.record["peak_gpu_gb"] is None and stage.record["peak_reserved_gb"] is None
-    ran = {name: stage.record[name] for name in ("graph_captures", "short_lists")}
-    assert ran == {"graph_captures": 0, "short_lists": 0}
     seconds, speed = stage.record["seconds"], stage.record["iterations_per_second"]
     assert 0 < seconds < 60 and 12 / speed == pytest.approx(seconds, abs=0.01)
     assert stage.metadata().records["canonical"] == stage.record

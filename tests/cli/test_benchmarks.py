@@ -112,9 +112,3 @@ def test_what_cannot_be_measured_is_said_in_one_line(benchmark, tmp_path, capsys
     said = capsys.readouterr().err
     assert stop.value.code == 2 and said.count("\n") == 1 and "leave out trainer=ddp" in said
     assert not list(tmp_path.iterdir())
-
-
-def test_what_the_host_does_beside_the_kernels(benchmark):
-    rows = benchmark("host", "--iterations", "100")["rows"]
-    assert [row["visits"] for row in rows] == [3, 7, 3, 7]  # each time the grid grows; of 7 frames
-    assert all(row["us an iteration"] > 0 < row["ms a visit"] for row in rows)

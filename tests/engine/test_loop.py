@@ -1,32 +1,10 @@
-"""Pixels and metrics of the batches of an iteration, by hand."""
+"""Metrics of the batches of an iteration, by hand."""
 
 from __future__ import annotations
 
-import pytest
 import torch
 
-from devrf.data.batch import Pixels
-from devrf.engine.learner import ParallelBatch
-from devrf.engine.loop import MetricAccumulator, take
-from devrf.rendering.sample_capacity import SampleCapacity
-
-
-def pixels(start: int) -> Pixels:
-    return Pixels(torch.arange(start, start + 3), torch.arange(3), torch.ones(3))
-
-
-@pytest.mark.parametrize("static_shape", [False, True])
-def test_pixels_of_a_static_batch_stay_in_the_same_memory(static_shape: bool) -> None:
-    capacity = SampleCapacity(3, torch.device("cpu")) if static_shape else None
-    batch = ParallelBatch(0, [], capacity)
-    first, second = pixels(0), pixels(10)
-    take(batch, first)
-    held = batch.pixels
-    assert held is not None and (held is first) == (not static_shape)
-    take(batch, second)
-    assert batch.pixels is (held if static_shape else second)
-    assert batch.pixels.image.tolist() == [10, 11, 12] and second.image[0] == 10
-    assert first.image.tolist() == [0, 1, 2]
+from devrf.engine.loop import MetricAccumulator
 
 
 def test_means_of_all_batches_and_the_loss_of_each() -> None:

@@ -115,25 +115,25 @@ def test_smoothing_adds_the_gradient_of_the_total_variation(
     torch.testing.assert_close(ours, theirs)
 
 
-def test_kept_gradients_stay_where_they_are_and_are_zero_after_a_step() -> None:
-    leaves = [torch.ones(1, 1, 1, 2, requires_grad=True), torch.ones(3, requires_grad=True)]
-    optimizer = GridAdam([{"params": [leaves[0]], "skip_zero": True}, {"params": [leaves[1]]}])
-    optimizer.keep_gradients()
-    places = [leaf.grad for leaf in leaves]
-    (2 * leaves[0].sum() + leaves[1].sum()).backward()
-    assert [leaf.grad for leaf in leaves] == places and places[0] is not None
-    assert places[0].flatten().tolist() == [2, 2]
+def test_gradients_of_skipping_groups_stay_where_they_are_and_are_zero_after_a_step() -> None:
+    kept, other = (torch.ones(1, 1, 1, 2, requires_grad=True) for _ in range(2))
+    optimizer = GridAdam([{"params": [kept], "skip_zero": True}, {"params": [other]}])
+    optimizer.make_gradients()
+    place = kept.grad
+    assert place is not None and other.grad is None
+    (2 * kept.sum() + other.sum()).backward()
+    assert kept.grad is place and place.flatten().tolist() == [2, 2]
     optimizer.step()
-    assert leaves[0][0, 0, 0, 0].item() == pytest.approx(1 - 1e-3)
-    (leaves[0].sum() + leaves[1].sum()).backward()
-    optimizer.drop_gradients(leaves[1:])
-    assert places[0].all() and leaves[1].grad is places[1] and not places[1].any()
+    assert kept.grad is place and not place.any() and other.grad is None
+    assert kept[0, 0, 0, 0].item() == pytest.approx(1 - 1e-3)
+    (kept.sum() + other.sum()).backward()
+    optimizer.drop_gradients([other])
+    assert place.all() and other.grad is None
     optimizer.zero_grad()
-    for leaf, place in zip(leaves, places, strict=True):
-        assert leaf.grad is place and not place.any()
-    other = torch.ones(2, requires_grad=True)
-    optimizer.replace(1, [other])
-    assert other.grad is not None
+    assert kept.grad is place and not place.any()
+    larger = torch.ones(1, 1, 2, 2, requires_grad=True)
+    optimizer.replace(0, [larger])
+    assert larger.grad is not None
 
 
 def test_what_is_replaced_or_forgotten_starts_afresh() -> None:
@@ -152,25 +152,17 @@ def test_what_is_replaced_or_forgotten_starts_afresh() -> None:
     assert new.item() == pytest.approx(0.0, abs=1e-7)
 
 
-def test_other_work_may_replace_the_step_after_the_rates_are_set() -> None:
+def test_the_rate_may_be_set_by_the_closure_and_be_a_tensor() -> None:
     parameter = torch.zeros(1, 1, 1, 1, requires_grad=True)
-    optimizer, order = GridAdam([parameter], lr=0.5), []
+    optimizer = GridAdam([parameter], lr=0.5)
 
     def closure() -> None:
-        order.append("asked")
         optimizer.param_groups[0]["lr"] = 0.25
-
-    def work() -> None:
-        order.append("work")
         parameter.grad = torch.ones(1, 1, 1, 1)
-        optimizer.apply()
 
-    with optimizer.stepping_by(work):
-        optimizer.step(closure)
-    assert order == ["asked", "work"] and parameter.item() == pytest.approx(-0.25)
-    # The rate may be a tensor, too.
+    optimizer.step(closure)
+    assert parameter.item() == pytest.approx(-0.25) and parameter.grad is None
     optimizer.param_groups[0]["lr"] = torch.tensor(0.5)
-    assert parameter.grad is None  # gone after the step
     parameter.grad = torch.ones(1, 1, 1, 1)
     optimizer.step()
-    assert len(order) == 2 and parameter.item() == pytest.approx(-0.75)
+    assert parameter.item() == pytest.approx(-0.75)

@@ -10,15 +10,12 @@ from torch.autograd import gradcheck
 
 from devrf.ops.compositing import (
     composite,
-    composite_segments,
     sum_by_doubling,
-    sum_segments,
     transmittances,
 )
 
 # Three rays: three samples, none, two.
 RAY = torch.tensor([0, 0, 0, 2, 2])
-FIRST = torch.tensor([0, 3, 3, 5])
 
 
 def test_opacities_by_hand_on_two_rays_with_an_empty_one_between() -> None:
@@ -45,29 +42,6 @@ def test_a_faint_ray_keeps_its_digits_behind_many_opaque_ones() -> None:
 def test_gradients(rng: torch.Generator) -> None:
     depth = torch.rand(5, generator=rng, dtype=torch.float64, requires_grad=True)
     assert gradcheck(lambda tau: composite(tau, RAY, 3), (depth,))
-
-
-def test_segments_are_the_same_rays_and_padding_is_nothing(rng: torch.Generator) -> None:
-    depth = torch.rand(8, generator=rng)
-    weights, end = composite_segments(depth, FIRST)
-    expected, left = composite(depth[:5], RAY, 3)
-    torch.testing.assert_close(weights[:5], expected)
-    torch.testing.assert_close(end, left)
-    assert weights.shape == (8,) and not weights[5:].any()
-
-
-def test_gradients_of_segments(rng: torch.Generator) -> None:
-    depth = torch.rand(7, generator=rng, dtype=torch.float64, requires_grad=True)
-    values = torch.rand(7, 2, generator=rng, dtype=torch.float64, requires_grad=True)
-    assert gradcheck(lambda tau: composite_segments(tau, FIRST), (depth,))
-    assert gradcheck(lambda w, c: sum_segments(w, c, FIRST), (depth, values))
-
-
-def test_sums_of_segments_by_hand() -> None:
-    weights = torch.tensor([1.0, 2.0, 3.0, 4.0, 5.0, 100.0])
-    values = torch.tensor([[1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [2.0, 0.0], [0.0, 1.0], [9.0, 9.0]])
-    sums = sum_segments(weights, values, FIRST)
-    assert torch.equal(sums, torch.tensor([[3.0, 5.0], [0.0, 0.0], [8.0, 5.0]]))
 
 
 @pytest.mark.parametrize("count", [0, 1, 7, 8, 1000])

@@ -1,4 +1,4 @@
-"""Marching along rays, compared with testing every sample; lists that follow what is needed."""
+"""Marching along rays, compared with testing every sample."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from devrf.geometry.box import Box
 from devrf.geometry.contraction import ContractedSpace
 from devrf.geometry.rays import Rays
 from devrf.rendering.occupancy import Occupancy
-from devrf.rendering.sample_capacity import SampleCapacity
 from devrf.rendering.sampling import hits, march, steps_through
 
 BOX = Box((-1.0, -0.5, 0.0), (1.0, 1.5, 1.0))
@@ -94,23 +93,3 @@ def test_no_rays_and_missing_rays_give_no_samples(cube):
     past = Rays(torch.tensor([[-3.0, 2.0, 0.0], [-3.0, 0.0, 0.0]]), d, d)
     assert len(march(past, cube, full, step=0.1, near=0.0, far=9.0)) == 0
     assert hits(past, cube, full, near=0.0, far=9.0).tolist() == [False, False]
-
-
-def test_lists_grow_by_half_at_least_and_shrink_only_from_great_waste():
-    capacity = SampleCapacity(64, torch.device("cpu"))
-    capacity.visible, capacity.significant = 4096, 1024
-
-    def needing(visible, significant):
-        capacity.note(torch.tensor(visible), torch.tensor(significant))
-        capacity.poll(), capacity.poll()
-        return capacity.visible, capacity.significant
-
-    assert needing(4097, 800) == (6144, 1024)
-    assert needing(20000, 1024) == (25088, 1024)  # 1.25 times what was needed, in 256s
-    assert needing(14000, 600) == (25088, 1024)  # less than 1.5 times what fits
-    assert needing(13000, 400) == (16384, 512)
-    assert capacity.num_short == 2
-    capacity.note(torch.tensor(12000), torch.tensor(300))
-    assert capacity.measure() and (capacity.visible, capacity.significant) == (15104, 512)
-    assert needing(4000, 4000) == (5120, 5120)
-    assert capacity.num_short == 3

@@ -26,7 +26,7 @@ from devrf.system.files import atomic_write
 # Held-out images of the dynamic capture at times that a training view has, and at others.
 OF_TIMES = ("training_times", "novel_times")
 # How iterations were carried out.
-EXECUTION = ("graph_captures", "short_lists", "peak_reserved_gb")
+EXECUTION = ("peak_reserved_gb",)
 
 
 def mean_scores(views: Sequence[HeldOutView]) -> dict[str, float | None]:
@@ -142,7 +142,7 @@ def data_record(scene: Scene) -> dict[str, Any]:
 
 
 def learning_record(metadata: CheckpointMetadata, stages: Sequence[str]) -> dict[str, Any]:
-    """How the ``stages`` were learned: settings, seconds, and which graphs really ran.
+    """How the ``stages`` were learned: settings, seconds, and the memory that torch held.
 
     ``settings`` are those that decided what was learned, by config key, in all stages.
     """

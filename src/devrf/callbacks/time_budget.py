@@ -145,7 +145,7 @@ class TimeBudget(Callback):
         # Out of time, what is left gets an iteration a phase.
         stride = whole / (left - entering) if left > entering else float(stage.total_iterations)
         share, divisible = stage.loop.batch_share, stage.cost_follows_rays
-        if stride > 1 and share > LEAST_BATCH and divisible and not stage.loop.capacities:
+        if stride > 1 and share > LEAST_BATCH and divisible:
             stride, pace, share = stride / 2, pace / 2, share / 2
         if not later:  # whole iterations are left: as many as end nearest to the budget
             iterations = max(1, round(left / (pace * stage.phase.cost)))

@@ -62,8 +62,6 @@ class TrainingRecord(Callback):
             "peak_gpu_gb": allocated,
             "peak_reserved_gb": reserved,
             "num_rollbacks": pl_module.num_rollbacks,
-            "graph_captures": pl_module.loop.num_captures,
-            "short_lists": pl_module.loop.num_short_lists,
         }
 
     @property

@@ -101,22 +101,11 @@ class Pixels:
     def __len__(self) -> int:
         return self.image.shape[0]
 
-    def take(self, others: Pixels) -> None:
-        """Become as many others, in the same memory."""
-        torch._foreach_copy_((self.image, self.flat), (others.image, others.flat))
-        if self.background is not others.background:
-            self.background.copy_(others.background)
-
     def between(self, start: int, stop: int) -> Pixels:
         """The pixels from ``start`` up to ``stop``, sharing memory."""
         part = slice(start, stop)
         behind = self.background if self.background.dim() == 1 else self.background[part]
         return Pixels(self.image[part], self.flat[part], behind)
-
-    def clone(self) -> Pixels:
-        """The same pixels in other memory; a plain background is shared."""
-        behind = self.background if self.background.dim() == 1 else self.background.clone()
-        return Pixels(self.image.clone(), self.flat.clone(), behind)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from devrf.data.batch import Pixels
 from devrf.ops.adam import GridAdam
-from devrf.rendering.sample_capacity import SampleCapacity
 from devrf.rendering.view import Viewable
 from devrf.scenes.scene import CaptureName, ImagesName, Scene, Views
 
@@ -57,13 +56,11 @@ class ParallelBatch:
     Attributes:
         number: its index in the iteration, from 0.
         parameters: what is learned from it, and from no other batch.
-        capacity: the length of its sample lists; None where their length depends on data.
         pixels: the pixels of the present iteration; None before the first.
     """
 
     number: int
     parameters: Sequence[Tensor]
-    capacity: SampleCapacity | None = None
     pixels: Pixels | None = None
 
 
@@ -167,11 +164,6 @@ class Learner(LightningModule, ABC):
 
     def prepare(self) -> None:
         """Called before each iteration; may wait for the device."""
-
-    @property
-    def view_cycle(self) -> int:
-        """In how many iterations a batch has come from every training view."""
-        return 1
 
     def converged(self, losses: Tensor) -> bool:
         """Whether the rest of the present phase can be skipped.

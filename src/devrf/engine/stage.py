@@ -268,7 +268,6 @@ class ScheduledStage(Learner):
         assert self.phase is not None
         before, stop = self.iterations_done, min(self.phase.stop, self.total_iterations)
         self._iterate(views, stop)
-        self.loop.poll()
         means: dict[str, Tensor] = {}
         if done := self.iterations_done - before:
             means, losses = self.loop.metrics.take(done, self.loop.processes)

@@ -168,7 +168,7 @@ class RayStage(ScheduledStage):
         fewer = self.schedule.rays_without_hull
         rays = self.schedule.rays if fewer is None or self.scene_model.has_hull else fewer
         learned = [parameter for group in groups for parameter in group["params"]]
-        self.loop.bind(rays, [learned], self.optimizer, static_shape=False)
+        self.loop.bind(rays, [learned])
 
     def prepare(self) -> None:
         """Let the model follow the schedule."""

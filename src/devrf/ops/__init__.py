@@ -5,14 +5,12 @@ Imports go down this list, never up:
 | module | functions |
 |---|---|
 | ``adam`` | ``GridAdam``: the optimiser made of ``adam_step``'s steps |
-| ``search`` | ``find_samples``: visible samples of rays; ``select_listed`` of them |
 | ``adam_step`` | ``adam_step``: one step on one tensor; ``add_total_variation_gradient`` |
 | ``color_network`` | ``decode``: features and directions → RGB |
 | ``motion`` | ``cycle_error``, ``flow_error``: the cycle and the flow term |
 | ``photometric`` | the terms that compare rays with images |
-| ``pixel_rays`` | ``gather_pixels``: rays and truth; ``steps_in_box``, ``steps_between`` |
-| ``warped_depth`` | ``warped_depth``: points of a moment → canonical positions, optical depths |
+| ``pixel_rays`` | ``gather_pixels``: rays and truth; ``steps_between`` |
 | ``trilinear`` | ``interpolate``: values of a grid between its points; ``resample`` |
-| ``compositing`` | ``composite``, ``composite_segments``: weights; ``composite_colors`` |
+| ``compositing`` | ``composite``: weights; ``color_and_depth`` |
 | ``corners`` | ``to_grid``: positions in a box to grid coordinates |
 """

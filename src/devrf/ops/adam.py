@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import torch
@@ -26,12 +25,7 @@ class GridAdam(torch.optim.Optimizer):
       of the backward pass; ``along_z`` times as much between neighbours along z.
     * ``touched_only``: add it only to entries that have a gradient.
 
-    ``lr`` may be a tensor () on the parameters' device. :meth:`step` copies a number into one
-    first; :meth:`apply` then reads nothing from the host and may be captured in a CUDA graph.
-
-    Attributes:
-        keeps_gradients: whether all gradients stay in the same memory: zero before each iteration,
-            accumulated by the backward pass, zeroed by the step.
+    ``lr`` may be a tensor () on the parameters' device.
     """
 
     def __init__(
@@ -52,11 +46,9 @@ class GridAdam(torch.optim.Optimizer):
             "along_z": 1.0,
             "touched_only": False,
         }
-        self.keeps_gradients = False
         self._rates: dict[int, Tensor] = {}
         # The number that each of these holds.
         self._filled: dict[Tensor, float] = {}
-        self._work = self.apply
         super().__init__(params, defaults)
 
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
@@ -78,25 +70,11 @@ class GridAdam(torch.optim.Optimizer):
                     # A fill does not wait for the device, unlike a copy from the host.
                     rate.fill_(group["lr"])
                     self._filled[rate] = group["lr"]
-        with torch.enable_grad():
-            self._work()
+        self._apply()
         return result
 
-    @contextmanager
-    def stepping_by(self, work: Callable[[], None]) -> Iterator[None]:
-        """Inside the context :meth:`step` runs ``work`` in place of :meth:`apply`.
-
-        For a whole iteration that contains :meth:`apply`, such as a captured one: callbacks that
-        set learning rates before a step then run before all of it.
-        """
-        usual, self._work = self._work, work
-        try:
-            yield
-        finally:
-            self._work = usual
-
     @torch.no_grad()
-    def apply(self) -> None:
+    def _apply(self) -> None:
         """Step at the rates that :meth:`step` has put on the device."""
         learned = [self._learned(group) for group in self.param_groups]
         steps = [self._state_of(parameter)["steps"] for group in learned for parameter in group]
@@ -114,7 +92,7 @@ class GridAdam(torch.optim.Optimizer):
                 how = {name: group[name] for name in ("along_z", "touched_only")}
                 for values, gradient, *_ in taken:
                     add_total_variation_gradient(values, gradient, group["smoothing"], **how)
-            kept = self._keeps(group)
+            kept = group["skip_zero"]
             for values, gradient, mean, square, step in taken:
                 rule = AdamRule(rate, step, **options)
                 adam_step(values, gradient, mean, square, rule, clear=kept)
@@ -154,27 +132,19 @@ class GridAdam(torch.optim.Optimizer):
 
     def drop_gradients(self, parameters: Iterable[Tensor]) -> None:
         """As :meth:`zero_grad`, for some of the parameters."""
-        kept = {id(p) for group in self.param_groups if self._keeps(group) for p in group["params"]}
+        kept = {id(p) for group in self.param_groups if group["skip_zero"] for p in group["params"]}
         for parameter in parameters:
             if id(parameter) in kept and parameter.grad is not None:
                 parameter.grad.zero_()
             else:
                 parameter.grad = None
 
-    def keep_gradients(self) -> None:
-        """Keep gradients in the same memory from now on, for later parameters too."""
-        self.keeps_gradients = True
-        self.make_gradients()
-
     def make_gradients(self) -> None:
         """Make those gradients that are kept and are not there yet, before a backward pass."""
         for group in self.param_groups:
-            for parameter in group["params"] if self._keeps(group) else ():
+            for parameter in group["params"] if group["skip_zero"] else ():
                 if parameter.grad is None:
                     parameter.grad = torch.zeros_like(parameter)
-
-    def _keeps(self, group: dict[str, Any]) -> bool:
-        return self.keeps_gradients or bool(group["skip_zero"])
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore a state, on the parameters' device."""

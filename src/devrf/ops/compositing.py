@@ -2,9 +2,6 @@
 
 Formulas use optical depths τ = σ·δ: opacity is α = 1 − exp(−τ), transmittance
 T_i = Π_{j<i} (1 − α_j) = exp(−Σ_{j<i} τ_j), without logarithms of numbers near zero.
-
-A ray's samples are given either by the ray of each sample, or by the place where each ray begins in
-a list that may end in padding (devrf.ops.search).
 """
 
 from __future__ import annotations
@@ -32,70 +29,6 @@ def composite(depth: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
     """
     weights, end = _Composite.apply(depth, ray, rays)  # type: ignore[no-untyped-call]
     return weights, end
-
-
-def composite_segments(depth: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
-    """As :func:`composite`, for rays given by the places where they begin.
-
-    Args:
-        depth: (S,) optical depths, front to back within each ray; padding at the end.
-        first: (R + 1,) int64, ascending: ray r has the samples first[r] … first[r + 1] − 1.
-            Places from first[R] on are padding.
-
-    Returns:
-        weights (S,), zero in the padding, and end transmittance (R,), differentiable once in
-        ``depth``.
-    """
-    rays = len(first) - 1
-    ray = _rays_of(first, len(depth))
-    # Padding forms one more ray, of zero depth.
-    tau = torch.where(ray < rays, depth, torch.zeros_like(depth))
-    weights, end = _Composite.apply(tau, ray, rays + 1)  # type: ignore[no-untyped-call]
-    return weights, end[:-1]
-
-
-def sum_segments(weights: Tensor, values: Tensor, first: Tensor) -> Tensor:
-    """Sums (R, C) of ``w_i · c_i`` over each ray's samples, without the padding.
-
-    Args:
-        weights: (S,) w.
-        values: (S, C) c, finite in the padding too.
-        first: (R + 1,) as for :func:`composite_segments`.
-
-    Returns:
-        (R, C), differentiable once in ``weights`` and ``values``.
-    """
-    ray = _rays_of(first, len(weights))
-    return sum_by_ray(weights[:, None] * values, ray, len(first))[:-1]
-
-
-def composite_colors(
-    weights: Tensor,
-    colors: Tensor,
-    distance: Tensor,
-    first: Tensor,
-    transmittance: Tensor,
-    background: Tensor,
-) -> tuple[Tensor, Tensor]:
-    """:func:`color_and_depth` of rays whose samples are listed, in one pass over them.
-
-    Args:
-        weights: (S,) w.
-        colors: (S, 3) c, finite in the padding too.
-        distance: (S,) z.
-        first: (R + 1,) as for :func:`composite_segments`.
-        transmittance: (R,) T_end.
-        background: (3,) or (R, 3) RGB; it gets no gradient.
-
-    Returns:
-        Colour (R, 3), differentiable once in ``weights``, ``colors`` and ``transmittance``, and
-        depth (R,), which is not differentiable.
-    """
-    weighted_color = sum_segments(weights, colors, first)
-    with torch.no_grad():
-        along = torch.stack([distance, torch.ones_like(distance)], dim=1)
-        reached, mass = sum_segments(weights, along, first).unbind(1)
-    return color_and_depth(weighted_color, reached, mass, transmittance, background)
 
 
 def transmittances(depth: Tensor, ray: Tensor, rays: int) -> Tensor:
@@ -153,12 +86,6 @@ class _Composite(torch.autograd.Function):
 def firsts(ray: Tensor, rays: int) -> Tensor:
     """The first sample of every ray, and the number of samples (R + 1,)."""
     return torch.searchsorted(ray, torch.arange(rays + 1, device=ray.device))
-
-
-def _rays_of(first: Tensor, samples: int) -> Tensor:
-    """The ray (S,) of each sample; R in the padding."""
-    place = torch.arange(samples, device=first.device)
-    return torch.searchsorted(first[1:].contiguous(), place, right=True)
 
 
 def running_sum(values: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ def flow_error(weight: Tensor, induced: Tensor, observed: Tensor, count: Tensor)
     """(1/M) Σ_i w_i |φ_i − φ|₁ ().
 
     Args:
-        weight: (K,) w of the samples on rays with flow, 0 in padding.
+        weight: (K,) w of the samples on rays with flow.
         induced: (K, 2) φ_i in pixels.
         observed: (K, 2) φ of their rays.
         count: () M.

@@ -20,7 +20,7 @@ def per_sample_color(weight: Tensor, color: Tensor, ray: Tensor, truth: Tensor) 
     """(1/R) Σ_i sg(w_i) |c_i − C|²: each sample by itself should have the pixel's colour.
 
     Args:
-        weight: (K,) w of the samples, 0 in padding; it gets no gradient.
+        weight: (K,) w of the samples; it gets no gradient.
         color: (K, 3) c of the samples.
         ray: (K,) int64, their rays.
         truth: (R, 3) C.
@@ -41,7 +41,7 @@ def distortion(weight: Tensor, distance: Tensor, ray: Tensor, rays: int) -> Tens
     mip-NeRF 360's distortion loss without its term of single samples, whose steps are equal here.
 
     Args:
-        weight: (K,) w of the samples, 0 in padding.
+        weight: (K,) w of the samples.
         distance: (K,) s of the samples, ascending along each ray.
         ray: (K,) int64, ascending.
         rays: R.

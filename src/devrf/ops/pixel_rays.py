@@ -1,8 +1,4 @@
-"""From drawn pixels to their rays and what the images show there; and a ray's steps in a box.
-
-:func:`devrf.engine.batches.gather_batch` is made of the first; the second gives what
-:func:`devrf.rendering.sampling.steps_through` gives.
-"""
+"""From drawn pixels to their rays and what the images show there; and the steps of a ray."""
 
 from __future__ import annotations
 
@@ -10,8 +6,6 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-
-from devrf.ops.corners import Corners
 
 
 class GatheredPixels(NamedTuple):
@@ -89,27 +83,6 @@ def gather_pixels(
     return GatheredPixels(
         pose[:, :, 3], directions, color, alpha, times[image], frames[image], pixel, vectors, valid
     )
-
-
-def steps_in_box(
-    origins: Tensor, directions: Tensor, *, box: Corners, step: float, near: float, far: float
-) -> tuple[Tensor, Tensor]:
-    """Distance (R,) of each ray's first sample, and number (R,) int64 of samples up to its exit.
-
-    Args:
-        origins: (R, 3) of rays in the box's units.
-        directions: (R, 3) of rays.
-        box: what the samples lie in.
-        step: distance between samples, in units of the directions.
-        near: distance before which nothing is sampled.
-        far: distance behind which nothing is sampled.
-    """
-    low, high = (origins.new_tensor(corner) for corner in (box.low, box.high))
-    d = torch.where(directions.abs() < 1e-9, torch.full_like(directions, 1e-9), directions)
-    to_low, to_high = (low - origins) / d, (high - origins) / d
-    entry = torch.minimum(to_low, to_high).amax(dim=-1).clamp(min=near)
-    leave = torch.maximum(to_low, to_high).amin(dim=-1).clamp(max=far)
-    return entry, steps_between(entry, leave, step)
 
 
 def steps_between(entry: Tensor, leave: Tensor, step: float) -> Tensor:

@@ -7,19 +7,47 @@ rays at a time, of those rays alone through which something can still be seen.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
+from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 from devrf.ops.compositing import color_and_depth, firsts, sum_by_ray, transmittances
-from devrf.rendering.list_rendering import VoxelField
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import ColorChange, RenderedImage
 from devrf.rendering.sampling import STOP, RenderSettings, Segments, segments_near
 
 # Segments of a ray in one slab: fewer are left off sooner, more are fewer operations.
 SLAB = 8
+
+
+class VoxelField(Protocol):
+    """A voxel radiance field, as it is rendered without its stages."""
+
+    @property
+    def box(self) -> Box:
+        """Where it lives."""
+
+    def step_length(self, step: float) -> float:
+        """Length of ``step`` voxels along a ray, in units of the ray's direction."""
+
+    def step_in_base_voxels(self, step: float) -> float:
+        """δ, the length that opacities are taken over."""
+
+    def optical_depth(self, points: Tensor, delta: float) -> Tensor:
+        """τ (M,) at ``points`` (M, 3), for steps of δ base voxels."""
+
+    def rgb(
+        self,
+        points: Tensor,
+        viewdirs: Tensor,
+        ray: Tensor,
+        precision: torch.dtype = torch.float32,
+        residual: Tensor | None = None,
+    ) -> Tensor:
+        """RGB (S, 3) at ``points`` (S, 3) on rays ``ray`` (S,) with ``viewdirs`` (R, 3)."""
 
 
 @torch.no_grad()

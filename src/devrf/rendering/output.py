@@ -72,7 +72,6 @@ class VoxelOutput(RenderOutput):
         weight: (K,) their weights w_i.
         sample_color: (K, 3) their colours c_i.
         residual: (K, 3) A_t(q_i) in logits; None without one.
-        first: (R + 1,) where each ray's samples begin in a list of fixed length; None elsewhere.
     """
 
     samples: Samples
@@ -80,29 +79,17 @@ class VoxelOutput(RenderOutput):
     weight: Tensor
     sample_color: Tensor
     residual: Tensor | None = None
-    first: Tensor | None = None
 
     def mean_over_samples(self, values: Tensor) -> Tensor:
-        """The mean () of values (K,) of samples, padding left out; 0 without samples."""
-        present = self.samples.present
-        if present is not None:
-            return torch.where(present, values, 0.0).sum() / present.sum().clamp(min=1)
+        """The mean () of values (K,) of samples, 0 without samples."""
         return values.mean() if len(values) else values.sum()
 
     def count_on(self, chosen: Tensor) -> Tensor:
-        """The number () of samples on the ``chosen`` (R,) rays, padding left out."""
-        counts, present = chosen[self.samples.ray], self.samples.present
-        return counts.sum() if present is None else (counts & present).sum()
+        """The number () of samples on the ``chosen`` (R,) rays."""
+        return chosen[self.samples.ray].sum()
 
     def on_rays(self, chosen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Ray (S,), canonical position (S, 3) and weight (S,) of the ``chosen`` (R,) rays' samples.
-
-        A list of fixed length keeps its length: other samples get weight 0 and a harmless position.
-        """
-        ray, counts = self.samples.ray, chosen[self.samples.ray]
-        if self.samples.present is None:
-            index = counts.nonzero()[:, 0]
-            return ray[index], self.canonical[index], self.weight[index]
-        counts = counts & self.samples.present
-        canonical = torch.where(counts[:, None], self.canonical, 0.0)
-        return ray, canonical, torch.where(counts, self.weight, 0.0)
+        """Ray (S,), position q (S, 3) and weight (S,) of the samples on ``chosen`` (R,) rays."""
+        ray = self.samples.ray
+        index = chosen[ray].nonzero()[:, 0]
+        return ray[index], self.canonical[index], self.weight[index]

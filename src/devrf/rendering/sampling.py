@@ -49,15 +49,12 @@ class Samples:
         distance: (S,) along the ray, in units of its direction.
         points: (S, 3) positions in the fields' space.
         rays: R.
-        present: None, or (S,) bool where the list ends in padding: which places are samples.
-            Padding has weight zero; its other values are finite and meaningless.
     """
 
     ray: Tensor
     distance: Tensor
     points: Tensor
     rays: int
-    present: Tensor | None = None
 
     def __len__(self) -> int:
         return self.ray.shape[0]
@@ -69,7 +66,6 @@ class Samples:
             self.distance.index_select(0, index),
             self.points.t().index_select(1, index).t(),
             self.rays,
-            None if self.present is None else self.present.index_select(0, index),
         )
 
 
@@ -79,11 +75,6 @@ def steps_through(
     """Distance (R,) of each ray's first sample, and number (R,) int64 of samples up to its exit."""
     entry, leave = box.crossing(rays, near, far)
     return entry, steps_between(entry, leave, step)
-
-
-def most_steps(box: Box, *, step: float, near: float, far: float) -> int:
-    """Upper bound of the samples of a ray whose direction has length 1 or more."""
-    return int(min(far - near, box.diagonal) / step) + 2
 
 
 @dataclass(frozen=True)

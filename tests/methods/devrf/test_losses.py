@@ -17,9 +17,7 @@ from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.rays import Rays
-from devrf.methods.devrf.deformation_field import GridWarp
 from devrf.methods.devrf.losses import (
-    MOTION_TERMS,
     PHOTOMETRIC_TERMS,
     MotionPrediction,
     Prediction,
@@ -228,50 +226,6 @@ def test_without_observed_flow_or_samples_nothing_is_learned(by_hand):
     empty = seen(by_hand.batch, torch.zeros(0, dtype=torch.long), none, none, torch.zeros(0))
     without = replace(by_hand, output=empty)
     assert cycle(without).item() == flow(without).item() == 0
-
-
-@pytest.mark.parametrize("flow_mean", ["rays", "samples"])
-@pytest.mark.parametrize("name", MOTION_TERMS)
-def test_padding_changes_no_term_and_no_gradient(by_hand, name, flow_mean, rng):
-    """Lists of fixed length end in places of weight 0, of any ray, where nothing is looked at."""
-    pose = by_hand.cameras.camera_to_world + torch.tensor([0.0, 0.0, 0.0, 1.0])
-    cameras = replace(by_hand.cameras, camera_to_world=pose)
-    box, output = by_hand.box, by_hand.output
-    leaves = [output.canonical.clone(), output.weight.clone(), torch.rand(3, 3, generator=rng)]
-    leaves += [torch.rand(3, 4, 3, 3, generator=rng) for _ in range(2)]
-    canonical, weight, color, forward, before = (leaf.requires_grad_() for leaf in leaves)
-    elsewhere = 50 * torch.rand(2, 3, generator=rng)
-
-    def term(padding: int) -> Tensor:
-        more = torch.arange(padding)
-        listed = replace(
-            output,
-            samples=Samples(
-                torch.cat([output.samples.ray, more]),
-                torch.zeros(3 + padding),
-                torch.cat([output.samples.points, elsewhere[more]]),
-                2,
-                torch.arange(3 + padding) < 3 if padding else None,
-            ),
-            canonical=torch.cat([canonical, elsewhere[more]]),
-            weight=torch.cat([weight, torch.zeros(padding)]),
-            sample_color=torch.cat([color, elsewhere[more]]),
-        )
-        moved = GridWarp((forward,), box), GridWarp((before,), box), cameras
-        shown = replace(by_hand, output=listed, flow_mean=flow_mean)
-        warps = dict(zip(("unwarp", "unwarp_previous", "cameras"), moved, strict=True))
-        return MOTION_TERMS[name](replace(shown, **warps))
-
-    exact, listed = term(0), term(2)
-    torch.testing.assert_close(listed, exact)
-    if exact.requires_grad:
-        assert exact.item() > 0
-        options: Any = {"allow_unused": True, "materialize_grads": True}
-        expected = torch.autograd.grad(exact, leaves, **options)
-        for ours, theirs in zip(
-            torch.autograd.grad(listed, leaves, **options), expected, strict=True
-        ):
-            torch.testing.assert_close(ours, theirs)
 
 
 def exact(scene: Scene, recipe: ProceduralScene, frame: int) -> MotionPrediction:

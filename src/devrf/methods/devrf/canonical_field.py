@@ -194,11 +194,6 @@ class CanonicalField(nn.Module):
         return step * 256 / self.planes * (self.box.size[2] / 2)
 
     @property
-    def raw_density(self) -> Tensor:
-        """v (X, Y, Z, 1), before the softplus."""
-        return self.density.values
-
-    @property
     def shift(self) -> float:
         """b = log(1 / (1 − α_init) − 1): makes a raw density of 0 mean α_init."""
         return math.log(1 / (1 - self.alpha_init) - 1)
@@ -237,13 +232,10 @@ class CanonicalField(nn.Module):
         assert isinstance(self.decoder, ColorDecoder)
         nn.init.zeros_(self.decoder.from_direction.weight)
 
-    def learn_directions(self, whether: bool) -> bool:
-        """Let the network learn from viewing directions, or not; whether that is a change."""
-        decoder = self.decoder
-        if not isinstance(decoder, ColorDecoder) or decoder.learns_directions == whether:
-            return False
-        decoder.learns_directions = whether
-        return True
+    def learn_directions(self, whether: bool) -> None:
+        """Let the network learn from viewing directions, or not."""
+        if isinstance(self.decoder, ColorDecoder):
+            self.decoder.learns_directions = whether
 
     def resize(self, voxels: int) -> None:
         """Resample both grids to about ``voxels`` voxels; new parameters result."""

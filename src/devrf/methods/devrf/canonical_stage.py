@@ -285,7 +285,7 @@ class CanonicalStage(VoxelStage):
         if self.schedule.restart_at_growth or not learns_them:
             self.optimizer.replace(2, decoder)
         learned = [p for group in groups for p in group["params"]]
-        self.bind(rays, [learned])
+        self.loop.bind(rays, [learned])
 
     def _look_for_gradients(self) -> None:
         """Have the optimiser read gradients only where samples may be, unless all are smoothed."""
@@ -313,8 +313,7 @@ class CanonicalStage(VoxelStage):
         if changed:
             self._look_for_gradients()
         learns = schedule.learns_directions(self.iteration)
-        if self.scene_model.canonical.learn_directions(learns) or changed:
-            self.loop.recapture()
+        self.scene_model.canonical.learn_directions(learns)
 
     def draw(self, batch: ParallelBatch) -> Pixels:
         """Random pixels of all images."""
@@ -329,7 +328,7 @@ class CanonicalStage(VoxelStage):
         """Render a batch of pixels and compare it with the images."""
         assert self.phase is not None
         model, schedule = self.scene_model, self.schedule
-        prediction = Prediction(*self.render_pixels(views, pixels, model.occupancy, batch.capacity))
+        prediction = Prediction(*self.render_pixels(views, pixels, model.occupancy))
         with span("losses"):
             total, terms = batch_loss(prediction, PHOTOMETRIC_TERMS, self.weights[self.phase.kind])
             if model.space.is_linear:

@@ -187,7 +187,7 @@ class DeformationStage(MotionStage):
         self.optimizer.replace(0, learned, smoothing=smoothing)
         for extension in self.extensions:
             extension.begin_level(self, level)
-        self.bind(self.schedule.rays, [frame.learned for frame in self.active])
+        self.loop.bind(self.schedule.rays, [frame.learned for frame in self.active])
 
     def _prefetch_after(self, phase: DeformationPhase) -> None:
         """Begin to fetch the next phase's frames, unless they change before it begins."""
@@ -228,22 +228,16 @@ class DeformationStage(MotionStage):
         most = epochs and epochs * sum(map(len, pools)) / (phase.stop - phase.start)
         return self.draw_pixels(pools[self.turn % len(pools)], most)
 
-    @property
-    def view_cycle(self) -> int:
-        """As many as there are pools, which batches are drawn from in turn."""
-        return max(len(frame.pools) for frame in self.active)
-
     def loss(
         self, batch: ParallelBatch, views: Views, pixels: Pixels
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Render a batch of the frame through its warp; compare images and motion."""
-        frame, capacity, field = self.active[batch.number], batch.capacity, self.field
-        # Before frame 1 nothing has moved; lists of fixed length take the same work each time.
-        before = [frame.before] if capacity is not None or frame.number > 1 else []
+        frame, field = self.active[batch.number], self.field
+        before = [frame.before] if frame.number > 1 else []  # before frame 1 nothing has moved
         changes = (extension.color_change(frame) for extension in self.extensions)
         color_change = next((change for change in changes if change is not None), None)
-        motion = field.warp_by(frame.backward), color_change
-        output, rays = self.render_pixels(views, pixels, frame.occupancy, capacity, *motion)
+        warp = field.warp_by(frame.backward)
+        output, rays = self.render_pixels(views, pixels, frame.occupancy, warp, color_change)
         prediction = MotionPrediction(
             output,
             rays,

@@ -43,7 +43,6 @@ class DeVRFView:
         time: t in [0, 1].
         color_change: what is added to the colours' logits at that time; None: nothing.
         at_rest: whether the warp of this time is the identity.
-        displacement: Δ_b(·, t) (X, Y, Z, 3) over the deformation field's box; None at rest.
     """
 
     canonical: CanonicalField
@@ -54,7 +53,6 @@ class DeVRFView:
     time: float
     color_change: ColorChange | None = None
     at_rest: bool = field(init=False)
-    displacement: Tensor | None = field(init=False, default=None)
     _warp: GridWarp | None = field(init=False, default=None)
 
     @torch.no_grad()
@@ -64,7 +62,7 @@ class DeVRFView:
         self.at_rest = motion is None or motion.clock.at(self.time).after == 0
         if motion is None or self.at_rest:
             return
-        self.displacement = displacement = motion.blended(self.time)
+        displacement = motion.blended(self.time)
         self._warp = warp = motion.warp_by(displacement)
         x, y, z = self.occupancy.mask.shape
 

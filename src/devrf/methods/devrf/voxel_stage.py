@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict
 
 import torch
-from torch import Tensor
 
 from devrf.data.batch import PixelPool, Pixels, RayBatch
 from devrf.engine.batches import gather_batch
@@ -17,10 +15,8 @@ from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import CanonicalRates, Precision
 from devrf.methods.devrf.volume_rendering import render
 from devrf.ops.adam import GridAdam
-from devrf.rendering.list_rendering import render_static
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import ColorChange, VoxelOutput
-from devrf.rendering.sample_capacity import SampleCapacity
 from devrf.scenes.scene import Views
 from devrf.system.device import multiplies_bfloat16
 from devrf.system.graphs import Graphs
@@ -67,19 +63,10 @@ class VoxelStage(ScheduledStage):
         (images,) = self.images
         return self.training_views(images)
 
-    @property
-    def static_shape(self) -> bool:
-        """Whether batches are rendered in lists of fixed length."""
-        return False
-
-    def bind(self, rays: int, parameters: Sequence[Sequence[Tensor]]) -> None:
-        """Prepare the loop for batches of ``rays`` that teach these parameters each."""
-        self.loop.bind(rays, parameters, self.optimizer, static_shape=self.static_shape)
-
     def draw_pixels(self, pool: PixelPool, most: float | None = None) -> Pixels:
-        """Random pixels of a pool; ``most``, over all processes, if lists may have any length."""
+        """Random pixels of a pool: a batch's, at ``most`` so many over all processes."""
         rays = self.loop.rays
-        if most is not None and not self.loop.capacities:
+        if most is not None:
             rays = min(rays, max(round(most / self.loop.processes), FEWEST_RAYS))
         with span("batch"):
             image, flat = pool.draw(rays, self.generator)
@@ -90,22 +77,26 @@ class VoxelStage(ScheduledStage):
         views: Views,
         pixels: Pixels,
         occupancy: Occupancy,
-        capacity: SampleCapacity | None,
         warp: GridWarp | None = None,
         color_change: ColorChange | None = None,
     ) -> tuple[VoxelOutput, RayBatch]:
-        """Render pixels of ``views``, in lists of fixed length if there is a ``capacity``."""
+        """Render pixels of ``views``."""
         model, chosen = self.scene_model, self.decoder_precision
         reduced = multiplies_bfloat16(self.device) if chosen == "auto" else chosen == "bfloat16"
         precision = torch.bfloat16 if reduced else torch.float32
         with span("batch"):
             batch = gather_batch(views, pixels.image, pixels.flat, pixels.background, model.space)
-        fields = model.canonical, occupancy, model.settings, batch.background
-        if capacity is None:
-            return render(batch.rays, *fields, warp, precision, color_change), batch
-        moved = ((), 0.0) if warp is None else (warp.slices, warp.weight)
-        listed = render_static(batch.rays, *fields, *moved, capacity, precision, color_change)
-        return listed, batch
+        output = render(
+            batch.rays,
+            model.canonical,
+            occupancy,
+            model.settings,
+            batch.background,
+            warp,
+            precision,
+            color_change,
+        )
+        return output, batch
 
 
 def field_optimizer(field: CanonicalField, rates: CanonicalRates) -> GridAdam:
