@@ -41,7 +41,6 @@ ckpt: null
 scene: robot
 method: devrf
 objective: dynamic.psnr
-graphs: auto
 decoder_precision: auto
 sizes: {{inner: {{_target_: {__name__}.Inner, size: 2}}}}
 loss: {{fine: {{color: 1.0}}}}

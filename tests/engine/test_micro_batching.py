@@ -122,9 +122,9 @@ def test_memory_that_runs_out_in_the_backward_pass_changes_nothing(learn, monkey
     whole, failing = learn(canonical()), canonical()
     usual, calls = failing.manual_backward, [0]
 
-    def backward(loss: torch.Tensor, gradient: torch.Tensor) -> None:
+    def backward(loss: torch.Tensor) -> None:
         calls[0] += 1
-        usual(loss, gradient=gradient)
+        usual(loss)
         if calls[0] == 3:
             raise torch.OutOfMemoryError("CUDA out of memory.")
 

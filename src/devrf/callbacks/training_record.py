@@ -49,7 +49,7 @@ class TrainingRecord(Callback):
         """Fill the record: wall-clock seconds without previews, memory in GiB (None on a CPU).
 
         ``peak_gpu_gb`` is what tensors took, ``peak_reserved_gb`` what torch's allocator held, with
-        its caches and the pools of CUDA graphs.
+        its caches.
         """
         assert isinstance(pl_module, ScheduledStage)
         wait(pl_module.device)

@@ -32,7 +32,6 @@ ROOT: dict[str, Any] = {
     "ckpt": str | Path | None,
     "objective": str,
     "scene": str,
-    "graphs": Literal["auto", "off"],
     "decoder_precision": Literal["auto", "float32", "bfloat16"],
 }
 # What cannot be loaded ends the command with one line; Hydra would log it before.

@@ -51,7 +51,7 @@ OF_A_SCENE = {"data", "facing", "seed"}
 # Keys by which Hydra builds a part.
 CODE = {"_target_", "_partial_", "_convert_", "_recursive_", "_args_"}
 # What is set without a section.
-ALONE = {"seed", "priors", "deterministic", "graphs", "decoder_precision"}
+ALONE = {"seed", "priors", "deterministic", "decoder_precision"}
 # An option's name leads to no other folder than its group's; a key is a path of plain names.
 OPTION = re.compile(r"(?!null$)[\w-]+", re.ASCII | re.IGNORECASE)
 GROUP = re.compile(r"/[\w-]+(/[\w-]+)*", re.ASCII)

@@ -47,7 +47,7 @@ log = logging.getLogger(__name__)
 DECIDES = {"evaluate": "evaluation", "render": "video"}
 NOTE = "done.json"  # in the folder of the lock
 # Settings of a datamodule or a stage that change nothing that is learned.
-UNDECISIVE = {"root", "name", "flow_cache", "export", "graphs", "store"}
+UNDECISIVE = {"root", "name", "flow_cache", "export", "store"}
 
 
 @dataclass(frozen=True)

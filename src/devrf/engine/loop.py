@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import torch
@@ -13,12 +12,8 @@ from torch import Tensor
 from devrf.engine.ddp import average, average_gradients, rays_per_rank, world_size
 from devrf.engine.learner import Learner, ParallelBatch
 from devrf.engine.micro_batching import MicroBatching
-from devrf.ops.adam import GridAdam
-from devrf.system.device import wait
-from devrf.system.graphs import CudaGraphCapture, Graphs
 from devrf.system.memory import OutOfMemoryError
 from devrf.system.profiling import span
-from devrf.system.streams import StreamParallel
 
 
 class MetricAccumulator:
@@ -53,28 +48,19 @@ class MetricAccumulator:
 class Loop:
     """Runs iterations: one optimiser step each, on one batch or on several independent ones.
 
-    Several batches are processed in parallel.
-
     Attributes:
-        graphs: ``off``: never capture iterations in a CUDA graph.
         batches: the batches of an iteration; empty before :meth:`bind`.
         micro_batching: divides batches when memory runs out.
         metrics: losses and their terms since they were last taken.
         batch_share: the part of a batch that is drawn; a time budget may halve it.
     """
 
-    def __init__(self, graphs: Graphs = "auto") -> None:
-        self.graphs = graphs
+    def __init__(self) -> None:
         self.batches: list[ParallelBatch] = []
         self.micro_batching = MicroBatching()
         self.metrics = MetricAccumulator()
         self.batch_share = 1.0
         self._rays, self.processes = 0, 1
-        self._device = torch.device("cpu")
-        # What losses are scaled by in the backward pass, which would fill one each time.
-        self._one = torch.ones(())
-        self._streams = StreamParallel()
-        self._capture: CudaGraphCapture | None = None
 
     @property
     def rays(self) -> int:
@@ -90,8 +76,6 @@ class Loop:
         """
         self.release()
         self._rays, self.processes = rays_per_rank(rays), world_size()
-        self._device = parameters[0][0].device
-        self._one = self._one.to(self._device)
         self.batches = [ParallelBatch(k, learned) for k, learned in enumerate(parameters)]
 
     def release(self) -> None:
@@ -122,8 +106,7 @@ class Loop:
 
     def _accumulate(self, stage: Learner, views: Any) -> None:
         """Compute the gradients of all batches; add losses and terms to the metrics."""
-        pieces = [partial(self._gradients, batch, stage, views) for batch in self.batches]
-        terms = self._streams(pieces, self._device)
+        terms = [self._gradients(batch, stage, views) for batch in self.batches]
         if self.processes > 1:
             groups = stage.optimizer.param_groups
             average_gradients(p for group in groups for p in group["params"])
@@ -135,26 +118,12 @@ class Loop:
 
         def backward(total: Tensor) -> None:
             with span("backward"):
-                stage.manual_backward(total, gradient=self._one)
+                stage.manual_backward(total)
 
         total, terms = self.micro_batching.gradients(
             lambda pixels: stage.loss(batch, views, pixels),
             batch.pixels,
             backward,
-            lambda: self._divided(batch, stage.optimizer),
+            lambda: stage.optimizer.drop_gradients(batch.parameters),
         )
         return {"loss": total.detach(), **terms}
-
-    def _divided(self, batch: ParallelBatch, optimizer: GridAdam) -> None:
-        """Prepare to restart a batch's iteration; later batches use the smaller parts, too."""
-        wait(self._device)  # other streams may still write to their lists
-        optimizer.drop_gradients(batch.parameters)
-
-    def capturer(self) -> CudaGraphCapture | None:
-        """Captures work in graphs; None unless in one process on a GPU."""
-        on_gpu = self._device.type == "cuda" and self.processes == 1
-        if not (self.graphs == "auto" and on_gpu):
-            return None
-        if self._capture is None or self._capture.device != self._device:
-            self._capture = CudaGraphCapture(self._device)
-        return self._capture

@@ -58,9 +58,7 @@ class MicroBatching:
             try:
                 return self._accumulate(loss, pixels, backward)
             except (RuntimeError, MemoryError) as error:
-                # A CUDA graph capture cannot be restarted from within.
-                capturing = device.type == "cuda" and torch.cuda.is_current_stream_capturing()
-                if capturing or not is_oom(error):
+                if not is_oom(error):
                     raise
                 message = str(error)
             # Outside the handler, where the error's traceback no longer holds tensors.

@@ -36,7 +36,6 @@ from devrf.errors import DevrfError
 from devrf.evaluation.held_out import score
 from devrf.ops.adam import GridAdam
 from devrf.rendering.renderer import Renderer
-from devrf.system.graphs import Graphs
 from devrf.system.memory import OutOfMemoryError
 
 # Attributes of a stage that a progress file holds by name: where it is in its schedule.
@@ -74,10 +73,10 @@ class ScheduledStage(Learner):
         loop: carries the iterations out.
     """
 
-    def __init__(self, iterations_per_step: int, graphs: Graphs = "auto") -> None:
+    def __init__(self, iterations_per_step: int) -> None:
         super().__init__()
         self.automatic_optimization = False
-        self.loop = Loop(graphs)
+        self.loop = Loop()
         self.iterations_per_step = iterations_per_step
         self.iteration = self.skipped = self.seed = self.num_rollbacks = 0
         self.stride, self.time_share, self.began = 1.0, 1.0, 0.0

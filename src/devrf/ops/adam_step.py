@@ -1,8 +1,4 @@
-"""One step of Adam on one tensor or several, and the gradient of a grid's total variation.
-
-The learning rate and the step number are tensors on the device: a captured CUDA graph uses their
-present values.
-"""
+"""One step of Adam on a tensor, and the gradient of a grid's total variation."""
 
 from __future__ import annotations
 

@@ -21,11 +21,6 @@ Part = Literal[
 _nothing = nullcontext()
 
 
-def measured() -> bool:
-    """Whether a profiler is active: no CUDA graph is replayed then."""
-    return profiler._is_profiler_enabled
-
-
 def span(part: Part) -> AbstractContextManager[object]:
     """Record the block as ``part``, if a profiler is active; spans may be nested."""
-    return profiler.record_function(part) if measured() else _nothing
+    return profiler.record_function(part) if profiler._is_profiler_enabled else _nothing

@@ -195,3 +195,22 @@ def test_adam_begins_anew_at_each_visit_or_goes_on_above_the_coarsest_level(
     watch = LambdaCallback(on_train_batch_end=count)
     trainer(watch, max_epochs=1).fit(stage, datamodule=datamodule)
     assert steps == {0: [1, 2, 3, 4, 1, 2], 1: fine}
+
+
+def test_a_frame_has_a_copy_of_the_frame_before_it(rest, four_frames, trainer):
+    schedule = DeformationSchedule(levels=(Level(4, 2), Level(5, 1)), rays=64)
+    stage, visited = DeformationStage(rest, schedule), []
+
+    def look(trainer: Trainer, stage: DeformationStage, *_: Any) -> None:
+        (frame,) = stage.active
+        visit = (stage.phase.level, frame.number)
+        if visited[-1:] != [visit]:
+            visited.append(visit)
+        neighbour = stage.field.to_time[frame.number - 1]
+        assert torch.equal(frame.before, neighbour)
+        assert bool(neighbour.any()) == (frame.number > 1)
+
+    watch = LambdaCallback(on_train_batch_start=look)
+    trainer(watch, max_epochs=1).fit(stage, datamodule=four_frames)
+    assert visited == [(0, 1), (0, 2), (0, 3), (1, 1), (1, 2), (1, 3)]
+    assert stage.iteration == stage.total_iterations == 8 + 4

@@ -33,7 +33,6 @@ from devrf.ops.photometric import distortion
 from devrf.rendering.occupancy import Occupancy, bounding_box, dilate
 from devrf.rendering.sampling import RenderSettings
 from devrf.scenes.scene import CaptureName, ImagesName, Views
-from devrf.system.graphs import Graphs
 from devrf.system.profiling import span
 
 log = logging.getLogger(__name__)
@@ -57,7 +56,6 @@ class CanonicalStage(VoxelStage):
         search_loss: Mapping[str, float] = SEARCH_LOSS,
         fine_loss: Mapping[str, float] = FINE_LOSS,
         iterations_per_step: int = 10,
-        graphs: Graphs = "auto",
         decoder_precision: Precision = "auto",
     ) -> None:
         """Build the stage; the defaults are the paper's for inward-facing scenes.
@@ -70,10 +68,9 @@ class CanonicalStage(VoxelStage):
             search_loss: weights of the geometry search's terms; ``tv`` is that of both grids.
             fine_loss: of the radiance field's.
             iterations_per_step: as of every :class:`VoxelStage`.
-            graphs: likewise.
             decoder_precision: likewise.
         """
-        super().__init__(iterations_per_step, graphs, decoder_precision)
+        super().__init__(iterations_per_step, decoder_precision)
         self.schedule = schedule or CanonicalSchedule()
         self.architecture = architecture or Architecture()
         self.rates = rates or CanonicalRates()

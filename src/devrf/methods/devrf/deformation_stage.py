@@ -24,7 +24,6 @@ from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import DEFORMATION_LOSS, MotionSettings, Precision
 from devrf.ops.adam import GridAdam
 from devrf.scenes.scene import Views
-from devrf.system.graphs import Graphs
 from devrf.system.profiling import span
 
 log = logging.getLogger(__name__)
@@ -50,7 +49,6 @@ class DeformationStage(MotionStage):
         flow_mean: FlowMean = "samples",
         extensions: Mapping[str, Extension] | None = None,
         iterations_per_step: int = 10,
-        graphs: Graphs = "auto",
         decoder_precision: Precision = "auto",
     ) -> None:
         """Build the stage; the defaults are the paper's for inward-facing scenes.
@@ -63,10 +61,9 @@ class DeformationStage(MotionStage):
             flow_mean: what the flow loss is a mean over (docs/method.md#flow).
             extensions: what is added beyond the paper, by name.
             iterations_per_step: as of every :class:`VoxelStage`.
-            graphs: likewise.
             decoder_precision: likewise.
         """
-        super().__init__(iterations_per_step, graphs, decoder_precision)
+        super().__init__(iterations_per_step, decoder_precision)
         self.schedule = schedule or DeformationSchedule()
         self.motion = motion or MotionSettings()
         self.flow_mean = flow_mean

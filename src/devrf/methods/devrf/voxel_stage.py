@@ -19,7 +19,6 @@ from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import ColorChange, VoxelOutput
 from devrf.scenes.scene import Views
 from devrf.system.device import multiplies_bfloat16
-from devrf.system.graphs import Graphs
 from devrf.system.profiling import span
 
 # Rays of a batch at the least, however few pixels there are.
@@ -35,20 +34,14 @@ class VoxelStage(ScheduledStage):
 
     scene_model: DeVRFModel
 
-    def __init__(
-        self,
-        iterations_per_step: int,
-        graphs: Graphs = "auto",
-        decoder_precision: Precision = "auto",
-    ) -> None:
+    def __init__(self, iterations_per_step: int, decoder_precision: Precision = "auto") -> None:
         """Build the stage.
 
         Args:
             iterations_per_step: optimiser iterations in one Lightning step.
-            graphs: whether a GPU replays iterations from CUDA graphs: ``auto`` where it can.
             decoder_precision: of the colour network while it learns; ``auto``: as the GPU allows.
         """
-        super().__init__(iterations_per_step, graphs)
+        super().__init__(iterations_per_step)
         self.decoder_precision = decoder_precision
 
     @property

@@ -24,7 +24,6 @@ from devrf.ops.compositing import sum_by_ray
 from devrf.ops.trilinear import interpolate
 from devrf.rendering.occupancy import Occupancy
 from devrf.scenes.scene import Views
-from devrf.system.graphs import CudaGraphCapture, GraphedStep
 
 # By how much a channel of a pixel may differ from what the model shows where it was, to be it.
 LIKENESS = 0.15
@@ -81,8 +80,7 @@ class StartAlongFlow(Extension):
         share = max(1 / max(stage.stride, 1.0), LEAST_SHARE)
         most, steps = round(share * MOST_TRACKS), round(share * FIT_STEPS)
         tracks = self._tracks.follow(frame, pool, stage.generator, learned=learned, most=most)
-        fixed = views.cameras, model.space
-        start_from_tracks(field, frame, tracks, *fixed, steps, capturer=stage.loop.capturer())
+        start_from_tracks(field, frame, tracks, views.cameras, model.space, steps)
         # Each process has followed pixels of its own.
         broadcast([field.to_canonical[frame], field.to_time[frame]])
 
@@ -228,7 +226,6 @@ def start_from_tracks(
     cameras: Cameras,
     space: Space = WORLD,
     steps: int = FIT_STEPS,
-    capturer: CudaGraphCapture | None = None,
 ) -> None:
     """Fit a frame's two slices, copied from the frame before, to the tracks.
 
@@ -243,7 +240,6 @@ def start_from_tracks(
         cameras: all cameras.
         space: the space that the field lives in.
         steps: optimiser steps of each fit.
-        capturer: captures a step of each fit in a CUDA graph; None: steps are done one by one.
     """
     if field.still_outside:
         tracks = tracks[field.box.contains(tracks.canonical)]
@@ -259,7 +255,7 @@ def start_from_tracks(
         pixel, _ = cameras.project(tracks.camera, space.to_world(points))
         return pixel - tracks.pixel
 
-    forward += _fit(misses, forward, scale, steps, capturer)
+    forward += _fit(misses, forward, scale, steps)
     arrived = tracks.canonical + interpolate(forward, coords)
     there = field.box.to_grid(arrived, field.shape)
 
@@ -267,7 +263,7 @@ def start_from_tracks(
         returned = arrived + interpolate(backward + change, there)
         return (returned - tracks.canonical) * scale
 
-    backward += _fit(errs, backward, scale, steps, capturer)
+    backward += _fit(errs, backward, scale, steps)
     field.frames.write(frame, (backward, forward))
 
 
@@ -283,13 +279,7 @@ def _pixels_per_unit(tracks: Tracks, cameras: Cameras, space: Space, small: floa
 
 
 @torch.enable_grad()
-def _fit(
-    residual: Callable[[Tensor], Tensor],
-    like: Tensor,
-    scale: float,
-    steps: int,
-    capturer: CudaGraphCapture | None,
-) -> Tensor:
+def _fit(residual: Callable[[Tensor], Tensor], like: Tensor, scale: float, steps: int) -> Tensor:
     """The smooth change of a grid (X, Y, Z, 3) that makes ``residual(change)`` small.
 
     Args:
@@ -297,29 +287,16 @@ def _fit(
         like: a grid of the shape and device wanted.
         scale: pixels per unit of the grid's values.
         steps: Adam steps; the rate falls linearly from half a pixel a step.
-        capturer: as for :func:`start_from_tracks`.
     """
     change, fastest = torch.zeros_like(like).requires_grad_(), 0.5 / scale
-    # A graph reads the rate on the device.
-    rate = fastest if capturer is None else torch.full((), fastest, device=like.device)
-    on_gpu = change.is_cuda
-    optimizer = torch.optim.Adam([change], lr=rate, fused=on_gpu, capturable=on_gpu)
-
-    def step() -> None:
-        optimizer.zero_grad(set_to_none=capturer is None)
+    optimizer = torch.optim.Adam([change], lr=fastest)
+    for number in range(steps):
+        optimizer.param_groups[0]["lr"] = fastest * (1 - number / steps)
+        optimizer.zero_grad()
         missed = residual(change)
         error = torch.nn.functional.huber_loss(missed, torch.zeros_like(missed), delta=1.0)
         rough = sum(change.diff(dim=axis).square().sum() for axis in range(3)) * scale**2
         total: Tensor = error + SMOOTHNESS * rough / like.shape[:3].numel()
         total.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
-
-    graphed = GraphedStep(step, capturer)
-    for number in range(steps):
-        now = fastest * (1 - number / steps)
-        if isinstance(rate, Tensor):
-            rate.fill_(now)
-        else:
-            optimizer.param_groups[0]["lr"] = now
-        graphed()
     return change.detach()
