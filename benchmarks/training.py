@@ -165,7 +165,6 @@ def measure_phase(stage: ScheduledStage, phase: Phase, views: Any, seconds: floa
     timed = timer.blocked_autorange(min_run_time=seconds)
     row = {
         "grid": "x".join(str(points) for points in stage.resolution),
-        "batches": len(stage.loop.batches),
         "ms": 1000 * timed.median / count,
         "iqr": 1000 * timed.iqr / count,
     }

@@ -145,8 +145,8 @@ def small_scene(device: torch.device, seed: int = 0) -> SmallScene:
     """The scene for a device: a GPU learns what ``experiment=paper`` does, for a moment.
 
     Grids, batches, networks and levels are the paper's; images are small, iterations are few, and
-    coarse geometry begins with the visual hull, because it has no time to be found. Frames of one
-    level are learned in parallel. On a CPU all is tiny.
+    coarse geometry begins with the visual hull, because it has no time to be found. On a CPU all
+    is tiny.
     """
     robot = partial(ProceduralDataModule, static_test_views=1, train_views=3, supersample=1)
     if device.type != "cuda":
@@ -157,7 +157,6 @@ def small_scene(device: torch.device, seed: int = 0) -> SmallScene:
         return SmallScene(device, data, *sizes, seed)
     data = robot(width=96, height=72, static_views=24, frames=9)
     levels = [replace(level, iterations=20) for level in PAPER_LEVELS]
-    levels[2] = replace(levels[2], parallel_frames=4)
     at_rest = replace(short(CanonicalSchedule(), 250), search_iterations=20)
     # Fog that twenty iterations of the search can clear.
     architecture = Architecture(search_alpha_init=1e-2)

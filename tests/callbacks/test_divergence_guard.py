@@ -124,7 +124,7 @@ def test_the_second_time_ends_the_stage_in_its_last_good_state(fit, canonical, t
 def test_a_frame_is_visited_again(fit, moving, caplog):
     stage = fit(moving(), Spoil("nan", 21), DivergenceGuard())
     phase = MOVING.phase(21, 3)
-    assert f"(frame {phase.frames[0]}, " in caplog.text
+    assert f"(frame {phase.frame}, " in caplog.text
     assert f"back to iteration {phase.start}," in caplog.text
     assert (stage.iteration, stage.num_rollbacks) == (30, 1) and finite(stage.state_dict())
 

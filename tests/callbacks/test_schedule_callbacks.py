@@ -52,7 +52,7 @@ def test_deformation_rates_and_phases_are_the_schedules_at_every_step(fit, rest)
     stage = fit(DeformationStage(rest, DEFORMATION, motion), watched(steps := []))
     assert [step for step, _, _ in steps] == list(range(15))
     # Three frames, shares of 3 and 2; frame 1 has two shares.
-    visits = [(phase.level, *phase.frames) for _, phase, _ in steps]
+    visits = [(phase.level, phase.frame) for _, phase, _ in steps]
     assert visits == [(0, 1)] * 6 + [(0, 2)] * 3 + [(1, 1)] * 4 + [(1, 2)] * 2
     scale = stage.field.box.longest
     for _, phase, rates in steps:
@@ -86,20 +86,20 @@ def test_the_record_says_what_training_took(fit, canonical):
     assert stage.metadata().records["canonical"] == stage.record
 
 
-def test_progress_and_curves_name_the_frames_of_a_visit(rest, four_frames, trainer, caplog):
+def test_progress_and_curves_name_the_frame_of_a_visit(rest, four_frames, trainer, caplog):
     caplog.set_level(logging.INFO, logger="devrf")
-    schedule = replace(DEFORMATION, coarse_to_fine=False, levels=(Level(6, 5, parallel_frames=2),))
+    schedule = replace(DEFORMATION, levels=(Level(6, 5),))
     stage = DeformationStage(rest, schedule, iterations_per_step=100)
     meter = Meter()
     trainer(Progress(line_every_seconds=0.0), meter, max_epochs=1).fit(
         stage, datamodule=four_frames
     )
     lines = [line for line in caplog.messages if line.startswith("dynamic ")]
-    first, last = (line.split("  ") for line in lines)
-    assert first[-2] == "frame 2" and re.fullmatch(r"about \d+ (s|min) left", first[-1])
-    assert last[-1] == "frames 1, 3"  # nothing is left
+    first, *_, last = (line.split("  ") for line in lines)
+    assert first[-2] == "frame 1" and re.fullmatch(r"about \d+ (s|min) left", first[-1])
+    assert last[-1] == "frame 3"  # nothing is left
     assert " dB" in lines[-1]
-    assert meter.row["dynamic/frame"] == 1
+    assert meter.row["dynamic/frame"] == 3
 
 
 def test_the_time_left_knows_that_finer_levels_take_longer(fit, canonical, caplog, monkeypatch):

@@ -36,7 +36,7 @@ def timed(monkeypatch: pytest.MonkeyPatch, fit, rest: LoadedCheckpoint) -> Calla
 
         def tick(trainer: Any, stage: Any, optimizer: Any) -> None:
             now[0] += ITERATION[stage.phase.level]
-            visits[stage.phase.level, *stage.phase.frames] += 1
+            visits[stage.phase.level, stage.phase.frame] += 1
 
         stage.enter = slowly
         monkeypatch.setattr(TrainingRecord, "seconds", property(lambda self: now[0]))

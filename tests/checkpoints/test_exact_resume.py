@@ -53,17 +53,8 @@ SEARCHING = CanonicalSchedule(
 MOVING = DeformationSchedule(levels=(Level(4, 6), Level(6, 4)), rays=64)
 # The occupancy is looked up anew in iterations 3, 6, 9 of a visit; frames start along tracks.
 OFTEN = MotionSettings(2e-3, unit="box", views="all", pixels="occupied", occupancy_every=3)
-# Four frames. Level 0 in 0–15; level 1: frame 2 in 16–21, frames 1 and 3 in 22–27.
-TOGETHER = DeformationSchedule(levels=(Level(4, 4), Level(6, 6, parallel_frames=2)), rays=64)
-# Then once more: frame 2 in 28–31, frames 1 and 3 in 32–35.
-AGAIN = replace(
-    TOGETHER,
-    levels=(
-        Level(4, 4),
-        Level(6, 6, parallel_frames=2),
-        Level(6, 4, parallel_frames=2),
-    ),
-)
+# Then once more: 30–35 and 36–38.
+AGAIN = replace(MOVING, levels=(*MOVING.levels, Level(6, 3)))
 
 
 PRIORS = {"render": 1.0, "cycle": 100.0, "tv": 1.0, "elastic": 0.1}
@@ -174,30 +165,28 @@ def test_the_deformation_stage_goes_on_exactly(learn, rest, each, leaves):
     assert_same(learn(build, *leaves), learn(build))
 
 
-# A visit ends after three steps, as their losses tell.
-@pytest.mark.parametrize("motion", [OFTEN, replace(ROUNDED, min_rel_improvement=1.0)])
-def test_frames_that_are_visited_together_go_on_exactly(learn, rest, four_frames, motion):
-    build = deformation(rest, TOGETHER, motion, tracks=StartAlongFlow("tracks"))
-    whole = learn(build, data=four_frames)
-    # At a visit of level 1, and mid-visit.
-    assert_same(learn(build, 16, 18, data=four_frames), whole)
-    assert len(whole["optimizer"]["param_groups"][0]["params"]) == 4
+def test_frames_that_are_left_early_go_on_exactly(learn, rest):
+    # A visit ends after three steps, as their losses tell.
+    early = replace(ROUNDED, min_rel_improvement=1.0)
+    build = deformation(rest, MOVING, early, tracks=StartAlongFlow("tracks"))
+    # Mid-visit at both levels.
+    assert_same(learn(build, 2, 19), learn(build))
 
 
-def test_colours_that_change_go_on_exactly(learn, rest, four_frames):
+def test_colours_that_change_go_on_exactly(learn, rest):
     colors = ColorResidual("always", side=5, start_level=2)
-    build = deformation(rest, TOGETHER, ROUNDED, color_residual=colors)
-    # Mid-visit at both levels, at the level's end.
-    whole = learn(build, data=four_frames)
-    assert_same(learn(build, 3, 16, 25, data=four_frames), whole)
-    assert len(whole["optimizer"]["param_groups"][1]["params"]) == 2
+    build = deformation(rest, MOVING, ROUNDED, color_residual=colors)
+    # Mid-visit at both levels, at a frame's end.
+    whole = learn(build)
+    assert_same(learn(build, 3, 20, 26), whole)
+    assert len(whole["optimizer"]["param_groups"][1]["params"]) == 1
 
 
-def test_a_second_sweep_with_the_elastic_prior_goes_on_exactly(learn, rest, four_frames):
+def test_a_second_sweep_with_the_elastic_prior_goes_on_exactly(learn, rest):
     build = deformation(rest, AGAIN, ROUNDED, PRIORS, elastic=Elastic())
     # At a look at the occupancy, at the end of a level, mid-visit.
-    whole = learn(build, data=four_frames)
-    assert_same(learn(build, 20, 28, 34, data=four_frames), whole)
+    whole = learn(build)
+    assert_same(learn(build, 21, 30, 34), whole)
 
 
 def test_only_what_is_to_be_gone_on_from_holds_the_way_there(

@@ -45,10 +45,6 @@ MISTAKES = {
         "schedule.deformation.levels.3.sides: no such key; did you mean",
     ),
     "part that is not there": (["data._target_=devrf.nothing"], "data._target_: cannot load"),
-    "parallel frames where they start from one another": (
-        ["schedule.deformation.levels.1.parallel_frames=2"],
-        "schedule.deformation.levels.1.parallel_frames: expected 1 at the first level",
-    ),
     "unknown loss term": (["+loss.deformation.foo=1"], "unknown term 'foo'"),
     "unknown accelerator": (["trainer.accelerator=abacus"], "trainer: "),
     "several devices, each for itself": (

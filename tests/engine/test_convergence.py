@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import pytest
-import torch
 
-from devrf.engine.convergence import Convergence, converged
+from devrf.engine.convergence import converged
 from devrf.errors import DevrfError
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
@@ -39,14 +38,3 @@ def test_a_frame_that_has_converged_is_left_if_asked(rest, datamodule, trainer):
 def test_a_gain_is_a_share():
     with pytest.raises(DevrfError, match="schedule.motion.min_rel_improvement"):
         MotionSettings(min_rel_improvement=0.0)
-
-
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-def test_losses_on_a_gpu_are_judged_one_step_late_and_go_on_so():
-    steps = [torch.tensor([loss], device="cuda") for loss in (1.0, 0.99, 0.985, 0.98)]
-    watch = Convergence()
-    assert [watch.converged(loss, 0.02) for loss in steps[:3]] == [False] * 3
-    again = Convergence()
-    again.load_state(watch.state())
-    assert again.converged(steps[3], 0.02)

@@ -82,14 +82,19 @@ PAPER = (160, 160, 160)
 
 
 @pytest.mark.parametrize(
-    ("gigabytes", "half", "parallel", "fits"),
-    [(6, False, 1, False), (8, False, 1, True), (6, True, 1, True), (8, False, 3, False)],
+    ("gigabytes", "half", "learned", "fits"),
+    [
+        (6, False, False, False),
+        (7, False, False, True),
+        (7, False, True, False),
+        (4, True, True, True),
+    ],
 )
-def test_a_quarter_of_the_gpu_is_left(gigabytes, half, parallel, fits):
+def test_a_quarter_of_the_gpu_is_left(gigabytes, half, learned, fits):
     # 2 · 50 · 160³ displacements of 12 bytes: 4.9 GB, or 2.5 in half precision. Of a frame that is
     # learned 11 grids (values 3, gradients 2, Adam's 4, a copy 2): 0.54 GB.
-    free = gigabytes * 10**9
-    assert fits_on_device(free, 50, PAPER, half=half, parallel=parallel) is fits
+    free = int(gigabytes * 10**9)
+    assert fits_on_device(free, 50, PAPER, half=half, learned=learned) is fits
 
 
 @pytest.mark.gpu

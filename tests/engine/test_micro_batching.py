@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import logging
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -28,8 +27,6 @@ from devrf.methods.devrf.deformation_stage import DeformationStage
 SMALL = Architecture(channels=4, width=8, frequencies=1)
 SCHEDULE = CanonicalSchedule(0, 12, True, 4, 12, (), rays=64)
 MOVING = DeformationSchedule(levels=(Level(4, 4),), rays=64)
-# Of four frames number 2 in iterations 0 to 3, then 1 and 3.
-TOGETHER = replace(MOVING, coarse_to_fine=False, levels=(Level(4, 4, parallel_frames=2),))
 # Without the terms that are means over what rays have met.
 BY_RAY = {"render": 1.0, "per_sample_color": 0.1, "entropy": 0.01}
 
@@ -68,8 +65,8 @@ def canonical() -> CanonicalStage:
     return CanonicalStage(SCHEDULE, SMALL, iterations_per_step=2)
 
 
-def moving(rest: LoadedCheckpoint, schedule: DeformationSchedule = MOVING) -> DeformationStage:
-    return DeformationStage(copy.deepcopy(rest), schedule, loss=BY_RAY)
+def moving(rest: LoadedCheckpoint) -> DeformationStage:
+    return DeformationStage(copy.deepcopy(rest), MOVING, loss=BY_RAY)
 
 
 def assert_alike(one: ScheduledStage, other: ScheduledStage) -> None:
@@ -91,31 +88,26 @@ def test_the_canonical_stage_learns_the_same_in_parts(learn, memory_for, caplog)
     assert ["2 micro" in said[0], "4 micro" in said[1], "8 micro" in said[2]] == [True] * 3
 
 
-def test_memory_that_runs_out_for_one_frame_changes_nothing_for_a_parallel_one(
-    learn, memory_for, rest, four_frames
-):
-    whole = learn(moving(rest, TOGETHER), data=four_frames)
-    # Four iterations of one frame, one of two frames; then the second of them does not fit.
-    calls = memory_for(32, from_call=4 + 2 + 1)
-    divided = learn(moving(rest, TOGETHER), data=four_frames)
+def test_memory_that_runs_out_in_a_visit_changes_nothing(learn, memory_for, rest):
+    whole = learn(moving(rest))
+    # Three frames: frame 1 in iterations 0 to 7; in the last of these the batch does not fit.
+    calls = memory_for(32, from_call=7)
+    divided = learn(moving(rest))
     assert divided.loop.micro_batching.count == 2
-    assert calls == [64] * 8 + [32] * 2 + [32] * 2 * 2 * 2
+    assert calls == [64] * 8 + [32] * 2 * 5
     assert_alike(divided, whole)
 
 
-def test_a_frame_that_never_fits_ends_the_stage_saved(
-    learn, memory_for, rest, four_frames, tmp_path
-):
-    calls = memory_for(4, from_call=4 + 2 + 1)
-    stage = moving(rest, TOGETHER)
-    with pytest.raises(DevrfError, match=r"at iteration 5 of 8 \(frames 1, 3, ") as caught:
-        learn(stage, PeriodicCheckpoint(tmp_path, every_seconds=1000), data=four_frames)
-    assert "schedule.deformation.levels.1.parallel_frames" in str(caught.value)
-    assert calls[7:] == [64, 32, 16, 8]
-    # The gradients of the first frame's batch are dropped with the other's.
+def test_a_frame_that_never_fits_ends_the_stage_saved(learn, memory_for, rest, tmp_path):
+    calls = memory_for(4, from_call=9)
+    stage = moving(rest)
+    with pytest.raises(DevrfError, match=r"at iteration 9 of 12 \(frame 2, ") as caught:
+        learn(stage, PeriodicCheckpoint(tmp_path, every_seconds=1000))
+    assert "schedule.deformation.levels.1.side" in str(caught.value)
+    assert calls[9:] == [64, 32, 16, 8]
     gradients = [p.grad for group in stage.optimizer.param_groups for p in group["params"]]
-    assert gradients == [None] * 4 and stage.iteration == 5
-    assert [path.name for path in tmp_path.iterdir()] == ["deformation-progress-5.ckpt"]
+    assert gradients == [None] * 2 and stage.iteration == 9
+    assert [path.name for path in tmp_path.iterdir()] == ["deformation-progress-9.ckpt"]
 
 
 def test_memory_that_runs_out_in_the_backward_pass_changes_nothing(learn, monkeypatch):

@@ -12,7 +12,6 @@ from lightning import Callback, Trainer
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint, save_checkpoint
 from devrf.data.datamodule import SceneDataModule
-from devrf.engine.learner import ParallelBatch
 from devrf.errors import DevrfError
 from devrf.methods.dnerf.model import DNeRF, DNeRFSettings
 from devrf.methods.hypernerf.model import HyperNeRF, HyperNeRFSettings
@@ -80,7 +79,7 @@ def test_a_fixed_share_of_a_joint_batch_is_static(
     share: float, static: int, ray_stage: Make, fit: Fit, tiny_scene: Scene
 ) -> None:
     stage = fit(ray_stage(DNeRF(TINY), static_share=share))
-    image = stage.draw(ParallelBatch(0, [])).image
+    image = stage.draw().image
     assert len(image) == 32 and int((image < len(tiny_scene.static.train)).sum()) == static
 
 
@@ -92,7 +91,7 @@ def test_the_curriculum_adds_frames(
     assert views.frames is not None
     for iteration, frames in ((0, 3), (4, 4)):
         stage.iteration = iteration
-        image = stage.draw(ParallelBatch(0, [])).image
+        image = stage.draw().image
         assert len(views.frames[image].unique()) == frames
 
 
@@ -100,7 +99,7 @@ def test_the_first_batches_may_see_the_centre_half_alone(ray_stage: Make, fit: F
     stage = fit(ray_stage(DNeRF(TINY), centre_crop=2, rays=2000))  # of 24×18 pixels
     for iteration, rows, columns in ((1, (4, 13), (6, 17)), (2, (0, 17), (0, 23))):
         stage.iteration = iteration
-        flat = stage.draw(ParallelBatch(0, [])).flat
+        flat = stage.draw().flat
         assert (int(flat.min()) // 24, int(flat.max()) // 24) == rows
         assert (int((flat % 24).min()), int((flat % 24).max())) == columns
 
@@ -110,7 +109,7 @@ def test_a_batch_may_have_few_times(
     step: str, times: int, ray_stage: Make, fit: Fit, four_frames: SceneDataModule
 ) -> None:
     stage = fit(ray_stage(DNeRF(TINY), step, times_per_batch=times, rays=60), data=four_frames)
-    image = stage.draw(ParallelBatch(0, [])).image
+    image = stage.draw().image
     if step == "joint":
         static = len(stage.training_views("static"))
         assert (image[:30] < static).all()
@@ -127,7 +126,7 @@ def test_a_batch_may_have_fewer_rays_where_no_masks_tell_what_is_empty(
     sizes = []
     for hull in (True, False):
         stage = fit(ray_stage(DNeRF(replace(TINY, hull=hull)), rays_without_hull=7))
-        sizes.append(len(stage.draw(ParallelBatch(0, [])).image))
+        sizes.append(len(stage.draw().image))
     assert sizes == [32, 7]
 
 

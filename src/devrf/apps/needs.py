@@ -149,15 +149,14 @@ def needs_of_devrf(
         grid: LEARNED * values,
         "schedule.canonical.rays": schedule.rays * ray,
     }
-    # Displacements of a frame: three numbers in both directions. Active frames are learned.
+    # Displacements of a frame: three numbers in both directions. The active one is learned.
     frame, frames = 24 * moving.levels[-1].side ** 3, len(scene.clock)
-    active = moving.max_parallel_frames(len(moving.levels) - 1, frames)
-    held = active if offloaded else frames
+    held = 1 if offloaded else frames
     in_motion = {
         images: tensor_bytes(scene.dynamic.train),
         grid: values,
-        f"schedule.deformation.levels.{last_level}.side": frame * (held + LEARNED * active),
-        "schedule.deformation.rays": active * moving.rays * COLOURED * ray,
+        f"schedule.deformation.levels.{last_level}.side": frame * (held + LEARNED),
+        "schedule.deformation.rays": moving.rays * COLOURED * ray,
     }
     return {
         "canonical": StageNeeds(at_rest, values),

@@ -81,8 +81,8 @@ class Meter(Callback):
             values["voxels"] = math.prod(pl_module.resolution)
         for group in pl_module.optimizer.param_groups:
             values[f"lr/{group['name']}"] = group["lr"]
-        if pl_module.phase is not None and pl_module.phase.frames:
-            values["frame"] = pl_module.phase.frames[0]  # a column has one number
+        if pl_module.phase is not None and pl_module.phase.frame is not None:
+            values["frame"] = pl_module.phase.frame
         if pl_module.device.type == "cuda":
             values["peak_gpu_gb"] = torch.cuda.max_memory_allocated(pl_module.device) / 2**30
         means, psnr = outputs or {}, batch_psnr(outputs or {})

@@ -117,7 +117,7 @@ class DivergenceGuard(Callback):
         self._snapshot(pl_module)
         if phase.kind != self._kind:
             self._kind = phase.kind
-            if not phase.frames:
+            if phase.frame is None:
                 self._range = [1.0, 0.0]  # a new field begins as fog
 
     def on_train_batch_end(

@@ -63,9 +63,9 @@ class LiveView(Callback):
             return
         with self.session.surviving():
             scheduler.drawing.renderer = _renderer(pl_module)
-            frames = () if pl_module.phase is None else pl_module.phase.frames
+            frame = None if pl_module.phase is None else pl_module.phase.frame
             clock = pl_module.scene.clock
-            controls.follow(clock.times[frames[-1]] if frames else None)
+            controls.follow(None if frame is None else clock.times[frame])
             self.session.refresh()
             self.session.step(0.0)
         self._last = time.perf_counter()

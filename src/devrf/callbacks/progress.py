@@ -14,7 +14,6 @@ from rich.progress import Progress as Bar
 from torch import Tensor
 
 from devrf.callbacks.curves import batch_psnr
-from devrf.engine.learner import in_words
 from devrf.engine.stage import ScheduledStage
 from devrf.system.progress import time_left
 
@@ -110,12 +109,12 @@ def in_one_line(
 
 
 def describe(means: Mapping[str, Tensor], stage: ScheduledStage, speed: float) -> str:
-    """PSNR of the last batches, iterations a second, resolution, and the frames if any."""
+    """PSNR of the last batches, iterations a second, resolution, and the frame if any."""
     psnr = batch_psnr(means)
     parts = [] if psnr is None else [f"{float(psnr):.1f} dB"]
     parts.append(f"{speed:.0f} it/s" if speed >= 10 else f"{speed:.2g} it/s")
     if stage.resolution:
         parts.append("x".join(str(n) for n in stage.resolution))
-    if stage.phase is not None and stage.phase.frames:
-        parts.append(in_words(stage.phase.frames))
+    if stage.phase is not None and stage.phase.frame is not None:
+        parts.append(f"frame {stage.phase.frame}")
     return "  ".join(parts)

@@ -190,7 +190,6 @@ class FrameStore(nn.Module):
         shape: Shape,
         *,
         half: bool,
-        parallel: int,
     ) -> None:
         """Choose where the frames are kept, before the clock of training starts.
 
@@ -200,14 +199,13 @@ class FrameStore(nn.Module):
             device: where they are learned.
             shape: of their grids in the end.
             half: whether in half precision.
-            parallel: how many are learned at once.
         """
         store = store if world_size() == 1 else "device"
         on_host = store == "host"
         if store == "auto" and device.type == "cuda":
             free, _ = torch.cuda.mem_get_info(device)
             frames = len(self.to_time)
-            on_host = not fits_on_device(free, frames, shape, half=half, parallel=parallel)
+            on_host = not fits_on_device(free, frames, shape, half=half)
             if on_host:
                 log.info(
                     "motion: %.1f GB are free on the GPU: frames are kept on the host", free / 1e9
@@ -258,9 +256,11 @@ class FrameStore(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
 
-def fits_on_device(free: int, frames: int, shape: Shape, *, half: bool, parallel: int) -> bool:
-    """Whether T ``frames``, ``parallel`` of them active, fit into ``free`` bytes of a GPU."""
+def fits_on_device(
+    free: int, frames: int, shape: Shape, *, half: bool, learned: bool = True
+) -> bool:
+    """Whether T ``frames`` fit into ``free`` bytes of a GPU, with one that is ``learned``."""
     x, y, z = shape
     grid = x * y * z * DISPLACEMENT
     stored = 2 * frames * grid // (2 if half else 1)
-    return stored + parallel * ACTIVE_GRIDS * grid <= FRAMES_SHARE * free
+    return stored + learned * ACTIVE_GRIDS * grid <= FRAMES_SHARE * free

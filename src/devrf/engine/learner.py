@@ -7,7 +7,6 @@ grids grow or other frames become active.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, Protocol
 
@@ -29,39 +28,18 @@ class Phase:
         kind: what is learned, in a word or two: ``search``, ``fine``, ``level 2``.
         start: first iteration.
         stop: one past the last iteration.
-        frames: the frames that are learned, ascending; empty where all times are learned at once.
+        frame: the frame that is learned; None where all times are learned at once.
     """
 
     kind: str
     start: int
     stop: int
-    frames: tuple[int, ...] = ()
+    frame: int | None = None
 
     @property
     def cost(self) -> float:
         """How long an iteration takes, about, in a unit that the stage's phases share."""
         return 1.0
-
-
-def in_words(frames: tuple[int, ...]) -> str:
-    """``frame 3``, or ``frames 3, 10``."""
-    noun = "frame" if len(frames) == 1 else "frames"
-    return f"{noun} {', '.join(str(frame) for frame in frames)}"
-
-
-@dataclass
-class ParallelBatch:
-    """One of the batches that an iteration learns from, independent of the others.
-
-    Attributes:
-        number: its index in the iteration, from 0.
-        parameters: what is learned from it, and from no other batch.
-        pixels: the pixels of the present iteration; None before the first.
-    """
-
-    number: int
-    parameters: Sequence[Tensor]
-    pixels: Pixels | None = None
 
 
 class LearnedModel(Viewable, Protocol):
@@ -133,14 +111,12 @@ class Learner(LightningModule, ABC):
         """Make grids and optimiser ready for ``phase``; ends by binding the loop to them."""
 
     @abstractmethod
-    def draw(self, batch: ParallelBatch) -> Pixels:
-        """The pixels of a batch's next iteration, drawn with the stage's generator."""
+    def draw(self) -> Pixels:
+        """The pixels of the next iteration, drawn with the stage's generator."""
 
     @abstractmethod
-    def loss(
-        self, batch: ParallelBatch, views: Any, pixels: Pixels
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """The weighted loss () of a batch's pixels of ``views``, and its terms () by name."""
+    def loss(self, views: Any, pixels: Pixels) -> tuple[Tensor, dict[str, Tensor]]:
+        """The weighted loss () of pixels of ``views``, and its terms () by name."""
 
     @abstractmethod
     def restore(self, phase: Any, state: dict[str, Any]) -> None:
@@ -165,11 +141,11 @@ class Learner(LightningModule, ABC):
     def prepare(self) -> None:
         """Called before each iteration; may wait for the device."""
 
-    def converged(self, losses: Tensor) -> bool:
+    def converged(self, loss: Tensor) -> bool:
         """Whether the rest of the present phase can be skipped.
 
         Args:
-            losses: (batches,) mean loss of each batch over the last Lightning step.
+            loss: () mean over the last Lightning step.
         """
         return False
 
@@ -177,10 +153,11 @@ class Learner(LightningModule, ABC):
         """Give modules the shapes of a stored ``state`` that is about to be loaded."""
 
     def describe(self, iteration: int) -> str:
-        """An iteration of the present phase, with its frames and resolution, for messages."""
-        frames = self.phase.frames if self.phase is not None else ()
+        """An iteration of the present phase, with its frame and resolution, for messages."""
+        number = None if self.phase is None else self.phase.frame
+        frame = "" if number is None else f"frame {number}"
         shape = "x".join(str(n) for n in self.resolution)
-        place = ", ".join(part for part in (frames and in_words(frames), shape) if part)
+        place = ", ".join(part for part in (frame, shape) if part)
         return f"iteration {iteration} of {self.total_iterations}{place and f' ({place})'}"
 
     @property

@@ -251,7 +251,7 @@ class ScheduledStage(Learner):
         """Run up to ``iterations_per_step`` iterations, all of the present phase.
 
         Returns:
-            Means () of the loss and of its terms by name, over these iterations and all batches;
+            Means () of the loss and of its terms by name, over these iterations;
             empty if memory ran out in the first.
         """
         if self.phase != self.phase_at(self.iteration):
@@ -269,8 +269,8 @@ class ScheduledStage(Learner):
         self._iterate(views, stop)
         means: dict[str, Tensor] = {}
         if done := self.iterations_done - before:
-            means, losses = self.loop.metrics.take(done, self.loop.processes)
-            if self.iteration < stop and self.converged(losses):
+            means = self.loop.metrics.take(done, self.loop.processes)
+            if self.iteration < stop and self.converged(means["loss"]):
                 self.skipped += stop - self.iteration
                 self.iteration = stop
         self._reseed()
@@ -369,7 +369,3 @@ class ScheduledStage(Learner):
         means = {f"test/{self.scored_capture}/{k}": v for k, v in scores.items()}
         self.log_dict(means, batch_size=1, sync_dist=True)
         return {"view": view}
-
-    def teardown(self, stage: str) -> None:
-        """Release the memory that only iterations need."""
-        self.loop.release()

@@ -13,7 +13,7 @@ from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import Pixels, RayBatch, concatenated
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.batches import FramePool, gather_batch
-from devrf.engine.learner import ParallelBatch, Phase
+from devrf.engine.learner import Phase
 from devrf.engine.stage import ScheduledStage
 from devrf.errors import expect
 from devrf.methods.base import RayTrainable
@@ -164,17 +164,15 @@ class RayStage(ScheduledStage):
         if self.schedule.centre_crop:
             self._centres = [FramePool.of(view_set, centre=True) for view_set in views]
         self.scene_model.learn_from(views, self.weights)
-        groups = self.optimizer.param_groups
         fewer = self.schedule.rays_without_hull
         rays = self.schedule.rays if fewer is None or self.scene_model.has_hull else fewer
-        learned = [parameter for group in groups for parameter in group["params"]]
-        self.loop.bind(rays, [learned])
+        self.loop.bind(rays)
 
     def prepare(self) -> None:
         """Let the model follow the schedule."""
         self.scene_model.on_iteration(self.iteration, self.total_iterations)
 
-    def draw(self, batch: ParallelBatch) -> Pixels:
+    def draw(self) -> Pixels:
         """Random pixels: of the static images first, where both captures are learned from.
 
         Images are numbered through, the static ones first. Last are those the model asks for.
@@ -209,7 +207,7 @@ class RayStage(ScheduledStage):
         return min(pool.frames, max(3, int(pool.frames * self.iteration / share)))
 
     def loss(
-        self, batch: ParallelBatch, views: Views | tuple[Views, ...], pixels: Pixels
+        self, views: Views | tuple[Views, ...], pixels: Pixels
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Render a batch and weigh the method's loss terms."""
         with span("batch"):

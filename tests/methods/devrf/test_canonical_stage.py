@@ -98,7 +98,7 @@ def test_coarse_and_few_pixels_make_a_coarse_grid_and_small_batches(fit):
         stages[0].scene_model.canonical.base_voxels
     )
     pixels = len(stages[1].pool)
-    drawn = [len(stage.draw(None).image) for stage in stages]
+    drawn = [len(stage.draw().image) for stage in stages]
     assert drawn == [4096, max(64, round(2 * pixels / 60))]
 
 

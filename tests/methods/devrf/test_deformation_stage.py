@@ -50,8 +50,8 @@ def test_a_visit_shows_its_pixels_as_often_as_said(rest, fit, views: Any):
     drawn = []
 
     class Watched(DeformationStage):
-        def draw(self, batch: Any) -> Any:
-            pixels = super().draw(batch)
+        def draw(self) -> Any:
+            pixels = super().draw()
             assert self.phase is not None
             drawn.append((self.phase.stop - self.phase.start, len(pixels.image)))
             return pixels
@@ -87,11 +87,11 @@ def test_total_variation_alone_smooths_both_directions(rest, datamodule, trainer
     before, mean = [], []
 
     def peak(*_: Any) -> None:
-        stage.active[0].forward.data[1, 1, 1] = 0.5
-        before.append(stage.active[0].forward.detach().clone())
+        stage.active.forward.data[1, 1, 1] = 0.5
+        before.append(stage.active.forward.detach().clone())
 
     def look(*_: Any) -> None:
-        mean.append(stage.optimizer.state[stage.active[0].forward]["mean"].clone())
+        mean.append(stage.optimizer.state[stage.active.forward]["mean"].clone())
 
     watch = LambdaCallback(on_train_batch_start=peak, on_train_batch_end=look)
     trainer(watch, max_steps=1).fit(stage, datamodule=datamodule)
@@ -148,7 +148,7 @@ def test_state_and_model_hold_what_an_active_frame_has_learned(rest, datamodule,
     stage, last = DeformationStage(rest, TINY, FAST, iterations_per_step=3), []
 
     def look(trainer: Trainer, stage: DeformationStage, *_: Any) -> None:
-        frame, learned = stage.active[0].number, stage.active[0].forward.detach().clone()
+        frame, learned = stage.active.number, stage.active.forward.detach().clone()
         stored = stage.state_dict()["scene_model.deformation.frames.to_time"][frame]
         assert learned.any() and torch.equal(stored, learned)
         assert torch.equal(stage.current_model().deformation.to_time[frame], learned)
@@ -202,7 +202,7 @@ def test_a_frame_has_a_copy_of_the_frame_before_it(rest, four_frames, trainer):
     stage, visited = DeformationStage(rest, schedule), []
 
     def look(trainer: Trainer, stage: DeformationStage, *_: Any) -> None:
-        (frame,) = stage.active
+        frame = stage.active
         visit = (stage.phase.level, frame.number)
         if visited[-1:] != [visit]:
             visited.append(visit)

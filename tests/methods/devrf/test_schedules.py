@@ -94,49 +94,42 @@ def test_forward_facing_and_without_coarse_to_fine():
     assert forward.total(40) == 24000
     assert forward.growths(40) == [8000, 16000, 20000, 22000]
     # Every share goes to the finest grid, where each frame starts from the one before it.
-    schedule = DeformationSchedule(with_level(5, parallel_frames=4), coarse_to_fine=False)
+    schedule = DeformationSchedule(coarse_to_fine=False)
     phases = deformation_phases(schedule, 50)
     assert schedule.total(50) == 25000 and schedule.growths(50) == []
     assert {(p.side, p.level, p.learning_rate_factor) for p in phases} == {(160, 0, 1.0)}
-    assert [p.frames for p in phases] == [(k,) for k in range(1, 50)]
+    assert [p.frame for p in phases] == list(range(1, 50))
     assert [p.init_from_previous for p in phases] == [False] + [True] * 48
 
 
 def course(schedule: DeformationSchedule, frames: int) -> list[tuple[Any, ...]]:
-    """Level, frames and iterations of each visit."""
+    """Level, frame and iterations of each visit."""
     phases = deformation_phases(schedule, frames)
-    return [(p.level, p.frames, p.start, p.stop) for p in phases]
+    return [(p.level, p.frame, p.start, p.stop) for p in phases]
 
 
-def test_frames_of_two_stretches_are_visited_together():
-    schedule = DeformationSchedule((Level(4, 6), Level(6, 4, parallel_frames=2)))
-    # Frames 0 to 6 and 7 to 13.
-    assert course(schedule, 14) == [
-        (0, (1,), 0, 12),
-        *((0, (k,), 6 * k, 6 * k + 6) for k in range(2, 14)),
-        (1, (7,), 84, 88),
-        *((1, (k, k + 7), 84 + 4 * k, 88 + 4 * k) for k in range(1, 7)),
+def test_frames_are_visited_one_after_another():
+    schedule = DeformationSchedule((Level(4, 6), Level(6, 4)))
+    assert course(schedule, 4) == [
+        (0, 1, 0, 12),
+        (0, 2, 12, 18),
+        (0, 3, 18, 24),
+        (1, 1, 24, 32),
+        (1, 2, 32, 36),
+        (1, 3, 36, 40),
     ]
-    assert schedule.total(14) == 112 and schedule.growths(14) == [84]
-    phases = deformation_phases(schedule, 14)
-    assert [p.init_from_previous for p in phases] == [False] + [True] * 12 + [False] * 7
-    # Frame 6 has not been learned at level 1 when frame 7 is.
-    assert [p.has_previous for p in phases] == [True] * 13 + [False] + [True] * 6
-    assert (schedule.max_parallel_frames(0, 14), schedule.max_parallel_frames(1, 14)) == (1, 2)
+    assert schedule.total(4) == 40 and schedule.growths(4) == [24]
+    phases = deformation_phases(schedule, 4)
+    assert [p.init_from_previous for p in phases] == [False, True, True, False, False, False]
 
 
 @given(
-    st.lists(
-        st.tuples(st.integers(2, 99), st.integers(1, 9), st.integers(1, 15)), min_size=1, max_size=5
-    ),
+    st.lists(st.tuples(st.integers(2, 99), st.integers(1, 9)), min_size=1, max_size=5),
     st.integers(2, 12),
     st.booleans(),
-    st.booleans(),
 )
-def test_deformation_phases_tile_every_schedule(levels, frames, coarse_to_fine, together):
-    rows = [Level(*level[:2], parallel_frames=level[2] if together else 1) for level in levels]
-    rows[0] = replace(rows[0], parallel_frames=1)
-    schedule = DeformationSchedule(rows, coarse_to_fine)
+def test_deformation_phases_tile_every_schedule(levels, frames, coarse_to_fine):
+    schedule = DeformationSchedule([Level(*level) for level in levels], coarse_to_fine)
     phases = deformation_phases(schedule, frames)
     assert phases[0].start == 0 and phases[-1].stop == schedule.total(frames)
     for phase, after in zip(phases, phases[1:], strict=False):
@@ -145,15 +138,9 @@ def test_deformation_phases_tile_every_schedule(levels, frames, coarse_to_fine, 
         assert {schedule.phase(k, frames) for k in range(phase.start, phase.stop)} == {phase}
     depth = len(levels) if coarse_to_fine else 1
     visits = [(level, frame) for level in range(depth) for frame in range(1, frames)]
-    visited = [(p.level, frame) for p in phases for frame in p.frames]
-    assert sorted(visited) == visits  # each exactly once
-    assert not any(frame + 1 in p.frames for p in phases for frame in p.frames)
-    assert together or visited == visits
+    assert [(p.level, p.frame) for p in phases] == visits
     begun = [[p.start for p in phases if p.level == level][0] for level in range(depth)]
     assert begun == [0, *schedule.growths(frames)]
-    for level in range(depth):
-        most = max(len(p.frames) for p in phases if p.level == level)
-        assert most == schedule.max_parallel_frames(level, frames)
     assert schedule.phase(schedule.total(frames) + 3, frames) == phases[-1]
 
 
@@ -166,7 +153,6 @@ def test_deformation_phases_tile_every_schedule(levels, frames, coarse_to_fine, 
         (lambda: DeformationSchedule(levels=()), "deformation.levels: expected at least one"),
         (lambda: DeformationSchedule(with_level(5, iterations=0)), "levels.5.iterations"),
         (lambda: DeformationSchedule(with_level(2, other_terms=-1)), "levels.2.other_terms"),
-        (lambda: DeformationSchedule(with_level(1, parallel_frames=2)), "levels.1.parallel_frames"),
     ],
 )
 def test_a_wrong_schedule_is_an_error(build, key):
@@ -176,12 +162,12 @@ def test_a_wrong_schedule_is_an_error(build, key):
 
 def test_rows_of_a_config_are_levels_in_the_order_of_their_numbers():
     rows: dict[str, Any] = {
-        "2": {"side": 6, "iterations": 4, "parallel_frames": 2},
+        "2": {"side": 6, "iterations": 4},
         "1": {"side": 4, "iterations": 6},
         "3": None,
     }
     schedule = DeformationSchedule.from_rows(rows, rays=64)
-    assert schedule == DeformationSchedule([Level(4, 6), Level(6, 4, parallel_frames=2)], rays=64)
+    assert schedule == DeformationSchedule([Level(4, 6), Level(6, 4)], rays=64)
     for wrong in ({"1": None}, {"2": {"side": 6}}):
         with pytest.raises(DevrfError, match="expected rows 1 to"):
             DeformationSchedule.from_rows({**rows, **wrong})

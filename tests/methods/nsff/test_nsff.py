@@ -13,7 +13,6 @@ import torch
 from devrf.callbacks import Meter
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
-from devrf.engine.learner import ParallelBatch
 from devrf.errors import DevrfError
 from devrf.methods.nsff.model import NSFF
 from devrf.methods.nsff.settings import NSFFSettings, Warmup
@@ -56,7 +55,7 @@ def test_batches_have_further_rays_where_something_moves(
     for step in (0, 1, 2):  # N₀ = 2
         stage.scene_model.on_iteration(step, 4)
         # Images are numbered through both captures.
-        image = stage.draw(ParallelBatch(0, [])).image
+        image = stage.draw().image
         sizes.append(len(image))
         assert int((image < len(tiny_scene.static.train)).sum()) == 16
     assert sizes == [36, 36, 32]

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from devrf.data.batch import PixelPool, Pixels
 from devrf.engine.batches import static_pool
-from devrf.engine.learner import ParallelBatch
 from devrf.errors import DevrfError
 from devrf.methods.devrf.architecture import Architecture, fitted_to, resolved_voxels
 from devrf.methods.devrf.canonical_field import CanonicalField
@@ -281,8 +280,7 @@ class CanonicalStage(VoxelStage):
         learns_them = [id(p) for p in decoder] == [id(p) for p in groups[2]["params"]]
         if self.schedule.restart_at_growth or not learns_them:
             self.optimizer.replace(2, decoder)
-        learned = [p for group in groups for p in group["params"]]
-        self.loop.bind(rays, [learned])
+        self.loop.bind(rays)
 
     def _look_for_gradients(self) -> None:
         """Have the optimiser read gradients only where samples may be, unless all are smoothed."""
@@ -312,16 +310,14 @@ class CanonicalStage(VoxelStage):
         learns = schedule.learns_directions(self.iteration)
         self.scene_model.canonical.learn_directions(learns)
 
-    def draw(self, batch: ParallelBatch) -> Pixels:
+    def draw(self) -> Pixels:
         """Random pixels of all images."""
         assert self.pool is not None and self.phase is not None
         schedule = self.schedule
         epochs = None if self.phase.kind == "search" else schedule.epochs
         return self.draw_pixels(self.pool, epochs and epochs * len(self.pool) / schedule.iterations)
 
-    def loss(
-        self, batch: ParallelBatch, views: Views, pixels: Pixels
-    ) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss(self, views: Views, pixels: Pixels) -> tuple[Tensor, dict[str, Tensor]]:
         """Render a batch of pixels and compare it with the images."""
         assert self.phase is not None
         model, schedule = self.scene_model, self.schedule

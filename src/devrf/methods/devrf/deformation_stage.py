@@ -11,10 +11,9 @@ from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import Pixels
-from devrf.engine.active_frames import ActiveFrames
+from devrf.engine.active_frame import ActiveFrame
 from devrf.engine.batches import frame_pools
-from devrf.engine.convergence import Convergence
-from devrf.engine.learner import ParallelBatch
+from devrf.engine.convergence import converged
 from devrf.errors import DevrfError
 from devrf.methods.devrf.deformation_field import DeformationField, deformed_occupancy
 from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
@@ -32,8 +31,8 @@ log = logging.getLogger(__name__)
 class DeformationStage(MotionStage):
     """Learns from the dynamic views how the scene deforms (docs/method.md#deformation-stage).
 
-    Coarse to fine, frames are learned one after another, or several in parallel, each from batches
-    of its own. Only their two slices are trained, and what extensions add; all else is frozen.
+    Coarse to fine, frames are learned one after another. Only the two slices of the present frame
+    are trained, and what extensions add; all else is frozen.
     """
 
     phase: DeformationPhase | None
@@ -76,8 +75,16 @@ class DeformationStage(MotionStage):
         self.earlier_records = rest.metadata.records
         placeholder, rate = torch.zeros(2, 2, 2, 3, requires_grad=True), self.motion.learning_rate
         self.optimizer = GridAdam([{"params": [placeholder], "lr": rate, "name": "motion"}])
-        self.active = ActiveFrames(self)
-        self._convergence = Convergence()
+        self.active = None
+        # The state holds what the active frame has learned.
+        self.register_state_dict_pre_hook(  # type: ignore[no-untyped-call]
+            lambda *_: self._write_back()
+        )
+        self.register_load_state_dict_post_hook(  # type: ignore[no-untyped-call]
+            lambda *_: self._check_out_again()
+        )
+        # Of the Lightning steps of the present visit.
+        self._losses: list[float] = []
 
     @classmethod
     def check_settings(cls, **settings: Any) -> None:
@@ -126,110 +133,123 @@ class DeformationStage(MotionStage):
         model.deformation = DeformationField(box, clock, *coarsest, still_outside=still_outside)
         device = self.trainer.strategy.root_device
         half = motion.stored_half(device)
-        parallel = schedule.max_parallel_frames(-1, len(clock))
-        model.deformation.frames.keep(motion.store, device, finest, half=half, parallel=parallel)
+        model.deformation.frames.keep(motion.store, device, finest, half=half)
 
     def enter(self, phase: DeformationPhase) -> None:
-        """Go to the phase's frames: grow the grids if a level begins, fresh Adam if asked for."""
+        """Go to the phase's frame: grow the grids if a level begins, fresh Adam if asked for."""
         previous, self.phase = self.phase, phase
-        self.active.write_back()
+        self._write_back()
         if previous is not None and previous.level != phase.level:
             self._free()
             self.field.resize(*self.schedule.grid(phase.level))
         self._initialise(phase)
-        self._activate(phase)
+        frame = self._activate(phase)
         self._prefetch_after(phase)
         self._update_occupancy()
-        occupied, joined = self.motion.pixels == "occupied", self.motion.views == "all"
-        for active in self.active:
-            shown = self.views, active.number, self.scene_model, active.occupancy
-            active.pools = frame_pools(*shown, occupied_only=occupied, join_views=joined)
+        frame.pools = frame_pools(
+            self.views,
+            frame.number,
+            self.scene_model,
+            frame.occupancy,
+            occupied_only=self.motion.pixels == "occupied",
+            join_views=self.motion.views == "all",
+        )
 
     def _free(self) -> None:
-        """Free the memory of the active frames, and that of all that refers to it."""
-        self.loop.release()
-        self.active.free()
+        """Free the memory of the active frame, and that of all that refers to it."""
+        self.active = None
         for group in range(len(self.optimizer.param_groups)):
             self.optimizer.replace(group, [])
 
     def _initialise(self, phase: DeformationPhase) -> None:
-        """Give the phase's frames their first values, in the fields."""
-        for frame in phase.frames:
-            if phase.init_from_previous:
-                self.field.frames.copy_previous(frame)
-            for extension in self.extensions:
-                extension.initialise(self, phase, frame)
+        """Give the phase's frame its first values, in the fields."""
+        if phase.init_from_previous:
+            self.field.frames.copy_previous(phase.frame)
+        for extension in self.extensions:
+            extension.initialise(self, phase)
 
-    def _activate(self, phase: DeformationPhase) -> None:
-        """Check out the phase's frames, into memory for as many."""
-        if len(self.active) != len(phase.frames):
-            self._allocate(phase)
+    def _activate(self, phase: DeformationPhase) -> ActiveFrame:
+        """Check out the phase's frame."""
+        if self.active is None:
+            self.active = self._allocate(phase)
         elif self.motion.adam_state != "carried" or phase.level == 0:
             self.optimizer.forget()
-        self.active.check_out(phase.frames)
-        self._convergence.reset()
-        level = f"schedule.deformation.levels.{phase.level + 1}"
-        together = (f"{level}.parallel_frames",) if len(phase.frames) > 1 else ()
-        self.memory_keys = (f"{level}.side", "schedule.deformation.rays", *together)
+        self.active.check_out(phase.frame)
+        self._losses = []
+        side = f"schedule.deformation.levels.{phase.level + 1}.side"
+        self.memory_keys = (side, "schedule.deformation.rays")
+        return self.active
 
-    def _allocate(self, phase: DeformationPhase) -> None:
-        """Make memory for the phase's frames at the fields' resolutions, and let Adam learn it."""
+    def _allocate(self, phase: DeformationPhase) -> ActiveFrame:
+        """Make memory for a frame at the fields' resolutions, and let Adam learn it."""
         self._free()
-        level, memory = phase.level, (self.field.frames, self.scene_model.occupancy)
+        level = phase.level
         further = {k: v for e in self.extensions for k, v in e.frame_fields(self, level).items()}
-        self.active.allocate(len(phase.frames), *memory, further)
+        frame = ActiveFrame.of(self.field.frames, self.scene_model.occupancy, further)
+        self.active = frame
         self.weights = self.motion_loss.weights_at(level)
-        learned = [tensor for frame in self.active for tensor in frame.slices]
         smoothing = self.motion_loss.smoothing(level, self.field.shape)
-        self.optimizer.replace(0, learned, smoothing=smoothing)
+        self.optimizer.replace(0, frame.slices, smoothing=smoothing)
         for extension in self.extensions:
             extension.begin_level(self, level)
-        self.loop.bind(self.schedule.rays, [frame.learned for frame in self.active])
+        self.loop.bind(self.schedule.rays)
+        return frame
+
+    def _write_back(self) -> None:
+        """Copy what was learned of the active frame into the fields; learning may go on."""
+        if self.active is not None:
+            self.active.write_back()
+
+    def _check_out_again(self) -> None:
+        """Copy the active frame out of the fields, which were loaded."""
+        if self.active is not None and self.active.number:
+            self.active.check_out(self.active.number)
 
     def _prefetch_after(self, phase: DeformationPhase) -> None:
-        """Begin to fetch the next phase's frames, unless they change before it begins."""
+        """Begin to fetch the next phase's frame, unless it changes before that begins."""
         following = self.phase_at(phase.stop)
         changes = any(extension.changes(self, following) for extension in self.extensions)
         same_level = following.level == phase.level and following != phase
         if same_level and not (changes or following.init_from_previous):
-            self.field.frames.prefetch(following.frames)
+            self.field.frames.prefetch([following.frame])
 
     def current_model(self) -> DeVRFModel:
-        """The moving scene, the active frames written back."""
-        self.active.write_back()
+        """The moving scene, the active frame written back."""
+        self._write_back()
         return self.scene_model
 
     def on_train_end(self) -> None:
-        """Write the last frames back."""
-        self.active.close()
+        """Write the last frame back."""
+        self._write_back()
+        self.active = None
         super().on_train_end()
 
     def _update_occupancy(self) -> None:
-        """Find the occupancy of each active frame under its present displacements."""
-        model = self.scene_model
-        for frame in self.active:
-            warp = self.field.warp_by(frame.backward)
-            frame.occupancy.refill(deformed_occupancy(model.occupancy, model.box, warp))
+        """Find the occupancy of the active frame under its present displacements."""
+        model, frame = self.scene_model, self.active
+        assert frame is not None
+        warp = self.field.warp_by(frame.backward)
+        frame.occupancy.refill(deformed_occupancy(model.occupancy, model.box, warp))
 
     def prepare(self) -> None:
-        """Update the frames' occupancy every ``occupancy_every`` iterations."""
+        """Update the frame's occupancy every ``occupancy_every`` iterations."""
         assert self.phase is not None
         if self.passes(self.motion.occupancy_every, self.phase.start):
             with span("sampling"):
                 self._update_occupancy()
 
-    def draw(self, batch: ParallelBatch) -> Pixels:
-        """Random pixels of the batch's frame, of its views in turn or of all."""
-        pools, phase, epochs = self.active[batch.number].pools, self.phase, self.motion.epochs
-        assert phase is not None
+    def draw(self) -> Pixels:
+        """Random pixels of the frame, of its views in turn or of all."""
+        frame, phase, epochs = self.active, self.phase, self.motion.epochs
+        assert frame is not None and phase is not None
+        pools = frame.pools
         most = epochs and epochs * sum(map(len, pools)) / (phase.stop - phase.start)
         return self.draw_pixels(pools[self.turn % len(pools)], most)
 
-    def loss(
-        self, batch: ParallelBatch, views: Views, pixels: Pixels
-    ) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss(self, views: Views, pixels: Pixels) -> tuple[Tensor, dict[str, Tensor]]:
         """Render a batch of the frame through its warp; compare images and motion."""
-        frame, field = self.active[batch.number], self.field
+        frame, field = self.active, self.field
+        assert frame is not None
         before = [frame.before] if frame.number > 1 else []  # before frame 1 nothing has moved
         changes = (extension.color_change(frame) for extension in self.extensions)
         color_change = next((change for change in changes if change is not None), None)
@@ -250,26 +270,27 @@ class DeformationStage(MotionStage):
         with span("losses"):
             return batch_loss(prediction, self.motion_loss.terms, self.weights)
 
-    def converged(self, losses: Tensor) -> bool:
-        """Whether each active frame's loss has stopped falling, if the schedule asks for that."""
+    def converged(self, loss: Tensor) -> bool:
+        """Whether the frame's loss has stopped falling, if the schedule asks for that."""
         gain = self.motion.min_rel_improvement
-        return gain is not None and self._convergence.converged(losses, gain)
+        if gain is None:
+            return False
+        self._losses.append(float(loss))
+        return converged(self._losses, gain)
 
     def rollback(self, iteration: int, skipped: int, lr_scale: float) -> None:
-        """Go on from an earlier iteration of the present frames, with an occupancy found anew."""
+        """Go on from an earlier iteration of the present frame, with an occupancy found anew."""
         super().rollback(iteration, skipped, lr_scale)
-        self._convergence.reset()
+        self._losses = []
         self._update_occupancy()
 
     def phase_state(self) -> dict[str, Any]:
-        """The state of each active frame, and its losses so far."""
+        """The state of the active frame, and its losses so far."""
+        assert self.active is not None
         exact = self.motion.stored_half(self.device)
-        frames = [frame.state(self.views, exact=exact) for frame in self.active]
-        return {"frames": frames, "convergence": self._convergence.state()}
+        return {"frame": self.active.state(self.views, exact=exact), "losses": [*self._losses]}
 
     def restore(self, phase: DeformationPhase, state: dict[str, Any]) -> None:
-        """Go on with the frames of ``phase``, the field being loaded."""
-        self._activate(phase)
-        for frame, of_frame in zip(self.active, state["frames"], strict=True):
-            frame.load_state(of_frame, self.views)
-        self._convergence.load_state(state["convergence"])
+        """Go on with the frame of ``phase``, the field being loaded."""
+        self._activate(phase).load_state(state["frame"], self.views)
+        self._losses = [*state["losses"]]

@@ -13,7 +13,7 @@ from functools import cached_property
 from torch import Tensor
 
 from devrf.data.flow import previous_images
-from devrf.engine.active_frames import ActiveFrame, ActiveFrames
+from devrf.engine.active_frame import ActiveFrame
 from devrf.engine.frame_store import FrameField
 from devrf.errors import DevrfError
 from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
@@ -38,13 +38,13 @@ class MotionStage(VoxelStage):
     Attributes:
         schedule: levels, iterations and rays.
         weights: of the loss terms that count at the present level.
-        active: the frames that are trained.
+        active: the frame that is trained; None before the first, and after the last.
     """
 
     schedule: DeformationSchedule
     capture: CaptureName = "dynamic"
     weights: dict[str, float]
-    active: ActiveFrames
+    active: ActiveFrame | None
 
     @cached_property
     def previous_images(self) -> Tensor:
@@ -81,18 +81,18 @@ class Extension:
         return {}
 
     def begin_level(self, stage: MotionStage, level: int) -> None:
-        """Memory of the active frames is ready; give the optimiser what is learned of them."""
+        """Memory of the active frame is ready; give the optimiser what is learned of it."""
 
     def weight_factor(self, term: str, level: int) -> float:
         """Factor of the weight of any loss term at ``level``."""
         return 1.0
 
     def changes(self, stage: MotionStage, phase: DeformationPhase) -> bool:
-        """Whether :meth:`initialise` changes the displacements of the phase's frames."""
+        """Whether :meth:`initialise` changes the displacements of the phase's frame."""
         return False
 
-    def initialise(self, stage: MotionStage, phase: DeformationPhase, frame: int) -> None:
-        """Give one of the phase's frames its first values, in the fields, before a visit."""
+    def initialise(self, stage: MotionStage, phase: DeformationPhase) -> None:
+        """Give the phase's frame its first values, in the fields, before a visit."""
 
     def color_change(self, frame: ActiveFrame) -> ColorChange | None:
         """What is added to the colours' logits of an active frame; None: nothing."""

@@ -222,5 +222,5 @@ def _place_of_frames(backward: Any, device: torch.device) -> torch.device:
         return torch.device("cpu")
     free, _ = torch.cuda.mem_get_info(device)
     frames, (x, y, z) = len(backward["elsewhere"]), backward["shape"]
-    fits = fits_on_device(free, frames, (x, y, z), half=True, parallel=0)
+    fits = fits_on_device(free, frames, (x, y, z), half=True, learned=False)
     return device if fits else torch.device("cpu")

@@ -83,8 +83,7 @@ def followed(model: DeVRFModel, views: Views, *columns: int, by_color: bool, **k
     flat = torch.tensor([ROW * WIDTH + column for column in columns], dtype=torch.int32)
     pool = PixelPool(torch.stack([torch.full_like(flat, 3), flat]))
     tracks = FlowTracks(model, views, previous_images(views), by_color=by_color)
-    known = {"learned": 3, **kw}
-    return tracks.follow(3, pool, torch.Generator().manual_seed(0), **known)
+    return tracks.follow(3, pool, torch.Generator().manual_seed(0), **kw)
 
 
 def x_of(column: float) -> float:
@@ -103,8 +102,6 @@ def test_a_pixel_ends_where_its_color_is_met(model, views):
     )
     assert met.camera.tolist() == [3]
     assert met.pixel.tolist() == [[MIDDLE + 0.5, ROW + 0.5]]
-    # No frame is asked that has not been learned.
-    assert len(followed(model, views, MIDDLE, by_color=True, learned=1)) == 0
     nearest = followed(model, views, MIDDLE, by_color=False)
     assert nearest.canonical[:, 0].tolist() == pytest.approx([x_of(RIGHT)], abs=0.02)
 
@@ -170,11 +167,10 @@ def test_without_tracks_the_frame_stays_where_the_one_before_is():
     assert torch.equal(field.to_canonical[2], field.to_canonical[1])
 
 
-def test_flow_starts_only_frames_whose_predecessor_was_learned(tiny_scene):
-    # Of four frames number 2 first, then 1 and 3: flow leads to frame 1, not yet learned.
-    schedule = DeformationSchedule((Level(5, 4, parallel_frames=2),), coarse_to_fine=False)
-    phases = [schedule.phase(at, 4) for at in (0, 4)]
-    assert [phase.frames for phase in phases] == [(2,), (1, 3)]
+def test_flow_starts_the_frames_of_the_first_level(tiny_scene):
+    schedule = DeformationSchedule((Level(5, 4), Level(6, 4)))
+    phases = [schedule.phase(at, 4) for at in (0, 8, 16)]
+    assert [(phase.level, phase.frame) for phase in phases] == [(0, 1), (0, 2), (1, 1)]
     stage: Any = SimpleNamespace(scene=tiny_scene)
-    assert [StartAlongFlow("flow").changes(stage, phase) for phase in phases] == [False, True]
+    assert [StartAlongFlow("flow").changes(stage, phase) for phase in phases] == [True, True, False]
     assert not any(StartAlongFlow("previous").changes(stage, phase) for phase in phases)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from devrf.checkpoints.stored_grids import StoredShape
 from devrf.data.color_change import CHANGING, color_drift
-from devrf.engine.active_frames import ActiveFrame
+from devrf.engine.active_frame import ActiveFrame
 from devrf.engine.frame_store import FrameField
 from devrf.errors import expect
 from devrf.geometry.box import Box
@@ -160,12 +160,13 @@ class ColorResidual(Extension):
         return {NAME: field} if learned and field is not None else {}
 
     def begin_level(self, stage: MotionStage, level: int) -> None:
-        """Let the optimiser learn the active frames' residuals, (X, Y, Z, 3) each.
+        """Let the optimiser learn the active frame's residuals (X, Y, Z, 3).
 
         Within a visit their rate falls as that of the displacements does; from level to level it
         does not.
         """
-        residuals = [frame.further[NAME] for frame in stage.active if NAME in frame.further]
+        assert stage.active is not None
+        residuals = [grid for name, grid in stage.active.further.items() if name == NAME]
         for number, group in enumerate(stage.optimizer.param_groups):
             if group["name"] == NAME:
                 group["base_lr"] = self._learning_rate / stage.schedule.learning_rate_factor(level)
@@ -177,11 +178,11 @@ class ColorResidual(Extension):
         """Where a texture may slide over the surface, some terms tell less."""
         return 1.0 if self._first is None or level < self._first else self._scale.get(term, 1.0)
 
-    def initialise(self, stage: MotionStage, phase: DeformationPhase, frame: int) -> None:
+    def initialise(self, stage: MotionStage, phase: DeformationPhase) -> None:
         """At the first level that learns it, start a frame from the one visited before it."""
         field = stage.scene_model.color_residual
         if isinstance(field, ResidualField) and phase.level == self._first:
-            field.copy_previous(frame)
+            field.copy_previous(phase.frame)
 
     def color_change(self, frame: ActiveFrame) -> ColorChange | None:
         """q → A_t(q), as learned so far."""

@@ -58,28 +58,27 @@ class StartAlongFlow(Extension):
         self._tracks = None
 
     def changes(self, stage: MotionStage, phase: DeformationPhase) -> bool:
-        """At the coarsest level, where there is flow to follow to a frame that is known."""
+        """At the coarsest level, where there is flow to follow."""
         recorded = stage.scene.dynamic.train
         # What a moving camera sees moves with it.
         known = recorded.flow is not None and not recorded.by_moving_camera
         asked = self._init_from != "previous" and known
-        return asked and phase.level == 0 and phase.has_previous
+        return asked and phase.level == 0
 
-    def initialise(self, stage: MotionStage, phase: DeformationPhase, frame: int) -> None:
+    def initialise(self, stage: MotionStage, phase: DeformationPhase) -> None:
         """Fit the frame's displacements to where its pixels are followed back to."""
         if not self.changes(stage, phase):
             return
         views, model, field = stage.views, stage.scene_model, stage.field
+        frame = phase.frame
         if self._tracks is None:
             by_color = self._init_from == "tracks"
             self._tracks = FlowTracks(model, views, stage.previous_images, by_color=by_color)
         pool = all_pixels(views, images_of(views, frame))
-        # A visit's first frame has its number: the visits before have learned as many.
-        learned = phase.frames[0]
         # A time budget does less of everything, and no more of this.
         share = max(1 / max(stage.stride, 1.0), LEAST_SHARE)
         most, steps = round(share * MOST_TRACKS), round(share * FIT_STEPS)
-        tracks = self._tracks.follow(frame, pool, stage.generator, learned=learned, most=most)
+        tracks = self._tracks.follow(frame, pool, stage.generator, most=most)
         start_from_tracks(field, frame, tracks, views.cameras, model.space, steps)
         # Each process has followed pixels of its own.
         broadcast([field.to_canonical[frame], field.to_time[frame]])
@@ -134,16 +133,14 @@ class FlowTracks:
         pool: PixelPool,
         generator: torch.Generator,
         *,
-        learned: int,
         most: int = MOST_TRACKS,
     ) -> Tracks:
         """Tracks Σ w_i q_i / Σ w_i to a frame.
 
         Args:
-            frame: the present frame, from 1 on.
+            frame: the present frame, from 1 on; those before it have been learned.
             pool: pixels of its images.
             generator: of the random choice, on the pool's device.
-            learned: how many of the frames before it have been learned, or are at rest.
             most: pixels at most, chosen at random.
         """
         views = self.views
@@ -156,7 +153,7 @@ class FlowTracks:
         now = gather_batch(views, here, flat, torch.ones(3, device=here.device))
         place, waiting = now.pixel, torch.arange(len(here), device=here.device)
         found: list[tuple[Tensor, Tensor]] = []
-        for step in range(1, min(learned, self.farthest) + 1):
+        for step in range(1, min(frame, self.farthest) + 1):
             going, place = self._back(here, place)
             waiting, here = waiting[going], self.previous[here[going]]
             point, color, mass = self._look(frame - step, here, place)

@@ -1,13 +1,13 @@
-"""The active frames: copies of their slices while they are trained (docs/method.md#warp)."""
+"""The active frame: a copy of its slices while it is trained (docs/method.md#warp)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from devrf.checkpoints.stored_grids import pack_bits, unpack_bits
 from devrf.data.batch import PixelPool
@@ -91,6 +91,7 @@ class ActiveFrame:
             self.store.write(self.number, self.slices)
             for name, values in self.further.items():
                 self.fields[name].values[self.number].copy_(values)
+            self.store.synchronize()
 
     def state(self, views: Views, *, exact: bool) -> dict[str, Any]:
         """Occupancy and pixels as plain data, for a progress file.
@@ -117,66 +118,3 @@ class ActiveFrame:
         self.occupancy.refill(Occupancy(mask, self.occupancy.box))
         masks = [unpack_bits(bits, (len(images), area), device) for bits in state["pixels"]]
         self.pools = [PixelPool.of_mask(images, mask) for mask in masks]
-
-
-class ActiveFrames:
-    """The frames that are trained in parallel."""
-
-    def __init__(self, module: nn.Module) -> None:
-        """No frame yet.
-
-        Before the state of ``module``, which holds the fields, is saved, the frames are written
-        back; after it was loaded they are checked out again.
-        """
-        self._frames: list[ActiveFrame] = []
-        module.register_state_dict_pre_hook(  # type: ignore[no-untyped-call]
-            lambda *_: self.write_back()
-        )
-        module.register_load_state_dict_post_hook(  # type: ignore[no-untyped-call]
-            lambda *_: self._check_out_again()
-        )
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def __iter__(self) -> Iterator[ActiveFrame]:
-        return iter(self._frames)
-
-    def __getitem__(self, number: int) -> ActiveFrame:
-        return self._frames[number]
-
-    def allocate(
-        self,
-        count: int,
-        store: FrameStore,
-        occupancy: Occupancy,
-        fields: Mapping[str, FrameField],
-    ) -> None:
-        """Make memory for ``count`` frames, as :meth:`ActiveFrame.of` does."""
-        self._frames = [ActiveFrame.of(store, occupancy, fields) for _ in range(count)]
-
-    def check_out(self, numbers: Sequence[int]) -> None:
-        """Copy as many frames as there is memory for out of the fields."""
-        for frame, number in zip(self._frames, numbers, strict=True):
-            frame.check_out(number)
-
-    def write_back(self) -> None:
-        """Copy what was learned of the frames into the fields; learning may go on."""
-        for frame in self._frames:
-            frame.write_back()
-        if self._frames:
-            self._frames[0].store.synchronize()
-
-    def close(self) -> None:
-        """Write the frames back, and free their memory."""
-        self.write_back()
-        self.free()
-
-    def free(self) -> None:
-        """Free the memory of the frames; what was not written back is lost."""
-        self._frames = []
-
-    def _check_out_again(self) -> None:
-        for frame in self._frames:
-            if frame.number:
-                frame.check_out(frame.number)
