@@ -30,13 +30,7 @@ def main() -> None:
         run = open_run(given.overrides)
         model = learned_scene(run).model
         views, background = run.scene.dynamic.test, background_value(run.scene.background)
-        ways = {"float32": Renderer(model)}
-        if run.device.type == "cuda":
-            ways["float16 decoder"] = Renderer(model, half=True)
-        rows = [
-            {"decoder": name, **frames_a_second(renderer, views, given.views, background)}
-            for name, renderer in ways.items()
-        ]
+        rows = [frames_a_second(Renderer(model), views, given.views, background)]
         into = given.json or run.folder / "benchmark_rendering.json"
         report(rows, into, run.device, scene=run.scene.name, overrides=given.overrides)
 

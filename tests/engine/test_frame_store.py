@@ -100,18 +100,16 @@ def test_a_quarter_of_the_gpu_is_left(gigabytes, half, learned, fits):
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 @pytest.mark.parametrize("half", [False, True])
-def test_frames_on_the_host_are_page_locked_and_come_back_as_they_were(half):
+def test_frames_on_the_host_come_back_as_they_were(half):
     device = torch.device("cuda", 0)
     store = FrameStore(3, (4, 5, 6)).to(device)
     store.offload(on_host=True, half=half)
-    assert store.to_time.is_pinned() and store.to_canonical.is_pinned()
+    assert store.to_time.device.type == store.to_canonical.device.type == "cpu"
     written = tuple(torch.rand(4, 5, 6, 3, device=device) for _ in range(2))
     store.write(1, written)  # type: ignore[arg-type]
-    store.synchronize()
-    store.prefetch([1])
     found = torch.empty(4, 5, 6, 3, device=device), torch.empty(4, 5, 6, 3, device=device)
     store.read(1, found)
     for ours, theirs in zip(found, written, strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1 / 2048 if half else 0, atol=1e-7)
     store.resize((6, 6, 6))
-    assert store.to_time.shape == (3, 6, 6, 6, 3) and store.to_time.is_pinned()
+    assert store.to_time.shape == (3, 6, 6, 6, 3) and store.to_time.device.type == "cpu"

@@ -127,10 +127,8 @@ def test_gradients_of_skipping_groups_stay_where_they_are_and_are_zero_after_a_s
     assert kept.grad is place and not place.any() and other.grad is None
     assert kept[0, 0, 0, 0].item() == pytest.approx(1 - 1e-3)
     (kept.sum() + other.sum()).backward()
-    optimizer.drop_gradients([other])
-    assert place.all() and other.grad is None
     optimizer.zero_grad()
-    assert kept.grad is place and not place.any()
+    assert kept.grad is place and not place.any() and other.grad is None
     larger = torch.ones(1, 1, 2, 2, requires_grad=True)
     optimizer.replace(0, [larger])
     assert larger.grad is not None
@@ -152,7 +150,7 @@ def test_what_is_replaced_or_forgotten_starts_afresh() -> None:
     assert new.item() == pytest.approx(0.0, abs=1e-7)
 
 
-def test_the_rate_may_be_set_by_the_closure_and_be_a_tensor() -> None:
+def test_the_rate_may_be_set_by_the_closure() -> None:
     parameter = torch.zeros(1, 1, 1, 1, requires_grad=True)
     optimizer = GridAdam([parameter], lr=0.5)
 
@@ -162,7 +160,3 @@ def test_the_rate_may_be_set_by_the_closure_and_be_a_tensor() -> None:
 
     optimizer.step(closure)
     assert parameter.item() == pytest.approx(-0.25) and parameter.grad is None
-    optimizer.param_groups[0]["lr"] = torch.tensor(0.5)
-    parameter.grad = torch.ones(1, 1, 1, 1)
-    optimizer.step()
-    assert parameter.item() == pytest.approx(-0.75)

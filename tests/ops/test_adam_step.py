@@ -11,7 +11,7 @@ from devrf.ops.adam_step import AdamRule, adam_step, add_total_variation_gradien
 
 
 def rule(step: int = 1, **options: Any) -> AdamRule:
-    return AdamRule(torch.tensor(0.1), torch.tensor(float(step)), **options)
+    return AdamRule(0.1, torch.tensor(float(step)), **options)
 
 
 def peak() -> Tensor:

@@ -1,4 +1,4 @@
-"""Free memory by the system and its control groups, how a lack shows, page-locked memory."""
+"""Free memory by the system and its control groups, how a lack shows."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import psutil
 import pytest
 import torch
 
-from devrf.system.memory import free_host_memory, gib, is_oom, numbers, page_locked
+from devrf.system.memory import free_host_memory, gib, is_oom, numbers
 
 MIB = 2**20
 GPU = "CUDA out of memory. Tried to allocate 20.00 MiB. GPU 0 has a total capacity of 23.68 GiB"
@@ -83,39 +83,3 @@ def test_the_numbers_of_an_error(said: str, asked: str) -> None:
 
 def test_bytes_in_gib() -> None:
     assert [gib(n * 2**30) for n in (21.34, 1.16, 0.0342)] == ["21.3", "1.2", "0.034"]
-
-
-class Runtime:
-    """Stands for CUDA's runtime."""
-
-    def __init__(self) -> None:
-        self.status = 0
-        self.locked: dict[int, int] = {}
-
-    def cudaHostRegister(self, place: int, size: int, flags: int) -> int:  # noqa: N802
-        if not self.status:
-            self.locked[place] = size
-        return self.status
-
-    def cudaHostUnregister(self, place: int) -> int:  # noqa: N802
-        del self.locked[place]
-        return 0
-
-
-def test_memory_is_locked_until_the_last_view_goes(monkeypatch: pytest.MonkeyPatch) -> None:
-    runtime = Runtime()
-    monkeypatch.setattr(torch.cuda, "cudart", lambda: runtime)
-    monkeypatch.setattr(torch.cuda, "synchronize", lambda: None)
-    tensor = page_locked((5, 7, 3), torch.float16)
-    assert tensor.shape == (5, 7, 3) and tensor.dtype == torch.float16
-    assert runtime.locked == {tensor.data_ptr(): 210}
-    tensor[2] = 1.5
-    view = tensor[2]
-    del tensor
-    assert len(runtime.locked) == 1 and bool((view == 1.5).all())
-    del view
-    assert runtime.locked == {}
-    runtime.status = 2
-    with pytest.raises(RuntimeError, match="CUDA does not lock 24 bytes \\(error 2\\)"):
-        page_locked((2, 3), torch.float32)
-    assert page_locked((0, 3), torch.float32).shape == (0, 3) and runtime.locked == {}

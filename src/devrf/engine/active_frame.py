@@ -80,7 +80,7 @@ class ActiveFrame:
         """Copy a frame out of the fields."""
         self.number = number
         self.store.read(number, self.slices)
-        self.before.copy_(self.store.to_time[number - 1], non_blocking=True)
+        self.before.copy_(self.store.to_time[number - 1])
         for name, values in self.further.items():
             values.copy_(self.fields[name].values[number])
 
@@ -91,7 +91,6 @@ class ActiveFrame:
             self.store.write(self.number, self.slices)
             for name, values in self.further.items():
                 self.fields[name].values[self.number].copy_(values)
-            self.store.synchronize()
 
     def state(self, views: Views, *, exact: bool) -> dict[str, Any]:
         """Occupancy and pixels as plain data, for a progress file.

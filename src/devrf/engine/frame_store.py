@@ -8,7 +8,7 @@ read in single precision, on the module's device.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Literal
 
 import torch
@@ -18,7 +18,6 @@ from devrf.engine.ddp import world_size
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.ops.trilinear import resample
-from devrf.system.memory import page_locked
 
 log = logging.getLogger(__name__)
 
@@ -84,11 +83,6 @@ class FrameStore(nn.Module):
             self.register_buffer(name, torch.zeros(frames, *shape, 3))
         # An empty tensor that is moved with the module: its device is the module's.
         self.register_buffer("here", torch.zeros(0), persistent=False)
-        self._fetched: dict[int, Directions] = {}
-        # Page-locked memory for later resolutions.
-        self._reserved: list[Tensor] = []
-        # One for good: the allocator keeps the memory of each stream apart.
-        self._side: torch.cuda.Stream | None = None
 
     @property
     def shape(self) -> Shape:
@@ -98,81 +92,41 @@ class FrameStore(nn.Module):
 
     @torch.no_grad()
     def read(self, frame: int, into: Directions) -> None:
-        """Copy a frame's backward and forward displacements ``into`` (X, Y, Z, 3) each.
-
-        Does not wait for the device.
-        """
-        source = self._fetched.pop(frame, None)
-        if source is None:
-            source = (self.to_canonical[frame], self.to_time[frame])
-        else:
-            present = torch.cuda.current_stream(self.here.device)
-            assert self._side is not None
-            present.wait_stream(self._side)
-            for tensor in source:
-                tensor.record_stream(present)
-        for tensor, value in zip(into, source, strict=True):
-            tensor.copy_(value, non_blocking=True)
+        """Copy a frame's backward and forward displacements ``into`` (X, Y, Z, 3) each."""
+        into[0].copy_(self.to_canonical[frame])
+        into[1].copy_(self.to_time[frame])
 
     @torch.no_grad()
     def write(self, frame: int, displacements: Directions) -> None:
         """Copy backward and forward ``displacements`` (X, Y, Z, 3) back into a frame.
 
-        Does not wait for the device: call :meth:`synchronize` before the host reads them.
-
         Frame 0 is the rest state, and cannot be written.
         """
         assert 1 <= frame < len(self.to_time), f"frame {frame} cannot be trained"
-        self.to_canonical[frame].copy_(displacements[0], non_blocking=True)
-        self.to_time[frame].copy_(displacements[1], non_blocking=True)
-        self._fetched.pop(frame, None)  # it holds the former values
-
-    def synchronize(self) -> None:
-        """Wait until everything that was written has reached the host."""
-        if self.on_host and self.here.is_cuda:
-            torch.cuda.current_stream(self.here.device).synchronize()
-
-    @torch.no_grad()
-    def prefetch(self, frames: Sequence[int]) -> None:
-        """Start copying frames that will be read next from the host, beside other work."""
-        if not (self.on_host and self.here.is_cuda):
-            return
-        device, self._fetched = self.here.device, {}
-        if self._side is None or self._side.device != device:
-            self._side = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
-        side = self._side
-        # Pending writes to the frames must finish first.
-        side.wait_stream(torch.cuda.current_stream(device))
-        with torch.cuda.stream(side):
-            for frame in frames:
-                backward = self.to_canonical[frame].to(device, non_blocking=True)
-                forward = self.to_time[frame].to(device, non_blocking=True)
-                self._fetched[frame] = (backward, forward)
+        self.to_canonical[frame].copy_(displacements[0])
+        self.to_time[frame].copy_(displacements[1])
 
     @torch.no_grad()
     def copy_previous(self, frame: int) -> None:
         """Initialise ``frame`` from the frame before it, in both directions."""
-        self.synchronize()
         self.to_canonical[frame] = self.to_canonical[frame - 1]
         self.to_time[frame] = self.to_time[frame - 1]
 
     @torch.no_grad()
     def resize(self, shape: Shape) -> None:
         """Resample every frame to grids of ``shape``, trilinearly."""
-        self._fetched = {}
         for name in NAMES:
             frames = getattr(self, name)
             resized = self._empty((len(frames), *shape, 3), frames.dtype)
             # Frame by frame: no temporary copy of all of them.
             for into, frame in zip(resized, frames, strict=True):
-                into.copy_(resample(frame.to(self.here), shape), non_blocking=True)
-            self.synchronize()
+                into.copy_(resample(frame.to(self.here), shape))
             setattr(self, name, resized)
 
     @torch.no_grad()
     def offload(self, *, on_host: bool, half: bool) -> None:
-        """Keep them on the host, page-locked where there is CUDA, or in half precision."""
-        self.on_host, self._reserved = on_host, []
+        """Keep them on the host, or in half precision."""
+        self.on_host = on_host
         for name in NAMES:
             frames = getattr(self, name)
             moved = self._empty(frames.shape, torch.float16 if half else torch.float32)
@@ -211,28 +165,10 @@ class FrameStore(nn.Module):
                     "motion: %.1f GB are free on the GPU: frames are kept on the host", free / 1e9
                 )
         self.offload(on_host=on_host, half=half)
-        self.reserve(shape)
-
-    def reserve(self, shape: Shape) -> None:
-        """Lock memory for :meth:`resize` to ``shape`` now: for gigabytes it takes seconds."""
-        frames = self.to_time
-        if self.on_host and torch.cuda.is_available() and frames.shape[1:4] != shape:
-            whole = (len(frames), *shape, 3)
-            self._reserved = [self._empty(whole, frames.dtype) for _ in NAMES]
 
     def _empty(self, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
         """An uninitialised tensor where displacements are kept."""
-        if not self.on_host:
-            return torch.empty(shape, dtype=dtype, device=self.here.device)
-        if self._reserved and self._reserved[-1].shape == shape:
-            return self._reserved.pop()
-        if torch.cuda.is_available():
-            try:
-                return page_locked(shape, dtype)
-            except RuntimeError as error:
-                reason = str(error).splitlines()[0]
-                log.warning("displacements are fetched slowly: no page-locked memory (%s)", reason)
-        return torch.empty(shape, dtype=dtype)
+        return torch.empty(shape, dtype=dtype, device="cpu" if self.on_host else self.here.device)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> FrameStore:
         names = NAMES if self.on_host else ()
@@ -241,14 +177,9 @@ class FrameStore(nn.Module):
         self._buffers.update(frames)
         return self
 
-    def __getstate__(self) -> dict[str, Any]:
-        """The state of a copy, without frames that are being fetched, or memory for others."""
-        return {**self.__dict__, "_fetched": {}, "_reserved": [], "_side": None}
-
     def _load_from_state_dict(
         self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
     ) -> None:
-        self._fetched = {}
         for name in NAMES:
             stored, frames = state_dict.get(prefix + name), getattr(self, name)
             if stored is not None and stored.shape != frames.shape:

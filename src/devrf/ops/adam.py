@@ -25,13 +25,12 @@ class GridAdam(torch.optim.Optimizer):
       of the backward pass; ``along_z`` times as much between neighbours along z.
     * ``touched_only``: add it only to entries that have a gradient.
 
-    ``lr`` may be a tensor () on the parameters' device.
     """
 
     def __init__(
         self,
         params: Iterable[Any],
-        lr: float | Tensor = 1e-3,
+        lr: float = 1e-3,
         betas: tuple[float, float] = (0.9, 0.99),
         eps: float = 1e-8,
     ) -> None:
@@ -46,9 +45,6 @@ class GridAdam(torch.optim.Optimizer):
             "along_z": 1.0,
             "touched_only": False,
         }
-        self._rates: dict[int, Tensor] = {}
-        # The number that each of these holds.
-        self._filled: dict[Tensor, float] = {}
         super().__init__(params, defaults)
 
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
@@ -60,43 +56,31 @@ class GridAdam(torch.optim.Optimizer):
         if closure is not None:
             with torch.enable_grad():
                 result = closure()
-        for number, group in enumerate(self.param_groups):
-            if group["params"] and not isinstance(group["lr"], Tensor):
-                device = group["params"][0].device
-                rate = self._rates.get(number)
-                if rate is None or rate.device != device:
-                    rate = self._rates[number] = torch.zeros((), dtype=torch.float64, device=device)
-                if self._filled.get(rate) != group["lr"]:
-                    # A fill does not wait for the device, unlike a copy from the host.
-                    rate.fill_(group["lr"])
-                    self._filled[rate] = group["lr"]
-        self._apply()
+        for group in self.param_groups:
+            self._step(group)
         return result
 
     @torch.no_grad()
-    def _apply(self) -> None:
-        """Step at the rates that :meth:`step` has put on the device."""
-        learned = [self._learned(group) for group in self.param_groups]
-        steps = [self._state_of(parameter)["steps"] for group in learned for parameter in group]
-        if steps:
-            torch._foreach_add_(steps, 1)
-        for number, (group, parameters) in enumerate(zip(self.param_groups, learned, strict=True)):
-            rate = group["lr"] if isinstance(group["lr"], Tensor) else self._rates.get(number)
-            names = "betas", "eps", "skip_zero", "per_voxel_lr", "rows"
-            options = {name: group[name] for name in names}
-            taken = [self._tensors_of(parameter) for parameter in parameters]
-            if not taken:
-                continue
-            assert rate is not None
+    def _step(self, group: dict[str, Any]) -> None:
+        """One step on the parameters of a group."""
+        names = "betas", "eps", "skip_zero", "per_voxel_lr", "rows"
+        options = {name: group[name] for name in names}
+        kept = group["skip_zero"]
+        for parameter in self._learned(group):
+            gradient, state = parameter.grad, self._state_of(parameter)
+            assert gradient is not None
             if group["smoothing"]:
-                how = {name: group[name] for name in ("along_z", "touched_only")}
-                for values, gradient, *_ in taken:
-                    add_total_variation_gradient(values, gradient, group["smoothing"], **how)
-            kept = group["skip_zero"]
-            for values, gradient, mean, square, step in taken:
-                rule = AdamRule(rate, step, **options)
-                adam_step(values, gradient, mean, square, rule, clear=kept)
-            for parameter in () if kept else parameters:
+                add_total_variation_gradient(
+                    parameter,
+                    gradient,
+                    group["smoothing"],
+                    along_z=group["along_z"],
+                    touched_only=group["touched_only"],
+                )
+            state["steps"] += 1
+            rule = AdamRule(group["lr"], state["steps"], **options)
+            adam_step(parameter, gradient, state["mean"], state["square"], rule, clear=kept)
+            if not kept:
                 parameter.grad = None
 
     def _learned(self, group: dict[str, Any]) -> list[Tensor]:
@@ -110,12 +94,6 @@ class GridAdam(torch.optim.Optimizer):
             learned.append(parameter)
         return learned
 
-    def _tensors_of(self, parameter: Tensor) -> tuple[Tensor, ...]:
-        """A parameter, its gradient, its two moments and its number of steps."""
-        state = self._state_of(parameter)
-        assert parameter.grad is not None
-        return parameter, parameter.grad, state["mean"], state["square"], state["steps"]
-
     def _state_of(self, parameter: Tensor) -> dict[str, Any]:
         """The parameter's number of steps () and its moments; zero at first."""
         state: dict[str, Any] = self.state[parameter]
@@ -128,16 +106,12 @@ class GridAdam(torch.optim.Optimizer):
 
     def zero_grad(self, set_to_none: bool = True) -> None:
         """Remove all gradients; those that are kept are set to zero."""
-        self.drop_gradients(each for group in self.param_groups for each in group["params"])
-
-    def drop_gradients(self, parameters: Iterable[Tensor]) -> None:
-        """As :meth:`zero_grad`, for some of the parameters."""
-        kept = {id(p) for group in self.param_groups if group["skip_zero"] for p in group["params"]}
-        for parameter in parameters:
-            if id(parameter) in kept and parameter.grad is not None:
-                parameter.grad.zero_()
-            else:
-                parameter.grad = None
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                if group["skip_zero"] and parameter.grad is not None:
+                    parameter.grad.zero_()
+                else:
+                    parameter.grad = None
 
     def make_gradients(self) -> None:
         """Make those gradients that are kept and are not there yet, before a backward pass."""

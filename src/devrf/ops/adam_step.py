@@ -14,8 +14,8 @@ class AdamRule:
     """Settings of a step of Adam (Kingma & Ba 2015), with additions for voxel grids.
 
     Attributes:
-        rate: () learning rate, on the device.
-        step: () number of this step, 1 for the first, on the device.
+        rate: learning rate.
+        step: () number of this step, 1 for the first.
         betas: decay of the mean and of the square.
         eps: added to the root of the square.
         skip_zero: an entry whose gradient is exactly zero keeps its value *and its moments*.
@@ -24,7 +24,7 @@ class AdamRule:
             gradient is read: it must be zero there.
     """
 
-    rate: Tensor
+    rate: float
     step: Tensor
     betas: tuple[float, float] = (0.9, 0.99)
     eps: float = 1e-8

@@ -144,7 +144,6 @@ class DeformationStage(MotionStage):
             self.field.resize(*self.schedule.grid(phase.level))
         self._initialise(phase)
         frame = self._activate(phase)
-        self._prefetch_after(phase)
         self._update_occupancy()
         frame.pools = frame_pools(
             self.views,
@@ -204,14 +203,6 @@ class DeformationStage(MotionStage):
         """Copy the active frame out of the fields, which were loaded."""
         if self.active is not None and self.active.number:
             self.active.check_out(self.active.number)
-
-    def _prefetch_after(self, phase: DeformationPhase) -> None:
-        """Begin to fetch the next phase's frame, unless it changes before that begins."""
-        following = self.phase_at(phase.stop)
-        changes = any(extension.changes(self, following) for extension in self.extensions)
-        same_level = following.level == phase.level and following != phase
-        if same_level and not (changes or following.init_from_previous):
-            self.field.frames.prefetch([following.frame])
 
     def current_model(self) -> DeVRFModel:
         """The moving scene, the active frame written back."""

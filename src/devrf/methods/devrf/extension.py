@@ -87,10 +87,6 @@ class Extension:
         """Factor of the weight of any loss term at ``level``."""
         return 1.0
 
-    def changes(self, stage: MotionStage, phase: DeformationPhase) -> bool:
-        """Whether :meth:`initialise` changes the displacements of the phase's frame."""
-        return False
-
     def initialise(self, stage: MotionStage, phase: DeformationPhase) -> None:
         """Give the phase's frame its first values, in the fields, before a visit."""
 

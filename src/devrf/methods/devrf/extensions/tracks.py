@@ -58,7 +58,7 @@ class StartAlongFlow(Extension):
         self._tracks = None
 
     def changes(self, stage: MotionStage, phase: DeformationPhase) -> bool:
-        """At the coarsest level, where there is flow to follow."""
+        """Whether a phase starts along the flow: at the coarsest level, where there is one."""
         recorded = stage.scene.dynamic.train
         # What a moving camera sees moves with it.
         known = recorded.flow is not None and not recorded.by_moving_camera
