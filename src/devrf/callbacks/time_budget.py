@@ -20,7 +20,7 @@ iterations takes 6, with one of 0.5 it takes 36. Every phase keeps one iteration
   wrong, levels get other shares of the time, but the end is where it should be.
 * Where the stride would be more than 1, batches are halved first, to a quarter at the least: more
   iterations learn more than larger ones. What takes as long with fewer rays keeps its batches
-  (:attr:`~devrf.engine.learner.Learner.cost_follows_rays`), and so do lists of fixed length.
+  (:attr:`~devrf.engine.learner.Learner.cost_follows_rays`).
 * Of several processes rank 0's clock decides.
 * A progress file holds the seconds so far: a run that was interrupted goes on with those left. What
   it learns then is not bit for bit what it would have learned: a clock never gives the same twice.
