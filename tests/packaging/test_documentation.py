@@ -52,11 +52,11 @@ def shell(file: Path) -> str:
 
 
 def commands() -> list[str]:
-    """Those without a placeholder to fill in; of several that choose and set the same, one."""
+    """Those without a placeholder or a package of one's own; of several that set the same, one."""
     different: dict[frozenset[str], str] = {}
     for file in [*PAGES, *SCRIPTS]:
         for command in COMMAND.findall(shell(file)):
-            if not re.search("NAME|CHOICE|PROTOCOL|hparams_search", command):
+            if not re.search("NAME|CHOICE|PROTOCOL|hparams_search|stiff_small", command):
                 words = (re.sub(r"(.*\..*)=.*", r"\1", word) for word in command.split())
                 different.setdefault(frozenset(words), command)
     return sorted(different.values())
