@@ -131,6 +131,19 @@ def of_frames(data: dict[str, Any]) -> None:
     data["state_dict"][GRID].update(elsewhere=torch.zeros(2**20, 1).half(), shape=[8, 2**17, 1])
 
 
+def of_nothing(data: dict[str, Any]) -> None:
+    """Says that a grid has 10^8 frames of no values."""
+    none = torch.zeros(10**8, 0).half()
+    data["state_dict"][GRID].update(elsewhere=none, kept=none[:0])
+
+
+def of_masks(data: dict[str, Any]) -> None:
+    """Says that a grid has many masks, of which the first alone is whole."""
+    grid = data["state_dict"][GRID]
+    short = [torch.zeros(1, dtype=torch.uint8)] * 300
+    grid.update(keep=[*grid["keep"], *short], elsewhere=torch.zeros(301, 1).half())
+
+
 HUGE: dict[str, Callable[[dict[str, Any]], object]] = {
     "wide layers": lambda data: data["devrf"]["model"]["architecture"].update(width=2**14),
     "too many units": lambda data: data["devrf"]["model"]["architecture"].update(width=10**9),
@@ -140,6 +153,8 @@ HUGE: dict[str, Callable[[dict[str, Any]], object]] = {
     ),
     "a grid of many voxels": lambda data: data["state_dict"][GRID].update(shape=[10**4] * 3),
     "many frames": of_frames,
+    "frames without values": of_nothing,
+    "masks without bits": of_masks,
     "a large image": lambda data: data["viewpoints"]["held_out"].update(width=10**6, height=10**6),
     "a scene that is no name": lambda data: data["devrf"].update(scene=["robot"]),
     "records that are none": lambda data: data["devrf"].update(records=[1]),
@@ -160,7 +175,7 @@ def test_grids_that_memory_cannot_hold_are_refused_before_they_are_unpacked(cano
         keep = torch.zeros(1, 2**21, dtype=torch.uint8)  # 2 MB of bits: 64 MB of numbers
         data["state_dict"][GRID].update(shape=[2**24, 1, 1], keep=keep)
 
-    assert "would take 0.13 GB of memory, and 0.01 GB are free" in refusal(edit(canonical, longer))
+    assert "would take 0.15 GB of memory, and 0.01 GB are free" in refusal(edit(canonical, longer))
 
 
 def test_damage_that_has_the_right_checksum_is_one_line(tmp_path):

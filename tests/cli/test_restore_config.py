@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -259,6 +260,9 @@ RECORDS = {
     "an option elsewhere": ["data@callbacks.x=procedural"],
     "an interpolation among values": ["field.width=1,${seed}"],
     "no text": [5],
+    "a sweep without end": ["seed=range(0,1000000000000)"],
+    "one that is shuffled": ["seed=shuffle(range(0,1000000000000))"],
+    "a search": ["seed=interval(0,1)"],
 }
 
 
@@ -272,10 +276,12 @@ def test_the_record_of_a_sweep_chooses_no_code(tmp_path, task):
 
 def test_the_record_of_a_sweep_does_not_unfold(tmp_path):
     """Each line refers ten times to the one before: 10^9 words in 460 bytes."""
-    lines = [f"a{k}: &a{k} [{','.join([f'*a{k - 1}'] * 10)}]" for k in range(1, 9)]
-    (tmp_path / "multirun.yaml").write_text("\n".join(["a0: &a0 [x]", *lines, "hydra: *a8"]))
-    with pytest.raises(DevrfError, match="not the record of a sweep"):
-        completed(["stage=inspect", f"hydra.sweep.dir={tmp_path}"])
+    for first, form in (("[x]", "[{}]"), ("{k: 1}", "{{<<: [{}]}}")):
+        refers = [f"a{k}: &a{k} {form.format(','.join([f'*a{k - 1}'] * 10))}" for k in range(1, 9)]
+        text = "\n".join([f"a0: &a0 {first}", *refers, "hydra: *a8"])
+        (tmp_path / "multirun.yaml").write_text(text)
+        with pytest.raises(DevrfError, match="not the record of a sweep"):
+            completed(["stage=inspect", f"hydra.sweep.dir={tmp_path}"])
 
 
 def test_a_sweep_goes_on_with_all_kinds_of_values(tmp_path, monkeypatch):
@@ -295,11 +301,30 @@ def test_a_sweep_goes_on_with_all_kinds_of_values(tmp_path, monkeypatch):
     assert (found.seed, found.data.name) == (2, "a, b")
 
 
-@pytest.mark.parametrize("name", ["run.log", ".hydra", ".devrf"])
+WRITTEN = ["run.log", ".hydra", ".devrf", ".hydra/config.yaml", ".devrf/process.txt"]
+
+
+@pytest.mark.parametrize("name", WRITTEN)
 def test_nothing_is_written_through_a_link(devrf, run, tmp_path, name):
     (tmp_path / "else").mkdir()
+    (run / name).parent.mkdir(exist_ok=True)
     (run / name).symlink_to(tmp_path / "else")
     outcome = devrf("stage=still", "hydra.run.dir=run")
-    assert (outcome.status, outcome.out) == (2, "")
-    assert outcome.err == f"devrf: run/{name}: a link; remove it: devrf writes there\n"
+    said = f"devrf: run/{name}: a link or a pipe; remove it: devrf writes there\n"
+    assert (outcome.status, outcome.out, outcome.err) == (2, "", said)
     assert not list((tmp_path / "else").iterdir())
+
+
+def test_nothing_of_a_sweep_is_written_through_a_link(devrf, tmp_path, tiny):
+    (tmp_path / "sweep" / "0_robot_seed_1" / ".hydra").mkdir(parents=True)
+    (tmp_path / "sweep" / "0_robot_seed_1" / ".hydra" / "config.yaml").symlink_to(tmp_path / "x")
+    outcome = devrf("-m", *tiny, "seed=1,2", "stage=inspect", "hydra.sweep.dir=sweep")
+    assert outcome.status == 2 and "a link or a pipe" in outcome.err
+    assert not (tmp_path / "x").exists()
+
+
+def test_a_pipe_is_no_checkpoint(devrf, run):
+    os.mkfifo(run / "checkpoints" / "later.ckpt")
+    assert devrf("stage=still", "still.height=20", "hydra.run.dir=run").status == 0
+    outcome = devrf("stage=still", "ckpt=run/checkpoints/later.ckpt")
+    assert outcome.status == 2 and outcome.err.count("\n") == 1

@@ -99,6 +99,8 @@ def digest_of(path: Path) -> str:
 
 def _metadata(path: Path) -> dict[str, str]:
     """The metadata of a file: ``devrf``, ``sha256`` and ``nested``."""
+    if not path.is_file():  # a pipe would be waited for
+        raise DevrfError(f"{path}: no file; set ckpt to one that devrf wrote")
     try:
         with safe_open(path, "pt") as file:
             metadata: dict[str, str] = file.metadata() or {}

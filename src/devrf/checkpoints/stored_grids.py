@@ -71,13 +71,18 @@ def unpack(
         OutOfMemoryError: the grids take more than is free.
     """
     x, y, z = (int(points) for points in packed["shape"])
-    if not 0 < x * y * z <= 8 * packed["keep"][0].numel():
-        raise ValueError("a mask of fewer voxels than the grid has")
-    shape, elsewhere = (x, y, z), packed["elsewhere"].to(device, torch.float32)
-    values = len(elsewhere) * x * y * z * elsewhere.shape[-1]
-    need_memory(2 * values * dtype.itemsize, "its fields", device)  # a module copies them
-    keep = [unpack_bits(bits, shape, device) for bits in packed["keep"]]
-    keep = keep * len(elsewhere) if len(keep) == 1 else keep
+    shape, voxels = (x, y, z), x * y * z
+    elsewhere, stored = packed["elsewhere"].to(device, torch.float32), packed["keep"]
+    masks, bits = stored.shape
+    if min(shape) < 1 or bits != math.ceil(voxels / 8) or masks not in (1, len(elsewhere)):
+        raise ValueError("masks of other voxels than the grids have")
+    if not elsewhere.numel() or elsewhere.ndim not in (2, 5):
+        raise ValueError("grids without values")
+    values = len(elsewhere) * voxels * elsewhere.shape[-1]
+    # A module copies them.
+    need_memory(2 * values * dtype.itemsize + masks * voxels, "its fields", device)
+    keep = [unpack_bits(mask, shape, device) for mask in stored]
+    keep = keep * len(elsewhere) if masks == 1 else keep
     details = packed["kept"].to(device, dtype).split([int(mask.sum()) for mask in keep])
     grids: Tensor = elsewhere.new_empty(len(elsewhere), *shape, elsewhere.shape[-1], dtype=dtype)
     for grid, rest, mask, detail in zip(grids, elsewhere, keep, details, strict=True):

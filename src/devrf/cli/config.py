@@ -137,8 +137,11 @@ def overrides_in(record: Path) -> list[str]:
     Raises:
         DevrfError: it is none.
     """
-    try:  # as plain YAML: OmegaConf would copy what it refers to
-        content = yaml.safe_load(record.read_text("utf-8"))
+    try:
+        text = record.read_text("utf-8")
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
+            raise ValueError("Hydra writes none, and what refers to itself has no end")
+        content = yaml.safe_load(text)
         texts = content["hydra"]["overrides"]["task"]
         if all(isinstance(text, str) for text in texts):
             return [*texts]

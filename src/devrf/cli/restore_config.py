@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
@@ -60,6 +61,9 @@ KEY = re.compile(r"[\w-]+(\.[\w-]+){0,16}", re.ASCII)
 RELATIVE = {"data.root", "evaluation.lpips_weights", "video.path"}
 # Where Hydra finds the settings: a group below hydra/ is none of the run's own choices.
 GROUP_OF_SETTINGS = "hydra/restored"
+
+# Values of a key in a sweep, at most.
+MOST_JOBS = 10_000
 
 # Options by /group, values by key.
 Command = dict[str, Any]
@@ -304,6 +308,13 @@ def _of_sweep(typed: Sequence[Override], folder: Path) -> list[str]:
         if not override.is_sweep_override():
             command |= checked(record, {name: override.value()})
             continue
+        sweep: Any = override.value()
+        if override.is_range_sweep():
+            count = (sweep.stop - sweep.start) / (sweep.step or 1)
+        else:
+            count = len(sweep.list) if override.is_choice_sweep() else math.inf
+        if not count <= MOST_JOBS:
+            raise DevrfError(f"{record}: {key} is no list of values; type the sweep again")
         try:
             texts = [parsed([f"{key}={text}"])[0].value() for text in override.sweep_iterator()]
         except HydraException:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import shutil
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,7 +27,7 @@ log = logging.getLogger(__name__)
 # Made in the folder before the config is checked.
 AT_FIRST = {".hydra", PLACE}
 # What is written by names that are known, and might lead elsewhere.
-APPENDED = ("run.log", ".hydra", PLACE)
+WRITTEN = ("run.log", ".hydra", PLACE)
 # Environment variables in which torchrun and SLURM number the processes that they start.
 RANKS = ("RANK", "SLURM_PROCID")
 
@@ -51,16 +52,17 @@ class RunFolderLock(Callback):
             hydra.cfg = before
         with report_user_errors():
             make_folder(folder)  # as Hydra does next, with a traceback where it cannot
-            for name in APPENDED:
-                if (folder / name).is_symlink():
-                    raise DevrfError(f"{folder / name}: a link; remove it: devrf writes there")
+            refuse_links(folder)
             if _locks(config):
                 lock_folder(folder, "hydra.run.dir")
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Lock the folder of a sweep; each of its jobs locks its own."""
         with report_user_errors():
-            lock_folder(Path(config.hydra.sweep.dir), "hydra.sweep.dir")
+            folder = Path(config.hydra.sweep.dir)
+            for job in [folder, *folder.glob("*/")]:
+                refuse_links(job)
+            lock_folder(folder, "hydra.sweep.dir")
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Release the sweep's folder."""
@@ -92,6 +94,20 @@ def working_in(folder: Path, config: DictConfig, key: str) -> Iterator[None]:
         release_folder(folder)
 
 
+def refuse_links(folder: Path) -> None:
+    """Refuse a run's folder in which names that are written to are no files or folders of its own.
+
+    Raises:
+        DevrfError: one is a link, or a pipe.
+    """
+    places = [folder / name for name in WRITTEN]
+    inside = (path for place in places[1:] if place.is_dir() for path in place.iterdir())
+    for path in [*places, *inside]:
+        mode = path.lstat().st_mode if os.path.lexists(path) else stat.S_IFREG
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            raise DevrfError(f"{path}: a link or a pipe; remove it: devrf writes there")
+
+
 def _locks(config: DictConfig) -> bool:
     """Whether a process needs the lock: rank 0 locks for its workers.
 
@@ -116,7 +132,7 @@ def archive_previous(folder: Path, *needed: Path) -> None:
     if not old:
         return
     close_logs()
-    taken = [int(p.name[9:]) for p in folder.glob("previous-*") if p.name[9:].isdigit()]
+    taken = [int(p.name[9:]) for p in folder.glob("previous-*") if p.name[9:].isdecimal()]
     previous = folder / f"previous-{max(taken, default=0) + 1}"
     previous.mkdir()
     for path in old:
