@@ -46,6 +46,8 @@ SCENE = [
 ]
 TINY = ["field.width=16", "schedule.canonical.side=16", "schedule.canonical.search_side=12"]
 TINY += ["schedule.canonical.rays=128", "schedule.deformation.rays=128"]
+# So few iterations do not learn what each growth takes away.
+TINY += ["schedule.canonical.density_drop=0", "schedule.canonical.occupancy_every=null"]
 
 
 def shortened(search: int, fine: int, frame: int) -> list[str]:
