@@ -26,6 +26,8 @@ from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.model import DeVRFModel
+from devrf.methods.dnerf.model import DNeRFSettings
+from devrf.methods.neural_volumes.settings import NeuralVolumesSettings
 from devrf.metrics.image import psnr
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
@@ -147,6 +149,7 @@ def of_masks(data: dict[str, Any]) -> None:
 HUGE: dict[str, Callable[[dict[str, Any]], object]] = {
     "wide layers": lambda data: data["devrf"]["model"]["architecture"].update(width=2**14),
     "too many units": lambda data: data["devrf"]["model"]["architecture"].update(width=10**9),
+    "octaves": lambda data: data["devrf"]["model"]["architecture"].update(frequencies=16000),
     "fine steps": lambda data: data["devrf"]["model"]["settings"].update(step=1e-9),
     "steps that are no number": lambda data: data["devrf"]["model"]["settings"].update(
         step=math.nan
@@ -178,12 +181,26 @@ def test_grids_that_memory_cannot_hold_are_refused_before_they_are_unpacked(cano
     assert "would take 0.15 GB of memory, and 0.01 GB are free" in refusal(edit(canonical, longer))
 
 
+@pytest.mark.parametrize(
+    "settings",
+    [
+        lambda: DNeRFSettings(bands=15000),
+        lambda: DNeRFSettings(steps=10**6),
+        lambda: NeuralVolumesSettings(template_channels=(1,) * 9),
+    ],
+)
+def test_networks_whose_samples_fill_memory_are_refused(settings):
+    with pytest.raises(DevrfError, match=r"^ray_stage\.model\.settings\."):
+        settings()
+
+
 def test_damage_that_has_the_right_checksum_is_one_line(tmp_path):
     path = tmp_path / "deep.ckpt"
     for nested in (
         "[" * 10**6,
         '{"dict": [[{"dict": []}, 1]]}',
         '{"tensor": [1]}',
+        '{"set": [2305843009213693951, 4611686018427387902]}',
         '{"x": 1, "y": 2}',
     ):
         path.write_bytes(_header(nested, {}, _digest(nested, {})))

@@ -192,5 +192,14 @@ def _unflatten(node: Any, tensors: Mapping[str, Any]) -> Any:
     if kind == "tensor":
         return tensors[value]
     if kind == "dict":
-        return {_unflatten(k, tensors): _unflatten(v, tensors) for k, v in value}
-    return {"tuple": tuple, "set": set}[kind](_unflatten(item, tensors) for item in value)
+        return {_key(k): _unflatten(v, tensors) for k, v in value}
+    if kind == "set":
+        return {_key(item) for item in value}
+    return {"tuple": tuple}[kind](_unflatten(item, tensors) for item in value)
+
+
+def _key(value: Any) -> Any:
+    """A key or a set's member: text, or a number none of whose multiples have one hash."""
+    if isinstance(value, str) or (isinstance(value, int) and abs(value) < 2**53):
+        return value
+    raise ValueError(value)

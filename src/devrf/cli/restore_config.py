@@ -45,8 +45,8 @@ log = logging.getLogger(__name__)
 OF_A_COMMAND = {"stage", "ckpt", "resume", "memory_check", "objective", "hparams_search"}
 OF_A_COMMAND |= {"hydra", "report", "still", "export", "trainer", "logger", "callbacks"}
 OF_A_COMMAND |= {"viewer", "fetch", "capture", "selfcheck", "scene", "defaults"}
-# Where a command writes.
-PLACES = {"data.export", "data.flow_cache"}
+# Where a command writes, and what it fetches.
+PLACES = {"data.export", "data.flow_cache", "evaluation.download"}
 # Of another method's run these are taken over.
 OF_A_SCENE = {"data", "facing", "seed"}
 # Keys by which Hydra builds a part.

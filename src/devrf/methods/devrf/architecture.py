@@ -52,6 +52,8 @@ class Architecture:
     def __post_init__(self) -> None:
         good = 0 < self.contracted_opacity < 1
         expect(good, "field.contracted_opacity", "between 0 and 1", self.contracted_opacity)
+        expect(0 <= self.frequencies <= 16, "field.frequencies", "0 to 16", self.frequencies)
+        expect(0 < self.channels <= 256, "field.channels", "1 to 256", self.channels)
 
     def in_space(self, space: Space, side: float) -> Architecture:
         """The sizes that hold in ``space`` for a grid of ``side`` voxels along an edge."""

@@ -27,6 +27,9 @@ from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import ColorChange
 from devrf.rendering.sampling import RenderSettings
 
+# Samples of a ray, at most, before empty space is skipped.
+SAMPLES = 2**14
+
 
 class ColorField(StoredClass, FrameField):
     """A field of frames that changes colours; an extension brings it."""
@@ -214,6 +217,8 @@ class DeVRFModel(Renderable):
         field = self.canonical
         if field.grid_shape(field.voxels) != shape_of(field.density.values):
             raise ValueError("a grid of another size than its description says")
+        if field.box.diagonal > SAMPLES * field.step_length(self.settings.step):
+            raise ValueError("a ray of more samples than any grid has")
 
 
 def _place_of_frames(backward: Any, device: torch.device) -> torch.device:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import ClassVar, Literal
 
 from devrf.errors import expect
@@ -10,8 +10,8 @@ from devrf.errors import expect
 Initialisation = Literal["uniform", "glorot"]
 Precision = Literal["auto", "float32", "bfloat16"]
 
-# Samples of a ray, at most.
-SAMPLES = 1024
+# Samples of a ray, and octaves of an encoding, at most.
+SAMPLES, BANDS = 1024, 32
 
 
 class CheckedSettings:
@@ -76,6 +76,8 @@ class PlacedSettings(CheckedSettings):
     def __post_init__(self) -> None:
         self.check_least(2, "width", "depth", "occupancy_side")
         self.check_samples("steps")
+        for name in (field.name for field in fields(self) if field.name.endswith("bands")):
+            self.check(name, 0 <= getattr(self, name) <= BANDS, f"0 to {BANDS}")
         share = self.empty_from
         self.check("empty_from", share is None or 0 <= share <= 1, "0 to 1, or null")
 

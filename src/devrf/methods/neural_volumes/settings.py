@@ -59,6 +59,7 @@ class NeuralVolumesSettings(CheckedSettings):
         self.check("step", self.step >= 1 / 512, "at least 1/512")
         for name in ("encoder_channels", "template_channels", "warp_channels"):
             channels = getattr(self, name)
+            self.check(name, len(channels) <= 8, "at most 8 levels")
             self.check(name, channels and min(channels) >= 1, "one or more numbers above 0")
         multiple = 2 ** len(self.encoder_channels)
         fits = [edge >= multiple and edge % multiple == 0 for edge in self.encoder_size]
