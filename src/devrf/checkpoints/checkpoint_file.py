@@ -195,7 +195,9 @@ def _unflatten(node: Any, tensors: Mapping[str, Any]) -> Any:
         return {_key(k): _unflatten(v, tensors) for k, v in value}
     if kind == "set":
         return {_key(item) for item in value}
-    return {"tuple": tuple}[kind](_unflatten(item, tensors) for item in value)
+    if kind == "tuple":
+        return tuple(_unflatten(item, tensors) for item in value)
+    raise ValueError(kind)
 
 
 def _key(value: Any) -> Any:

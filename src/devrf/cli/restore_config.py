@@ -36,6 +36,7 @@ from devrf.cli.config import (
     overrides_in,
     scene_folder_name,
 )
+from devrf.cli.config_check import RESERVED
 from devrf.cli.messages import in_quotes
 from devrf.errors import DevrfError
 
@@ -49,8 +50,6 @@ OF_A_COMMAND |= {"viewer", "fetch", "capture", "selfcheck", "scene", "defaults"}
 PLACES = {"data.export", "data.flow_cache", "evaluation.download"}
 # Of another method's run these are taken over.
 OF_A_SCENE = {"data", "facing", "seed"}
-# Keys by which Hydra builds a part.
-CODE = {"_target_", "_partial_", "_convert_", "_recursive_", "_args_"}
 # What is set without a section.
 ALONE = {"seed", "priors", "deterministic", "decoder_precision"}
 # An option's name leads to no other folder than its group's; a key is a path of plain names.
@@ -101,7 +100,7 @@ def present_command(config: DictConfig) -> Command:
 def differing(now: Any, before: Any, path: str = "") -> Iterator[str]:
     """The keys of values in one config that another has not; of lists the whole, of code none."""
     for key, value in now.items():
-        old, where = before.get(key, CODE), f"{path}{key}"
+        old, where = before.get(key, RESERVED), f"{path}{key}"
         if _of_a_command(where):
             continue
         if isinstance(value, Mapping):
@@ -145,7 +144,7 @@ def checked(path: Path, command: Mapping[str, Any]) -> Command:
 def _is_plain(value: object, depth: int = 16) -> bool:
     """Whether a value is data: no code, nothing that refers to something else or is missing."""
     if isinstance(value, Mapping):
-        names = all(isinstance(k, str) and KEY.fullmatch(k) and k not in CODE for k in value)
+        names = all(isinstance(k, str) and KEY.fullmatch(k) and k not in RESERVED for k in value)
         return names and _is_plain(list(value.values()), depth)
     if isinstance(value, list):
         return depth > 0 and all(_is_plain(item, depth - 1) for item in value)
@@ -156,7 +155,7 @@ def _is_plain(value: object, depth: int = 16) -> bool:
 
 def _of_a_command(key: str) -> bool:
     """Whether a key or group says only what to do, or builds a part."""
-    return root(key) in OF_A_COMMAND or key in PLACES or bool(CODE & {*key.split(".")})
+    return root(key) in OF_A_COMMAND or key in PLACES or bool(RESERVED & {*key.split(".")})
 
 
 def root(key: str) -> str:
@@ -230,7 +229,7 @@ def of_named_run(typed: Sequence[Override], multirun: bool) -> list[str]:
         _source.append(f"{checkpoints[commands.index({})]}: {said} defaults")
         return []
     first = commands[0]
-    shared = {k: first[k] for k in first if all(c.get(k, CODE) == first[k] for c in commands)}
+    shared = {k: first[k] for k in first if all(c.get(k, RESERVED) == first[k] for c in commands)}
     put = _put(beneath(typed, shared), typed, source, multirun=multirun)
     if multirun:
         # The sweep is the one that is typed, not that of an experiment.
