@@ -214,8 +214,10 @@ def test_two_nodes_of_torchrun_learn_what_two_processes_of_one_command_learn(
             learn = ("-m", "devrf", *common, *own, *devices)
             commands = [("-m", *agent, f"--node-rank={rank}", *learn) for rank in (0, 1)]
             first, second = nodes([tmp_path] * 2, commands, [{}, {}], modules)
-            assert (first[0], second) == (0, (0, "", "")), first
+            assert (first[0], second[:2]) == (0, (0, "")), (first, second)
             assert first[1].count("canonical: seconds") == 1
+            # torchrun's agent warns there when the agent that keeps the store ends before it.
+            assert "devrf:" not in second[2]
         written = [json.loads((tmp_path / name / f"static-{k}.json").read_text()) for k in (0, 1)]
         fields[name] = written[0]["fields"]
         assert written[1]["fields"] == fields[name]
