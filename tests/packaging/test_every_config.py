@@ -47,6 +47,28 @@ CHOSEN = [
 ]
 
 
+def chain(group, name):
+    """The files of ``group`` that make up its option ``name``, by its defaults list."""
+    file = config_folder() / group / f"{name}.yaml"
+    if not file.is_file():  # an option of Hydra's own
+        return []
+    entries = OmegaConf.load(file).get("defaults", ())
+    bases = [entry for entry in entries if isinstance(entry, str) and entry != "_self_"]
+    own = [base for base in bases if "/" not in base]
+    return [name, *(inherited for base in own for inherited in chain(group, base))]
+
+
+@pytest.mark.parametrize("group", NAMES)
+def test_an_option_is_read_in_one_file_of_its_group_or_two(group):
+    chains = [chain(group, name) for name in NAMES[group]]
+    assert not [names for names in chains if len(names) > 2]
+
+
+def test_cpu_small_is_best_small_for_forward_facing_scenes(composed):
+    scene = "data=procedural_forward"
+    assert composed(scene, "experiment=cpu_small") == composed(scene, "experiment=best_small")
+
+
 known: set[str] = set()
 
 
