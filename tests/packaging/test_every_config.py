@@ -69,6 +69,12 @@ def test_cpu_small_is_best_small_for_forward_facing_scenes(composed):
     assert composed(scene, "experiment=cpu_small") == composed(scene, "experiment=best_small")
 
 
+@pytest.mark.parametrize(("data", "factor"), [("inward", 1), ("colmap", "auto"), ("lego", 2)])
+def test_best_takes_images_at_the_size_that_the_scenes_choice_says(composed, data, factor):
+    for experiment in ("experiment=quickstart", "experiment=best"):
+        assert composed(f"data={data}", "data.root=x", experiment).data.downscale == factor
+
+
 known: set[str] = set()
 
 
