@@ -16,6 +16,10 @@ from devrf.cli.run import STEPS as TAKEN
 # Arguments, and what the one line must name.
 MISTAKES = {
     "misspelt key": (["data.widht=3"], "data.widht: no such key; did you mean data.width?"),
+    "misspelt settings for a scene": (
+        ["for_scene=paper_lgo"],
+        "for_scene=paper_lgo: no such option; choose one of paper_daisy, ",
+    ),
     "no choice of a group": (["method=null"], "method=null: choose one of devrf, dnerf, "),
     "key of other scenes": (
         ["data=inward", "data.root=scene", "data.scene_seed=3"],

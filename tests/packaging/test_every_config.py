@@ -42,6 +42,7 @@ def rooted(composed, folder, *overrides):
 
 # What is learned is not DeVRF's two stages, or it is no choice by itself, or in every config.
 OTHERS = ("method", "comparison=", "hydra/", "protocol=", "profile=", "for_scene=", "source=")
+OTHERS += ("paper_scene=",)
 CHOSEN = [
     name for name in CHOICES if not name.startswith(OTHERS) and name.split("=")[1] != "default"
 ]

@@ -153,9 +153,11 @@ def _published(root: str, overrides: Sequence[Override]) -> str | None:
     name = Path(root).expanduser().resolve().name.lower().replace("-", "_")
     own, paper = (config_folder() / f"{p}{name}.yaml" for p in ("data/", "for_scene/paper_"))
     wanted = values(overrides, "experiment") == ["paper"] and name not in values(overrides, "data")
-    if not wanted or not paper.is_file() or not recognise(root).name.startswith("DeVRF"):
+    if not wanted or not (own.is_file() and paper.is_file()):
         return None
-    (reader,) = OmegaConf.load(own).defaults
+    if not recognise(root).name.startswith("DeVRF"):
+        return None
+    reader, _ = OmegaConf.load(own).defaults
     usual = OmegaConf.create({"data": OmegaConf.load(own.with_stem(reader))})
     del usual.data["_target_"]  # the scene's choice inherits it
     scene = OmegaConf.merge({"data": OmegaConf.load(own)}, OmegaConf.load(paper))
