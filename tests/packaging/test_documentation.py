@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib.util
 import re
 import shlex
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -97,6 +99,20 @@ def test_commands_compose(command, composed, tmp_path, monkeypatch):
     paths = r"=(PATH|FOLDER|…|mine|scenes/fox)$"
     words = [re.sub(paths, "=scene", word) for word in words if word != "-m"]
     check_config(composed(*completed(words)))
+
+
+def test_workflows_fit_githubs_schema(tmp_path):
+    workflows = [file for file in SCRIPTS if file.suffix == ".yml"]
+    if not workflows:
+        pytest.skip("a source distribution has none")
+    command = [sys.executable, "-m", "check_jsonschema", "--builtin-schema"]
+    command.append("vendor.github-workflows")
+    done = subprocess.run([*command, *workflows], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    misspelt = tmp_path / "ci.yml"
+    misspelt.write_text(workflows[0].read_text().replace("runs-on:", "run-on:"))
+    done = subprocess.run([*command, misspelt], capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and "'runs-on' is a required property" in done.stdout
 
 
 @pytest.mark.parametrize("file", [*SCRIPTS, *PAGES[:2]], ids=lambda file: file.name)
