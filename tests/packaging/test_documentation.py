@@ -16,7 +16,7 @@ import yaml
 from omegaconf import OmegaConf
 
 from devrf.cli.complete import completed
-from devrf.cli.config import group_choices
+from devrf.cli.config import config_folder, group_choices, known_stages
 from devrf.cli.config_check import check_config
 
 REPOSITORY = Path(__file__).parents[2]
@@ -25,6 +25,12 @@ PAGES += sorted((REPOSITORY / "docs").rglob("*.md"))
 # What continuous integration runs; a source distribution has none of it.
 SCRIPTS = [*sorted((REPOSITORY / ".github/workflows").glob("*.yml")), REPOSITORY / ".ci/run"]
 SCRIPTS = [script for script in SCRIPTS if script.is_file()]
+# What else says commands: the help, and comments, docstrings among them.
+TOLD = [REPOSITORY / "Makefile", REPOSITORY / "benchmarks" / "README.md"]
+TOLD += [REPOSITORY / "conf" / "hydra" / "help" / "devrf.yaml"]
+COMMENTED = sorted((REPOSITORY / "conf").rglob("*.yaml"))
+COMMENTED += sorted((REPOSITORY / "src").rglob("*.py"))
+COMMENTED += sorted((REPOSITORY / "benchmarks").glob("*.py"))
 
 SPAN = re.compile(r"`([^`\n]+)`")
 TEST = re.compile(r"(tests/[\w/]+\.py)(?:::(\w+))?")
@@ -33,6 +39,11 @@ EQUATION = re.compile(r"\\\((.+?)\\\)|\\\[(.+?)\\\]", re.S)
 # `python -m devrf`, or the installed program: VENV/bin/devrf.
 ARGUMENT = r"'?[\w./]+=[^\s`]+"
 COMMAND = re.compile(rf"(?:python -m |/bin/)devrf\"? ((?:-m )?{ARGUMENT}(?: {ARGUMENT})*)")
+COMMENT = re.compile(r'"""(.*?)"""|# ([^\n]*)', re.DOTALL)
+# In a comment: arguments alone, without what ends the sentence.
+SETTING = r"'?[a-z_][\w./]*=[^\s`\"]*[^\s`\".,:;)]"
+SETTINGS = re.compile(rf"(?<![\w.])((?:-m )?{SETTING}(?: {SETTING})*)")
+PLACEHOLDER = re.compile("NAME|CHOICE|PROTOCOL|FILE|hparams_search|stiff_small|=(choice|option|…)$")
 MAKE = re.compile(r"(?:^ *|[`&;] ?)make ((?:[a-z-]+ ?)+)", re.MULTILINE)
 GROUPS = "callbacks|data|evaluation|export|field|sampling|schedule|still|video|viewer"
 KEY = re.compile(rf"([a-z_]+(?:\.[a-z_]+)+)=|^((?:{GROUPS})(?:\.[a-z_]+)+)$")
@@ -56,12 +67,23 @@ def shell(file: Path) -> str:
 def commands() -> list[str]:
     """Those without a placeholder or a package of one's own; of several that set the same, one."""
     different: dict[frozenset[str], str] = {}
-    for file in [*PAGES, *SCRIPTS]:
-        for command in COMMAND.findall(shell(file)):
-            if not re.search("NAME|CHOICE|PROTOCOL|hparams_search|stiff_small", command):
-                words = (re.sub(r"(.*\..*)=.*", r"\1", word) for word in command.split())
-                different.setdefault(frozenset(words), command)
+    texts = [shell(file) for file in [*PAGES, *SCRIPTS, *TOLD]]
+    written = [command for text in texts for command in COMMAND.findall(text)]
+    written += [words for words in in_comments() if " " in words]
+    for command in written:
+        if not PLACEHOLDER.search(command):
+            words = (re.sub(r"(.*\..*)=.*", r"\1", word) for word in command.split())
+            different.setdefault(frozenset(words), command)
     return sorted(different.values())
+
+
+def in_comments() -> list[str]:
+    """Arguments in comments whose keys are groups or keys of the config: a command, or a part."""
+    known = {*group_choices(), *OmegaConf.load(config_folder() / "config.yaml")}
+    comments = [words for file in COMMENTED for words in COMMENT.findall(file.read_text())]
+    written = [found for words in comments for found in SETTINGS.findall(" ".join(words))]
+    keys = re.compile(rf"(?:(?:-m|'?(?:{'|'.join(sorted(known))})[.=]\S*)(?: |$))+")
+    return [arguments for arguments in written if keys.fullmatch(arguments)]
 
 
 def spans(page: Path) -> list[str]:
@@ -113,6 +135,18 @@ def test_workflows_fit_githubs_schema(tmp_path):
     misspelt.write_text(workflows[0].read_text().replace("runs-on:", "run-on:"))
     done = subprocess.run([*command, misspelt], capture_output=True, text=True, check=False)
     assert done.returncode == 1 and "'runs-on' is a required property" in done.stdout
+
+
+def test_options_that_comments_name_exist():
+    groups = {**group_choices(), "stage": known_stages()}
+    words = [word for text in in_comments() for word in text.split()]
+    words = [word for word in words if "=" in word and not PLACEHOLDER.search(word)]
+    named = [(key, value.split(",")) for key, value in (word.split("=", 1) for word in words)]
+    options = [(key, option) for key, values in named if key in groups for option in values]
+    assert len(options) > 50
+    missing = [(group, option) for group, option in options if option not in groups[group]]
+    plugins = {("hydra/launcher", "joblib")}
+    assert set(missing) <= {("viewer", "true"), ("viewer", "false"), *plugins}
 
 
 @pytest.mark.parametrize("file", [*SCRIPTS, *PAGES[:2]], ids=lambda file: file.name)
