@@ -213,6 +213,12 @@ def test_where_a_run_lives_is_told_from_scene_experiment_and_ablation(composed, 
     assert HydraConfig.get().run.dir == folder
 
 
+@pytest.mark.parametrize("data", ["procedural", "procedural_forward"])
+def test_videos_of_the_table_of_ablations_are_alike_for_both_facings(composed, data):
+    video = composed("experiment=ablation_table", f"data={data}").video
+    assert (video.frames, video.fps, video.max_seconds) == (6, 24, 15)
+
+
 def test_every_ablation_is_in_a_table(composed):
     tables = []
     for table, scenes in (
