@@ -76,6 +76,13 @@ def test_best_takes_images_at_the_size_that_the_scenes_choice_says(composed, dat
         assert composed(f"data={data}", "data.root=x", experiment).data.downscale == factor
 
 
+@pytest.mark.parametrize(("data", "iterations"), [("inward", 10), ("forward", 50)])
+def test_iterations_in_a_step_of_best(composed, data, iterations):
+    config = composed(f"data={data}", "data.root=x", "experiment=best")
+    steps = (config.canonical.iterations_per_step, config.deformation.iterations_per_step)
+    assert steps == (iterations, iterations)
+
+
 known: set[str] = set()
 
 
