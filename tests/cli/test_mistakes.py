@@ -18,7 +18,7 @@ MISTAKES = {
     "misspelt key": (["data.widht=3"], "data.widht: no such key; did you mean data.width?"),
     "misspelt settings for a scene": (
         ["for_scene=paper_lgo"],
-        "for_scene=paper_lgo: no such option; choose one of paper_daisy, ",
+        "did you mean for_scene=paper_lego?",
     ),
     "no choice of a group": (["method=null"], "method=null: choose one of devrf, dnerf, "),
     "key of other scenes": (

@@ -56,12 +56,15 @@ CHOICES += ["method=dnerf", "method=neural_volumes"]
 
 
 def shell(file: Path) -> str:
-    """A file's text; of a workflow what its steps run. A command is on one line."""
+    """A file's text; of a workflow what its steps run. A command is on one line.
+
+    A command that is shown with the error that it ends in is left out.
+    """
     text = file.read_text()
     if file.suffix == ".yml":
         jobs = yaml.safe_load(text)["jobs"].values()
         text = "\n".join(step.get("run", "") for job in jobs for step in job["steps"])
-    return re.sub(r"\\\n\s*", "", text)
+    return re.sub(r"\\\n\s*|\$ .*\ndevrf: .*", "", text)
 
 
 def commands() -> list[str]:
