@@ -1,23 +1,21 @@
 """A run that knows itself: a later command begins from what it was learned with.
 
 A checkpoint holds the options of config groups that were chosen, by ``/group``, and what was set
-beside them, by config key, as plain values. A later command chooses the same options by name, and
-Hydra merges the rest, as a config file of values alone, beneath what is typed: only that differs.
-So nothing that a file says is read as an override, as an interpolation or as code.
+beside them, by config key, as plain values. A later command sets the same, beneath what is typed.
+Text is put in quotes, so nothing that a file says is read as an interpolation or as code.
 """
 
 from __future__ import annotations
 
 import json
 import logging
-import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
+import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
@@ -26,16 +24,7 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
-from devrf.cli.config import (
-    OF_A_CHECKPOINT,
-    RESTORED,
-    choices,
-    config_folder,
-    group_choices,
-    overrides,
-    overrides_in,
-    scene_folder_name,
-)
+from devrf.cli.config import OF_A_CHECKPOINT, choices, config_folder, overrides, scene_folder_name
 from devrf.cli.config_check import RESERVED
 from devrf.cli.messages import in_quotes
 from devrf.errors import DevrfError
@@ -56,21 +45,16 @@ ALONE = {"seed", "priors", "deterministic", "decoder_precision"}
 OPTION = re.compile(r"(?!null$)[\w-]+", re.ASCII | re.IGNORECASE)
 GROUP = re.compile(r"/[\w-]+(/[\w-]+)*", re.ASCII)
 KEY = re.compile(r"[\w-]+(\.[\w-]+){0,16}", re.ASCII)
+# Text that is more than text.
+CODE = re.compile(rf"\$\{{|^\?\?\?$|{'|'.join(RESERVED)}")
 # Values that are relative to the folder in which they were typed.
 RELATIVE = {"data.root", "evaluation.lpips_weights", "video.path"}
-# Where Hydra finds the settings: a group below hydra/ is none of the run's own choices.
-GROUP_OF_SETTINGS = "hydra/restored"
-
-# Values of a key in a sweep, at most.
-MOST_JOBS = 10_000
 
 # Options by /group, values by key.
 Command = dict[str, Any]
 
 # Where the present command's settings come from, until a log is there to say so.
 _source: list[str] = []
-# The folder of the present command's restored settings.
-_folder: list[TemporaryDirectory[str]] = []
 
 
 def present_command(config: DictConfig) -> Command:
@@ -89,15 +73,12 @@ def present_command(config: DictConfig) -> Command:
     app = GlobalHydra.instance().is_initialized()  # not in another process of a sweep
     with nullcontext() if app else initialize_config_dir(str(config_folder()), version_base="1.3"):
         alone = compose("config", [*found_in, *(str(o.input_line) for o in typed)])
-    changed = differing(OmegaConf.to_container(config), OmegaConf.to_container(alone))
-    settings = {key: _plain_at(config, key) for key in changed if KEY.fullmatch(key)}
-    return {
-        **{group: option for group, option in chosen.items() if not _of_a_command(group)},
-        **{key: value for key, value in settings.items() if _is_plain(value)},
-    }
+    changed = _differing(OmegaConf.to_container(config), OmegaConf.to_container(alone))
+    said = chosen | {key: _plain_at(config, key) for key in changed}
+    return {key: value for key, value in said.items() if _is_known(key, value)}
 
 
-def differing(now: Any, before: Any, path: str = "") -> Iterator[str]:
+def _differing(now: Any, before: Any, path: str = "") -> Iterator[str]:
     """The keys of values in one config that another has not; of lists the whole, of code none."""
     for key, value in now.items():
         old, where = before.get(key, RESERVED), f"{path}{key}"
@@ -106,7 +87,7 @@ def differing(now: Any, before: Any, path: str = "") -> Iterator[str]:
         if isinstance(value, Mapping):
             old = old if isinstance(old, Mapping) else {}
             if value.get("_target_") == old.get("_target_"):
-                yield from differing(value, old, f"{where}.")
+                yield from _differing(value, old, f"{where}.")
         elif value != old:
             yield where
 
@@ -128,28 +109,27 @@ def checked(path: Path, command: Mapping[str, Any]) -> Command:
         DevrfError: something else is among them.
     """
     for key, value in command.items():
-        if GROUP.fullmatch(key):
-            known = isinstance(value, str) and OPTION.fullmatch(value) is not None
-        else:
-            known = KEY.fullmatch(key) is not None and _is_plain(value)
-            known = known and ("." in key or key in ALONE)
-        if not known or _of_a_command(key):
+        if not _is_known(key, value):
             said = f"{key}={value}"[:80]
             raise DevrfError(f"{path}: {said!r} is no option or setting of a learned run")
-        if isinstance(value, Mapping):
-            checked(path, {f"{key}.{name}": below for name, below in value.items()})
     return {**command}
 
 
-def _is_plain(value: object, depth: int = 16) -> bool:
+def _is_known(key: str, value: object) -> bool:
+    """Whether a run may have been learned with it: an option by name, or a plain value by key."""
+    if _of_a_command(key):
+        return False
+    if GROUP.fullmatch(key):
+        return isinstance(value, str) and OPTION.fullmatch(value) is not None
+    return KEY.fullmatch(key) is not None and ("." in key or key in ALONE) and _is_plain(value)
+
+
+def _is_plain(value: object, depth: int = 8) -> bool:
     """Whether a value is data: no code, nothing that refers to something else or is missing."""
-    if isinstance(value, Mapping):
-        names = all(isinstance(k, str) and KEY.fullmatch(k) and k not in RESERVED for k in value)
-        return names and _is_plain(list(value.values()), depth)
     if isinstance(value, list):
         return depth > 0 and all(_is_plain(item, depth - 1) for item in value)
     if isinstance(value, str):
-        return "${" not in value and value != "???" and value.isprintable() and len(value) < 5000
+        return value.isprintable() and not CODE.search(value)
     return value is None or isinstance(value, bool | int | float)
 
 
@@ -167,6 +147,20 @@ def as_typed(command: Mapping[str, Any]) -> list[str]:
     """It as it may be typed, for people."""
     said = {k: v if isinstance(v, str) else json.dumps(v) for k, v in command.items()}
     return [f"{key.lstrip('/')}={value}" for key, value in said.items()]
+
+
+def _override(key: str, value: Any) -> str:
+    """What sets an option of a group, or a key, to just this value."""
+    return f"{key[1:]}={value}" if key[0] == "/" else f"++{key}={_literal(value)}"
+
+
+def _literal(value: Any) -> str:
+    """A plain value in Hydra's grammar."""
+    if isinstance(value, list):
+        return f"[{','.join(map(_literal, value))}]"
+    if isinstance(value, str):
+        return in_quotes(value)
+    return str(value) if isinstance(value, float) else json.dumps(value)
 
 
 def parsed(overrides: Iterable[str]) -> list[Override]:
@@ -214,23 +208,27 @@ def of_named_run(typed: Sequence[Override], multirun: bool) -> list[str]:
         return []
     if sweep is not None and not checkpoints:
         return _of_sweep(typed, Path(sweep))
-    source = ", ".join(map(str, checkpoints))
-    if folder is not None and not checkpoints and not multirun:
-        from devrf.checkpoints.checkpoint import latest_checkpoint  # loads torch
+    if not checkpoints and (folder is None or multirun):
+        return []
+    from devrf.checkpoints.checkpoint import latest_checkpoint, metadata_of  # loads torch
 
-        source = folder
-        if (last := latest_checkpoint(Path(folder))) is not None:
-            checkpoints = [last]
+    source = ", ".join(map(str, checkpoints))
+    if folder is not None and not checkpoints:
+        source, last = folder, latest_checkpoint(Path(folder))
+        checkpoints = [] if last is None else [last]
     if not checkpoints or not all(path.is_file() for path in checkpoints):
         return []  # a file that is missing is reported by the step that loads it
-    commands = [_command_of(path) for path in checkpoints]
+    commands = [checked(path, metadata_of(path).command) for path in checkpoints]
     if {} in commands:
         said = "does not say how it was learned; data and settings are those typed, and the"
         _source.append(f"{checkpoints[commands.index({})]}: {said} defaults")
         return []
     first = commands[0]
     shared = {k: first[k] for k in first if all(c.get(k, RESERVED) == first[k] for c in commands)}
-    put = _put(beneath(typed, shared), typed, source, multirun=multirun)
+    command = _beneath(typed, shared)
+    if command:
+        _source.append(f"{source}: as it was learned, with {' '.join(as_typed(command))}")
+    put = [_override(key, setting) for key, setting in command.items()]
     if multirun:
         # The sweep is the one that is typed, not that of an experiment.
         return put if values(typed, "hparams_search") else [*put, "hydra.sweeper.params=null"]
@@ -240,7 +238,7 @@ def of_named_run(typed: Sequence[Override], multirun: bool) -> list[str]:
     return put
 
 
-def beneath(typed: Sequence[Override], command: Command) -> Command:
+def _beneath(typed: Sequence[Override], command: Command) -> Command:
     """What stays beneath what is typed.
 
     Another option of a group begins from its own values. Another method takes over the scene
@@ -258,35 +256,6 @@ def beneath(typed: Sequence[Override], command: Command) -> Command:
     }
 
 
-def _put(command: Command, typed: Sequence[Override], source: str, *, multirun: bool) -> list[str]:
-    """The overrides that take over a command; its settings go into a config file of values."""
-    if not command:
-        return []
-    _source.append(f"{source}: as it was learned, with {' '.join(as_typed(command))}")
-    put = [f"{key[1:]}={option}" for key, option in command.items() if key[0] == "/"]
-    settings = OmegaConf.create()
-    for key, setting in command.items():
-        if key[0] != "/":
-            OmegaConf.update(settings, key, setting, force_add=True)
-    if settings:
-        if multirun:  # other machines may take its jobs
-            Path("outputs").mkdir(exist_ok=True)
-        place = TemporaryDirectory(dir="outputs" if multirun else None, prefix=RESTORED)
-        _folder[:] = [place]  # until the command ends
-        file = Path(place.name, GROUP_OF_SETTINGS, "run.yaml")
-        file.parent.mkdir(parents=True)
-        file.write_text(f"# @package _global_\n{OmegaConf.to_yaml(settings)}", encoding="utf-8")
-        paths = [f"file://{Path(place.name).absolute()}"]
-        for override in typed:  # Hydra takes the first list of folders
-            if override.key_or_group == "hydra.searchpath":
-                paths += override.value()  # type: ignore[arg-type]
-        put += [
-            f"hydra.searchpath=[{','.join(map(in_quotes, paths))}]",
-            f"+{GROUP_OF_SETTINGS}=run",
-        ]
-    return put
-
-
 def _of_sweep(typed: Sequence[Override], folder: Path) -> list[str]:
     """What the sweep in ``hydra.sweep.dir`` was started with, unless another is typed.
 
@@ -296,37 +265,34 @@ def _of_sweep(typed: Sequence[Override], folder: Path) -> list[str]:
     record = folder / "multirun.yaml"
     if any(override.is_sweep_override() for override in typed) or not record.is_file():
         return []
-    groups = group_choices()
-    swept: list[str] = []
-    command: Command = {}
-    for override in parsed(overrides_in(record)):
+    said: Command = {}
+    lines: dict[str, str] = {}
+    for override in _recorded(record):
         key = override.get_key_element().lstrip("+")
         if _of_a_command(key) or override.is_delete():
             continue
-        name = f"/{key}" if key in groups else key
-        if not override.is_sweep_override():
-            command |= checked(record, {name: override.value()})
-            continue
-        sweep: Any = override.value()
-        if override.is_range_sweep():
-            count = (sweep.stop - sweep.start) / (sweep.step or 1)
-        else:
-            count = len(sweep.list) if override.is_choice_sweep() else math.inf
-        if not count <= MOST_JOBS:
+        key = f"/{key}" if (config_folder() / key).is_dir() else key
+        if override.is_sweep_override() and not override.is_discrete_sweep():
             raise DevrfError(f"{record}: {key} is no list of values; type the sweep again")
-        try:
-            texts = [parsed([f"{key}={text}"])[0].value() for text in override.sweep_iterator()]
-        except HydraException:
-            raise DevrfError(f"{record}: {key} has several mappings; type the sweep") from None
+        texts = values([override], override.key_or_group)
         for text in texts:
-            checked(record, {name: text})
-        if not values(typed, key):
-            said = (
-                in_quotes(text) if isinstance(text, str) else json.dumps(text) for text in texts
-            )
-            swept.append(f"{key}={','.join(said)}")
-    put = _put(beneath(typed, command), typed, str(folder), multirun=True)
-    return [*put, *swept, "hydra.mode=MULTIRUN"]
+            checked(record, {key: text})
+        said[key], lines[key] = ",".join(texts), str(override.input_line)
+    kept = [lines[key] for key in _beneath(typed, said)]
+    _source.append(f"{folder}: the sweep goes on, with {' '.join(kept)}")
+    return [*kept, "hydra.mode=MULTIRUN"]
+
+
+def _recorded(record: Path) -> list[Override]:
+    """The overrides of a sweep, from its ``multirun.yaml``."""
+    try:
+        text = record.read_text("utf-8")
+        # Hydra writes no aliases, which may unfold without end.
+        if not any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
+            return parsed(yaml.safe_load(text)["hydra"]["overrides"]["task"])
+    except (yaml.YAMLError, LookupError, TypeError, ValueError, RecursionError, HydraException):
+        pass
+    raise DevrfError(f"{record}: not the record of a sweep; type the sweep again")
 
 
 def _folder_for(checkpoint: Path) -> Path:
@@ -343,14 +309,3 @@ def _folder_for(checkpoint: Path) -> Path:
         same = last is not None and last.resolve() == checkpoint.resolve()
         return run if same else run / checkpoint.stem
     return Path("outputs") / scene_folder_name(metadata_of(checkpoint).scene) / checkpoint.stem
-
-
-def _command_of(checkpoint: Path) -> Command:
-    """The command that a checkpoint was learned with; empty where it does not say.
-
-    Raises:
-        DevrfError: the file is none of devrf's, or says what is no option or plain value.
-    """
-    from devrf.checkpoints.checkpoint import metadata_of  # loads torch
-
-    return checked(checkpoint, metadata_of(checkpoint).command)
