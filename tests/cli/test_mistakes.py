@@ -208,12 +208,12 @@ def test_a_fault_of_the_program_keeps_its_traceback(devrf, monkeypatch):
 @pytest.mark.parametrize(
     ("argument", "meant"),
     [
-        ("train", "stage=pipeline"),
+        ("rendr", "stage=render"),
         ("quickstart", "experiment=quickstart"),
         ("fox", "data.root=fox"),
         ("experiment=quickstrat", "experiment=quickstart"),
         ("experiment=papr", "experiment=paper"),
-        ("stage=train", "stage=pipeline"),
+        ("stage=evalute", "stage=evaluate"),
         ("decoder_precision=flot32", "decoder_precision=float32"),
         ("evaluation.metrics=[lpisp]", "lpips"),
     ],

@@ -15,33 +15,15 @@ from hydra.types import RunMode
 from omegaconf import OmegaConf
 
 from devrf.apps.settings import ReportSettings
-from devrf.errors import DevrfError, did_you_mean
+from devrf.errors import DevrfError
 
 PIPELINE = "pipeline"
-# What the folder of a named run's settings begins with.
-RESTORED = ".restored-"
 # Stages for which the run's scene need not be right.
 APART = ("report", "fetch", "capture", "selfcheck")
 # Stages that learn nothing; the protocol's stages come beside these.
 STEPS = ("prepare", "inspect", "evaluate", "render", "still", "view", "export", *APART)
 # Of these, what uses a checkpoint.
 OF_A_CHECKPOINT = ("evaluate", "render", "still", "view", "export")
-# What users of other programs write, by what it is here.
-SYNONYMS = {
-    "stage=pipeline": ("train", "fit", "learn", "run", "start"),
-    "stage=evaluate": ("eval", "test", "score", "metrics"),
-    "stage=render": ("video", "film"),
-    "stage=view": ("viewer", "browser", "viser", "gui"),
-    "stage=still": ("image", "picture", "photo"),
-    "stage=fetch": ("download", "get"),
-    "stage=export": ("mesh", "gltf", "convert"),
-    "stage=capture": ("footage", "colmap", "sfm", "process"),
-    "stage=inspect": ("check", "info", "show"),
-    "stage=report": ("compare", "table"),
-    "stage=selfcheck": ("doctor", "diagnose", "self-check"),
-    "--help": ("help",),
-    "--version": ("version",),
-}
 
 
 def config_folder() -> Path:
@@ -65,14 +47,6 @@ def known_stages() -> list[str]:
     for path in sorted((config_folder() / "protocol").glob("*.yaml"), reverse=True):
         learning |= dict.fromkeys(OmegaConf.select(OmegaConf.load(path), "stages"))
     return [PIPELINE, *learning, *STEPS]
-
-
-def meant_stage(word: str) -> str:
-    """The end of a message: which stage may have been meant by ``word``; else empty."""
-    for meant, words in SYNONYMS.items():
-        if word.lower() in words:
-            return f"; did you mean {meant}?"
-    return did_you_mean(word, known_stages(), "stage=")
 
 
 def scene_name(data: Any) -> str:
@@ -170,8 +144,7 @@ def search_path() -> list[str]:
             words += ["--config-dir", source.path]
         elif source.provider == "hydra.searchpath in command-line":
             folders.append(f"{source.schema}://{source.path}")
-    typed = [folder for folder in folders if RESTORED not in folder]
-    return [*words, f"hydra.searchpath=[{','.join(typed)}]"] if typed else words
+    return [*words, f"hydra.searchpath=[{','.join(folders)}]"] if folders else words
 
 
 def choices() -> dict[str, str | None]:

@@ -13,7 +13,7 @@ from pathlib import Path
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf.errors import OmegaConfBaseException
 
-from devrf.cli.config import group_choices, meant_stage
+from devrf.cli.config import group_choices, known_stages
 from devrf.cli.config_check import unknown_key
 from devrf.errors import DevrfError, did_you_mean
 from devrf.system.files import REFUSED
@@ -101,8 +101,8 @@ def _not_understood(argument: str) -> str:
         return f"{argument}: not understood; did you mean {' or '.join(options)}?"
     if Path(argument).is_dir():
         return f"{argument}: not understood; did you mean data.root={shlex.quote(argument)}?"
-    meant = meant_stage(argument) or "; write KEY=VALUE, or --help for what there is"
-    return f"{argument}: not understood{meant}"
+    meant = did_you_mean(argument, known_stages(), "stage=")
+    return f"{argument}: not understood{meant or '; write KEY=VALUE, or --help for what there is'}"
 
 
 def _missing_option(error: MissingConfigException) -> str:

@@ -20,7 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from devrf.apps.render import camera_path
 from devrf.apps.settings import ViewerSettings
-from devrf.cli.config import APART, OF_A_CHECKPOINT, in_search, in_sweep, meant_stage
+from devrf.cli.config import APART, OF_A_CHECKPOINT, in_search, in_sweep
 from devrf.cli.context import RunContext
 from devrf.cli.evaluate import evaluate
 from devrf.cli.memory import compare
@@ -33,7 +33,7 @@ from devrf.cli.sweep import report
 from devrf.cli.train import learn
 from devrf.engine.ddp import ManualDDP
 from devrf.engine.workers import launch_workers
-from devrf.errors import DevrfError
+from devrf.errors import DevrfError, did_you_mean
 from devrf.evaluation.objective import check_objective, objective
 from devrf.system.folder_lock import PLACE
 from devrf.system.memory import shortage_in_words
@@ -79,8 +79,9 @@ def plan(stage: str, protocol: Sequence[str]) -> tuple[Names, Names]:
         return (stage,), ()
     if stage in STEPS:
         return (), (stage,)
-    known = ", ".join(["pipeline", *protocol, *STEPS])
-    raise DevrfError(f"stage: expected one of {known}, not {stage!r}{meant_stage(stage)}")
+    known = ["pipeline", *protocol, *STEPS]
+    meant = did_you_mean(stage, known, "stage=")
+    raise DevrfError(f"stage: expected one of {', '.join(known)}, not {stage!r}{meant}")
 
 
 def run_stage(config: DictConfig, folder: Path) -> float | None:
