@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.types import RunMode
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from devrf.apps.settings import ReportSettings
-from devrf.errors import DevrfError
 
 PIPELINE = "pipeline"
 # Stages for which the run's scene need not be right.
@@ -49,12 +46,13 @@ def known_stages() -> list[str]:
     return [PIPELINE, *learning, *STEPS]
 
 
-def scene_name(data: Any) -> str:
-    """A scene's name for folders and tables: ``name``, else ``shape``, else the folder's name."""
+def scene_name(config: DictConfig) -> str:
+    """The scene's name for folders and tables: typed, that of its data, else its folder's."""
+    data = config.data
     if OmegaConf.is_missing(data, "root"):
-        return "scene"
-    chosen = data.get("name") or data.get("shape") or Path(str(data.get("root"))).resolve().name
-    return scene_folder_name(str(chosen))
+        return config.scene or "scene"
+    named = config.scene or data.get("name") or data.get("shape")
+    return scene_folder_name(str(named or Path(str(data.get("root"))).resolve().name))
 
 
 def scene_folder_name(scene: str) -> str:
@@ -62,77 +60,48 @@ def scene_folder_name(scene: str) -> str:
     return re.sub(r"[^\w.-]+", "_", scene).lstrip(".") or "scene"
 
 
-def run_folder(stage: str, report: Any, capture: Any, scene: str, choices: Any) -> str:
+def run_folder(_root_: Any) -> str:
     """A run's folder; of a report, where it is written.
 
     It is named after scene and experiment, and what else is chosen beside the usual. Without an
     experiment DeVRF learns as by ``experiment=quickstart``: they are one run.
     """
+    stage, report, chosen = _root_.stage, _root_.report, _root_.hydra.runtime.choices
     if stage in ("fetch", "selfcheck"):
         return f"outputs/{stage}"
     if stage == "capture":
-        return f"outputs/{scene_folder_name(Path(str(capture.into or 'scene')).name)}/capture"
+        into = Path(str(_root_.capture.into or "scene"))
+        return f"outputs/{scene_folder_name(into.name)}/capture"
     if stage == "report":
         # A misspelt folder is not created: the step reports that there is none.
         runs = report.runs if Path(report.runs).is_dir() else "outputs"
         return str(ReportSettings(runs, report.into).folder)
-    parts = [choices.experiment or "quickstart"]
-    if choices.ablation not in (None, "full"):
-        parts.append(choices.ablation)
-    if (choices.method, choices.protocol) != ("devrf", "two_stage"):
-        parts += [choices.method, choices.protocol]
-    return f"outputs/{scene}/{'-'.join(parts)}"
+    parts = [chosen.experiment or "quickstart"]
+    if chosen.ablation not in (None, "full"):
+        parts.append(chosen.ablation)
+    if (chosen.method, chosen.protocol) != ("devrf", "two_stage"):
+        parts += [chosen.method, chosen.protocol]
+    return f"outputs/{scene_name(_root_)}/{'-'.join(parts)}"
 
 
-def config_record(stage: str) -> str | None:
-    """Where in its folder a run's composed config is; a report may lie beside another run's.
-
-    stage=fetch is no run; stage=view may look at one that goes on.
-    """
-    return None if stage in ("report", "fetch", "view") else ".hydra"
-
-
-def job_folder(number: int, scene: str, sweep: str, overrides: Sequence[str], params: Any) -> str:
+def job_folder(_root_: Any) -> str:
     """The folder of a sweep's job: number, scene, and what else is varied: ``0_robot_tv_0.5``."""
-    record = Path(sweep) / "multirun.yaml"  # some searches write none; they name their params
-    typed = overrides_in(record) if record.is_file() else []
-    varied = dict.fromkeys(params or (), True)
-    for override in OverridesParser.create().parse_overrides(typed):
+    hydra = _root_.hydra
+    record = Path(hydra.sweep.dir) / "multirun.yaml"  # some searches write none
+    typed = OmegaConf.load(record).hydra.overrides.task if record.is_file() else []
+    varied = dict.fromkeys(hydra.sweeper.get("params") or (), True)
+    for override in OverridesParser.create().parse_overrides(list(typed)):
         varied[override.get_key_element()] = override.is_sweep_override()
     varied |= dict.fromkeys(("data", "data.root", "data.name", "data.shape"), False)
-    values = [override.partition("=") for override in overrides]
-    words = [f"{key.rpartition('.')[2]}_{value}" for key, _, value in values if varied.get(key)]
-    return scene_folder_name("_".join([str(number), scene, *words]))[:150]
-
-
-def overrides_in(record: Path) -> list[str]:
-    """The overrides in a sweep's record, ``multirun.yaml``.
-
-    Raises:
-        DevrfError: it is none.
-    """
-    try:
-        text = record.read_text("utf-8")
-        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
-            raise ValueError("Hydra writes none, and what refers to itself has no end")
-        content = yaml.safe_load(text)
-        texts = content["hydra"]["overrides"]["task"]
-        if all(isinstance(text, str) for text in texts):
-            return [*texts]
-    except (yaml.YAMLError, LookupError, TypeError, ValueError, RecursionError):
-        pass
-    raise DevrfError(f"{record}: not the record of a sweep; type the sweep again")
-
-
-def tracked_name(folder: str, otherwise: str | None) -> str | None:
-    """A tracker's name of a sweep's job, or of a sweep: its folder's; of another run as given."""
-    return Path(folder).name if in_sweep() else otherwise
+    pairs = [override.partition("=") for override in hydra.overrides.task]
+    words = [f"{key.rpartition('.')[2]}_{value}" for key, _, value in pairs if varied.get(key)]
+    return scene_folder_name("_".join([str(hydra.job.num), scene_name(_root_), *words]))[:150]
 
 
 @cache  # for the whole process
 def register_config() -> None:
-    """Make the resolvers ``${devrf.scene_name:…}`` … known to Hydra."""
-    for word in (scene_name, run_folder, config_record, job_folder, tracked_name):
+    """Make the names of folders known to Hydra, ``${devrf.run_folder:}``."""
+    for word in (run_folder, job_folder):
         OmegaConf.register_new_resolver(f"devrf.{word.__name__}", word, replace=True)
 
 

@@ -31,7 +31,7 @@ ROOT: dict[str, Any] = {
     "priors": Literal["all", "none"],
     "ckpt": str | Path | None,
     "objective": str,
-    "scene": str,
+    "scene": str | None,
     "decoder_precision": Literal["auto", "float32", "bfloat16"],
 }
 # What cannot be loaded ends the command with one line; Hydra would log it before.

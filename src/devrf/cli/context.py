@@ -27,7 +27,7 @@ from devrf.checkpoints.checkpoint import (
 )
 from devrf.checkpoints.checkpoint_file import digest_of
 from devrf.checkpoints.progress import progress_files
-from devrf.cli.config import PIPELINE
+from devrf.cli.config import PIPELINE, scene_name
 from devrf.cli.restore_config import present_command
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.ddp import ManualDDP
@@ -58,6 +58,7 @@ class RunContext:
     def __init__(self, config: DictConfig, folder: Path) -> None:
         self.config = config
         self._composed = config.copy()
+        config.scene = scene_name(config)
         self.folder = folder
         self.step_began = time.perf_counter()
         self.chooses_size = False

@@ -13,7 +13,7 @@ from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
-from omegaconf import DictConfig
+from omegaconf import DictConfig, read_write
 from omegaconf.errors import OmegaConfBaseException
 
 from devrf.cli.config import in_sweep
@@ -28,6 +28,8 @@ log = logging.getLogger(__name__)
 AT_FIRST = {".hydra", PLACE}
 # What is written by names that are known, and might lead elsewhere.
 WRITTEN = ("run.log", ".hydra", PLACE)
+# Stages that leave .hydra alone: they look at other runs, or are none.
+UNRECORDED = ("report", "fetch", "view")
 # Environment variables in which torchrun and SLURM number the processes that they start.
 RANKS = ("RANK", "SLURM_PROCID")
 
@@ -50,6 +52,9 @@ class RunFolderLock(Callback):
             return  # Hydra will report what is wrong with the config
         finally:
             hydra.cfg = before
+        if config.stage in UNRECORDED:
+            with read_write(config.hydra):
+                config.hydra.output_subdir = None
         with report_user_errors():
             make_folder(folder)  # as Hydra does next, with a traceback where it cannot
             refuse_links(folder)
@@ -114,7 +119,7 @@ def _locks(config: DictConfig) -> bool:
     A report and the viewer only read, but for a camera path that is written at once; stage=fetch
     locks where it writes.
     """
-    return config.stage not in ("report", "fetch", "view") and not _is_worker(config)
+    return config.stage not in UNRECORDED and not _is_worker(config)
 
 
 def _is_worker(config: DictConfig) -> bool:

@@ -17,7 +17,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from devrf.cli.config import choices, overrides
+from devrf.cli.config import choices, overrides, scene_name
 from devrf.cli.messages import is_user_error, one_line, report_user_errors
 from devrf.errors import DevrfError
 from devrf.system.files import remove_if_only, write_json
@@ -70,7 +70,7 @@ def _record(error: Exception, config: DictConfig, folder: Path) -> None:
     user_error, where, scene = is_user_error(error), "", None
     message = one_line(error) if user_error else f"{type(error).__name__}: {one_line(error)}"
     with suppress(OmegaConfBaseException):
-        scene = str(config.scene)
+        scene = scene_name(config)
     failure = {
         "scene": scene,
         "choices": choices(),
