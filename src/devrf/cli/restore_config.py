@@ -10,19 +10,16 @@ from __future__ import annotations
 import json
 import logging
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import yaml
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from devrf.cli.config import OF_A_CHECKPOINT, choices, config_folder, overrides, scene_folder_name
 from devrf.cli.config_check import RESERVED
@@ -60,46 +57,29 @@ _source: list[str] = []
 def present_command(config: DictConfig) -> Command:
     """What the present command chose and set, but for what says only what to do.
 
-    Code that was typed (``_target_``), and keys that were removed, are not kept. Empty outside
-    Hydra.
+    Code that was typed (``_target_``), and what was removed, is not kept. Empty outside Hydra.
     """
-    if not HydraConfig.initialized():
-        return {}
-    known = [override for override in parsed(overrides()) if override.key_or_group in choices()]
-    typed = [override for override in known if not override.is_delete()]
-    chosen = {f"/{o.key_or_group}": o.value() for o in typed if o.value() and not o.is_add()}
-    # Those alone, to compare with.
-    found_in = [text for text in HydraConfig.get().overrides.hydra if "hydra.searchpath" in text]
-    app = GlobalHydra.instance().is_initialized()  # not in another process of a sweep
-    with nullcontext() if app else initialize_config_dir(str(config_folder()), version_base="1.3"):
-        alone = compose("config", [*found_in, *(str(o.input_line) for o in typed)])
-    changed = _differing(OmegaConf.to_container(config), OmegaConf.to_container(alone))
-    said = chosen | {key: _plain_at(config, key) for key in changed}
+    said: Command = {}
+    for override in parsed(overrides()):
+        key = override.key_or_group
+        if key in choices():
+            said[f"/{key}"] = choices()[key]
+        elif not (override.is_delete() or _of_a_command(key)):
+            said |= _plain_at(config, key)
     return {key: value for key, value in said.items() if _is_known(key, value)}
 
 
-def _differing(now: Any, before: Any, path: str = "") -> Iterator[str]:
-    """The keys of values in one config that another has not; of lists the whole, of code none."""
-    for key, value in now.items():
-        old, where = before.get(key, RESERVED), f"{path}{key}"
-        if _of_a_command(where):
-            continue
-        if isinstance(value, Mapping):
-            old = old if isinstance(old, Mapping) else {}
-            if value.get("_target_") == old.get("_target_"):
-                yield from _differing(value, old, f"{where}.")
-        elif value != old:
-            yield where
-
-
-def _plain_at(config: DictConfig, key: str) -> Any:
-    """A value of a config, resolved; a path absolute where it exists."""
+def _plain_at(config: DictConfig, key: str) -> Command:
+    """The values at and below a key of a config, resolved; a path absolute where it exists."""
     value = OmegaConf.select(config, key)
-    if OmegaConf.is_config(value):
-        return OmegaConf.to_container(value, resolve=True)
+    if isinstance(value, DictConfig):
+        below = (_plain_at(config, f"{key}.{name}") for name in value)
+        return {name: found for part in below for name, found in part.items()}
+    if isinstance(value, ListConfig):
+        value = OmegaConf.to_container(value, resolve=True)
     if key in RELATIVE and isinstance(value, str) and Path(value).expanduser().exists():
-        return str(Path(value).expanduser().absolute())
-    return value
+        value = str(Path(value).expanduser().absolute())
+    return {key: value}
 
 
 def checked(path: Path, command: Mapping[str, Any]) -> Command:
