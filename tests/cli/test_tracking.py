@@ -92,7 +92,7 @@ def test_wandb_holds_config_and_name(watched):
     assert tracked.config["data"]["shape"] == "robot"
     assert tracked.config["schedule"]["deformation"]["levels"]["2"]["side"] == 8
     assert (tracked.run.project, tracked.run.display_name) == ("devrf", "run")
-    assert list(tracked.run.tags) == ["robot", "full"]
+    assert list(tracked.run.tags) == ["full"]
 
 
 def test_wandb_holds_the_curves_of_both_stages(watched):
