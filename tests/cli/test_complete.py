@@ -134,6 +134,15 @@ def test_what_the_files_of_a_scene_say_comes_after_what_was_typed(scenes, monkey
     assert completed(typed.split()) == [*typed.split(), *told.split()]
 
 
+@pytest.mark.parametrize("place", ["--config-dir {}", "hydra.searchpath=[file://{}]"])
+def test_an_experiment_in_a_folder_of_ones_own_chooses_the_reader(scenes, tmp_path, place):
+    (tmp_path / "experiment").mkdir()
+    chosen = "# @package _global_\ndefaults: [override /data: nerfstudio]\n"
+    (tmp_path / "experiment" / "mine.yaml").write_text(chosen)
+    typed = [*place.format(tmp_path).split(), "experiment=mine", f"data.root={scenes}/walker"]
+    assert completed(typed) == typed
+
+
 def test_what_the_files_say_is_said_in_one_line(devrf, scenes, short):
     done = devrf(f"data.root={scenes}/phone", *short, "stage=inspect")
     line = f"{scenes}/phone: the layout of nerfstudio, instant-ngp (data=nerfstudio facing=forward)"

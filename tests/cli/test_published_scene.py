@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import logging
-
 import pytest
 
-from devrf.cli.complete import completed, log_told
+from devrf.cli.complete import completed
+from devrf.cli.restore_config import told
 
 
 @pytest.mark.parametrize(
@@ -17,9 +16,7 @@ from devrf.cli.complete import completed, log_told
         ("data=inward", False),
     ],
 )
-def test_the_choice_of_the_scene_is_named(caplog, typed, said):
+def test_the_choice_of_the_scene_is_named(typed, said):
     completed([*typed.split(), "data.root=scenes/lego"])
-    with caplog.at_level(logging.INFO):
-        log_told()
     line = "scenes/lego: if it is DeVRF's, data=lego has what is published for it"
-    assert (caplog.messages == [line]) is said
+    assert (told == [line]) is said

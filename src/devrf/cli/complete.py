@@ -9,7 +9,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import re
 from collections.abc import Sequence
@@ -26,10 +25,8 @@ from hydra.types import RunMode
 
 from devrf.cli.config import APART, config_folder, group_choices
 from devrf.cli.messages import in_quotes
-from devrf.cli.restore_config import of_named_run, parsed, value, values
+from devrf.cli.restore_config import of_named_run, parsed, told, value, values
 from devrf.errors import DevrfError
-
-log = logging.getLogger(__name__)
 
 # Keys whose values are files or folders.
 PATHS = {
@@ -42,9 +39,6 @@ PATHS = {
 SHORTHAND = {f"viewer={value}": f"viewer.training={value}" for value in ("true", "false")}
 KEY_VALUE = re.compile(r"(\+{0,2}([\w./@-]+)=)(.*)", re.DOTALL)
 
-# What the present command's scene has told, until a log is there to say so.
-_told: list[str] = []
-
 
 def completed(arguments: Sequence[str]) -> list[str]:
     """The command line that Hydra composes for what was typed, without the program's name.
@@ -53,7 +47,7 @@ def completed(arguments: Sequence[str]) -> list[str]:
         DevrfError: a scene's folder cannot be recognised, the scenes of a sweep need different
             options, or a group's choice is null.
     """
-    _told.clear()
+    told.clear()
     known, _ = get_args_parser().parse_known_intermixed_args(arguments)
     words = [quoted_path(SHORTHAND.get(w.lower(), w), known.multirun) for w in arguments]
     texts = [words[k] for k, word in enumerate(arguments) if word in known.overrides]
@@ -102,12 +96,6 @@ def quoted_path(argument: str, multirun: bool) -> str:
     return argument if read == path else parts[1] + in_quotes(path)
 
 
-def log_told() -> None:
-    """Say what the scene's files have told."""
-    for line in _told:
-        log.info("%s", line)
-
-
 def _told_by_files(
     roots: Sequence[str], overrides: Sequence[Override], searched: Sequence[str]
 ) -> list[str]:
@@ -148,9 +136,9 @@ def _told_by_scene(option: str | None, root: str, overrides: Sequence[Override])
     scene = Path(root).expanduser().resolve().name
     if value(overrides, "experiment") == "paper" and option in ("inward", "forward"):
         if (config_folder() / f"for_scene/paper_{scene}.yaml").is_file():
-            _told.append(f"{root}: if it is DeVRF's, data={scene} has what is published for it")
+            told.append(f"{root}: if it is DeVRF's, data={scene} has what is published for it")
     if words:
-        _told.append(f"{root}: {why} ({' '.join(words)}){remark}")
+        told.append(f"{root}: {why} ({' '.join(words)}){remark}")
     return words
 
 

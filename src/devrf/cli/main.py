@@ -18,11 +18,11 @@ from omegaconf import DictConfig
 
 import devrf
 from devrf.apps.fetch import catalogue
-from devrf.cli.complete import completed, log_told, quoted_path
+from devrf.cli.complete import completed, quoted_path
 from devrf.cli.config import config_folder, in_sweep, known_stages, register_config
 from devrf.cli.config_check import ROOT, check_config, check_extras, choices_at, choices_of
 from devrf.cli.messages import report_user_errors
-from devrf.cli.restore_config import log_source
+from devrf.cli.restore_config import log_told
 from devrf.cli.run_folder import working_in
 from devrf.cli.sweep import forget_failure, name_failures, record_failure
 from devrf.errors import DevrfError
@@ -91,7 +91,6 @@ def run(config: DictConfig) -> float | None:
     key = "hydra.sweep.dir" if in_sweep() else "hydra.run.dir"
     guard = record_failure(config, folder) if in_sweep() else report_user_errors()
     with guard, working_in(folder, config, key):
-        log_source()
         log_told()
         check_config(config)
         check_extras(config)

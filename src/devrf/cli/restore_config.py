@@ -49,8 +49,8 @@ RELATIVE = {"data.root", "evaluation.lpips_weights", "video.path"}
 # Options by /group, values by key.
 Command = dict[str, Any]
 
-# Where the present command's settings come from, until a log is there to say so.
-_source: list[str] = []
+# What was set that was not typed, and why, until a log is there to say so.
+told: list[str] = []
 
 
 def present_command(config: DictConfig) -> Command:
@@ -72,7 +72,7 @@ def _plain_at(config: DictConfig, key: str) -> Command:
     """The values at and below a key of a config, resolved; a path absolute where it exists."""
     value = OmegaConf.select(config, key)
     if isinstance(value, DictConfig):
-        below = (_plain_at(config, f"{key}.{name}") for name in value)
+        below = (_plain_at(config, f"{key}.{name}") for name in map(str, value))
         return {name: found for part in below for name, found in part.items()}
     if isinstance(value, ListConfig):
         value = OmegaConf.to_container(value, resolve=True)
@@ -168,9 +168,9 @@ def value(overrides: Sequence[Override], key: str) -> str | None:
     return texts[0] if len(texts) == 1 else None
 
 
-def log_source() -> None:
+def log_told() -> None:
     """Say where the settings come from that were not typed."""
-    for line in _source:
+    for line in told:
         log.info("%s", line)
 
 
@@ -180,7 +180,6 @@ def of_named_run(typed: Sequence[Override], multirun: bool) -> list[str]:
     Raises:
         DevrfError: a checkpoint says what is no option or plain value.
     """
-    _source.clear()
     checkpoints = [Path(path) for path in values(typed, "ckpt")]
     folder, sweep = value(typed, "hydra.run.dir"), value(typed, "hydra.sweep.dir")
     if value(typed, "stage") == "report":
@@ -200,13 +199,13 @@ def of_named_run(typed: Sequence[Override], multirun: bool) -> list[str]:
     commands = [checked(path, metadata_of(path).command) for path in checkpoints]
     if {} in commands:
         said = "does not say how it was learned; data and settings are those typed, and the"
-        _source.append(f"{checkpoints[commands.index({})]}: {said} defaults")
+        told.append(f"{checkpoints[commands.index({})]}: {said} defaults")
         return []
     first = commands[0]
     shared = {k: first[k] for k in first if all(c.get(k, RESERVED) == first[k] for c in commands)}
     command = _beneath(typed, shared)
     if command:
-        _source.append(f"{source}: as it was learned, with {' '.join(as_typed(command))}")
+        told.append(f"{source}: as it was learned, with {' '.join(as_typed(command))}")
     put = [_override(key, setting) for key, setting in command.items()]
     if multirun:
         # The sweep is the one that is typed, not that of an experiment.
@@ -258,7 +257,7 @@ def _of_sweep(typed: Sequence[Override], folder: Path) -> list[str]:
             checked(record, {key: text})
         said[key], lines[key] = ",".join(texts), str(override.input_line)
     kept = [lines[key] for key in _beneath(typed, said)]
-    _source.append(f"{folder}: the sweep goes on, with {' '.join(kept)}")
+    told.append(f"{folder}: the sweep goes on, with {' '.join(kept)}")
     return [*kept, "hydra.mode=MULTIRUN"]
 
 
