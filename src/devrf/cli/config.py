@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -105,15 +106,16 @@ def register_config() -> None:
         OmegaConf.register_new_resolver(f"devrf.{word.__name__}", word, replace=True)
 
 
-def search_path() -> list[str]:
-    """The present command's own folders of configs, as they are typed."""
-    words, folders = [], []
+def command_line(*words: str) -> str:
+    """A command to type next; the present one's own folders of configs are named again."""
+    options, folders = list[str](), list[str]()
     for source in HydraConfig.get().runtime.config_sources if HydraConfig.initialized() else ():
         if source.provider == "command-line":
-            words += ["--config-dir", source.path]
+            options += ["--config-dir", source.path]
         elif source.provider == "hydra.searchpath in command-line":
             folders.append(f"{source.schema}://{source.path}")
-    return [*words, f"hydra.searchpath=[{','.join(folders)}]"] if folders else words
+    searched = [f"hydra.searchpath=[{','.join(folders)}]"] if folders else []
+    return shlex.join(["python", "-m", "devrf", *options, *searched, *words])
 
 
 def choices() -> dict[str, str | None]:

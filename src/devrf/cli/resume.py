@@ -35,6 +35,7 @@ from devrf.checkpoints.checkpoint import (
 )
 from devrf.checkpoints.checkpoint_file import digest_of, read_checkpoint_file, read_description
 from devrf.checkpoints.progress import progress_files
+from devrf.cli.config import command_line
 from devrf.cli.config_check import REFERENCE
 from devrf.cli.context import RunContext
 from devrf.errors import DevrfError
@@ -169,9 +170,10 @@ def unfinished(run: RunContext) -> str | None:
     progress = read_description(path).get("progress")
     if progress is None:
         return None
+    again = command_line(f"hydra.run.dir={run.place}")
     return (
         f"{path}: iteration {progress['iteration']} of {progress['total']} of the "
-        f"{progress['stage']} stage; python -m devrf hydra.run.dir={run.place} goes on"
+        f"{progress['stage']} stage; {again} goes on"
     )
 
 
