@@ -295,6 +295,52 @@ def test_a_sweep_goes_on_with_all_kinds_of_values(tmp_path, monkeypatch):
 
 
 WRITTEN = ["run.log", ".hydra", ".devrf", ".hydra/config.yaml", ".devrf/process.txt"]
+WRITTEN += ["images", "videos", "logs", "logs/pipeline", "export", "export/points", "paths"]
+
+
+DEEP = "[" * 200_000
+FOREIGN = {
+    "deep scores": ("metrics.json", DEEP),
+    "scores that are none": ("metrics.json", "[]"),
+    "deep notes": (".devrf/done.json", DEEP),
+    "notes of no files": (".devrf/done.json", '{"notes": [3, {"with": 1, "files": [5, [1]]}]}'),
+}
+
+
+@pytest.mark.parametrize(("name", "text"), FOREIGN.values(), ids=list(FOREIGN))
+def test_a_damaged_record_is_passed_over_or_one_line(devrf, trained, tmp_path, name, text):
+    shutil.copytree(trained[0], tmp_path / "run")
+    (tmp_path / "run" / name).write_text(text)
+    outcome = devrf("hydra.run.dir=run", "evaluation.metrics=[]" if "done" in name else "seed=0")
+    said = f"devrf: {tmp_path / 'run' / name}: damaged; remove it, and the run is scored again\n"
+    assert (outcome.status, outcome.err) in ((0, ""), (2, said))
+    assert devrf("stage=report", "report.runs=run", "hydra.run.dir=other").status == (
+        2 if name == "metrics.json" else 0
+    )
+
+
+TABLES = {
+    "bytes": b"step,\xff\n1,2\n",
+    "cells of no column": b"step,a\n1,2,3\n",
+    "a cell without end": b"a,b\n" + b"x" * 200_000 + b",2\n",
+    "a step that is no number": b"step,deformation/loss\nx,2\n",
+}
+
+
+@pytest.mark.parametrize("table", TABLES.values(), ids=list(TABLES))
+def test_a_damaged_table_of_curves_is_one_line(devrf, run, table):
+    (run / "checkpoints" / "deformation.ckpt").unlink()
+    (run / "logs" / "pipeline").mkdir(parents=True)
+    (run / "logs" / "pipeline" / "metrics.csv").write_bytes(table)
+    outcome = devrf("hydra.run.dir=run", "logger=csv")
+    said = "run/logs/pipeline/metrics.csv: damaged; remove it, and curves begin anew\n"
+    assert outcome.status == 2 and outcome.err.count("\n") == 1 and outcome.err.endswith(said)
+
+
+def test_a_message_that_quotes_a_file_leaves_the_terminal_alone(devrf, edited):
+    evil = edited(lambda entry: entry["model"].update({"class": "x\x1b]0;pwned\x07.Y\n.Z"}))
+    outcome = devrf("stage=still", f"ckpt={evil}")
+    assert outcome.status == 2 and outcome.err.rstrip("\n").isprintable()
 
 
 @pytest.mark.parametrize("name", WRITTEN)

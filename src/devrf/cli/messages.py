@@ -85,7 +85,7 @@ def one_line(error: BaseException) -> str:
         text = f"{error.filename or 'output'}: {error.strerror}"
     else:
         text = _of_hydra(error)
-    return " ".join(text.split())
+    return "".join(sign if sign.isprintable() else "?" for sign in " ".join(text.split()))
 
 
 def _not_understood(argument: str) -> str:

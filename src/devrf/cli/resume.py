@@ -217,7 +217,8 @@ def _made_with(run: RunContext, step: str) -> dict[str, Any] | None:
 
 
 def _notes(folder: Path) -> list[dict[str, Any]]:
-    with suppress(OSError, ValueError, LookupError, TypeError):
+    with suppress(OSError, ValueError, LookupError, TypeError, RecursionError):
         notes: list[dict[str, Any]] = json.loads((folder / PLACE / NOTE).read_text())["notes"]
-        return [note for note in notes if {*note} >= {"with", "files"}]
+        known = [note for note in notes if {*note} >= {"with", "files"}]
+        return [note for note in known if all(isinstance(name, str) for name in note["files"])]
     return []

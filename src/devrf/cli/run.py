@@ -138,7 +138,12 @@ def _prepare_to_learn(run: RunContext, requested: Names, steps: Names) -> None:
 
 def _ended(run: RunContext, steps: Names) -> float | None:
     """The objective; a pipeline ends with its results, and what to try next."""
-    metrics = json.loads((run.folder / "metrics.json").read_text())
+    scores = run.folder / "metrics.json"
+    try:
+        metrics = json.loads(scores.read_bytes())
+        best = objective(run.config.objective, metrics)
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        raise DevrfError(f"{scores}: damaged; remove it, and the run is scored again") from None
     if steps == AFTER_LEARNING and not in_sweep():
         results = ", ".join(name for name in RESULTS if (run.folder / name).exists())
         log.info("results: %s (%s)", run.place, results)
@@ -146,7 +151,7 @@ def _ended(run: RunContext, steps: Names) -> float | None:
         if metrics.get("at_rest"):
             further[0].remove("still.time=0.35")
         say_next(*further, ["stage=report"])
-    return objective(run.config.objective, metrics)
+    return best
 
 
 def learn_beside(config: dict[str, Any], folder: Path) -> None:

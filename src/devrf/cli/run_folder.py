@@ -26,8 +26,8 @@ log = logging.getLogger(__name__)
 
 # Made in the folder before the config is checked.
 AT_FIRST = {".hydra", PLACE}
-# What is written by names that are known, and might lead elsewhere.
-WRITTEN = ("run.log", ".hydra", PLACE)
+# What is written by names that are known, and might lead elsewhere; all that is in the first four.
+WRITTEN = (".hydra", PLACE, "logs", "export", "run.log", "checkpoints", "images", "videos", "paths")
 # Stages that leave .hydra alone: they look at other runs, or are none.
 UNRECORDED = ("report", "fetch", "view")
 # Environment variables in which torchrun and SLURM number the processes that they start.
@@ -106,7 +106,7 @@ def refuse_links(folder: Path) -> None:
         DevrfError: one is a link, or a pipe.
     """
     places = [folder / name for name in WRITTEN]
-    inside = (path for place in places[1:] if place.is_dir() for path in place.iterdir())
+    inside = (path for place in places[:4] if place.is_dir() for path in place.iterdir())
     for path in [*places, *inside]:
         mode = path.lstat().st_mode if os.path.lexists(path) else stat.S_IFREG
         if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
