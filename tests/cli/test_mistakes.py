@@ -48,6 +48,10 @@ MISTAKES = {
         ["+schedule.deformation.levels.3.sides=4"],
         "schedule.deformation.levels.3.sides: no such key; did you mean",
     ),
+    "a value in place of a part": (
+        ["schedule.extensions.bending=1"],
+        "schedule.extensions.bending: expected a section with _target_, not 1",
+    ),
     "part that is not there": (["data._target_=devrf.nothing"], "data._target_: cannot load"),
     "unknown loss term": (["+loss.deformation.foo=1"], "unknown term 'foo'"),
     "unknown accelerator": (["trainer.accelerator=abacus"], "trainer: "),
