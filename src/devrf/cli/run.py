@@ -93,25 +93,19 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
     Raises:
         DevrfError: the input is wrong.
     """
-    run = RunContext(config, folder)
-    learning, steps = plan(config.stage, run.learning_stages)
-    if learning and run.is_trial:
-        steps = ()  # nothing of it is worth a score or a video
-    with shortage_in_words(config.stage, run.device, None):  # of networks that are too wide
-        _check(run, learning, steps)
-    ended = False
-    try:
+    with RunContext(config, folder) as run:
+        learning, steps = plan(config.stage, run.learning_stages)
+        if learning and run.is_trial:
+            steps = ()  # nothing of it is worth a score or a video
+        with shortage_in_words(config.stage, run.device, None):  # of networks that are too wide
+            _check(run, learning, steps)
         if learning:
             if run.leads:
                 _prepare_to_learn(run, learning, steps)
             _learn(run, learning)
-        if not learning or run.leads:
-            for name in steps:
-                if not (learning and done(run, name)):
-                    _take(run, name, STEPS[name])
-        ended = True
-    finally:
-        run.close(failed=not ended)
+        for name in steps if run.leads or not learning else ():
+            if not (learning and done(run, name)):
+                _take(run, name, STEPS[name])
     scored = "evaluate" in steps and run.leads and unfinished(run) is None
     return _ended(run, steps) if scored else None
 
