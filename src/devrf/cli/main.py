@@ -24,7 +24,7 @@ from devrf.cli.config_check import ROOT, check_config, check_extras, choices_at,
 from devrf.cli.messages import report_user_errors
 from devrf.cli.restore_config import log_told
 from devrf.cli.run_folder import working_in
-from devrf.cli.sweep import forget_failure, name_failures, record_failure
+from devrf.cli.sweep import name_failures, record_failure
 from devrf.errors import DevrfError
 from devrf.system.process import (
     Interrupted,
@@ -88,9 +88,8 @@ def entry() -> None:
 def run(config: DictConfig) -> float | None:
     """Run ``stage=…`` in Hydra's output folder; return the objective, if measured."""
     folder = Path(HydraConfig.get().runtime.output_dir)
-    key = "hydra.sweep.dir" if in_sweep() else "hydra.run.dir"
     guard = record_failure(config, folder) if in_sweep() else report_user_errors()
-    with guard, working_in(folder, config, key):
+    with guard, working_in(folder, config):
         log_told()
         check_config(config)
         check_extras(config)
@@ -98,9 +97,7 @@ def run(config: DictConfig) -> float | None:
         with importing():
             from devrf.cli.run import run_stage
 
-        value = run_stage(config, folder)
-        forget_failure(folder)
-        return value
+        return run_stage(config, folder)
     return None  # of a job that failed
 
 

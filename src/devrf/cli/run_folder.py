@@ -28,6 +28,8 @@ log = logging.getLogger(__name__)
 AT_FIRST = {".hydra", PLACE}
 # What is written by names that are known, and might lead elsewhere; all that is in the first four.
 WRITTEN = (".hydra", PLACE, "logs", "export", "run.log", "checkpoints", "images", "videos", "paths")
+# Why a sweep's job failed.
+FAILURE = "failure.json"
 # Stages that leave .hydra alone: they look at other runs, or are none.
 UNRECORDED = ("report", "fetch", "view")
 # Environment variables in which torchrun and SLURM number the processes that they start.
@@ -35,7 +37,7 @@ RANKS = ("RANK", "SLURM_PROCID")
 
 
 class RunFolderLock(Callback):
-    """Hydra callback that locks the folder of a run or sweep before anything is written there.
+    """Hydra callback that locks the folder of a run before anything is written there.
 
     Hydra writes before it calls the program, which then uses this lock. Hydra ignores what a
     callback raises, except an exit: errors are reported here.
@@ -52,45 +54,35 @@ class RunFolderLock(Callback):
             return  # Hydra will report what is wrong with the config
         finally:
             hydra.cfg = before
-        if config.stage in UNRECORDED:
-            with read_write(config.hydra):
-                config.hydra.output_subdir = None
         with report_user_errors():
             make_folder(folder)  # as Hydra does next, with a traceback where it cannot
             refuse_links(folder)
-            if _locks(config):
+            if config.stage in UNRECORDED:
+                with read_write(config.hydra):
+                    config.hydra.output_subdir = None
+            elif not _is_worker(config):
                 lock_folder(folder, "hydra.run.dir")
-
-    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Lock the folder of a sweep; each of its jobs locks its own."""
-        with report_user_errors():
-            folder = Path(config.hydra.sweep.dir)
-            for job in [folder, *folder.glob("*/")]:
-                refuse_links(job)
-            lock_folder(folder, "hydra.sweep.dir")
-
-    def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        """Release the sweep's folder."""
-        release_folder(Path(config.hydra.sweep.dir))
 
 
 @contextmanager
-def working_in(folder: Path, config: DictConfig, key: str) -> Iterator[None]:
+def working_in(folder: Path, config: DictConfig) -> Iterator[None]:
     """While the block lasts, no other process works in a run's folder.
 
     A folder that holds no results is removed if the block ends in a user error, but not by a
-    worker: rank 0 works there. That of a sweep's job stays, for the record of its failure. ``key``
-    is the setting that chooses another folder.
+    worker: rank 0 works there, and locks for it. That of a sweep's job stays, for the record of
+    its failure, which a success removes. A report and the viewer only read, but for a camera path
+    that is written at once; stage=fetch locks where it writes.
 
     Raises:
         DevrfError: another process works there.
     """
-    if _locks(config):
-        lock_folder(folder, key)
-    alone = not in_sweep() and not _is_worker(config)
-    was_new = alone and holds_at_most(folder, AT_FIRST)
+    leads = not _is_worker(config)
+    if leads and config.stage not in UNRECORDED:
+        lock_folder(folder, "hydra.sweep.dir" if in_sweep() else "hydra.run.dir")
+    was_new = leads and not in_sweep() and holds_at_most(folder, AT_FIRST)
     try:
         yield
+        (folder / FAILURE).unlink(missing_ok=True)
     except Exception as error:
         if was_new and is_user_error(error):
             remove_if_only(folder, {*AT_FIRST, "run.log"})
@@ -111,15 +103,6 @@ def refuse_links(folder: Path) -> None:
         mode = path.lstat().st_mode if os.path.lexists(path) else stat.S_IFREG
         if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
             raise DevrfError(f"{path}: a link or a pipe; remove it: devrf writes there")
-
-
-def _locks(config: DictConfig) -> bool:
-    """Whether a process needs the lock: rank 0 locks for its workers.
-
-    A report and the viewer only read, but for a camera path that is written at once; stage=fetch
-    locks where it writes.
-    """
-    return config.stage not in UNRECORDED and not _is_worker(config)
 
 
 def _is_worker(config: DictConfig) -> bool:
