@@ -64,7 +64,7 @@ def composed(typed: list[str]) -> DictConfig:
 def test_in_a_folder_nothing_has_to_be_typed_again(devrf, tiny, run):
     outcome = devrf("stage=deformation", "hydra.run.dir=run")
     assert (outcome.status, outcome.err) == (0, "")
-    assert "run: as it was learned, with data.width=24 " in outcome.out
+    assert "run/checkpoints/deformation.ckpt: as it was learned, with data.width=24 " in outcome.out
     assert "deformation: learned already" in outcome.out
     assert (config(run).data.width, config(run).schedule.canonical.iterations) == (24, 6)
 

@@ -49,30 +49,24 @@ def completed(arguments: Sequence[str]) -> list[str]:
     """
     told.clear()
     known, _ = get_args_parser().parse_known_intermixed_args(arguments)
-    words = [quoted_path(SHORTHAND.get(w.lower(), w), known.multirun) for w in arguments]
-    texts = [words[k] for k, word in enumerate(arguments) if word in known.overrides]
+    flags = [word for word in arguments if word not in known.overrides]
+    texts = [quoted_path(SHORTHAND.get(w.lower(), w), known.multirun) for w in known.overrides]
     try:
         typed = parsed(texts)
     except HydraException:  # reported when Hydra parses them
-        return words
-    if not typed:
-        return words
+        return [*flags, *texts]
     for override in typed:
-        if override.value() is None and not override.is_delete():
-            if options := group_choices().get(override.key_or_group):
-                line = override.input_line
-                raise DevrfError(f"{line}: choose one of {', '.join(options)}, or leave it out")
+        options = group_choices().get(override.key_or_group)
+        if options and override.value() is None and not override.is_delete():
+            line = override.input_line
+            raise DevrfError(f"{line}: choose one of {', '.join(options)}, or leave it out")
     before = of_named_run(typed, known.multirun)
     searched = [text for text in texts if text.startswith("hydra.searchpath=")]
     if known.config_dir:
-        searched.append(
-            f"hydra.searchpath=[{in_quotes(f'file://{Path(known.config_dir).absolute()}')}]"
-        )
+        folder = in_quotes(f"file://{Path(known.config_dir).absolute()}")
+        searched.append(f"hydra.searchpath=[{folder}]")
     added = _told_by_files(values(typed, "data.root"), parsed([*before, *texts]), searched)
-    # Hydra takes all overrides from one place.
-    first = words.index(texts[0])
-    after = [word for word in words[first:] if word not in texts]
-    return [*words[:first], *before, *texts, *added, *after]
+    return [*flags, *before, *texts, *added]
 
 
 def quoted_path(argument: str, multirun: bool) -> str:

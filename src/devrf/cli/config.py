@@ -139,3 +139,12 @@ def in_sweep() -> bool:
 def in_search() -> bool:
     """Whether the sweeper optimises, and so needs the objective of each job."""
     return in_sweep() and "direction" in HydraConfig.get().sweeper
+
+
+def leaves(value: Any, key: str) -> dict[str, Any]:
+    """The plain values at and below a key of a config, by their keys, resolved."""
+    if not isinstance(value, DictConfig):
+        listed = OmegaConf.is_config(value)
+        return {key: OmegaConf.to_container(value, resolve=True) if listed else value}
+    below = [leaves(item, f"{key}.{name!s}") for name, item in value.items()]
+    return {name: plain for part in below for name, plain in part.items()}

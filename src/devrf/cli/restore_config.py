@@ -11,6 +11,7 @@ import json
 import logging
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +19,16 @@ import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
-from devrf.cli.config import OF_A_CHECKPOINT, choices, config_folder, overrides, scene_folder_name
+from devrf.cli.config import (
+    OF_A_CHECKPOINT,
+    choices,
+    group_choices,
+    leaves,
+    overrides,
+    scene_folder_name,
+)
 from devrf.cli.config_check import RESERVED
 from devrf.cli.messages import in_quotes
 from devrf.errors import DevrfError
@@ -38,13 +46,14 @@ OF_A_SCENE = {"data", "facing", "seed"}
 # What is set without a section.
 ALONE = {"seed", "priors", "deterministic", "decoder_precision"}
 # An option's name leads to no other folder than its group's; a key is a path of plain names.
-OPTION = re.compile(r"(?!null$)[\w-]+", re.ASCII | re.IGNORECASE)
-GROUP = re.compile(r"/[\w-]+(/[\w-]+)*", re.ASCII)
-KEY = re.compile(r"[\w-]+(\.[\w-]+){0,16}", re.ASCII)
+NAME = re.compile(r"(?!null$)[\w-]+", re.ASCII | re.IGNORECASE)
+DEEPEST = 16
 # Text that is more than text.
 CODE = re.compile(rf"\$\{{|^\?\?\?$|{'|'.join(RESERVED)}")
 # Values that are relative to the folder in which they were typed.
 RELATIVE = {"data.root", "evaluation.lpips_weights", "video.path"}
+# What reading a damaged record raises.
+UNREADABLE = (yaml.YAMLError, HydraException, LookupError, TypeError, ValueError, RecursionError)
 
 # Options by /group, values by key.
 Command = dict[str, Any]
@@ -63,22 +72,12 @@ def present_command(config: DictConfig) -> Command:
         key = override.key_or_group
         if key in choices():
             said[f"/{key}"] = choices()[key]
-        elif not (override.is_delete() or _of_a_command(key)):
-            said |= _plain_at(config, key)
+        elif not override.is_delete():
+            said |= leaves(OmegaConf.select(config, key), key)
+    for key in RELATIVE & {*said}:
+        if isinstance(said[key], str) and (path := Path(said[key]).expanduser()).exists():
+            said[key] = str(path.absolute())
     return {key: value for key, value in said.items() if _is_known(key, value)}
-
-
-def _plain_at(config: DictConfig, key: str) -> Command:
-    """The values at and below a key of a config, resolved; a path absolute where it exists."""
-    value = OmegaConf.select(config, key)
-    if isinstance(value, DictConfig):
-        below = (_plain_at(config, f"{key}.{name}") for name in map(str, value))
-        return {name: found for part in below for name, found in part.items()}
-    if isinstance(value, ListConfig):
-        value = OmegaConf.to_container(value, resolve=True)
-    if key in RELATIVE and isinstance(value, str) and Path(value).expanduser().exists():
-        value = str(Path(value).expanduser().absolute())
-    return {key: value}
 
 
 def checked(path: Path, command: Mapping[str, Any]) -> Command:
@@ -96,11 +95,14 @@ def checked(path: Path, command: Mapping[str, Any]) -> Command:
 
 def _is_known(key: str, value: object) -> bool:
     """Whether a run may have been learned with it: an option by name, or a plain value by key."""
-    if _of_a_command(key):
+    names = re.split("[./]", key.lstrip("/"))
+    if names[0] in OF_A_COMMAND or key in PLACES or RESERVED & {*names}:
         return False
-    if GROUP.fullmatch(key):
-        return isinstance(value, str) and OPTION.fullmatch(value) is not None
-    return KEY.fullmatch(key) is not None and ("." in key or key in ALONE) and _is_plain(value)
+    if len(names) > DEEPEST or not all(map(NAME.fullmatch, names)):
+        return False
+    if key.startswith("/"):
+        return isinstance(value, str) and NAME.fullmatch(value) is not None
+    return (len(names) > 1 or key in ALONE) and _is_plain(value)
 
 
 def _is_plain(value: object, depth: int = 8) -> bool:
@@ -110,11 +112,6 @@ def _is_plain(value: object, depth: int = 8) -> bool:
     if isinstance(value, str):
         return value.isprintable() and not CODE.search(value)
     return value is None or isinstance(value, bool | int | float)
-
-
-def _of_a_command(key: str) -> bool:
-    """Whether a key or group says only what to do, or builds a part."""
-    return root(key) in OF_A_COMMAND or key in PLACES or bool(RESERVED & {*key.split(".")})
 
 
 def root(key: str) -> str:
@@ -184,28 +181,26 @@ def of_named_run(typed: Sequence[Override], multirun: bool) -> list[str]:
     folder, sweep = value(typed, "hydra.run.dir"), value(typed, "hydra.sweep.dir")
     if value(typed, "stage") == "report":
         return []
-    if sweep is not None and not checkpoints:
+    if not checkpoints and sweep is not None:
         return _of_sweep(typed, Path(sweep))
     if not checkpoints and (folder is None or multirun):
         return []
     from devrf.checkpoints.checkpoint import latest_checkpoint, metadata_of  # loads torch
 
-    source = ", ".join(map(str, checkpoints))
-    if folder is not None and not checkpoints:
-        source, last = folder, latest_checkpoint(Path(folder))
-        checkpoints = [] if last is None else [last]
+    if not checkpoints and (last := latest_checkpoint(Path(str(folder)))):
+        checkpoints = [last]
     if not checkpoints or not all(path.is_file() for path in checkpoints):
         return []  # a file that is missing is reported by the step that loads it
     commands = [checked(path, metadata_of(path).command) for path in checkpoints]
-    if {} in commands:
-        said = "does not say how it was learned; data and settings are those typed, and the"
-        told.append(f"{checkpoints[commands.index({})]}: {said} defaults")
-        return []
-    first = commands[0]
-    shared = {k: first[k] for k in first if all(c.get(k, RESERVED) == first[k] for c in commands)}
+    shared = {k: v for k, v in commands[0].items() if all(c.get(k, ...) == v for c in commands)}
     command = _beneath(typed, shared)
-    if command:
-        told.append(f"{source}: as it was learned, with {' '.join(as_typed(command))}")
+    said = f"as it was learned, with {' '.join(as_typed(command))}"
+    if {} in commands:
+        said = (
+            "does not say how it was learned; data and settings are those typed, and the defaults"
+        )
+    if command or {} in commands:
+        told.append(f"{', '.join(map(str, checkpoints))}: {said}")
     put = [_override(key, setting) for key, setting in command.items()]
     if multirun:
         # The sweep is the one that is typed, not that of an experiment.
@@ -243,33 +238,29 @@ def _of_sweep(typed: Sequence[Override], folder: Path) -> list[str]:
     record = folder / "multirun.yaml"
     if any(override.is_sweep_override() for override in typed) or not record.is_file():
         return []
-    said: Command = {}
     lines: dict[str, str] = {}
     for override in _recorded(record):
         key = override.get_key_element().lstrip("+")
-        if _of_a_command(key) or override.is_delete():
+        if root(key) in OF_A_COMMAND or override.is_delete():
             continue
-        key = f"/{key}" if (config_folder() / key).is_dir() else key
         if override.is_sweep_override() and not override.is_discrete_sweep():
             raise DevrfError(f"{record}: {key} is no list of values; type the sweep again")
-        texts = values([override], override.key_or_group)
-        for text in texts:
+        key = f"/{key}" if key in group_choices() else key
+        for text in values([override], override.key_or_group):
             checked(record, {key: text})
-        said[key], lines[key] = ",".join(texts), str(override.input_line)
-    kept = [lines[key] for key in _beneath(typed, said)]
+        lines[key] = str(override.input_line)
+    kept = [lines[key] for key in _beneath(typed, lines)]
     told.append(f"{folder}: the sweep goes on, with {' '.join(kept)}")
     return [*kept, "hydra.mode=MULTIRUN"]
 
 
 def _recorded(record: Path) -> list[Override]:
     """The overrides of a sweep, from its ``multirun.yaml``."""
-    try:
+    with suppress(*UNREADABLE):
         text = record.read_text("utf-8")
         # Hydra writes no aliases, which may unfold without end.
         if not any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
             return parsed(yaml.safe_load(text)["hydra"]["overrides"]["task"])
-    except (yaml.YAMLError, LookupError, TypeError, ValueError, RecursionError, HydraException):
-        pass
     raise DevrfError(f"{record}: not the record of a sweep; type the sweep again")
 
 
@@ -281,9 +272,9 @@ def _folder_for(checkpoint: Path) -> Path:
     """
     from devrf.checkpoints.checkpoint import latest_checkpoint, metadata_of
 
+    run = Path("outputs") / scene_folder_name(metadata_of(checkpoint).scene)
     if checkpoint.parent.name == "checkpoints":
         run = checkpoint.parent.parent
-        last = latest_checkpoint(run)
-        same = last is not None and last.resolve() == checkpoint.resolve()
-        return run if same else run / checkpoint.stem
-    return Path("outputs") / scene_folder_name(metadata_of(checkpoint).scene) / checkpoint.stem
+        if latest_checkpoint(run) == checkpoint:
+            return run
+    return run / checkpoint.stem
