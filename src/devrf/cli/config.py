@@ -136,11 +136,6 @@ def in_sweep() -> bool:
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
-def in_search() -> bool:
-    """Whether the sweeper optimises, and so needs the objective of each job."""
-    return in_sweep() and "direction" in HydraConfig.get().sweeper
-
-
 def leaves(value: Any, key: str) -> dict[str, Any]:
     """The plain values at and below a key of a config, by their keys, resolved."""
     if not isinstance(value, DictConfig):

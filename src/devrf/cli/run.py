@@ -14,13 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from lightning import seed_everything
 from omegaconf import DictConfig, OmegaConf
 
 from devrf.apps.render import camera_path
 from devrf.apps.settings import ViewerSettings
-from devrf.cli.config import APART, OF_A_CHECKPOINT, in_search, in_sweep
+from devrf.cli.config import APART, OF_A_CHECKPOINT, in_sweep
 from devrf.cli.context import RunContext
 from devrf.cli.evaluate import evaluate
 from devrf.cli.memory import compare
@@ -206,7 +207,8 @@ def _check(run: RunContext, learning: Names, steps: Names) -> None:
     if learning or "evaluate" in steps:
         run.evaluation.check()
         check_objective(config.objective, run.evaluation.metrics)
-    if in_search() and "evaluate" not in steps:
+    # A sweeper with a direction optimises, and so needs the objective of each job.
+    if in_sweep() and "direction" in HydraConfig.get().sweeper and "evaluate" not in steps:
         raise DevrfError(
             f"stage: a search needs the objective, which stage={config.stage} does not score"
         )
