@@ -24,7 +24,7 @@ from devrf.cli.config_check import ROOT, check_config, check_extras, choices_at,
 from devrf.cli.messages import report_user_errors
 from devrf.cli.restore_config import log_told
 from devrf.cli.run_folder import working_in
-from devrf.cli.sweep import name_failures, record_failure
+from devrf.cli.sweep import naming_failures, record_failure
 from devrf.errors import DevrfError
 from devrf.system.process import (
     Interrupted,
@@ -72,13 +72,9 @@ def entry() -> None:
         return
     tune_for_cpu()
     try:
-        with handle_signals(end_at_once), report_user_errors():
+        with handle_signals(end_at_once), report_user_errors(), naming_failures():
             sys.argv[1:] = completed(sys.argv[1:])
-            try:
-                main()
-            except Exception as error:
-                name_failures(error)
-                raise
+            main()
     # A KeyboardInterrupt is raised by another library's handler of Ctrl-C.
     except (Interrupted, KeyboardInterrupt) as stop:
         print(f"devrf: {getattr(stop, 'message', 'interrupted')}", file=sys.stderr)

@@ -121,19 +121,23 @@ class SweepMonitor(Callback):
         return bool(failed)
 
 
-def name_failures(error: Exception) -> None:
-    """Name the failed jobs of a sweep that ``error`` has ended, or remove its unused folder.
+@contextmanager
+def naming_failures() -> Iterator[None]:
+    """Name the failed jobs of a sweep that an error ends, or remove its unused folder.
 
     Raises:
         SystemExit: with status 3: a search ends so when none of its jobs was scored.
     """
-    sweep, SweepMonitor.started = SweepMonitor.started, None
-    if sweep is None:
-        return
-    if is_user_error(error):
-        remove_if_only(sweep.folder, OF_SWEEP)
-    if sweep.name_failures() and "No trials are completed" in str(error):
-        raise SystemExit(JOBS_FAILED) from None
+    SweepMonitor.started = None
+    try:
+        yield
+    except Exception as error:
+        if (sweep := SweepMonitor.started) is not None:
+            if is_user_error(error):
+                remove_if_only(sweep.folder, OF_SWEEP)
+            if sweep.name_failures() and "No trials are completed" in str(error):
+                raise SystemExit(JOBS_FAILED) from None
+        raise
 
 
 class SweepReport(Callback):
