@@ -285,7 +285,9 @@ def test_the_record_of_a_sweep_does_not_unfold(tmp_path):
 def test_a_sweep_goes_on_with_all_kinds_of_values(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     task = ["experiment=quickstart,cpu_small", "schedule.canonical.upsample_at=[1],[2,3]", "seed=2"]
-    record = {"hydra": {"overrides": {"task": [*task, "+data.name='a, b'", "trainer=cpu"]}}}
+    of_the_command = ["trainer=cpu", "data.flow_cache=/elsewhere", "stage=inspect"]
+    typed = [*task, "+data.name='a, b'", *of_the_command]
+    record = {"hydra": {"overrides": {"task": typed}}}
     (tmp_path / "multirun.yaml").write_text(json.dumps(record))
     typed = [f"hydra.sweep.dir={tmp_path}", "stage=inspect"]
     assert completed(typed) == [*task, "+data.name='a, b'", "hydra.mode=MULTIRUN", *typed]

@@ -96,9 +96,7 @@ def checked(path: Path, command: Mapping[str, Any]) -> Command:
 def _is_known(key: str, value: object) -> bool:
     """Whether a run may have been learned with it: an option by name, or a plain value by key."""
     names = re.split("[./]", key.lstrip("/"))
-    if names[0] in OF_A_COMMAND or key in PLACES or RESERVED & {*names}:
-        return False
-    if len(names) > DEEPEST or not all(map(NAME.fullmatch, names)):
+    if _of_a_command(key) or len(names) > DEEPEST or not all(map(NAME.fullmatch, names)):
         return False
     if key.startswith("/"):
         return isinstance(value, str) and NAME.fullmatch(value) is not None
@@ -112,6 +110,11 @@ def _is_plain(value: object, depth: int = 8) -> bool:
     if isinstance(value, str):
         return value.isprintable() and not CODE.search(value)
     return value is None or isinstance(value, bool | int | float)
+
+
+def _of_a_command(key: str) -> bool:
+    """Whether a key or group says only what to do, or builds a part."""
+    return root(key) in OF_A_COMMAND or key in PLACES or bool(RESERVED & {*key.split(".")})
 
 
 def root(key: str) -> str:
@@ -241,7 +244,7 @@ def _of_sweep(typed: Sequence[Override], folder: Path) -> list[str]:
     lines: dict[str, str] = {}
     for override in _recorded(record):
         key = override.get_key_element().lstrip("+")
-        if root(key) in OF_A_COMMAND or override.is_delete():
+        if _of_a_command(key) or override.is_delete():
             continue
         if override.is_sweep_override() and not override.is_discrete_sweep():
             raise DevrfError(f"{record}: {key} is no list of values; type the sweep again")
