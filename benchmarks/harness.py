@@ -81,7 +81,7 @@ def learned_scene(run: RunContext) -> LoadedCheckpoint:
 
 def run_stage(config: DictConfig, folder: Path) -> None:
     """Take ``config.stage`` in a run's folder, in which no other process works meanwhile."""
-    with working_in(folder, config, "hydra.run.dir"):
+    with working_in(folder, config):
         command.run_stage(config, folder)
 
 

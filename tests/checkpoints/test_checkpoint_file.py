@@ -14,12 +14,15 @@ from safetensors.torch import load_file, save_file
 from devrf.checkpoints import checkpoint_file as module
 from devrf.checkpoints.checkpoint_file import (
     DTYPES,
+    _digest,
+    _header,
     digest_of,
     read_checkpoint_file,
     read_description,
     write_checkpoint_file,
 )
 from devrf.errors import DevrfError
+from devrf.system.memory import own_memory
 
 GRID = torch.arange(600.0).view(2, 3, 100)
 PLAIN = [1, 2.5, "three\n", None, True, (4, (5, [])), {6, 7}, {0: {"0": float("inf")}}]
@@ -122,6 +125,17 @@ def test_files_of_others_are_refused(tmp_path):
     }
     header = json.dumps(hostile).encode()
     assert "not a devrf" in refusal(path, len(header).to_bytes(8, "little") + header + bytes(40))
+
+
+def test_a_long_header_does_not_fill_memory(path):
+    """Three million lists in 9 MB would take 0.4 GB, and those that 100 MB hold 4 GB."""
+    nested = f'{{"dict": [["devrf", [{",".join(["[]"] * 3_000_000)}]]]}}'
+    path.write_bytes(_header(nested, {}, _digest(nested, {})))
+    before = own_memory()
+    for read in (read_checkpoint_file, read_description):
+        with pytest.raises(DevrfError, match="not a devrf checkpoint"):
+            read(path)
+    assert own_memory() - before < 50e6
 
 
 def test_a_failed_write_leaves_the_file_of_before(path, monkeypatch):

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hydra.core.hydra_config import HydraConfig
 
 import devrf as package
 import devrf.cli.run  # what every command loads is there before the garbage collector looks
@@ -103,6 +104,7 @@ def call(folder: Path, *arguments: str) -> Outcome:
                 status = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
             finally:
                 os.environ.pop("PL_GLOBAL_SEED", None)
+                HydraConfig.instance().cfg = None  # which --cfg leaves behind
                 for handler in set(root.handlers) - set(handlers):
                     handler.close()
                 root.handlers[:] = handlers

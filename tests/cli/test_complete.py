@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 import shutil
 import subprocess
 from pathlib import Path
@@ -49,15 +48,13 @@ def test_the_rest_is_left_to_hydra():
 
 
 def test_the_line_prints_what_to_type(devrf):
-    for typed, quoted in (
-        ("data.name=a (1)", "'data.name=\"a (1)\"'"),
-        ("data.root=a,b", "'data.root=\"a,b\"'"),
-    ):
-        outcome = devrf("data=inward", typed)
-        assert outcome.status == 2 and outcome.err.count("\n") == 1
-        assert quoted in outcome.err
-        (argument,) = shlex.split(quoted)
-        assert PARSER.parse_override(argument).value() == typed.partition("=")[2]
+    outcome = devrf("data=inward", "data.name=a (1)")
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert "'data.name=\"a (1)\"'" in outcome.err
+    assert PARSER.parse_override('data.name="a (1)"').value() == "a (1)"
+    outcome = devrf("data=inward", "data.root=a,b")
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert "'data.root=a,b'" in outcome.err and "use key=[value1,value2]" in outcome.err
 
 
 def test_the_keys_of_paths_exist(devrf):
@@ -132,6 +129,15 @@ def scenes(tmp_path_factory) -> Path:
 def test_what_the_files_of_a_scene_say_comes_after_what_was_typed(scenes, monkeypatch, typed, told):
     monkeypatch.chdir(scenes)
     assert completed(typed.split()) == [*typed.split(), *told.split()]
+
+
+@pytest.mark.parametrize("place", ["--config-dir {}", "hydra.searchpath=[file://{}]"])
+def test_an_experiment_in_a_folder_of_ones_own_chooses_the_reader(scenes, tmp_path, place):
+    (tmp_path / "experiment").mkdir()
+    chosen = "# @package _global_\ndefaults: [override /data: nerfstudio]\n"
+    (tmp_path / "experiment" / "mine.yaml").write_text(chosen)
+    typed = [*place.format(tmp_path).split(), "experiment=mine", f"data.root={scenes}/walker"]
+    assert completed(typed) == typed
 
 
 def test_what_the_files_say_is_said_in_one_line(devrf, scenes, short):

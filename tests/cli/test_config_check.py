@@ -111,7 +111,7 @@ def test_the_key_at_fault_is_named(changes, message):
         (Sequence[Sequence[float]], [[[0.0, 1]]], [[0.0]]),
         (Mapping[str, float], [{"color": 1}], [{"color": "high"}]),
         (Any, ["anything"], []),
-        (Exception, ["x"], []),  # no config value has the type
+        (Exception, [{"_target_": "pathlib.Path"}], ["x", 1]),  # only a part can have it
     ],
 )
 def test_values_of_each_type(monkeypatch, hint, fitting, wrong):

@@ -48,6 +48,10 @@ MISTAKES = {
         ["+schedule.deformation.levels.3.sides=4"],
         "schedule.deformation.levels.3.sides: no such key; did you mean",
     ),
+    "a value in place of a part": (
+        ["schedule.extensions.bending=1"],
+        "schedule.extensions.bending: expected a section with _target_, not 1",
+    ),
     "part that is not there": (["data._target_=devrf.nothing"], "data._target_: cannot load"),
     "unknown loss term": (["+loss.deformation.foo=1"], "unknown term 'foo'"),
     "unknown accelerator": (["trainer.accelerator=abacus"], "trainer: "),
@@ -208,12 +212,12 @@ def test_a_fault_of_the_program_keeps_its_traceback(devrf, monkeypatch):
 @pytest.mark.parametrize(
     ("argument", "meant"),
     [
-        ("train", "stage=pipeline"),
+        ("rendr", "stage=render"),
         ("quickstart", "experiment=quickstart"),
         ("fox", "data.root=fox"),
         ("experiment=quickstrat", "experiment=quickstart"),
         ("experiment=papr", "experiment=paper"),
-        ("stage=train", "stage=pipeline"),
+        ("stage=evalute", "stage=evaluate"),
         ("decoder_precision=flot32", "decoder_precision=float32"),
         ("evaluation.metrics=[lpisp]", "lpips"),
     ],

@@ -64,7 +64,7 @@ def composed(typed: list[str]) -> DictConfig:
 def test_in_a_folder_nothing_has_to_be_typed_again(devrf, tiny, run):
     outcome = devrf("stage=deformation", "hydra.run.dir=run")
     assert (outcome.status, outcome.err) == (0, "")
-    assert "run: as it was learned, with field=small" in outcome.out
+    assert "run/checkpoints/deformation.ckpt: as it was learned, with data.width=24 " in outcome.out
     assert "deformation: learned already" in outcome.out
     assert (config(run).data.width, config(run).schedule.canonical.iterations) == (24, 6)
 
@@ -260,8 +260,6 @@ RECORDS = {
     "an option elsewhere": ["data@callbacks.x=procedural"],
     "an interpolation among values": ["field.width=1,${seed}"],
     "no text": [5],
-    "a sweep without end": ["seed=range(0,1000000000000)"],
-    "one that is shuffled": ["seed=shuffle(range(0,1000000000000))"],
     "a search": ["seed=interval(0,1)"],
 }
 
@@ -287,21 +285,64 @@ def test_the_record_of_a_sweep_does_not_unfold(tmp_path):
 def test_a_sweep_goes_on_with_all_kinds_of_values(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     task = ["experiment=quickstart,cpu_small", "schedule.canonical.upsample_at=[1],[2,3]", "seed=2"]
-    record = {"hydra": {"overrides": {"task": [*task, "+data.name='a, b'", "trainer=cpu"]}}}
+    of_the_command = ["trainer=cpu", "data.flow_cache=/elsewhere", "stage=inspect"]
+    typed = [*task, "+data.name='a, b'", *of_the_command]
+    record = {"hydra": {"overrides": {"task": typed}}}
     (tmp_path / "multirun.yaml").write_text(json.dumps(record))
     typed = [f"hydra.sweep.dir={tmp_path}", "stage=inspect"]
-    *rest, first, second, mode, last, stage = completed(typed)
-    assert (first, second) == (
-        'experiment="quickstart","cpu_small"',
-        f"{task[1]}".replace(",3", ", 3"),
-    )
-    assert (mode, [last, stage]) == ("hydra.mode=MULTIRUN", typed)
-    with initialize_config_dir(str(config_folder()), version_base="1.3"):
-        found = compose("config", rest)
-    assert (found.seed, found.data.name) == (2, "a, b")
+    assert completed(typed) == [*task, "+data.name='a, b'", "hydra.mode=MULTIRUN", *typed]
+    # Of a group, or a key, that is typed nothing is taken over.
+    other = [*typed, "experiment=paper", "seed=3"]
+    assert completed(other) == [task[1], "+data.name='a, b'", "hydra.mode=MULTIRUN", *other]
 
 
 WRITTEN = ["run.log", ".hydra", ".devrf", ".hydra/config.yaml", ".devrf/process.txt"]
+WRITTEN += ["images", "videos", "logs", "logs/pipeline", "export", "export/points", "paths"]
+
+
+DEEP = "[" * 200_000
+FOREIGN = {
+    "deep scores": ("metrics.json", DEEP),
+    "scores that are none": ("metrics.json", "[]"),
+    "deep notes": (".devrf/done.json", DEEP),
+    "notes of no files": (".devrf/done.json", '{"notes": [3, {"with": 1, "files": [5, [1]]}]}'),
+}
+
+
+@pytest.mark.parametrize(("name", "text"), FOREIGN.values(), ids=list(FOREIGN))
+def test_a_damaged_record_is_passed_over_or_one_line(devrf, trained, tmp_path, name, text):
+    shutil.copytree(trained[0], tmp_path / "run")
+    (tmp_path / "run" / name).write_text(text)
+    outcome = devrf("hydra.run.dir=run", "evaluation.metrics=[]" if "done" in name else "seed=0")
+    said = f"devrf: {tmp_path / 'run' / name}: damaged; remove it, and the run is scored again\n"
+    assert (outcome.status, outcome.err) in ((0, ""), (2, said))
+    assert devrf("stage=report", "report.runs=run", "hydra.run.dir=other").status == (
+        2 if name == "metrics.json" else 0
+    )
+
+
+TABLES = {
+    "bytes": b"step,\xff\n1,2\n",
+    "cells of no column": b"step,a\n1,2,3\n",
+    "a cell without end": b"a,b\n" + b"x" * 200_000 + b",2\n",
+    "a step that is no number": b"step,deformation/loss\nx,2\n",
+}
+
+
+@pytest.mark.parametrize("table", TABLES.values(), ids=list(TABLES))
+def test_a_damaged_table_of_curves_is_one_line(devrf, run, table):
+    (run / "checkpoints" / "deformation.ckpt").unlink()
+    (run / "logs" / "pipeline").mkdir(parents=True)
+    (run / "logs" / "pipeline" / "metrics.csv").write_bytes(table)
+    outcome = devrf("hydra.run.dir=run", "logger=csv")
+    said = "run/logs/pipeline/metrics.csv: damaged; remove it, and curves begin anew\n"
+    assert outcome.status == 2 and outcome.err.count("\n") == 1 and outcome.err.endswith(said)
+
+
+def test_a_message_that_quotes_a_file_leaves_the_terminal_alone(devrf, edited):
+    evil = edited(lambda entry: entry["model"].update({"class": "x\x1b]0;pwned\x07.Y\n.Z"}))
+    outcome = devrf("stage=still", f"ckpt={evil}")
+    assert outcome.status == 2 and outcome.err.rstrip("\n").isprintable()
 
 
 @pytest.mark.parametrize("name", WRITTEN)

@@ -69,7 +69,7 @@ def alone(tmp_path):
 
     def block(**trainer):
         config = OmegaConf.create({"stage": "canonical", "trainer": trainer})
-        return working_in(tmp_path / "run", config, "hydra.run.dir")
+        return working_in(tmp_path / "run", config)
 
     return block
 
@@ -102,7 +102,7 @@ def folder(tmp_path, monkeypatch):
 
 def fail(folder, error, made=None):
     config = OmegaConf.create({"stage": "canonical", "trainer": {}})
-    with pytest.raises(type(error)), working_in(folder, config, "hydra.run.dir"):
+    with pytest.raises(type(error)), working_in(folder, config):
         (folder / "run.log").write_text("reading the scene\n")
         if made:
             (folder / made).write_text("made")
@@ -117,7 +117,7 @@ def test_a_mistake_leaves_nothing(folder, tmp_path):
 def test_a_mistake_of_a_worker_leaves_the_folder_to_rank_0(folder, monkeypatch):
     monkeypatch.setenv("RANK", "1")
     config = OmegaConf.create({"stage": "canonical", "trainer": {"strategy": {}}})
-    with pytest.raises(DevrfError), working_in(folder, config, "hydra.run.dir"):
+    with pytest.raises(DevrfError), working_in(folder, config):
         raise DevrfError("trainer.devices: wrong")
     assert (folder / ".hydra" / "config.yaml").is_file()
 

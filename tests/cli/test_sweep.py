@@ -103,7 +103,8 @@ def test_a_plugin_that_is_missing_is_named_with_the_remedy(devrf, tmp_path, tiny
     launchers = ConfigStore.instance().repo["hydra"]["launcher"]
     monkeypatch.delitem(launchers, "submitit_slurm.yaml", raising=False)
     outcome = devrf("-m", *tiny, "hydra/launcher=slurm", "seed=0,1")
-    expected = 'devrf: hydra/launcher=submitit_slurm: not installed; pip install "devrf[sweeps]"\n'
+    needed = '; others need pip install "devrf[sweeps]"'
+    expected = f"devrf: hydra/launcher=submitit_slurm: no such option{needed}\n"
     assert (outcome.status, outcome.err) == (2, expected)
     assert not list(tmp_path.iterdir())
 

@@ -91,8 +91,8 @@ def test_wandb_holds_config_and_name(watched):
     tracked = watched.runs[0]
     assert tracked.config["data"]["shape"] == "robot"
     assert tracked.config["schedule"]["deformation"]["levels"]["2"]["side"] == 8
-    assert (tracked.run.project, tracked.run.display_name) == ("devrf", "robot")
-    assert list(tracked.run.tags) == ["robot", "full"] and tracked.run.run_group == ""
+    assert (tracked.run.project, tracked.run.display_name) == ("devrf", "run")
+    assert list(tracked.run.tags) == ["full"]
 
 
 def test_wandb_holds_the_curves_of_both_stages(watched):

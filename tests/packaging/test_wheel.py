@@ -6,11 +6,13 @@ import os
 import subprocess
 import sys
 import tarfile
+import tomllib
 import venv
 import zipfile
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 from devrf.cli.config import config_folder
 
@@ -75,6 +77,16 @@ def test_the_wheel_has_code_configs_and_licence(wheel):
     assert "devrf/apps/report/published.toml" in names
     assert [name for name in names if name.endswith("licenses/LICENSE")]
     assert {name.split("/")[0].split("-")[0] for name in names} == {"devrf"}
+
+
+def test_all_extras_bring_no_torchvision():
+    """Beside torch's CPU build, pip takes torchvision's CUDA build, which does not work."""
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
+    (everything,) = project["optional-dependencies"]["all"]
+    extras = Requirement(everything).extras
+    assert "viewer" in extras and "raft" not in extras
+    brought = [word for extra in extras for word in project["optional-dependencies"][extra]]
+    assert not any(Requirement(word).name == "torchvision" for word in brought)
 
 
 def test_the_source_distribution_has_what_a_build_needs(built):

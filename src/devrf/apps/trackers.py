@@ -111,19 +111,20 @@ class WandbTracker(WandbLogger):
     ) -> None:
         """Name the run; it begins when something is logged first.
 
-        wandb works in ``wandb/`` below the run's folder. ``group`` is the sweep that it is a job
-        of; ``entity`` None the account that is logged in. Offline, ``wandb sync`` sends it later.
+        wandb works in ``wandb/`` below the run's folder. By default ``name`` is that of the folder,
+        ``group`` of the one that it lies in: the scene's, or the sweep's of which it is a job.
+        ``entity`` None is the account that is logged in. Offline, ``wandb sync`` sends it later.
         ``WANDB_MODE`` in the environment goes before ``offline``.
         """
-        given = os.environ.get("WANDB_MODE")
+        given, folder = os.environ.get("WANDB_MODE"), Path(save_dir).resolve()
         if offline if not given else given in OFFLINE:
             # Read when wandb is first imported. It reports on itself even when offline.
             os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
         super().__init__(
-            name=name and name[:LONGEST_NAME],
+            name=(name or folder.name)[:LONGEST_NAME],
             save_dir=save_dir,
             project=project,
-            group=group,
+            group=(group or folder.parent.name)[:LONGEST_NAME],
             tags=list(tags),
             entity=entity,
             # Not as Lightning's `offline`, which changes WANDB_MODE.

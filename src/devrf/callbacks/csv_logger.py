@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import logging
+import math
 from argparse import Namespace
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from lightning.fabric.loggers.logger import rank_zero_experiment
 from lightning.pytorch.loggers import CSVLogger
 from lightning.pytorch.utilities import rank_zero_only
 
+from devrf.errors import DevrfError
 from devrf.system.files import atomic_write
 
 log = logging.getLogger(__name__)
@@ -29,13 +31,22 @@ class ResumableCSVLogger(CSVLogger):
     """
 
     def __init__(self, save_dir: str | Path, name: str = "logs", version: str = "run") -> None:
-        """Read the table if there is one, without a last line that was cut off."""
+        """Read the table if there is one, without a last line that was cut off.
+
+        Raises:
+            DevrfError: it is damaged.
+        """
         super().__init__(save_dir, name, version)
         self.path = Path(self.log_dir) / "metrics.csv"
-        text = self.path.read_text() if self.path.is_file() else ""
-        reader = csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1]))
-        self._columns = list(reader.fieldnames or [])
-        self._rows = [{key: cell for key, cell in row.items() if cell} for row in reader]
+        try:
+            text = self.path.read_text() if self.path.is_file() else ""
+            reader = csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1]))
+            self._columns = list(reader.fieldnames or [])
+            self._rows = [{key: cell for key, cell in row.items() if cell} for row in reader]
+            if any(None in row or math.isnan(float(row.get("step", 0))) for row in self._rows):
+                raise ValueError("cells of no column, or of no step")
+        except (ValueError, csv.Error):
+            raise DevrfError(f"{self.path}: damaged; remove it, and curves begin anew") from None
         # Rows in the file; None: it has to be written anew.
         self._written: int | None = None
         self._failing = False

@@ -13,6 +13,7 @@ import hashlib
 import json
 from collections import defaultdict
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,8 @@ from devrf.system.memory import need_memory
 
 FORMAT = "5"
 UNKNOWN = "0" * 64  # in the digest's place until it is known
+# Bytes of a header at most: usual are 20,000. In memory each may become 50.
+HEADER = 2**23
 # The names of safetensors.
 DTYPES = {getattr(torch, f"float{bits}"): f"F{bits}" for bits in (16, 32, 64)}
 DTYPES |= {getattr(torch, f"int{bits}"): f"I{bits}" for bits in (8, 16, 32, 64)}
@@ -101,11 +104,13 @@ def _metadata(path: Path) -> dict[str, str]:
     """The metadata of a file: ``devrf``, ``sha256`` and ``nested``."""
     if not path.is_file():  # a pipe would be waited for
         raise DevrfError(f"{path}: no file; set ckpt to one that devrf wrote")
-    try:
-        with safe_open(path, "pt") as file:
-            metadata: dict[str, str] = file.metadata() or {}
-    except SafetensorError:
-        metadata = {}
+    metadata: dict[str, str] = {}
+    with path.open("rb") as start:
+        length = int.from_bytes(start.read(8), "little")
+    with suppress(SafetensorError):
+        if length <= HEADER:
+            with safe_open(path, "pt") as file:
+                metadata = file.metadata() or {}
     if not {"devrf", "sha256", "nested"} <= set(metadata):
         raise DevrfError(
             f"{path}: not a devrf checkpoint, or a damaged one; set ckpt to a whole file that "

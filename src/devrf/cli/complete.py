@@ -9,7 +9,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import re
 from collections.abc import Sequence
@@ -18,18 +17,16 @@ from itertools import product
 from pathlib import Path
 
 from hydra import initialize_config_dir
+from hydra._internal.utils import get_args_parser
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import OmegaConf
 
 from devrf.cli.config import APART, config_folder, group_choices
 from devrf.cli.messages import in_quotes
-from devrf.cli.restore_config import differing, of_named_run, parsed, value, values
+from devrf.cli.restore_config import of_named_run, parsed, told, value, values
 from devrf.errors import DevrfError
-
-log = logging.getLogger(__name__)
 
 # Keys whose values are files or folders.
 PATHS = {
@@ -42,9 +39,6 @@ PATHS = {
 SHORTHAND = {f"viewer={value}": f"viewer.training={value}" for value in ("true", "false")}
 KEY_VALUE = re.compile(r"(\+{0,2}([\w./@-]+)=)(.*)", re.DOTALL)
 
-# What the present command's scene has told, until a log is there to say so.
-_told: list[str] = []
-
 
 def completed(arguments: Sequence[str]) -> list[str]:
     """The command line that Hydra composes for what was typed, without the program's name.
@@ -53,28 +47,26 @@ def completed(arguments: Sequence[str]) -> list[str]:
         DevrfError: a scene's folder cannot be recognised, the scenes of a sweep need different
             options, or a group's choice is null.
     """
-    _told.clear()
-    multirun = not {"-m", "--multirun"}.isdisjoint(arguments)
-    words = [quoted_path(SHORTHAND.get(word.lower(), word), multirun) for word in arguments]
-    at = [k for k, w in enumerate(words) if w[:1] != "-" and ("=" in w or w[:1] == "~")]
-    texts = [words[k] for k in at]
+    told.clear()
+    known, _ = get_args_parser().parse_known_intermixed_args(arguments)
+    flags = [word for word in arguments if word not in known.overrides]
+    texts = [quoted_path(SHORTHAND.get(w.lower(), w), known.multirun) for w in known.overrides]
     try:
         typed = parsed(texts)
     except HydraException:  # reported when Hydra parses them
-        return words
-    if not typed:
-        return words
+        return [*flags, *texts]
     for override in typed:
-        group, is_null = override.key_or_group, override.value() is None
-        if is_null and not override.is_delete() and (options := group_choices().get(group)):
-            raise DevrfError(
-                f"{override.input_line}: choose one of {', '.join(options)}, or leave it out"
-            )
-    before = of_named_run(typed, multirun)
-    texts += _told_by_files(values(typed, "data.root"), parsed([*before, *texts]))
-    # Hydra takes all overrides from one place.
-    after = [words[k] for k in range(at[0], len(words)) if k not in at]
-    return [*words[: at[0]], *before, *texts, *after]
+        options = group_choices().get(override.key_or_group)
+        if options and override.value() is None and not override.is_delete():
+            line = override.input_line
+            raise DevrfError(f"{line}: choose one of {', '.join(options)}, or leave it out")
+    before = of_named_run(typed, known.multirun)
+    searched = [text for text in texts if text.startswith("hydra.searchpath=")]
+    if known.config_dir:
+        folder = in_quotes(f"file://{Path(known.config_dir).absolute()}")
+        searched.append(f"hydra.searchpath=[{folder}]")
+    added = _told_by_files(values(typed, "data.root"), parsed([*before, *texts]), searched)
+    return [*flags, *before, *texts, *added]
 
 
 def quoted_path(argument: str, multirun: bool) -> str:
@@ -98,13 +90,9 @@ def quoted_path(argument: str, multirun: bool) -> str:
     return argument if read == path else parts[1] + in_quotes(path)
 
 
-def log_told() -> None:
-    """Say what the scene's files have told."""
-    for line in _told:
-        log.info("%s", line)
-
-
-def _told_by_files(roots: Sequence[str], overrides: Sequence[Override]) -> list[str]:
+def _told_by_files(
+    roots: Sequence[str], overrides: Sequence[Override], searched: Sequence[str]
+) -> list[str]:
     """What the files of the scenes in ``roots`` say that no override says.
 
     Raises:
@@ -113,7 +101,7 @@ def _told_by_files(roots: Sequence[str], overrides: Sequence[Override]) -> list[
     if not roots or value(overrides, "stage") in APART or any("${" in root for root in roots):
         return []
     options: Sequence[str | None] = values(overrides, "data")
-    options = options or _of_experiments(values(overrides, "experiment")) or [None]
+    options = options or _of_experiments(values(overrides, "experiment"), searched) or [None]
     words = [_told_by_scene(option, root, overrides) for option, root in product(options, roots)]
     if any(other != words[0] for other in words):
         needed = " and ".join(dict.fromkeys(" ".join(other) or "neither" for other in words))
@@ -139,36 +127,17 @@ def _told_by_scene(option: str | None, root: str, overrides: Sequence[Override])
     peer = value(overrides, "method") not in (None, "devrf")
     if peer and not known and by_one_camera(option, root):
         words.append("protocol=dynamic")
-    if said := _published(root, overrides):
-        _told.append(said)
+    scene = Path(root).expanduser().resolve().name
+    if value(overrides, "experiment") == "paper" and option in ("inward", "forward"):
+        if (config_folder() / f"for_scene/paper_{scene}.yaml").is_file():
+            told.append(f"{root}: if it is DeVRF's, data={scene} has what is published for it")
     if words:
-        _told.append(f"{root}: {why} ({' '.join(words)}){remark}")
+        told.append(f"{root}: {why} ({' '.join(words)}){remark}")
     return words
 
 
-def _published(root: str, overrides: Sequence[Override]) -> str | None:
-    """What ``data=NAME`` would set where experiment=paper reads that scene by its folder alone."""
-    from devrf.scenes.formats import recognise
-
-    name = Path(root).expanduser().resolve().name.lower().replace("-", "_")
-    own, paper = (config_folder() / f"{p}{name}.yaml" for p in ("data/", "for_scene/paper_"))
-    wanted = values(overrides, "experiment") == ["paper"] and name not in values(overrides, "data")
-    if not wanted or not (own.is_file() and paper.is_file()):
-        return None
-    if not recognise(root).name.startswith("DeVRF"):
-        return None
-    reader, _ = OmegaConf.load(own).defaults
-    usual = OmegaConf.create({"data": OmegaConf.load(own.with_stem(reader))})
-    del usual.data["_target_"]  # the scene's choice inherits it
-    scene = OmegaConf.merge({"data": OmegaConf.load(own)}, OmegaConf.load(paper))
-    typed = {"data.name", "data.defaults", *(override.key_or_group for override in overrides)}
-    keys = (key for key in differing(scene, usual) if key not in typed)
-    sets = ", ".join(f"{key}={OmegaConf.select(scene, key)}" for key in keys)
-    return f"{root}: one of DeVRF's scenes; data={name} would set {sets}" if sets else None
-
-
-def _of_experiments(names: Sequence[str]) -> list[str]:
-    """The options of ``data`` that experiments choose."""
+def _of_experiments(names: Sequence[str], searched: Sequence[str]) -> list[str]:
+    """The options of ``data`` that experiments choose, which may lie in other folders."""
     chosen: list[str | list[str] | None] = []
     if not names:
         return []
@@ -176,6 +145,7 @@ def _of_experiments(names: Sequence[str]) -> list[str]:
         loader = GlobalHydra.instance().config_loader()
         for name in names:
             with suppress(HydraException):  # reported when Hydra composes it
-                found = loader.compute_defaults_list("config", [f"experiment={name}"], RunMode.RUN)
+                words = [f"experiment={name}", *searched]
+                found = loader.compute_defaults_list("config", words, RunMode.RUN)
                 chosen.append(found.overrides.override_choices.get("data"))
     return [str(option) for option in chosen if option is not None]

@@ -3,45 +3,25 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+import shlex
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.types import RunMode
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from devrf.apps.settings import ReportSettings
-from devrf.errors import DevrfError, did_you_mean
 
 PIPELINE = "pipeline"
-# What the folder of a named run's settings begins with.
-RESTORED = ".restored-"
 # Stages for which the run's scene need not be right.
 APART = ("report", "fetch", "capture", "selfcheck")
 # Stages that learn nothing; the protocol's stages come beside these.
 STEPS = ("prepare", "inspect", "evaluate", "render", "still", "view", "export", *APART)
 # Of these, what uses a checkpoint.
 OF_A_CHECKPOINT = ("evaluate", "render", "still", "view", "export")
-# What users of other programs write, by what it is here.
-SYNONYMS = {
-    "stage=pipeline": ("train", "fit", "learn", "run", "start"),
-    "stage=evaluate": ("eval", "test", "score", "metrics"),
-    "stage=render": ("video", "film"),
-    "stage=view": ("viewer", "browser", "viser", "gui"),
-    "stage=still": ("image", "picture", "photo"),
-    "stage=fetch": ("download", "get"),
-    "stage=export": ("mesh", "gltf", "convert"),
-    "stage=capture": ("footage", "colmap", "sfm", "process"),
-    "stage=inspect": ("check", "info", "show"),
-    "stage=report": ("compare", "table"),
-    "stage=selfcheck": ("doctor", "diagnose", "self-check"),
-    "--help": ("help",),
-    "--version": ("version",),
-}
 
 
 def config_folder() -> Path:
@@ -67,20 +47,13 @@ def known_stages() -> list[str]:
     return [PIPELINE, *learning, *STEPS]
 
 
-def meant_stage(word: str) -> str:
-    """The end of a message: which stage may have been meant by ``word``; else empty."""
-    for meant, words in SYNONYMS.items():
-        if word.lower() in words:
-            return f"; did you mean {meant}?"
-    return did_you_mean(word, known_stages(), "stage=")
-
-
-def scene_name(data: Any) -> str:
-    """A scene's name for folders and tables: ``name``, else ``shape``, else the folder's name."""
+def scene_name(config: DictConfig) -> str:
+    """The scene's name for folders and tables: typed, that of its data, else its folder's."""
+    data = config.data
     if OmegaConf.is_missing(data, "root"):
-        return "scene"
-    chosen = data.get("name") or data.get("shape") or Path(str(data.get("root"))).resolve().name
-    return scene_folder_name(str(chosen))
+        return config.scene or "scene"
+    named = config.scene or data.get("name") or data.get("shape")
+    return scene_folder_name(str(named or Path(str(data.get("root"))).resolve().name))
 
 
 def scene_folder_name(scene: str) -> str:
@@ -88,90 +61,61 @@ def scene_folder_name(scene: str) -> str:
     return re.sub(r"[^\w.-]+", "_", scene).lstrip(".") or "scene"
 
 
-def run_folder(stage: str, report: Any, capture: Any, scene: str, choices: Any) -> str:
+def run_folder(_root_: Any) -> str:
     """A run's folder; of a report, where it is written.
 
     It is named after scene and experiment, and what else is chosen beside the usual. Without an
     experiment DeVRF learns as by ``experiment=quickstart``: they are one run.
     """
+    stage, report, chosen = _root_.stage, _root_.report, _root_.hydra.runtime.choices
     if stage in ("fetch", "selfcheck"):
         return f"outputs/{stage}"
     if stage == "capture":
-        return f"outputs/{scene_folder_name(Path(str(capture.into or 'scene')).name)}/capture"
+        into = Path(str(_root_.capture.into or "scene"))
+        return f"outputs/{scene_folder_name(into.name)}/capture"
     if stage == "report":
         # A misspelt folder is not created: the step reports that there is none.
         runs = report.runs if Path(report.runs).is_dir() else "outputs"
         return str(ReportSettings(runs, report.into).folder)
-    parts = [choices.experiment or "quickstart"]
-    if choices.ablation not in (None, "full"):
-        parts.append(choices.ablation)
-    if (choices.method, choices.protocol) != ("devrf", "two_stage"):
-        parts += [choices.method, choices.protocol]
-    return f"outputs/{scene}/{'-'.join(parts)}"
+    parts = [chosen.experiment or "quickstart"]
+    if chosen.ablation not in (None, "full"):
+        parts.append(chosen.ablation)
+    if (chosen.method, chosen.protocol) != ("devrf", "two_stage"):
+        parts += [chosen.method, chosen.protocol]
+    return f"outputs/{scene_name(_root_)}/{'-'.join(parts)}"
 
 
-def config_record(stage: str) -> str | None:
-    """Where in its folder a run's composed config is; a report may lie beside another run's.
-
-    stage=fetch is no run; stage=view may look at one that goes on.
-    """
-    return None if stage in ("report", "fetch", "view") else ".hydra"
-
-
-def job_folder(number: int, scene: str, sweep: str, overrides: Sequence[str], params: Any) -> str:
+def job_folder(_root_: Any) -> str:
     """The folder of a sweep's job: number, scene, and what else is varied: ``0_robot_tv_0.5``."""
-    record = Path(sweep) / "multirun.yaml"  # some searches write none; they name their params
-    typed = overrides_in(record) if record.is_file() else []
-    varied = dict.fromkeys(params or (), True)
-    for override in OverridesParser.create().parse_overrides(typed):
+    hydra = _root_.hydra
+    record = Path(hydra.sweep.dir) / "multirun.yaml"  # some searches write none
+    typed = OmegaConf.load(record).hydra.overrides.task if record.is_file() else []
+    varied = dict.fromkeys(hydra.sweeper.get("params") or (), True)
+    for override in OverridesParser.create().parse_overrides(list(typed)):
         varied[override.get_key_element()] = override.is_sweep_override()
     varied |= dict.fromkeys(("data", "data.root", "data.name", "data.shape"), False)
-    values = [override.partition("=") for override in overrides]
-    words = [f"{key.rpartition('.')[2]}_{value}" for key, _, value in values if varied.get(key)]
-    return scene_folder_name("_".join([str(number), scene, *words]))[:150]
-
-
-def overrides_in(record: Path) -> list[str]:
-    """The overrides in a sweep's record, ``multirun.yaml``.
-
-    Raises:
-        DevrfError: it is none.
-    """
-    try:
-        text = record.read_text("utf-8")
-        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
-            raise ValueError("Hydra writes none, and what refers to itself has no end")
-        content = yaml.safe_load(text)
-        texts = content["hydra"]["overrides"]["task"]
-        if all(isinstance(text, str) for text in texts):
-            return [*texts]
-    except (yaml.YAMLError, LookupError, TypeError, ValueError, RecursionError):
-        pass
-    raise DevrfError(f"{record}: not the record of a sweep; type the sweep again")
-
-
-def tracked_name(folder: str, otherwise: str | None) -> str | None:
-    """A tracker's name of a sweep's job, or of a sweep: its folder's; of another run as given."""
-    return Path(folder).name if in_sweep() else otherwise
+    pairs = [override.partition("=") for override in hydra.overrides.task]
+    words = [f"{key.rpartition('.')[2]}_{value}" for key, _, value in pairs if varied.get(key)]
+    return scene_folder_name("_".join([str(hydra.job.num), scene_name(_root_), *words]))[:150]
 
 
 @cache  # for the whole process
 def register_config() -> None:
-    """Make the resolvers ``${devrf.scene_name:…}`` … known to Hydra."""
-    for word in (scene_name, run_folder, config_record, job_folder, tracked_name):
+    """Make the names of folders known to Hydra, ``${devrf.run_folder:}``."""
+    for word in (run_folder, job_folder):
         OmegaConf.register_new_resolver(f"devrf.{word.__name__}", word, replace=True)
 
 
-def search_path() -> list[str]:
-    """The present command's own folders of configs, as they are typed."""
-    words, folders = [], []
+def command_line(*words: str) -> str:
+    """A command to type next; the present one's own folders of configs are named again."""
+    options, folders = list[str](), list[str]()
     for source in HydraConfig.get().runtime.config_sources if HydraConfig.initialized() else ():
         if source.provider == "command-line":
-            words += ["--config-dir", source.path]
+            options += ["--config-dir", source.path]
         elif source.provider == "hydra.searchpath in command-line":
             folders.append(f"{source.schema}://{source.path}")
-    typed = [folder for folder in folders if RESTORED not in folder]
-    return [*words, f"hydra.searchpath=[{','.join(typed)}]"] if typed else words
+    searched = [f"hydra.searchpath=[{','.join(folders)}]"] if folders else []
+    return shlex.join(["python", "-m", "devrf", *options, *searched, *words])
 
 
 def choices() -> dict[str, str | None]:
@@ -192,6 +136,10 @@ def in_sweep() -> bool:
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
-def in_search() -> bool:
-    """Whether the sweeper optimises, and so needs the objective of each job."""
-    return in_sweep() and "direction" in HydraConfig.get().sweeper
+def leaves(value: Any, key: str) -> dict[str, Any]:
+    """The plain values at and below a key of a config, by their keys, resolved."""
+    if not isinstance(value, DictConfig):
+        listed = OmegaConf.is_config(value)
+        return {key: OmegaConf.to_container(value, resolve=True) if listed else value}
+    below = [leaves(item, f"{key}.{name!s}") for name, item in value.items()]
+    return {name: plain for part in below for name, plain in part.items()}

@@ -18,13 +18,13 @@ from omegaconf import DictConfig
 
 import devrf
 from devrf.apps.fetch import catalogue
-from devrf.cli.complete import completed, log_told, quoted_path
+from devrf.cli.complete import completed, quoted_path
 from devrf.cli.config import config_folder, in_sweep, known_stages, register_config
 from devrf.cli.config_check import ROOT, check_config, check_extras, choices_at, choices_of
 from devrf.cli.messages import report_user_errors
-from devrf.cli.restore_config import log_source
+from devrf.cli.restore_config import log_told
 from devrf.cli.run_folder import working_in
-from devrf.cli.sweep import forget_failure, name_failures, record_failure
+from devrf.cli.sweep import naming_failures, record_failure
 from devrf.errors import DevrfError
 from devrf.system.process import (
     Interrupted,
@@ -72,13 +72,9 @@ def entry() -> None:
         return
     tune_for_cpu()
     try:
-        with handle_signals(end_at_once), report_user_errors():
+        with handle_signals(end_at_once), report_user_errors(), naming_failures():
             sys.argv[1:] = completed(sys.argv[1:])
-            try:
-                main()
-            except Exception as error:
-                name_failures(error)
-                raise
+            main()
     # A KeyboardInterrupt is raised by another library's handler of Ctrl-C.
     except (Interrupted, KeyboardInterrupt) as stop:
         print(f"devrf: {getattr(stop, 'message', 'interrupted')}", file=sys.stderr)
@@ -88,10 +84,8 @@ def entry() -> None:
 def run(config: DictConfig) -> float | None:
     """Run ``stage=…`` in Hydra's output folder; return the objective, if measured."""
     folder = Path(HydraConfig.get().runtime.output_dir)
-    key = "hydra.sweep.dir" if in_sweep() else "hydra.run.dir"
     guard = record_failure(config, folder) if in_sweep() else report_user_errors()
-    with guard, working_in(folder, config, key):
-        log_source()
+    with guard, working_in(folder, config):
         log_told()
         check_config(config)
         check_extras(config)
@@ -99,9 +93,7 @@ def run(config: DictConfig) -> float | None:
         with importing():
             from devrf.cli.run import run_stage
 
-        value = run_stage(config, folder)
-        forget_failure(folder)
-        return value
+        return run_stage(config, folder)
     return None  # of a job that failed
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import shlex
 import sys
 from functools import partial
 
@@ -19,7 +18,7 @@ from devrf.apps.needs import needs_table
 from devrf.apps.settings import CaptureSettings
 from devrf.callbacks.trial import seconds_to_learn
 from devrf.cli.complete import completed
-from devrf.cli.config import search_path
+from devrf.cli.config import command_line
 from devrf.cli.context import RunContext
 from devrf.cli.memory import compare, needs
 from devrf.engine.ddp import ManualDDP
@@ -35,7 +34,7 @@ def say_next(*commands: list[str]) -> None:
     """Log commands that go on from here."""
     log.info("next:")
     for words in commands:
-        log.info("  %s", shlex.join(["python", "-m", "devrf", *search_path(), *words]))
+        log.info("  %s", command_line(*words))
 
 
 def fetch(run: RunContext) -> None:

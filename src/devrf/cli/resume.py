@@ -17,14 +17,14 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
+from pydantic import TypeAdapter, ValidationError
 
 import devrf
 from devrf.checkpoints.checkpoint import (
@@ -35,8 +35,10 @@ from devrf.checkpoints.checkpoint import (
 )
 from devrf.checkpoints.checkpoint_file import digest_of, read_checkpoint_file, read_description
 from devrf.checkpoints.progress import progress_files
+from devrf.cli.config import command_line, leaves
 from devrf.cli.config_check import REFERENCE
 from devrf.cli.context import RunContext
+from devrf.cli.restore_config import PLACES
 from devrf.errors import DevrfError
 from devrf.system.files import write_json
 from devrf.system.folder_lock import PLACE
@@ -46,6 +48,7 @@ log = logging.getLogger(__name__)
 # The config group that decides what a step makes, by step; other steps are always done.
 DECIDES = {"evaluate": "evaluation", "render": "video"}
 NOTE = "done.json"  # in the folder of the lock
+NOTES = TypeAdapter(dict[str, list[str]])
 # Settings of a datamodule or a stage that change nothing that is learned.
 UNDECISIVE = {"root", "name", "flow_cache", "export", "store"}
 
@@ -56,49 +59,45 @@ class ResumePoint:
 
     Attributes:
         training_config: the present settings that decide what is learned.
-        finished: there is nothing left to learn.
         progress: the file to go on from.
         iteration: of that file.
     """
 
     training_config: dict[str, Any]
-    finished: bool = False
     progress: Path | None = None
     iteration: int = 0
 
 
 def deciding_settings(config: DictConfig, stage: str) -> dict[str, Any]:
     """The settings that decide what a stage learns, by the key at which the user sets them."""
-    sections = (stage,) if stage in config else ("ray_stage", "protocol")
-    parts = {key: OmegaConf.to_container(config[key], resolve=False) for key in ("data", *sections)}
-    settings = dict(_values(config, parts, ""))
-    settings.update(method=config.method, seed=config.seed)
+    settings = {"method": config.method, "seed": config.seed}
+    for section in ("data", stage) if stage in config else ("data", "ray_stage", "protocol"):
+        settings |= _values(config, section)
     for key, usual in (("schedule.seconds", None), ("priors", "all")):
         if (value := OmegaConf.select(config, key)) != usual:
             settings[key] = value
-    return {key: settings[key] for key in sorted(settings)}
+    # As a checkpoint's JSON gives it back.
+    plain: dict[str, Any] = json.loads(json.dumps(settings, sort_keys=True))
+    return plain
 
 
-def _values(config: DictConfig, raw: Mapping[Any, Any], path: str) -> Iterator[tuple[str, Any]]:
-    for key, value in raw.items():
-        where = f"{path}{key}"
-        reference = REFERENCE.fullmatch(value) if isinstance(value, str) else None
-        if reference:  # the key to name is the one where the value stands
-            where = reference.group(1)
-            value = OmegaConf.select(config, where)
-            if isinstance(value, DictConfig):
-                value = OmegaConf.to_container(value, resolve=False)
-        if isinstance(value, Mapping):
-            yield from _values(config, value, f"{where}.")
+def _values(config: DictConfig, path: str) -> dict[str, Any]:
+    """The plain values below a key; what refers to another key is named by that one."""
+    found: dict[str, Any] = {}
+    node: Any = OmegaConf.to_container(OmegaConf.select(config, path), resolve=False)
+    for key, raw in node.items():
+        reference = REFERENCE.fullmatch(str(raw))
+        where = reference[1] if reference else f"{path}.{key}"
+        value = OmegaConf.select(config, where)
+        if isinstance(value, DictConfig):
+            found |= _values(config, where)
         elif key not in UNDECISIVE:
-            plain = OmegaConf.select(config, where)
-            if OmegaConf.is_config(plain):
-                plain = OmegaConf.to_container(plain, resolve=True)
-            yield where, json.loads(json.dumps(plain))  # as a checkpoint's JSON gives it back
+            found |= leaves(value, where)
+    return found
 
 
-def beginning(run: RunContext, stage: str) -> ResumePoint:
-    """Find where ``stage`` begins in the run's folder.
+def beginning(run: RunContext, stage: str) -> ResumePoint | None:
+    """Find where ``stage`` begins in the run's folder; None if there is nothing left to learn.
 
     Raises:
         DevrfError: a checkpoint there was learned with other settings, has another format, or is
@@ -115,7 +114,7 @@ def beginning(run: RunContext, stage: str) -> ResumePoint:
         if _agrees(path, metadata, training_config) and metadata.complete:
             log.info("%s: learned already (%s); resume=false learns it anew", stage, path)
             remove_progress(path.parent, stage)
-            return ResumePoint(training_config, finished=True)
+            return None
     for progress in progress_files(path.parent, stage):
         try:
             content = read_checkpoint_file(progress)
@@ -169,53 +168,53 @@ def unfinished(run: RunContext) -> str | None:
     progress = read_description(path).get("progress")
     if progress is None:
         return None
+    again = command_line(f"hydra.run.dir={run.place}")
     return (
         f"{path}: iteration {progress['iteration']} of {progress['total']} of the "
-        f"{progress['stage']} stage; python -m devrf hydra.run.dir={run.place} goes on"
+        f"{progress['stage']} stage; {again} goes on"
     )
 
 
 def done(run: RunContext, step: str) -> bool:
     """Whether a step has been done with the same checkpoint and settings; says so."""
-    present = _made_with(run, step)
-    for note in _notes(run.folder):
-        files = note["files"]
-        if note["with"] == present and all((run.folder / name).is_file() for name in files):
-            log.info("%s: done already (%s); stage=%s does it again", step, ", ".join(files), step)
-            return True
-    return False
+    files = _notes(run.folder).get(_made_with(run, step), [])
+    if not files or not all((run.folder / name).is_file() for name in files):
+        return False
+    log.info("%s: done already (%s); stage=%s does it again", step, ", ".join(files), step)
+    return True
 
 
 def note_done(run: RunContext, step: str, files: Sequence[Path] | None) -> None:
     """Note what a step has written, and forget what these files were before."""
     if step in DECIDES and files:
         names = sorted(path.relative_to(run.folder).as_posix() for path in files)
-        others = [note for note in _notes(run.folder) if not {*names} & {*note["files"]}]
-        note = {"with": _made_with(run, step), "files": names}
-        write_json(run.folder / PLACE / NOTE, {"notes": [*others, note]})
+        others = {k: v for k, v in _notes(run.folder).items() if not {*names} & {*v}}
+        write_json(run.folder / PLACE / NOTE, {**others, _made_with(run, step): names})
 
 
-def _made_with(run: RunContext, step: str) -> dict[str, Any] | None:
-    """What decides a step's results, as plain data; None without a checkpoint."""
+def _made_with(run: RunContext, step: str) -> str:
+    """A digest of what decides a step's results; empty without a checkpoint."""
     try:
         checkpoint = digest_of(run.checkpoint())
     except (DevrfError, OSError):
-        return None
-    config: Any = OmegaConf.to_container(run.config, resolve=True)
-    data = {k: v for k, v in config["data"].items() if k not in ("flow_cache", "export")}
-    if data.get("root") is not None:
-        data["root"] = str(Path(data["root"]).resolve())
-    made: dict[str, Any] = {"checkpoint": checkpoint, "version": devrf.__version__, "data": data}
-    if step == "evaluate" and run.datamodule.validation:
-        made["validation"] = True
-    keyframes = Path(str(config["video"]["path"]))
-    if step == "render" and keyframes.is_file():
-        made["keyframes"] = sha256(keyframes.read_bytes()).hexdigest()
-    return made | {"logger": config["logger"]["_target_"], "step": config[DECIDES[step]]}
+        return ""
+    data = leaves(run.config.data, "data")
+    if (root := data.get("data.root")) is not None:
+        data["data.root"] = Path(root).resolve()
+    keyframes = Path(str(run.config.video.path)) if step == "render" else Path()
+    made = (
+        *(step, checkpoint, devrf.__version__, run.config.logger._target_),
+        {key: value for key, value in data.items() if key not in PLACES},
+        leaves(run.config[DECIDES[step]], step),
+        step == "evaluate" and run.datamodule.validation,
+        keyframes.read_bytes() if keyframes.is_file() else None,
+    )
+    return sha256(repr(made).encode()).hexdigest()
 
 
-def _notes(folder: Path) -> list[dict[str, Any]]:
-    with suppress(OSError, ValueError, LookupError, TypeError):
-        notes: list[dict[str, Any]] = json.loads((folder / PLACE / NOTE).read_text())["notes"]
-        return [note for note in notes if {*note} >= {"with", "files"}]
-    return []
+def _notes(folder: Path) -> dict[str, list[str]]:
+    """The files that steps have written, by the digest of what decided them."""
+    try:
+        return NOTES.validate_json((folder / PLACE / NOTE).read_bytes())
+    except (OSError, ValidationError):
+        return {}

@@ -14,13 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from lightning import seed_everything
 from omegaconf import DictConfig, OmegaConf
 
 from devrf.apps.render import camera_path
 from devrf.apps.settings import ViewerSettings
-from devrf.cli.config import APART, OF_A_CHECKPOINT, in_search, in_sweep, meant_stage
+from devrf.cli.config import APART, OF_A_CHECKPOINT, in_sweep
 from devrf.cli.context import RunContext
 from devrf.cli.evaluate import evaluate
 from devrf.cli.memory import compare
@@ -33,7 +34,7 @@ from devrf.cli.sweep import report
 from devrf.cli.train import learn
 from devrf.engine.ddp import ManualDDP
 from devrf.engine.workers import launch_workers
-from devrf.errors import DevrfError
+from devrf.errors import DevrfError, did_you_mean
 from devrf.evaluation.objective import check_objective, objective
 from devrf.system.folder_lock import PLACE
 from devrf.system.memory import shortage_in_words
@@ -79,8 +80,9 @@ def plan(stage: str, protocol: Sequence[str]) -> tuple[Names, Names]:
         return (stage,), ()
     if stage in STEPS:
         return (), (stage,)
-    known = ", ".join(["pipeline", *protocol, *STEPS])
-    raise DevrfError(f"stage: expected one of {known}, not {stage!r}{meant_stage(stage)}")
+    known = ["pipeline", *protocol, *STEPS]
+    meant = did_you_mean(stage, known, "stage=")
+    raise DevrfError(f"stage: expected one of {', '.join(known)}, not {stage!r}{meant}")
 
 
 def run_stage(config: DictConfig, folder: Path) -> float | None:
@@ -92,25 +94,19 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
     Raises:
         DevrfError: the input is wrong.
     """
-    run = RunContext(config, folder)
-    learning, steps = plan(config.stage, run.learning_stages)
-    if learning and run.is_trial:
-        steps = ()  # nothing of it is worth a score or a video
-    with shortage_in_words(config.stage, run.device, None):  # of networks that are too wide
-        _check(run, learning, steps)
-    ended = False
-    try:
+    with RunContext(config, folder) as run:
+        learning, steps = plan(config.stage, run.learning_stages)
+        if learning and run.is_trial:
+            steps = ()  # nothing of it is worth a score or a video
+        with shortage_in_words(config.stage, run.device, None):  # of networks that are too wide
+            _check(run, learning, steps)
         if learning:
             if run.leads:
                 _prepare_to_learn(run, learning, steps)
             _learn(run, learning)
-        if not learning or run.leads:
-            for name in steps:
-                if not (learning and done(run, name)):
-                    _take(run, name, STEPS[name])
-        ended = True
-    finally:
-        run.close(failed=not ended)
+        for name in steps if run.leads or not learning else ():
+            if not (learning and done(run, name)):
+                _take(run, name, STEPS[name])
     scored = "evaluate" in steps and run.leads and unfinished(run) is None
     return _ended(run, steps) if scored else None
 
@@ -137,7 +133,12 @@ def _prepare_to_learn(run: RunContext, requested: Names, steps: Names) -> None:
 
 def _ended(run: RunContext, steps: Names) -> float | None:
     """The objective; a pipeline ends with its results, and what to try next."""
-    metrics = json.loads((run.folder / "metrics.json").read_text())
+    scores = run.folder / "metrics.json"
+    try:
+        metrics = json.loads(scores.read_bytes())
+        best = objective(run.config.objective, metrics)
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        raise DevrfError(f"{scores}: damaged; remove it, and the run is scored again") from None
     if steps == AFTER_LEARNING and not in_sweep():
         results = ", ".join(name for name in RESULTS if (run.folder / name).exists())
         log.info("results: %s (%s)", run.place, results)
@@ -145,7 +146,7 @@ def _ended(run: RunContext, steps: Names) -> float | None:
         if metrics.get("at_rest"):
             further[0].remove("still.time=0.35")
         say_next(*further, ["stage=report"])
-    return objective(run.config.objective, metrics)
+    return best
 
 
 def learn_beside(config: dict[str, Any], folder: Path) -> None:
@@ -206,7 +207,8 @@ def _check(run: RunContext, learning: Names, steps: Names) -> None:
     if learning or "evaluate" in steps:
         run.evaluation.check()
         check_objective(config.objective, run.evaluation.metrics)
-    if in_search() and "evaluate" not in steps:
+    # A sweeper with a direction optimises, and so needs the objective of each job.
+    if in_sweep() and "direction" in HydraConfig.get().sweeper and "evaluate" not in steps:
         raise DevrfError(
             f"stage: a search needs the objective, which stage={config.stage} does not score"
         )

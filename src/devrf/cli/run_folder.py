@@ -13,7 +13,7 @@ from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
-from omegaconf import DictConfig
+from omegaconf import DictConfig, read_write
 from omegaconf.errors import OmegaConfBaseException
 
 from devrf.cli.config import in_sweep
@@ -26,14 +26,18 @@ log = logging.getLogger(__name__)
 
 # Made in the folder before the config is checked.
 AT_FIRST = {".hydra", PLACE}
-# What is written by names that are known, and might lead elsewhere.
-WRITTEN = ("run.log", ".hydra", PLACE)
+# What is written by names that are known, and might lead elsewhere; all that is in the first four.
+WRITTEN = (".hydra", PLACE, "logs", "export", "run.log", "checkpoints", "images", "videos", "paths")
+# Why a sweep's job failed.
+FAILURE = "failure.json"
+# Stages that leave .hydra alone: they look at other runs, or are none.
+UNRECORDED = ("report", "fetch", "view")
 # Environment variables in which torchrun and SLURM number the processes that they start.
 RANKS = ("RANK", "SLURM_PROCID")
 
 
 class RunFolderLock(Callback):
-    """Hydra callback that locks the folder of a run or sweep before anything is written there.
+    """Hydra callback that locks the folder of a run before anything is written there.
 
     Hydra writes before it calls the program, which then uses this lock. Hydra ignores what a
     callback raises, except an exit: errors are reported here.
@@ -53,39 +57,32 @@ class RunFolderLock(Callback):
         with report_user_errors():
             make_folder(folder)  # as Hydra does next, with a traceback where it cannot
             refuse_links(folder)
-            if _locks(config):
+            if config.stage in UNRECORDED:
+                with read_write(config.hydra):
+                    config.hydra.output_subdir = None
+            elif not _is_worker(config):
                 lock_folder(folder, "hydra.run.dir")
-
-    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Lock the folder of a sweep; each of its jobs locks its own."""
-        with report_user_errors():
-            folder = Path(config.hydra.sweep.dir)
-            for job in [folder, *folder.glob("*/")]:
-                refuse_links(job)
-            lock_folder(folder, "hydra.sweep.dir")
-
-    def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        """Release the sweep's folder."""
-        release_folder(Path(config.hydra.sweep.dir))
 
 
 @contextmanager
-def working_in(folder: Path, config: DictConfig, key: str) -> Iterator[None]:
+def working_in(folder: Path, config: DictConfig) -> Iterator[None]:
     """While the block lasts, no other process works in a run's folder.
 
     A folder that holds no results is removed if the block ends in a user error, but not by a
-    worker: rank 0 works there. That of a sweep's job stays, for the record of its failure. ``key``
-    is the setting that chooses another folder.
+    worker: rank 0 works there, and locks for it. That of a sweep's job stays, for the record of
+    its failure, which a success removes. A report and the viewer only read, but for a camera path
+    that is written at once; stage=fetch locks where it writes.
 
     Raises:
         DevrfError: another process works there.
     """
-    if _locks(config):
-        lock_folder(folder, key)
-    alone = not in_sweep() and not _is_worker(config)
-    was_new = alone and holds_at_most(folder, AT_FIRST)
+    leads = not _is_worker(config)
+    if leads and config.stage not in UNRECORDED:
+        lock_folder(folder, "hydra.sweep.dir" if in_sweep() else "hydra.run.dir")
+    was_new = leads and not in_sweep() and holds_at_most(folder, AT_FIRST)
     try:
         yield
+        (folder / FAILURE).unlink(missing_ok=True)
     except Exception as error:
         if was_new and is_user_error(error):
             remove_if_only(folder, {*AT_FIRST, "run.log"})
@@ -101,20 +98,11 @@ def refuse_links(folder: Path) -> None:
         DevrfError: one is a link, or a pipe.
     """
     places = [folder / name for name in WRITTEN]
-    inside = (path for place in places[1:] if place.is_dir() for path in place.iterdir())
+    inside = (path for place in places[:4] if place.is_dir() for path in place.iterdir())
     for path in [*places, *inside]:
         mode = path.lstat().st_mode if os.path.lexists(path) else stat.S_IFREG
         if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
             raise DevrfError(f"{path}: a link or a pipe; remove it: devrf writes there")
-
-
-def _locks(config: DictConfig) -> bool:
-    """Whether a process needs the lock: rank 0 locks for its workers.
-
-    A report and the viewer only read, but for a camera path that is written at once; stage=fetch
-    locks where it writes.
-    """
-    return config.stage not in ("report", "fetch", "view") and not _is_worker(config)
 
 
 def _is_worker(config: DictConfig) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import logging
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
@@ -17,21 +18,23 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from devrf.cli.config import choices, overrides
+from devrf.cli.config import choices, overrides, scene_name
 from devrf.cli.messages import is_user_error, one_line, report_user_errors
+from devrf.cli.run_folder import FAILURE, refuse_links
 from devrf.errors import DevrfError
 from devrf.system.files import remove_if_only, write_json
-from devrf.system.folder_lock import PLACE
+from devrf.system.folder_lock import PLACE, lock_folder, release_folder
 from devrf.system.process import forget_peak_memory
 
 if TYPE_CHECKING:
     from devrf.cli.context import RunContext
 
 log = logging.getLogger(__name__)
+# Its handler is the file of the log alone.
+faults = logging.getLogger("devrf.cli.failures")
 
 # The exit status of a sweep with failed jobs.
 JOBS_FAILED = 3
-FAILURE = "failure.json"
 # What the sweep's folder holds before Hydra starts the first job.
 OF_SWEEP = {"multirun.yaml", PLACE}
 
@@ -60,48 +63,36 @@ def record_failure(config: DictConfig, folder: Path) -> Iterator[None]:
         gc.collect()  # so that the next job does not start with the memory of this one
 
 
-def forget_failure(folder: Path) -> None:
-    """Remove an earlier ``failure.json`` from the folder of a run that succeeded."""
-    (folder / FAILURE).unlink(missing_ok=True)
-
-
 def _record(error: Exception, config: DictConfig, folder: Path) -> None:
     """Report why a job failed: in its folder, and in one line on stderr."""
-    user_error, where, scene = is_user_error(error), "", None
-    message = one_line(error) if user_error else f"{type(error).__name__}: {one_line(error)}"
+    message, where, scene = one_line(error), "", None
+    if not is_user_error(error):
+        message = f"{type(error).__name__}: {message}"
+        where = f"; the traceback is in {folder / 'run.log'}"
+        faults.error("the job failed", exc_info=error)
     with suppress(OmegaConfBaseException):
-        scene = str(config.scene)
+        scene = scene_name(config)
     failure = {
         "scene": scene,
         "choices": choices(),
         "overrides": overrides(),
         "seed": config.get("seed"),
         "error": message,
-        "mistake": user_error,
+        "mistake": is_user_error(error),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
     }
     write_json(folder / FAILURE, failure)
-    if not user_error:
-        # The traceback is for the job's log, not for the terminal.
-        trace = (type(error), error, error.__traceback__)
-        record = log.makeRecord(log.name, logging.ERROR, __file__, 0, "the job failed", (), trace)
-        for handler in logging.getLogger().handlers:
-            if isinstance(handler, logging.FileHandler):
-                handler.handle(record)
-        where = f"; the traceback is in {folder / 'run.log'}"
     print(f"devrf: job {folder.name}: {message}{where}", file=sys.stderr)
 
 
 class SweepMonitor(Callback):
-    """Hydra callback that names the jobs of a sweep that failed, with exit status 3.
-
-    A sweep that a user error ends before its first job leaves no folder behind.
-    """
+    """Hydra callback that has a sweep's folder to itself, and names the jobs that failed."""
 
     started: SweepMonitor | None = None
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Note what the sweep's folder holds before the first job; refuse SLURM where it is not."""
+        """Lock the sweep's folder; each job locks its own. Refuse SLURM where there is none."""
+        self.folder, self.began = Path(config.hydra.sweep.dir), time.time()
         with report_user_errors():
             missing = [name for name in ("srun", "sbatch") if which(name) is None]
             if config.hydra.launcher._target_.endswith(".SlurmLauncher") and missing:
@@ -109,44 +100,44 @@ class SweepMonitor(Callback):
                     f"hydra/launcher: no {' and no '.join(missing)} here; type the command where "
                     "SLURM takes jobs, or leave hydra/launcher out"
                 )
-        self.folder = Path(config.hydra.sweep.dir)
-        self.was_there = self.folder.exists()
-        self.earlier = self._records()
+            for folder in (self.folder, *self.folder.glob("*/")):
+                refuse_links(folder)
+            lock_folder(self.folder, "hydra.sweep.dir")
         SweepMonitor.started = self
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """End the program if jobs failed; other callbacks have ended before this one."""
         SweepMonitor.started = None
+        release_folder(self.folder)
         if self.name_failures():
             raise SystemExit(JOBS_FAILED)
 
     def name_failures(self) -> bool:
         """Print which jobs failed, if any did."""
-        failed = sorted(job for job, _ in self._records() - self.earlier)
-        if failed:
+        records = [f for f in self.folder.rglob(FAILURE) if f.stat().st_mtime >= self.began]
+        if failed := sorted(str(file.parent.relative_to(self.folder)) for file in records):
             why = f"{FAILURE} in each folder below {self.folder} says why"
             print(f"devrf: jobs failed: {', '.join(failed)}; {why}", file=sys.stderr)
         return bool(failed)
 
-    def _records(self) -> set[tuple[str, int]]:
-        """The folder of each record of a failure, and when it was written, in nanoseconds."""
-        files = self.folder.rglob(FAILURE)
-        return {(str(f.parent.relative_to(self.folder)), f.stat().st_mtime_ns) for f in files}
 
-
-def name_failures(error: Exception) -> None:
-    """Name the failed jobs of a sweep that ``error`` has ended, or remove its unused folder.
+@contextmanager
+def naming_failures() -> Iterator[None]:
+    """Name the failed jobs of a sweep that an error ends, or remove its unused folder.
 
     Raises:
         SystemExit: with status 3: a search ends so when none of its jobs was scored.
     """
-    sweep, SweepMonitor.started = SweepMonitor.started, None
-    if sweep is None:
-        return
-    if is_user_error(error) and not sweep.was_there:
-        remove_if_only(sweep.folder, OF_SWEEP)
-    if sweep.name_failures() and "No trials are completed" in str(error):
-        raise SystemExit(JOBS_FAILED) from None
+    SweepMonitor.started = None
+    try:
+        yield
+    except Exception as error:
+        if (sweep := SweepMonitor.started) is not None:
+            if is_user_error(error):
+                remove_if_only(sweep.folder, OF_SWEEP)
+            if sweep.name_failures() and "No trials are completed" in str(error):
+                raise SystemExit(JOBS_FAILED) from None
+        raise
 
 
 class SweepReport(Callback):

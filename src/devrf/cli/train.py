@@ -32,10 +32,10 @@ LIMITS |= dict.fromkeys(("max_time", "limit_train_batches", "overfit_batches"))
 
 def learn(run: RunContext, name: str) -> None:
     """Learn a stage of the protocol, or the rest of it."""
-    begin = ResumePoint({})  # of a trial
+    begin: ResumePoint | None = ResumePoint({})  # of a trial
     if not run.is_trial:
-        begin = run.strategy.broadcast(beginning(run, name) if run.leads else begin)
-    if begin.finished:
+        begin = run.strategy.broadcast(beginning(run, name) if run.leads else None)
+    if begin is None:
         return
     build, below = run.stage_builder(name), run.protocol[name].builds_on
     if below is None:

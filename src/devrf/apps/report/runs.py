@@ -62,7 +62,7 @@ def collect(folder: Path) -> Collection:
                 continue
             try:
                 record = read(json.loads(file.read_bytes()))
-            except (OSError, ValueError, LookupError, TypeError, AttributeError):
+            except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
                 skipped.append(f"{file}: skipped; it is damaged, or not as devrf writes it")
             else:
                 records[status].append({**record, "folder": name, "path": place, "status": status})
