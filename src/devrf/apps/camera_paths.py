@@ -22,18 +22,24 @@ from devrf.rendering.view import Viewable
 
 # Cameras stand all around where the widest gap between two, seen from above, is no more than this,
 # or than so many times what even spacing would leave.
-WIDEST_GAP, UNEVEN = math.radians(60), 1.5
+WIDEST_GAP = math.radians(60)
+UNEVEN = 1.5
 # The variance of cameras' own horizontals, as a share, below which their mean up counts.
 LEVEL = 0.02
 # Cameras that look the same way differ by less than 45 degrees.
 SAME_WAY = math.sqrt(0.5)
 # The way through the captured cameras: so many of them at most, and points on it; a film's order
 # is at most so many times longer than a short tour. Distances count in what cameras look at.
-MAX_STOPS, POINTS, OF_A_FILM = 300, 1000, 2.0
+MAX_STOPS = 300
+POINTS = 1000
+OF_A_FILM = 2.0
 # Tours are made shorter to the pace that leads once around in 4.4 seconds, with at least so many
 # stops; motion of under 0.3 seconds, or 1.5 stops, is smoothed, by a twelfth of the way at most.
-PACE, MIN_STOPS = 2.0, 6
-SMOOTH_SECONDS, SMOOTH_STOPS, SMOOTH_MOST = 0.3, 1.5, 1 / 12
+PACE = 2.0
+MIN_STOPS = 6
+SMOOTH_SECONDS = 0.3
+SMOOTH_STOPS = 1.5
+SMOOTH_MOST = 1 / 12
 
 # The cameras of a video, from captured ones, what they look at (3,), and settings.
 Way = Callable[[Cameras, Tensor, VideoSettings], Cameras]
@@ -49,7 +55,8 @@ def orbit(cameras: Cameras, target: Tensor, settings: VideoSettings) -> Cameras:
     They go all around where these did; else to and fro in the sector that these covered, and that
     ``video.orbit_turns`` times. Without ``video.orbit_elevation`` they are as high as these.
     """
-    offsets, up = cameras.positions - target, upward(cameras)
+    offsets = cameras.positions - target
+    up = upward(cameras)
     east = normalize(torch.linalg.cross(torch.eye(3)[int(up.abs().argmin())], up), dim=0)
     axes = torch.stack([east, torch.linalg.cross(up, east)])
     radius = float(offsets.norm(dim=1).mean())
@@ -84,7 +91,8 @@ def upward(cameras: Cameras) -> Tensor:
     It is across the horizontals of their images, which the mean of their own up is not where they
     look down from one side. It is that mean as far as horizontals are parallel.
     """
-    right, own = cameras.camera_to_world[:, :, 0], cameras.camera_to_world[:, :, 1].mean(dim=0)
+    right = cameras.camera_to_world[:, :, 0]
+    own = cameras.camera_to_world[:, :, 1].mean(dim=0)
     spread = right.T @ right / len(right) + LEVEL * torch.eye(3)
     return normalize(torch.linalg.solve(spread, own), dim=0)
 
@@ -94,7 +102,8 @@ def spiral(cameras: Cameras, target: Tensor, settings: VideoSettings) -> Cameras
 
     Where cameras look in many directions, that is the one that most of them share.
     """
-    level, alike = upward(cameras), cameras.forwards @ cameras.forwards.T
+    level = upward(cameras)
+    alike = cameras.forwards @ cameras.forwards.T
     cameras = cameras[alike[int(alike.sum(dim=1).argmax())] > SAME_WAY]
     right, up, _, middle = average_pose(cameras.camera_to_world).unbind(dim=1)
     axes = torch.stack([right, up])
@@ -156,7 +165,8 @@ def tour(apart: np.ndarray) -> list[int]:
         distances = apart[order[-1]].copy()
         distances[order] = np.inf
         order.append(int(distances.argmin()))
-    ring, closed = np.array([*order, len(apart)]), np.pad(apart.astype(float), (0, 1))
+    ring = np.array([*order, len(apart)])
+    closed = np.pad(apart.astype(float), (0, 1))
     while True:
         after = np.roll(ring, -1)
         legs = closed[ring, after]
@@ -250,7 +260,8 @@ def time_freeze(ring: Ring, stop: float, settings: VideoSettings) -> Shots:
     third = settings.frames // 3
     around = settings.frames - 2 * third
     cameras = ring(replace(settings, frames=around))
-    before, after = torch.linspace(0, stop, third + 1)[:-1], torch.linspace(stop, 1, third)
+    before = torch.linspace(0, stop, third + 1)[:-1]
+    after = torch.linspace(stop, 1, third)
     times = [*before.tolist(), *[stop] * around, *after.tolist()]
     return cameras[[0] * third + list(range(around)) + [0] * third], times
 

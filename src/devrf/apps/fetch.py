@@ -45,7 +45,8 @@ OWN = Path(__file__).with_name("catalogue.toml")
 RECORD = "fetched.json"
 ARCHIVE = "archive"
 # Images hardly expand, and camera files by ten times or so; a small archive may by more.
-MOST_EXPANSION, SMALL = 20, 2**26
+MOST_EXPANSION = 20
+SMALL = 2**26
 # The file by which a scene's folder is known, by the layout that reads it.
 MARKERS = {
     "inward": "transforms_train.json",
@@ -251,7 +252,8 @@ def _download(scene: PublishedScene, folder: Path, progress: bool) -> dict[str, 
     get = pooch.HTTPDownloader(
         progressbar=progress and scene.is_archive, headers={"User-Agent": "devrf"}
     )
-    fetched, console = {}, Console(stderr=True)
+    fetched = {}
+    console = Console(stderr=True)
     hidden = scene.is_archive or not progress
     for name in track(scene.downloads, scene.name, console=console, disable=hidden):
         try:
@@ -286,7 +288,8 @@ def _check_size(packed: zipfile.ZipFile, archive: Path, work: Path) -> None:
     Raises:
         DevrfError: it would expand far beyond that; ``work`` is removed, and the archive with it.
     """
-    size, whole = archive.stat().st_size, sum(file.file_size for file in packed.infolist())
+    size = archive.stat().st_size
+    whole = sum(file.file_size for file in packed.infolist())
     if whole > max(MOST_EXPANSION * size, SMALL):
         shutil.rmtree(work, ignore_errors=True)
         raise DevrfError(
@@ -297,7 +300,8 @@ def _check_size(packed: zipfile.ZipFile, archive: Path, work: Path) -> None:
 
 def _unpacked(scene: PublishedScene, work: Path) -> Path:
     """The folder of the archive that holds the scene's marker, without the folders around it."""
-    archive, place = work / "files" / ARCHIVE, work / "unpacked"
+    archive = work / "files" / ARCHIVE
+    place = work / "unpacked"
     shutil.rmtree(place, ignore_errors=True)
     try:
         with zipfile.ZipFile(archive) as packed:

@@ -22,7 +22,8 @@ SIZE = "data.downscale"
 # A checkpoint, and three progress files at once, each with values and Adam's two means.
 FILES = 10
 # Images are made at most so many times smaller; other values, too.
-MOST_OF_SIZE, MOST = 8, 64
+MOST_OF_SIZE = 8
+MOST = 64
 # Bytes by resource: GPU memory, host memory, disk.
 Bytes = Mapping[str, float]
 
@@ -73,7 +74,8 @@ def least_change(
             return False
 
     for key in sorted(parts, key=lambda key: (key != SIZE, -parts[key])):
-        value, values = present[key], range(0)
+        value = present[key]
+        values = range(0)
         if key == SIZE:
             values = range(value + 1, MOST_OF_SIZE * value + 1)
         elif isinstance(value, int | float):

@@ -23,9 +23,12 @@ GAP = 4
 # Longest name that fits below a small image, in characters.
 LONGEST_NAME = 30
 # Grey levels of text, and of the lines around images, most of which have a white background.
-INK, LINE = "#262626", "#c8c8c8"
+INK = "#262626"
+LINE = "#c8c8c8"
 # Text is so high for each pixel of an image's height, and between these heights, in pixels.
-TEXT, SMALLEST_TEXT, LARGEST_TEXT = 0.05, 9, 26
+TEXT = 0.05
+SMALLEST_TEXT = 9
+LARGEST_TEXT = 26
 
 
 def depth_colors(depth: Tensor, opacity: Tensor, near: float, far: float) -> Tensor:

@@ -21,12 +21,14 @@ from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.scenes.scene import Scene
 
 # Python and its libraries on the host; measured, as is what the C library keeps of freed memory.
-PROGRAM, FRAGMENTATION = 600_000_000, 1.3
+PROGRAM = 600_000_000
+FRAGMENTATION = 1.3
 # Values, gradients, Adam's two means, and the copy that a rollback returns to.
 LEARNED = 5
 # Measured around a free-standing object: the share of a ray's samples that are occupied, and of
 # these the share whose colour counts once surfaces have formed.
-OCCUPIED, COLOURED = 0.3, 0.25
+OCCUPIED = 0.3
+COLOURED = 0.25
 
 
 @dataclass(frozen=True)
@@ -150,7 +152,8 @@ def needs_of_devrf(
         "schedule.canonical.rays": schedule.rays * ray,
     }
     # Displacements of a frame: three numbers in both directions. The active one is learned.
-    frame, frames = 24 * moving.levels[-1].side ** 3, len(scene.clock)
+    frame = 24 * moving.levels[-1].side ** 3
+    frames = len(scene.clock)
     held = 1 if offloaded else frames
     in_motion = {
         images: tensor_bytes(scene.dynamic.train),

@@ -73,7 +73,8 @@ def scores_by_section(
         return {name: record.get(name) for name in TRAINING}
 
     static: dict[str, Any] = mean_scores(frames["static"])
-    sections, last = {"static": static}, metadata.stage
+    sections = {"static": static}
+    last = metadata.stage
     if rest is not None or "dynamic" not in frames:
         sections["static"] = sections[rest or last] = static | training(rest or last)
     if "dynamic" in frames:

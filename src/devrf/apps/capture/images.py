@@ -93,8 +93,10 @@ def fitted(picture: Picture, size: Size) -> Picture:
     """A picture cropped in the middle to the proportions of ``size``, and brought to it."""
     height, width = picture.shape[:2]
     scale = max(size[0] / width, size[1] / height)
-    w, h = min(width, round(size[0] / scale)), min(height, round(size[1] / scale))
-    left, top = (width - w) // 2, (height - h) // 2
+    w = min(width, round(size[0] / scale))
+    h = min(height, round(size[1] / scale))
+    left = (width - w) // 2
+    top = (height - h) // 2
     part = picture[top : top + h, left : left + w]
     if (w, h) == size:
         return part
@@ -185,7 +187,8 @@ log = logging.getLogger(__name__)
 LONGER_SIDE = 320
 # Squared distance from the background, in its variances, from which a pixel moves; and the
 # variance that a pixel has at least, in grey levels squared (compression).
-_FAR, _LEAST_VARIANCE = 25.0, 16.0
+_FAR = 25.0
+_LEAST_VARIANCE = 16.0
 # What a pixel shows for this share of the pictures is background; of less, it moves.
 _MOST_OF_THE_TIME = 0.5
 # Connected pixels that are a smaller share of the image are noise.

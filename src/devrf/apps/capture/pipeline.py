@@ -36,7 +36,8 @@ log = logging.getLogger(__name__)
 # Part of every key: a change of a step makes what was kept before foreign.
 VERSION = 1
 # Below the scene's folder: what the steps have found, and the images.
-WORK, IMAGES = "capture", "images"
+WORK = "capture"
+IMAGES = "images"
 
 
 def scene_from_footage(settings: CaptureSettings) -> Path:
@@ -165,7 +166,8 @@ def _write_images(
     filmed: dict[Path, tuple[int, int]],
 ) -> None:
     """The images, written again where anything has changed."""
-    images, file = into / IMAGES, work / "images.json"
+    images = into / IMAGES
+    file = work / "images.json"
     source = [
         [video.label, _stamp(video.path), video.positions, video.masks and _stamp(video.masks)]
         for video in footage
@@ -232,10 +234,12 @@ def _frames(
     ``taken`` are seconds of the moving camera's frames, if the scene moved before it.
     """
     place = {image.name: k for k, image in enumerate(model.images)}
-    frames, test = list[dict[str, Any]](), set[str]()
+    frames = list[dict[str, Any]]()
+    test = set[str]()
 
     def add(name: str, camera: str, time: float, held_out: bool) -> None:
-        k, path = place[camera], f"{IMAGES}/{name}"
+        k = place[camera]
+        path = f"{IMAGES}/{name}"
         lens = model.cameras[model.images[k].camera]
         pose = [*world.poses[k].tolist(), [0.0, 0.0, 0.0, 1.0]]
         frames.append({"file_path": path, "time": time, **lens, "transform_matrix": pose})
@@ -245,7 +249,8 @@ def _frames(
     named = zip(moving.positions, moving.names, strict=True)
     known = [(position, name) for position, name in named if name in place]
     _, held_out = every_nth(len(known), settings.holdout)
-    first, last = known[0][0], known[-1][0]
+    first = known[0][0]
+    last = known[-1][0]
     for k, (position, name) in enumerate(known):
         time = 0.0
         if taken is not None:

@@ -72,13 +72,16 @@ def reconstruct(
     library: Any = importlib.import_module("pycolmap")
     library.logging.minloglevel = 3
     library.set_random_seed(0)
-    base, models, listed = work / "matches.db", work / "models", work / "pairs.txt"
+    base = work / "matches.db"
+    models = work / "models"
+    listed = work / "pairs.txt"
     base.unlink(missing_ok=True)
     shutil.rmtree(models, ignore_errors=True)
     models.mkdir(parents=True)
     names = [*dict.fromkeys([*moving.names, *fixed])]
     log.info("structure from motion: features of %d images", len(names))
-    modes, on_host = library.CameraMode, {"device": library.Device.cpu}
+    modes = library.CameraMode
+    on_host = {"device": library.Device.cpu}
     library.extract_features(
         base,
         images,

@@ -64,7 +64,9 @@ def survey(path: Path, frames: Iterable[tuple[float, Picture]] | None = None) ->
             several sizes.
     """
     size: tuple[int, int] | None = None
-    times, sharp, motion = list[float](), list[float](), list[float]()
+    times = list[float]()
+    sharp = list[float]()
+    motion = list[float]()
     before: Grey | None = None
     for time, picture in frames or pictures(path):
         height, width = picture.shape[:2]

@@ -92,9 +92,12 @@ class UpFrame:
             mean = cameras.camera_to_world[:, :, 1].mean(dim=0)
             axis = int(mean.abs().argmax())
             up = cast(Up, "-" * bool(mean[axis] < 0) + "xyz"[axis])
-        axis, sign = "xyz".index(up[-1]), -1.0 if up.startswith("-") else 1.0
-        x, y = torch.zeros(3), torch.zeros(3)
-        x[1 if axis == 0 else 0], y[axis] = 1.0, sign
+        axis = "xyz".index(up[-1])
+        sign = -1.0 if up.startswith("-") else 1.0
+        x = torch.zeros(3)
+        y = torch.zeros(3)
+        x[1 if axis == 0 else 0] = 1.0
+        y[axis] = sign
         return cls(torch.stack([x, y, torch.linalg.cross(x, y)]), metres, up)
 
     def points(self, points: Tensor) -> Tensor:
@@ -103,7 +106,8 @@ class UpFrame:
 
     def pose(self, camera: Cameras) -> Tensor:
         """Camera-to-frame (4, 4) float64 of one camera of the world, OpenGL axes."""
-        pose, whole = camera.camera_to_world[0], torch.eye(4, dtype=torch.float64)
+        pose = camera.camera_to_world[0]
+        whole = torch.eye(4, dtype=torch.float64)
         whole[:3, :3] = self.rotation @ pose[:, :3]
         whole[:3, 3] = self.points(pose[:, 3])
         return whole
@@ -142,7 +146,8 @@ class MovingMesh:
 
 def carried(surface: Surface, model: Renderable, times: Sequence[float]) -> MovingMesh:
     """A surface at rest, carried through time: each canonical vertex q goes to x(q, t)."""
-    points, moved = surface.points.to(model.device), []
+    points = surface.points.to(model.device)
+    moved = []
     for time in times:
         forward = model.forward_map(time)
         assert forward is not None  # who has a surface to export has it
@@ -156,7 +161,8 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     They point to where faces are counter-clockwise from; along z where all faces around are empty.
     """
     a, b, c = vertices[faces].unbind(dim=1)
-    across, normals = torch.linalg.cross(b - a, c - a), torch.zeros_like(vertices)
+    across = torch.linalg.cross(b - a, c - a)
+    normals = torch.zeros_like(vertices)
     for corner in range(3):
         normals.index_add_(0, faces[:, corner], across)
     lengths = normals.norm(dim=1, keepdim=True)
@@ -166,7 +172,8 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
 # Cameras that look at the scene, at most.
 CAMERAS = 24
 # Rows of the images that tell how much of them is filled, and of the largest ones.
-FIRST, LARGEST = 24, 2048
+FIRST = 24
+LARGEST = 2048
 # So many more pixels than the share that is filled asks for.
 SPARE = 1.3
 
@@ -191,7 +198,8 @@ def _seen(
     renderer: Renderer, cameras: Cameras, time: float, background: float
 ) -> tuple[Tensor, Tensor]:
     """As :func:`seen_points`, of all pixels of the cameras."""
-    points, colors = [], []
+    points = []
+    colors = []
     for camera in range(len(cameras)):
         rays = cameras.image_rays(camera)
         image = renderer.picture(rays, time, background)

@@ -22,12 +22,17 @@ from devrf.geometry.cameras import Cameras
 from devrf.system.files import atomic_write
 
 # Component types and buffer targets of the standard.
-FLOAT, UNSIGNED_INT, UNSIGNED_SHORT = 5126, 5125, 5123
+FLOAT = 5126
+UNSIGNED_INT = 5125
+UNSIGNED_SHORT = 5123
 TYPES = {np.dtype("f4"): FLOAT, np.dtype("u4"): UNSIGNED_INT, np.dtype("u2"): UNSIGNED_SHORT}
-VERTICES, INDICES = 34962, 34963
+VERTICES = 34962
+INDICES = 34963
 KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 # Chunks of the container, and its name.
-JSON, BIN, MAGIC = 0x4E4F534A, 0x004E4942, 0x46546C67
+JSON = 0x4E4F534A
+BIN = 0x004E4942
+MAGIC = 0x46546C67
 # What a camera shows begins at this share of the scene's size.
 NEAREST = 1e-3
 

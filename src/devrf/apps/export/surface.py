@@ -53,7 +53,8 @@ def isosurface(model: Renderable, outside: Tensor, threshold: float, side: int |
     from skimage import measure  # an extra
 
     field = _field(model)
-    box, shape = field.box, field.shape
+    box = field.box
+    shape = field.shape
     if side is not None:
         x, y, z = (max(2, round(edge / box.longest * (side - 1)) + 1) for edge in box.size)
         shape = x, y, z
@@ -75,14 +76,16 @@ def isosurface(model: Renderable, outside: Tensor, threshold: float, side: int |
     hidden = empty & ~_reached(empty, box, outside)
     values[hidden] = 2 * abs(level) + values.max()
     vertices, faces, _, _ = measure.marching_cubes(values, level, gradient_direction="ascent")
-    low, size = np.array(box.low), np.array(box.size)
+    low = np.array(box.low)
+    size = np.array(box.size)
     points = low + vertices * (size / (np.array(shape) - 1))
     return points.astype(np.float32), faces.astype(np.int64)
 
 
 def entries(model: Renderable, cameras: Cameras) -> Tensor:
     """Points (K, 3) in the fields' space at which rays of the cameras begin to be sampled."""
-    space, box = model.space, _field(model).box
+    space = model.space
+    box = _field(model).box
     cameras = cameras.resized(ENTRIES, ENTRIES)
     points = []
     for camera in range(len(cameras)):
@@ -131,7 +134,8 @@ def canonical_surface(model: Renderable, cameras: Cameras, settings: ExportSetti
     """
     import trimesh  # an extra
 
-    space, outside = model.space, entries(model, cameras)
+    space = model.space
+    outside = entries(model, cameras)
     points, faces = isosurface(model, outside, settings.threshold, settings.side)
     mesh = trimesh.Trimesh(points, faces, process=False)
     # Unbounded spaces reach to infinity: of a face all vertices have to be near enough.
@@ -158,7 +162,8 @@ def canonical_surface(model: Renderable, cameras: Cameras, settings: ExportSetti
 
 def _mirrors(space: Space, box: Box) -> bool:
     """Whether the way to the world turns right-handed axes into left-handed ones."""
-    corner, steps = torch.tensor(box.middle), torch.diag(torch.tensor(box.size) / 100)
+    corner = torch.tensor(box.middle)
+    steps = torch.diag(torch.tensor(box.size) / 100)
     way = space.to_world(corner + steps) - space.to_world(corner)
     return bool(torch.linalg.det(way / way.norm(dim=1, keepdim=True)) < 0)
 
@@ -166,11 +171,14 @@ def _mirrors(space: Space, box: Box) -> bool:
 # Vertices whose colour is found at once.
 VERTICES = 2**13
 # Where a ray begins and ends, in voxels behind the vertex, and how far its samples are apart.
-BEFORE, BEHIND, STEP = -1.0, 3.0, 0.25
+BEFORE = -1.0
+BEHIND = 3.0
+STEP = 0.25
 # Samples with a smaller share of what is seen are left out.
 SIGNIFICANT = 0.01
 # Directions over which colours are averaged, and the widest, in degrees off the normal.
-DIRECTIONS, WIDEST = 16, 60.0
+DIRECTIONS = 16
+WIDEST = 60.0
 
 
 def vertex_colors(
@@ -202,9 +210,13 @@ def _seen(
     weight = torch.exp(depth - depth.cumsum(dim=1)) * -torch.expm1(-depth)
     weight = weight / weight.sum(dim=1, keepdim=True).clamp(min=1e-9)
     vertex, sample = (weight > SIGNIFICANT).nonzero(as_tuple=True)
-    share, where = weight[vertex, sample, None], samples[vertex, sample]
-    field, device, frames = _field(model), model.device, _frames(normals)
-    colors, total = torch.zeros_like(points), toward_eyes[:, 2].sum()
+    share = weight[vertex, sample, None]
+    where = samples[vertex, sample]
+    field = _field(model)
+    device = model.device
+    frames = _frames(normals)
+    colors = torch.zeros_like(points)
+    total = toward_eyes[:, 2].sum()
     for direction in toward_eyes:
         viewdirs = -(frames @ direction)
         color = field.color(where.to(device), viewdirs[vertex].to(device)).cpu()

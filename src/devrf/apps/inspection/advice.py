@@ -104,7 +104,8 @@ def _twins(test: Views, train: Views, middle: Tensor) -> list[str]:
     ends = torch.searchsorted(along(train)[order], places)
     names = []
     for k, (start, stop) in enumerate(ends.tolist()):
-        pose, some = test.cameras.camera_to_world[k], order[start:stop]
+        pose = test.cameras.camera_to_world[k]
+        some = order[start:stop]
         turned = (poses[some, :, :3] - pose[:, :3]).abs().amax(dim=(1, 2))
         moved = (poses[some, :, 3] - pose[:, 3]).norm(dim=1) / reach
         apart = (train.times[some] - test.times[k]).abs()
@@ -114,7 +115,8 @@ def _twins(test: Views, train: Views, middle: Tensor) -> list[str]:
 
 
 def _box_unknown(scene: Scene) -> Iterator[Advice]:
-    views, box = scene.static.train, scene.bounds.box
+    views = scene.static.train
+    box = scene.bounds.box
     if scene.kind != "inward" or not scene.space.is_linear or views.has_alpha:
         return
     try:
@@ -168,7 +170,8 @@ def _images(scene: Scene) -> Iterator[Advice]:
         return (project(views, torch.arange(len(views)), middle)[1][:, 0] <= 0).tolist()
 
     def beside(views: Views) -> list[bool]:
-        coarse, whole = points[::4, ::4, ::4].reshape(-1, 3), points.reshape(-1, 3)
+        coarse = points[::4, ::4, ::4].reshape(-1, 3)
+        whole = points.reshape(-1, 3)
         seen = sees(views, torch.arange(len(views)), coarse) | torch.tensor(away(views))
         for k in (~seen).nonzero()[:, 0]:
             seen[k] = sees(views, k[None], whole)[0]
@@ -263,7 +266,8 @@ def _masks(scene: Scene) -> Iterator[Advice]:
 def _times(scene: Scene) -> Iterator[Advice]:
     if not scene.moves:
         return
-    views, clock = scene.dynamic.train, scene.clock
+    views = scene.dynamic.train
+    clock = scene.clock
     first = float(views.times.min())
     if first > FrameClock.TOLERANCE:
         yield Advice(
@@ -275,7 +279,8 @@ def _times(scene: Scene) -> Iterator[Advice]:
     numbers = set(views.view.tolist())
     if len(numbers) == len(views):
         return  # a moving camera: each image is a view of its own
-    seen, fewer = defaultdict[int, set[int]](set), []
+    seen = defaultdict[int, set[int]](set)
+    fewer = []
     for frame, number in zip(
         clock.frames_of(views.times).tolist(), views.view.tolist(), strict=True
     ):
@@ -304,7 +309,8 @@ def _one_camera(scene: Scene) -> Iterator[Advice]:
 
 
 def _flow(scene: Scene) -> Iterator[Advice]:
-    views, flow = scene.dynamic.train, scene.dynamic.train.flow
+    views = scene.dynamic.train
+    flow = scene.dynamic.train.flow
     longest = max(views.width, views.height)
     if flow is None:
         length = 0.0 if views.by_moving_camera else _frame_to_frame(views)
@@ -315,9 +321,12 @@ def _flow(scene: Scene) -> Iterator[Advice]:
                 "film more frames a second, or try data.flow=dis, which estimates it",
             )
         return
-    long, broken, covered = [], [], []
+    long = []
+    broken = []
+    covered = []
     for k, _ in frame_pairs(views):
-        vectors, valid = flow.vectors[k], flow.valid[k]
+        vectors = flow.vectors[k]
+        valid = flow.valid[k]
         inside = views.pixels[k, ..., 3] > OPAQUE if views.has_alpha else torch.ones_like(valid)
         covered.append(float((valid & inside).sum()) / max(int(inside.sum()), 1))
         length = vectors[valid].norm(dim=-1)
@@ -333,10 +342,8 @@ def _flow(scene: Scene) -> Iterator[Advice]:
             "or set data.flow=dis or data.flow=none",
         )
     if broken:
-        problem, remedy = (
-            "valid where it is not a number",
-            "mask these pixels, or set data.flow=none",
-        )
+        problem = "valid where it is not a number"
+        remedy = "mask these pixels, or set data.flow=none"
         yield Advice(f"flow of {listed(broken)}", problem, remedy)
     share = sum(covered) / max(len(covered), 1)
     if covered and share < MIN_FLOW:
@@ -350,7 +357,8 @@ def _flow(scene: Scene) -> Iterator[Advice]:
 
 def _frame_to_frame(views: Views) -> float:
     """How far parts move between two frames, in pixels: of a few pairs, the 99th percentile."""
-    longest, between = 0.0, estimator("dis")
+    longest = 0.0
+    between = estimator("dis")
     pairs = frame_pairs(views)
     for image, earlier in (pairs[k] for k in evenly(len(pairs), SAMPLED_PAIRS)):
         vectors, valid = flow_between(views, image, earlier, between)

@@ -41,7 +41,8 @@ ABLATIONS = {
     "without_crop": "Ours w/o crop",
     "without_last_level": "Ours w/o last level",
 }
-CHOICES, SETTINGS = "run.choices.", "run.settings."
+CHOICES = "run.choices."
+SETTINGS = "run.settings."
 IGNORED = {"objective", "seed", "stage", "method"}
 # Without an experiment a run has the config of this one.
 DEFAULT_EXPERIMENT = "quickstart"
@@ -75,7 +76,8 @@ def labelled(runs: pd.DataFrame) -> pd.DataFrame:
     the number of views; ``views``, the number of dynamic training views (NaN where unknown);
     ``kind``, the same for runs of alike scenes with the same names and typed settings.
     """
-    names, settings = _names(runs), _settings(runs)
+    names = _names(runs)
+    settings = _settings(runs)
     settings.pop("schedule.seconds", None)  # said by the scene's title
     typed = _typed(settings, runs)
     scenes = runs["scene"].where(~runs["at_rest"].eq(True), runs["scene"] + " (at rest)")
@@ -153,7 +155,8 @@ def _distinguishing(
 
 def _methods(runs: pd.DataFrame) -> list[str]:
     """What methods and ablations are called; of a scene at rest no ablation is."""
-    names, ablations = [], _options(runs, "ablation")
+    names = []
+    ablations = _options(runs, "ablation")
     for method, ablation, at_rest in zip(runs["method"], ablations, runs["at_rest"], strict=True):
         name = METHODS.get(method, method)
         if at_rest is not True and method == DEFAULT_METHOD and ablation in ABLATIONS:

@@ -27,11 +27,14 @@ COLORS = (
     "#4B0096 #96D21E #FF0069 #69001E #D200A5 #A587FF #0F3C00 #4B1E5A "
     "#00E178 #FFB496 #B4C369 #1E870F #D25A5A #006969 #5AD2D2 #D2001E"
 ).split()
-DASHES, ALIKE = ("-", "--", ":", "-."), 8
+DASHES = ("-", "--", ":", "-.")
+ALIKE = 8
 POINTS = "osD^"
 # Inches of a line of the legend: the figure grows by it, so that curves keep their room.
-LEGEND_LINE, MOST_COLUMNS = 0.19, 8
-PUBLISHED, GREY = ", published", "#9a9a9a"
+LEGEND_LINE = 0.19
+MOST_COLUMNS = 8
+PUBLISHED = ", published"
+GREY = "#9a9a9a"
 STYLE: dict[Any, Any] = {
     "figure.dpi": 160,
     "font.size": 9,
@@ -142,13 +145,15 @@ def against_budget(table: Table, place: str) -> Figure | None:
         return None
     columns = [column for column in (PSNR, SSIM, LPIPS) if runs[column.title].notna().any()]
     figure = Figure(figsize=(0.8 + 3.3 * len(columns), 4.0), layout="constrained")
-    methods, labels = list(runs["method"].unique()), runs.groupby("method")["label"].unique()
+    methods = list(runs["method"].unique())
+    labels = runs.groupby("method")["label"].unique()
     for axes, column in zip(
         figure.subplots(1, len(columns), squeeze=False)[0], columns, strict=True
     ):
         for (method, label), row in runs.groupby(["method", "label"], sort=False):
             values = row.groupby("budget")[column.title]
-            means, spread = values.mean(), values.std().fillna(0.0)
+            means = values.mean()
+            spread = values.std().fillna(0.0)
             dashes = DASHES[list(labels[method]).index(label) % len(DASHES)]
             look: dict[str, Any] = {"color": COLORS[methods.index(method)], "linestyle": dashes}
             look |= {"linewidth": 2.8 if method == DEFAULT_METHOD else 1.4, "marker": "o"}
@@ -259,9 +264,12 @@ def _legend(figure: Figure) -> None:
         legend.remove()
 
 
-BATCHES, MEAN, PREVIEWS = "#9ec9e6", "#0072b2", "#d55e00"
+BATCHES = "#9ec9e6"
+MEAN = "#0072b2"
+PREVIEWS = "#d55e00"
 # The running mean is over so large a part of the curve; more labels of grids would overlap.
-WINDOW, MOST_GRIDS = 1 / 25, 8
+WINDOW = 1 / 25
+MOST_GRIDS = 8
 
 
 @mpl.rc_context(STYLE)

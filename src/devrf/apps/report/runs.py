@@ -19,7 +19,8 @@ COLUMNS = (
     *("train_seconds", "peak_gpu_gb", "dynamic.psnr", "dynamic.ssim", "dynamic.lpips"),
     *("run.device", "run.overrides", "run.seed", "run.checkpoint", "run.date", "path"),
 )
-DEFAULT_METHOD, DEFAULT_PROTOCOL = "devrf", "two_stage"
+DEFAULT_METHOD = "devrf"
+DEFAULT_PROTOCOL = "two_stage"
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,8 @@ def collect(folder: Path) -> Collection:
                 skipped.append(f"{file}: skipped; it is damaged, or not as devrf writes it")
             else:
                 records[status].append({**record, "folder": name, "path": place, "status": status})
-    runs, failures = _frame(records["finished"]), _frame(records["failed"])
+    runs = _frame(records["finished"])
+    failures = _frame(records["failed"])
     return Collection(folder, runs, failures, tuple(skipped))
 
 
@@ -96,13 +98,15 @@ def _natural(name: str) -> tuple[int, int, str]:
 
 
 def _finished(metrics: dict[str, Any]) -> dict[str, Any]:
-    at_rest, static = metrics.get("at_rest", False), metrics.get("static", {})
+    at_rest = metrics.get("at_rest", False)
+    static = metrics.get("static", {})
     # Other protocols may have no stage of their own for the static capture.
     stages = [] if at_rest else [metrics.get("dynamic", {})]
     if at_rest or static.get("seconds") is not None or metrics["protocol"] == DEFAULT_PROTOCOL:
         stages.append(static)
     frame = pd.DataFrame(stages, columns=["seconds", "peak_gpu_gb"], dtype=object).map(number)
-    seconds, memory = frame["seconds"].sum(skipna=False), frame["peak_gpu_gb"].max(skipna=False)
+    seconds = frame["seconds"].sum(skipna=False)
+    memory = frame["peak_gpu_gb"].max(skipna=False)
     head = {key: metrics[key] for key in ("scene", "method")}
     return metrics | head | {"at_rest": at_rest, "train_seconds": seconds, "peak_gpu_gb": memory}
 

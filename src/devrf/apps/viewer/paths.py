@@ -30,7 +30,8 @@ from devrf.geometry.cameras import Cameras
 from devrf.rendering.view import Viewable
 
 # Keyframes of a known path, and the seconds that it takes to go round.
-KEYFRAMES, SECONDS = 13, 8.0
+KEYFRAMES = 13
+SECONDS = 8.0
 # Points of the line that shows a path.
 POINTS = 120
 # Known paths of scenes that move.
@@ -42,7 +43,8 @@ Act = Callable[[viser.GuiEvent[Any]], None]
 
 def known_paths(cameras: Cameras, model: Callable[[], Viewable]) -> dict[str, Preset]:
     """The paths that ``video.path`` names, with the time, from the static ``cameras``."""
-    once, longer = VideoSettings(frames=KEYFRAMES), VideoSettings(frames=3 * KEYFRAMES)
+    once = VideoSettings(frames=KEYFRAMES)
+    longer = VideoSettings(frames=3 * KEYFRAMES)
     times = torch.linspace(0, 1, KEYFRAMES).tolist()
 
     def filmed(name: str, video: VideoSettings) -> Cameras:
@@ -92,8 +94,12 @@ class PathPanel:
         path appears in the scene, or vanishes.
         """
         self.keyframes: tuple[Keyframe, ...] = ()
-        self._server, self._folder, self._run, self._height = server, folder, run, height
-        self._time, self._changed = time, changed
+        self._server = server
+        self._folder = folder
+        self._run = run
+        self._height = height
+        self._time = time
+        self._changed = changed
         self._line: viser.LineSegmentsHandle | None = None
         gui = server.gui
         with gui.add_folder("Video", expand_by_default=False):
