@@ -156,7 +156,8 @@ def _by_camera(views: Views) -> list[Views]:
 def _check_times(views: list[Views]) -> None:
     frames = len(views[-1])
     # Times are not written, but counted.
-    expected, near = torch.arange(frames) / (frames - 1), FrameClock.TOLERANCE
+    expected = torch.arange(frames) / (frames - 1)
+    near = FrameClock.TOLERANCE
     for view in views:
         if len(view) != frames or bool(((view.times - expected).abs() > near).any()):
             raise scene_error(

@@ -127,7 +127,8 @@ def stacked_flow(
         flow, mask = read_flow_file(files[row], *source_size)
         if size != source_size:
             flow, mask = shrink_flow(flow, mask, width, height)
-        vectors[row], valid[row] = flow, mask
+        vectors[row] = flow
+        valid[row] = mask
 
     in_threads(fill, files, source_size)
     log.info(

@@ -74,7 +74,8 @@ def chosen(path: Path, positions: Sequence[int]) -> Iterator[tuple[int, Picture]
 
     DevrfError if it is no footage, or ends before the last position.
     """
-    wanted, last = set(positions), max(positions)
+    wanted = set(positions)
+    last = max(positions)
     if is_folder(path):
         files = listed_images(path)
         for position in sorted(wanted):
@@ -82,7 +83,8 @@ def chosen(path: Path, positions: Sequence[int]) -> Iterator[tuple[int, Picture]
         return
     with _opened(path) as video:
         for position in range(last + 1):
-            found, image = video.grab(), None
+            found = video.grab()
+            image = None
             if found and position in wanted:
                 found, image = video.retrieve()
             if not found:
@@ -113,7 +115,8 @@ def _frames(path: Path, video: cv2.VideoCapture) -> Iterator[tuple[float, Pictur
     rate = float(video.get(cv2.CAP_PROP_FPS))
     if not 0 < rate < 10_000:
         raise scene_error(path, f"states no frame rate; {_REMEDY}")
-    position, last = 0, -1.0
+    position = 0
+    last = -1.0
     while True:
         found, image = video.read()
         if not found:
@@ -123,7 +126,8 @@ def _frames(path: Path, video: cv2.VideoCapture) -> Iterator[tuple[float, Pictur
         if not time > last:
             time = last + 1 / rate if position else 0.0
         yield time, _rgb(image)
-        position, last = position + 1, time
+        position = position + 1
+        last = time
     if position < 2:
         raise scene_error(
             path,

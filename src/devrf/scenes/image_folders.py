@@ -124,9 +124,11 @@ def whole_factor(downscale: int | str, size_at: SizeAt) -> int:
     if isinstance(downscale, int):
         return downscale
     device = "gpu" if downscale == "auto" and torch.cuda.is_available() else downscale
-    limit, factors = LONGEST.get(device, LONGEST["cpu"]), [1 << k for k in range(10)]
+    limit = LONGEST.get(device, LONGEST["cpu"])
+    factors = [1 << k for k in range(10)]
     if match := _UP_TO.fullmatch(downscale):
-        limit, factors = sys.maxsize, list(range(int(match[1]), 0, -1))
+        limit = sys.maxsize
+        factors = list(range(int(match[1]), 0, -1))
     sizes = {factor: size for factor in factors if (size := size_at(factor)) is not None}
     if not sizes:
         return factors[0]  # the reader of the files says what is missing

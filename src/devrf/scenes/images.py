@@ -126,7 +126,8 @@ def _turn(orientation: int, stored: Size, camera: Size | None) -> tuple[int, boo
     if camera is None:
         return 1, True
     turned = stored[::-1] if orientation in QUARTER_TURNS else stored
-    as_stored, as_seen = same_shape(stored, camera), same_shape(turned, camera)
+    as_stored = same_shape(stored, camera)
+    as_seen = same_shape(turned, camera)
     if as_seen and not as_stored:
         return orientation, False
     return 1, as_seen == as_stored

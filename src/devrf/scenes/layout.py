@@ -53,7 +53,8 @@ class Layout:
 
     def size_at(self, factor: int) -> tuple[int, int]:
         """Width and height in pixels of the static images made smaller by ``factor``."""
-        transforms, first = self.static_train.transforms, int(self.static_train.index[0])
+        transforms = self.static_train.transforms
+        first = int(self.static_train.index[0])
         width, height = image_size(transforms.images[first], transforms.intrinsics[first].size)
         return width // factor, height // factor
 
@@ -77,7 +78,8 @@ class Layout:
 def static_alone(train: Transforms, test: Transforms, why: str) -> Layout:
     """The layout of a scene at rest, whose images all show one moment; ``why`` is for the log."""
     log.info("%s: %s: all images show one moment, the scene is at rest", train.file, why)
-    train_set, test_set = at_one_moment(train), at_one_moment(test)
+    train_set = at_one_moment(train)
+    test_set = at_one_moment(test)
     return Layout(train_set, test_set, train_set, test_set)
 
 

@@ -165,8 +165,10 @@ def estimate_flow(
 
 def flow_between(views: Views, image: int, other: int, between: Estimator) -> tuple[Tensor, Tensor]:
     """Flow (H, W, 2) of an image to another, in pixels, and where it is valid, (H, W) bool."""
-    now, then = _on_white(views.pixels[image]), _on_white(views.pixels[other])
-    there, back = between(now, then), between(then, now)
+    now = _on_white(views.pixels[image])
+    then = _on_white(views.pixels[other])
+    there = between(now, then)
+    back = between(then, now)
     valid = consistent(there, back)
     if views.has_alpha:
         valid &= views.pixels[image, ..., 3].cpu() > ALPHA_THRESHOLD

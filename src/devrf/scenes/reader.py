@@ -208,7 +208,8 @@ class PosedReader(InwardReader):
             box_source = source if found else scene.bounds.box_source
             bounds = replace(scene.bounds, reason=reason, box_source=box_source)
             return replace(scene, bounds=bounds)
-        name, captures = self.name_of(folder), centred(static, dynamic)
+        name = self.name_of(folder)
+        captures = centred(static, dynamic)
         if reader.near is None or reader.near <= 0:
             apart = float(captures[0].train.cameras.positions.norm(dim=1).max())
             raise scene_error(

@@ -60,7 +60,8 @@ def _weighted_by_alpha(image: Pixels, linear: Callable[[Array], Array]) -> Pixel
         # Colours behind a zero alpha are arbitrary: premultiplied, they cannot bleed in.
         values[..., :3] *= values[..., 3:]
         found = linear(values)
-        color, alpha = found[..., :3], found[..., 3:]
+        color = found[..., :3]
+        alpha = found[..., 3:]
         found[..., :3] = np.divide(color, alpha, out=np.zeros_like(color), where=alpha > 0)
     return (found + 0.5).clip(0, 255).astype(np.uint8)
 
@@ -130,7 +131,8 @@ def _pinhole_view(lens: Lens, width: int, height: int) -> tuple[Lens, Tensor] | 
     zoom = _zoom(lens, centres)
     if zoom is None:
         return None
-    (fx, fy), center = lens.focal, lens.center
+    (fx, fy) = lens.focal
+    center = lens.center
     plain = Lens((fx * zoom, fy * zoom), center)
     directions = _directions(plain, centres)
     if not bool(lens.distortion.upright(directions).all()):
@@ -152,7 +154,8 @@ def _zoom(lens: Lens, centres: Tensor) -> float | None:
 
     if seen(1.0):
         return 1.0
-    low, high = 1.0, _LONGEST
+    low = 1.0
+    high = _LONGEST
     if not seen(high):
         return None
     for _ in range(_HALVINGS):
@@ -163,18 +166,21 @@ def _zoom(lens: Lens, centres: Tensor) -> float | None:
 
 def _centres(width: int, height: int) -> Tensor:
     """(H, W, 2) float64 x, y of the pixels' centres."""
-    x, y = torch.arange(width) + 0.5, torch.arange(height) + 0.5
+    x = torch.arange(width) + 0.5
+    y = torch.arange(height) + 0.5
     return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).double()
 
 
 def _directions(pinhole: Lens, pixels: Tensor) -> Tensor:
     """(..., 2) x/z and y/z of a pinhole's ``pixels`` (..., 2)."""
-    focal, center = pixels.new_tensor(pinhole.focal), pixels.new_tensor(pinhole.center)
+    focal = pixels.new_tensor(pinhole.focal)
+    center = pixels.new_tensor(pinhole.center)
     return (pixels - center) / focal
 
 
 def _on_lens(lens: Lens, directions: Tensor) -> Tensor:
     """Pixels (..., 2) on which ``directions`` (..., 2) fall."""
     x, y = lens.distortion.distort(directions).unbind(-1)
-    (fx, fy), (cx, cy) = lens.focal, lens.center
+    (fx, fy) = lens.focal
+    (cx, cy) = lens.center
     return torch.stack([fx * x + lens.skew * y + cx, fy * y + cy], dim=-1)

@@ -206,7 +206,8 @@ class Scene:
     space: Space = WORLD
 
     def __post_init__(self) -> None:
-        clock, numbered = self.clock, dict[int, Views]()
+        clock = self.clock
+        numbered = dict[int, Views]()
 
         def with_frames(views: Views) -> Views:
             # A moving camera's images may be both captures: they stay one.
@@ -224,7 +225,8 @@ class Scene:
         The static ones alone where the others are of another size or by a moving camera, or where
         either alone have masks. An image from the place of a static one is left out.
         """
-        static, moving = self.static.train, self.dynamic.train
+        static = self.static.train
+        moving = self.dynamic.train
         alike = static.pixels.shape[1:] == moving.pixels.shape[1:]
         masked = [views.valid_mask is not None for views in (static, moving)]
         if not alike or moving.by_moving_camera or masked[0] != masked[1]:

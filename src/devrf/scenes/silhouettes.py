@@ -21,7 +21,9 @@ from devrf.scenes.scene import Views
 # NumPy for the carving: hundreds of small steps, which torch's threads only slow down.
 Array = npt.NDArray[Any]
 
-OUTSIDE, INSIDE, UNSEEN = 0, 1, 2
+OUTSIDE = 0
+INSIDE = 1
+UNSEEN = 2
 # A pixel belongs to the silhouette when at least half of it is covered.
 ALPHA_THRESHOLD = 127
 
@@ -68,12 +70,14 @@ def motion_box(views: Views, box: Box, *, resolution: int = 64, search: float = 
                 cached[number] = _pixel_index(views, image, points)
             verdict = masks[image][cached[number][left]]
             keep = verdict != OUTSIDE
-            left, seen = left[keep], seen[keep] + (verdict[keep] == INSIDE)
+            left = left[keep]
+            seen = seen[keep] + (verdict[keep] == INSIDE)
         hull[left[seen >= 2]] = True
     if not hull.any():
         return None
     held = points[torch.from_numpy(hull).to(points.device)]
-    low, high = held.amin(dim=0) - cell, held.amax(dim=0) + cell
+    low = held.amin(dim=0) - cell
+    high = held.amax(dim=0) + cell
     return Box.of(low, high).clipped(area)
 
 

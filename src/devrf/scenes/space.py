@@ -73,14 +73,17 @@ def inward_space(
         why = "data.space=world" if choice == "world" else given or masks
         where = given or "what the static cameras all see"
         return WORLD, replace(bounds, reason=why, box_source=where)
-    inner, where = box or box_from_cameras(static.cameras), given
+    inner = box or box_from_cameras(static.cameras)
+    where = given
     if box is None:
         where = "what the static cameras all see"
         motion = motion_box(dynamic, inner) if dynamic is not None and dynamic.cut_out else None
         if motion is not None:
-            inner, where = inner.union(motion), where + ", and where the silhouettes move"
+            inner = inner.union(motion)
+            where = where + ", and where the silhouettes move"
         if bound_scale != "auto":
-            inner, where = inner.scaled(float(bound_scale)), where + f" x {float(bound_scale):g}"
+            inner = inner.scaled(float(bound_scale))
+            where = where + f" x {float(bound_scale):g}"
     space = ContractedSpace(inner.low, inner.high, SHELL)
     if near is None:
         middle = static.cameras.positions.new_tensor(inner.middle)
@@ -150,7 +153,8 @@ def dynamic_only(scene: Scene) -> Scene:
     Bounds are found anew, from the dynamic training cameras alone; DevrfError if these do not
     tell.
     """
-    views, held_out = scene.dynamic.train, scene.dynamic.test
+    views = scene.dynamic.train
+    held_out = scene.dynamic.test
     at_rest = [v[(v.times == v.times.min()).nonzero()[:, 0]] for v in (views, held_out)]
     if isinstance(scene.space, NormalizedDevice):
         bounds = forward_bounds([views], scene.space, "all that the dynamic cameras see")

@@ -194,7 +194,8 @@ def normalised(model: SparseModel, facing: Facing = "auto") -> World:
 
     ``facing`` says from where the cameras look. DevrfError if points or cameras do not tell.
     """
-    poses, points = model.poses, torch.from_numpy(model.points)
+    poses = model.poses
+    points = torch.from_numpy(model.points)
     depths = torch.cat([model.depths(k) for k in range(len(model.images))])
     depths = depths[depths > 0]
     if len(depths) < LEAST_POINTS:
@@ -223,7 +224,8 @@ def widest_angle(poses: Tensor) -> float:
 
 
 def _forward(poses: Tensor, points: Tensor, near: float, far: float) -> World:
-    frame, scale = average_pose(poses), NEAREST / near
+    frame = average_pose(poses)
+    scale = NEAREST / near
     return World(*_moved(poses, points, frame, scale), "ndc", 1.0, far * scale, None)
 
 
@@ -237,7 +239,8 @@ def _inward(poses: Tensor, points: Tensor, near: float, far: float) -> World:
     frame = torch.stack([right, torch.linalg.cross(up, right), up, middle], dim=1)
     scale = AROUND / float((poses[:, :, 3] - middle).norm(dim=1).median())
     poses, points = _moved(poses, points, frame, scale)
-    near, far = 0.5 * near * scale, far * scale
+    near = 0.5 * near * scale
+    far = far * scale
     if met is not None:
         # Sparse points are on floor and walls, too: in their box the thing would have a fraction of
         # the voxels.

@@ -74,7 +74,8 @@ def distinct_poses(poses: Tensor) -> Tensor:
     entries = poses.flatten(1).double().numpy()
     # Poses that are near each other are near each other along any line: of many, few are compared.
     line = np.sqrt(np.arange(2.0, 2 + entries.shape[1]))
-    along, reach = entries @ line, near * line.sum()
+    along = entries @ line
+    reach = near * line.sum()
     order = along.argsort()
     ends = np.searchsorted(along[order], [along - reach, along + reach])
     numbers = np.full(len(entries), -1)
@@ -122,7 +123,8 @@ def in_motion(transforms: Transforms) -> Split:
     """
     order = torch.arange(len(transforms.images))
     camera = distinct_poses(transforms.poses)
-    views, fixed = int(camera.max()) + 1, stand_still(camera)
+    views = int(camera.max()) + 1
+    fixed = stand_still(camera)
     if transforms.times is not None:
         times = torch.tensor(transforms.times)
     else:

@@ -85,7 +85,8 @@ def _shortened(text: str, most: int) -> str:
 
 def reduced_size(width: int, height: int, downscale: int, where: object) -> tuple[int, int]:
     """(width, height) // downscale, or DevrfError if a side falls under 8 px."""
-    w, h = width // downscale, height // downscale
+    w = width // downscale
+    h = height // downscale
     if min(w, h) < MIN_SIDE:
         raise scene_error(
             where,

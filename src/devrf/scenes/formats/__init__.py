@@ -100,7 +100,8 @@ def _layouts(folder: Path) -> list[KnownLayout]:
 
 def _of_no_layout(folder: Path) -> str:
     """What to do about a folder of no known layout: scenes, images or videos may be around it."""
-    above, inside = folder.absolute().parent, entries(folder)
+    above = folder.absolute().parent
+    inside = entries(folder)
     if _layouts(above):
         return f"is a part of a scene; write {shlex.quote(f'data.root={above}')}"
     for path in inside:

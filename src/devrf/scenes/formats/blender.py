@@ -60,7 +60,8 @@ class BlenderReader(InwardReader):
 
     def _layout(self, root: Path) -> tuple[Layout, bool, Path]:
         """The splits, whether times were left out, and the folder where flow files would lie."""
-        static, flow_folder = root / "static", root / "train_flow"
+        static = root / "static"
+        flow_folder = root / "train_flow"
         if not os.path.isdir(static) and not dynamic_folders(root):
             layout = one_capture(*_train_and_test(root, root, self.missing), self.static_until)
         elif self.dynamic is None and not dynamic_folders(root):
@@ -92,7 +93,9 @@ class BlenderReader(InwardReader):
         if any(not known.distortion.none for known in split.transforms.intrinsics):
             log.warning("flow files in %s left out: they are of images before undistortion", folder)
             return None
-        used, first, last = int(split.index[0]), split.times.min(), split.times.max()
+        used = int(split.index[0])
+        first = split.times.min()
+        last = split.times.max()
         expected = views.times > first + 1e-6 if direction == "bwd" else views.times < last - 1e-6
         return read_flow(
             folder,
@@ -106,7 +109,8 @@ class BlenderReader(InwardReader):
 
 def _train_and_test(folder: Path, root: Path, missing: Missing) -> tuple[Transforms, Transforms]:
     """The images of a capture to learn from, and those held out."""
-    test, val = folder / "transforms_test.json", folder / "transforms_val.json"
+    test = folder / "transforms_test.json"
+    val = folder / "transforms_val.json"
     held_out = val if os.path.isfile(val) and not os.path.isfile(test) else test
     _, train = read_transforms(folder / "transforms_train.json", root, missing=missing)
     return train, read_transforms(held_out, root, missing=missing)[1]

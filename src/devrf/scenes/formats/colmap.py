@@ -104,7 +104,8 @@ class ColmapReader(PosedReader, FixedViewsReader):
         model = read_model(place)
         world = normalised(model, FACING.get(self.space, "inward"))
         camera = model.cameras[model.images[0].camera]
-        width, height = int(camera["w"]), int(camera["h"])
+        width = int(camera["w"])
+        height = int(camera["h"])
         factor = self.choose_factor(lambda factor: (width // factor, height // factor))
         source = images_of(model, folder, factor)
         layout, smaller = self._layout(folder, model, world.poses, source.path, factor)
@@ -123,7 +124,8 @@ class ColmapReader(PosedReader, FixedViewsReader):
         if len(present) < 2:
             raise scene_error(model.folder, "poses one image, expected one more to hold out")
         known = list(present)
-        used, files = tuple(lenses[k] for k in known), tuple(present.values())
+        used = tuple(lenses[k] for k in known)
+        files = tuple(present.values())
         images = Transforms(model.folder, used, files, poses[known].float(), None)
         train, test = every_nth(len(known), self.holdout, 0)
         if self.dynamic is None and not dynamic_folders(folder):
@@ -137,7 +139,8 @@ class ColmapReader(PosedReader, FixedViewsReader):
         moving_sets = fixed_views(views, model.folder, poses[posed], used, test_view)
         # What the held-out camera saw of the scene at rest is held out, too.
         unseen = {k for k, position in enumerate(known) if position == posed[test_view]}
-        train, test = [k for k in train if k not in unseen], sorted({*test, *unseen})
+        train = [k for k in train if k not in unseen]
+        test = sorted({*test, *unseen})
         rest_sets = at_rest(images[train]), at_rest(images[test])
         return Layout(*rest_sets, *moving_sets), views[0].downscale
 

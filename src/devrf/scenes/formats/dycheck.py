@@ -21,8 +21,10 @@ from devrf.scenes.validation import abbreviated, scene_error
 
 log = logging.getLogger(__name__)
 
-SPLITS, COVISIBLE = "splits", "covisible"
-TRAIN, VAL = f"{SPLITS}/train.json", f"{SPLITS}/val.json"
+SPLITS = "splits"
+COVISIBLE = "covisible"
+TRAIN = f"{SPLITS}/train.json"
+VAL = f"{SPLITS}/val.json"
 
 
 class _Split(BaseModel):
@@ -59,7 +61,8 @@ class DycheckReader(ItemsReader):
                 folder / VAL,
                 f"lists {abbreviated(both[0])}, as {TRAIN} does; list it in one of them",
             )
-        least, count = 1 if held_out else 2, len(learned)
+        least = 1 if held_out else 2
+        count = len(learned)
         if count < least:
             raise scene_error(
                 folder / TRAIN, f"lists {count} images, expected at least {least}; add some"

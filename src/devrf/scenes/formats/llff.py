@@ -88,7 +88,8 @@ class LlffReader(FixedViewsReader):
 
     def _layout(self, folder: Path) -> tuple[Layout, int, list[ViewFolder]]:
         """The splits, by what static images are made smaller, and the fixed views learned from."""
-        posed, moving = static_folder(folder), bool(dynamic_folders(folder)) or self.dynamic
+        posed = static_folder(folder)
+        moving = bool(dynamic_folders(folder)) or self.dynamic
         if moving and self.monocular:
             raise scene_error(
                 "data.monocular", f"{folder} has fixed views, so it is no video; leave it null"
@@ -105,7 +106,8 @@ class LlffReader(FixedViewsReader):
         if not moving:
             return static_alone(train, test, "there are no times"), source.downscale, []
         folder = chosen_dynamic(folder, self.dynamic)
-        views, cameras = view_folders(folder, factor), read_dynamic_poses(folder)
+        views = view_folders(folder, factor)
+        cameras = read_dynamic_poses(folder)
         count = len(views)
         if len(cameras) < count:
             raise scene_error(
@@ -134,7 +136,8 @@ class LlffReader(FixedViewsReader):
 
 def static_folder(root: Path) -> Path:
     """Where the static cameras and images are: ``static/`` or ``root`` itself; else DevrfError."""
-    static, here = root / "static", (root / POSES, root / PRECOMPUTED)
+    static = root / "static"
+    here = (root / POSES, root / PRECOMPUTED)
     if not os.path.isdir(static) and any(map(os.path.isfile, here)) and not dynamic_folders(root):
         return root
     return existing_folder(static)
@@ -144,7 +147,8 @@ def _posed_images(folder: Path, source: Path) -> Transforms:
     """All images in ``source`` with the cameras of ``poses_bounds.npy``, or NR-NeRF's file."""
     alone = os.path.isfile(folder / PRECOMPUTED) and not os.path.isfile(folder / POSES)
     read = read_precomputed_poses if alone else read_static_poses
-    posed, images = read(folder).normalised(), listed_images(source)
+    posed = read(folder).normalised()
+    images = listed_images(source)
     if len(images) != len(posed):
         raise scene_error(
             posed.file,

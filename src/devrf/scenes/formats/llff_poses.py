@@ -90,7 +90,8 @@ def read_static_poses(folder: Path) -> PosedSet:
     focal, cx, cy; or H, W, fx, fy, cx, cy; for all images. DevrfError if a file is missing or
     holds something else.
     """
-    file, inner = folder / POSES, folder / "hwf_cxcy.npy"
+    file = folder / POSES
+    inner = folder / "hwf_cxcy.npy"
     rows = read_numbers(file, "the static cameras, (N, 17) or (N, 14)")
     if rows.ndim != 2 or rows.shape[1] not in (14, 17) or len(rows) == 0:
         raise scene_error(
@@ -135,7 +136,8 @@ def read_dynamic_poses(folder: Path) -> PosedSet:
     A matrix holds axes [right, up, back], position, [H, W, focal]. DevrfError if a file is
     missing or holds something else.
     """
-    file, depths = folder / "poses.npy", folder / "bds.npy"
+    file = folder / "poses.npy"
+    depths = folder / "bds.npy"
     matrix = read_numbers(file, "the moving capture's cameras, (N, 3, 5)")
     if matrix.ndim != 3 or matrix.shape[1:] != (3, 5) or len(matrix) == 0:
         raise scene_error(file, f"has shape {matrix.shape}, expected (N, 3, 5); write it again")

@@ -69,7 +69,8 @@ def placed(
     """The scene of two captures, near and far as the options or else the world have them."""
     near = world.near if reader.near is None else reader.near
     far = world.far if reader.far is None else reader.far
-    options, cameras = replace(reader, near=near, far=far), static.train.cameras
+    options = replace(reader, near=near, far=far)
+    cameras = static.train.cameras
     wide = reader.box is None and not static.train.cut_out and 0 <= near < far
     if not wide or (reader.space != "world" and axes_do_meet(cameras)):
         return options.scene(folder, static, dynamic)
@@ -196,8 +197,10 @@ class ItemsReader(InwardReader):
                 listing, "all images to learn from, or all that are held out, are absent; add them"
             )
         cameras = [read_camera(folder, item, world) for item in ids]
-        moments, masks = self.moments(folder, ids), self.masks_of(folder, ids, images)
-        first, span = min(moments), (max(moments) - min(moments)) or 1.0
+        moments = self.moments(folder, ids)
+        masks = self.masks_of(folder, ids, images)
+        first = min(moments)
+        span = (max(moments) - min(moments)) or 1.0
         posed = Transforms(
             listing,
             tuple(intrinsics for _, intrinsics in cameras),
@@ -250,7 +253,9 @@ class NerfiesReader(ItemsReader):
         """The ids in ``dataset.json``."""
         file = folder / self.listing
         listed = read_json(file, _Dataset, "it lists the images; add it")
-        ids, train, val = listed.ids or [], listed.train_ids or [], listed.val_ids or []
+        ids = listed.ids or []
+        train = listed.train_ids or []
+        val = listed.val_ids or []
         items = ids or list(dict.fromkeys(train + val))
         position = {item: i for i, item in enumerate(items)}
         unknown = [item for item in train + val if item not in position]

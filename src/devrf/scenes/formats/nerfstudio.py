@@ -81,7 +81,8 @@ def _layout(root: Path, options: NerfstudioReader) -> Layout:
         if layout.static_train.transforms is not layout.dynamic_train.transforms:
             validation = validation[_seen_moving(validation)]
         return layout.with_validation(validation)
-    still, moving = root / "static" / FILE, root / "dynamic" / FILE
+    still = root / "static" / FILE
+    moving = root / "dynamic" / FILE
     train, test, validation = _splits(still, root, options)
     if not os.path.isfile(moving):
         layout = static_alone(train, test, f"there is no dynamic/{FILE}")
@@ -151,7 +152,8 @@ def _one_file(train: Transforms, test: Transforms, static_until: float | None) -
         return one_capture(train, test, static_until)
     still = at_zero.nonzero()[:, 0].tolist()
     still_test = (_times(test) <= TIME_TOLERANCE).nonzero()[:, 0].tolist()
-    moving, moving_test = _seen_moving(train), _seen_moving(test)
+    moving = _seen_moving(train)
+    moving_test = _seen_moving(test)
     if not moving or not moving_test:
         raise scene_error(
             train.file,
@@ -161,7 +163,8 @@ def _one_file(train: Transforms, test: Transforms, static_until: float | None) -
     rest_test = test
     if not still_test:
         log.warning("no held-out image at time 0: the static scene is tested on one in training")
-        still_test, rest_test = still[:1], train
+        still_test = still[:1]
+        rest_test = train
     log.info("%d images at time 0 are the static set of %d", len(still), len(times))
     return Layout(
         at_rest(train[still]),

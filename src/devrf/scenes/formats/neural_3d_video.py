@@ -93,7 +93,8 @@ def read_frames(
     Raises:
         DevrfError: a video is damaged, or they do not fit into memory.
     """
-    start, folder = time.perf_counter(), paths[0].parent
+    start = time.perf_counter()
+    folder = paths[0].parent
     size = reduced_size(*filmed, downscale, paths[0])
     shape = (len(frames), len(paths), size[1], size[0], 3)
     what = f"{len(frames)} frames of {len(paths)} videos at {size[0]}x{size[1]} px"
@@ -144,7 +145,8 @@ class Neural3DVideoReader(SceneReader):
     def read(self) -> Scene:
         """See :meth:`devrf.scenes.reader.SceneReader.read`."""
         folder = scene_folder(self.root)
-        posed, videos = read_static_poses(folder), camera_videos(folder)
+        posed = read_static_poses(folder)
+        videos = camera_videos(folder)
         if len(posed) != len(videos.paths):
             raise scene_error(
                 posed.file,

@@ -86,7 +86,9 @@ class Part:
         x, y, z = local
         x, y = turn(x, y, self.spin(speed, time))
         factor = math.exp(self.squash(speed, time))
-        x, y, z = x / math.sqrt(factor), y / math.sqrt(factor), z * factor
+        x = x / math.sqrt(factor)
+        y = y / math.sqrt(factor)
+        z = z * factor
         x, y = turn(x, y, self.twist(speed, time) * (z / self.along).clamp(0, 1))
         z, x = turn(z, x, self.bend(speed, time) * self._ramp(x, y, z))
         return x, y, z
@@ -97,7 +99,9 @@ class Part:
         z, x = turn(z, x, -self.bend(speed, time) * self._ramp(x, y, z))
         x, y = turn(x, y, -self.twist(speed, time) * (z / self.along).clamp(0, 1))
         factor = math.exp(self.squash(speed, time))
-        x, y, z = x * math.sqrt(factor), y * math.sqrt(factor), z / factor
+        x = x * math.sqrt(factor)
+        y = y * math.sqrt(factor)
+        z = z / factor
         x, y = turn(x, y, -self.spin(speed, time))
         return x, y, z
 

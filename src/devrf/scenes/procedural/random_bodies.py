@@ -25,10 +25,12 @@ from devrf.scenes.procedural.solids import Material, Paint, Rgb, Xyz
 
 # Bodies that are drawn for a seed at most, and the share of points inside of other parts below
 # which one is taken at once.
-TRIES, ENTERED = 12, 0.02
+TRIES = 12
+ENTERED = 0.02
 # Share of a picture that the square around a body covers, and the share of its longest edge at
 # rest that what moves most goes.
-COVERS, MOVES = (0.15, 0.7), (0.1, 0.8)
+COVERS = (0.15, 0.7)
+MOVES = (0.1, 0.8)
 # How round parts turn about themselves where texture slides.
 SPIN = Swing(1.5, 1.2, 0.0)
 TIMES = tuple(k / 12 for k in range(13))
@@ -40,13 +42,15 @@ def random_body(seed: int, speed: float = 1.0, sliding: bool = False) -> Assembl
 
     ``sliding``: round parts spin, so that their texture slides over a silhouette that stays.
     """
-    best, least = Assembled(()), math.inf
+    best = Assembled(())
+    least = math.inf
     for attempt in range(TRIES):
         draw = Random(f"{seed}/{attempt}")
         body = _fitted(_drawn(draw), draw.uniform(*COVERS), draw.uniform(*MOVES))
         entered = _entered(body)
         if entered < least:
-            best, least = body, entered
+            best = body
+            least = entered
         if least < ENTERED:
             break
     round_parts = [part.half[0] == part.half[1] and part.kind != "box" for part in best.parts]
@@ -65,7 +69,8 @@ def placed(body: Assembled, center: Xyz, reach: float) -> Assembled:
 
 def _drawn(draw: Random) -> list[Part]:
     """Four to nine parts."""
-    style, count = draw.choice(("chain", "tree", "loop")), draw.randint(4, 9)
+    style = draw.choice(("chain", "tree", "loop"))
+    count = draw.randint(4, 9)
     parts = _loop(draw) if style == "loop" else []
     bars = len(parts)
     while len(parts) < count:
@@ -78,7 +83,8 @@ def _drawn(draw: Random) -> list[Part]:
 
 def _loop(draw: Random) -> list[Part]:
     """Four equal bars on hinges that stay closed: a rhombus that opens and shuts."""
-    along, thick = draw.uniform(0.2, 0.3), draw.uniform(0.03, 0.08)
+    along = draw.uniform(0.2, 0.3)
+    thick = draw.uniform(0.03, 0.08)
     side, normal, ahead = _axes(draw, _direction(draw)).unbind(1)
     angle = draw.uniform(0.3, 0.6)
     swing = _swing(draw, 0.2, 0.4)
@@ -110,8 +116,10 @@ def _carried(draw: Random, parts: Sequence[Part], parent: int) -> Part:
         "blade": (0.45 * along, 0.03, along),
     }[kind]
     swing = _swing(draw, 0.3, 1.1)
-    slides, amount = draw.random() < 0.2, draw.uniform(0.1, 0.3)
-    lead, base = _direction(draw), torch.zeros(3, dtype=torch.float64)
+    slides = draw.random() < 0.2
+    amount = draw.uniform(0.1, 0.3)
+    lead = _direction(draw)
+    base = torch.zeros(3, dtype=torch.float64)
     if parent >= 0:
         carrier = parts[parent]
         ahead = carrier.axes[:, 2]
@@ -160,7 +168,8 @@ def _scaled(part: Part, size: float, motion: float) -> Part:
     }
     slide = replace(part.slide, amplitude=size * motion * part.slide.amplitude)
     a, b, c = part.half
-    half, base = (size * a, size * b, size * c), size * part.base
+    half = (size * a, size * b, size * c)
+    base = size * part.base
     return replace(part, half=half, base=base, slide=slide, **moving)
 
 
@@ -214,7 +223,8 @@ def _paint(draw: Random) -> Paint:
     def color() -> Rgb:
         return draw.uniform(0.05, 0.95), draw.uniform(0.05, 0.95), draw.uniform(0.05, 0.95)
 
-    base, accent = color(), color()
+    base = color()
+    accent = color()
     while math.dist(base, accent) < 0.4:
         accent = color()
     # Six pixels or more of an image of 64: finer texture would be lost in any small image.

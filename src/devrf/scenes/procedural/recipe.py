@@ -142,7 +142,8 @@ class ProceduralScene(Recipe):
         """Render everything."""
         where = extent(self.model())
         inside = self.surroundings == "room"
-        rig, surface = HAND_HELD if inside else STUDIO, self.filmed()
+        rig = HAND_HELD if inside else STUDIO
+        surface = self.filmed()
         placed: dict[str, Any] = {"width": self.width, "height": self.height}
         placed |= {"reach": where.reach, "rig": rig}
         learned, tested = static_rig(self.static_views, self.static_test_views, **placed)
@@ -189,7 +190,8 @@ HOLDOUT = 8
 NEAR = 1.0
 # Where a random body hangs, and the radius of a ball that it does not leave: it touches neither
 # wall nor floor.
-_HANGS, _STAYS_WITHIN = (0.0, 0.0, -2.6), 1.1
+_HANGS = (0.0, 0.0, -2.6)
+_STAYS_WITHIN = 1.1
 
 
 @dataclass(frozen=True)
@@ -222,7 +224,8 @@ class ProceduralForwardScene(Recipe):
         held_out = -(-self.static_views // (HOLDOUT - 1))
         static = facing_static_rig(self.static_views + held_out, **size)
         order = torch.arange(len(static))
-        learned, tested = static[order % HOLDOUT != 0], static[order % HOLDOUT == 0]
+        learned = static[order % HOLDOUT != 0]
+        tested = static[order % HOLDOUT == 0]
         watching, unseen = facing_dynamic_rig(self.train_views, **size)
         at_rest = film.at_rest(learned, tested)
         moving = film.moving(watching, unseen, self.frames, self.unseen_frames)

@@ -15,7 +15,9 @@ from torch import Tensor
 from devrf.scenes.procedural.motion import Swing, rotation
 from devrf.scenes.procedural.solids import Material, Paint, Rgb, Solid, SolidTable, Xyz
 
-X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+X = (1.0, 0.0, 0.0)
+Y = (0.0, 1.0, 0.0)
+Z = (0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
