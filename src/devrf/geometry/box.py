@@ -84,7 +84,8 @@ class Box:
         if planes is None:
             sides = [edge / self.voxel_size(voxels) for edge in self.size]
         else:
-            edge, wider = (width * height * planes / voxels) ** 0.5, aspect**0.5
+            edge = (width * height * planes / voxels) ** 0.5
+            wider = aspect**0.5
             sides = [width * wider / edge, height / wider / edge, planes]
         # 1e-6 is added so that a cube of 10^3 voxels has side 10 in spite of rounding.
         x, y, z = (max(2, int(side + 1e-6)) for side in sides)

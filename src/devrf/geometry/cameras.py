@@ -128,7 +128,8 @@ class Cameras:
 
     def pixel_grid(self) -> Tensor:
         """(H·W, 2) pixel centres x, y in row-major order."""
-        device, dtype = self.focal.device, self.focal.dtype
+        device = self.focal.device
+        dtype = self.focal.dtype
         y, x = torch.meshgrid(
             torch.arange(self.height, device=device, dtype=dtype),
             torch.arange(self.width, device=device, dtype=dtype),
@@ -141,11 +142,14 @@ class Cameras:
 
         Those of :meth:`rays`, from what columns and rows share: half the launches of a GPU.
         """
-        device, dtype = self.focal.device, self.focal.dtype
+        device = self.focal.device
+        dtype = self.focal.dtype
         columns = torch.arange(0.5, self.width, device=device, dtype=dtype)
         rows = torch.arange(0.5, self.height, device=device, dtype=dtype)
-        center, focal = self.center[camera], self.focal[camera]
-        x, y = (columns - center[0]) / focal[0], (center[1] - rows) / focal[1]
+        center = self.center[camera]
+        focal = self.focal[camera]
+        x = (columns - center[0]) / focal[0]
+        y = (center[1] - rows) / focal[1]
         right, up, backward, position = self.camera_to_world[camera].unbind(-1)
         of_row = y[:, None] * up - backward
         directions = (x[:, None] * right + of_row[:, None]).view(-1, 3)

@@ -88,9 +88,11 @@ class ContractedSpace:
     def rays(self, rays: Rays) -> Rays:
         """World rays, whose points are in contracted space (:class:`ContractedRays`)."""
         center, half = self._frame(rays.origins)
-        origin, slope = (rays.origins - center) / half, rays.directions / half
+        origin = (rays.origins - center) / half
+        slope = rays.directions / half
         axis = slope.abs().argmax(dim=-1, keepdim=True)
-        along, pace = origin.gather(1, axis), slope.gather(1, axis)
+        along = origin.gather(1, axis)
+        pace = slope.gather(1, axis)
         # How fast a ray moves sideways in the shell, if it does not lead away from the centre.
         sideways = (slope * along - origin * pace).abs().amax(dim=-1) / pace[:, 0].abs()
         stretch = (0.5 * (1 + self.shell) * sideways).clamp(min=self.shell)

@@ -71,7 +71,8 @@ class NormalizedDevice:
 
         The view directions stay those of the world.
         """
-        o, d = rays.origins, rays.directions
+        o = rays.origins
+        d = rays.directions
         start = o + d * (-(self.near + o[:, 2:]) / d[:, 2:])
         sx, sy = self.slopes
         origin = self.from_world(start)

@@ -61,7 +61,8 @@ class Rays:
         """
         d = self.directions
         d = torch.where(d.abs() < 1e-9, torch.full_like(d, 1e-9), d)
-        to_low, to_high = (low - self.origins) / d, (high - self.origins) / d
+        to_low = (low - self.origins) / d
+        to_high = (high - self.origins) / d
         entry = torch.minimum(to_low, to_high).amax(dim=-1)
         leave = torch.maximum(to_low, to_high).amin(dim=-1)
         return entry.clamp(min=near), leave.clamp(max=far)
