@@ -56,7 +56,8 @@ class SceneDataModule(LightningDataModule, ABC):
 
     def replace(self, scene: Scene) -> None:
         """Serve ``scene`` from now on, which knows more of the same images."""
-        self._scene, self._on_device = scene, {}
+        self._scene = scene
+        self._on_device = {}
 
     def prepare_data(self) -> None:
         """Read the scene in one process of several, before the others find what it has kept."""

@@ -54,7 +54,8 @@ def with_forward_flow(
         cache: an ``.npz`` beside which the estimate is kept, or None.
         files: what was read from files, if any.
     """
-    train, flow = scene.dynamic.train, files
+    train = scene.dynamic.train
+    flow = files
     if flow is None and source in ("dis", "raft"):
         if cache is not None:
             cache = cache.with_name(f"{cache.stem}_forward{cache.suffix}")
