@@ -29,7 +29,8 @@ from devrf.system.memory import OutOfMemoryError
 MODEL = "scene_model."
 # Keys of a training config for the digest of the canonical checkpoint that is built on: the run's
 # own, or a given one.
-OWN_REST, GIVEN_REST = "checkpoints/canonical.ckpt", "ckpt"
+OWN_REST = "checkpoints/canonical.ckpt"
+GIVEN_REST = "ckpt"
 # A whole number in a model's config (layers, units, samples of a ray) is at most this.
 LARGEST = 2**14
 # What is raised where parts of a file contradict each other.
@@ -38,7 +39,8 @@ UNFIT += (TypeError, AttributeError, ArithmeticError)
 # A model has no more values than its file, but for grids of few voxels that take the stored shape.
 UNSTORED = 2**16
 # Pixels along the side of an image, at most; and how much longer one side is than the other.
-SIDE, ASPECT = 2**14, 16
+SIDE = 2**14
+ASPECT = 16
 # What training took: by name, numbers, and words that say how it ran.
 TrainingFigures = dict[str, float | str | None]
 
@@ -104,7 +106,8 @@ class Viewpoints:
         train = scene.dynamic.train
         views = torch.unique(train.view) if scene.moves else ()
         first = [int((train.view == view).nonzero()[0]) for view in views]
-        static, held_out = scene.static.train.cameras, scene.dynamic.test.cameras[[0]]
+        static = scene.static.train.cameras
+        held_out = scene.dynamic.test.cameras[[0]]
         return cls(scene.background, scene.clock, static, train.cameras[first], held_out)
 
     @classmethod

@@ -40,7 +40,8 @@ def pack(grids: Tensor, keep: Tensor, *, smooth: bool) -> Packed:
         ValueError: a value that half precision cannot hold.
     """
     thin = _thinned(grids.shape[1:4])
-    details, elsewhere = [], []
+    details = []
+    elsewhere = []
     for n, stored in enumerate(grids):
         grid = stored.to(keep.device, torch.float32)
         if float(grid.abs().amax()) > torch.finfo(torch.float16).max:
@@ -71,8 +72,10 @@ def unpack(
         OutOfMemoryError: the grids take more than is free.
     """
     x, y, z = (int(points) for points in packed["shape"])
-    shape, voxels = (x, y, z), x * y * z
-    elsewhere, stored = packed["elsewhere"].to(device, torch.float32), packed["keep"]
+    shape = (x, y, z)
+    voxels = x * y * z
+    elsewhere = packed["elsewhere"].to(device, torch.float32)
+    stored = packed["keep"]
     masks, bits = stored.shape
     if min(shape) < 1 or bits != math.ceil(voxels / 8) or masks not in (1, len(elsewhere)):
         raise ValueError("masks of other voxels than the grids have")
@@ -141,7 +144,8 @@ class StoredShape(nn.Module):
         self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
     ) -> None:
         for name in self.resizable:
-            stored, current = state_dict.get(prefix + name), getattr(self, name)
+            stored = state_dict.get(prefix + name)
+            current = getattr(self, name)
             if stored is not None and stored.shape != current.shape:
                 empty = current.new_empty(stored.shape)
                 setattr(self, name, nn.Parameter(empty) if name in self._parameters else empty)
