@@ -102,7 +102,8 @@ class DeformableField(NeuralField):
         """What samples of rays come to in a radiance field."""
         if not self.space.is_linear:
             samples = samples.unbounded()
-        points, when = self.placement.normalised(samples.points), time.index_select(0, samples.ray)
+        points = self.placement.normalised(samples.points)
+        when = time.index_select(0, samples.ray)
         canonical, ambient = self.deform(points, when)
         density, color = field(canonical, rays.viewdirs, samples.ray, ambient)
         scaled = samples.scaled(self.placement.half_edge)
@@ -113,10 +114,12 @@ class DeformableField(NeuralField):
         self, rays: Rays, time: Tensor, background: Tensor, *, jitter: bool
     ) -> tuple[RaySamples, RenderOutput | None]:
         """Even samples, and more where these have weight; what a learning coarse field sees."""
-        s, field = self.settings, self.coarse or self.canonical
+        s = self.settings
+        field = self.coarse or self.canonical
         near, far = limits(rays, self.box, self.depth_limits)
         distance = stratified(near, far, s.coarse, jitter=jitter)
-        first, output = flattened(rays, distance, far), None
+        first = flattened(rays, distance, far)
+        output = None
         if self.coarse is not None and jitter:
             output = self._rendered(field, first, rays, time, background)
             weight = output.extras["weight"].detach()
@@ -130,7 +133,8 @@ class DeformableField(NeuralField):
     @torch.no_grad()
     def _weights(self, field: RadianceField, samples: RaySamples, time: Tensor) -> Tensor:
         """Weights (S,) of samples, from their densities alone."""
-        points, when = self.placement.normalised(samples.points), time.index_select(0, samples.ray)
+        points = self.placement.normalised(samples.points)
+        when = time.index_select(0, samples.ray)
         density = field.sigma(*self.deform(points, when))
         length = samples.length / self.placement.half_edge
         weight, _ = composite(density * length, samples.ray, samples.rays)

@@ -186,7 +186,8 @@ class RadianceField(nn.Module):
 
     def reduced(self) -> AbstractContextManager[None]:
         """Where the field computes in bfloat16 while it learns, if its settings say so."""
-        chosen, device = self._settings.precision, self.density.weight.device
+        chosen = self._settings.precision
+        device = self.density.weight.device
         reduced = multiplies_bfloat16(device) if chosen == "auto" else chosen == "bfloat16"
         if not (reduced and self.training):
             return nullcontext()
@@ -208,7 +209,8 @@ class RadianceField(nn.Module):
         """
         with self.reduced():
             raw, logits, _ = self.heads(points, viewdirs, ray, ambient)
-            density, color = self._activated(raw), torch.sigmoid(logits)
+            density = self._activated(raw)
+            color = torch.sigmoid(logits)
         return density.float(), color.float()
 
     def sigma(self, points: Tensor, ambient: Tensor | None = None) -> Tensor:

@@ -19,7 +19,11 @@ from devrf.scenes.silhouettes import visual_hull
 # A cell is empty below LEAST of opacity a step: what it is at a random place and time, or DECAY
 # of what it was. EVERY so many iterations a SHARE of all cells is looked at anew; the first time
 # all of them, at FIRST times.
-LEAST, DECAY, EVERY, SHARE, FIRST = 0.01, 0.9, 16, 0.5, 4
+LEAST = 0.01
+DECAY = 0.9
+EVERY = 16
+SHARE = 0.5
+FIRST = 4
 # Points that a field is asked for at once.
 CHUNK = 1 << 18
 
@@ -74,8 +78,10 @@ class LearnedOccupancy(StoredShape):
             return
         if step == 0:
             self.opacity.fill_(1)
-        start, previous = round(share * total), (step if self._step is None else self._step)
-        self._step, previous = step, min(previous, step - 1)
+        start = round(share * total)
+        previous = step if self._step is None else self._step
+        self._step = step
+        previous = min(previous, step - 1)
         if step < start or step // EVERY == previous // EVERY:
             return
         flat = self.opacity.view(-1)

@@ -23,7 +23,8 @@ from devrf.rendering.output import RenderedImage, RenderOutput
 from devrf.scenes.scene import Scene
 
 # Rays of a view that are rendered at once, on a CPU and on a GPU.
-ON_CPU, ON_GPU = 2048, 2**14
+ON_CPU = 2048
+ON_GPU = 2**14
 
 
 class PlacedModel(RayTrainable):
@@ -54,7 +55,9 @@ class PlacedModel(RayTrainable):
 
     def set_place(self, box: Box, space: Space, depths: tuple[float, float]) -> None:
         """Take the box, the fields' space, and the distances between which rays are sampled."""
-        self.box, self.space, self.depth_limits = box, space, depths
+        self.box = box
+        self.space = space
+        self.depth_limits = depths
         self.placement = Placement(box, space)
 
     def set_times(self, times: tuple[float, ...]) -> None:
@@ -94,7 +97,8 @@ class NeuralField(PlacedModel):
 
     def setup(self, scene: Scene) -> None:
         """Take the scene's bounds and times; carve the frames' occupancy from their alpha masks."""
-        bounds, s = scene.bounds, self.settings
+        bounds = scene.bounds
+        s = self.settings
         self.set_place(bounds.whole, scene.space, (bounds.near, bounds.far))
         self.set_times(scene.clock.times)
         if s.sampling == "occupancy":
@@ -174,7 +178,8 @@ class RayView:
             half: networks in half precision, on a CUDA device.
         """
         on_gpu = model.device.type == "cuda"
-        self._render_rays, self._time = render_rays, time
+        self._render_rays = render_rays
+        self._time = time
         self._half = half and on_gpu
         self.at_rest = model.clock.at(time).after == 0
         self.chunk = ON_GPU if on_gpu else ON_CPU

@@ -89,7 +89,8 @@ def accumulated(
         transmittance: (R,) T_end.
         background: (3,) or (R, 3) RGB.
     """
-    ray, rays = samples.ray, samples.rays
+    ray = samples.ray
+    rays = samples.rays
     weighted_color = sum_by_ray(color, ray, rays)
     with torch.no_grad():
         mass = sum_by_ray(weight, ray, rays)
@@ -146,9 +147,11 @@ def importance(
     wanted = stratified(torch.zeros_like(near), torch.ones_like(far), count, jitter=jitter)
     above = torch.searchsorted(reached, wanted.contiguous(), right=True)
     above = above.clamp(min=1, max=edge.shape[1] - 1)
-    low, high = reached.gather(1, above - 1), reached.gather(1, above)
+    low = reached.gather(1, above - 1)
+    high = reached.gather(1, above)
     within = ((wanted - low) / (high - low).clamp(min=1e-8)).clamp(0, 1)
-    start, stop = edge.gather(1, above - 1), edge.gather(1, above)
+    start = edge.gather(1, above - 1)
+    stop = edge.gather(1, above)
     return start + within * (stop - start)
 
 

@@ -11,7 +11,8 @@ Initialisation = Literal["uniform", "glorot"]
 Precision = Literal["auto", "float32", "bfloat16"]
 
 # Samples of a ray, and octaves of an encoding, at most.
-SAMPLES, BANDS = 1024, 32
+SAMPLES = 1024
+BANDS = 32
 
 
 class CheckedSettings:

@@ -67,9 +67,11 @@ def drawn(weight: Tensor, ray: Tensor, rays: Tensor, count: int) -> tuple[Tensor
     total = torch.zeros(count, dtype=reached.dtype, device=weight.device).index_add(
         0, ray, weight.double()
     )
-    mass, start = total[rays], (total.cumsum(0) - total)[rays]
+    mass = total[rays]
+    start = (total.cumsum(0) - total)[rays]
     some = (mass > 0).nonzero()[:, 0]
-    mass, start = mass[some], start[some]
+    mass = mass[some]
+    start = start[some]
     wanted = start + torch.rand_like(mass) * mass
     picked = torch.searchsorted(reached, wanted, right=True).clamp(max=max(len(weight) - 1, 0))
     return picked, mass.to(weight.dtype)

@@ -39,11 +39,13 @@ class RigidWarp(nn.Module):
 
     def __init__(self, settings: NerfiesSettings) -> None:
         super().__init__()
-        s, width = settings, settings.warp_width
+        s = settings
+        width = settings.warp_width
         self.bands = s.warp_bands
         self.encode = SinusoidalEncoding(3, s.warp_bands)
         self.trunk = Trunk(self.encode.size + s.code, width, s.warp_depth, s.warp_skip)
-        self.rotation, self.velocity = nn.Linear(width, 3), nn.Linear(width, 3)
+        self.rotation = nn.Linear(width, 3)
+        self.velocity = nn.Linear(width, 3)
         self.register_buffer("opened", torch.zeros(()))
         initialise(self.trunk, "glorot")
         for head in (self.rotation, self.velocity):
@@ -54,7 +56,8 @@ class RigidWarp(nn.Module):
         """Where points (S, 3) of normalised space lead; ``code`` (S, code) is of their times."""
         window = octave_window(self.opened, self.bands)
         x = self.trunk(torch.cat([self.encode(points, window), code], dim=-1))
-        rotation, velocity = self.rotation(x), self.velocity(x)
+        rotation = self.rotation(x)
+        velocity = self.velocity(x)
         return rigid_motion(points, rotation.to(points.dtype), velocity.to(points.dtype))
 
 
@@ -187,7 +190,8 @@ class Nerfies(DeformableField):
             mass = weight[sample]
         if self.rest_is_canonical:
             moving = (time[sample] > 0).nonzero()[:, 0]
-            sample, mass = sample[moving], mass[moving]
+            sample = sample[moving]
+            mass = mass[moving]
         code = self.codes(time[sample])
         stretch = strain(jacobians(lambda x: self.warp(x, code), points[sample]))
         return (mass * SCALE * robust(stretch, SCALE)).sum() / count

@@ -48,7 +48,8 @@ def encoder_images(scene: Scene, settings: NeuralVolumesSettings) -> Tensor:
     Raises:
         DevrfError: too few fixed cameras have an image of every frame.
     """
-    views, wanted = scene.dynamic.train, settings.encoder_views
+    views = scene.dynamic.train
+    wanted = settings.encoder_views
     assert views.frames is not None
     cameras = cameras_of_every_frame(views)
     expected = (
@@ -57,8 +58,10 @@ def encoder_images(scene: Scene, settings: NeuralVolumesSettings) -> Tensor:
     settings.check("encoder_views", wanted <= len(cameras), expected + "image of every frame")
     height, width = settings.encoder_size
     scale = min(1.0, height / views.height, width / views.width)
-    rows, columns = round(views.height * scale), round(views.width * scale)
-    top, left = (height - rows) // 2, (width - columns) // 2
+    rows = round(views.height * scale)
+    columns = round(views.width * scale)
+    top = (height - rows) // 2
+    left = (width - columns) // 2
     behind = round(255 * background_value(scene.background))
     images = torch.full((len(scene.clock), wanted, 3, height, width), behind, dtype=torch.uint8)
     for k in range(wanted):

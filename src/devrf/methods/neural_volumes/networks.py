@@ -60,7 +60,8 @@ class VolumeDecoder(nn.Module):
         levels: list[nn.Module] = [nn.LeakyReLU(LEAK)]
         for read, made in zip(channels, channels[1:], strict=False):
             levels += [doubling(read, made), nn.LeakyReLU(LEAK)]
-        self.first, self.levels = xavier(nn.Linear(code, channels[0])), nn.Sequential(*levels)
+        self.first = xavier(nn.Linear(code, channels[0]))
+        self.levels = nn.Sequential(*levels)
         self.output = doubling(channels[-1], outputs, 1.0)
         self.side = 2 ** len(channels)
 
@@ -71,7 +72,8 @@ class VolumeDecoder(nn.Module):
 
 
 # Colours are standardised as published: mean 100 and deviation 25 of 255.
-MEAN, DEVIATION = 100 / 255, 25 / 255
+MEAN = 100 / 255
+DEVIATION = 25 / 255
 
 
 class TimeEncoder(nn.Module):
@@ -80,7 +82,8 @@ class TimeEncoder(nn.Module):
     def __init__(self, settings: NeuralVolumesSettings) -> None:
         """Build a stack of convolutions for each camera, and the layers that join them."""
         super().__init__()
-        s, stack = settings, [3, *settings.encoder_channels]
+        s = settings
+        stack = [3, *settings.encoder_channels]
         self.cameras = nn.ModuleList()
         for _ in range(s.encoder_views):
             layers: list[nn.Module] = []
@@ -146,8 +149,11 @@ class AffineMixWarp(nn.Module):
 
     def __init__(self, settings: NeuralVolumesSettings) -> None:
         super().__init__()
-        code, side, maps = settings.code, settings.warp_side, settings.maps
-        self.side, self.maps = side, maps
+        code = settings.code
+        side = settings.warp_side
+        maps = settings.maps
+        self.side = side
+        self.maps = maps
         self.scale, self.rotation, self.shift, self.weight = (
             nn.Sequential(
                 xavier(nn.Linear(code, width)),
@@ -164,7 +170,8 @@ class AffineMixWarp(nn.Module):
 
     def forward(self, code: Tensor) -> Tensor:
         """Positions (M, 3, side, side, side) in the template, for codes (M, code)."""
-        count, side = len(code), self.side
+        count = len(code)
+        side = self.side
         scale = self.scale(code).view(count, self.maps, 3, 1)
         rotation = rotation_matrices(self.rotation(code).view(count, self.maps, 4))
         shift = 0.1 * self.shift(code).view(count, self.maps, 3, 1)

@@ -32,7 +32,8 @@ from devrf.scenes.scene import Scene, Views
 log = logging.getLogger(__name__)
 
 # The most that a point moves along an axis from a frame to the next, in normalised space.
-REACH_IN_NDC, REACH_IN_A_BOX = 1.0, 0.2
+REACH_IN_NDC = 1.0
+REACH_IN_A_BOX = 0.2
 
 
 class NSFF(NeuralField):
@@ -57,7 +58,9 @@ class NSFF(NeuralField):
         """Build the networks, as published if no settings are given."""
         super().__init__(settings or NSFFSettings())
         self.fields = TwoFields(self.settings)
-        self._step, self._absent, self.cut_out = 0, frozenset[str](), True
+        self._step = 0
+        self._absent = frozenset[str]()
+        self.cut_out = True
         self._images: ImagePriors | None = None
         self.place()
 
@@ -133,7 +136,8 @@ class NSFF(NeuralField):
         unbounded = not (self.cut_out and self.space.is_linear)
         samples = samples.unbounded() if unbounded else samples
         samples = samples.scaled(self.placement.half_edge)
-        ray, fields = samples.ray, self.fields
+        ray = samples.ray
+        fields = self.fields
         points = self.placement.normalised(samples.points)
         static = fields.static.at(points, rays.viewdirs, ray)
         dynamic = fields.dynamic.at(points, time.index_select(0, ray), rays.viewdirs, ray)
@@ -171,7 +175,8 @@ class NSFF(NeuralField):
             DevrfError: nothing that counts is there.
         """
         assert isinstance(output, BlendedOutput)
-        warmup, step = self.settings.warmup, self._step
+        warmup = self.settings.warmup
+        step = self._step
         renders = Renders(
             fields=self.fields,
             placement=self.placement,
@@ -204,9 +209,11 @@ class FlowingView(RayView):
         self, rays: Rays, pixels: Tensor, cameras: Cameras, time: float
     ) -> tuple[Tensor, Tensor]:
         """As of every :class:`~devrf.rendering.view.MovingView`."""
-        now, black = torch.full_like(pixels[:, 0], self._time), torch.zeros_like(rays.origins[0])
+        now = torch.full_like(pixels[:, 0], self._time)
+        black = torch.zeros_like(rays.origins[0])
         out = self._model.render_rays(rays, now, black)
-        ray, blend = out.samples.ray, out.blend
+        ray = out.samples.ray
+        blend = out.blend
         places = self._moved(out.points, rays.viewdirs, ray, time), out.points
         moving, still = (
             cameras.project_into(0, self._model.placement.world(points))[0] - pixels[ray]
@@ -224,7 +231,8 @@ class FlowingView(RayView):
         clock = self._model.clock
         frame, last = (m.before + m.weight for m in (clock.at(self._time), clock.at(time)))
         while abs(last - frame) > clock.TOLERANCE:
-            side, step = FORWARD if last > frame else BACKWARD, min(abs(last - frame), 1.0)
+            side = FORWARD if last > frame else BACKWARD
+            step = min(abs(last - frame), 1.0)
             now = float(np.interp(frame, range(len(clock)), clock.times))
             when = torch.full_like(points[:, 0], now)
             flow = self._model.fields.dynamic.at(points, when, viewdirs, ray).flow

@@ -34,7 +34,8 @@ class ImagePriors:
             views: of each capture, on one device.
             space: the fields' space.
         """
-        self._views, self._space = tuple(views), space
+        self._views = tuple(views)
+        self._space = space
         first, *others = (view_set.cameras for view_set in views)
         self.cameras = first.joined(*others)
         self.neighbour = torch.arange(len(self.cameras))[:, None].repeat(1, 2)

@@ -148,7 +148,9 @@ class Renders:
             sides = [torch.where(self.batch.frame == len(self.times) - 1, BACKWARD, side)]
         every = torch.arange(len(self.output.points), device=self.batch.time.device)
         anyone = torch.ones_like(self.batch.time, dtype=torch.bool)
-        frame, points, dynamic = self.batch.frame, self.output.points, self.output.dynamic
+        frame = self.batch.frame
+        points = self.output.points
+        dynamic = self.output.dynamic
         return [self._warp(side, frame, anyone, every, points, dynamic) for side in sides]
 
     @property
@@ -176,7 +178,8 @@ class Renders:
 
         Of ``frame`` the others tell what a :class:`Warp` would.
         """
-        samples, count = self.output.samples, len(self.times)
+        samples = self.output.samples
+        count = len(self.times)
         frame = frame + torch.where(side == FORWARD, 1, -1)
         exists = exists & (frame >= 0) & (frame < count)
         frame = frame.clamp(0, count - 1)
@@ -184,7 +187,8 @@ class Renders:
         sample = sample[going]
         ray = samples.ray[sample]
         toward = side[ray]
-        moved, occlusion = dynamic.flow[going, toward], dynamic.occlusion[going, toward]
+        moved = dynamic.flow[going, toward]
+        occlusion = dynamic.occlusion[going, toward]
         points = points[going] + moved
         warped = self.fields.dynamic.at(
             points, self.times[frame[ray]], self.batch.rays.viewdirs, ray
@@ -206,7 +210,8 @@ class Renders:
         if not self.fields.additive:
             weight, end = composite(depth, ray, self.rays)
             return self._color(weight, dynamic.color, ray, end), weight
-        static, v = self.output.depths[1][sample], self.output.static.blend[sample]
+        static = self.output.depths[1][sample]
+        v = self.output.static.blend[sample]
         blend = self.fields.blended(depth, static, v, ray, self.rays, unbounded=False)
         color = self._color(blend.dynamic, dynamic.color, ray, blend.transmittance)
         behind = blend.static[:, None] * self.output.static.color[sample]
