@@ -78,7 +78,8 @@ class Similarity:
         """The best one: its rotation is that of the cameras' axes, the rest of their centres."""
         u, _, v = torch.linalg.svd((true[:, :, :3] @ found[:, :, :3].mT).sum(dim=0))
         turn = u @ torch.diag(torch.tensor([1.0, 1.0, float(torch.linalg.det(u @ v))]).double()) @ v
-        a, b = found[:, :, 3] @ turn.mT, true[:, :, 3]
+        a = found[:, :, 3] @ turn.mT
+        b = true[:, :, 3]
         centred = a - a.mean(dim=0)
         scale = (centred * (b - b.mean(dim=0))).sum() / centred.square().sum()
         return Similarity(turn, scale, b.mean(dim=0) - scale * a.mean(dim=0))
@@ -115,7 +116,8 @@ def with_true_cameras(captured: Path, into: Path, film: Filmed) -> None:
     fx, fy, cx, cy = (*film.moving.focal[0].tolist(), *film.moving.center[0].tolist())
     lens = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "k1": 0.0}
     frames = listing["frames"]
-    true, found = film.true_poses(frames), poses_of(frames)
+    true = film.true_poses(frames)
+    found = poses_of(frames)
     own = Similarity.between(found, true).to_captured(true)
     for frame, pose in zip(frames, own.tolist(), strict=True):
         frame.update(lens, transform_matrix=[*pose, [0.0, 0.0, 0.0, 1.0]])

@@ -28,11 +28,14 @@ def main() -> None:
     arguments.add_argument("folder", type=Path, help="of the .ply files and their index.json")
     folder = arguments.parse_args().folder
     recipe = ProceduralScene(width=96, height=96, static_views=36, frames=14)
-    robot, scene = recipe.model(), recipe()
-    views, diagonal = scene.dynamic.test, math.hypot(*scene.bounds.whole.size)
+    robot = recipe.model()
+    scene = recipe()
+    views = scene.dynamic.test
+    diagonal = math.hypot(*scene.bounds.whole.size)
     print("time   off     missing")
     for frame in json.loads((folder / "index.json").read_text())["frames"]:
-        mesh, time = trimesh.load_mesh(folder / frame["file"]), float(frame["time"])
+        mesh = trimesh.load_mesh(folder / frame["file"])
+        time = float(frame["time"])
         off = robot.distance(torch.tensor(mesh.vertices).float(), time).abs().mean()
         image = int((views.times - time).abs().argmin())
         assert views.depth is not None

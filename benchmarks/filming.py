@@ -25,7 +25,9 @@ RATE = 10
 # Frames that each fixed camera has filmed of the rest state before the motion begins.
 EARLY = (3, 1, 0, 2)
 # Of the robot's videos: pixels, field of view in radians, distance from the robot.
-SIZE, FIELD, DISTANCE = (240, 180), 1.05, 3.4
+SIZE = (240, 180)
+FIELD = 1.05
+DISTANCE = 3.4
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,8 @@ def forward(folder: Path) -> Filmed:
         torch.save(scene, kept)
     sets = (scene.static.train, scene.static.test)
     still = torch.cat([views.pixels for views in sets]).numpy()
-    train, test = scene.dynamic.train, scene.dynamic.test
+    train = scene.dynamic.train
+    test = scene.dynamic.test
     count = int(train.view.max()) + 1
     seen = [*(train.pixels[train.view == v].numpy() for v in range(count)), test.pixels.numpy()]
     assert scene.static.train.depth is not None

@@ -52,7 +52,8 @@ TINY += ["schedule.canonical.density_drop=0", "schedule.canonical.occupancy_ever
 
 def shortened(search: int, fine: int, frame: int) -> list[str]:
     """Overrides of the paper's schedule: iterations of the search, the field, and each frame."""
-    key, levels = "schedule.canonical", range(1, 6)
+    key = "schedule.canonical"
+    levels = range(1, 6)
     given = [
         *(f"{key}.search_iterations={search}", f"{key}.visual_hull_init=true"),
         *(f"{key}.iterations={fine}", f"{key}.decay_iterations={fine}"),
@@ -129,7 +130,9 @@ def learned(
 
 def parts(into: Path) -> Iterator[Row]:
     """Eager iterations at each resolution of the learned scene, by part, and their kernels."""
-    run, tables, usual = run_of(into, "paper"), [], training.parts
+    run = run_of(into, "paper")
+    tables = []
+    usual = training.parts
 
     def noted(work: Callable[[], None], *, cuda: bool) -> dict[str, float]:
         with profile(record_shapes=False) as profiled:
@@ -139,7 +142,8 @@ def parts(into: Path) -> Iterator[Row]:
         return usual(work, cuda=cuda)
 
     training.parts = noted
-    stored, seconds = harness.learned_scene(run), 1.0 if GPU else 0.01
+    stored = harness.learned_scene(run)
+    seconds = 1.0 if GPU else 0.01
     for rows in (training.canonical_rows, training.deformation_rows):
         yield from rows(run, stored, seconds)
     (into / "profile.txt").write_text("\n\n".join(tables))
@@ -148,9 +152,11 @@ def parts(into: Path) -> Iterator[Row]:
 def frames(into: Path) -> Iterator[Row]:
     """Frames a second at a new time and again at the same, and what a frame launches."""
     run = run_of(into, "paper")
-    began, stored = time.perf_counter(), harness.learned_scene(run)
+    began = time.perf_counter()
+    stored = harness.learned_scene(run)
     yield {"seconds to load and unpack": time.perf_counter() - began}
-    views, background = run.scene.dynamic.test, background_value(run.scene.background)
+    views = run.scene.dynamic.test
+    background = background_value(run.scene.background)
     renderer = Renderer(stored.model)
     row = rendering.frames_a_second(renderer, views, min(5, len(views)), background)
     with profile() as profiled:
@@ -204,7 +210,8 @@ def main() -> None:
         left = end - time.monotonic()
         if record(into, name)["status"] == "done" or left < 5:
             continue
-        began, command = time.monotonic(), [sys.executable, str(HERE), "--into", str(into)]
+        began = time.monotonic()
+        command = [sys.executable, str(HERE), "--into", str(into)]
         with (into / f"{name}.log").open("w") as output, suppress(subprocess.TimeoutExpired):
             limit = min(left, 60 * STEPS[name][0])
             subprocess.run(

@@ -35,11 +35,13 @@ class Stopwatch:
 
     def __init__(self, device: torch.device) -> None:
         self.stage: ScheduledStage | None = None
-        self._device, self._usual = device, dict[tuple[type, str], Any]()
+        self._device = device
+        self._usual = dict[tuple[type, str], Any]()
         self._seconds: dict[str, float] = defaultdict(float)
         # By resolution: seconds and iterations.
         self._levels: dict[tuple[int, ...], tuple[float, int]] = {}
-        self._since, self._iteration = time.perf_counter(), 0
+        self._since = time.perf_counter()
+        self._iteration = 0
 
     def __enter__(self) -> Stopwatch:
         for label, (owner, name) in TIMED.items():
@@ -77,7 +79,8 @@ class Stopwatch:
             finally:
                 self._seconds[label] += time.perf_counter() - began
                 if label.startswith("visits"):
-                    self.stage, self._since = own, time.perf_counter()
+                    self.stage = own
+                    self._since = time.perf_counter()
 
         return method
 
@@ -90,4 +93,5 @@ class Stopwatch:
         seconds, iterations = self._levels.get(shape, (0.0, 0))
         seconds += time.perf_counter() - self._since
         self._levels[shape] = seconds, iterations + stage.iteration - self._iteration
-        self._since, self._iteration = time.perf_counter(), stage.iteration
+        self._since = time.perf_counter()
+        self._iteration = stage.iteration

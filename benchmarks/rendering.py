@@ -29,7 +29,8 @@ def main() -> None:
     with report_user_errors():
         run = open_run(given.overrides)
         model = learned_scene(run).model
-        views, background = run.scene.dynamic.test, background_value(run.scene.background)
+        views = run.scene.dynamic.test
+        background = background_value(run.scene.background)
         rows = [frames_a_second(Renderer(model), views, given.views, background)]
         into = given.json or run.folder / "benchmark_rendering.json"
         report(rows, into, run.device, scene=run.scene.name, overrides=given.overrides)

@@ -98,7 +98,9 @@ class MeasurePhases(Callback):
 
     def __init__(self, kind: str, learned: DeVRFModel | None, seconds: float) -> None:
         self.rows: list[Row] = []
-        self._kind, self._learned, self._seconds = kind, learned, seconds
+        self._kind = kind
+        self._learned = learned
+        self._seconds = seconds
 
     def on_train_batch_start(
         self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int
@@ -133,7 +135,8 @@ def give_fields(stage: ScheduledStage, learned: DeVRFModel) -> None:
     last = stage.phase_at(stage.total_iterations)
     model = stage.scene_model
     assert isinstance(model, DeVRFModel)
-    model.canonical, model.occupancy = learned.canonical, learned.occupancy
+    model.canonical = learned.canonical
+    model.occupancy = learned.occupancy
     if isinstance(stage, DeformationStage):
         assert isinstance(last, DeformationPhase)
         model.canonical.requires_grad_(False)

@@ -214,7 +214,8 @@ def rendering(scene: SmallScene) -> str:
     scene.learn(stage, PLAIN)
     model = stage.current_model()
     assert isinstance(model, DeVRFModel)
-    views, background = scene.data.scene.dynamic.test, background_value(scene.data.scene.background)
+    views = scene.data.scene.dynamic.test
+    background = background_value(scene.data.scene.background)
     last = len(views) - 1
 
     def picture(device: torch.device) -> torch.Tensor:

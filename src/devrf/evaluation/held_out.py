@@ -112,7 +112,8 @@ def score_all(
     time: float | None = None,
 ) -> list[HeldOutView]:
     """:func:`score` of each of the held-out ``views``; progress is shown by the ``name`` of all."""
-    renderer, count = Renderer(model), len(views)
+    renderer = Renderer(model)
+    count = len(views)
     scored = (score(renderer, views, k, background, suite, time=time) for k in range(count))
     return list(followed(scored, count, name))
 

@@ -9,8 +9,10 @@ from torch.nn.functional import conv2d, max_pool2d
 from torchmetrics.functional.image import multiscale_structural_similarity_index_measure
 
 # Of SSIM: the window's side and Gaussian deviation in pixels; its constants for a range of 1.
-WINDOW, SIGMA = 11, 1.5
-C1, C2 = 0.01**2, 0.03**2
+WINDOW = 11
+SIGMA = 1.5
+C1 = 0.01**2
+C2 = 0.03**2
 # The coarsest of MS-SSIM's five scales, 1/16 of the image, must hold a whole window.
 MS_SSIM_SMALLEST = 16 * WINDOW
 
@@ -114,7 +116,8 @@ def _partial_blur(image: Tensor, mask: Tensor) -> Tensor:
     for shape in ((1, 1, 1, WINDOW), (1, 1, WINDOW, 1)):
         total = conv2d(image * valid, kernel.view(shape).repeat(3, 1, 1, 1), groups=3)
         count = conv2d(valid, torch.ones(shape))
-        image, valid = WINDOW * total / count.clamp(min=1), (count > 0).float()
+        image = WINDOW * total / count.clamp(min=1)
+        valid = (count > 0).float()
     return image
 
 

@@ -50,7 +50,8 @@ class Trunk:
 
     def build(self) -> nn.Sequential:
         """The layers, with weights yet to be loaded, numbered as torchvision's."""
-        channels, built = 3, nn.Sequential()
+        channels = 3
+        built = nn.Sequential()
         for layer in self.layers:
             if len(layer) == 2:
                 kernel, stride = layer
