@@ -93,7 +93,10 @@ class CameraPath:
         path = torch.cat([rotation, position[:, :, None]], dim=2).float()
         time = torch.from_numpy(np.interp(seconds, knots, times))[:, None]
         rows = torch.cat([fov.clamp(1, 179), time.clamp(0, 1), seconds[:, None]], dim=1).tolist()
-        return [Keyframe(pose, *row) for pose, row in zip(path, rows, strict=True)]
+        return [
+            Keyframe(pose, fov=fov_now, time=time_now, seconds=second)
+            for pose, (fov_now, time_now, second) in zip(path, rows, strict=True)
+        ]
 
     def sampled(self, frames: int) -> list[Keyframe]:
         """``frames`` keyframes, evenly spread over the video."""

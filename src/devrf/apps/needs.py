@@ -64,8 +64,12 @@ def smaller(scene: Scene, by: float) -> Scene:
     ]
     space = scene.space
     if isinstance(space, NormalizedDevice):
-        size = {"width": round(space.width / by), "height": round(space.height / by)}
-        space = replace(space, **size, focal=(space.focal[0] / by, space.focal[1] / by))
+        space = replace(
+            space,
+            width=round(space.width / by),
+            height=round(space.height / by),
+            focal=(space.focal[0] / by, space.focal[1] / by),
+        )
     return replace(scene, static=captures[0], dynamic=captures[1], space=space)
 
 

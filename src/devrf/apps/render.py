@@ -110,7 +110,10 @@ def _within_limit(settings: VideoSettings, renderer: Renderer, cameras: Cameras)
         log.info(
             "videos have %d frames of %d rows, not %d of %d, which would take longer than "
             "video.max_seconds=%g; null renders them",
-            *(within.frames, within.height, settings.frames, cameras.height),
+            within.frames,
+            within.height,
+            settings.frames,
+            cameras.height,
             settings.max_seconds,
         )
     return within

@@ -154,10 +154,10 @@ def write_contact_sheet(path: Path, views: Sequence[HeldOutView], rows: int = 6)
     for view in shown:
         error = error_colors(view.compared, view.truth)
         depth = depth_colors(view.depth, view.opacity, near, far)
-        tiles = view.truth, view.prediction, error, depth
+        tiles = (view.truth, view.prediction, error, depth)
         rows_of_tiles.append([scaled(tile, height) for tile in tiles])
         name = wrap(short_name(view.name), 16, break_long_words=False, break_on_hyphens=False)
-        scores = f"PSNR {view.psnr:.2f} dB", f"SSIM {view.ssim:.3f}"
+        scores = (f"PSNR {view.psnr:.2f} dB", f"SSIM {view.ssim:.3f}")
         time = [f"time {view.time:.2f}"] if any(view.time for view in views) else []
         labels.append([*name, *time, *scores])
     sheet = image_grid(rows_of_tiles, HEADINGS, labels)

@@ -73,7 +73,9 @@ def timeline(
     if end - start < 0.95 * longest:
         log.info(
             "videos of different lengths: %.2f to %.2f s; the %.2f s that all show are used",
-            *(shortest, longest, end - start),
+            shortest,
+            longest,
+            end - start,
         )
     slowest = int(np.argmin([survey.rate for survey in surveys]))
     slack = 0.5 / surveys[slowest].rate

@@ -155,7 +155,13 @@ def _surveyed(path: Path, work: Path) -> Survey:
 
     slug = f"{path.stem}-{_digest(str(path.resolve()))[:6]}"
     values = kept(work / f"survey-{slug}.json", _stamp(path), make)
-    return Survey(*(tuple(values[key]) for key in ("size", "times", "sharpness", "motion")))
+    width, height = values["size"]
+    return Survey(
+        size=(width, height),
+        times=tuple(values["times"]),
+        sharpness=tuple(values["sharpness"]),
+        motion=tuple(values["motion"]),
+    )
 
 
 def _write_images(

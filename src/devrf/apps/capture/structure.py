@@ -81,7 +81,6 @@ def reconstruct(
     names = [*dict.fromkeys([*moving.names, *fixed])]
     log.info("structure from motion: features of %d images", len(names))
     modes = library.CameraMode
-    on_host = {"device": library.Device.cpu}
     library.extract_features(
         base,
         images,
@@ -89,7 +88,7 @@ def reconstruct(
         camera_mode=modes.SINGLE if settings.intrinsics == "shared" else modes.PER_FOLDER,
         reader_options=library.ImageReaderOptions(camera_model=settings.camera),
         extraction_options=library.FeatureExtractionOptions(use_gpu=False),
-        **on_host,
+        device=library.Device.cpu,
     )
     compared = pairs(moving.names, [n for n in fixed if n not in moving.names], settings.matching)
     listed.write_text("".join(f"{a} {b}\n" for a, b in compared))
@@ -98,7 +97,7 @@ def reconstruct(
     wanted = library.ImportedPairingOptions(match_list_path=str(listed))
     verification = library.TwoViewGeometryOptions()
     verification.ransac.random_seed = 0
-    library.match_image_pairs(base, matching, wanted, verification, **on_host)
+    library.match_image_pairs(base, matching, wanted, verification, device=library.Device.cpu)
     log.info("structure from motion: cameras and points")
     mapping = library.IncrementalPipelineOptions(random_seed=0, min_model_size=3)
     reconstructions = library.incremental_mapping(base, images, models, mapping)
@@ -128,7 +127,9 @@ def checked_model(folder: Path, moving: Chosen, fixed: dict[str, Path]) -> Spars
     if len(known) < len(moving.names):
         log.warning(
             "%s: %d of %d frames could not be placed, and are left out",
-            *(moving.path, len(moving.names) - len(known), len(moving.names)),
+            moving.path,
+            len(moving.names) - len(known),
+            len(moving.names),
         )
     if not is_folder(moving.path):
         _check_turns(model, moving, known)

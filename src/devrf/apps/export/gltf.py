@@ -70,13 +70,14 @@ def write_gltf(
         "material": 0,
     }
     if names:
-        moves = (vertices[1:] - vertices[0]).numpy(), (normals[1:] - normals[0]).numpy()
+        moves = (vertices[1:] - vertices[0]).numpy()
+        turns = (normals[1:] - normals[0]).numpy()
         primitive["targets"] = [
             {
                 "POSITION": content.array(move, VERTICES, limits=True),
                 "NORMAL": content.array(turn, VERTICES),
             }
-            for move, turn in zip(*moves, strict=True)
+            for move, turn in zip(moves, turns, strict=True)
         ]
     shown: dict[str, Any] = {"name": "scene", "primitives": [primitive]}
     nodes: list[dict[str, Any]] = [{"name": "scene", "mesh": 0}]

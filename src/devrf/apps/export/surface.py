@@ -87,10 +87,11 @@ def entries(model: Renderable, cameras: Cameras) -> Tensor:
     space = model.space
     box = _field(model).box
     cameras = cameras.resized(ENTRIES, ENTRIES)
+    near, far = model.depth_limits
     points = []
     for camera in range(len(cameras)):
         rays = space.rays(cameras.image_rays(camera))
-        entry, leave = box.crossing(rays, *model.depth_limits)
+        entry, leave = box.crossing(rays, near, far)
         met = (entry < leave).nonzero()[:, 0]
         points.append(rays.at(met, entry[met]))
     return torch.cat(points)
@@ -196,8 +197,13 @@ def vertex_colors(
     voxel = points.new_tensor(field.box.size) / (points.new_tensor(field.shape) - 1)
     inward = -voxel * vertex_normals((points - low) / voxel, faces)
     eyes = _cap(DIRECTIONS, math.radians(WIDEST)) if averaged else torch.eye(3)[2:]
-    parts = zip(*(torch.split(part, VERTICES) for part in (points, inward, normals)), strict=True)
-    return torch.cat([_seen(model, p, way, n, eyes) for p, way, n in parts]).clamp(0, 1)
+    blocks = zip(
+        torch.split(points, VERTICES),
+        torch.split(inward, VERTICES),
+        torch.split(normals, VERTICES),
+        strict=True,
+    )
+    return torch.cat([_seen(model, p, way, n, eyes) for p, way, n in blocks]).clamp(0, 1)
 
 
 def _seen(

@@ -64,7 +64,7 @@ def inspection_figure(scene: Scene) -> Figure:
     """The page of a scene: 16 inches wide, 100 pixels each."""
     views = scene.static.train
     tiles = [(shown(views, k), short_name(views.names[k])) for k in evenly(len(views), COLUMNS)]
-    static = f"Static training set: {len(views)} images", [tiles]
+    static = (f"Static training set: {len(views)} images", [tiles])
     moving = _dynamic_sections(scene.dynamic.train) if scene.moves else []
     sections: list[Section] = [static, *moving]
     tile = min(TALLEST, WIDTH / COLUMNS * views.height / views.width)
@@ -204,12 +204,20 @@ def draw_cameras(scene: Scene, side: Any, plan: Axes) -> None:
         plan.plot(x, y, color=group.color, linewidth=group.width, label=group.label)
     for name, number, position, color in _fixed_views(scene):
         x, y, z = ((position - middle) @ axes.T).tolist()
-        style: dict[str, Any] = {"color": color, "fontweight": "bold", "path_effects": HALO}
-        side.text(x, y, z, f"  {number}", **style)
+        side.text(x, y, z, f"  {number}", color=color, fontweight="bold", path_effects=HALO)
         if scene.kind == "inward":  # forward-facing cameras stand above one another
             outward = 26 / max(math.hypot(x, y), 1e-6)  # points
-            style |= {"textcoords": "offset points", "ha": "center", "va": "center"}
-            plan.annotate(f"{name} {number}", (x, y), xytext=(x * outward, y * outward), **style)
+            plan.annotate(
+                f"{name} {number}",
+                (x, y),
+                xytext=(x * outward, y * outward),
+                textcoords="offset points",
+                color=color,
+                fontweight="bold",
+                path_effects=HALO,
+                ha="center",
+                va="center",
+            )
     points = torch.cat([ends.reshape(-1, 3) for ends in shown])
     low = points.amin(dim=0).tolist()
     high = points.amax(dim=0).tolist()

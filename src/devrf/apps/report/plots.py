@@ -155,9 +155,17 @@ def against_budget(table: Table, place: str) -> Figure | None:
             means = values.mean()
             spread = values.std().fillna(0.0)
             dashes = DASHES[list(labels[method]).index(label) % len(DASHES)]
-            look: dict[str, Any] = {"color": COLORS[methods.index(method)], "linestyle": dashes}
-            look |= {"linewidth": 2.8 if method == DEFAULT_METHOD else 1.4, "marker": "o"}
-            axes.errorbar(means.index, means, spread, capsize=2, label=label, **look)
+            axes.errorbar(
+                means.index,
+                means,
+                spread,
+                color=COLORS[methods.index(method)],
+                linestyle=dashes,
+                linewidth=2.8 if method == DEFAULT_METHOD else 1.4,
+                marker="o",
+                capsize=2,
+                label=label,
+            )
         axes.set(title=place, xscale="log", xlabel="training time", ylabel=column.heading)
         axes.xaxis.set_major_locator(FixedLocator(budgets))
         axes.xaxis.set_minor_locator(NullLocator())
@@ -184,8 +192,9 @@ def against_views(table: Table) -> Figure | None:
             color, dashes = _style(k)
             known = group.dropna(subset=column.title)
             label = scene if one_line else f"{scene}: {line}"
-            points = known["views"], known[column.title]
-            axes.plot(*points, dashes, color=color, marker="o", label=label)
+            axes.plot(
+                known["views"], known[column.title], dashes, color=color, marker="o", label=label
+            )
         axes.set(xlabel="dynamic training views", ylabel=column.heading)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     _legend(figure)
@@ -200,12 +209,18 @@ def _points(axes: Axes, table: Table, block: Block) -> None:
         axes.plot(seconds, psnr, mark, color=color, markersize=6, label=label)
     for label, seconds, psnr in _seconds_and_psnr(block.published):
         method = re.sub(VARIANT, "", label)
-        look: dict[str, Any] = {"color": GREY, "markerfacecolor": "none"}
-        axes.plot(seconds, psnr, MARKERS[method], label=f"{method}{PUBLISHED}", **look)
+        axes.plot(
+            seconds,
+            psnr,
+            MARKERS[method],
+            color=GREY,
+            markerfacecolor="none",
+            label=f"{method}{PUBLISHED}",
+        )
     axes.set(title=block.title, xscale="log", xlabel="training time", ylabel=f"{PSNR.title} (dB)")
     low, high = axes.get_xlim()
-    axes.set_xlim(low / 1.5, high * 1.5)
-    axes.xaxis.set_major_locator(FixedLocator(_ticks(*axes.get_xlim())))
+    low, high = axes.set_xlim(low / 1.5, high * 1.5)
+    axes.xaxis.set_major_locator(FixedLocator(_ticks(low, high)))
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter(_time)
 
@@ -292,7 +307,8 @@ def write_training_curve(
     axes.plot(curve.index, curve, color=BATCHES, linewidth=0.9, label="batches")
     axes.plot(mean.index, mean, color=MEAN, linewidth=1.8, label="running mean")
     if previews:
-        axes.plot(*zip(*previews, strict=True), "o", color=PREVIEWS, label="held-out preview")
+        iterations, psnr = zip(*previews, strict=True)
+        axes.plot(iterations, psnr, "o", color=PREVIEWS, label="held-out preview")
     if 1 < len(grids) <= MOST_GRIDS:
         for iteration, shape in grids:
             axes.axvline(iteration, color="0.75", linewidth=0.8, linestyle=":")

@@ -15,9 +15,25 @@ from devrf.errors import DevrfError
 
 # What every run has; further columns are what its file holds, by dotted name.
 COLUMNS = (
-    *("folder", "status", "scene", "method", "protocol", "at_rest", "error", "mistake"),
-    *("train_seconds", "peak_gpu_gb", "dynamic.psnr", "dynamic.ssim", "dynamic.lpips"),
-    *("run.device", "run.overrides", "run.seed", "run.checkpoint", "run.date", "path"),
+    "folder",
+    "status",
+    "scene",
+    "method",
+    "protocol",
+    "at_rest",
+    "error",
+    "mistake",
+    "train_seconds",
+    "peak_gpu_gb",
+    "dynamic.psnr",
+    "dynamic.ssim",
+    "dynamic.lpips",
+    "run.device",
+    "run.overrides",
+    "run.seed",
+    "run.checkpoint",
+    "run.date",
+    "path",
 )
 DEFAULT_METHOD = "devrf"
 DEFAULT_PROTOCOL = "two_stage"

@@ -147,7 +147,7 @@ class FrustaLayer:
             nearest = float(times[int((times - time).abs().argmin())])
         if (static, nearest) == self._shown:
             return
-        self._shown = static, nearest
+        self._shown = (static, nearest)
         frusta = static_frusta(self._cameras, self._scene) if static else []
         if nearest is not None and self._scene is not None:
             frusta += dynamic_frusta(self._scene, nearest)

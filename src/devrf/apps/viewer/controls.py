@@ -147,9 +147,11 @@ class Controls:
         """
         crop = None
         if self._crop.value:
-            ends = min, max
             shares = [
-                [within(end(slider.value), (0, 100)) / 100 for end in ends]
+                (
+                    within(min(slider.value), (0, 100)) / 100,
+                    within(max(slider.value), (0, 100)) / 100,
+                )
                 for slider in self._sides
             ]
             corners = list(zip(box.low, box.size, shares, strict=True))

@@ -151,7 +151,7 @@ class Drawing:
         self, channel: str, camera: Cameras, image: RenderedImage, vectors: Tensor
     ) -> Tensor:
         """The channel (H, W, 3) in [0, 1], on the host."""
-        shape = camera.height, camera.width
+        shape = (camera.height, camera.width)
         opacity = image.opacity.view(shape).cpu()
         if channel == "depth":
             model = self.renderer.model

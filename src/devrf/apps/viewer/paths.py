@@ -61,10 +61,18 @@ def known_paths(cameras: Cameras, model: Callable[[], Viewable]) -> dict[str, Pr
     def ring(video: VideoSettings) -> Cameras:
         return filmed(default_way(model().space, closed=True), video)
 
+    def bullet(stop: float) -> tuple[Keyframe, ...]:
+        shots, shot_times = bullet_time(ring, stop, once)
+        return keyframes_of(shots, shot_times, SECONDS)
+
+    def freeze(stop: float) -> tuple[Keyframe, ...]:
+        shots, shot_times = time_freeze(ring, stop, longer)
+        return keyframes_of(shots, shot_times, 3 * SECONDS)
+
     return {
         **{name: partial(running, name) for name in WAYS},
-        "bullet time": lambda stop: keyframes_of(*bullet_time(ring, stop, once), SECONDS),
-        "time freeze": lambda stop: keyframes_of(*time_freeze(ring, stop, longer), 3 * SECONDS),
+        "bullet time": bullet,
+        "time freeze": freeze,
     }
 
 
