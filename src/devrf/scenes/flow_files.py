@@ -117,6 +117,7 @@ def stacked_flow(
     pixels.
     """
     start = time.perf_counter()
+    source_width, source_height = source_size
     width, height = size
     folder = next(iter(files.values())).parent
     check_memory(count * width * height * _BYTES, folder, f"the flow of {count} images")
@@ -124,7 +125,7 @@ def stacked_flow(
     valid = np.zeros((count, height, width), dtype=np.bool_)
 
     def fill(row: int) -> None:
-        flow, mask = read_flow_file(files[row], *source_size)
+        flow, mask = read_flow_file(files[row], source_width, source_height)
         if size != source_size:
             flow, mask = shrink_flow(flow, mask, width, height)
         vectors[row] = flow

@@ -46,8 +46,9 @@ class FilmHeader:
 def film_header(path: Path) -> FilmHeader:
     """What a video says of itself, no frame decoded; DevrfError if it is none."""
     with _opened(path) as video:
-        keys = cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_COUNT
-        width, height, frames = (int(video.get(key)) for key in keys)
+        width = int(video.get(cv2.CAP_PROP_FRAME_WIDTH))
+        height = int(video.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        frames = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
     return FilmHeader((width, height), frames)
 
 

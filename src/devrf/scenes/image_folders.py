@@ -135,20 +135,24 @@ def whole_factor(downscale: int | str, size_at: SizeAt) -> int:
     enough = [factor for factor, size in sizes.items() if min(size) >= LEAST_SIDE]
     enough = enough or [max(sizes, key=lambda factor: (min(sizes[factor]), -factor))]
     factor = next((factor for factor in enough if max(sizes[factor]) <= limit), enough[-1])
+    width, height = sizes[factor]
     reason = f"data.downscale={downscale}" if match else f"chosen for a {device.upper()}"
     log.info(
         "images of %dx%d px, made smaller by %d (%s; data.downscale=NUMBER chooses otherwise)",
-        *(*sizes[factor], factor, reason),
+        width,
+        height,
+        factor,
+        reason,
     )
     return factor
 
 
-def folder_size(parent: Path, **names: str) -> SizeAt:
-    """The size at a factor of images in folders of several sizes; ``names`` as of image_folder."""
+def folder_size(parent: Path, *, full: str = "images", reduced: str = "images_{}") -> SizeAt:
+    """The size at a factor of images in folders of several sizes, named as for image_folder."""
 
     def size_at(factor: int) -> tuple[int, int] | None:
         try:
-            source = image_folder(parent, factor, **names)
+            source = image_folder(parent, factor, full=full, reduced=reduced)
         except DevrfError:
             return None
         width, height = image_size(listed_images(source.path)[0])

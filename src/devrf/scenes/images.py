@@ -214,10 +214,10 @@ def load_images(
     start = time.perf_counter()
     headers = _headers(paths, cameras or [None] * len(paths))
     first = headers[0]
-    size = reduced_size(first.width, first.height, downscale, paths[0])
+    width, height = reduced_size(first.width, first.height, downscale, paths[0])
     alpha = finish is not None or any(header.has_alpha for header in headers)
-    shape = (len(paths), size[1], size[0], 4 if alpha else 3)
-    what = f"{len(paths)} images of {size[0]}x{size[1]} px"
+    shape = (len(paths), height, width, 4 if alpha else 3)
+    what = f"{len(paths)} images of {width}x{height} px"
     check_memory(math.prod(shape), paths[0].parent, what)
     # NumPy in the threads: each would otherwise start a team of torch threads of its own.
     pixels = np.empty(shape, dtype=np.uint8)
@@ -226,8 +226,9 @@ def load_images(
         # An image without alpha in a set with alpha is opaque: WebP drops a full alpha channel.
         image = decode(paths[index], headers[index], "RGBA" if alpha else "RGB")
         image = image if finish is None else finish(index, image)
-        whole = size == (first.width, first.height)
-        pixels[index] = image if whole else shrink_pixels(image, *size)
+        if (width, height) != (first.width, first.height):
+            image = shrink_pixels(image, width, height)
+        pixels[index] = image
 
     in_threads(fill, range(len(paths)), (first.width, first.height))
     log.info("read %s from %s in %.1f s", what, paths[0].parent, time.perf_counter() - start)

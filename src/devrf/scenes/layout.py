@@ -144,13 +144,19 @@ def fewer(layout: Layout, train_views: int | None, frames: int | None) -> tuple[
     kept = None if frames is None else evenly_spread(train.used_times, frames)
     if kept is None:
         return replace(layout, dynamic_train=train), False
-    splits = {"dynamic_train": at_times(train, kept)}
-    for name in ("dynamic_test", "validation"):
-        split = getattr(layout, name)
+
+    def held_out(split: Split) -> Split:
+        thinned = at_times(split, kept)
         # Held-out times of their own (D-NeRF) need not meet the kept ones: then all stay.
-        if split is not None and len((same := at_times(split, kept)).index):
-            splits[name] = same
-    return replace(layout, **splits), True
+        return thinned if len(thinned.index) else split
+
+    thinner = replace(
+        layout,
+        dynamic_train=at_times(train, kept),
+        dynamic_test=held_out(layout.dynamic_test),
+        validation=None if layout.validation is None else held_out(layout.validation),
+    )
+    return thinner, True
 
 
 def load_layout(

@@ -53,7 +53,7 @@ def _dis() -> Estimator:
     def flow(image: Tensor, other: Tensor) -> Tensor:
         height, width = image.shape[:2]
         factor = max(1.0, LEAST_SIDE / min(height, width))
-        size = math.ceil(width * factor), math.ceil(height * factor)
+        size = (math.ceil(width * factor), math.ceil(height * factor))
         grey = [cv2.cvtColor(i.numpy(), cv2.COLOR_RGB2GRAY) for i in (image, other)]
         if size != (width, height):
             grey = [cv2.resize(g, size, interpolation=cv2.INTER_CUBIC) for g in grey]
@@ -90,7 +90,7 @@ def _raft() -> Estimator:
     def flow(image: Tensor, other: Tensor) -> Tensor:
         height, width = image.shape[:2]
         # Edge pixels are repeated to the right and below, so that positions stay as they are.
-        margin = 0, _padded(width) - width, 0, _padded(height) - height
+        margin = (0, _padded(width) - width, 0, _padded(height) - height)
         pair = torch.stack([image, other]).to(device).permute(0, 3, 1, 2).float() / 127.5 - 1
         first, second = pad(pair, margin, mode="replicate").chunk(2)
         with torch.no_grad():

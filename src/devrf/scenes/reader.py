@@ -209,15 +209,15 @@ class PosedReader(InwardReader):
             bounds = replace(scene.bounds, reason=reason, box_source=box_source)
             return replace(scene, bounds=bounds)
         name = self.name_of(folder)
-        captures = centred(static, dynamic)
+        static, dynamic = centred(static, dynamic)
         if reader.near is None or reader.near <= 0:
-            apart = float(captures[0].train.cameras.positions.norm(dim=1).max())
+            apart = float(static.train.cameras.positions.norm(dim=1).max())
             raise scene_error(
                 "data.near",
                 "data.space=ndc needs a near plane before all that is seen, in world units; try "
                 f"data.near={apart:.3g}, which is as far as cameras are from their middle",
             )
-        return forward_facing_scene(name, *captures, reader.near, self.background)
+        return forward_facing_scene(name, static, dynamic, reader.near, self.background)
 
 
 def _with_bounds(options: PosedReader, stated: SceneBounds | None) -> PosedReader:

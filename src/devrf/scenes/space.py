@@ -155,10 +155,14 @@ def dynamic_only(scene: Scene) -> Scene:
     """
     views = scene.dynamic.train
     held_out = scene.dynamic.test
-    at_rest = [v[(v.times == v.times.min()).nonzero()[:, 0]] for v in (views, held_out)]
+    at_rest = Capture(train=_earliest(views), test=_earliest(held_out))
     if isinstance(scene.space, NormalizedDevice):
         bounds = forward_bounds([views], scene.space, "all that the dynamic cameras see")
-        return replace(scene, static=Capture(*at_rest), bounds=bounds)
+        return replace(scene, static=at_rest, bounds=bounds)
     choice: SpaceChoice = "world" if scene.space.is_linear else "contracted"
     space, bounds = inward_space(choice, views, views, [views, held_out])
-    return replace(scene, static=Capture(*at_rest), bounds=bounds, space=space)
+    return replace(scene, static=at_rest, bounds=bounds, space=space)
+
+
+def _earliest(views: Views) -> Views:
+    return views[(views.times == views.times.min()).nonzero()[:, 0]]

@@ -226,7 +226,8 @@ def widest_angle(poses: Tensor) -> float:
 def _forward(poses: Tensor, points: Tensor, near: float, far: float) -> World:
     frame = average_pose(poses)
     scale = NEAREST / near
-    return World(*_moved(poses, points, frame, scale), "ndc", 1.0, far * scale, None)
+    poses, points = _moved(poses, points, frame, scale)
+    return World(poses, points, space="ndc", near=1.0, far=far * scale, box=None)
 
 
 def _inward(poses: Tensor, points: Tensor, near: float, far: float) -> World:

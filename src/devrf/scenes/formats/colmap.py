@@ -136,13 +136,18 @@ class ColmapReader(PosedReader, FixedViewsReader):
         posed = fixed_cameras(model, moving, len(views))
         test_view = held_out_view(len(views), self.test_view)
         used = tuple(lenses[k] for k in posed)
-        moving_sets = fixed_views(views, model.folder, poses[posed], used, test_view)
+        moving_train, moving_test = fixed_views(views, model.folder, poses[posed], used, test_view)
         # What the held-out camera saw of the scene at rest is held out, too.
         unseen = {k for k, position in enumerate(known) if position == posed[test_view]}
         train = [k for k in train if k not in unseen]
         test = sorted({*test, *unseen})
-        rest_sets = at_rest(images[train]), at_rest(images[test])
-        return Layout(*rest_sets, *moving_sets), views[0].downscale
+        layout = Layout(
+            static_train=at_rest(images[train]),
+            static_test=at_rest(images[test]),
+            dynamic_train=moving_train,
+            dynamic_test=moving_test,
+        )
+        return layout, views[0].downscale
 
 
 def _bounds(world: World, cut_out: bool) -> SceneBounds:

@@ -115,10 +115,15 @@ class LlffReader(FixedViewsReader):
                 f"has {len(cameras)} cameras, but there are {count} folders view1 …; add some",
             )
         unseen = held_out_view(count, self.test_view)
-        moving_sets = fixed_views(
+        moving_train, moving_test = fixed_views(
             views, cameras.file, cameras.poses[-count:], cameras.intrinsics[-count:], unseen
         )
-        layout = Layout(at_rest(train), at_rest(test), *moving_sets)
+        layout = Layout(
+            static_train=at_rest(train),
+            static_test=at_rest(test),
+            dynamic_train=moving_train,
+            dynamic_test=moving_test,
+        )
         return layout, source.downscale, views[:unseen] + views[unseen + 1 :]
 
     def _video(self, images: Transforms) -> Layout:

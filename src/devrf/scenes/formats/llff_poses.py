@@ -157,7 +157,7 @@ def _of_matrices(file: Path, matrix: Numbers, depths: Path, bounds: Numbers) -> 
 
 def _of_columns(file: Path, columns: Numbers) -> tuple[Intrinsics, ...]:
     """The intrinsics in columns H, W, focal (N, 3)."""
-    return tuple(_intrinsics(file, *row) for row in columns.tolist())
+    return tuple(_intrinsics(file, h, w, focal) for h, w, focal in columns.tolist())
 
 
 def _shared(file: Path) -> Intrinsics:

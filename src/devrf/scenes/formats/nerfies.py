@@ -184,9 +184,8 @@ class ItemsReader(InwardReader):
         world = read_json(
             folder / "scene.json", World, "it says where the scene is; set data.root to its folder"
         )
-        names = {"full": "1x", "reduced": "{}x"}
-        factor = self.choose_factor(folder_size(folder / "rgb", **names))
-        images = image_folder(folder / "rgb", factor, **names)
+        factor = self.choose_factor(folder_size(folder / "rgb", full="1x", reduced="{}x"))
+        images = image_folder(folder / "rgb", factor, full="1x", reduced="{}x")
         files = [f"rgb/{images.path.name}/{item}" for item in items]
         present = present_images(files, listing, folder, self.missing)
         ids = [items[position] for position in present]
@@ -212,8 +211,8 @@ class ItemsReader(InwardReader):
         layout = one_capture(posed[train], posed[test], self.static_until)
         layout, _ = fewer(layout, None, self.frames)
         ignored: Masks = "none" if masks is None else "ignore"
-        captures = load_layout(layout, folder, images.downscale, ignored)
-        return placed(self, folder, world, *captures)
+        static, dynamic = load_layout(layout, folder, images.downscale, ignored)
+        return placed(self, folder, world, static, dynamic)
 
 
 class _Dataset(BaseModel):

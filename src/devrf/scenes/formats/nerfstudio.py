@@ -87,11 +87,18 @@ def _layout(root: Path, options: NerfstudioReader) -> Layout:
     if not os.path.isfile(moving):
         layout = static_alone(train, test, f"there is no dynamic/{FILE}")
         return layout.with_validation(validation)
-    rest = at_rest(train), at_rest(test)
+    static_train = at_rest(train)
+    static_test = at_rest(test)
     train, test, validation = _splits(moving, root, options)
     if train.times is None:
         raise scene_error(moving, 'its frames have no "time"; give every frame its time in [0, 1]')
-    return Layout(*rest, in_motion(train), in_motion(test)).with_validation(validation)
+    layout = Layout(
+        static_train=static_train,
+        static_test=static_test,
+        dynamic_train=in_motion(train),
+        dynamic_test=in_motion(test),
+    )
+    return layout.with_validation(validation)
 
 
 def _splits(

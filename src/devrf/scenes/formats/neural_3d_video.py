@@ -95,9 +95,9 @@ def read_frames(
     """
     start = time.perf_counter()
     folder = paths[0].parent
-    size = reduced_size(*filmed, downscale, paths[0])
-    shape = (len(frames), len(paths), size[1], size[0], 3)
-    what = f"{len(frames)} frames of {len(paths)} videos at {size[0]}x{size[1]} px"
+    width, height = reduced_size(filmed[0], filmed[1], downscale, paths[0])
+    shape = (len(frames), len(paths), height, width, 3)
+    what = f"{len(frames)} frames of {len(paths)} videos at {width}x{height} px"
     check_memory(math.prod(shape), folder, what)
     pixels = np.empty(shape, dtype=np.uint8)
 
@@ -108,7 +108,9 @@ def read_frames(
                     paths[column],
                     f"frame {frame} is not of {filmed[0]}x{filmed[1]} px; convert the video",
                 )
-            pixels[row, column] = picture if downscale == 1 else shrink_pixels(picture, *size)
+            if downscale != 1:
+                picture = shrink_pixels(picture, width, height)
+            pixels[row, column] = picture
 
     in_threads(fill, range(len(paths)), filmed)
     log.info("read %s from %s in %.1f s", what, folder, time.perf_counter() - start)
@@ -158,10 +160,10 @@ class Neural3DVideoReader(SceneReader):
         width, height = videos.header.size
         factor = self.choose_factor(lambda factor: (width // factor, height // factor))
         moving = Capture(
-            *(_views(videos, posed, chosen, frames, times, factor) for chosen in (train, [test]))
+            train=_views(videos, posed, train, frames, times, factor),
+            test=_views(videos, posed, [test], frames, times, factor),
         )
-        first = (views[(views.times == 0).nonzero()[:, 0]] for views in (moving.train, moving.test))
-        still = Capture(*first)
+        still = Capture(train=_first_frame(moving.train), test=_first_frame(moving.test))
         return forward_facing_scene(self.name_of(folder), still, moving, self.near, self.background)
 
     def _split(self, videos: CameraVideos) -> tuple[int, list[int]]:
@@ -190,6 +192,10 @@ class Neural3DVideoReader(SceneReader):
         count = total if self.frames is None else min(self.frames, total)
         frames = torch.linspace(0, total - 1, count, dtype=torch.float64).round().long()
         return frames.tolist(), (frames / (total - 1)).float()
+
+
+def _first_frame(views: Views) -> Views:
+    return views[(views.times == 0).nonzero()[:, 0]]
 
 
 def _views(

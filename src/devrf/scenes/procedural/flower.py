@@ -315,7 +315,8 @@ class Flower:
             axes = _PAINTED.rotation[number]
             hinge = _PAINTED.origin[number]
             local = (unbent - hinge.to(unbent)) @ axes.to(unbent)
-            leaves.append(leaf.blade.distance(*local.unbind(-1)))
+            x, y, z = local.unbind(-1)
+            leaves.append(leaf.blade.distance(x, y, z))
         petals = [whorl.distance(unbent, _OPENING(self.speed, time)) for whorl in WHORLS]
         bending = torch.stack([stem, heart, *leaves, *petals])
         # Beyond the ramp the motion is rigid: up to the ramp's end, distances hold as they are.

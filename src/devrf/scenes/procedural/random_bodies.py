@@ -29,8 +29,10 @@ TRIES = 12
 ENTERED = 0.02
 # Share of a picture that the square around a body covers, and the share of its longest edge at
 # rest that what moves most goes.
-COVERS = (0.15, 0.7)
-MOVES = (0.1, 0.8)
+MIN_COVERED = 0.15
+MAX_COVERED = 0.7
+MIN_MOVED = 0.1
+MAX_MOVED = 0.8
 # How round parts turn about themselves where texture slides.
 SPIN = Swing(1.5, 1.2, 0.0)
 TIMES = tuple(k / 12 for k in range(13))
@@ -46,7 +48,10 @@ def random_body(seed: int, speed: float = 1.0, sliding: bool = False) -> Assembl
     least = math.inf
     for attempt in range(TRIES):
         draw = Random(f"{seed}/{attempt}")
-        body = _fitted(_drawn(draw), draw.uniform(*COVERS), draw.uniform(*MOVES))
+        parts = _drawn(draw)
+        covers = draw.uniform(MIN_COVERED, MAX_COVERED)
+        moves = draw.uniform(MIN_MOVED, MAX_MOVED)
+        body = _fitted(parts, covers, moves)
         entered = _entered(body)
         if entered < least:
             best = body
@@ -55,8 +60,8 @@ def random_body(seed: int, speed: float = 1.0, sliding: bool = False) -> Assembl
             break
     round_parts = [part.half[0] == part.half[1] and part.kind != "box" for part in best.parts]
     spins = (SPIN if sliding and is_round else STILL for is_round in round_parts)
-    parts = (replace(part, spin=spin) for part, spin in zip(best.parts, spins, strict=True))
-    return Assembled(tuple(parts), speed)
+    spinning = (replace(part, spin=spin) for part, spin in zip(best.parts, spins, strict=True))
+    return Assembled(tuple(spinning), speed)
 
 
 def placed(body: Assembled, center: Xyz, reach: float) -> Assembled:

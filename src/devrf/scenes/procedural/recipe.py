@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import KW_ONLY
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import torch
 from pydantic import Field, model_validator
@@ -144,10 +144,17 @@ class ProceduralScene(Recipe):
         inside = self.surroundings == "room"
         rig = HAND_HELD if inside else STUDIO
         surface = self.filmed()
-        placed: dict[str, Any] = {"width": self.width, "height": self.height}
-        placed |= {"reach": where.reach, "rig": rig}
-        learned, tested = static_rig(self.static_views, self.static_test_views, **placed)
-        watching, unseen = dynamic_rig(self.train_views, **placed)
+        learned, tested = static_rig(
+            self.static_views,
+            self.static_test_views,
+            width=self.width,
+            height=self.height,
+            reach=where.reach,
+            rig=rig,
+        )
+        watching, unseen = dynamic_rig(
+            self.train_views, width=self.width, height=self.height, reach=where.reach, rig=rig
+        )
         film = Filming(surface, where.reach, self.supersample, self.light)
         if inside:
             film = Filming(surface, REACH, self.supersample, self.light, STEPS, opaque=True)
@@ -219,14 +226,17 @@ class ProceduralForwardScene(Recipe):
     def __call__(self) -> Scene:
         """Render everything."""
         film = Filming(self.filmed(), _REACH, self.supersample, self.light, STEPS, opaque=True)
-        size = {"width": self.width, "height": self.height}
         # Of each eight views seven are learned from.
         held_out = -(-self.static_views // (HOLDOUT - 1))
-        static = facing_static_rig(self.static_views + held_out, **size)
+        static = facing_static_rig(
+            self.static_views + held_out, width=self.width, height=self.height
+        )
         order = torch.arange(len(static))
         learned = static[order % HOLDOUT != 0]
         tested = static[order % HOLDOUT == 0]
-        watching, unseen = facing_dynamic_rig(self.train_views, **size)
+        watching, unseen = facing_dynamic_rig(
+            self.train_views, width=self.width, height=self.height
+        )
         at_rest = film.at_rest(learned, tested)
         moving = film.moving(watching, unseen, self.frames, self.unseen_frames)
         space = reference_space(static, NEAR)

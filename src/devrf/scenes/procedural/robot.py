@@ -199,4 +199,5 @@ class Robot:
         """Distance (K, M) to each solid."""
         matrix, offset = _into_solids(self.speed, time)
         local = torch.addmm(offset.to(points), matrix.to(points), points.T)
-        return _TABLE.distances(*local.view(3, len(SOLIDS), -1))
+        x, y, z = local.view(3, len(SOLIDS), -1)
+        return _TABLE.distances(x, y, z)

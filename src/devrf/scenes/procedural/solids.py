@@ -211,7 +211,8 @@ class SolidTable:
 
     def distances_of(self, points: Tensor) -> Tensor:
         """Distance (K, M) at rest to each solid, of points (M, 3) relative to the base."""
-        return self.distances(*(points.T[:, None] - self.center.to(points).T[..., None]))
+        x, y, z = points.T[:, None] - self.center.to(points).T[..., None]
+        return self.distances(x, y, z)
 
     def outline(self) -> Material:
         """Points around the solids at rest."""
