@@ -135,14 +135,16 @@ class DeformableField(NeuralField):
         """Weights (S,) of samples, from their densities alone."""
         points = self.placement.normalised(samples.points)
         when = time.index_select(0, samples.ray)
-        density = field.sigma(*self.deform(points, when))
+        canonical, ambient = self.deform(points, when)
+        density = field.sigma(canonical, ambient)
         length = samples.length / self.placement.half_edge
         weight, _ = composite(density * length, samples.ray, samples.rays)
         return weight
 
     def optical_depth(self, points: Tensor, time: Tensor, length: float) -> Tensor:
         """τ (S,) of the canonical field, where the points lead."""
-        return self.canonical.sigma(*self.deform(points, time)) * length
+        canonical, ambient = self.deform(points, time)
+        return self.canonical.sigma(canonical, ambient) * length
 
     def loss_terms(
         self, output: RenderOutput, batch: RayBatch, names: Collection[str]

@@ -84,8 +84,9 @@ class PlacedModel(RayTrainable):
     def from_config(cls, config: Mapping[str, Any]) -> Self:
         """Networks of the same sizes in the same place."""
         model = cls(cls.settings_class(**config["settings"]))
+        low, high = config["box"]
         near, far = config["limits"]
-        model.set_place(Box.of(*config["box"]), space_from(config["space"]), (near, far))
+        model.set_place(Box.of(low, high), space_from(config["space"]), (near, far))
         model.set_times(tuple(config["times"]))
         for name in cls.remembered:
             setattr(model, name, config[name])

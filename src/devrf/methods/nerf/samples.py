@@ -104,8 +104,9 @@ def limits(rays: Rays, box: Box, depths: tuple[float, float]) -> tuple[Tensor, T
 
     A ray that misses the box is sampled in a stretch of no length.
     """
-    entry, leave = box.crossing(rays, *depths)
-    near = entry.clamp(max=depths[1])
+    nearest, farthest = depths
+    entry, leave = box.crossing(rays, nearest, farthest)
+    near = entry.clamp(max=farthest)
     return near, torch.maximum(leave, near)
 
 

@@ -39,9 +39,9 @@ def shared(dynamic: Tensor, static: Tensor, share: Tensor) -> tuple[Tensor, Tens
         static: (S,) τ_s of the static field alone.
         share: (S,) v in [0, 1], the share of the dynamic part.
     """
-    opacities = share * torch.expm1(-dynamic), (1 - share) * torch.expm1(-static)
-    moving, still = (-torch.log1p(opacity.clamp(min=LEAST - 1)) for opacity in opacities)
-    return moving, still
+    moving = share * torch.expm1(-dynamic)
+    still = (1 - share) * torch.expm1(-static)
+    return -torch.log1p(moving.clamp(min=LEAST - 1)), -torch.log1p(still.clamp(min=LEAST - 1))
 
 
 def blended(dynamic: Tensor, static: Tensor, ray: Tensor, rays: int) -> Blend:
@@ -205,5 +205,6 @@ class TwoFields(nn.Module):
         """
         if self.additive:
             return blended(dynamic, static, ray, rays)
-        blend = blended(*shared(dynamic, static, v), ray, rays)
+        dynamic, static = shared(dynamic, static, v)
+        blend = blended(dynamic, static, ray, rays)
         return closed(blend, v, ray) if unbounded else blend

@@ -142,11 +142,11 @@ class NSFF(NeuralField):
         static = fields.static.at(points, rays.viewdirs, ray)
         dynamic = fields.dynamic.at(points, time.index_select(0, ray), rays.viewdirs, ray)
         noise = fields.noise(static.raw)
-        depths = (
-            fields.optical_depth(dynamic.raw, samples.length, noise),
-            fields.optical_depth(static.raw, samples.length, noise),
+        dynamic_depth = fields.optical_depth(dynamic.raw, samples.length, noise)
+        static_depth = fields.optical_depth(static.raw, samples.length, noise)
+        blend = fields.blended(
+            dynamic_depth, static_depth, static.blend, ray, len(rays), unbounded=unbounded
         )
-        blend = fields.blended(*depths, static.blend, ray, len(rays), unbounded=unbounded)
         weight = blend.dynamic + blend.static
         color = blend.dynamic[:, None] * dynamic.color + blend.static[:, None] * static.color
         output = accumulated(samples, weight, color, blend.transmittance, background)
@@ -158,7 +158,7 @@ class NSFF(NeuralField):
             points=points,
             static=static,
             dynamic=dynamic,
-            depths=depths,
+            depths=(dynamic_depth, static_depth),
             blend=blend,
         )
 
@@ -214,11 +214,10 @@ class FlowingView(RayView):
         out = self._model.render_rays(rays, now, black)
         ray = out.samples.ray
         blend = out.blend
-        places = self._moved(out.points, rays.viewdirs, ray, time), out.points
-        moving, still = (
-            cameras.project_into(0, self._model.placement.world(points))[0] - pixels[ray]
-            for points in places
-        )
+        there = self._moved(out.points, rays.viewdirs, ray, time)
+        placement = self._model.placement
+        moving = cameras.project_into(0, placement.world(there))[0] - pixels[ray]
+        still = cameras.project_into(0, placement.world(out.points))[0] - pixels[ray]
         total = blend.dynamic[:, None] * moving + blend.static[:, None] * still
         mass = sum_by_ray(blend.dynamic + blend.static, ray, len(rays))
         return sum_by_ray(total, ray, len(rays)) / mass.clamp(min=1e-6)[:, None], mass
