@@ -199,7 +199,10 @@ class DivergenceGuard(Callback):
             return
         log.warning(
             "%s: %s: back to iteration %d, learning rates at %g of the schedule's",
-            *(stage.name, wrong, stage.iteration, stage.lr_scale),
+            stage.name,
+            wrong,
+            stage.iteration,
+            stage.lr_scale,
         )
 
 

@@ -142,7 +142,9 @@ class PeriodicCheckpoint(Callback):
                 good = "there is none yet" if self.saved is None else f"iteration {self.saved}"
                 log.warning(
                     "%s: %s; training goes on, the last good progress file stays (%s)",
-                    *(path, error.strerror, good),
+                    path,
+                    error.strerror,
+                    good,
                 )
             self._failing = True
         else:

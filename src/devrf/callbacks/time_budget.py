@@ -196,7 +196,10 @@ class TimeBudget(Callback):
         assert isinstance(pl_module, ScheduledStage)
         log.info(
             "%s: %d iterations for its %d, on %.0f%% of their rays, in %.1f s of %.1f",
-            *(pl_module.name, pl_module.iterations_done, pl_module.iteration),
+            pl_module.name,
+            pl_module.iterations_done,
+            pl_module.iteration,
             100 * pl_module.loop.batch_share,
-            *(self._record.seconds, self._budget),
+            self._record.seconds,
+            self._budget,
         )

@@ -111,7 +111,8 @@ class Box:
 
     def nearest(self, points: Tensor) -> Tensor:
         """The nearest points (..., 3) of the box, inside included."""
-        return points.clamp(*self.corners(points))
+        low, high = self.corners(points)
+        return points.clamp(low, high)
 
     def corners(self, like: Tensor) -> tuple[Tensor, Tensor]:
         """The two corners (3,) as tensors with the dtype and device of ``like``; to be read only.
@@ -144,7 +145,8 @@ class Box:
         A ray that misses has entry > exit; entry is negative for a ray that starts inside, if
         ``near`` is.
         """
-        return rays.crossing(*self.corners(rays.origins), near, far)
+        low, high = self.corners(rays.origins)
+        return rays.crossing(low, high, near, far)
 
     @staticmethod
     def of(low: Tensor | list[float], high: Tensor | list[float]) -> Box:
