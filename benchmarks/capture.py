@@ -32,26 +32,30 @@ from devrf.system.files import write_json
 
 def levels(*rows: tuple[int, int]) -> list[str]:
     """Overrides for levels of (side, iterations of a frame), the third left out."""
-    given = [f"{{side:{side},iterations:{count}}}" for side, count in rows]
-    return [f"schedule.deformation.levels.{k}={row}" for k, row in enumerate([*given, "null"], 1)]
+    values = [f"{{side:{side},iterations:{count}}}" for side, count in rows]
+    return [f"schedule.deformation.levels.{k}={row}" for k, row in enumerate([*values, "null"], 1)]
 
 
 # What is learned: half of the images' size, for some hundred iterations.
 LEARNED = {
     "forward": (
-        *("experiment=quickstart", "schedule.canonical.upsample_at=[60,120]"),
+        "experiment=quickstart",
+        "schedule.canonical.upsample_at=[60,120]",
         "schedule.canonical.iterations=300",
         *levels((8, 16), (16, 10)),
     ),
     "inward": (
-        *("experiment=quickstart", "schedule.canonical.upsample_at=[50,100,150]"),
+        "experiment=quickstart",
+        "schedule.canonical.upsample_at=[50,100,150]",
         "schedule.canonical.iterations=300",
         *levels((8, 12), (12, 8)),
         "schedule.deformation.rays=768",
     ),
     "monocular": (
-        *("experiment=quickstart", "schedule.canonical.upsample_at=[40,80,120]"),
-        *("schedule.canonical.iterations=250", "schedule.canonical.rays=1024"),
+        "experiment=quickstart",
+        "schedule.canonical.upsample_at=[40,80,120]",
+        "schedule.canonical.iterations=250",
+        "schedule.canonical.rays=1024",
         *levels((8, 6), (12, 3)),
         "schedule.deformation.rays=768",
     ),
@@ -113,7 +117,8 @@ def with_true_cameras(captured: Path, into: Path, film: Filmed) -> None:
     into.mkdir()
     (into / "images").symlink_to((captured / "images").resolve())
     listing = json.loads((captured / "transforms.json").read_text())
-    fx, fy, cx, cy = (*film.moving.focal[0].tolist(), *film.moving.center[0].tolist())
+    fx, fy = film.moving.focal[0].tolist()
+    cx, cy = film.moving.center[0].tolist()
     lens = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "k1": 0.0}
     frames = listing["frames"]
     true = film.true_poses(frames)

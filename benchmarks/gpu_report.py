@@ -39,29 +39,43 @@ HERE = Path(__file__).resolve()
 DEVICE = torch.device("cuda", 0) if torch.cuda.is_available() else torch.device("cpu")
 GPU = DEVICE.type == "cuda"
 # The embedded scene as large as the paper's: 100 views at rest, 4 of 50 frames, 400 × 400 pixels.
-SIZE, VIEWS, FRAMES = (400, 100, 50) if GPU else (24, 6, 3)
+SIZE = 400 if GPU else 24
+VIEWS = 100 if GPU else 6
+FRAMES = 50 if GPU else 3
 SCENE = [
-    *("data=procedural", "data.supersample=1", f"data.width={SIZE}", f"data.height={SIZE}"),
-    *(f"data.static_views={VIEWS}", f"data.frames={FRAMES}"),
+    "data=procedural",
+    "data.supersample=1",
+    f"data.width={SIZE}",
+    f"data.height={SIZE}",
+    f"data.static_views={VIEWS}",
+    f"data.frames={FRAMES}",
 ]
-TINY = ["field.width=16", "schedule.canonical.side=16", "schedule.canonical.search_side=12"]
-TINY += ["schedule.canonical.rays=128", "schedule.deformation.rays=128"]
-# So few iterations do not learn what each growth takes away.
-TINY += ["schedule.canonical.density_drop=0", "schedule.canonical.occupancy_every=null"]
+TINY = [
+    "field.width=16",
+    "schedule.canonical.side=16",
+    "schedule.canonical.search_side=12",
+    "schedule.canonical.rays=128",
+    "schedule.deformation.rays=128",
+    # So few iterations do not learn what each growth takes away.
+    "schedule.canonical.density_drop=0",
+    "schedule.canonical.occupancy_every=null",
+]
 
 
 def shortened(search: int, fine: int, frame: int) -> list[str]:
     """Overrides of the paper's schedule: iterations of the search, the field, and each frame."""
     key = "schedule.canonical"
     levels = range(1, 6)
-    given = [
-        *(f"{key}.search_iterations={search}", f"{key}.visual_hull_init=true"),
-        *(f"{key}.iterations={fine}", f"{key}.decay_iterations={fine}"),
+    overrides = [
+        f"{key}.search_iterations={search}",
+        f"{key}.visual_hull_init=true",
+        f"{key}.iterations={fine}",
+        f"{key}.decay_iterations={fine}",
         f"{key}.upsample_at=[{','.join(str(fine * k // 20) for k in (1, 2, 3, 4))}]",
         *(f"schedule.deformation.levels.{k}.iterations={frame}" for k in levels),
     ]
     sides = (f"schedule.deformation.levels.{k}.side={k + 2}" for k in levels)
-    return given if GPU else [*given, *sides, *TINY]
+    return overrides if GPU else [*overrides, *sides, *TINY]
 
 
 def run_of(into: Path, name: str, *overrides: str, experiment: str = "paper") -> RunContext:
@@ -121,7 +135,7 @@ def learned(
         with Stopwatch(DEVICE) as watch:
             harness.run_stage(run.config, run.folder)
         seconds = time.perf_counter() - began
-        peaks = torch.cuda.max_memory_allocated(), torch.cuda.max_memory_reserved()
+        peaks = (torch.cuda.max_memory_allocated(), torch.cuda.max_memory_reserved())
         yield {"stage": stage, "all seconds": seconds, "bytes allocated, reserved": peaks}
         if stage != "evaluate":
             yield from watch.rows()

@@ -92,6 +92,6 @@ class Stopwatch:
         shape = tuple(stage.resolution)
         seconds, iterations = self._levels.get(shape, (0.0, 0))
         seconds += time.perf_counter() - self._since
-        self._levels[shape] = seconds, iterations + stage.iteration - self._iteration
+        self._levels[shape] = (seconds, iterations + stage.iteration - self._iteration)
         self._since = time.perf_counter()
         self._iteration = stage.iteration

@@ -9,6 +9,7 @@ from __future__ import annotations
 from harness import learned_scene, open_run, parser, report
 
 # isort: split
+from functools import partial
 from statistics import median
 from typing import Any
 
@@ -44,13 +45,15 @@ def frames_a_second(
     again: list[float] = []
     threads = torch.get_num_threads()
     for index in torch.linspace(0, len(views) - 1, count).round().int().tolist():
-        camera = views.cameras, index, float(views.times[index]), background
-        timer = Timer(
-            "renderer.view(*camera)",
-            globals={"renderer": renderer, "camera": camera},
-            num_threads=threads,
+        render = partial(
+            renderer.view,
+            views.cameras,
+            index,
+            time=float(views.times[index]),
+            background=background,
         )
-        renderer.view(*camera)
+        timer = Timer("render()", globals={"render": render}, num_threads=threads)
+        render()
         renderer.at.cache_clear()
         first.append(timer.timeit(1).median)
         again.append(timer.timeit(3).median)
