@@ -44,7 +44,8 @@ OWN = Path(__file__).with_name("catalogue.toml")
 # Beside the data: where they are from, when, and their checksums.
 RECORD = "fetched.json"
 ARCHIVE = "archive"
-# Images hardly expand, and camera files by ten times or so; a small archive may by more.
+# Images hardly expand, and camera files about tenfold. An archive that unpacks to at most SMALL
+# bytes may expand by more.
 MOST_EXPANSION = 20
 SMALL = 2**26
 # The file by which a scene's folder is known, by the layout that reads it.
@@ -289,11 +290,11 @@ def _check_size(packed: zipfile.ZipFile, archive: Path, work: Path) -> None:
         DevrfError: it would expand far beyond that; ``work`` is removed, and the archive with it.
     """
     size = archive.stat().st_size
-    whole = sum(file.file_size for file in packed.infolist())
-    if whole > max(MOST_EXPANSION * size, SMALL):
+    unpacked_size = sum(file.file_size for file in packed.infolist())
+    if unpacked_size > max(MOST_EXPANSION * size, SMALL):
         shutil.rmtree(work, ignore_errors=True)
         raise DevrfError(
-            f"{archive}: {decimal(size)} would unpack to {decimal(whole)}, more than "
+            f"{archive}: {decimal(size)} would unpack to {decimal(unpacked_size)}, more than "
             f"{MOST_EXPANSION} times as much; it was removed: ask who published it"
         )
 
@@ -306,7 +307,7 @@ def _unpacked(scene: PublishedScene, work: Path) -> Path:
     try:
         with zipfile.ZipFile(archive) as packed:
             _check_size(packed, archive, work)
-            packed.extractall(place)  # what would be written elsewhere is written there
+            packed.extractall(place)  # names that lead elsewhere are written below it, too
     except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
         raise DevrfError(
             f"{archive}: cannot be unpacked ({error}); remove it, and the same command fetches it "

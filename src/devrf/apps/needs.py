@@ -1,7 +1,7 @@
-"""What it takes to learn a scene: an estimate of what is large.
+"""An estimate of the memory that learning a scene takes.
 
-Counted are the images, the fields with their gradients and Adam's state, and a batch. The rest is
-small beside them; where memory runs out all the same, batches are split
+It counts the images, the fields with their gradients and Adam's state, and a batch. The rest is
+small beside them; if memory runs out all the same, batches are split
 (:mod:`devrf.engine.micro_batching`).
 """
 
@@ -20,14 +20,15 @@ from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.scenes.scene import Scene
 
-# Python and its libraries on the host; measured, as is what the C library keeps of freed memory.
+# Bytes of Python and its libraries on the host, measured.
 PROGRAM = 600_000_000
+# Factor for the freed memory that the C library keeps, measured.
 FRAGMENTATION = 1.3
 # Values, gradients, Adam's two means, and the copy that a rollback returns to.
 LEARNED = 5
-# Measured around a free-standing object: the share of a ray's samples that are occupied, and of
-# these the share whose colour counts once surfaces have formed.
+# The share of a ray's samples that are occupied, measured around a free-standing object.
 OCCUPIED = 0.3
+# The share of occupied samples whose colour counts once surfaces have formed, measured there, too.
 COLOURED = 0.25
 
 
@@ -36,8 +37,8 @@ class StageNeeds:
     """What a stage needs, in bytes.
 
     Attributes:
-        parts: on the device that trains, by the config key that changes them most: the batch by
-            that of its rays.
+        parts: bytes on the device that trains, by the config key that changes them most; the
+            batch's key is that of its rays.
         learned: the values of the fields.
     """
 
@@ -51,7 +52,7 @@ class StageNeeds:
 
 
 def smaller(scene: Scene, by: float) -> Scene:
-    """What a scene of images smaller by ``by`` needs: corners of the images stand for them."""
+    """A scene that needs as much as one of images smaller by ``by``: it has their corners only."""
 
     def corner(of_views: Any) -> Any:
         if not isinstance(of_views, Tensor) or of_views.ndim < 3:
@@ -144,7 +145,7 @@ def needs_of_devrf(
     """
     schedule, sizes = fitted_to(scene, canonical.schedule, canonical.architecture)
     values = 4 * (1 + sizes.channels) * schedule.side**3
-    # With the graph of its gradients: measured, for each sample whose colour counts.
+    # Bytes of each sample whose colour counts, with the graph of its gradients; measured.
     sample = 600 + 24 * sizes.width + 96 * sizes.channels
     along = 2 / 3 * schedule.side * OCCUPIED if sizes.planes is None else sizes.planes
     ray = along / canonical.sampling.step * sample / processes

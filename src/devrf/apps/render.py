@@ -102,7 +102,7 @@ def _within_limit(settings: VideoSettings, renderer: Renderer, cameras: Cameras)
     """
     if settings.max_seconds is None:
         return settings
-    still(renderer, cameras.of_height(MIN_HEIGHT), 0.5, 1.0)  # what only the first one needs
+    still(renderer, cameras.of_height(MIN_HEIGHT), 0.5, 1.0)  # a warm-up, which is not timed
     began = time.perf_counter()
     still(renderer, cameras, 0.5, 1.0)
     within = settings.within_limit(time.perf_counter() - began, cameras.height)

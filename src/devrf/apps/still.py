@@ -37,7 +37,7 @@ log = logging.getLogger(__name__)
 
 # Pictures of small images are rendered at this height, in pixels, unless another is asked for.
 READABLE = 400
-# Contact sheets: lower images are enlarged to this height, higher ones reduced to the other.
+# The least and the largest height of images in contact sheets; others are resized.
 MIN_HEIGHT = 300
 MAX_HEIGHT = 640
 DEPTH = "depth: near is bright"
@@ -60,7 +60,7 @@ class StillSettings:
     def name(self, moves: bool) -> str:
         """What the image's file is called, without its suffix: ``still_held_out_t0.5_h800``.
 
-        Of a scene that never ``moves`` it says no time.
+        It has no time if the scene never ``moves``.
         """
         time = f"_t{self.time:g}" if moves else ""
         size = "" if self.height is None else f"_h{self.height}"
@@ -78,8 +78,10 @@ class StillSettings:
             captured = viewpoints.static
             index = self.view
         if not 0 <= index < len(captured):
-            some = f"expected held_out or 0 to {len(viewpoints.static) - 1}, not {self.view}"
-            raise DevrfError(f"still.view: {some}")
+            raise DevrfError(
+                f"still.view: expected held_out or 0 to {len(viewpoints.static) - 1}, "
+                f"not {self.view}"
+            )
         return sized(captured[[index]], self.height)
 
 
@@ -144,7 +146,7 @@ def preview(model: Viewable, views: Views, index: int, background: Background) -
 def write_contact_sheet(path: Path, views: Sequence[HeldOutView], rows: int = 6) -> Tensor:
     """Write a PNG of ``rows`` of the views with name, time and scores; the sheet (H, W, 3).
 
-    Where all are at time 0 none is said.
+    Times are left out if all are 0.
     """
     shown = [views[k] for k in evenly(len(views), rows)]
     near, far = _depth_range(shown)

@@ -23,7 +23,7 @@ PIXEL = 0.2
 MAX_FRAMES = 90_000
 # H.264 has blocks of so many pixels.
 MIN_HEIGHT = 16
-# What rendering is to take decides first the height, down to so many rows, then the frames.
+# To render within max_seconds, images get lower, down to LOW rows; then frames get fewer.
 LOW = 160
 MIN_FRAMES = 24
 
@@ -65,7 +65,7 @@ class VideoSettings:
     def within_limit(self, seconds: float, height: int) -> VideoSettings:
         """The settings for images of ``height`` rows that take ``seconds`` each.
 
-        Images are made lower if need be, and where that does not suffice there are fewer.
+        Images are made lower if need be; if that does not suffice, there are fewer.
         """
         share = 1.0 if self.max_seconds is None else self.max_seconds / (self.frames * seconds)
         if share >= 1:
@@ -126,8 +126,7 @@ def held_out_pictures(
 def held_out_images(views: Views, frames: int) -> list[int]:
     """The held-out image for each of ``frames`` times, evenly spread over [0, 1].
 
-    Of a capture with fixed cameras these are images of the first one. Images at rest follow one
-    another.
+    If cameras are fixed, all are images of the first one. Images at rest follow one another.
     """
     first = (views.view == views.view[0]).nonzero()[:, 0]
     images = first if len(first) > 1 else torch.arange(len(views))

@@ -21,10 +21,10 @@ from devrf.scenes.sparse_model import SparseModel, read_model
 
 log = logging.getLogger(__name__)
 
-# Of a video, an image is compared with so many that follow it, and then at doubling distances.
+# An image of a video is compared with so many that follow it, then with some at doubling distances.
 NEIGHBOURS = 10
-# Neighbouring frames of one video do not turn by more degrees than this, and so many times as much
-# as those in the middle: what looks alike has been taken for the same.
+# A camera that turns by more degrees than this between two frames of a video, and so many times the
+# median, has been placed wrongly: two places that look alike were taken for one.
 MOST_TURN = 45.0
 MOST_TURNS = 5.0
 # A model of a smaller share of a moving camera's images is not the scene.

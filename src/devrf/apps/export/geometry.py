@@ -107,10 +107,10 @@ class UpFrame:
     def pose(self, camera: Cameras) -> Tensor:
         """Camera-to-frame (4, 4) float64 of one camera of the world, OpenGL axes."""
         pose = camera.camera_to_world[0]
-        whole = torch.eye(4, dtype=torch.float64)
-        whole[:3, :3] = self.rotation @ pose[:, :3]
-        whole[:3, 3] = self.points(pose[:, 3])
-        return whole
+        camera_to_frame = torch.eye(4, dtype=torch.float64)
+        camera_to_frame[:3, :3] = self.rotation @ pose[:, :3]
+        camera_to_frame[:3, 3] = self.points(pose[:, 3])
+        return camera_to_frame
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ def carried(surface: Surface, model: Renderable, times: Sequence[float]) -> Movi
     moved = []
     for time in times:
         forward = model.forward_map(time)
-        assert forward is not None  # who has a surface to export has it
+        assert forward is not None  # every model with a surface has one
         moved.append(model.space.to_world(forward(points)).float().cpu())
     return MovingMesh(tuple(times), torch.stack(moved), surface.faces, surface.colors)
 
@@ -171,10 +171,11 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
 
 # Cameras that look at the scene, at most.
 CAMERAS = 24
-# Rows of the images that tell how much of them is filled, and of the largest ones.
+# Rows of the first images, which tell what share of their pixels is filled.
 FIRST = 24
+# Rows of the largest images.
 LARGEST = 2048
-# So many more pixels than the share that is filled asks for.
+# The images have so many times the pixels that are expected to suffice.
 SPARE = 1.3
 
 
@@ -183,13 +184,13 @@ def seen_points(
 ) -> tuple[Tensor, Tensor]:
     """Points (N, 3) that the cameras see at ``time``, world units, and their sRGB colours (N, 3).
 
-    They are where rays end, in the mean. Of many cameras (world units) some are taken, evenly
-    chosen, and of many points ``count``. ``background`` is a grey level.
+    Each is at the mean depth of a ray. At most :data:`CAMERAS` cameras (world units) and ``count``
+    points are taken, evenly chosen. ``background`` is a grey level.
     """
-    some = cameras[_evenly(len(cameras), CAMERAS)].to(renderer.device)
-    filled = len(_seen(renderer, some.of_height(FIRST), time, background)[0])
-    rows = FIRST * (SPARE * count / max(filled, 1)) ** 0.5
-    points, colors = _seen(renderer, some.of_height(min(round(rows), LARGEST)), time, background)
+    cameras = cameras[_evenly(len(cameras), CAMERAS)].to(renderer.device)
+    filled = len(_seen(renderer, cameras.of_height(FIRST), time, background)[0])
+    rows = min(round(FIRST * (SPARE * count / max(filled, 1)) ** 0.5), LARGEST)
+    points, colors = _seen(renderer, cameras.of_height(rows), time, background)
     chosen = _evenly(len(points), count)
     return points[chosen], colors[chosen]
 

@@ -15,7 +15,7 @@ from devrf.system.files import atomic_write, write_json
 
 FRAME = "world: the axes and the unit of the capture"
 
-# What a moment's file holds: as trimesh writes it.
+# What the file of one time holds: a mesh or points of trimesh.
 Drawn = Any
 
 

@@ -18,9 +18,9 @@ from devrf.geometry.space import Space
 from devrf.methods.base import Renderable
 from devrf.rendering.view import SurfaceField
 
-# Points at which a field is asked at once.
+# Points at which a field is evaluated at once.
 CHUNK = 2**18
-# A voxel with less optical depth counts as having so much: the logarithm ends here.
+# The least optical depth of a voxel, so that its logarithm is finite.
 LEAST = 1e-6
 # Rays of each camera, along each side of its image, that say where empty space begins.
 ENTRIES = 16
@@ -57,7 +57,7 @@ def isosurface(model: Renderable, outside: Tensor, threshold: float, side: int |
     shape = field.shape
     if side is not None:
         x, y, z = (max(2, round(edge / box.longest * (side - 1)) + 1) for edge in box.size)
-        shape = x, y, z
+        shape = (x, y, z)
     points = torch.split(box.grid_points(shape, torch.empty(0)).view(-1, 3), CHUNK)
     depth = torch.cat([_optical_depth(model, part) for part in points]).view(shape)
     level = _logit(torch.tensor(-math.log1p(-threshold))).item()
@@ -99,12 +99,12 @@ def entries(model: Renderable, cameras: Cameras) -> Tensor:
 
 def _field(model: Renderable) -> SurfaceField:
     field = model.surface()
-    assert field is not None  # the export has asked
+    assert field is not None  # the export has checked
     return field
 
 
 def _optical_depth(model: Renderable, points: Tensor) -> Tensor:
-    """τ (M,) at ``points`` (M, 3) of the host, there."""
+    """τ (M,) at ``points`` (M, 3), both on the host."""
     return _field(model).optical_depth(points.to(model.device)).cpu()
 
 
@@ -121,9 +121,9 @@ def _reached(empty: npt.NDArray[np.bool_], box: Box, outside: Tensor) -> npt.NDA
     shape = torch.tensor(empty.shape)
     cells = box.to_grid(outside, empty.shape).round().long()
     inside = ((cells >= 0) & (cells < shape)).all(dim=1)
-    begun = np.unique(labels[tuple(cells[inside].t().numpy())])
-    reached: npt.NDArray[np.bool_] = np.isin(labels, begun[begun > 0])
-    # Where all cameras stand in fog there is nothing to go by.
+    seeds = np.unique(labels[tuple(cells[inside].t().numpy())])
+    reached: npt.NDArray[np.bool_] = np.isin(labels, seeds[seeds > 0])
+    # If all cameras stand in fog, nothing tells which empty cells are outside.
     return reached if reached.any() else empty
 
 
@@ -139,7 +139,7 @@ def canonical_surface(model: Renderable, cameras: Cameras, settings: ExportSetti
     outside = entries(model, cameras)
     points, faces = isosurface(model, outside, settings.threshold, settings.side)
     mesh = trimesh.Trimesh(points, faces, process=False)
-    # Unbounded spaces reach to infinity: of a face all vertices have to be near enough.
+    # Unbounded spaces reach to infinity: all vertices of a face have to be near enough.
     away = (space.to_world(torch.from_numpy(points)) - cameras.positions.mean(dim=0)).norm(dim=1)
     near = (away <= settings.reach * away.median()).numpy()[faces].all(axis=1)
     if not near.any():
@@ -171,13 +171,13 @@ def _mirrors(space: Space, box: Box) -> bool:
 
 # Vertices whose colour is found at once.
 VERTICES = 2**13
-# Where a ray begins and ends, in voxels behind the vertex, and how far its samples are apart.
+# Where a ray begins and ends behind the vertex, and how far its samples are apart, in voxels.
 BEFORE = -1.0
 BEHIND = 3.0
 STEP = 0.25
 # Samples with a smaller share of what is seen are left out.
 SIGNIFICANT = 0.01
-# Directions over which colours are averaged, and the widest, in degrees off the normal.
+# Directions over which colours are averaged, and their largest angle to the normal in degrees.
 DIRECTIONS = 16
 WIDEST = 60.0
 

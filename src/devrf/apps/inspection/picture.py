@@ -24,7 +24,7 @@ from devrf.scenes.optical_flow import frame_pairs
 from devrf.scenes.scene import OpticalFlow, Scene, Views
 from devrf.system.files import atomic_write
 
-# Inches, of which each is 100 pixels: the page's width; the heights of its parts.
+# The page's width, and the heights of its parts, in inches of 100 pixels.
 WIDTH = 16.0
 CAMERAS = 7.2
 HEADING = 0.55
@@ -137,8 +137,8 @@ def sample_images(views: Views) -> list[list[int]]:
     order = sorted(range(len(views)), key=lambda k: (float(views.times[k]), k))
     numbers = list(first_images(views))
     if len(numbers) == len(views):
-        some = [order[k] for k in evenly(len(order), 2 * COLUMNS)]
-        return [some[k : k + COLUMNS] for k in range(0, len(some), COLUMNS)]
+        images = [order[k] for k in evenly(len(order), 2 * COLUMNS)]
+        return [images[k : k + COLUMNS] for k in range(0, len(images), COLUMNS)]
     rows = []
     for k in evenly(len(numbers), MOST_VIEWS):
         of_view = [image for image in order if int(views.view[image]) == numbers[k]]
@@ -168,7 +168,7 @@ def shown(views: Views, image: int) -> np.ndarray:
 
 
 def _smaller(colors: Tensor) -> np.ndarray:
-    """Reduced by a whole factor to little more than is shown: a page of full images is large."""
+    """Colours reduced by a whole factor to little more than is shown, to keep the page small."""
     image = Image.fromarray(to_bytes(colors).numpy())
     return np.asarray(image.reduce(max(1, image.width // 300)))
 

@@ -168,13 +168,13 @@ def flow_facts(views: Views) -> str:
     for k in images:  # one by one: all of a large scene's flow at once would be copied
         valid = views.flow.valid[k]
         length = views.flow.vectors[k][valid].norm(dim=-1)
-        count = count + len(length)
-        total = total + float(length.sum())
+        count += len(length)
+        total += float(length.sum())
         longest = max(longest, float(length.max())) if len(length) else longest
         if views.has_alpha:
             alpha = views.pixels[k, ..., 3] > OPAQUE
-            inside = inside + int(alpha.sum())
-            covered = covered + int((alpha & valid).sum())
+            inside += int(alpha.sum())
+            covered += int((alpha & valid).sum())
     share = _percent(count / max(len(images) * views.width * views.height, 1))
     in_alpha = f" ({_percent(covered / max(inside, 1))} of the alpha masks)" * views.has_alpha
     return (

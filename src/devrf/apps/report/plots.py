@@ -57,7 +57,7 @@ MARKERS = dict(zip(NAMES, "s^vDPX", strict=True))
 VARIANT = r"-2 ?stage$|-dynamic$| \(base\)$| w/ .*$"
 # Seconds to label on an axis: of these multiples the first that there is room for.
 UNITS = (0.01, 0.1, 1, 10, 60, 600, 3600, 36000, 360000, math.inf)
-MULTIPLES = (1, 1.5, 2, 3, 4, 6), (1, 2, 3, 4, 6), (1, 2, 5), (1, 3), (1,)
+MULTIPLES = ((1, 1.5, 2, 3, 4, 6), (1, 2, 3, 4, 6), (1, 2, 5), (1, 3), (1,))
 MOST_TICKS = 5
 
 
@@ -95,8 +95,8 @@ def psnr_over_time(table: Table, scene: str) -> Figure | None:
     figure = Figure(figsize=(6.4, 3.6), layout="constrained")
     axes = figure.subplots()
     for label, runs in table.runs[table.runs["scene"] == scene].groupby("label", sort=False):
-        of_runs = [metric_over_time(path, "psnr") for path in runs["path"]]
-        curve = pd.concat(of_runs, axis=1, join="inner").mean(axis=1)
+        curves = [metric_over_time(path, "psnr") for path in runs["path"]]
+        curve = pd.concat(curves, axis=1, join="inner").mean(axis=1)
         if len(curve):
             color, dashes = _look(table, label)
             marker = "o" if len(curve) < 30 else ""
@@ -282,8 +282,9 @@ def _legend(figure: Figure) -> None:
 BATCHES = "#9ec9e6"
 MEAN = "#0072b2"
 PREVIEWS = "#d55e00"
-# The running mean is over so large a part of the curve; more labels of grids would overlap.
+# The running mean is over this share of the curve.
 WINDOW = 1 / 25
+# More labels of grids would overlap.
 MOST_GRIDS = 8
 
 

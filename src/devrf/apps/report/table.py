@@ -204,7 +204,7 @@ def _is_of_published_data(run: Mapping[str, Any]) -> bool:
 
 
 def _values(runs: pd.DataFrame, column: Column) -> pd.Series:
-    """The values of a column, NaN where unknown; those of scenes at rest are of the static set."""
+    """The values of a column, NaN where unknown; scenes at rest have those of the static set."""
     values = runs[column.key].map(number).astype(float)
     section, _, name = column.key.partition(".")
     at_rest = runs["at_rest"].eq(True)
@@ -265,7 +265,7 @@ def _cells(
 def _average(
     runs: pd.DataFrame, rows: pd.DataFrame, scenes: list[str], columns: Sequence[Column]
 ) -> pd.DataFrame:
-    """Means over all scenes, if they are alike, of what was run on all of them, without spread."""
+    """Means over all scenes, if these are alike, of rows that every scene has; without spread."""
     groups = rows.groupby("label", sort=False)
     titles = [column.title for column in columns]
     means = _over_scenes(rows[titles], scenes).join(groups[["name", "protocol"]].first())
@@ -278,7 +278,8 @@ def _average(
 def _gains(rows: pd.DataFrame, average: pd.DataFrame) -> pd.DataFrame:
     """What the rows of an average gain over its first: see :class:`Table`."""
     by_scene = rows[rows["label"].isin(average.index)].pivot(index="label", columns="scene")
-    psnr, seconds = (by_scene[title].reindex(average.index) for title in ("PSNR", "Time"))
+    psnr = by_scene["PSNR"].reindex(average.index)
+    seconds = by_scene["Time"].reindex(average.index)
     gain = psnr - psnr.iloc[0]
     first = average["head", "name"].iloc[0]
     least = zip(gain.min(axis=1), gain.idxmin(axis=1), strict=True)
@@ -295,7 +296,7 @@ def _gains(rows: pd.DataFrame, average: pd.DataFrame) -> pd.DataFrame:
 
 
 def _published(scenes: list[str], columns: Sequence[Column]) -> pd.DataFrame:
-    """The paper's rows of a scene, or their means over several; of none, none."""
+    """The paper's rows of a scene, or their means over several; empty for no scene."""
     values = _over_scenes(_of(published().values, scenes), scenes).dropna()
     values = values.reindex(columns=[column.title for column in columns])
     rows = values.assign(name=values.index, protocol="", counts=[{1} for _ in values.index])
@@ -325,10 +326,8 @@ def _scored_again(runs: pd.DataFrame) -> pd.Series:
 def _sampled(runs: pd.DataFrame) -> list[str]:
     """How the methods that choose their samples took them, a sentence for each way."""
     absent = pd.Series(None, runs.index, dtype=object)
-    kind, hull = (
-        runs.get(f"run.settings.ray_stage.model.settings.{key}", absent)
-        for key in ("sampling", "hull")
-    )
+    kind = runs.get("run.settings.ray_stage.model.settings.sampling", absent)
+    hull = runs.get("run.settings.ray_stage.model.settings.hull", absent)
     # A hull of alpha masks counts with samples by occupancy only; Neural Volumes' always are.
     carved = hull.eq(True) & kind.fillna("occupancy").eq("occupancy")
     way = kind.where(kind.notna() | hull.isna(), "even steps")

@@ -100,8 +100,9 @@ def _write(path: Path, text: str) -> None:
 COLUMNS = 3
 TRUTH = 0
 RENDERED = 1
+# Pixels above each picture for its label, and between pictures.
 BAND = 22
-MARGIN = 4  # pixels: above each picture for its label, and between them
+MARGIN = 4
 
 
 def scene_video(table: Table, scene: str) -> Iterator[np.ndarray] | None:

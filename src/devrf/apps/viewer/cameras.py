@@ -27,10 +27,11 @@ if TYPE_CHECKING:
 
 # From OpenGL's camera axes (y up, z backwards) to OpenCV's (y down, z forwards), and back.
 FLIP = (1.0, -1.0, -1.0)
-# Rows of an image in a frustum, and the most frusta of a capture.
+# Rows of an image in a frustum.
 ROWS = 96
+# The most frusta of a capture.
 MAX_FRUSTA = 60
-# A frustum is as deep as its neighbour is far, within these shares of the distance of the scene.
+# A frustum is as deep as its neighbour is far, within these shares of the distance to the scene.
 MIN_DEPTH = 0.03
 MAX_DEPTH = 0.12
 COLOR = (40, 110, 170)

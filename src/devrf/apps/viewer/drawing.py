@@ -21,16 +21,17 @@ from devrf.rendering.output import RenderedImage
 from devrf.rendering.renderer import Renderer, points_at_depth
 from devrf.rendering.view import MovingView
 
-# Motion is shown as optical flow over so much time, and saturated at this share of the height.
+# Motion is shown as optical flow over STEP of the time, saturated at this share of the height.
 STEP = 0.05
 SATURATED = 0.02
-# Seconds that a block of rays should take: between blocks a frame can be given up.
+# Seconds that a block of rays should take, and its fewest rays: a frame can be given up between
+# blocks.
 BLOCK_SECONDS = 0.08
 MIN_RAYS = 512
 # In empty space nothing hides what is drawn into the scene.
 NOWHERE = 1e3
-# A finer frame has at most so many times the rows of the one before; one that would be nearly
-# full is full at once.
+# A finer frame has at most FINER times the rows of the one before. A frame with more than NEARLY of
+# all rows gets all at once.
 FINER = 3
 NEARLY = 0.75
 
@@ -106,16 +107,16 @@ class Drawing:
         keyframe = replace(shot.keyframe, fov=2 * math.degrees(math.atan(tangent)))
         parts = []
         depth = None
-        for moment in times:
+        for current in times:
             camera = cameras_of([keyframe], shot.aspect / len(times), height)
             camera = camera.to(self.renderer.device)
             started = time.perf_counter()
             with torch.no_grad():
-                self.renderer.at(moment)  # cached, or it takes a while
+                self.renderer.at(current)  # cached, or it takes a while
             self._overhead += 0.3 * (time.perf_counter() - started - self._overhead)
             started = time.perf_counter()
             blocks = []
-            for block in self._blocks(shot, camera, moment):
+            for block in self._blocks(shot, camera, current):
                 blocks.append(block)
                 yield None
             image = RenderedImage.joined([image for image, _ in blocks])

@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 
 # Seconds between looks at the clock while nothing is to be rendered.
 TICK = 0.02
-# Of full frames, as JPEG. Coarse ones are enlarged, which would show JPEG's blocks and halos.
+# JPEG's quality for full frames. Coarse ones are enlarged, which would show its blocks and halos.
 QUALITY = 92
 
 
