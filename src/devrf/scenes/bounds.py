@@ -15,7 +15,7 @@ from devrf.scenes.validation import FARTHEST, scene_error
 
 # Room for motion where nothing else is known: the published scenes use 1.05 to 2.
 FALLBACK_BOUND_SCALE = 1.5
-# At rest: as much as is left around the rest state where the room for motion is known.
+# Room around a scene at rest: as much as around the rest state where the room for motion is known.
 REST_BOUND_SCALE = 1.05
 STILL = "no motion: the scene is at rest"
 # Mean square sine of the angle between the axes and their common direction: about 2 degrees.
@@ -32,8 +32,8 @@ GIVE = "set data.box=[[x,y,z],[x,y,z]], data.near and data.far"
 def nearest_point(origins: Tensor, axes: Tensor, parallel: float) -> Tensor | None:
     """The point (3,) nearest to N lines through ``origins`` (N, 3) along unit ``axes`` (N, 3).
 
-    By least squares: solves Σ (I − d dᵀ) p = Σ (I − d dᵀ) o. None where the mean square sine of the
-    angle between the axes and their common direction is below ``parallel``.
+    It solves the least-squares problem Σ (I − d dᵀ) p = Σ (I − d dᵀ) o. None if the mean square
+    sine of the angle between the axes and their common direction is below ``parallel``.
     """
     across = torch.eye(3, dtype=axes.dtype) - axes[:, :, None] * axes[:, None, :]
     normal = across.mean(dim=0)
@@ -105,7 +105,7 @@ def resolved_box(low: Tensor, high: Tensor) -> Box:
 
 def box_of_frusta(cameras: Cameras, near: float, far: float) -> Box:
     """The box of all that the cameras see between two distances (world units) along their rays."""
-    # Ends of rays lie on a sphere, which bulges between its corners: so fine a grid sees it.
+    # Ends of rays lie on a sphere, which bulges between its corners: the grid has to be this fine.
     steps = torch.linspace(0, 1, 17).to(cameras.center)
     share = torch.cartesian_prod(steps, steps)
     pixels = share * share.new_tensor([cameras.width, cameras.height])
@@ -144,7 +144,7 @@ def inward_bounds(
     ``bound_scale="auto"`` silhouettes say where it moves, where there are alpha masks; else the
     given box, or a fixed scale, leaves room.
     """
-    given = box is not None
+    box_is_given = box is not None
     scale = FALLBACK_BOUND_SCALE if bound_scale == "auto" else float(bound_scale)
     box = box or box_from_cameras(static.cameras)
     motion = None
@@ -160,7 +160,7 @@ def inward_bounds(
             views = len(set(dynamic.view.tolist()))
             frames = len(set(dynamic.times.tolist()))
             source = f"silhouettes of {views} views x {frames} frames"
-    limited = given and motion is None and bound_scale == "auto"
+    limited = box_is_given and motion is None and bound_scale == "auto"
     if limited:
         source = "data.box (no alpha masks from two cameras at every time)"
     reach = box if motion is None else box.union(motion)

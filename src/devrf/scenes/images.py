@@ -1,8 +1,8 @@
 """Image files → uint8 tensors: measured, turned where they have to be, made smaller.
 
 A photo may carry an EXIF orientation: viewers turn it, most tools that find cameras do not. The
-camera's own size tells which of the two it was found on, if it tells anything: an image is turned
-where only the turned one has the camera's shape, and is else read as it is stored.
+camera's own size may tell which of the two it was found on: an image is turned if only the turned
+one has the camera's shape; otherwise it is read as it is stored.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ TURNS = {
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
 }
-# Of these, width and height change places.
+# Turns that exchange width and height.
 QUARTER_TURNS = (5, 6, 7, 8)
 
 Size = tuple[float, float]
@@ -202,8 +202,8 @@ def load_images(
         paths: at least one existing file, 8 bits a channel, with or without alpha.
         downscale: integer factor ≥ 1; each side becomes floor(side / downscale), by area averages
             of premultiplied colours.
-        cameras: (width, height) of the images that each camera is for, of any scale; None where it
-            is unknown, or of all.
+        cameras: (width, height) of the images that each camera is for, of any scale; None if it
+            is unknown, for one image or for all.
         finish: what to make of each RGBA image, by its position, before it is made smaller; images
             without alpha come to it opaque.
 

@@ -20,7 +20,7 @@ from devrf.scenes.transforms import SceneBounds
 from devrf.scenes.validation import LARGEST, Options, checked_box, scene_error
 
 FlowSource = Literal["auto", "files", "dis", "raft", "none"]
-# Of layouts that have no place for flow files.
+# The flow sources of layouts that have no place for flow files.
 EstimatedFlow = Literal["auto", "dis", "raft", "none"]
 
 Count = Annotated[int, Field(strict=True, ge=1)]
@@ -82,7 +82,7 @@ class SceneReader(Options, ABC):
     factor: ClassVar[int] = 1
 
     def choose_factor(self, size_at: SizeAt) -> int:
-        """By what images of such sizes are made smaller; :attr:`factor` from now on."""
+        """The factor by which images of such sizes are made smaller; sets :attr:`factor`."""
         self.__dict__["factor"] = factor = whole_factor(self.downscale, size_at)
         return factor
 
@@ -204,8 +204,8 @@ class PosedReader(InwardReader):
         if reader.space != "ndc":
             scene = reader.scene(folder, static, dynamic)
             reason = scene.bounds.reason if reader.space == self.space else source
-            found = self.box is None and reader.box is not None
-            box_source = source if found else scene.bounds.box_source
+            box_is_stated = self.box is None and reader.box is not None
+            box_source = source if box_is_stated else scene.bounds.box_source
             bounds = replace(scene.bounds, reason=reason, box_source=box_source)
             return replace(scene, bounds=bounds)
         name = self.name_of(folder)

@@ -42,11 +42,12 @@ def look_up_pixels(image: Pixels, source: Array) -> Pixels:
     Alpha is not premultiplied; black where it is 0. Places outside take the nearest pixel of the
     border.
     """
-    x, y = (np.ascontiguousarray(source[..., axis] - np.float32(0.5)) for axis in (0, 1))
+    x = np.ascontiguousarray(source[..., 0] - np.float32(0.5))
+    y = np.ascontiguousarray(source[..., 1] - np.float32(0.5))
 
     def looked_up(values: Array) -> Array:
-        found = cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return np.asarray(found, dtype=np.float32).reshape(*x.shape, image.shape[2])
+        looked = cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(looked, dtype=np.float32).reshape(*x.shape, image.shape[2])
 
     return _weighted_by_alpha(image, looked_up)
 
@@ -55,15 +56,15 @@ def _weighted_by_alpha(image: Pixels, linear: Callable[[Array], Array]) -> Pixel
     """A linear filter of an 8-bit image, rounded."""
     values = image.astype(np.float32)
     if image.shape[2] != 4:
-        found = linear(values)
+        filtered = linear(values)
     else:
         # Colours behind a zero alpha are arbitrary: premultiplied, they cannot bleed in.
         values[..., :3] *= values[..., 3:]
-        found = linear(values)
-        color = found[..., :3]
-        alpha = found[..., 3:]
-        found[..., :3] = np.divide(color, alpha, out=np.zeros_like(color), where=alpha > 0)
-    return (found + 0.5).clip(0, 255).astype(np.uint8)
+        filtered = linear(values)
+        color = filtered[..., :3]
+        alpha = filtered[..., 3:]
+        filtered[..., :3] = np.divide(color, alpha, out=np.zeros_like(color), where=alpha > 0)
+    return (filtered + 0.5).clip(0, 255).astype(np.uint8)
 
 
 def shrink_flow(
@@ -131,7 +132,7 @@ def _pinhole_view(lens: Lens, width: int, height: int) -> tuple[Lens, Tensor] | 
     zoom = _zoom(lens, centres)
     if zoom is None:
         return None
-    (fx, fy) = lens.focal
+    fx, fy = lens.focal
     center = lens.center
     plain = Lens((fx * zoom, fy * zoom), center)
     directions = _directions(plain, centres)
@@ -181,6 +182,6 @@ def _directions(pinhole: Lens, pixels: Tensor) -> Tensor:
 def _on_lens(lens: Lens, directions: Tensor) -> Tensor:
     """Pixels (..., 2) on which ``directions`` (..., 2) fall."""
     x, y = lens.distortion.distort(directions).unbind(-1)
-    (fx, fy) = lens.focal
-    (cx, cy) = lens.center
+    fx, fy = lens.focal
+    cx, cy = lens.center
     return torch.stack([fx * x + lens.skew * y + cx, fy * y + cy], dim=-1)

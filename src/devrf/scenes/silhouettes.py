@@ -1,4 +1,4 @@
-"""Visual hulls of alpha masks: the box of everything that moves, and of one state a grid.
+"""Visual hulls of alpha masks: the box of everything that moves, and a grid of one state.
 
 A hull from a few views holds the object and more: the box is an outer bound.
 """
@@ -61,7 +61,7 @@ def motion_box(views: Views, box: Box, *, resolution: int = 64, search: float = 
     for images in frames:
         # Only points not yet in the union need a look; each view leaves fewer of them.
         left = np.flatnonzero(~hull)
-        seen = np.zeros(len(left), dtype=np.int64)
+        inside_views = np.zeros(len(left), dtype=np.int64)
         for image in images:
             number = int(views.view[image])
             if number not in cached:
@@ -71,8 +71,8 @@ def motion_box(views: Views, box: Box, *, resolution: int = 64, search: float = 
             verdict = masks[image][cached[number][left]]
             keep = verdict != OUTSIDE
             left = left[keep]
-            seen = seen[keep] + (verdict[keep] == INSIDE)
-        hull[left[seen >= 2]] = True
+            inside_views = inside_views[keep] + (verdict[keep] == INSIDE)
+        hull[left[inside_views >= 2]] = True
     if not hull.any():
         return None
     held = points[torch.from_numpy(hull).to(points.device)]
@@ -166,7 +166,7 @@ def visual_hull(
         solid = solid.to(points.device)
         grown = torch.nn.functional.max_pool2d(solid, 2 * reach + 1, 1, reach)[0]
         x, y = pixel.floor().long().unbind(-1)
-        seen = (depth > 0) & (x >= 0) & (x < views.width) & (y >= 0) & (y < views.height)
-        row = torch.where(seen, y * views.width + x, 0)
-        held[left[seen & (grown.view(-1)[row] == 0)]] = False
+        in_image = (depth > 0) & (x >= 0) & (x < views.width) & (y >= 0) & (y < views.height)
+        row = torch.where(in_image, y * views.width + x, 0)
+        held[left[in_image & (grown.view(-1)[row] == 0)]] = False
     return held.view(shape)

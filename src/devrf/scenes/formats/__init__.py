@@ -37,8 +37,8 @@ class KnownLayout:
 COLMAP = KnownLayout(
     "colmap", "COLMAP", ("sparse/**/cameras.*", "sparse/**/images.*", "sparse/**/points3D.*")
 )
-# Folders that hold files of several layouts have that of the first: of two captures before one,
-# of what says more about its images before what says less.
+# A folder with files of several layouts has the first of them: layouts of two captures come before
+# those of one, and files that say more about the images before files that say less.
 LAYOUTS = (
     KnownLayout("dycheck", "DyCheck", ("splits/train.json", "scene.json")),
     KnownLayout("nerfies", "Nerfies", ("dataset.json", "scene.json")),
@@ -53,7 +53,7 @@ LAYOUTS = (
     COLMAP,
     KnownLayout("forward", "LLFF", ("poses_bounds.npy",)),
 )
-# Of footage, which stage=capture makes scenes of.
+# Suffixes of footage, of which stage=capture makes scenes.
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 
 
@@ -93,7 +93,7 @@ def _fitting(root: str | Path) -> tuple[Path, list[KnownLayout]]:
 
 
 def _layouts(folder: Path) -> list[KnownLayout]:
-    """The layouts that a folder has, that of the first choice first; installed packages' before."""
+    """The layouts that a folder has, the preferred one first; installed packages' come before."""
     installed = [point.load() for point in entry_points(group="devrf.layouts")]
     return [layout for layout in (*installed, *LAYOUTS) if not layout.missing(folder)]
 
@@ -112,7 +112,7 @@ def _of_no_layout(folder: Path) -> str:
             return _footage(place)
     if videos := [path for path in inside if path.suffix.lower() in VIDEOS]:
         return _footage(*videos)
-    # Of layouts that begin alike, the one that lacks the least.
+    # A layout is left out if another one lacks only some of the same files.
     missing = {layout.name: layout.missing(folder) for layout in LAYOUTS}
     lacks = [
         f"{name}: no {files[0]}"
@@ -123,7 +123,7 @@ def _of_no_layout(folder: Path) -> str:
 
 
 def _footage(static: Path, *views: Path) -> str:
-    """What to type to make a scene of photographs or videos; of several the first is at rest."""
+    """What to type to make a scene of photographs or videos; the first one is taken at rest."""
     name = static.parent.name if static.name == "images" else static.stem
     listed = [f"capture.views=[{','.join(map(str, views))}]"] if views else []
     words = [f"capture.static={static}", *listed, f"capture.into=scenes/{name or 'mine'}"]

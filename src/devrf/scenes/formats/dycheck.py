@@ -54,7 +54,8 @@ class DycheckReader(ItemsReader):
 
     def listed(self, folder: Path) -> Listed:
         """The images in both splits."""
-        learned, held_out = (_read_split(folder / name) for name in (TRAIN, VAL))
+        learned = _read_split(folder / TRAIN)
+        held_out = _read_split(folder / VAL)
         both = [name for name in learned if name in held_out]
         if both:
             raise scene_error(
@@ -75,8 +76,8 @@ class DycheckReader(ItemsReader):
 
     def moments(self, folder: Path, ids: Sequence[str]) -> Sequence[float]:
         """The times in both splits."""
-        taken = {**_read_split(folder / TRAIN), **_read_split(folder / VAL)}
-        return [taken[item] for item in ids]
+        times = {**_read_split(folder / TRAIN), **_read_split(folder / VAL)}
+        return [times[item] for item in ids]
 
     def masks_of(
         self, folder: Path, ids: Sequence[str], images: ImageFolder

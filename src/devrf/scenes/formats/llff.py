@@ -55,7 +55,7 @@ class LlffReader(FixedViewsReader):
         near: distance of the near plane from the average camera, in the world's unit; the nearest
             point of the static scene is at 1/0.75.
         monocular: whether LLFF's images are a video; None: where NR-NeRF's ``precomputed.json`` is.
-        static_until: of a video, the latest time of an image that counts as static.
+        static_until: in a video, the latest time of an image that counts as static.
     """
 
     _: KW_ONLY
@@ -133,9 +133,9 @@ class LlffReader(FixedViewsReader):
             raise scene_error(images.file, f"a video of {count} images; expected at least 3")
         timed = replace(images, times=tuple(k / (count - 1) for k in range(count)))
         train, test = (in_motion(timed[part]) for part in every_nth(count, self.holdout))
-        kept = None if self.frames is None else evenly_spread(train.times, self.frames)
-        # Of a video the static set is thinned out, too.
-        train = train if kept is None else at_times(train, kept)
+        times = None if self.frames is None else evenly_spread(train.times, self.frames)
+        # The static set of a video is thinned out, too.
+        train = train if times is None else at_times(train, times)
         return without_static_set(train, test, self.static_until)
 
 

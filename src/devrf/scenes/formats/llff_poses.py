@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 # The file of LLFF's cameras, and that of NR-NeRF's, whose images follow one another in time.
 POSES = "poses_bounds.npy"
 PRECOMPUTED = "precomputed.json"
-# The nearest point of the scene comes to rest at 1/0.75 of the near plane, as the field does it.
+# The nearest point of the scene is placed at 1/0.75 of the near plane's distance, as LLFF does.
 BOUND_FACTOR = 0.75
 # A camera's least depth below this share of their median is taken for that of a stray point.
 STRAY_SHARE = 0.5
@@ -171,7 +171,7 @@ def _shared(file: Path) -> Intrinsics:
 
 
 def _intrinsics(file: Path, h: float, w: float, fx: float, *more: float) -> Intrinsics:
-    """Of H, W, focal; H, W, focal, cx, cy; or H, W, fx, fy, cx, cy."""
+    """The intrinsics in H, W, focal; H, W, focal, cx, cy; or H, W, fx, fy, cx, cy."""
     fy = more[0] if len(more) == 3 else fx
     cx, cy = more[-2:] or (w / 2, h / 2)
     if min(h, w) < 1 or min(fx, fy) <= 0:

@@ -66,7 +66,7 @@ class World(BaseModel):
 def placed(
     reader: InwardReader, folder: Path, world: World, static: Capture, dynamic: Capture
 ) -> Scene:
-    """The scene of two captures, near and far as the options or else the world have them."""
+    """The scene of two captures; near and far are from the options, or else from the world."""
     near = world.near if reader.near is None else reader.near
     far = world.far if reader.far is None else reader.far
     options = replace(reader, near=near, far=far)
@@ -75,9 +75,9 @@ def placed(
     if not wide or (reader.space != "world" and axes_do_meet(cameras)):
         return options.scene(folder, static, dynamic)
     # Without alpha masks the backdrop is to be learned too.
-    seen = box_of_frusta(cameras, near, far)
+    frusta_box = box_of_frusta(cameras, near, far)
     scale = FALLBACK_BOUND_SCALE if reader.bound_scale == "auto" else reader.bound_scale
-    options = replace(options, box=seen, space="world", bound_scale=scale)
+    options = replace(options, box=frusta_box, space="world", bound_scale=scale)
     scene = options.scene(folder, static, dynamic)
     why = "data.space=world" if reader.space == "world" else "the cameras look in one direction"
     bounds = replace(scene.bounds, reason=why, box_source="all that the cameras see up to far")
@@ -151,7 +151,7 @@ class ItemsReader(InwardReader):
     the box is all that they see between near and far.
 
     Attributes:
-        holdout: where no list says what is held out, one of so many images is.
+        holdout: one of so many images is held out, if no list says which.
         static_until: the latest time of an image that counts as static.
     """
 

@@ -25,7 +25,7 @@ from devrf.scenes.validation import abbreviated, scene_error
 log = logging.getLogger(__name__)
 
 FILE = "transforms.json"
-# So many images at time 0 are a static set: from fewer no field can be learned.
+# The least number of images at time 0 that make a static set: fewer teach no field.
 _SEVERAL = 3
 
 
@@ -133,7 +133,7 @@ def _splits(
 def _listed(names: list[str] | None, split: str, transforms: Transforms, root: Path) -> list[int]:
     """Positions in the file, ascending, of the images that it lists for a split."""
     position = {image: i for i, image in enumerate(transforms.images)}
-    found = list[int]()
+    positions = list[int]()
     for name in names or []:
         image = image_at(inside(root, transforms.file.parent, name, transforms.file))
         if image is None and transforms.skipped:
@@ -143,8 +143,8 @@ def _listed(names: list[str] | None, split: str, transforms: Transforms, root: P
                 transforms.file,
                 f"{split}_filenames lists {abbreviated(name)}, which is in no frame; correct it",
             )
-        found.append(position[image])
-    return sorted(set(found))
+        positions.append(position[image])
+    return sorted(set(positions))
 
 
 def _one_file(train: Transforms, test: Transforms, static_until: float | None) -> Layout:
@@ -184,13 +184,13 @@ def _one_file(train: Transforms, test: Transforms, static_until: float | None) -
 def _seen_moving(transforms: Transforms) -> list[int]:
     """The images at later times, and those at time 0 by cameras that stay to see more.
 
-    What else there is at time 0 tells nothing of motion, and its many cameras would hide that
-    the others stand still.
+    Other images at time 0 tell nothing of motion, and their many cameras would hide that the
+    others stand still.
     """
     later = _times(transforms) > TIME_TOLERANCE
     camera = distinct_poses(transforms.poses)
-    kept: list[int] = (later | torch.isin(camera, camera[later])).nonzero()[:, 0].tolist()
-    return kept
+    images: list[int] = (later | torch.isin(camera, camera[later])).nonzero()[:, 0].tolist()
+    return images
 
 
 def _times(transforms: Transforms) -> Tensor:

@@ -55,17 +55,17 @@ def camera_videos(folder: Path) -> CameraVideos:
 
     DevrfError if they are fewer than two, one cannot be read, or they differ in length or size.
     """
-    found = {
+    numbers = {
         path: int(match[1])
         for path in entries(folder)
         if (match := _VIDEO.fullmatch(path.name)) and os.path.isfile(path)
     }
-    if len(found) < 2:
+    if len(numbers) < 2:
         raise scene_error(
             folder,
-            f"{len(found)} videos cam00.mp4, cam01.mp4, …, expected 2 or more; set data.root",
+            f"{len(numbers)} videos cam00.mp4, cam01.mp4, …, expected 2 or more; set data.root",
         )
-    headers = {path: film_header(path) for path in found}
+    headers = {path: film_header(path) for path in numbers}
     first, header = next(iter(headers.items()))
     for path, other in headers.items():
         if other != header or other.frames < 2:
@@ -73,7 +73,7 @@ def camera_videos(folder: Path) -> CameraVideos:
                 path,
                 f"{_in_words(other)}, but {first.name} has {_in_words(header)}; cut or convert it",
             )
-    return CameraVideos(tuple(found), tuple(found.values()), header)
+    return CameraVideos(tuple(numbers), tuple(numbers.values()), header)
 
 
 def _in_words(header: FilmHeader) -> str:
@@ -83,7 +83,7 @@ def _in_words(header: FilmHeader) -> str:
 def read_frames(
     paths: Sequence[Path], frames: Sequence[int], filmed: Size, downscale: int
 ) -> Tensor:
-    """The chosen ``frames`` (T, ascending) of K videos; of others nothing is kept in memory.
+    """The chosen ``frames`` (T, ascending) of K videos; no other frames are kept in memory.
 
     ``filmed`` is their (width, height); sides become floor(side / ``downscale``), by area averages.
 

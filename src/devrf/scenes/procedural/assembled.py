@@ -20,7 +20,7 @@ from devrf.scenes.procedural.solids import Material, Paint, PaintedParts, Xyz, r
 STILL = Swing(0.0, 1.0, 0.0)
 # The most that a ramp 3u² − 2u³ over the distance u shears, per radian: u · 6u (1 − u) at 2/3.
 BEND_SHEAR = 8 / 9
-# Beyond a part's ball by this much its distance is the ball's, plus this much.
+# Farther than this from a part's ball, the distance to the part is taken from the ball.
 SHELL = 0.05
 
 
@@ -126,7 +126,7 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Assembled:
-    """A :class:`~devrf.scenes.procedural.solids.Shape` of K parts.
+    """A :class:`~devrf.scenes.procedural.solids.Shape` made of K parts.
 
     Attributes:
         parts: its parts.
@@ -138,7 +138,8 @@ class Assembled:
 
     @cached_property
     def _painted(self) -> PaintedParts:
-        axes, base = (torch.stack([getattr(p, of) for p in self.parts]) for of in ("axes", "base"))
+        axes = torch.stack([part.axes for part in self.parts])
+        base = torch.stack([part.base for part in self.parts])
         return PaintedParts([part.paint for part in self.parts], base, axes)
 
     def distance(self, points: Tensor, time: float) -> Tensor:

@@ -140,13 +140,13 @@ class Filming:
     ) -> Capture:
         """All fixed cameras at frame 0, then all at frame 1, …, with the exact backward flow.
 
-        Of ``frames`` ≥ 2 frames, at times k / (T − 1), the cameras to learn from leave out
-        ``unseen``.
+        There are ``frames`` ≥ 2 frames, at times k / (T − 1); the cameras to learn from leave out
+        those in ``unseen``.
         """
-        every = range(frames)
-        seen = [frame for frame in every if frame not in unseen]
+        train_frames = [frame for frame in range(frames) if frame not in unseen]
         return Capture(
-            self._moving(train, seen, frames, "train"), self._moving(test, every, frames, "test")
+            train=self._moving(train, train_frames, frames, "train"),
+            test=self._moving(test, range(frames), frames, "test"),
         )
 
     def _still(self, cameras: Cameras, split: str) -> Views:

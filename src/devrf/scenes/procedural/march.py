@@ -32,8 +32,8 @@ def trace(
         time: in [0, 1].
         start: (M,) distances before which nothing is; +inf for a ray known to miss.
         reach: radius of a ball about the origin that holds the shape at ``time``.
-        steps: a ray that has met nothing after so many counts as a miss; where everything is
-            in front of something else, only many make sure that none does.
+        steps: a ray that has met nothing after so many counts as a miss; if every ray meets
+            something, many are needed so that none is missed.
     """
     result = torch.full_like(start, math.inf)
     entry, leave = _ball_crossing(rays, reach)
@@ -104,7 +104,7 @@ def _march_cones(
         keep = (~near & (onward < leave[active])).nonzero().squeeze(-1)
         active = active[keep]
         distance = onward[keep]
-    # Rays of cones that still creep along a silhouette start where these are.
+    # If a cone still creeps along a silhouette, its rays start where it is.
     result[active] = distance
     return result
 

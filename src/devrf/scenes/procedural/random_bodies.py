@@ -23,14 +23,14 @@ from devrf.scenes.procedural.motion import Swing
 from devrf.scenes.procedural.rigs import STUDIO
 from devrf.scenes.procedural.solids import Material, Paint, Rgb, Xyz
 
-# Bodies that are drawn for a seed at most, and the share of points inside of other parts below
-# which one is taken at once.
+# At most so many bodies are drawn for a seed.
 TRIES = 12
+# A body is taken at once if a smaller share of its points than this enters other parts.
 ENTERED = 0.02
-# Share of a picture that the square around a body covers, and the share of its longest edge at
-# rest that what moves most goes.
+# The share of a picture that the square around a body covers.
 MIN_COVERED = 0.15
 MAX_COVERED = 0.7
+# How far the point goes that moves most, as a share of the body's longest edge at rest.
 MIN_MOVED = 0.1
 MAX_MOVED = 0.8
 # How round parts turn about themselves where texture slides.
@@ -40,7 +40,7 @@ TIMES = tuple(k / 12 for k in range(13))
 
 @lru_cache(maxsize=32)
 def random_body(seed: int, speed: float = 1.0, sliding: bool = False) -> Assembled:
-    """The body that a ``seed`` gives: of some, the one whose parts go least through each other.
+    """The body that a ``seed`` gives: the one drawn whose parts enter each other the least.
 
     ``sliding``: round parts spin, so that their texture slides over a silhouette that stays.
     """
@@ -158,8 +158,8 @@ def _fitted(parts: Sequence[Part], covers: float, moves: float) -> Assembled:
         motion *= min(max(moves * edge / max(went, 1e-6), 0.3), 2.0)
     points = paths.reshape(-1, 3)
     middle = (points.amin(dim=0) + points.amax(dim=0)) / 2
-    seen = 2 * STUDIO.distance * math.tan(STUDIO.field_of_view / 2)
-    size = math.sqrt(covers) * seen / edge
+    picture = 2 * STUDIO.distance * math.tan(STUDIO.field_of_view / 2)
+    size = math.sqrt(covers) * picture / edge
     placed = (replace(part, base=part.base - middle.double()) for part in body.parts)
     return Assembled(tuple(_scaled(part, size, 1.0) for part in placed))
 
@@ -205,7 +205,7 @@ def _swing(draw: Random, least: float, most: float) -> Swing:
 
 
 def _direction(draw: Random) -> Tensor:
-    """A unit vector (3,) float64, any as likely as any other."""
+    """A unit vector (3,) float64, uniformly distributed."""
     drawn = torch.tensor([draw.gauss(0, 1) for _ in range(3)], dtype=torch.float64)
     return torch.nn.functional.normalize(drawn, dim=0)
 

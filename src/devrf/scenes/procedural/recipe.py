@@ -36,8 +36,8 @@ from devrf.scenes.validation import MIN_SIDE, Options, scene_error
 Side = Annotated[int, Field(strict=True, ge=MIN_SIDE, le=4096)]
 Count = Annotated[int, Field(strict=True, ge=1, le=10_000)]
 Frames = Annotated[int, Field(strict=True, ge=2, le=10_000)]
-# Further than at speed 2 the flower folds into itself, the robot goes through its own body and the
-# toy is squashed to pieces.
+# Above speed 2 the flower folds into itself, the robot goes through its own body and the toy is
+# squashed to pieces.
 Speed = Annotated[float, Field(strict=True, ge=0, le=2)]
 Texture = Literal["soft", "fine"]
 
@@ -195,8 +195,8 @@ _REACH = 9.0
 # One static view in so many is held out, the first one included, as readers of LLFF do.
 HOLDOUT = 8
 NEAR = 1.0
-# Where a random body hangs, and the radius of a ball that it does not leave: it touches neither
-# wall nor floor.
+# Where a random body hangs, and the radius of a ball that it does not leave, so that it touches
+# neither wall nor floor.
 _HANGS = (0.0, 0.0, -2.6)
 _STAYS_WITHIN = 1.1
 
@@ -226,7 +226,7 @@ class ProceduralForwardScene(Recipe):
     def __call__(self) -> Scene:
         """Render everything."""
         film = Filming(self.filmed(), _REACH, self.supersample, self.light, STEPS, opaque=True)
-        # Of each eight views seven are learned from.
+        # Seven of each eight views are learned from.
         held_out = -(-self.static_views // (HOLDOUT - 1))
         static = facing_static_rig(
             self.static_views + held_out, width=self.width, height=self.height

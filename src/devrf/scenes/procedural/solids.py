@@ -1,4 +1,4 @@
-"""What a shape can be asked, signed distances, solid textures, and painted rounded boxes."""
+"""The protocol of shapes, signed distances, solid textures, and painted rounded boxes."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ class PaintedParts:
         return torch.lerp(self._base.to(rest)[part], self._accent.to(rest)[part], share)
 
     def outline(self, half: Tensor, middle: Tensor) -> Material:
-        """A grid of points over the boxes around the parts, so that theirs holds the object.
+        """A grid of points over the boxes around the parts; the box of the points holds the object.
 
         Args:
             half: (K, 3) half edges along the parts' axes, world units.

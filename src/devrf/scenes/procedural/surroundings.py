@@ -111,7 +111,7 @@ WEAVE = (
     ((11.9, 37.1, -43.7), 5.1, (0.6, 0.8, 0.9)),
     ((-33.1, -43.3, 31.7), 1.6, (0.7, 0.6, 0.5)),
 )
-# Paler than what stands before it.
+# The paint's darkest and lightest colour, paler than what stands before it.
 _DARKEST = (0.42, 0.45, 0.52)
 _LIGHTEST = (0.86, 0.88, 0.90)
 
@@ -163,7 +163,7 @@ _ROOM_HALF = (6.0, 5.0)
 _HEIGHT = 5.2
 # Radius of a ball about the origin that holds the room.
 REACH = 10.0
-# Fine paint: so much of it is the mural, its waves so much longer than on the wall it was made for.
+# The share of the mural in fine paint, and how much longer its waves are than on the wall.
 _MURAL = 0.6
 _LONGER = 1.6
 # Rays that creep past toy or furniture have to reach a wall; in 256 steps not all do.
