@@ -135,7 +135,7 @@ def _header(nested: str, tensors: Mapping[str, Tensor], digest: str) -> bytes:
     total = 0
     for name, tensor in tensors.items():
         begin = total
-        total = total + tensor.nbytes
+        total += tensor.nbytes
         shape = list(tensor.shape)
         dtype = DTYPES[tensor.dtype]
         entries[name] = {"dtype": dtype, "shape": shape, "data_offsets": [begin, total]}

@@ -18,20 +18,20 @@ from torch import Tensor, nn
 from devrf.ops.trilinear import resample
 from devrf.system.memory import need_memory
 
-# Grid points of the detailed grid to one of the thinned-out grid.
+# Grid points of the detailed grid for each one of the thinned-out grid, along an axis.
 THINNING = 4
 
 Packed = dict[str, Any]
 
 
 def pack(grids: Tensor, keep: Tensor, *, smooth: bool) -> Packed:
-    """Store grids in about 2·C bytes a kept voxel; one after another where ``keep`` is.
+    """Store grids in about 2·C bytes a kept voxel, one after another, on the device of ``keep``.
 
     Args:
         grids: (N, X, Y, Z, C) of finite values.
         keep: (N, X, Y, Z) bool, where detail is kept; (1, X, Y, Z) serves all N.
-        smooth: which values elsewhere get: True, the trilinear interpolation of every fourth
-            grid point; False, each channel's mean over the voxels that are left out.
+        smooth: what values elsewhere are replaced by: True, the trilinear interpolation of every
+            fourth grid point; False, each channel's mean over the voxels that are left out.
 
     Returns:
         Tensors on the host and numbers, by name, for :func:`unpack`.

@@ -10,10 +10,11 @@ from torch.nn.functional import grid_sample, max_pool2d
 from devrf.data.flow import previous_images
 from devrf.scenes.scene import Views
 
-# Images of which colours are followed, evenly spread, and frames that they are followed back.
+# The number of images whose colours are followed, evenly spread.
 IMAGES = 64
+# The number of frames that they are followed back.
 STEPS = 4
-# From which drift on colours are not those of the rest state (docs/method.md#color-drift).
+# With this drift or more, colours are not those of the rest state (docs/method.md#color-drift).
 CHANGING = 0.07
 # Colours are smoothed before they are compared: what is finer than the pixels flickers as it moves.
 SIGMA = 1.5
@@ -53,12 +54,12 @@ def color_drift(views: Views) -> float | None:
         The change, of which 1 is from black to white; None where no flow can be followed, or where
         the recording has no more than ``STEPS`` steps.
     """
-    near, steps = _mean_change(views, STEPS)
-    far, more = _mean_change(views, 2 * STEPS)
-    if near is None or far is None or more == steps:
+    near, near_steps = _mean_change(views, STEPS)
+    far, far_steps = _mean_change(views, 2 * STEPS)
+    if near is None or far is None or far_steps == near_steps:
         return None
-    whole = len(set(views.times.tolist())) - 1
-    return (far - near) / (more - steps) * whole
+    all_steps = len(set(views.times.tolist())) - 1
+    return (far - near) / (far_steps - near_steps) * all_steps
 
 
 def _mean_change(views: Views, steps: int) -> tuple[float | None, int]:

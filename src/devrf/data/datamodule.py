@@ -23,7 +23,7 @@ class SceneDataModule(LightningDataModule, ABC):
     host during training. A test batch is the position of one held-out image.
     """
 
-    # By what images that were read have been made smaller.
+    # The factor by which images were made smaller as they were read.
     downscale = 1
     # Whether methods are told what the scene tells beside its images.
     priors: Priors = "all"

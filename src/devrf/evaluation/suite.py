@@ -76,8 +76,8 @@ def _lpips_covisible(inputs: MetricInput) -> float | None:
     lpips = inputs.lpips
     if valid_mask is None or lpips is None or lpips.trunk is not TRUNKS["alex"]:
         return None
-    seen = valid_mask[..., None]
-    return lpips.forward(inputs.prediction * seen, inputs.truth * seen, valid_mask)
+    mask = valid_mask[..., None]
+    return lpips.forward(inputs.prediction * mask, inputs.truth * mask, valid_mask)
 
 
 def _depth_error(inputs: MetricInput) -> float | None:

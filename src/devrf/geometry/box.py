@@ -120,8 +120,10 @@ class Box:
         They are made once: a tensor made of Python's numbers at every step would make the device
         wait for the host.
         """
-        low, high = (constant(corner, like.dtype, like.device) for corner in (self.low, self.high))
-        return low, high
+        return (
+            constant(self.low, like.dtype, like.device),
+            constant(self.high, like.dtype, like.device),
+        )
 
     def to_grid(self, points: Tensor, shape: tuple[int, int, int]) -> Tensor:
         """Grid coordinates (..., 3): 0 on the low faces, shape − 1 on the high ones."""

@@ -65,12 +65,12 @@ class Cameras:
 
     def joined(self, *others: Cameras) -> Cameras:
         """These cameras and ``others``, of the same image size."""
-        every = (self, *others)
+        parts = (self, *others)
         return replace(
             self,
-            camera_to_world=torch.cat([cameras.camera_to_world for cameras in every]),
-            focal=torch.cat([cameras.focal for cameras in every]),
-            center=torch.cat([cameras.center for cameras in every]),
+            camera_to_world=torch.cat([cameras.camera_to_world for cameras in parts]),
+            focal=torch.cat([cameras.focal for cameras in parts]),
+            center=torch.cat([cameras.center for cameras in parts]),
         )
 
     @property
@@ -121,7 +121,7 @@ class Cameras:
         return _on_image(local, self.focal[camera], self.center[camera])
 
     def project_into(self, camera: int, points: Tensor) -> tuple[Tensor, Tensor]:
-        """As :meth:`project`, of all ``points`` (M, 3) into one camera: a matrix product."""
+        """As :meth:`project`, for all ``points`` (M, 3) in one camera: a matrix product."""
         pose = self.camera_to_world[camera]
         local = (points - pose[:, 3]) @ pose[:, :3]
         return _on_image(local, self.focal[camera], self.center[camera])
@@ -140,7 +140,8 @@ class Cameras:
     def image_rays(self, camera: int) -> Rays:
         """All H·W rays of one camera, in row-major order.
 
-        Those of :meth:`rays`, from what columns and rows share: half the launches of a GPU.
+        They are those of :meth:`rays`, computed from what columns and rows share: a GPU has half
+        as many launches.
         """
         device = self.focal.device
         dtype = self.focal.dtype
@@ -223,7 +224,7 @@ def _on_image(local: Tensor, focal: Tensor, center: Tensor) -> tuple[Tensor, Ten
 
 @dataclass(frozen=True)
 class Distortion:
-    """Where a real lens puts what a pinhole would put elsewhere (Brown 1966, as in OpenCV).
+    """How a real lens moves a pinhole's points in the image (Brown 1966, as in OpenCV).
 
     Points are (x/z, y/z) of a camera whose x points right and y down, before focal lengths and
     principal point. With r² = x² + y² and g = 1 + k1·r² + k2·r⁴ + k3·r⁶ + k4·r⁸,

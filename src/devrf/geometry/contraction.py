@@ -20,10 +20,10 @@ from devrf.geometry.rays import Rays
 
 Xyz = tuple[float, float, float]
 
-# Points nearer to the outer faces than this share of the shell count as being there: in a float32
-# what is a million inner boxes away can still be told from infinity.
+# Points nearer to the outer faces than this share of the shell are taken to be at this distance: a
+# float32 can still tell what is a million inner boxes away from infinity.
 INFINITY = 1e-6
-# Contracted units that most rays move in a unit of their distance, at most.
+# The most contracted units that most rays move in a unit of their distance.
 PACE = 1.25
 
 

@@ -69,7 +69,7 @@ class Rays:
 
     @property
     def pace(self) -> float:
-        """The most units of the fields' space that a unit of distance is, 0 without rays."""
+        """The most units of the fields' space in a unit of distance; 0 without rays."""
         return float(self.directions.norm(dim=1).amax()) if len(self) else 0.0
 
     def ends(self) -> Tensor | None:

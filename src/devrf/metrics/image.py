@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d
 from torchmetrics.functional.image import multiscale_structural_similarity_index_measure
 
-# Of SSIM: the window's side and Gaussian deviation in pixels; its constants for a range of 1.
+# SSIM's window, its side and Gaussian deviation in pixels; SSIM's constants for a range of 1.
 WINDOW = 11
 SIGMA = 1.5
 C1 = 0.01**2
@@ -26,8 +26,8 @@ def psnr(prediction: Tensor, truth: Tensor) -> float:
 def ssim(prediction: Tensor, truth: Tensor) -> float:
     """Mean structural similarity of two (H, W, 3) images in [0, 1] (Wang et al. 2004).
 
-    Gaussian window of 11×11, σ 1.5; only pixels whose window lies inside the image count where
-    the image is large enough to have any.
+    Gaussian window of 11×11, σ 1.5; only pixels whose window lies inside the image count, if the
+    image is large enough to have any.
     """
     return float(ssim_map(prediction, truth).mean())
 
@@ -35,7 +35,7 @@ def ssim(prediction: Tensor, truth: Tensor) -> float:
 def ssim_map(prediction: Tensor, truth: Tensor) -> Tensor:
     """Structural similarity at each pixel that :func:`ssim` counts: (H − 10, W − 10, 3).
 
-    Of images smaller than a window (H, W, 3), with what is missing mirrored.
+    It is (H, W, 3) for images smaller than a window; what is missing is mirrored.
     """
     a, b = (_batched(image) for image in (prediction, truth))
     padding = "valid" if min(a.shape[-2:]) >= WINDOW else "same"
@@ -77,32 +77,33 @@ def ssim_masked(prediction: Tensor, truth: Tensor, mask: Tensor) -> float | None
 def ssim_within(prediction: Tensor, truth: Tensor, mask: Tensor) -> float | None:
     """Mean SSIM of the windows of two (H, W, 3) images that lie inside ``mask`` (H, W).
 
-    What is beyond the mask has no part in it. None where no window lies inside.
+    Pixels outside the mask do not count. None where no window lies inside.
     """
     values = ssim_map(prediction, truth)
-    # Of images smaller than a window, what is missing is mirrored, and so not beyond the mask.
+    # What images smaller than a window lack is mirrored, and so not beyond the mask.
     padding = (WINDOW - 1) // 2 if values.shape[:2] == mask.shape else 0
     touched = max_pool2d((~mask).float()[None], WINDOW, 1, padding)[0] > 0
     return None if bool(touched.all()) else float(values[~touched].mean())
 
 
 def ssim_partial(prediction: Tensor, truth: Tensor, mask: Tensor) -> float | None:
-    """DyCheck's masked SSIM (mSSIM) of two (H, W, 3) images in [0, 1]: what ``mask`` (H, W) holds.
+    """DyCheck's masked SSIM (mSSIM) of two (H, W, 3) images in [0, 1], within ``mask`` (H, W).
 
     Windows are partial convolutions (Liu et al. 2018): along rows, then along columns, what is
     beyond the mask counts 0, and the sum is scaled by 11 over the number of pixels that count. The
     mean is over all windows inside the image; one without any such pixel has the similarity 1.
-    None of images smaller than a window, or where the mask is empty.
+    None for images smaller than a window, or if the mask is empty.
     """
     if min(mask.shape) < WINDOW or not bool(mask.any()):
         return None
     a, b = (_batched(image) for image in (prediction, truth))
-    means = (_partial_blur(image, mask) for image in (a, b, a * a, b * b, a * b))
-    mean_a, mean_b, square_a, square_b, product = means
-    variance_a = (square_a - mean_a.square()).clamp(min=0)
-    variance_b = (square_b - mean_b.square()).clamp(min=0)
-    most = (variance_a * variance_b).sqrt()
-    covariance = (product - mean_a * mean_b).clamp(-most, most)
+    mean_a = _partial_blur(a, mask)
+    mean_b = _partial_blur(b, mask)
+    variance_a = (_partial_blur(a * a, mask) - mean_a.square()).clamp(min=0)
+    variance_b = (_partial_blur(b * b, mask) - mean_b.square()).clamp(min=0)
+    max_covariance = (variance_a * variance_b).sqrt()
+    covariance = _partial_blur(a * b, mask) - mean_a * mean_b
+    covariance = covariance.clamp(-max_covariance, max_covariance)
     alike = (2 * mean_a * mean_b + C1) * (2 * covariance + C2)
     energy = (mean_a.square() + mean_b.square() + C1) * (variance_a + variance_b + C2)
     return float((alike / energy).mean())

@@ -137,7 +137,7 @@ class Lpips(nn.Module):
 
     @torch.no_grad()
     def maps(self, prediction: Tensor, truth: Tensor) -> list[Tensor] | None:
-        """Differences (1, 1, h, w) after each tap, or None of images that are too small."""
+        """Differences (1, 1, h, w) after each tap; None for images that are too small."""
         if min(truth.shape[:2]) < self.trunk.smallest:
             return None
         features = zip(self._features(prediction), self._features(truth), strict=True)
