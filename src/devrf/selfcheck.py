@@ -204,8 +204,10 @@ def require_gpu(scene: SmallScene, reason: str) -> None:
 
 def resume(scene: SmallScene, name: str) -> str:
     """Whether a stage that SIGTERM stops goes on to equal bits with ``deterministic=true``."""
-    whole, first, second = (scene.stage(name, EXACT) for _ in range(3))
-    scene.learn(whole, EXACT)
+    uninterrupted = scene.stage(name, EXACT)
+    first = scene.stage(name, EXACT)
+    second = scene.stage(name, EXACT)
+    scene.learn(uninterrupted, EXACT)
 
     def interrupt(*_: Any) -> None:
         if 0 <= first.iteration - first.total_iterations // 2 < first.iterations_per_step:
@@ -221,8 +223,8 @@ def resume(scene: SmallScene, name: str) -> str:
         interrupted = stop.number is not None and 0 < first.iteration < first.total_iterations
         require(interrupted and bool(files), f"{stopped}, {len(files)} progress files")
         scene.learn(second, EXACT, resumed_from=str(files[0]))
-    require(second.iteration == whole.iteration, f"ended at iteration {second.iteration}")
-    pairs = zip(whole.state_dict().values(), second.state_dict().values(), strict=True)
+    require(second.iteration == uninterrupted.iteration, f"ended at iteration {second.iteration}")
+    pairs = zip(uninterrupted.state_dict().values(), second.state_dict().values(), strict=True)
     same = all(torch.equal(a, b) for a, b in pairs if isinstance(a, torch.Tensor))
     require(same, f"{stopped}, came to other fields")
     return f"{stopped}, equal bits"

@@ -50,7 +50,7 @@ class Meter(Callback):
     def __init__(self) -> None:
         self.row: Numbers = {}
         self._last = (0.0, 0)
-        # Of the row to come: its trainer, capture, iteration, numbers, and those on their way.
+        # The row to come: its trainer, capture, iteration, numbers, and what reads the others.
         self._begun: tuple[Trainer, str, int, Numbers, Callable[[], Numbers]] | None = None
 
     def state_dict(self) -> dict[str, Any]:
@@ -90,7 +90,7 @@ class Meter(Callback):
         psnr = batch_psnr(outputs or {})
         read = arriving(means if psnr is None else {**means, "psnr": psnr})
         self._flush()
-        self._begun = trainer, pl_module.capture, done, values, read
+        self._begun = (trainer, pl_module.capture, done, values, read)
 
     def _flush(self) -> None:
         """Write the row that was begun."""

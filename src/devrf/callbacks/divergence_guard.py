@@ -25,7 +25,7 @@ SNAPSHOT_EVERY = 1000
 MIN_ITERATIONS = 20
 # An expected opacity (or transparency) below this is too small to judge by.
 FAINT = 0.02
-# Shares of the expected opacity: seen before, and as good as gone.
+# Shares of the expected opacity: above THERE something was seen, below GONE nothing is left.
 THERE = 0.1
 GONE = 0.01
 # Shares of the expected transparency. Much light passes beside the field whatever happens.
@@ -88,7 +88,7 @@ class DivergenceGuard(Callback):
         self._steps: list[tuple[int, dict[str, Tensor]]] = []
         self._good: Snapshot | None = None
         self._checked = 0
-        # Of the opacity, since grids of this kind are learned.
+        # The kind of grids that is learned, and the lowest and highest opacity since then.
         self._kind = ""
         self._range = [1.0, 0.0]
 

@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 # Each update reads one number from the device.
 BAR_EVERY_SECONDS = 0.5
-# Share of the latest line's pace in the one that tells the time left.
+# The weight of the latest line's pace in the pace that gives the time left.
 LATEST = 0.4
 
 

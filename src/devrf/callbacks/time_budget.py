@@ -50,12 +50,12 @@ TRIAL_SHARE = 0.25
 LEAST_BATCH = 1 / 4
 # Added to the last strides, whose sum would else fall short of the end.
 ROUNDING = 1e-6
-# How much of an average the latest measurement is.
+# The weight of the latest measurement in an average.
 LATEST = 0.3
 
 
 def running_mean(mean: float | None, value: float) -> float:
-    """``mean`` with a further ``value``; alone where there is none."""
+    """The mean with a further ``value``; the value alone if there is no ``mean``."""
     return value if mean is None else mean + LATEST * (value - mean)
 
 
@@ -154,9 +154,9 @@ class TimeBudget(Callback):
         share = stage.loop.batch_share
         divisible = stage.cost_follows_rays
         if stride > 1 and share > LEAST_BATCH and divisible:
-            stride = stride / 2
-            pace = pace / 2
-            share = share / 2
+            stride /= 2
+            pace /= 2
+            share /= 2
         if not later:  # whole iterations are left: as many as end nearest to the budget
             iterations = max(1, round(left / (pace * stage.phase.cost)))
             stride = (stage.phase.stop - stage.position) / iterations + ROUNDING
