@@ -29,7 +29,7 @@ from devrf.rendering.output import RenderOutput
 class DeformableField(NeuralField):
     """(σ, c) = T(x′, w, d), where a deformation leads a point x at time t to x′ and w.
 
-    A method says what the deformation is (:meth:`deform`). T lives in normalised space.
+    A method defines the deformation (:meth:`deform`). T lives in normalised space.
 
     Attributes:
         canonical: T.
@@ -77,9 +77,9 @@ class DeformableField(NeuralField):
     ) -> RenderOutput:
         """What rays see, and samples.
 
-        ``extras`` has of the S samples ``points`` (S, 3) x in normalised space, ``time``, ``ray``
-        and ``weight`` (S,); and if a coarse field learns, ``coarse_color`` (R, 3) and the others
-        with ``coarse_`` before their names.
+        ``extras`` has ``points`` (S, 3) x in normalised space, ``time``, ``ray`` and ``weight``
+        (S,) of the S samples. If a coarse field learns, it also has ``coarse_color`` (R, 3), and
+        the same of the coarse samples with ``coarse_`` before their names.
         """
         if self.settings.sampling == "occupancy":
             samples = self.march(rays, time, jitter=jitter)
@@ -99,7 +99,7 @@ class DeformableField(NeuralField):
         time: Tensor,
         background: Tensor,
     ) -> RenderOutput:
-        """What samples of rays come to in a radiance field."""
+        """The render of samples in a radiance field."""
         if not self.space.is_linear:
             samples = samples.unbounded()
         points = self.placement.normalised(samples.points)
@@ -113,7 +113,7 @@ class DeformableField(NeuralField):
     def _by_weight(
         self, rays: Rays, time: Tensor, background: Tensor, *, jitter: bool
     ) -> tuple[RaySamples, RenderOutput | None]:
-        """Even samples, and more where these have weight; what a learning coarse field sees."""
+        """Even samples and more where these have weight; the render of a learning coarse field."""
         s = self.settings
         field = self.coarse or self.canonical
         near, far = limits(rays, self.box, self.depth_limits)

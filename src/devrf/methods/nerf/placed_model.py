@@ -94,7 +94,7 @@ class PlacedModel(RayTrainable):
 
 
 class NeuralField(PlacedModel):
-    """Networks that are asked point by point, in normalised space."""
+    """Networks that are evaluated point by point, in normalised space."""
 
     def setup(self, scene: Scene) -> None:
         """Take the scene's bounds and times; carve the frames' occupancy from their alpha masks."""
@@ -142,7 +142,7 @@ class NeuralField(PlacedModel):
     def march(self, rays: Rays, time: Tensor, *, jitter: bool) -> RaySamples:
         """Even steps where something may be at the frames around each ray's time."""
         before, after, _ = self.clock.between(time)
-        # Of the box's diagonal, in units of the longest direction.
+        # A share of the box's diagonal, in units of the longest direction.
         longest = float(rays.directions.norm(dim=1).amax()) if len(rays) else 1.0
         step = self.box.diagonal / (self.settings.steps * longest)
         return self.occupancy.march(

@@ -1,4 +1,4 @@
-"""Samples along rays: where they are drawn, and what they come to."""
+"""Samples along rays: where they are drawn, and how they are composited."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from devrf.geometry.rays import Rays
 from devrf.ops.compositing import color_and_depth, composite, sum_by_ray
 from devrf.rendering.output import RenderOutput
 
-# Opaque at any density that a softplus gives.
+# A length that is opaque at any density that a softplus gives.
 UNBOUNDED = 1e10
 
 

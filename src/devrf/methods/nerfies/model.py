@@ -143,7 +143,7 @@ class Nerfies(DeformableField):
         self.warp.opened.fill_(opened * self.settings.warp_bands)
 
     def deform(self, points: Tensor, time: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Where points lead, and what enters T beside; nothing moves where rest is canonical."""
+        """Where points lead, and what enters T beside; nothing moves at a canonical rest state."""
         if not self.rest_is_canonical:
             return self.bend(points, time)
         moving = (time > 0).nonzero()[:, 0]
@@ -154,7 +154,7 @@ class Nerfies(DeformableField):
         return points.index_copy(0, moving, bent), ambient
 
     def bend(self, points: Tensor, time: Tensor) -> tuple[Tensor, Tensor | None]:
-        """As :meth:`deform`, at any time alike."""
+        """As :meth:`deform`, but time 0 is like any other time."""
         return self.warp(points, self.codes(time)), None
 
     def parts(self) -> dict[str, Iterable[nn.Parameter]]:
@@ -176,11 +176,12 @@ class Nerfies(DeformableField):
         return terms
 
     def _elastic(self, output: RenderOutput, rays: int) -> Tensor:
-        """Of the coarse samples where these have a field of their own, as published."""
-        first = "coarse_" if "coarse_points" in output.extras else ""
-        points, time, weight, ray = (
-            output.extras[first + name].detach() for name in ("points", "time", "weight", "ray")
-        )
+        """The term over the coarse samples if these have a field of their own, as published."""
+        prefix = "coarse_" if "coarse_points" in output.extras else ""
+        points = output.extras[f"{prefix}points"].detach()
+        time = output.extras[f"{prefix}time"].detach()
+        weight = output.extras[f"{prefix}weight"].detach()
+        ray = output.extras[f"{prefix}ray"].detach()
         count = min(self.settings.elastic_rays or rays, rays)
         chosen = torch.randperm(rays, device=ray.device)[:count]
         if self.settings.elastic == "drawn":

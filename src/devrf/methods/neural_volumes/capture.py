@@ -1,4 +1,4 @@
-"""What Neural Volumes asks of a scene, and the images that its encoder reads."""
+"""What Neural Volumes needs of a scene, and the images that its encoder reads."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ def check_scene(scene: Scene) -> None:
 def encoder_images(scene: Scene, settings: NeuralVolumesSettings) -> Tensor:
     """The images of each frame by cameras that are spread over the rig, on the host.
 
-    Images larger than the encoder's are made smaller; what is left around them is the background. A
-    frame that no camera has (time 0 of a capture that begins later) has the images of the next.
+    Images larger than the encoder's are made smaller; the background fills the rest. A frame that
+    no camera has (time 0 of a capture that begins later) gets the images of the next one.
 
     Returns:
         (T, K, 3, h, w) uint8.
@@ -85,5 +85,5 @@ def cameras_of_every_frame(views: Views) -> list[int]:
     frames_of: dict[int, set[int]] = {}
     for camera, frame in zip(views.view.tolist(), views.frames.tolist(), strict=True):
         frames_of.setdefault(camera, set()).add(frame)
-    every = set().union(*frames_of.values())
-    return sorted(camera for camera, frames in frames_of.items() if frames == every)
+    all_frames = set().union(*frames_of.values())
+    return sorted(camera for camera, frames in frames_of.items() if frames == all_frames)

@@ -33,7 +33,7 @@ from devrf.methods.neural_volumes.volumes import (
 from devrf.rendering.output import RenderOutput
 from devrf.scenes.scene import Scene
 
-# Moments of a published batch; frames encoded at once.
+# The number of frames in a published batch, and of frames that are encoded at once.
 MOMENTS = 16
 
 
@@ -42,7 +42,7 @@ class NeuralVolumes(PlacedModel):
 
     name: ClassVar[str] = "neural_volumes"
     losses: ClassVar[tuple[str, ...]] = ("color", "kl", "opacity_prior", "tv")
-    cost_follows_rays: ClassVar[bool] = False  # of a moment's volume, whatever looks at it
+    cost_follows_rays: ClassVar[bool] = False  # a volume costs the same for any number of rays
     protocols: ClassVar[tuple[str, ...] | None] = ("joint", "dynamic")
     settings_class = NeuralVolumesSettings
     settings: NeuralVolumesSettings

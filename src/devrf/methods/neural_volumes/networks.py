@@ -108,9 +108,9 @@ class TimeEncoder(nn.Module):
         return 0.1 * self.mean(joined), 0.01 * self.log_deviation(joined)
 
 
-# A quaternion of this length or less counts as shorter than one: 0 is no rotation.
+# The least length that a quaternion is divided by, so that 0 is no rotation.
 LEAST_NORM = 1e-5**0.5
-# So small are the last layers of affine maps that begin next to the identity.
+# The last layers of affine maps that begin next to the identity begin in ±SMALL.
 SMALL = 1e-5
 
 
@@ -149,24 +149,25 @@ class AffineMixWarp(nn.Module):
 
     def __init__(self, settings: NeuralVolumesSettings) -> None:
         super().__init__()
-        code = settings.code
-        side = settings.warp_side
-        maps = settings.maps
-        self.side = side
-        self.maps = maps
-        self.scale, self.rotation, self.shift, self.weight = (
-            nn.Sequential(
-                xavier(nn.Linear(code, width)),
+        self.side = settings.warp_side
+        self.maps = settings.maps
+
+        def branch(width: int, outputs: int) -> nn.Sequential:
+            return nn.Sequential(
+                xavier(nn.Linear(settings.code, width)),
                 nn.LeakyReLU(LEAK),
-                xavier(nn.Linear(width, outputs * maps), 1.0),
+                xavier(nn.Linear(width, outputs * settings.maps), 1.0),
             )
-            for width, outputs in ((128, 3), (128, 4), (128, 3), (64, side**3))
-        )
+
+        self.scale = branch(128, 3)
+        self.rotation = branch(128, 4)
+        self.shift = branch(128, 3)
+        self.weight = branch(64, settings.warp_side**3)
         if settings.identity_start:
             for last in (self.scale[-1], self.rotation[-1], self.shift[-1]):
                 nn.init.uniform_(last.weight, -SMALL, SMALL)  # type: ignore[arg-type]
             nn.init.ones_(self.scale[-1].bias)  # type: ignore[arg-type]
-        self.register_buffer("grid", identity_grid(side), persistent=False)
+        self.register_buffer("grid", identity_grid(settings.warp_side), persistent=False)
 
     def forward(self, code: Tensor) -> Tensor:
         """Positions (M, 3, side, side, side) in the template, for codes (M, code)."""

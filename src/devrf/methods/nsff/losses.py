@@ -89,17 +89,23 @@ def smooth_time(r: Renders) -> Tensor:
     """
     own = r.output.points
     near = r.near
-    there, back = (own + r.output.dynamic.flow[:, side] for side in (FORWARD, BACKWARD))
+    after = own + r.output.dynamic.flow[:, FORWARD]
+    before = own + r.output.dynamic.flow[:, BACKWARD]
     moved = torch.arange(len(near.sample), device=own.device)
     onward = near.points + near.dynamic.flow[moved, near.side[near.ray]]
-    bending = _bending(r, own, (there, own, back))
-    return 2 * bending + _bending(r, own[near.sample], (onward, near.points, own[near.sample]))
+    start = own[near.sample]
+    bending = _bending(r, own, after=after, middle=own, before=before)
+    chained_bending = _bending(r, start, after=onward, middle=near.points, before=start)
+    return 2 * bending + chained_bending
 
 
-def _bending(r: Renders, seen: Tensor, path: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-    """½‖X⁺ + X⁻ − 2X‖² () of a ``path`` X⁺, X, X⁻ (S, 3), where ``seen`` (S, 3) are near."""
-    after, middle, before = map(r.placement.euclidean, path)
-    bend = 0.5 * (after + before - 2 * middle).square()
+def _bending(r: Renders, seen: Tensor, *, after: Tensor, middle: Tensor, before: Tensor) -> Tensor:
+    """½‖X⁺ + X⁻ − 2X‖² () of paths (S, 3) ``after``, ``middle``, ``before``.
+
+    Only samples whose ``seen`` (S, 3) are near count.
+    """
+    euclidean = r.placement.euclidean
+    bend = 0.5 * (euclidean(after) + euclidean(before) - 2 * euclidean(middle)).square()
     return _mean(bend, r.placement.within(seen, TIME_SHARE)[:, None])
 
 
@@ -178,7 +184,7 @@ TERMS: Mapping[str, Callable[[Renders], Tensor]] = {
     "disocclusion": disocclusion,
     "blend_entropy": blend_entropy,
 }
-# Terms of what there is not where densities add.
+# Terms that do not exist if densities add.
 OF_A_SHARE = ("dynamic", "disocclusion")
 
 

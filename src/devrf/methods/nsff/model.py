@@ -65,7 +65,7 @@ class NSFF(NeuralField):
         self.place()
 
     def set_place(self, box: Box, space: Space, depths: tuple[float, float]) -> None:
-        """As of every method; in NDC points may move further."""
+        """As for every method; in NDC points may move further."""
         super().set_place(box, space, depths)
         reach = REACH_IN_NDC if isinstance(space, NormalizedDevice) else REACH_IN_A_BOX
         self.fields.dynamic.reach = self.settings.flow_reach or reach
@@ -76,7 +76,7 @@ class NSFF(NeuralField):
         self.register_buffer("times", torch.tensor(times, device=self.device), persistent=False)
 
     def setup(self, scene: Scene) -> None:
-        """As of every method, and whether alpha masks cut the scene out."""
+        """As for every method, and find out whether alpha masks cut the scene out."""
         super().setup(scene)
         self.cut_out = scene.static.train.cut_out or scene.dynamic.train.cut_out
 
@@ -102,7 +102,7 @@ class NSFF(NeuralField):
         return self.settings.warmup.steps(len(self.clock))
 
     def learn_from(self, views: Sequence[Views], terms: Collection[str]) -> None:
-        """Look for priors; what is missing is said, and its terms are left out."""
+        """Look for priors; the log names missing ones, whose terms are left out."""
         self._images = ImagePriors(views, self.space)
         missing = missing_terms(self._images, terms, additive=self.fields.additive)
         self._absent = frozenset(missing)
@@ -125,7 +125,7 @@ class NSFF(NeuralField):
     def render_rays(
         self, rays: Rays, time: Tensor, background: Tensor, *, jitter: bool = False
     ) -> BlendedOutput:
-        """As of every method, and what it was made of."""
+        """As for every method, with what the render was made of."""
         if self.settings.sampling == "occupancy":
             samples = self.march(rays, time, jitter=jitter)
         else:
@@ -200,7 +200,7 @@ class FlowingView(RayView):
     """NSFF at one time: what is dynamic goes where its flows lead, the rest stays."""
 
     def __init__(self, model: NSFF, time: float, *, half: bool) -> None:
-        """As of every method."""
+        """As for every method."""
         super().__init__(model, model.render_rays, time, half=half)
         self._model = model
 
@@ -208,7 +208,7 @@ class FlowingView(RayView):
     def induced_flow(
         self, rays: Rays, pixels: Tensor, cameras: Cameras, time: float
     ) -> tuple[Tensor, Tensor]:
-        """As of every :class:`~devrf.rendering.view.MovingView`."""
+        """As for every :class:`~devrf.rendering.view.MovingView`."""
         now = torch.full_like(pixels[:, 0], self._time)
         black = torch.zeros_like(rays.origins[0])
         out = self._model.render_rays(rays, now, black)
@@ -225,10 +225,13 @@ class FlowingView(RayView):
     def _moved(self, points: Tensor, viewdirs: Tensor, ray: Tensor, time: float) -> Tensor:
         """Where dynamic points (S, 3), normalised, are at ``time``: led on from frame to frame.
 
-        Of a step that ends between two frames as much of the flow counts.
+        If a step ends between two frames, that part of the flow counts.
         """
         clock = self._model.clock
-        frame, last = (m.before + m.weight for m in (clock.at(self._time), clock.at(time)))
+        own = clock.at(self._time)
+        other = clock.at(time)
+        frame = own.before + own.weight
+        last = other.before + other.weight
         while abs(last - frame) > clock.TOLERANCE:
             side = FORWARD if last > frame else BACKWARD
             step = min(abs(last - frame), 1.0)
