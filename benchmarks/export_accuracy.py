@@ -44,8 +44,10 @@ def main() -> None:
         seen = views.cameras[[image]].image_rays(0).at(met, depth[met])
         points, _ = trimesh.sample.sample_surface(mesh, POINTS, seed=0)
         missing, _ = KDTree(points).query(seen.numpy())
-        shares = float(off) / diagonal, missing.mean() / diagonal
-        print(f"{time:.3f}  " + "  ".join(f"{100 * share:.2f} %" for share in shares))
+        print(
+            f"{time:.3f}  {100 * float(off) / diagonal:.2f} %  "
+            f"{100 * missing.mean() / diagonal:.2f} %"
+        )
 
 
 if __name__ == "__main__":

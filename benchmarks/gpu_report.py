@@ -88,7 +88,9 @@ def run_of(into: Path, name: str, *overrides: str, experiment: str = "paper") ->
 
 def machine(into: Path) -> Iterator[Row]:
     """Device, driver, versions and revision."""
-    packages = sorted(f"{each.metadata['Name']} {each.version}" for each in distributions())
+    packages = sorted(
+        f"{package.metadata['Name']} {package.version}" for package in distributions()
+    )
     yield {"platform": platform.platform(), "python": sys.version, "packages": packages}
     yield {"revision": said(["git", "-C", str(HERE.parent), "rev-parse", "HEAD"])}
     device = str(torch.cuda.get_device_properties(DEVICE)) if GPU else "no GPU"
@@ -98,10 +100,10 @@ def machine(into: Path) -> Iterator[Row]:
 def said(command: list[str]) -> str:
     """What a command prints, or why it could not be run."""
     try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        result = subprocess.run(command, capture_output=True, text=True, check=False)
     except OSError as error:
         return str(error)
-    return done.stdout + done.stderr
+    return result.stdout + result.stderr
 
 
 def checks(into: Path) -> Iterator[Row]:
@@ -181,7 +183,7 @@ def frames(into: Path) -> Iterator[Row]:
 
 
 TENTH = shortened(0, 2000, 20) if GPU else []
-# Each with the minutes that it may take, in the order in which they tell most.
+# Each step with the minutes that it may take, the most telling first.
 STEPS: dict[str, tuple[float, Callable[[Path], Iterator[Row]]]] = {
     "machine": (1, machine),
     "checks": (6, checks),
@@ -210,17 +212,17 @@ def main() -> None:
     arguments.add_argument("--root", type=Path, help="a scene from disk; else the embedded one")
     arguments.add_argument("--steps", nargs="*", default=[*STEPS], help="these alone")
     arguments.add_argument("--run", help=argparse.SUPPRESS)
-    given = arguments.parse_args()
-    into: Path = given.into.absolute()
+    options = arguments.parse_args()
+    into: Path = options.into.absolute()
     into.mkdir(parents=True, exist_ok=True)
-    if given.run:
-        make(into, given.run)
+    if options.run:
+        make(into, options.run)
         return
-    if given.root:
-        (into / "root.txt").write_text(str(given.root.absolute()))
-    end = time.monotonic() + 60 * given.minutes
+    if options.root:
+        (into / "root.txt").write_text(str(options.root.absolute()))
+    end = time.monotonic() + 60 * options.minutes
     # What has failed, or was cut short, is tried again once the rest is there.
-    for name in sorted(given.steps, key=lambda name: record(into, name)["status"] != "left"):
+    for name in sorted(options.steps, key=lambda name: record(into, name)["status"] != "left"):
         left = end - time.monotonic()
         if record(into, name)["status"] == "done" or left < 5:
             continue

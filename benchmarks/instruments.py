@@ -1,4 +1,4 @@
-"""Notes what a run does while it does it: seconds by what they go to."""
+"""Measures what a run spends its seconds on, while it runs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.system.device import wait
 
 Row = dict[str, Any]
-# Methods that are timed, with what is nested in them, by what their seconds go to.
+# Methods that are timed, with what is nested in them, by what they do.
 TIMED = {
     "iterations": (ScheduledStage, "training_step"),
     "logging": (Meter, "on_train_batch_end"),
@@ -56,7 +56,7 @@ class Stopwatch:
             setattr(owner, name, usual)
 
     def rows(self) -> Iterator[Row]:
-        """Seconds by what they went to; then milliseconds of an iteration by resolution."""
+        """Seconds by what was done; then milliseconds of an iteration by resolution."""
         yield {"seconds": dict(self._seconds)}
         for shape, (seconds, iterations) in self._levels.items():
             yield {

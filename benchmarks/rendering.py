@@ -26,15 +26,15 @@ def main() -> None:
     """Render some held-out views of the run that the command line describes."""
     arguments = parser(__doc__)
     arguments.add_argument("--views", type=int, default=5, help="how many, from first to last")
-    given = arguments.parse_args()
+    options = arguments.parse_args()
     with report_user_errors():
-        run = open_run(given.overrides)
+        run = open_run(options.overrides)
         model = learned_scene(run).model
         views = run.scene.dynamic.test
         background = background_value(run.scene.background)
-        rows = [frames_a_second(Renderer(model), views, given.views, background)]
-        into = given.json or run.folder / "benchmark_rendering.json"
-        report(rows, into, run.device, scene=run.scene.name, overrides=given.overrides)
+        rows = [frames_a_second(Renderer(model), views, options.views, background)]
+        into = options.json or run.folder / "benchmark_rendering.json"
+        report(rows, into, run.device, scene=run.scene.name, overrides=options.overrides)
 
 
 def frames_a_second(

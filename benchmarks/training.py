@@ -43,14 +43,14 @@ def main() -> None:
     """Measure the stages of the run that the command line describes."""
     arguments = parser(__doc__)
     arguments.add_argument("--seconds", type=float, default=2.0, help="of timing a resolution")
-    given = arguments.parse_args()
+    options = arguments.parse_args()
     with report_user_errors():
-        run = open_run(given.overrides)
+        run = open_run(options.overrides)
         stored = learned_scene(run)
-        rows = canonical_rows(run, stored, given.seconds)
-        rows += deformation_rows(run, stored, given.seconds)
-        into = given.json or run.folder / "benchmark_training.json"
-        report(rows, into, run.device, scene=run.scene.name, overrides=given.overrides)
+        rows = canonical_rows(run, stored, options.seconds)
+        rows += deformation_rows(run, stored, options.seconds)
+        into = options.json or run.folder / "benchmark_training.json"
+        report(rows, into, run.device, scene=run.scene.name, overrides=options.overrides)
 
 
 def canonical_rows(run: RunContext, stored: LoadedCheckpoint, seconds: float) -> list[Row]:
@@ -118,16 +118,16 @@ class MeasurePhases(Callback):
 
 def one_phase_of_each_resolution(stage: ScheduledStage) -> dict[str, Phase]:
     """The middle one of a stage's phases at each resolution by its name, coarse to fine."""
-    found: dict[str, list[Phase]] = {}
+    phases_by_name: dict[str, list[Phase]] = {}
     start = 0
     while start < stage.total_iterations:
         phase = stage.phase_at(start)
         name = phase.kind
         if isinstance(phase, CanonicalPhase):
             name += f" {phase.voxels}"
-        found.setdefault(name, []).append(phase)
+        phases_by_name.setdefault(name, []).append(phase)
         start = phase.stop
-    return {name: phases[len(phases) // 2] for name, phases in found.items()}
+    return {name: phases[len(phases) // 2] for name, phases in phases_by_name.items()}
 
 
 def give_fields(stage: ScheduledStage, learned: DeVRFModel) -> None:
