@@ -183,17 +183,19 @@ def fetched(scene: PublishedScene, settings: FetchSettings, progress: bool) -> F
         OSError: the disk refuses.
     """
     into = Path(settings.into).expanduser()
-    done = fetched_before(scene, into)
-    if done is None:
+    result = fetched_before(scene, into)
+    if result is None:
         source = scene.collection
         log.info(
             "%s: %s; from %s; licence: %s", scene.name, scene.about, source.page, source.licence
         )
-        done = fetch_scene(scene, into, settings.sha256, progress)
-    log.info("%s: %s", scene.name, f"in {done.path}" if done.anew else f"is in {done.path} already")
-    known = f"none was known to compare it with; kept in {done.path / RECORD}"
-    log.info("SHA-256 %s%s", done.sha256, ", as expected" if done.compared else f": {known}")
-    return done
+        result = fetch_scene(scene, into, settings.sha256, progress)
+    log.info(
+        "%s: %s", scene.name, f"in {result.path}" if result.anew else f"is in {result.path} already"
+    )
+    remark = f"none was known to compare it with; kept in {result.path / RECORD}"
+    log.info("SHA-256 %s%s", result.sha256, ", as expected" if result.compared else f": {remark}")
+    return result
 
 
 def fetch_scene(scene: PublishedScene, into: Path, sha256: str | None, progress: bool) -> Fetched:

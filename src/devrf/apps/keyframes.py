@@ -215,8 +215,8 @@ def read_path(file: Path) -> CameraPath:
     Raises:
         DevrfError: there is no such file, or it is no camera path.
     """
-    known = ", ".join([*WAYS, *PRESETS])
-    remedy = f"give video.path {known}, or a file that the viewer saved"
+    choices = ", ".join([*WAYS, *PRESETS])
+    remedy = f"give video.path {choices}, or a file that the viewer saved"
     return _path(read_json(file, _PathFile, remedy), file)
 
 

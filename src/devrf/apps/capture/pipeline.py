@@ -264,7 +264,7 @@ def _frames(
             time = (frame_seconds[position] - frame_seconds[first]) / duration
         add(name, name, time, k in held_out)
     test_view = settings.test_view - (settings.test_view > 0)
-    _, held_out = every_nth(len(clock.times), settings.holdout) if fixed else ([], [])
+    held_out = every_nth(len(clock.times), settings.holdout)[1] if fixed else []
     for v, video in enumerate(fixed):
         for k, (name, time) in enumerate(zip(video.names, clock.times, strict=True)):
             is_test = v == test_view % len(fixed) if len(fixed) > 1 else k in held_out

@@ -94,10 +94,10 @@ def reconstruct(
     listed.write_text("".join(f"{a} {b}\n" for a, b in compared))
     log.info("structure from motion: matches of %d pairs", len(compared))
     matching = library.FeatureMatchingOptions(use_gpu=False)
-    wanted = library.ImportedPairingOptions(match_list_path=str(listed))
+    pairing = library.ImportedPairingOptions(match_list_path=str(listed))
     verification = library.TwoViewGeometryOptions()
     verification.ransac.random_seed = 0
-    library.match_image_pairs(base, matching, wanted, verification, device=library.Device.cpu)
+    library.match_image_pairs(base, matching, pairing, verification, device=library.Device.cpu)
     log.info("structure from motion: cameras and points")
     mapping = library.IncrementalPipelineOptions(random_seed=0, min_model_size=3)
     reconstructions = library.incremental_mapping(base, images, models, mapping)
@@ -118,21 +118,21 @@ def checked_model(folder: Path, moving: Chosen, fixed: dict[str, Path]) -> Spars
     """
     model = read_model(folder)
     placed = {image.name for image in model.images}
-    known = [name for name in moving.names if name in placed]
-    if len(known) < max(3, LEAST_SHARE * len(moving.names)):
+    posed = [name for name in moving.names if name in placed]
+    if len(posed) < max(3, LEAST_SHARE * len(moving.names)):
         raise DevrfError(
-            f"{moving.path}: cameras were found for {len(known)} of {len(moving.names)} frames "
+            f"{moving.path}: cameras were found for {len(posed)} of {len(moving.names)} frames "
             f"only, the others have too few matches with them; {_FILM}"
         )
-    if len(known) < len(moving.names):
+    if len(posed) < len(moving.names):
         log.warning(
             "%s: %d of %d frames could not be placed, and are left out",
             moving.path,
-            len(moving.names) - len(known),
+            len(moving.names) - len(posed),
             len(moving.names),
         )
     if not is_folder(moving.path):
-        _check_turns(model, moving, known)
+        _check_turns(model, moving, posed)
     for name, path in fixed.items():
         if name not in placed:
             raise DevrfError(
@@ -143,16 +143,16 @@ def checked_model(folder: Path, moving: Chosen, fixed: dict[str, Path]) -> Spars
     return model
 
 
-def _check_turns(model: SparseModel, moving: Chosen, known: Sequence[str]) -> None:
+def _check_turns(model: SparseModel, moving: Chosen, posed: Sequence[str]) -> None:
     place = {image.name: k for k, image in enumerate(model.images)}
-    turns = model.poses[[place[name] for name in known], :, :3]
+    turns = model.poses[[place[name] for name in posed], :, :3]
     trace = (turns[1:] * turns[:-1]).sum(dim=(1, 2))
     degrees = torch.rad2deg(((trace - 1) / 2).clamp(-1, 1).acos())
     worst = int(degrees.argmax())
     turn = float(degrees[worst])
     if turn > max(MOST_TURN, MOST_TURNS * float(degrees.median())):
         raise DevrfError(
-            f"{moving.path}: between {Path(known[worst]).stem} and {Path(known[worst + 1]).stem}, "
+            f"{moving.path}: between {Path(posed[worst]).stem} and {Path(posed[worst + 1]).stem}, "
             f"frames that follow one another, its camera seems to turn by {turn:.0f} degrees: "
             "different places look alike; give more frames with capture.frames, or "
             "capture.matching=sequential, or film where there is more texture"

@@ -113,8 +113,8 @@ def _rank(name: str, names: Iterable[str]) -> int:
 
 
 def _label(traits: pd.DataFrame, without: str = "") -> list[str]:
-    said = traits.drop(columns=without, errors="ignore")
-    return ["; ".join(filter(None, texts)) for texts in said.itertuples(index=False)]
+    columns = traits.drop(columns=without, errors="ignore")
+    return ["; ".join(filter(None, texts)) for texts in columns.itertuples(index=False)]
 
 
 def _distinguishing(

@@ -90,8 +90,8 @@ def collect(folder: Path) -> Collection:
 
 def number(value: Any) -> float:
     """A recorded value as a number; NaN where it is none, or not finite."""
-    known = isinstance(value, int | float) and not isinstance(value, bool)
-    return float(value) if known and math.isfinite(value) else math.nan
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return float(value) if is_number and math.isfinite(value) else math.nan
 
 
 def metric_over_time(path: Path, metric: str) -> pd.Series:

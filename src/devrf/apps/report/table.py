@@ -199,8 +199,8 @@ def _is_of_published_data(run: Mapping[str, Any]) -> bool:
     data = {key: run.get(f"run.{key}") for key in ("image_size", "frames", "train_views")}
     if isinstance(data["image_size"], list):
         data["image_size"] = sorted(data["image_size"])
-    said = run.get("run.choices.data") == run["scene"]
-    return said and data == published().data.get(run["scene"])
+    is_named = run.get("run.choices.data") == run["scene"]
+    return is_named and data == published().data.get(run["scene"])
 
 
 def _values(runs: pd.DataFrame, column: Column) -> pd.Series:
