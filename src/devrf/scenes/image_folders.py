@@ -59,10 +59,10 @@ def image_folder(
             folders[int(match[1]) if match else 1] = path
     fitting = [factor for factor in folders if downscale % factor == 0]
     if not fitting:
-        wanted = full if downscale == 1 else f"{reduced.format(downscale)} or {full}"
+        expected = full if downscale == 1 else f"{reduced.format(downscale)} or {full}"
         present = ", ".join(sorted(path.name for path in folders.values())) or "none"
         raise scene_error(
-            parent, f"no folder {wanted} (found: {present}); add it, or change data.downscale"
+            parent, f"no folder {expected} (found: {present}); add it, or change data.downscale"
         )
     best = max(fitting)
     return ImageFolder(folders[best], downscale // best)
@@ -99,9 +99,9 @@ _UP_TO = re.compile(r"up_to_([1-9]\d{0,3})")
 
 
 def _downscale(value: object) -> object:
-    whole = isinstance(value, int) and not isinstance(value, bool) and value >= 1
-    known = isinstance(value, str) and (value in ("auto", *LONGEST) or _UP_TO.fullmatch(value))
-    if not whole and not known:
+    is_factor = isinstance(value, int) and not isinstance(value, bool) and value >= 1
+    is_choice = isinstance(value, str) and (value in ("auto", *LONGEST) or _UP_TO.fullmatch(value))
+    if not is_factor and not is_choice:
         raise ValueError(
             f"expected auto, a whole number of at least 1, or up_to_<number>, not {value!r}"
         )

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from devrf.scenes.images import image_size
 from devrf.scenes.masks import Masks
@@ -66,13 +67,17 @@ class Layout:
         if not transforms.images:
             return self
         split = in_motion(transforms) if self.moves else at_one_moment(transforms)
-        own, *others = (
-            torch.cat([s.transforms.poses.flatten(1), s.times[:, None]], dim=1)
-            for s in (split, self.dynamic_train, self.dynamic_test)
+        used = torch.cat(
+            [_poses_and_times(self.dynamic_train), _poses_and_times(self.dynamic_test)]
         )
-        used = torch.cat(others)
+        own = _poses_and_times(split)
         split = split.where(torch.stack([(used != image).any(dim=1).all() for image in own]))
         return replace(self, validation=split) if len(split.index) else self
+
+
+def _poses_and_times(split: Split) -> Tensor:
+    """(N, 13): the pose of each image of the file, and its time."""
+    return torch.cat([split.transforms.poses.flatten(1), split.times[:, None]], dim=1)
 
 
 def static_alone(train: Transforms, test: Transforms, why: str) -> Layout:

@@ -148,20 +148,23 @@ def _zoom(lens: Lens, centres: Tensor) -> float | None:
     directions = _directions(Lens(lens.focal, lens.center), border)
     size = border.new_tensor([width, height])
 
-    def seen(zoom: float) -> bool:
+    def fills(zoom: float) -> bool:
         source = _on_lens(lens, directions / zoom)
         upright = lens.distortion.upright(directions / zoom)
         return bool((((source >= 0) & (source <= size)).all(dim=-1) & upright).all())
 
-    if seen(1.0):
+    if fills(1.0):
         return 1.0
     low = 1.0
     high = _LONGEST
-    if not seen(high):
+    if not fills(high):
         return None
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
-        low, high = (low, middle) if seen(middle) else (middle, high)
+        if fills(middle):
+            high = middle
+        else:
+            low = middle
     return high
 
 

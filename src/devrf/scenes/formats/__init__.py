@@ -72,11 +72,11 @@ def check_choice(root: str | Path, choice: str) -> None:
     """DevrfError that names the right option, if ``data=choice`` does not read such a folder."""
     folder, fitting = _fitting(root)
     if all(layout.choice != choice for layout in fitting):
-        known = fitting[0]
+        layout = fitting[0]
         raise scene_error(
             folder,
-            f"has the files of {known.name}, which data={choice} does not read; write "
-            f"data={known.choice}, or leave data= out",
+            f"has the files of {layout.name}, which data={choice} does not read; write "
+            f"data={layout.choice}, or leave data= out",
         )
 
 

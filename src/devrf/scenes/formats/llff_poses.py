@@ -60,8 +60,8 @@ class PosedSet:
         least = self.bounds[:, 0]
         agreed = least[least >= STRAY_SHARE * least.median()]
         if stray := len(least) - len(agreed):
-            known = f"the nearest depth is {float(agreed.min()):.3g}, not {float(least.min()):.3g}"
-            log.info("%s: %d cameras see stray points before them: %s", self.file, stray, known)
+            depths = f"the nearest depth is {float(agreed.min()):.3g}, not {float(least.min()):.3g}"
+            log.info("%s: %d cameras see stray points before them: %s", self.file, stray, depths)
         scale = 1 / (BOUND_FACTOR * float(agreed.min()))
         middle = average_pose(self.poses)
         # NaN compares false.
