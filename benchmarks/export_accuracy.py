@@ -41,9 +41,9 @@ def main() -> None:
         assert views.depth is not None
         depth = views.depth[image].view(-1)
         met = depth.isfinite().nonzero()[:, 0]
-        seen = views.cameras[[image]].image_rays(0).at(met, depth[met])
+        visible = views.cameras[[image]].image_rays(0).at(met, depth[met])
         points, _ = trimesh.sample.sample_surface(mesh, POINTS, seed=0)
-        missing, _ = KDTree(points).query(seen.numpy())
+        missing, _ = KDTree(points).query(visible.numpy())
         print(
             f"{time:.3f}  {100 * float(off) / diagonal:.2f} %  "
             f"{100 * missing.mean() / diagonal:.2f} %"

@@ -261,17 +261,17 @@ def make(into: Path, name: str) -> None:
 def record(into: Path, name: str) -> Row:
     """What is known of a step."""
     path = into / f"{name}.json"
-    known: Row = json.loads(path.read_text()) if path.exists() else {"status": "left", "rows": []}
-    return known
+    entry: Row = json.loads(path.read_text()) if path.exists() else {"status": "left", "rows": []}
+    return entry
 
 
 def write_report(into: Path) -> None:
     """One page of all that has been found."""
     lines = []
     for name in STEPS:
-        known = record(into, name)
-        lines += [f"## {name}: {known['status']}", ""]
-        lines += [f"- {json.dumps(row)}" for row in known["rows"]] + [""]
+        entry = record(into, name)
+        lines += [f"## {name}: {entry['status']}", ""]
+        lines += [f"- {json.dumps(row)}" for row in entry["rows"]] + [""]
     (into / "REPORT.md").write_text("\n".join(lines))
 
 

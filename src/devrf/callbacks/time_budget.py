@@ -145,12 +145,12 @@ class TimeBudget(Callback):
             least = entering + pace * sum(phase.cost for phase in later)
             if least > left:
                 return self._too_short(stage, self._step_began + least)
-        whole = pace * sum(
+        needed = pace * sum(
             phase.cost * max(0.0, phase.stop - max(phase.start, stage.position))
             for phase in (stage.phase, *later)
         )
         # Out of time, what is left gets an iteration a phase.
-        stride = whole / (left - entering) if left > entering else float(stage.total_iterations)
+        stride = needed / (left - entering) if left > entering else float(stage.total_iterations)
         share = stage.loop.batch_share
         divisible = stage.cost_follows_rays
         if stride > 1 and share > LEAST_BATCH and divisible:

@@ -37,7 +37,8 @@ def ssim_map(prediction: Tensor, truth: Tensor) -> Tensor:
 
     It is (H, W, 3) for images smaller than a window; what is missing is mirrored.
     """
-    a, b = (_batched(image) for image in (prediction, truth))
+    a = _batched(prediction)
+    b = _batched(truth)
     padding = "valid" if min(a.shape[-2:]) >= WINDOW else "same"
     similarity: Tensor = kornia_ssim(a, b, window_size=WINDOW, max_val=1.0, padding=padding)
     return similarity[0].permute(1, 2, 0)
@@ -49,7 +50,8 @@ def ms_ssim(prediction: Tensor, truth: Tensor) -> float | None:
     Five scales with the paper's exponents; each is the mean over all windows inside the image
     and all channels, negative ones counting as 0. None where a side is under 176 pixels.
     """
-    a, b = (_batched(image) for image in (prediction, truth))
+    a = _batched(prediction)
+    b = _batched(truth)
     if min(a.shape[-2:]) < MS_SSIM_SMALLEST:
         return None
     return float(multiscale_structural_similarity_index_measure(a, b, data_range=1.0))
@@ -96,7 +98,8 @@ def ssim_partial(prediction: Tensor, truth: Tensor, mask: Tensor) -> float | Non
     """
     if min(mask.shape) < WINDOW or not bool(mask.any()):
         return None
-    a, b = (_batched(image) for image in (prediction, truth))
+    a = _batched(prediction)
+    b = _batched(truth)
     mean_a = _partial_blur(a, mask)
     mean_b = _partial_blur(b, mask)
     variance_a = (_partial_blur(a * a, mask) - mean_a.square()).clamp(min=0)

@@ -99,14 +99,14 @@ def smooth_time(r: Renders) -> Tensor:
     return 2 * bending + chained_bending
 
 
-def _bending(r: Renders, seen: Tensor, *, after: Tensor, middle: Tensor, before: Tensor) -> Tensor:
+def _bending(r: Renders, start: Tensor, *, after: Tensor, middle: Tensor, before: Tensor) -> Tensor:
     """½‖X⁺ + X⁻ − 2X‖² () of paths (S, 3) ``after``, ``middle``, ``before``.
 
-    Only samples whose ``seen`` (S, 3) are near count.
+    Only samples whose ``start`` (S, 3) is near count.
     """
     euclidean = r.placement.euclidean
     bend = 0.5 * (euclidean(after) + euclidean(before) - 2 * euclidean(middle)).square()
-    return _mean(bend, r.placement.within(seen, TIME_SHARE)[:, None])
+    return _mean(bend, r.placement.within(start, TIME_SHARE)[:, None])
 
 
 def _mean(values: Tensor, mask: Tensor) -> Tensor:
