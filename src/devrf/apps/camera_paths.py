@@ -144,7 +144,7 @@ def captured(cameras: Cameras, target: Tensor, settings: VideoSettings) -> Camer
 
 
 def in_order(apart: np.ndarray, longest: float) -> list[int]:
-    """In which order to pass N places, by the distances (N, N) between them.
+    """The order in which to pass N places, by the distances (N, N) between them.
 
     It is the order that they have, if that is a film's; else a tour, which leaves places out if it
     would be longer than ``longest``.

@@ -75,7 +75,7 @@ class Collection(BaseModel):
         files: what to fetch where ``url`` names a file.
         folder: name of the scene's folder in the archive, where it holds several scenes.
         scenes: what each shows, by name.
-        sha256: checksums of the archives, by scene; of several files that of their list.
+        sha256: checksums of the archives, by scene; for several files, of their list.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -150,7 +150,7 @@ class Fetched:
 
     Attributes:
         path: its folder.
-        sha256: of the archive; of several files that of the list of their checksums.
+        sha256: of the archive; for several files, of the list of their checksums.
         compared: whether it was compared with a checksum that was known before.
         anew: whether it was fetched now, and not before.
     """
@@ -273,7 +273,7 @@ def _download(scene: PublishedScene, folder: Path, progress: bool) -> dict[str, 
 
 
 def _digest(files: dict[str, Path]) -> str:
-    """The SHA-256 of an archive; of several files that of the lines that sha256sum prints."""
+    """The SHA-256 of an archive; for several files, of the lines that sha256sum prints."""
     import pooch
 
     digests = {name: str(pooch.file_hash(str(path))) for name, path in files.items()}

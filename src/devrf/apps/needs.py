@@ -110,7 +110,7 @@ def needs_of_networks(scene: Scene, model: RayTrainable, images: str, rays: floa
         scene: what it learns.
         model: its parameters, on any device.
         images: the config key that changes the images' size.
-        rays: of a batch, in each process.
+        rays: rays of a batch, in each process.
     """
     learned = tensor_bytes(model.parameters())
     parts = {

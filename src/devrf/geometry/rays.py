@@ -87,6 +87,6 @@ class Rays:
         return replace(self, **{name: change(value) for name, value in self._tensors().items()})
 
     def _tensors(self) -> dict[str, Tensor]:
-        """What there is for each ray, by the attribute's name."""
+        """The tensors with a row for each ray, by the attribute's name."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: value for name, value in values.items() if isinstance(value, Tensor)}

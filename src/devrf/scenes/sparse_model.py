@@ -42,7 +42,7 @@ class ModelImage:
         name: relative to the folder of images.
         camera: number of its camera.
         quaternion: w, x, y, z of the world-to-camera rotation, x right, y down, z ahead.
-        translation: of the same.
+        translation: translation of the same transform.
         points: (K,) int64, numbers of the points that it shows.
     """
 

@@ -26,8 +26,8 @@ LONGER_SIDE = 640
 MOTION_SIDE = 160
 # A change of so many grey levels, or fewer, is noise.
 NOISE = 2.0
-# Below this, an image of a textured scene is blurred so far that few features are left. Of sharp
-# photographs the value is 0.5 and more; of strong blur up to 0.44, as H.264 makes blocks of it.
+# Below this, an image of a textured scene is blurred so far that few features are left. Sharp
+# photographs have 0.5 and more; strong blur has up to 0.44, as H.264 makes blocks of it.
 BLURRED = 0.45
 # From fewer images there is no structure from motion worth the name.
 MIN_IMAGES = 3

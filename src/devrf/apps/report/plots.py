@@ -55,7 +55,7 @@ STYLE: dict[Any, Any] = {
 NAMES = ("DeVRF", "D-NeRF", "Nerfies", "HyperNeRF", "NSFF", "Neural Volumes")
 MARKERS = dict(zip(NAMES, "s^vDPX", strict=True))
 VARIANT = r"-2 ?stage$|-dynamic$| \(base\)$| w/ .*$"
-# Seconds to label on an axis: of these multiples the first that there is room for.
+# Seconds to label on an axis: the first of these multiples for which there is room.
 UNITS = (0.01, 0.1, 1, 10, 60, 600, 3600, 36000, 360000, math.inf)
 MULTIPLES = ((1, 1.5, 2, 3, 4, 6), (1, 2, 3, 4, 6), (1, 2, 5), (1, 3), (1,))
 MOST_TICKS = 5

@@ -137,6 +137,6 @@ def _failed(failure: dict[str, Any]) -> dict[str, Any]:
 def _frame(records: list[dict[str, Any]]) -> pd.DataFrame:
     flat = [pd.json_normalize(record).to_dict("records")[0] for record in records]
     names = dict.fromkeys([*COLUMNS, *(name for record in flat for name in record)])
-    # Of type object, so that numbers are written as they were read.
+    # Values are objects, so that numbers are written as they were read.
     frame = pd.DataFrame(flat, columns=list(names), dtype=object)
     return frame.assign(**{"run.overrides": [row.get("run.overrides") or [] for row in flat]})

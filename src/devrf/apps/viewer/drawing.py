@@ -74,7 +74,7 @@ class Drawing:
     """Draws shots of a learned scene, and knows how fast that goes.
 
     Attributes:
-        renderer: of the scene; another may take its place while the scene is learned.
+        renderer: renders the scene; it may be replaced while the scene is learned.
         channels: what can be shown of it.
         has_rest: whether it has a rest state beside others.
         at_rest: whether it looks the same at all times.
@@ -257,7 +257,7 @@ class RenderScheduler:
         return False
 
     def _most_urgent(self) -> tuple[Hashable, _Request] | None:
-        """Whose frame is the coarsest; of several the one that was served longest ago."""
+        """The browser with the coarsest frame; among equals the one served longest ago."""
         waiting = [item for item in self._requests.items() if item[1].rows < self._height]
         return min(waiting, key=lambda item: item[1].rows, default=None)
 

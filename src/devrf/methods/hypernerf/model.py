@@ -136,5 +136,5 @@ class HyperNeRF(Nerfies):
         return self.warp(points, code), self.encode(w, window)
 
     def parts(self) -> dict[str, Iterable[nn.Parameter]]:
-        """Those of Nerfies; what slices; and, apart from T, the weights by which w enters it."""
+        """Nerfies' parts, the slicing network, and, apart from T, the weights by which w enters."""
         return {**super().parts(), "ambient": self.slicing.parameters()}

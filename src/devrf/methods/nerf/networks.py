@@ -185,7 +185,7 @@ class RadianceField(nn.Module):
         initialise(self, s.initialisation)
 
     def reduced(self) -> AbstractContextManager[None]:
-        """Where the field computes in bfloat16 while it learns, if its settings say so."""
+        """A block in which the field computes in bfloat16 while it learns, if so configured."""
         precision = self._settings.precision
         device = self.density.weight.device
         reduced = multiplies_bfloat16(device) if precision == "auto" else precision == "bfloat16"

@@ -67,9 +67,9 @@ class LearnedOccupancy(StoredShape):
         """Look at cells again if iteration ``step`` is one to do so.
 
         Args:
-            step: of a stage, from 0; at 0 what another stage saw is forgotten.
+            step: iteration of a stage, from 0; at 0 what another stage saw is forgotten.
             total: iterations of the stage.
-            share: of these, before which nothing is left out; None: nothing ever is.
+            share: share of these before which nothing is left out; None: nothing ever is.
             box: where the cells are, in the fields' space.
             opacity_at: the opacity (S,) of a step at points (S, 3) of that space and times (S,) in
                 [0, 1].

@@ -30,7 +30,7 @@ class KnownLayout:
     remark: str = ""
 
     def missing(self, root: Path) -> list[str]:
-        """Those of ``files`` that are not in ``root``."""
+        """The ``files`` that are not in ``root``."""
         return [name for name in self.files if not any(map(os.path.isfile, root.glob(name)))]
 
 

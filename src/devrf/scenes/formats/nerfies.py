@@ -51,7 +51,7 @@ class World(BaseModel):
     """The frame of reference, (position − center) · scale.
 
     Attributes:
-        center: of the world, in the cameras' units.
+        center: centre of the world, in the cameras' units.
         scale: world units in one of the cameras'.
         near: distance before which nothing is, world units.
         far: distance behind which nothing is, world units.
@@ -89,7 +89,7 @@ class Camera(BaseModel):
 
     Attributes:
         orientation: rows of the world-to-camera rotation.
-        position: of the camera, in the file's units.
+        position: position of the camera, in the file's units.
         focal_length: pixels, horizontally.
         pixel_aspect_ratio: vertical over horizontal focal length.
         skew: pixels.

@@ -78,7 +78,7 @@ def extent(shape: Body) -> Extent:
 
 
 def moved(shape: Shape, points: Tensor, time: float, to: float) -> Tensor:
-    """Where the material of surface ``points`` (M, 3) at ``time`` is at time ``to``: (M, 3)."""
+    """Positions (M, 3), at time ``to``, of the material of surface ``points`` at ``time``."""
     return shape.forward(shape.material(points, time), to)
 
 
