@@ -32,26 +32,30 @@ from devrf.system.files import write_json
 
 def levels(*rows: tuple[int, int]) -> list[str]:
     """Overrides for levels of (side, iterations of a frame), the third left out."""
-    given = [f"{{side:{side},iterations:{count}}}" for side, count in rows]
-    return [f"schedule.deformation.levels.{k}={row}" for k, row in enumerate([*given, "null"], 1)]
+    values = [f"{{side:{side},iterations:{count}}}" for side, count in rows]
+    return [f"schedule.deformation.levels.{k}={row}" for k, row in enumerate([*values, "null"], 1)]
 
 
 # What is learned: half of the images' size, for some hundred iterations.
 LEARNED = {
     "forward": (
-        *("experiment=quickstart", "schedule.canonical.upsample_at=[60,120]"),
+        "experiment=quickstart",
+        "schedule.canonical.upsample_at=[60,120]",
         "schedule.canonical.iterations=300",
         *levels((8, 16), (16, 10)),
     ),
     "inward": (
-        *("experiment=quickstart", "schedule.canonical.upsample_at=[50,100,150]"),
+        "experiment=quickstart",
+        "schedule.canonical.upsample_at=[50,100,150]",
         "schedule.canonical.iterations=300",
         *levels((8, 12), (12, 8)),
         "schedule.deformation.rays=768",
     ),
     "monocular": (
-        *("experiment=quickstart", "schedule.canonical.upsample_at=[40,80,120]"),
-        *("schedule.canonical.iterations=250", "schedule.canonical.rays=1024"),
+        "experiment=quickstart",
+        "schedule.canonical.upsample_at=[40,80,120]",
+        "schedule.canonical.iterations=250",
+        "schedule.canonical.rays=1024",
         *levels((8, 6), (12, 3)),
         "schedule.deformation.rays=768",
     ),
@@ -74,11 +78,12 @@ class Similarity:
     shift: Tensor
 
     @staticmethod
-    def between(found: Tensor, true: Tensor) -> Similarity:
+    def between(estimated: Tensor, true: Tensor) -> Similarity:
         """The best one: its rotation is that of the cameras' axes, the rest of their centres."""
-        u, _, v = torch.linalg.svd((true[:, :, :3] @ found[:, :, :3].mT).sum(dim=0))
+        u, _, v = torch.linalg.svd((true[:, :, :3] @ estimated[:, :, :3].mT).sum(dim=0))
         turn = u @ torch.diag(torch.tensor([1.0, 1.0, float(torch.linalg.det(u @ v))]).double()) @ v
-        a, b = found[:, :, 3] @ turn.mT, true[:, :, 3]
+        a = estimated[:, :, 3] @ turn.mT
+        b = true[:, :, 3]
         centred = a - a.mean(dim=0)
         scale = (centred * (b - b.mean(dim=0))).sum() / centred.square().sum()
         return Similarity(turn, scale, b.mean(dim=0) - scale * a.mean(dim=0))
@@ -94,13 +99,13 @@ class Similarity:
         return self.turn.mT @ torch.cat([poses[:, :, :3], centres], dim=2)
 
 
-def compared(found: Tensor, true: Tensor) -> tuple[Tensor, Tensor]:
+def compared(estimated: Tensor, true: Tensor) -> tuple[Tensor, Tensor]:
     """Degrees and true units by which cameras are off, after the best similarity."""
-    there = Similarity.between(found, true).to_true(found)
-    off = true[:, :, :3].mT @ there[:, :, :3]
+    aligned = Similarity.between(estimated, true).to_true(estimated)
+    off = true[:, :, :3].mT @ aligned[:, :, :3]
     trace = off.diagonal(dim1=1, dim2=2).sum(dim=1)
     angle = torch.rad2deg(((trace - 1) / 2).clamp(-1, 1).acos())
-    return angle, (there[:, :, 3] - true[:, :, 3]).norm(dim=1)
+    return angle, (aligned[:, :, 3] - true[:, :, 3]).norm(dim=1)
 
 
 def with_true_cameras(captured: Path, into: Path, film: Filmed) -> None:
@@ -112,12 +117,13 @@ def with_true_cameras(captured: Path, into: Path, film: Filmed) -> None:
     into.mkdir()
     (into / "images").symlink_to((captured / "images").resolve())
     listing = json.loads((captured / "transforms.json").read_text())
-    fx, fy, cx, cy = (*film.moving.focal[0].tolist(), *film.moving.center[0].tolist())
+    fx, fy = film.moving.focal[0].tolist()
+    cx, cy = film.moving.center[0].tolist()
     lens = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "k1": 0.0}
     frames = listing["frames"]
-    true, found = film.true_poses(frames), poses_of(frames)
-    own = Similarity.between(found, true).to_captured(true)
-    for frame, pose in zip(frames, own.tolist(), strict=True):
+    true = film.true_poses(frames)
+    poses = Similarity.between(poses_of(frames), true).to_captured(true)
+    for frame, pose in zip(frames, poses.tolist(), strict=True):
         frame.update(lens, transform_matrix=[*pose, [0.0, 0.0, 0.0, 1.0]])
     write_json(into / "transforms.json", listing)
 
@@ -137,8 +143,11 @@ def learned(scene: str, root: Path, run: Path) -> dict[str, float]:
         config.stage = stage
         harness.run_stage(config, run)
     metrics = json.loads((run / "metrics.json").read_text())
-    found = {"PSNR": metrics["dynamic"]["psnr"], "PSNR at rest": metrics["static"]["psnr"]}
-    return found | {"learn s": time.perf_counter() - began}
+    return {
+        "PSNR": metrics["dynamic"]["psnr"],
+        "PSNR at rest": metrics["static"]["psnr"],
+        "learn s": time.perf_counter() - began,
+    }
 
 
 def main() -> None:
@@ -149,28 +158,30 @@ def main() -> None:
     arguments.add_argument("--lens", default="SIMPLE_PINHOLE", help="as capture.camera")
     arguments.add_argument("--mattes", help="as capture.alpha_masks")
     arguments.add_argument("--cameras", action="store_true", help="do not learn the scene")
-    given = arguments.parse_args()
-    folder: Path = given.folder or Path("outputs/benchmarks/capture") / given.scene
+    options = arguments.parse_args()
+    folder: Path = options.folder or Path("outputs/benchmarks/capture") / options.scene
     folder.mkdir(parents=True, exist_ok=True)
-    film = SCENES[given.scene](folder)
+    film = SCENES[options.scene](folder)
     into = folder / "captured"
     shutil.rmtree(into, ignore_errors=True)
     began = time.perf_counter()
-    settings = replace(film.settings, into=str(into), camera=given.lens, alpha_masks=given.mattes)
+    settings = replace(
+        film.settings, into=str(into), camera=options.lens, alpha_masks=options.mattes
+    )
     captured = scene_from_footage(settings)
-    row: dict[str, Any] = {"scene": given.scene, "capture s": time.perf_counter() - began}
+    row: dict[str, Any] = {"scene": options.scene, "capture s": time.perf_counter() - began}
     frames = json.loads((captured / "transforms.json").read_text())["frames"]
     angle, distance = compared(poses_of(frames), film.true_poses(frames))
     row |= {
         "rotation max deg": float(angle.max()),
         "centre max %": 100 * float(distance.max()) / film.distance,
     }
-    if not given.cameras:
-        row |= learned(given.scene, captured, folder / "run-captured")
+    if not options.cameras:
+        row |= learned(options.scene, captured, folder / "run-captured")
         with_true_cameras(captured, folder / "true", film)
-        true = learned(given.scene, folder / "true", folder / "run-true")
+        true = learned(options.scene, folder / "true", folder / "run-true")
         row |= {f"{key}, true cameras": value for key, value in true.items() if key != "learn s"}
-    harness.report([row], given.json or folder / "capture.json", torch.device("cpu"))
+    harness.report([row], options.json or folder / "capture.json", torch.device("cpu"))
 
 
 if __name__ == "__main__":

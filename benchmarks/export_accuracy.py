@@ -28,21 +28,26 @@ def main() -> None:
     arguments.add_argument("folder", type=Path, help="of the .ply files and their index.json")
     folder = arguments.parse_args().folder
     recipe = ProceduralScene(width=96, height=96, static_views=36, frames=14)
-    robot, scene = recipe.model(), recipe()
-    views, diagonal = scene.dynamic.test, math.hypot(*scene.bounds.whole.size)
+    robot = recipe.model()
+    scene = recipe()
+    views = scene.dynamic.test
+    diagonal = math.hypot(*scene.bounds.whole.size)
     print("time   off     missing")
     for frame in json.loads((folder / "index.json").read_text())["frames"]:
-        mesh, time = trimesh.load_mesh(folder / frame["file"]), float(frame["time"])
+        mesh = trimesh.load_mesh(folder / frame["file"])
+        time = float(frame["time"])
         off = robot.distance(torch.tensor(mesh.vertices).float(), time).abs().mean()
         image = int((views.times - time).abs().argmin())
         assert views.depth is not None
         depth = views.depth[image].view(-1)
         met = depth.isfinite().nonzero()[:, 0]
-        seen = views.cameras[[image]].image_rays(0).at(met, depth[met])
+        visible = views.cameras[[image]].image_rays(0).at(met, depth[met])
         points, _ = trimesh.sample.sample_surface(mesh, POINTS, seed=0)
-        missing, _ = KDTree(points).query(seen.numpy())
-        shares = float(off) / diagonal, missing.mean() / diagonal
-        print(f"{time:.3f}  " + "  ".join(f"{100 * share:.2f} %" for share in shares))
+        missing, _ = KDTree(points).query(visible.numpy())
+        print(
+            f"{time:.3f}  {100 * float(off) / diagonal:.2f} %  "
+            f"{100 * missing.mean() / diagonal:.2f} %"
+        )
 
 
 if __name__ == "__main__":

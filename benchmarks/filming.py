@@ -1,4 +1,4 @@
-"""Embedded scenes filmed into videos, as a telephone would, with the cameras that were there."""
+"""Embedded scenes filmed into videos, as a phone would, and the true cameras."""
 
 from __future__ import annotations
 
@@ -24,8 +24,10 @@ from devrf.scenes.scene import Scene
 RATE = 10
 # Frames that each fixed camera has filmed of the rest state before the motion begins.
 EARLY = (3, 1, 0, 2)
-# Of the robot's videos: pixels, field of view in radians, distance from the robot.
-SIZE, FIELD, DISTANCE = (240, 180), 1.05, 3.4
+# The robot's videos: their pixels, field of view in radians, and distance from the robot.
+SIZE = (240, 180)
+FIELD = 1.05
+DISTANCE = 3.4
 
 
 @dataclass(frozen=True)
@@ -60,27 +62,28 @@ class Filmed:
 
 
 def forward(folder: Path) -> Filmed:
-    """The finely painted toy before its wall, 240×136; of each three static frames one is sharp."""
-    kept = folder / "scene.pt"
-    if kept.is_file():
-        scene: Scene = torch.load(kept, weights_only=False)
+    """The finely painted toy before its wall, 240×136; one of each three static frames is sharp."""
+    cache = folder / "scene.pt"
+    if cache.is_file():
+        scene: Scene = torch.load(cache, weights_only=False)
     else:
         scene = ProceduralForwardScene(
             width=240, height=136, static_views=21, train_views=3, frames=10, texture="fine"
         )()
-        torch.save(scene, kept)
+        torch.save(scene, cache)
     sets = (scene.static.train, scene.static.test)
     still = torch.cat([views.pixels for views in sets]).numpy()
-    train, test = scene.dynamic.train, scene.dynamic.test
+    train = scene.dynamic.train
+    test = scene.dynamic.test
     count = int(train.view.max()) + 1
-    seen = [*(train.pixels[train.view == v].numpy() for v in range(count)), test.pixels.numpy()]
+    moving = [*(train.pixels[train.view == v].numpy() for v in range(count)), test.pixels.numpy()]
     assert scene.static.train.depth is not None
     return Filmed(
-        _settings(folder, _shaken(still), seen, frames=24),
+        _settings(folder, _shaken(still), moving, frames=24),
         joined(*(views.cameras for views in sets)),
         joined(train.cameras[list(range(count))], test.cameras[[0]]),
         3,
-        # As the scene's size counts the median distance of what the cameras see.
+        # The median distance of what the cameras see.
         float(scene.static.train.depth.median()),
     )
 
@@ -92,10 +95,10 @@ def inward(folder: Path) -> Filmed:
     stand = _around(torch.tensor([0.2, 0.8, -0.4, 0.5]), torch.tensor([0.35, 0.5, 0.5, 0.42]))
     still = _kept(folder / "static.pt", walk, [0.0] * len(walk))
     times = (torch.arange(10) / 9).tolist()
-    seen = [
+    moving = [
         _kept(folder / f"view{v + 1}.pt", stand[[v] * len(times)], times) for v in range(len(stand))
     ]
-    settings = _settings(folder, iter(still), seen)
+    settings = _settings(folder, iter(still), moving)
     return Filmed(settings, walk, stand, 1, DISTANCE)
 
 
@@ -120,24 +123,24 @@ def joined(*cameras: Cameras) -> Cameras:
     """Cameras of one size, one after the other."""
     first = cameras[0]
     return Cameras(
-        torch.cat([one.camera_to_world for one in cameras]),
-        torch.cat([one.focal for one in cameras]),
-        torch.cat([one.center for one in cameras]),
+        torch.cat([part.camera_to_world for part in cameras]),
+        torch.cat([part.focal for part in cameras]),
+        torch.cat([part.center for part in cameras]),
         first.width,
         first.height,
     )
 
 
 def _settings(
-    folder: Path, still: Iterator[np.ndarray], seen: list[np.ndarray], **more: Any
+    folder: Path, still: Iterator[np.ndarray], moving: list[np.ndarray], frames: int = 60
 ) -> CaptureSettings:
-    """The videos are written; each fixed one begins a little earlier or later."""
+    """Write the videos; each fixed one begins a little earlier or later."""
     write_pictures(folder / "static.mp4", still, RATE)
-    paths = [folder / f"view{number}.mp4" for number in range(1, len(seen) + 1)]
-    for path, early, pixels in zip(paths, EARLY, seen, strict=True):
+    paths = [folder / f"view{number}.mp4" for number in range(1, len(moving) + 1)]
+    for path, early, pixels in zip(paths, EARLY, moving, strict=True):
         write_pictures(path, iter([pixels[0]] * early + [*pixels, pixels[-1]]), RATE)
     views = tuple(map(str, paths))
-    return CaptureSettings(static=str(folder / "static.mp4"), views=views, **more)
+    return CaptureSettings(static=str(folder / "static.mp4"), views=views, frames=frames)
 
 
 def _shaken(pictures: np.ndarray) -> Iterator[np.ndarray]:

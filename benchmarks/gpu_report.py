@@ -39,28 +39,43 @@ HERE = Path(__file__).resolve()
 DEVICE = torch.device("cuda", 0) if torch.cuda.is_available() else torch.device("cpu")
 GPU = DEVICE.type == "cuda"
 # The embedded scene as large as the paper's: 100 views at rest, 4 of 50 frames, 400 × 400 pixels.
-SIZE, VIEWS, FRAMES = (400, 100, 50) if GPU else (24, 6, 3)
+SIZE = 400 if GPU else 24
+VIEWS = 100 if GPU else 6
+FRAMES = 50 if GPU else 3
 SCENE = [
-    *("data=procedural", "data.supersample=1", f"data.width={SIZE}", f"data.height={SIZE}"),
-    *(f"data.static_views={VIEWS}", f"data.frames={FRAMES}"),
+    "data=procedural",
+    "data.supersample=1",
+    f"data.width={SIZE}",
+    f"data.height={SIZE}",
+    f"data.static_views={VIEWS}",
+    f"data.frames={FRAMES}",
 ]
-TINY = ["field.width=16", "schedule.canonical.side=16", "schedule.canonical.search_side=12"]
-TINY += ["schedule.canonical.rays=128", "schedule.deformation.rays=128"]
-# So few iterations do not learn what each growth takes away.
-TINY += ["schedule.canonical.density_drop=0", "schedule.canonical.occupancy_every=null"]
+TINY = [
+    "field.width=16",
+    "schedule.canonical.side=16",
+    "schedule.canonical.search_side=12",
+    "schedule.canonical.rays=128",
+    "schedule.deformation.rays=128",
+    # So few iterations do not learn what each growth takes away.
+    "schedule.canonical.density_drop=0",
+    "schedule.canonical.occupancy_every=null",
+]
 
 
 def shortened(search: int, fine: int, frame: int) -> list[str]:
     """Overrides of the paper's schedule: iterations of the search, the field, and each frame."""
-    key, levels = "schedule.canonical", range(1, 6)
-    given = [
-        *(f"{key}.search_iterations={search}", f"{key}.visual_hull_init=true"),
-        *(f"{key}.iterations={fine}", f"{key}.decay_iterations={fine}"),
+    key = "schedule.canonical"
+    levels = range(1, 6)
+    overrides = [
+        f"{key}.search_iterations={search}",
+        f"{key}.visual_hull_init=true",
+        f"{key}.iterations={fine}",
+        f"{key}.decay_iterations={fine}",
         f"{key}.upsample_at=[{','.join(str(fine * k // 20) for k in (1, 2, 3, 4))}]",
         *(f"schedule.deformation.levels.{k}.iterations={frame}" for k in levels),
     ]
     sides = (f"schedule.deformation.levels.{k}.side={k + 2}" for k in levels)
-    return given if GPU else [*given, *sides, *TINY]
+    return overrides if GPU else [*overrides, *sides, *TINY]
 
 
 def run_of(into: Path, name: str, *overrides: str, experiment: str = "paper") -> RunContext:
@@ -73,7 +88,9 @@ def run_of(into: Path, name: str, *overrides: str, experiment: str = "paper") ->
 
 def machine(into: Path) -> Iterator[Row]:
     """Device, driver, versions and revision."""
-    packages = sorted(f"{each.metadata['Name']} {each.version}" for each in distributions())
+    packages = sorted(
+        f"{package.metadata['Name']} {package.version}" for package in distributions()
+    )
     yield {"platform": platform.platform(), "python": sys.version, "packages": packages}
     yield {"revision": said(["git", "-C", str(HERE.parent), "rev-parse", "HEAD"])}
     device = str(torch.cuda.get_device_properties(DEVICE)) if GPU else "no GPU"
@@ -83,10 +100,10 @@ def machine(into: Path) -> Iterator[Row]:
 def said(command: list[str]) -> str:
     """What a command prints, or why it could not be run."""
     try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        result = subprocess.run(command, capture_output=True, text=True, check=False)
     except OSError as error:
         return str(error)
-    return done.stdout + done.stderr
+    return result.stdout + result.stderr
 
 
 def checks(into: Path) -> Iterator[Row]:
@@ -120,7 +137,7 @@ def learned(
         with Stopwatch(DEVICE) as watch:
             harness.run_stage(run.config, run.folder)
         seconds = time.perf_counter() - began
-        peaks = torch.cuda.max_memory_allocated(), torch.cuda.max_memory_reserved()
+        peaks = (torch.cuda.max_memory_allocated(), torch.cuda.max_memory_reserved())
         yield {"stage": stage, "all seconds": seconds, "bytes allocated, reserved": peaks}
         if stage != "evaluate":
             yield from watch.rows()
@@ -129,7 +146,9 @@ def learned(
 
 def parts(into: Path) -> Iterator[Row]:
     """Eager iterations at each resolution of the learned scene, by part, and their kernels."""
-    run, tables, usual = run_of(into, "paper"), [], training.parts
+    run = run_of(into, "paper")
+    tables = []
+    usual = training.parts
 
     def noted(work: Callable[[], None], *, cuda: bool) -> dict[str, float]:
         with profile(record_shapes=False) as profiled:
@@ -139,7 +158,8 @@ def parts(into: Path) -> Iterator[Row]:
         return usual(work, cuda=cuda)
 
     training.parts = noted
-    stored, seconds = harness.learned_scene(run), 1.0 if GPU else 0.01
+    stored = harness.learned_scene(run)
+    seconds = 1.0 if GPU else 0.01
     for rows in (training.canonical_rows, training.deformation_rows):
         yield from rows(run, stored, seconds)
     (into / "profile.txt").write_text("\n\n".join(tables))
@@ -148,9 +168,11 @@ def parts(into: Path) -> Iterator[Row]:
 def frames(into: Path) -> Iterator[Row]:
     """Frames a second at a new time and again at the same, and what a frame launches."""
     run = run_of(into, "paper")
-    began, stored = time.perf_counter(), harness.learned_scene(run)
+    began = time.perf_counter()
+    stored = harness.learned_scene(run)
     yield {"seconds to load and unpack": time.perf_counter() - began}
-    views, background = run.scene.dynamic.test, background_value(run.scene.background)
+    views = run.scene.dynamic.test
+    background = background_value(run.scene.background)
     renderer = Renderer(stored.model)
     row = rendering.frames_a_second(renderer, views, min(5, len(views)), background)
     with profile() as profiled:
@@ -161,7 +183,7 @@ def frames(into: Path) -> Iterator[Row]:
 
 
 TENTH = shortened(0, 2000, 20) if GPU else []
-# Each with the minutes that it may take, in the order in which they tell most.
+# Each step with the minutes that it may take, the most telling first.
 STEPS: dict[str, tuple[float, Callable[[Path], Iterator[Row]]]] = {
     "machine": (1, machine),
     "checks": (6, checks),
@@ -190,21 +212,22 @@ def main() -> None:
     arguments.add_argument("--root", type=Path, help="a scene from disk; else the embedded one")
     arguments.add_argument("--steps", nargs="*", default=[*STEPS], help="these alone")
     arguments.add_argument("--run", help=argparse.SUPPRESS)
-    given = arguments.parse_args()
-    into: Path = given.into.absolute()
+    options = arguments.parse_args()
+    into: Path = options.into.absolute()
     into.mkdir(parents=True, exist_ok=True)
-    if given.run:
-        make(into, given.run)
+    if options.run:
+        make(into, options.run)
         return
-    if given.root:
-        (into / "root.txt").write_text(str(given.root.absolute()))
-    end = time.monotonic() + 60 * given.minutes
+    if options.root:
+        (into / "root.txt").write_text(str(options.root.absolute()))
+    end = time.monotonic() + 60 * options.minutes
     # What has failed, or was cut short, is tried again once the rest is there.
-    for name in sorted(given.steps, key=lambda name: record(into, name)["status"] != "left"):
+    for name in sorted(options.steps, key=lambda name: record(into, name)["status"] != "left"):
         left = end - time.monotonic()
         if record(into, name)["status"] == "done" or left < 5:
             continue
-        began, command = time.monotonic(), [sys.executable, str(HERE), "--into", str(into)]
+        began = time.monotonic()
+        command = [sys.executable, str(HERE), "--into", str(into)]
         with (into / f"{name}.log").open("w") as output, suppress(subprocess.TimeoutExpired):
             limit = min(left, 60 * STEPS[name][0])
             subprocess.run(
@@ -238,17 +261,17 @@ def make(into: Path, name: str) -> None:
 def record(into: Path, name: str) -> Row:
     """What is known of a step."""
     path = into / f"{name}.json"
-    known: Row = json.loads(path.read_text()) if path.exists() else {"status": "left", "rows": []}
-    return known
+    entry: Row = json.loads(path.read_text()) if path.exists() else {"status": "left", "rows": []}
+    return entry
 
 
 def write_report(into: Path) -> None:
     """One page of all that has been found."""
     lines = []
     for name in STEPS:
-        known = record(into, name)
-        lines += [f"## {name}: {known['status']}", ""]
-        lines += [f"- {json.dumps(row)}" for row in known["rows"]] + [""]
+        entry = record(into, name)
+        lines += [f"## {name}: {entry['status']}", ""]
+        lines += [f"- {json.dumps(row)}" for row in entry["rows"]] + [""]
     (into / "REPORT.md").write_text("\n".join(lines))
 
 

@@ -73,7 +73,8 @@ def circles(edges: Edges) -> list[list[str]]:
     """The strongly connected components of more than one node."""
     reached: Edges = {}
     for start in edges:
-        waiting, reached[start] = [*edges[start]], set()
+        waiting = [*edges[start]]
+        reached[start] = set()
         while waiting:
             node = waiting.pop()
             if node not in reached[start]:

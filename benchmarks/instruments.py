@@ -1,4 +1,4 @@
-"""Notes what a run does while it does it: seconds by what they go to."""
+"""Measures what a run spends its seconds on, while it runs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.system.device import wait
 
 Row = dict[str, Any]
-# Methods that are timed, with what is nested in them, by what their seconds go to.
+# Methods that are timed, with what is nested in them, by what they do.
 TIMED = {
     "iterations": (ScheduledStage, "training_step"),
     "logging": (Meter, "on_train_batch_end"),
@@ -35,11 +35,13 @@ class Stopwatch:
 
     def __init__(self, device: torch.device) -> None:
         self.stage: ScheduledStage | None = None
-        self._device, self._usual = device, dict[tuple[type, str], Any]()
+        self._device = device
+        self._usual = dict[tuple[type, str], Any]()
         self._seconds: dict[str, float] = defaultdict(float)
         # By resolution: seconds and iterations.
         self._levels: dict[tuple[int, ...], tuple[float, int]] = {}
-        self._since, self._iteration = time.perf_counter(), 0
+        self._since = time.perf_counter()
+        self._iteration = 0
 
     def __enter__(self) -> Stopwatch:
         for label, (owner, name) in TIMED.items():
@@ -54,7 +56,7 @@ class Stopwatch:
             setattr(owner, name, usual)
 
     def rows(self) -> Iterator[Row]:
-        """Seconds by what they went to; then milliseconds of an iteration by resolution."""
+        """Seconds by what was done; then milliseconds of an iteration by resolution."""
         yield {"seconds": dict(self._seconds)}
         for shape, (seconds, iterations) in self._levels.items():
             yield {
@@ -77,7 +79,8 @@ class Stopwatch:
             finally:
                 self._seconds[label] += time.perf_counter() - began
                 if label.startswith("visits"):
-                    self.stage, self._since = own, time.perf_counter()
+                    self.stage = own
+                    self._since = time.perf_counter()
 
         return method
 
@@ -89,5 +92,6 @@ class Stopwatch:
         shape = tuple(stage.resolution)
         seconds, iterations = self._levels.get(shape, (0.0, 0))
         seconds += time.perf_counter() - self._since
-        self._levels[shape] = seconds, iterations + stage.iteration - self._iteration
-        self._since, self._iteration = time.perf_counter(), stage.iteration
+        self._levels[shape] = (seconds, iterations + stage.iteration - self._iteration)
+        self._since = time.perf_counter()
+        self._iteration = stage.iteration

@@ -9,6 +9,7 @@ from __future__ import annotations
 from harness import learned_scene, open_run, parser, report
 
 # isort: split
+from functools import partial
 from statistics import median
 from typing import Any
 
@@ -25,14 +26,15 @@ def main() -> None:
     """Render some held-out views of the run that the command line describes."""
     arguments = parser(__doc__)
     arguments.add_argument("--views", type=int, default=5, help="how many, from first to last")
-    given = arguments.parse_args()
+    options = arguments.parse_args()
     with report_user_errors():
-        run = open_run(given.overrides)
+        run = open_run(options.overrides)
         model = learned_scene(run).model
-        views, background = run.scene.dynamic.test, background_value(run.scene.background)
-        rows = [frames_a_second(Renderer(model), views, given.views, background)]
-        into = given.json or run.folder / "benchmark_rendering.json"
-        report(rows, into, run.device, scene=run.scene.name, overrides=given.overrides)
+        views = run.scene.dynamic.test
+        background = background_value(run.scene.background)
+        rows = [frames_a_second(Renderer(model), views, options.views, background)]
+        into = options.json or run.folder / "benchmark_rendering.json"
+        report(rows, into, run.device, scene=run.scene.name, overrides=options.overrides)
 
 
 def frames_a_second(
@@ -43,13 +45,15 @@ def frames_a_second(
     again: list[float] = []
     threads = torch.get_num_threads()
     for index in torch.linspace(0, len(views) - 1, count).round().int().tolist():
-        camera = views.cameras, index, float(views.times[index]), background
-        timer = Timer(
-            "renderer.view(*camera)",
-            globals={"renderer": renderer, "camera": camera},
-            num_threads=threads,
+        render = partial(
+            renderer.view,
+            views.cameras,
+            index,
+            time=float(views.times[index]),
+            background=background,
         )
-        renderer.view(*camera)
+        timer = Timer("render()", globals={"render": render}, num_threads=threads)
+        render()
         renderer.at.cache_clear()
         first.append(timer.timeit(1).median)
         again.append(timer.timeit(3).median)

@@ -43,14 +43,14 @@ def main() -> None:
     """Measure the stages of the run that the command line describes."""
     arguments = parser(__doc__)
     arguments.add_argument("--seconds", type=float, default=2.0, help="of timing a resolution")
-    given = arguments.parse_args()
+    options = arguments.parse_args()
     with report_user_errors():
-        run = open_run(given.overrides)
+        run = open_run(options.overrides)
         stored = learned_scene(run)
-        rows = canonical_rows(run, stored, given.seconds)
-        rows += deformation_rows(run, stored, given.seconds)
-        into = given.json or run.folder / "benchmark_training.json"
-        report(rows, into, run.device, scene=run.scene.name, overrides=given.overrides)
+        rows = canonical_rows(run, stored, options.seconds)
+        rows += deformation_rows(run, stored, options.seconds)
+        into = options.json or run.folder / "benchmark_training.json"
+        report(rows, into, run.device, scene=run.scene.name, overrides=options.overrides)
 
 
 def canonical_rows(run: RunContext, stored: LoadedCheckpoint, seconds: float) -> list[Row]:
@@ -98,7 +98,9 @@ class MeasurePhases(Callback):
 
     def __init__(self, kind: str, learned: DeVRFModel | None, seconds: float) -> None:
         self.rows: list[Row] = []
-        self._kind, self._learned, self._seconds = kind, learned, seconds
+        self._kind = kind
+        self._learned = learned
+        self._seconds = seconds
 
     def on_train_batch_start(
         self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int
@@ -116,16 +118,16 @@ class MeasurePhases(Callback):
 
 def one_phase_of_each_resolution(stage: ScheduledStage) -> dict[str, Phase]:
     """The middle one of a stage's phases at each resolution by its name, coarse to fine."""
-    found: dict[str, list[Phase]] = {}
+    phases_by_name: dict[str, list[Phase]] = {}
     start = 0
     while start < stage.total_iterations:
         phase = stage.phase_at(start)
         name = phase.kind
         if isinstance(phase, CanonicalPhase):
             name += f" {phase.voxels}"
-        found.setdefault(name, []).append(phase)
+        phases_by_name.setdefault(name, []).append(phase)
         start = phase.stop
-    return {name: phases[len(phases) // 2] for name, phases in found.items()}
+    return {name: phases[len(phases) // 2] for name, phases in phases_by_name.items()}
 
 
 def give_fields(stage: ScheduledStage, learned: DeVRFModel) -> None:
@@ -133,7 +135,8 @@ def give_fields(stage: ScheduledStage, learned: DeVRFModel) -> None:
     last = stage.phase_at(stage.total_iterations)
     model = stage.scene_model
     assert isinstance(model, DeVRFModel)
-    model.canonical, model.occupancy = learned.canonical, learned.occupancy
+    model.canonical = learned.canonical
+    model.occupancy = learned.occupancy
     if isinstance(stage, DeformationStage):
         assert isinstance(last, DeformationPhase)
         model.canonical.requires_grad_(False)

@@ -89,15 +89,27 @@ class SmallScene:
 
     def stage(self, name: str, variant: Variant) -> ScheduledStage:
         """The canonical or the deformation stage."""
-        how: dict[str, Any] = {"decoder_precision": variant.precision, "iterations_per_step": 5}
         if name == "canonical":
-            return CanonicalStage(self.at_rest, self.architecture, sampling=self.sampling, **how)
+            return CanonicalStage(
+                self.at_rest,
+                self.architecture,
+                sampling=self.sampling,
+                decoder_precision=variant.precision,
+                iterations_per_step=5,
+            )
         settings = MotionSettings(5e-3, unit="box", store="host")
         # Imported here: every command loads this module, and an extension may be taken out.
         from devrf.methods.devrf.extensions.tracks import StartAlongFlow
 
-        how |= {"flow_mean": "rays", "extensions": {"tracks": StartAlongFlow("flow")}}
-        return DeformationStage(copy.deepcopy(self.canonical), self.in_motion, settings, **how)
+        return DeformationStage(
+            copy.deepcopy(self.canonical),
+            self.in_motion,
+            settings,
+            decoder_precision=variant.precision,
+            iterations_per_step=5,
+            flow_mean="rays",
+            extensions={"tracks": StartAlongFlow("flow")},
+        )
 
     def learn(
         self,
@@ -153,15 +165,29 @@ def small_scene(device: torch.device, seed: int = 0) -> SmallScene:
         data = robot(width=24, height=18, static_views=8, frames=3)
         tiny = CanonicalSchedule(0, search_side=12, side=16, upsample_at=[10], rays=192)
         in_motion = DeformationSchedule([Level(4, 5), Level(6, 2)], rays=192)
-        sizes = short(tiny, 20), in_motion, Architecture(width=16), Sampling(alpha_threshold=3e-3)
-        return SmallScene(device, data, *sizes, seed)
+        return SmallScene(
+            device,
+            data,
+            at_rest=short(tiny, 20),
+            in_motion=in_motion,
+            architecture=Architecture(width=16),
+            sampling=Sampling(alpha_threshold=3e-3),
+            seed=seed,
+        )
     data = robot(width=96, height=72, static_views=24, frames=9)
     levels = [replace(level, iterations=20) for level in PAPER_LEVELS]
     at_rest = replace(short(CanonicalSchedule(), 250), search_iterations=20)
     # Fog that twenty iterations of the search can clear.
     architecture = Architecture(search_alpha_init=1e-2)
-    sizes = at_rest, DeformationSchedule(levels), architecture, Sampling()
-    return SmallScene(device, data, *sizes, seed)
+    return SmallScene(
+        device,
+        data,
+        at_rest=at_rest,
+        in_motion=DeformationSchedule(levels),
+        architecture=architecture,
+        sampling=Sampling(),
+        seed=seed,
+    )
 
 
 def require(condition: bool, message: str) -> None:
@@ -178,8 +204,10 @@ def require_gpu(scene: SmallScene, reason: str) -> None:
 
 def resume(scene: SmallScene, name: str) -> str:
     """Whether a stage that SIGTERM stops goes on to equal bits with ``deterministic=true``."""
-    whole, first, second = (scene.stage(name, EXACT) for _ in range(3))
-    scene.learn(whole, EXACT)
+    uninterrupted = scene.stage(name, EXACT)
+    first = scene.stage(name, EXACT)
+    second = scene.stage(name, EXACT)
+    scene.learn(uninterrupted, EXACT)
 
     def interrupt(*_: Any) -> None:
         if 0 <= first.iteration - first.total_iterations // 2 < first.iterations_per_step:
@@ -195,8 +223,8 @@ def resume(scene: SmallScene, name: str) -> str:
         interrupted = stop.number is not None and 0 < first.iteration < first.total_iterations
         require(interrupted and bool(files), f"{stopped}, {len(files)} progress files")
         scene.learn(second, EXACT, resumed_from=str(files[0]))
-    require(second.iteration == whole.iteration, f"ended at iteration {second.iteration}")
-    pairs = zip(whole.state_dict().values(), second.state_dict().values(), strict=True)
+    require(second.iteration == uninterrupted.iteration, f"ended at iteration {second.iteration}")
+    pairs = zip(uninterrupted.state_dict().values(), second.state_dict().values(), strict=True)
     same = all(torch.equal(a, b) for a, b in pairs if isinstance(a, torch.Tensor))
     require(same, f"{stopped}, came to other fields")
     return f"{stopped}, equal bits"
@@ -214,7 +242,8 @@ def rendering(scene: SmallScene) -> str:
     scene.learn(stage, PLAIN)
     model = stage.current_model()
     assert isinstance(model, DeVRFModel)
-    views, background = scene.data.scene.dynamic.test, background_value(scene.data.scene.background)
+    views = scene.data.scene.dynamic.test
+    background = background_value(scene.data.scene.background)
     last = len(views) - 1
 
     def picture(device: torch.device) -> torch.Tensor:

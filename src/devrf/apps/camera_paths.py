@@ -20,20 +20,28 @@ from devrf.geometry.space import Space
 from devrf.rendering.renderer import Renderer, points_at_depth
 from devrf.rendering.view import Viewable
 
-# Cameras stand all around where the widest gap between two, seen from above, is no more than this,
-# or than so many times what even spacing would leave.
-WIDEST_GAP, UNEVEN = math.radians(60), 1.5
+# Cameras stand all around if the widest gap between two, seen from above, is at most WIDEST_GAP, or
+# UNEVEN times the gap of evenly spaced ones.
+WIDEST_GAP = math.radians(60)
+UNEVEN = 1.5
 # The variance of cameras' own horizontals, as a share, below which their mean up counts.
 LEVEL = 0.02
 # Cameras that look the same way differ by less than 45 degrees.
 SAME_WAY = math.sqrt(0.5)
-# The way through the captured cameras: so many of them at most, and points on it; a film's order
-# is at most so many times longer than a short tour. Distances count in what cameras look at.
-MAX_STOPS, POINTS, OF_A_FILM = 300, 1000, 2.0
-# Tours are made shorter to the pace that leads once around in 4.4 seconds, with at least so many
-# stops; motion of under 0.3 seconds, or 1.5 stops, is smoothed, by a twelfth of the way at most.
-PACE, MIN_STOPS = 2.0, 6
-SMOOTH_SECONDS, SMOOTH_STOPS, SMOOTH_MOST = 0.3, 1.5, 1 / 12
+# The way through the captured cameras passes at most MAX_STOPS of them, and is sampled at POINTS.
+MAX_STOPS = 300
+POINTS = 1000
+# Images are in a film's order if that is at most so many times longer than a short tour. The unit
+# of length is the distance from the cameras to what they look at.
+OF_A_FILM = 2.0
+# Tours are shortened to this length a second, with which a circle takes 4.4 seconds, but keep at
+# least MIN_STOPS.
+PACE = 2.0
+MIN_STOPS = 6
+# Motion of under so many seconds or stops is smoothed, over at most this share of the way.
+SMOOTH_SECONDS = 0.3
+SMOOTH_STOPS = 1.5
+SMOOTH_MOST = 1 / 12
 
 # The cameras of a video, from captured ones, what they look at (3,), and settings.
 Way = Callable[[Cameras, Tensor, VideoSettings], Cameras]
@@ -46,10 +54,12 @@ Shots = tuple[Cameras, list[float]]
 def orbit(cameras: Cameras, target: Tensor, settings: VideoSettings) -> Cameras:
     """Cameras on a circle around ``target`` (3,), looking at it, as far from it as the captured.
 
-    They go all around where these did; else to and fro in the sector that these covered, and that
-    ``video.orbit_turns`` times. Without ``video.orbit_elevation`` they are as high as these.
+    They go all around if the captured cameras did; else to and fro in the sector that those
+    covered. They do so ``video.orbit_turns`` times. Without ``video.orbit_elevation`` they are as
+    high as the captured ones.
     """
-    offsets, up = cameras.positions - target, upward(cameras)
+    offsets = cameras.positions - target
+    up = upward(cameras)
     east = normalize(torch.linalg.cross(torch.eye(3)[int(up.abs().argmin())], up), dim=0)
     axes = torch.stack([east, torch.linalg.cross(up, east)])
     radius = float(offsets.norm(dim=1).mean())
@@ -81,10 +91,11 @@ def sector(angles: Tensor) -> tuple[float, float]:
 def upward(cameras: Cameras) -> Tensor:
     """The direction (3,) that is up where N cameras were.
 
-    It is across the horizontals of their images, which the mean of their own up is not where they
-    look down from one side. It is that mean as far as horizontals are parallel.
+    It is perpendicular to the horizontals of their images. The mean of the cameras' own up is not,
+    if they look down from one side; that mean counts as far as the horizontals are parallel.
     """
-    right, own = cameras.camera_to_world[:, :, 0], cameras.camera_to_world[:, :, 1].mean(dim=0)
+    right = cameras.camera_to_world[:, :, 0]
+    own = cameras.camera_to_world[:, :, 1].mean(dim=0)
     spread = right.T @ right / len(right) + LEVEL * torch.eye(3)
     return normalize(torch.linalg.solve(spread, own), dim=0)
 
@@ -92,9 +103,10 @@ def upward(cameras: Cameras) -> Tensor:
 def spiral(cameras: Cameras, target: Tensor, settings: VideoSettings) -> Cameras:
     """Cameras on a small ring among those captured that look the same way, looking at ``target``.
 
-    Where cameras look in many directions, that is the one that most of them share.
+    If cameras look in many directions, those count that look in the most common one.
     """
-    level, alike = upward(cameras), cameras.forwards @ cameras.forwards.T
+    level = upward(cameras)
+    alike = cameras.forwards @ cameras.forwards.T
     cameras = cameras[alike[int(alike.sum(dim=1).argmax())] > SAME_WAY]
     right, up, _, middle = average_pose(cameras.camera_to_world).unbind(dim=1)
     axes = torch.stack([right, up])
@@ -107,8 +119,8 @@ def spiral(cameras: Cameras, target: Tensor, settings: VideoSettings) -> Cameras
 def captured(cameras: Cameras, target: Tensor, settings: VideoSettings) -> Cameras:
     """Cameras on a smooth way through the captured ones, at an even pace, looking as they did.
 
-    Frames of a film are passed in their order, photographs on a short tour, which leaves some out
-    where the video is too short for all. ``target`` (3,) says how far away it is that they see.
+    They pass frames of a film in their order, and photographs on a short tour, which leaves some
+    out if the video is too short for all. The distance to ``target`` (3,) is the unit of length.
     """
     cameras = cameras[evenly(len(cameras), MAX_STOPS)]
     reach = float((cameras.positions - target).norm(dim=1).median())
@@ -132,9 +144,9 @@ def captured(cameras: Cameras, target: Tensor, settings: VideoSettings) -> Camer
 
 
 def in_order(apart: np.ndarray, longest: float) -> list[int]:
-    """In which order to pass N places, by the distances (N, N) between them.
+    """The order in which to pass N places, by the distances (N, N) between them.
 
-    The order that they have, if it is that of a film; else a tour, which leaves places out where it
+    It is the order that they have, if that is a film's; else a tour, which leaves places out if it
     would be longer than ``longest``.
     """
     order = tour(apart)
@@ -149,22 +161,23 @@ def in_order(apart: np.ndarray, longest: float) -> list[int]:
 def tour(apart: np.ndarray) -> list[int]:
     """A short way through N places that are (N, N) apart: to the nearest next, then 2-opt.
 
-    A place that is next to all others makes the way a ring, in which it stands for the open end.
+    A place that has no distance to any other closes the way to a ring; the way is opened there.
     """
     order = [int(apart.sum(axis=1).argmax())]
     while len(order) < len(apart):
         distances = apart[order[-1]].copy()
         distances[order] = np.inf
         order.append(int(distances.argmin()))
-    ring, closed = np.array([*order, len(apart)]), np.pad(apart.astype(float), (0, 1))
+    ring = np.array([*order, len(apart)])
+    closed = np.pad(apart.astype(float), (0, 1))
     while True:
         after = np.roll(ring, -1)
         legs = closed[ring, after]
-        # Two legs less, two others more: what lies between them is passed the other way.
+        # What two legs are replaced by two others saves, which reverses the way between them.
         saved = legs[:, None] + legs - closed[np.ix_(ring, ring)] - closed[np.ix_(after, after)]
         np.fill_diagonal(saved, 0.0)
         first, last = sorted(np.unravel_index(saved.argmax(), saved.shape))
-        # Rounding, which could go to and fro for ever, is no gain; nor is NaN.
+        # Less than rounding could alternate for ever, and NaN saves nothing.
         if not saved[first, last] > 1e-6 * legs.sum():
             break
         ring[first + 1 : last + 1] = ring[first + 1 : last + 1][::-1].copy()
@@ -204,9 +217,9 @@ WAYS: dict[str, Way] = {"orbit": orbit, "spiral": spiral, "captured": captured}
 
 
 def default_way(space: Space, closed: bool = False) -> str:
-    """What films a scene best; ``closed``: and comes back to where it began.
+    """The way that suits a scene; ``closed``: one that comes back to where it began.
 
-    Photographs know nothing of what is beside their cameras.
+    In an unbounded scene it stays near the captured cameras: nothing else is known.
     """
     if isinstance(space, NormalizedDevice):
         return "spiral"
@@ -216,7 +229,7 @@ def default_way(space: Space, closed: bool = False) -> str:
 def looked_at(model: Viewable, cameras: Cameras, ahead: Callable[[], float]) -> Tensor:
     """What captured cameras look at (3,), world units: the middle of the scene.
 
-    Of a forward-facing scene it is so far ``ahead`` of their middle.
+    In a forward-facing scene it is the point ``ahead`` of the middle of the cameras, so far away.
     """
     if not isinstance(model.space, NormalizedDevice):
         return torch.tensor(model.space.inner(model.box).middle)
@@ -250,7 +263,8 @@ def time_freeze(ring: Ring, stop: float, settings: VideoSettings) -> Shots:
     third = settings.frames // 3
     around = settings.frames - 2 * third
     cameras = ring(replace(settings, frames=around))
-    before, after = torch.linspace(0, stop, third + 1)[:-1], torch.linspace(stop, 1, third)
+    before = torch.linspace(0, stop, third + 1)[:-1]
+    after = torch.linspace(stop, 1, third)
     times = [*before.tolist(), *[stop] * around, *after.tolist()]
     return cameras[[0] * third + list(range(around)) + [0] * third], times
 

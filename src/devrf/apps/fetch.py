@@ -44,8 +44,10 @@ OWN = Path(__file__).with_name("catalogue.toml")
 # Beside the data: where they are from, when, and their checksums.
 RECORD = "fetched.json"
 ARCHIVE = "archive"
-# Images hardly expand, and camera files by ten times or so; a small archive may by more.
-MOST_EXPANSION, SMALL = 20, 2**26
+# Images hardly expand, and camera files about tenfold. An archive that unpacks to at most SMALL
+# bytes may expand by more.
+MOST_EXPANSION = 20
+SMALL = 2**26
 # The file by which a scene's folder is known, by the layout that reads it.
 MARKERS = {
     "inward": "transforms_train.json",
@@ -73,7 +75,7 @@ class Collection(BaseModel):
         files: what to fetch where ``url`` names a file.
         folder: name of the scene's folder in the archive, where it holds several scenes.
         scenes: what each shows, by name.
-        sha256: checksums of the archives, by scene; of several files that of their list.
+        sha256: checksums of the archives, by scene; for several files, of their list.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -148,7 +150,7 @@ class Fetched:
 
     Attributes:
         path: its folder.
-        sha256: of the archive; of several files that of the list of their checksums.
+        sha256: of the archive; for several files, of the list of their checksums.
         compared: whether it was compared with a checksum that was known before.
         anew: whether it was fetched now, and not before.
     """
@@ -181,17 +183,19 @@ def fetched(scene: PublishedScene, settings: FetchSettings, progress: bool) -> F
         OSError: the disk refuses.
     """
     into = Path(settings.into).expanduser()
-    done = fetched_before(scene, into)
-    if done is None:
+    result = fetched_before(scene, into)
+    if result is None:
         source = scene.collection
         log.info(
             "%s: %s; from %s; licence: %s", scene.name, scene.about, source.page, source.licence
         )
-        done = fetch_scene(scene, into, settings.sha256, progress)
-    log.info("%s: %s", scene.name, f"in {done.path}" if done.anew else f"is in {done.path} already")
-    known = f"none was known to compare it with; kept in {done.path / RECORD}"
-    log.info("SHA-256 %s%s", done.sha256, ", as expected" if done.compared else f": {known}")
-    return done
+        result = fetch_scene(scene, into, settings.sha256, progress)
+    log.info(
+        "%s: %s", scene.name, f"in {result.path}" if result.anew else f"is in {result.path} already"
+    )
+    remark = f"none was known to compare it with; kept in {result.path / RECORD}"
+    log.info("SHA-256 %s%s", result.sha256, ", as expected" if result.compared else f": {remark}")
+    return result
 
 
 def fetch_scene(scene: PublishedScene, into: Path, sha256: str | None, progress: bool) -> Fetched:
@@ -251,7 +255,8 @@ def _download(scene: PublishedScene, folder: Path, progress: bool) -> dict[str, 
     get = pooch.HTTPDownloader(
         progressbar=progress and scene.is_archive, headers={"User-Agent": "devrf"}
     )
-    fetched, console = {}, Console(stderr=True)
+    fetched = {}
+    console = Console(stderr=True)
     hidden = scene.is_archive or not progress
     for name in track(scene.downloads, scene.name, console=console, disable=hidden):
         try:
@@ -268,7 +273,7 @@ def _download(scene: PublishedScene, folder: Path, progress: bool) -> dict[str, 
 
 
 def _digest(files: dict[str, Path]) -> str:
-    """The SHA-256 of an archive; of several files that of the lines that sha256sum prints."""
+    """The SHA-256 of an archive; for several files, of the lines that sha256sum prints."""
     import pooch
 
     digests = {name: str(pooch.file_hash(str(path))) for name, path in files.items()}
@@ -286,23 +291,25 @@ def _check_size(packed: zipfile.ZipFile, archive: Path, work: Path) -> None:
     Raises:
         DevrfError: it would expand far beyond that; ``work`` is removed, and the archive with it.
     """
-    size, whole = archive.stat().st_size, sum(file.file_size for file in packed.infolist())
-    if whole > max(MOST_EXPANSION * size, SMALL):
+    size = archive.stat().st_size
+    unpacked_size = sum(file.file_size for file in packed.infolist())
+    if unpacked_size > max(MOST_EXPANSION * size, SMALL):
         shutil.rmtree(work, ignore_errors=True)
         raise DevrfError(
-            f"{archive}: {decimal(size)} would unpack to {decimal(whole)}, more than "
+            f"{archive}: {decimal(size)} would unpack to {decimal(unpacked_size)}, more than "
             f"{MOST_EXPANSION} times as much; it was removed: ask who published it"
         )
 
 
 def _unpacked(scene: PublishedScene, work: Path) -> Path:
     """The folder of the archive that holds the scene's marker, without the folders around it."""
-    archive, place = work / "files" / ARCHIVE, work / "unpacked"
+    archive = work / "files" / ARCHIVE
+    place = work / "unpacked"
     shutil.rmtree(place, ignore_errors=True)
     try:
         with zipfile.ZipFile(archive) as packed:
             _check_size(packed, archive, work)
-            packed.extractall(place)  # what would be written elsewhere is written there
+            packed.extractall(place)  # names that lead elsewhere are written below it, too
     except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
         raise DevrfError(
             f"{archive}: cannot be unpacked ({error}); remove it, and the same command fetches it "

@@ -21,8 +21,9 @@ from devrf.system.memory import free_host_memory, free_memory, gib, own_memory
 SIZE = "data.downscale"
 # A checkpoint, and three progress files at once, each with values and Adam's two means.
 FILES = 10
-# Images are made at most so many times smaller; other values, too.
-MOST_OF_SIZE, MOST = 8, 64
+# Images are made at most MOST_OF_SIZE times smaller, other values at most MOST times.
+MOST_OF_SIZE = 8
+MOST = 64
 # Bytes by resource: GPU memory, host memory, disk.
 Bytes = Mapping[str, float]
 
@@ -48,12 +49,12 @@ def needed_bytes(
 
 
 def lacking(needed: Bytes, free: Bytes) -> list[str]:
-    """Of what there is too little."""
+    """The resources of which there is too little."""
     return [name for name in free if needed[name] > free[name]]
 
 
 def in_words(needed: Bytes, free: Bytes) -> str:
-    """What is needed of what there is."""
+    """How much is needed of how much is free, of each resource."""
     return ", ".join(f"{gib(needed[name])} of {gib(free[name])} GiB of {name}" for name in free)
 
 
@@ -73,7 +74,8 @@ def least_change(
             return False
 
     for key in sorted(parts, key=lambda key: (key != SIZE, -parts[key])):
-        value, values = present[key], range(0)
+        value = present[key]
+        values = range(0)
         if key == SIZE:
             values = range(value + 1, MOST_OF_SIZE * value + 1)
         elif isinstance(value, int | float):

@@ -23,9 +23,12 @@ GAP = 4
 # Longest name that fits below a small image, in characters.
 LONGEST_NAME = 30
 # Grey levels of text, and of the lines around images, most of which have a white background.
-INK, LINE = "#262626", "#c8c8c8"
-# Text is so high for each pixel of an image's height, and between these heights, in pixels.
-TEXT, SMALLEST_TEXT, LARGEST_TEXT = 0.05, 9, 26
+INK = "#262626"
+LINE = "#c8c8c8"
+# The height of text: its share of an image's height, and its limits in pixels.
+TEXT = 0.05
+SMALLEST_TEXT = 9
+LARGEST_TEXT = 26
 
 
 def depth_colors(depth: Tensor, opacity: Tensor, near: float, far: float) -> Tensor:
@@ -86,7 +89,7 @@ def side_by_side(images: Sequence[Tensor]) -> Tensor:
 
 
 def short_name(name: str) -> str:
-    """The name of an image's file as a label, without folders; of a long name its end."""
+    """The name of an image's file as a label, without folders; a long name is cut to its end."""
     name = Path(name).name
     return name if len(name) <= LONGEST_NAME else f"…{name[1 - LONGEST_NAME :]}"
 
@@ -138,7 +141,7 @@ def image_grid(
 
 
 def scaled(image: Tensor, height: int, width: int | None = None) -> Tensor:
-    """An image (H, W, 3) in [0, 1] of another size, smoothly interpolated, by default in shape."""
+    """An image (H, W, 3) in [0, 1], smoothly resized; without ``width`` it keeps its aspect."""
     if width is None:
         width = max(1, round(image.shape[1] * height / image.shape[0]))
     if tuple(image.shape[:2]) == (height, width):

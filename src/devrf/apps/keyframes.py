@@ -86,16 +86,22 @@ class CameraPath:
         seconds = seconds.double().clamp(knots[0], knots[-1])
         known = torch.cat([poses[:, :, 3], fovs[:, None], _quaternions(poses[:, :, :3])], dim=1)
         values = hermite(knots, known, seconds)
-        position, fov, wxyz = values[:, :3], values[:, 3:4], values[:, 4:]
+        position = values[:, :3]
+        fov = values[:, 3:4]
+        wxyz = values[:, 4:]
         rotation = quaternion_to_rotation_matrix(torch.nn.functional.normalize(wxyz, dim=1))
         path = torch.cat([rotation, position[:, :, None]], dim=2).float()
         time = torch.from_numpy(np.interp(seconds, knots, times))[:, None]
         rows = torch.cat([fov.clamp(1, 179), time.clamp(0, 1), seconds[:, None]], dim=1).tolist()
-        return [Keyframe(pose, *row) for pose, row in zip(path, rows, strict=True)]
+        return [
+            Keyframe(pose, fov=fov_now, time=time_now, seconds=second)
+            for pose, (fov_now, time_now, second) in zip(path, rows, strict=True)
+        ]
 
     def sampled(self, frames: int) -> list[Keyframe]:
         """``frames`` keyframes, evenly spread over the video."""
-        first, last = self.keyframes[0].seconds, self.keyframes[-1].seconds
+        first = self.keyframes[0].seconds
+        last = self.keyframes[-1].seconds
         return self.at(torch.linspace(first, last, frames, dtype=torch.float64))
 
 
@@ -131,8 +137,10 @@ def hermite(knots: Tensor, values: Tensor, at: Tensor) -> Tensor:
         return values.expand(len(at), -1)
     before = torch.searchsorted(knots, at, right=True).clamp(1, len(knots) - 1) - 1
     u = ((at - knots[before]) / (knots[before + 1] - knots[before]))[:, None]
-    after, k = before + 1, torch.arange(len(knots))
-    low, high = (k - 1).clamp(min=0), (k + 1).clamp(max=len(knots) - 1)
+    after = before + 1
+    k = torch.arange(len(knots))
+    low = (k - 1).clamp(min=0)
+    high = (k + 1).clamp(max=len(knots) - 1)
     slope = (values[high] - values[low]) / (knots[high] - knots[low])[:, None]
     step = (knots[after] - knots[before])[:, None]
     return (
@@ -207,8 +215,8 @@ def read_path(file: Path) -> CameraPath:
     Raises:
         DevrfError: there is no such file, or it is no camera path.
     """
-    known = ", ".join([*WAYS, *PRESETS])
-    remedy = f"give video.path {known}, or a file that the viewer saved"
+    choices = ", ".join([*WAYS, *PRESETS])
+    remedy = f"give video.path {choices}, or a file that the viewer saved"
     return _path(read_json(file, _PathFile, remedy), file)
 
 
@@ -250,7 +258,8 @@ def write_path(file: Path, path: CameraPath, height: int) -> None:
 
 
 def _path(content: _PathFile, where: object) -> CameraPath:
-    cameras, last = content.camera_path, max(len(content.camera_path) - 1, 1)
+    cameras = content.camera_path
+    last = max(len(content.camera_path) - 1, 1)
     keyframes = [
         Keyframe(
             _pose(keyframe.matrix).float(), keyframe.fov, keyframe.render_time, keyframe.seconds

@@ -48,9 +48,9 @@ def dynamic_scores(views: Sequence[HeldOutView], clock: FrameClock) -> dict[str,
     novel = [view for view in views if not clock.knows(view.time)]
     known = [view for view in views if clock.knows(view.time)]
     scores: dict[str, Any] = _with_rest_pose(views)
-    for name, some in zip(OF_TIMES, (known, novel), strict=True):
-        if novel and some:
-            scores[name] = {**_with_rest_pose(some), "images": len(some)}
+    for name, group in zip(OF_TIMES, (known, novel), strict=True):
+        if novel and group:
+            scores[name] = {**_with_rest_pose(group), "images": len(group)}
     return scores
 
 
@@ -73,7 +73,8 @@ def scores_by_section(
         return {name: record.get(name) for name in TRAINING}
 
     static: dict[str, Any] = mean_scores(frames["static"])
-    sections, last = {"static": static}, metadata.stage
+    sections = {"static": static}
+    last = metadata.stage
     if rest is not None or "dynamic" not in frames:
         sections["static"] = sections[rest or last] = static | training(rest or last)
     if "dynamic" in frames:
@@ -128,7 +129,7 @@ def frame_rows(
 
 
 def data_record(scene: Scene) -> dict[str, Any]:
-    """How much data a scene is: kind, held-out images' size and number; of motion frames, views."""
+    """How much data a scene has: kind, frames, views, and held-out images' size and number."""
     height, width = scene.dynamic.test.pixels.shape[1:3]
     frames = scene.clock.frames_of(scene.dynamic.train.times)
     return {
@@ -202,12 +203,12 @@ def git_revision(root: Path | None = None) -> str | None:
         return None
     command = ["git", "describe", "--always", "--dirty", "--exclude=*", "--abbrev=40"]
     try:
-        done = subprocess.run(
+        result = subprocess.run(
             command, cwd=root, capture_output=True, text=True, timeout=10, check=True
         )
     except (OSError, subprocess.SubprocessError):
         return None
-    return done.stdout.strip() or None
+    return result.stdout.strip() or None
 
 
 def peak_host_memory() -> float | None:

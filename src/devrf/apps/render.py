@@ -59,12 +59,14 @@ def videos(
 
     With ``video.path`` there is that path alone.
     """
-    behind, static = background_value(viewpoints.background), viewpoints.static
+    behind = background_value(viewpoints.background)
+    static = viewpoints.static
     path = camera_path(settings)
     if path is not None:
         settings = replace(settings, frames=path.frames, fps=path.fps)
     settings = _within_limit(settings, renderer, settings.sized(viewpoints.held_out))
-    sized, space = settings.sized(static), renderer.model.space
+    sized = settings.sized(static)
+    space = renderer.model.space
 
     def filmed(name: str) -> Callable[[VideoSettings], Cameras]:
         target = looked_at(renderer.model, static, lambda: focus_distance(renderer, static))
@@ -85,7 +87,8 @@ def videos(
         yield video(settings.path, path_pictures(renderer, cameras, behind, times))
         return
     if held_out is not None:
-        images, background = held_out_images(held_out, settings.frames), viewpoints.background
+        images = held_out_images(held_out, settings.frames)
+        background = viewpoints.background
         shown = held_out_pictures(renderer, held_out, images, settings, background)
         yield video("held_out", shown)
     name = settings.path or default_way(space)
@@ -99,7 +102,7 @@ def _within_limit(settings: VideoSettings, renderer: Renderer, cameras: Cameras)
     """
     if settings.max_seconds is None:
         return settings
-    still(renderer, cameras.of_height(MIN_HEIGHT), 0.5, 1.0)  # what only the first one needs
+    still(renderer, cameras.of_height(MIN_HEIGHT), 0.5, 1.0)  # a warm-up, which is not timed
     began = time.perf_counter()
     still(renderer, cameras, 0.5, 1.0)
     within = settings.within_limit(time.perf_counter() - began, cameras.height)
@@ -107,7 +110,10 @@ def _within_limit(settings: VideoSettings, renderer: Renderer, cameras: Cameras)
         log.info(
             "videos have %d frames of %d rows, not %d of %d, which would take longer than "
             "video.max_seconds=%g; null renders them",
-            *(within.frames, within.height, settings.frames, cameras.height),
+            within.frames,
+            within.height,
+            settings.frames,
+            cameras.height,
             settings.max_seconds,
         )
     return within

@@ -114,7 +114,8 @@ class ViewerSettings:
     share: float = 0.03
 
     def __post_init__(self) -> None:
-        seconds, share = self.move_seconds, self.share
+        seconds = self.move_seconds
+        share = self.share
         expect(1 <= self.port <= 65535, "viewer.port", "1 to 65535", self.port)
         expect(16 <= self.height <= 4096, "viewer.height", "16 to 4096", self.height)
         expect(0 < seconds <= 10, "viewer.move_seconds", "more than 0, at most 10", seconds)
@@ -138,9 +139,11 @@ class ViewerSettings:
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 probe.bind(address[4])
         except OSError as error:
-            key, remedy = "host", "an address of this machine, such as viewer.host=127.0.0.1"
+            key = "host"
+            remedy = "an address of this machine, such as viewer.host=127.0.0.1"
             if error.errno == errno.EADDRINUSE:
-                key, remedy = "port", f"another, such as viewer.port={self.port % 65535 + 1}"
+                key = "port"
+                remedy = f"another, such as viewer.port={self.port % 65535 + 1}"
             raise DevrfError(
                 f"viewer.{key}: cannot listen on {self.host}:{self.port} ({error.strerror}); "
                 f"give {remedy}"

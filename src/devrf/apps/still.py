@@ -37,8 +37,9 @@ log = logging.getLogger(__name__)
 
 # Pictures of small images are rendered at this height, in pixels, unless another is asked for.
 READABLE = 400
-# Contact sheets: lower images are enlarged to this height, higher ones reduced to the other.
-MIN_HEIGHT, MAX_HEIGHT = 300, 640
+# The least and the largest height of images in contact sheets; others are resized.
+MIN_HEIGHT = 300
+MAX_HEIGHT = 640
 DEPTH = "depth: near is bright"
 HEADINGS = ("truth", "rendered", "error: 0 to 0.25 or more", DEPTH)
 
@@ -59,7 +60,7 @@ class StillSettings:
     def name(self, moves: bool) -> str:
         """What the image's file is called, without its suffix: ``still_held_out_t0.5_h800``.
 
-        Of a scene that never ``moves`` it says no time.
+        It has no time if the scene never ``moves``.
         """
         time = f"_t{self.time:g}" if moves else ""
         size = "" if self.height is None else f"_h{self.height}"
@@ -71,12 +72,16 @@ class StillSettings:
         Raises:
             DevrfError: the scene has no such camera.
         """
-        captured, index = viewpoints.held_out, 0
+        captured = viewpoints.held_out
+        index = 0
         if isinstance(self.view, int):
-            captured, index = viewpoints.static, self.view
+            captured = viewpoints.static
+            index = self.view
         if not 0 <= index < len(captured):
-            some = f"expected held_out or 0 to {len(viewpoints.static) - 1}, not {self.view}"
-            raise DevrfError(f"still.view: {some}")
+            raise DevrfError(
+                f"still.view: expected held_out or 0 to {len(viewpoints.static) - 1}, "
+                f"not {self.view}"
+            )
         return sized(captured[[index]], self.height)
 
 
@@ -97,10 +102,12 @@ def still(
 
     ``background`` is a grey level; what is outside a ``crop`` is left out.
     """
-    model, shape = renderer.model, (cameras.height, cameras.width)
+    model = renderer.model
+    shape = (cameras.height, cameras.width)
     image = renderer.view(cameras, index, time, background, crop)
     near, far = model.space.depth_range(model.box, model.depth_limits, cameras.positions[index])
-    depth, opacity = image.depth.view(shape).cpu(), image.opacity.view(shape).cpu()
+    depth = image.depth.view(shape).cpu()
+    opacity = image.opacity.view(shape).cpu()
     color = image.color.view(*shape, 3).clamp(0, 1).cpu()
     return color, depth_colors(depth, opacity, near, far)
 
@@ -127,7 +134,8 @@ class Preview(NamedTuple):
 
 def preview(model: Viewable, views: Views, index: int, background: Background) -> Preview:
     """Render one of the held-out views, on the host, and compare it with the truth."""
-    time, behind = float(views.times[index]), background_value(background)
+    time = float(views.times[index])
+    behind = background_value(background)
     prediction, depth = still(Renderer(model, times=1), views.cameras, time, behind, index)
     truth = truth_image(views, index, background).cpu()
     compared = compare(prediction, truth, views.valid_mask_of(index))
@@ -138,19 +146,20 @@ def preview(model: Viewable, views: Views, index: int, background: Background) -
 def write_contact_sheet(path: Path, views: Sequence[HeldOutView], rows: int = 6) -> Tensor:
     """Write a PNG of ``rows`` of the views with name, time and scores; the sheet (H, W, 3).
 
-    Where all are at time 0 none is said.
+    Times are left out if all are 0.
     """
     shown = [views[k] for k in evenly(len(views), rows)]
     near, far = _depth_range(shown)
     height = min(max(shown[0].truth.shape[0], MIN_HEIGHT), MAX_HEIGHT)
-    rows_of_tiles, labels = [], []
+    rows_of_tiles = []
+    labels = []
     for view in shown:
         error = error_colors(view.compared, view.truth)
         depth = depth_colors(view.depth, view.opacity, near, far)
-        tiles = view.truth, view.prediction, error, depth
+        tiles = (view.truth, view.prediction, error, depth)
         rows_of_tiles.append([scaled(tile, height) for tile in tiles])
         name = wrap(short_name(view.name), 16, break_long_words=False, break_on_hyphens=False)
-        scores = f"PSNR {view.psnr:.2f} dB", f"SSIM {view.ssim:.3f}"
+        scores = (f"PSNR {view.psnr:.2f} dB", f"SSIM {view.ssim:.3f}")
         time = [f"time {view.time:.2f}"] if any(view.time for view in views) else []
         labels.append([*name, *time, *scores])
     sheet = image_grid(rows_of_tiles, HEADINGS, labels)
@@ -164,5 +173,6 @@ def _depth_range(views: Sequence[HeldOutView]) -> tuple[float, float]:
     if len(order) == 0:
         return 0.0, 1.0
     margin = (len(order) - 1) // 100
-    near, far = float(order[margin]), float(order[-1 - margin])
+    near = float(order[margin])
+    far = float(order[-1 - margin])
     return near, max(far, near + 1e-6)

@@ -45,7 +45,7 @@ class Tracker(Protocol):
 
 
 def trackers(loggers: Iterable[Logger]) -> list[Tracker]:
-    """Those of the loggers that are trackers."""
+    """The loggers that are trackers."""
     return [logger for logger in loggers if isinstance(logger, Tracker)]
 
 
@@ -114,10 +114,11 @@ class WandbTracker(WandbLogger):
         wandb works in ``wandb/`` below the run's folder. By default ``name`` is that of the folder,
         ``group`` of the one that it lies in: the scene's, or the sweep's of which it is a job.
         ``entity`` None is the account that is logged in. Offline, ``wandb sync`` sends it later.
-        ``WANDB_MODE`` in the environment goes before ``offline``.
+        ``WANDB_MODE`` in the environment takes precedence over ``offline``.
         """
-        given, folder = os.environ.get("WANDB_MODE"), Path(save_dir).resolve()
-        if offline if not given else given in OFFLINE:
+        mode = os.environ.get("WANDB_MODE")
+        folder = Path(save_dir).resolve()
+        if offline if not mode else mode in OFFLINE:
             # Read when wandb is first imported. It reports on itself even when offline.
             os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
         super().__init__(
@@ -128,7 +129,7 @@ class WandbTracker(WandbLogger):
             tags=list(tags),
             entity=entity,
             # Not as Lightning's `offline`, which changes WANDB_MODE.
-            mode=None if given else "offline" if offline else "online",
+            mode=None if mode else "offline" if offline else "online",
         )
         # wandb ignores it and warns where it is given.
         self._wandb_init.pop("anonymous", None)

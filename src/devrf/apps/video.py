@@ -23,8 +23,9 @@ PIXEL = 0.2
 MAX_FRAMES = 90_000
 # H.264 has blocks of so many pixels.
 MIN_HEIGHT = 16
-# What rendering is to take decides first the height, down to so many rows, then the frames.
-LOW, MIN_FRAMES = 160, 24
+# To render within max_seconds, images get lower, down to LOW rows; then frames get fewer.
+LOW = 160
+MIN_FRAMES = 24
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,8 @@ class VideoSettings:
     time: float = 0.5
 
     def __post_init__(self) -> None:
-        height, max_seconds = self.height, self.max_seconds
+        height = self.height
+        max_seconds = self.max_seconds
         expect(0 <= self.time <= 1, "video.time", "0 to 1", self.time)
         expect(0 < self.frames <= MAX_FRAMES, "video.frames", f"1 to {MAX_FRAMES}", self.frames)
         expect(0 < self.fps <= 1000, "video.fps", "more than 0, at most 1000", self.fps)
@@ -63,7 +65,7 @@ class VideoSettings:
     def within_limit(self, seconds: float, height: int) -> VideoSettings:
         """The settings for images of ``height`` rows that take ``seconds`` each.
 
-        Images are made lower if need be, and where that does not suffice there are fewer.
+        Images are made lower if need be; if that does not suffice, there are fewer.
         """
         share = 1.0 if self.max_seconds is None else self.max_seconds / (self.frames * seconds)
         if share >= 1:
@@ -103,16 +105,19 @@ def held_out_pictures(
 
     ``images`` are those of the ``views`` to show, one a frame (:func:`held_out_images`).
     """
-    cameras, behind = settings.sized(views.cameras), background_value(background)
+    cameras = settings.sized(views.cameras)
+    behind = background_value(background)
     larger = ", enlarged" if cameras.height > views.height else ""
     for frame, image in enumerate(images):
         time = frame / max(len(images) - 1, 1)
         color, depth = still(renderer, cameras, time, behind, image)
         # Resized from its own size, not rendered: it shows what there is to compare with.
         truth = scaled(truth_image(views, image, background), cameras.height, cameras.width)
-        at, at_time = "", ""
+        at = ""
+        at_time = ""
         if renderer.model.moves:
-            at, at_time = f" at {float(views.times[image]):.2f}", f" at time {time:.2f}"
+            at = f" at {float(views.times[image]):.2f}"
+            at_time = f" at time {time:.2f}"
         size = f"({views.width}x{views.height}{larger})"
         headings = [f"truth{at} {size}", f"rendered{at_time}", DEPTH]
         yield image_grid([[truth, color, depth]], headings)
@@ -121,8 +126,7 @@ def held_out_pictures(
 def held_out_images(views: Views, frames: int) -> list[int]:
     """The held-out image for each of ``frames`` times, evenly spread over [0, 1].
 
-    Of a capture with fixed cameras these are images of the first one. Images at rest follow one
-    another.
+    If cameras are fixed, all are images of the first one. Images at rest follow one another.
     """
     first = (views.view == views.view[0]).nonzero()[:, 0]
     images = first if len(first) > 1 else torch.arange(len(views))

@@ -67,7 +67,8 @@ class ResumableCSVLogger(CSVLogger):
             or float(row.get("step", 0)) <= iteration
         ]
         if len(rows) < len(self._rows):
-            self._rows, self._written = rows, None
+            self._rows = rows
+            self._written = None
             self.save()
 
     @rank_zero_only
@@ -78,7 +79,8 @@ class ResumableCSVLogger(CSVLogger):
             row["step"] = str(step)
         self._rows.append(row)
         if not set(row) <= set(self._columns):
-            self._columns, self._written = sorted({*self._columns, *row}), None
+            self._columns = sorted({*self._columns, *row})
+            self._written = None
         self.save()
 
     @rank_zero_only
@@ -102,6 +104,8 @@ class ResumableCSVLogger(CSVLogger):
         except OSError as error:
             if not self._failing:
                 log.warning("%s: %s; its rows wait in memory", self.path, error.strerror)
-            self._written, self._failing = None, True
+            self._written = None
+            self._failing = True
         else:
-            self._written, self._failing = len(self._rows), False
+            self._written = len(self._rows)
+            self._failing = False

@@ -50,18 +50,19 @@ TRIAL_SHARE = 0.25
 LEAST_BATCH = 1 / 4
 # Added to the last strides, whose sum would else fall short of the end.
 ROUNDING = 1e-6
-# How much of an average the latest measurement is.
+# The weight of the latest measurement in an average.
 LATEST = 0.3
 
 
 def running_mean(mean: float | None, value: float) -> float:
-    """``mean`` with a further ``value``; alone where there is none."""
+    """The mean with a further ``value``; the value alone if there is no ``mean``."""
     return value if mean is None else mean + LATEST * (value - mean)
 
 
 def phases_of(stage: ScheduledStage) -> list[Phase]:
     """All phases of a stage that has been set up, in their order."""
-    phases, place = list[Phase](), 0
+    phases = list[Phase]()
+    place = 0
     while place < stage.total_iterations:
         phases.append(stage.phase_at(place))
         place = phases[-1].stop
@@ -84,7 +85,8 @@ class TimeBudget(Callback):
         self._entering: dict[str, float] = {}  # seconds to enter a phase of a kind
         self._warm = self._checked = False
         self._step_began = self._step_ended = 0.0
-        self._done, self._most_iterations = 0, 1
+        self._done = 0
+        self._most_iterations = 1
         self._phase: Phase | None = None
         self._phases: list[Phase] = []
 
@@ -95,7 +97,8 @@ class TimeBudget(Callback):
         assert isinstance(pl_module, ScheduledStage)
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
         self._record = next(other for other in callbacks if isinstance(other, TrainingRecord))
-        self._phases, self._phase = phases_of(pl_module), pl_module.phase
+        self._phases = phases_of(pl_module)
+        self._phase = pl_module.phase
         self._budget = self.seconds * pl_module.time_share
         self._most_iterations = pl_module.iterations_per_step
         pl_module.iterations_per_step = 1  # whose time is not known yet
@@ -109,13 +112,15 @@ class TimeBudget(Callback):
             return
         assert isinstance(pl_module, ScheduledStage)
         wait(pl_module.device)
-        self._step_began, self._done = self._record.seconds, pl_module.iterations_done
+        self._step_began = self._record.seconds
+        self._done = pl_module.iterations_done
         phase = pl_module.phase
         if phase is not None and phase != self._phase:
             entering = running_mean(
                 self._entering.get(phase.kind), self._step_began - self._step_ended
             )
-            self._phase, self._entering[phase.kind] = phase, entering
+            self._phase = phase
+            self._entering[phase.kind] = entering
         if self._pace is not None:
             fitted = trainer.strategy.broadcast(self._fitted(pl_module))
             if isinstance(fitted, str):
@@ -128,25 +133,30 @@ class TimeBudget(Callback):
     def _fitted(self, stage: ScheduledStage) -> tuple[float, int, float] | str:
         """Stride, iterations and share of batches from now on; or why the budget is too short."""
         assert self._pace is not None and stage.phase is not None
-        pace, left = self._pace, self._budget - self._step_began
+        pace = self._pace
+        left = self._budget - self._step_began
         later = [phase for phase in self._phases if phase.start > stage.iteration]
         # As long as an iteration, where no phase of the kind has been entered yet.
         entering = sum(self._entering.get(phase.kind, pace * phase.cost) for phase in later)
         # The first iteration is slow, and says little unless it has taken all the time.
         tried = self._step_began >= TRIAL_SHARE * self._budget and (self._warm or left < 0)
         if tried and not self._checked:
-            self._checked, least = True, entering + pace * sum(phase.cost for phase in later)
+            self._checked = True
+            least = entering + pace * sum(phase.cost for phase in later)
             if least > left:
                 return self._too_short(stage, self._step_began + least)
-        whole = pace * sum(
+        needed = pace * sum(
             phase.cost * max(0.0, phase.stop - max(phase.start, stage.position))
             for phase in (stage.phase, *later)
         )
         # Out of time, what is left gets an iteration a phase.
-        stride = whole / (left - entering) if left > entering else float(stage.total_iterations)
-        share, divisible = stage.loop.batch_share, stage.cost_follows_rays
+        stride = needed / (left - entering) if left > entering else float(stage.total_iterations)
+        share = stage.loop.batch_share
+        divisible = stage.cost_follows_rays
         if stride > 1 and share > LEAST_BATCH and divisible:
-            stride, pace, share = stride / 2, pace / 2, share / 2
+            stride /= 2
+            pace /= 2
+            share /= 2
         if not later:  # whole iterations are left: as many as end nearest to the budget
             iterations = max(1, round(left / (pace * stage.phase.cost)))
             stride = (stage.phase.stop - stage.position) / iterations + ROUNDING
@@ -171,7 +181,8 @@ class TimeBudget(Callback):
             return
         assert isinstance(pl_module, ScheduledStage) and self._phase is not None
         wait(pl_module.device)
-        self._step_ended, done = self._record.seconds, pl_module.iterations_done - self._done
+        self._step_ended = self._record.seconds
+        done = pl_module.iterations_done - self._done
         if done > 0:  # none, if memory ran out
             pace = (self._step_ended - self._step_began) / (done * self._phase.cost)
             # The first step warms up.
@@ -185,7 +196,10 @@ class TimeBudget(Callback):
         assert isinstance(pl_module, ScheduledStage)
         log.info(
             "%s: %d iterations for its %d, on %.0f%% of their rays, in %.1f s of %.1f",
-            *(pl_module.name, pl_module.iterations_done, pl_module.iteration),
+            pl_module.name,
+            pl_module.iterations_done,
+            pl_module.iteration,
             100 * pl_module.loop.batch_share,
-            *(self._record.seconds, self._budget),
+            self._record.seconds,
+            self._budget,
         )

@@ -29,16 +29,26 @@ from devrf.system.memory import OutOfMemoryError
 MODEL = "scene_model."
 # Keys of a training config for the digest of the canonical checkpoint that is built on: the run's
 # own, or a given one.
-OWN_REST, GIVEN_REST = "checkpoints/canonical.ckpt", "ckpt"
+OWN_REST = "checkpoints/canonical.ckpt"
+GIVEN_REST = "ckpt"
 # A whole number in a model's config (layers, units, samples of a ray) is at most this.
 LARGEST = 2**14
 # What is raised where parts of a file contradict each other.
-UNFIT: tuple[type[Exception], ...] = (DevrfError, RuntimeError, LookupError, ValueError)
-UNFIT += (TypeError, AttributeError, ArithmeticError)
-# A model has no more values than its file, but for grids of few voxels that take the stored shape.
+UNFIT: tuple[type[Exception], ...] = (
+    DevrfError,
+    RuntimeError,
+    LookupError,
+    ValueError,
+    TypeError,
+    AttributeError,
+    ArithmeticError,
+)
+# A model may have so many more values than its file: small grids that take the stored shape.
 UNSTORED = 2**16
-# Pixels along the side of an image, at most; and how much longer one side is than the other.
-SIDE, ASPECT = 2**14, 16
+# The most pixels along the side of an image.
+SIDE = 2**14
+# The most that one side of an image is longer than the other.
+ASPECT = 16
 # What training took: by name, numbers, and words that say how it ran.
 TrainingFigures = dict[str, float | str | None]
 
@@ -57,10 +67,11 @@ class CheckpointMetadata:
         training_config: the settings that decided what was learned, by config key; empty for a
             stage that was not trained from a config.
         earlier_configs: the same of the stages that this one builds on, by name.
-        command: what the command chose and set that learned it, but for what says only what to do:
-            the options of config groups by ``/group``, plain values by config key.
+        command: what the command that learned it chose and set, except for what only says what to
+            do: the options of config groups by ``/group``, plain values by config key.
         complete: whether the stage has gone through its whole schedule.
-        moves: whether the scene was seen at more than one time; None in a file of before.
+        moves: whether the scene was seen at more than one time; None in a file of an earlier
+            version.
     """
 
     scene: str
@@ -82,7 +93,7 @@ _PROGRESS = TypeAdapter(dict[str, str | int])
 
 @dataclass(frozen=True)
 class Viewpoints:
-    """What is known of a scene without its images: who saw it, and when.
+    """What is known about a scene without its images: the cameras that saw it, and when.
 
     Attributes:
         background: what is behind the alpha mask.
@@ -104,12 +115,13 @@ class Viewpoints:
         train = scene.dynamic.train
         views = torch.unique(train.view) if scene.moves else ()
         first = [int((train.view == view).nonzero()[0]) for view in views]
-        static, held_out = scene.static.train.cameras, scene.dynamic.test.cameras[[0]]
+        static = scene.static.train.cameras
+        held_out = scene.dynamic.test.cameras[[0]]
         return cls(scene.background, scene.clock, static, train.cameras[first], held_out)
 
     @classmethod
     def stored(cls, entry: dict[str, Any]) -> Viewpoints | None:
-        """The viewpoints of which a checkpoint holds ``asdict``; None in one of before."""
+        """The viewpoints of which a checkpoint holds ``asdict``; None in an earlier version's."""
         if "clock" not in entry:
             return None
         cameras = {name: Cameras(**entry[name]) for name in ("static", "dynamic", "held_out")}
@@ -284,13 +296,13 @@ def metadata_in(path: Path, data: dict[str, Any]) -> CheckpointMetadata:
             _PROGRESS.validate_python(
                 {name: progress[name] for name in ("stage", "iteration", "total")}
             )
-        said = (
+        texts = (
             metadata.scene,
             metadata.stage,
             str(metadata.protocol),
             str(progress and progress["stage"]),
         )
-        if not all(text.isprintable() for text in said):
+        if not all(text.isprintable() for text in texts):
             raise TypeError("a name that cannot be printed")
         return metadata
     except (LookupError, TypeError, ValidationError) as error:

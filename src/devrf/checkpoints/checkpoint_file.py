@@ -139,8 +139,10 @@ def _header(nested: str, tensors: Mapping[str, Tensor], digest: str) -> bytes:
     }
     total = 0
     for name, tensor in tensors.items():
-        begin, total = total, total + tensor.nbytes
-        shape, dtype = list(tensor.shape), DTYPES[tensor.dtype]
+        begin = total
+        total += tensor.nbytes
+        shape = list(tensor.shape)
+        dtype = DTYPES[tensor.dtype]
         entries[name] = {"dtype": dtype, "shape": shape, "data_offsets": [begin, total]}
     header = json.dumps(entries).encode()
     header += b" " * (-len(header) % 8)

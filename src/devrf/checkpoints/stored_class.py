@@ -43,7 +43,7 @@ def stored_class(path: object, kind: type[Kind]) -> type[Kind]:
     if module.startswith(f"{METHODS}.") or module in plugins:
         with suppress(ImportError, ValueError):
             import_module(module)
-    found = _known.get(str(path))
-    if found is None or not issubclass(found, kind):
+    known = _known.get(str(path))
+    if known is None or not issubclass(known, kind):
         raise LookupError(str(path))
-    return found
+    return known

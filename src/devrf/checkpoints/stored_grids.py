@@ -18,20 +18,20 @@ from torch import Tensor, nn
 from devrf.ops.trilinear import resample
 from devrf.system.memory import need_memory
 
-# Grid points of the detailed grid to one of the thinned-out grid.
+# Grid points of the detailed grid for each one of the thinned-out grid, along an axis.
 THINNING = 4
 
 Packed = dict[str, Any]
 
 
 def pack(grids: Tensor, keep: Tensor, *, smooth: bool) -> Packed:
-    """Store grids in about 2·C bytes a kept voxel; one after another where ``keep`` is.
+    """Store grids in about 2·C bytes a kept voxel, one after another, on the device of ``keep``.
 
     Args:
         grids: (N, X, Y, Z, C) of finite values.
         keep: (N, X, Y, Z) bool, where detail is kept; (1, X, Y, Z) serves all N.
-        smooth: which values elsewhere get: True, the trilinear interpolation of every fourth
-            grid point; False, each channel's mean over the voxels that are left out.
+        smooth: what values elsewhere are replaced by: True, the trilinear interpolation of every
+            fourth grid point; False, each channel's mean over the voxels that are left out.
 
     Returns:
         Tensors on the host and numbers, by name, for :func:`unpack`.
@@ -40,7 +40,8 @@ def pack(grids: Tensor, keep: Tensor, *, smooth: bool) -> Packed:
         ValueError: a value that half precision cannot hold.
     """
     thin = _thinned(grids.shape[1:4])
-    details, elsewhere = [], []
+    details = []
+    elsewhere = []
     for n, stored in enumerate(grids):
         grid = stored.to(keep.device, torch.float32)
         if float(grid.abs().amax()) > torch.finfo(torch.float16).max:
@@ -71,8 +72,10 @@ def unpack(
         OutOfMemoryError: the grids take more than is free.
     """
     x, y, z = (int(points) for points in packed["shape"])
-    shape, voxels = (x, y, z), x * y * z
-    elsewhere, stored = packed["elsewhere"].to(device, torch.float32), packed["keep"]
+    shape = (x, y, z)
+    voxels = x * y * z
+    elsewhere = packed["elsewhere"].to(device, torch.float32)
+    stored = packed["keep"]
     masks, bits = stored.shape
     if min(shape) < 1 or bits != math.ceil(voxels / 8) or masks not in (1, len(elsewhere)):
         raise ValueError("masks of other voxels than the grids have")
@@ -141,7 +144,8 @@ class StoredShape(nn.Module):
         self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
     ) -> None:
         for name in self.resizable:
-            stored, current = state_dict.get(prefix + name), getattr(self, name)
+            stored = state_dict.get(prefix + name)
+            current = getattr(self, name)
             if stored is not None and stored.shape != current.shape:
                 empty = current.new_empty(stored.shape)
                 setattr(self, name, nn.Parameter(empty) if name in self._parameters else empty)

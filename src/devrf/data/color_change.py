@@ -10,12 +10,15 @@ from torch.nn.functional import grid_sample, max_pool2d
 from devrf.data.flow import previous_images
 from devrf.scenes.scene import Views
 
-# Images of which colours are followed, evenly spread, and frames that they are followed back.
-IMAGES, STEPS = 64, 4
-# From which drift on colours are not those of the rest state (docs/method.md#color-drift).
+# The number of images whose colours are followed, evenly spread.
+IMAGES = 64
+# The number of frames that they are followed back.
+STEPS = 4
+# With this drift or more, colours are not those of the rest state (docs/method.md#color-drift).
 CHANGING = 0.07
 # Colours are smoothed before they are compared: what is finer than the pixels flickers as it moves.
-SIGMA, TAPS = 1.5, 9
+SIGMA = 1.5
+TAPS = 9
 # Pixels nearer than this to the alpha mask's edge, or to an occlusion, are left out.
 MARGIN = 4
 
@@ -51,12 +54,12 @@ def color_drift(views: Views) -> float | None:
         The change, of which 1 is from black to white; None where no flow can be followed, or where
         the recording has no more than ``STEPS`` steps.
     """
-    near, steps = _mean_change(views, STEPS)
-    far, more = _mean_change(views, 2 * STEPS)
-    if near is None or far is None or more == steps:
+    near, near_steps = _mean_change(views, STEPS)
+    far, far_steps = _mean_change(views, 2 * STEPS)
+    if near is None or far is None or far_steps == near_steps:
         return None
-    whole = len(set(views.times.tolist())) - 1
-    return (far - near) / (more - steps) * whole
+    all_steps = len(set(views.times.tolist())) - 1
+    return (far - near) / (far_steps - near_steps) * all_steps
 
 
 def _mean_change(views: Views, steps: int) -> tuple[float | None, int]:
@@ -83,10 +86,13 @@ def _chain(image: int, previous: list[int], steps: int) -> list[int]:
 def _change(views: Views, chain: list[int]) -> float | None:
     """The mean change from a chain's last image to its first; None where too little is left."""
     assert views.flow is not None
-    height, width = views.height, views.width
-    x, y = torch.arange(width) + 0.5, torch.arange(height) + 0.5
+    height = views.height
+    width = views.width
+    x = torch.arange(width) + 0.5
+    y = torch.arange(height) + 0.5
     start = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
-    place, usable = start, _inside(views, chain[0])
+    place = start
+    usable = _inside(views, chain[0])
     for image, earlier in zip(chain, chain[1:], strict=False):
         valid = views.flow.valid[image]
         vectors = torch.where(valid[..., None], views.flow.vectors[image], 0.0)
@@ -97,7 +103,8 @@ def _change(views: Views, chain: list[int]) -> float | None:
         usable = usable & ((place - start).norm(dim=-1) > 0.5)
     if int(usable.sum()) < MARGIN**2:
         return None
-    now, before = _smooth(views, chain[0]), _smooth(views, chain[-1])
+    now = _smooth(views, chain[0])
+    before = _smooth(views, chain[-1])
     return float((_look_up(before, place) - now).abs()[:, usable].mean())
 
 

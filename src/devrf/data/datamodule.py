@@ -23,7 +23,7 @@ class SceneDataModule(LightningDataModule, ABC):
     host during training. A test batch is the position of one held-out image.
     """
 
-    # By what images that were read have been made smaller.
+    # The factor by which images were made smaller as they were read.
     downscale = 1
     # Whether methods are told what the scene tells beside its images.
     priors: Priors = "all"
@@ -56,7 +56,8 @@ class SceneDataModule(LightningDataModule, ABC):
 
     def replace(self, scene: Scene) -> None:
         """Serve ``scene`` from now on, which knows more of the same images."""
-        self._scene, self._on_device = scene, {}
+        self._scene = scene
+        self._on_device = {}
 
     def prepare_data(self) -> None:
         """Read the scene in one process of several, before the others find what it has kept."""

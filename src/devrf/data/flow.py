@@ -33,7 +33,7 @@ def with_flow(scene: Scene, source: FlowSource, cache: Path | None) -> Scene:
     train = scene.dynamic.train
     if source in ("dis", "raft"):
         flow = estimate_flow(train, source, cache)
-        return _replaced(scene, flow=_where_valid(flow, train))
+        return _with_train(scene, replace(train, flow=_where_valid(flow, train)))
     if scene.moves and train.flow is None:
         if source == "files":
             raise scene_error("data.flow", "files: the scene has none; set data.flow=auto")
@@ -46,7 +46,7 @@ def with_forward_flow(
 ) -> Scene:
     """The scene with forward flow of its moving training views, where it can be had.
 
-    It is had as backward flow is: see :func:`with_flow`.
+    It comes from the same source as backward flow (:func:`with_flow`).
 
     Args:
         scene: with backward flow, or without.
@@ -54,14 +54,15 @@ def with_forward_flow(
         cache: an ``.npz`` beside which the estimate is kept, or None.
         files: what was read from files, if any.
     """
-    train, flow = scene.dynamic.train, files
+    train = scene.dynamic.train
+    flow = files
     if flow is None and source in ("dis", "raft"):
         if cache is not None:
             cache = cache.with_name(f"{cache.stem}_forward{cache.suffix}")
         flow = estimate_flow(train, source, cache, forward=True)
     if flow is None:
         return scene
-    return _replaced(scene, forward_flow=_where_valid(flow, train))
+    return _with_train(scene, replace(train, forward_flow=_where_valid(flow, train)))
 
 
 def _where_valid(flow: OpticalFlow, views: Views) -> OpticalFlow:
@@ -71,9 +72,8 @@ def _where_valid(flow: OpticalFlow, views: Views) -> OpticalFlow:
     return replace(flow, valid=flow.valid & views.valid_mask)
 
 
-def _replaced(scene: Scene, **flow: OpticalFlow) -> Scene:
-    """The scene with other attributes of its moving training views."""
-    train = replace(scene.dynamic.train, **flow)  # type: ignore[arg-type]
+def _with_train(scene: Scene, train: Views) -> Scene:
+    """The scene with other moving training views."""
     return replace(scene, dynamic=replace(scene.dynamic, train=train))
 
 

@@ -1,4 +1,4 @@
-"""What a scene's camera files say of it, before anything else is read.
+"""What a scene's camera files say about it, before anything else is read.
 
 A damaged file says nothing here: its reader reports it.
 """

@@ -1,4 +1,4 @@
-"""What a scene tells beside its images, and the scene without it: ``priors=none``."""
+"""What a scene provides beside its images, and the scene without it: ``priors=none``."""
 
 from __future__ import annotations
 
@@ -24,10 +24,8 @@ def without_priors(scene: Scene) -> Scene:
     plain: Background = "white" if scene.background == "random" else scene.background
     scale = max(scene.bounds.scale, FALLBACK_BOUND_SCALE)
     bounds = replace(scene.bounds, motion=None, scale=scale, source="priors=none")
-    static, dynamic = (
-        replace(capture, train=_bare(capture.train, plain))
-        for capture in (scene.static, scene.dynamic)
-    )
+    static = replace(scene.static, train=_bare(scene.static.train, plain))
+    dynamic = replace(scene.dynamic, train=_bare(scene.dynamic.train, plain))
     return replace(scene, static=static, dynamic=dynamic, bounds=bounds, background=plain)
 
 

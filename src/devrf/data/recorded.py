@@ -63,7 +63,8 @@ class RecordedDataModule(SceneDataModule):
             raise
         self.downscale = self.reader.factor
         if scene.kind == "inward":
-            bounds, kind = scene.bounds, "world" if scene.space.is_linear else "contracted"
+            bounds = scene.bounds
+            kind = "world" if scene.space.is_linear else "contracted"
             log.info(
                 "%s: %s space (%s), box from %s", scene.name, kind, bounds.reason, bounds.box_source
             )
@@ -73,7 +74,8 @@ class RecordedDataModule(SceneDataModule):
 
     def provide(self, priors: Collection[str]) -> None:
         """Read or estimate forward flow, if a method wants it."""
-        scene, reader = self.scene, self.reader
+        scene = self.scene
+        reader = self.reader
         if "forward_flow" in priors and scene.dynamic.train.forward_flow is None and scene.moves:
             files = None
             if reader.wants_flow_files:

@@ -54,7 +54,8 @@ class RenderedDataModule(SceneDataModule):
 
     def provide(self, priors: Collection[str]) -> None:
         """Compute exact forward flow, if a method wants it."""
-        scene, train = self.scene, self.scene.dynamic.train
+        scene = self.scene
+        train = self.scene.dynamic.train
         wanted = "forward_flow" in priors and train.forward_flow is None
         if self.flow == "exact" and wanted and isinstance(self.recipe, Recipe):
             flow = exact_flow(self.recipe.filmed(), train, forward=True)

@@ -77,7 +77,8 @@ def score(
     if not renderer.at(time).at_rest:
         rest = _image(renderer.view(views.cameras, index, 0.0, behind), views)
     valid_mask = views.valid_mask_of(index)
-    compared, rest = (compare(image, truth, valid_mask) for image in (prediction, rest))
+    compared = compare(prediction, truth, valid_mask)
+    rest = compare(rest, truth, valid_mask)
     further: dict[str, float | None] = {}
     opacity = rendered.opacity.cpu().view(truth.shape[:2])
     if suite is not None and suite.metrics:
@@ -111,8 +112,9 @@ def score_all(
     *,
     time: float | None = None,
 ) -> list[HeldOutView]:
-    """:func:`score` of each of the held-out ``views``; progress is shown by the ``name`` of all."""
-    renderer, count = Renderer(model), len(views)
+    """:func:`score` of each of the held-out ``views``; progress is shown under ``name``."""
+    renderer = Renderer(model)
+    count = len(views)
     scored = (score(renderer, views, k, background, suite, time=time) for k in range(count))
     return list(followed(scored, count, name))
 
@@ -131,8 +133,8 @@ def _psnr(compared: Tensor, truth: Tensor, valid_mask: Tensor | None) -> float:
 
 
 def _ssim(compared: Tensor, truth: Tensor, valid_mask: Tensor | None) -> float:
-    # Where no window has valid pixels alone, those centred on valid pixels are taken; where these
-    # are at the image's rim, all windows.
+    # If no window has valid pixels alone, those centred on valid pixels are taken; if no such
+    # window is inside the image, all windows.
     if valid_mask is not None:
         for measure in (ssim_within, ssim_masked):
             value = measure(compared, truth, valid_mask)

@@ -14,7 +14,8 @@ TRAINING = ("seconds", "iterations", "iterations_per_second", "peak_gpu_gb", "nu
 SCORES = ("psnr", "ssim")
 OF_BOTH = (*SCORES, *TRAINING, "checkpoint_mb")
 OF_MOTION = ("rest_pose_psnr",)
-STATIC, DYNAMIC = ("static", "canonical"), ("dynamic", "deformation")
+STATIC = ("static", "canonical")
+DYNAMIC = ("dynamic", "deformation")
 # The section that metrics.json has only where the objective is one of its numbers.
 VALIDATION = "validation"
 

@@ -72,11 +72,12 @@ def _ssim_covisible(inputs: MetricInput) -> float | None:
 
 def _lpips_covisible(inputs: MetricInput) -> float | None:
     """DyCheck's mLPIPS: with AlexNet, and both images black where pixels are not valid."""
-    valid_mask, lpips = inputs.valid_mask, inputs.lpips
+    valid_mask = inputs.valid_mask
+    lpips = inputs.lpips
     if valid_mask is None or lpips is None or lpips.trunk is not TRUNKS["alex"]:
         return None
-    seen = valid_mask[..., None]
-    return lpips.forward(inputs.prediction * seen, inputs.truth * seen, valid_mask)
+    mask = valid_mask[..., None]
+    return lpips.forward(inputs.prediction * mask, inputs.truth * mask, valid_mask)
 
 
 def _depth_error(inputs: MetricInput) -> float | None:
@@ -167,7 +168,8 @@ def flow_error(renderer: Renderer, views: Views, index: int) -> float | None:
         return None
     pixels = pixel_positions(flat, views.width)
     rays = views.cameras.rays(torch.full_like(flat, index), pixels)
-    time, earlier = float(views.times[index]), float(views.times[before])
+    time = float(views.times[index])
+    earlier = float(views.times[before])
     flow = renderer.induced_flow(rays, pixels, views.cameras[[before]], time, earlier)
     if flow is None:
         return None

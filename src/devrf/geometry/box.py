@@ -84,7 +84,8 @@ class Box:
         if planes is None:
             sides = [edge / self.voxel_size(voxels) for edge in self.size]
         else:
-            edge, wider = (width * height * planes / voxels) ** 0.5, aspect**0.5
+            edge = (width * height * planes / voxels) ** 0.5
+            wider = aspect**0.5
             sides = [width * wider / edge, height / wider / edge, planes]
         # 1e-6 is added so that a cube of 10^3 voxels has side 10 in spite of rounding.
         x, y, z = (max(2, int(side + 1e-6)) for side in sides)
@@ -110,7 +111,8 @@ class Box:
 
     def nearest(self, points: Tensor) -> Tensor:
         """The nearest points (..., 3) of the box, inside included."""
-        return points.clamp(*self.corners(points))
+        low, high = self.corners(points)
+        return points.clamp(low, high)
 
     def corners(self, like: Tensor) -> tuple[Tensor, Tensor]:
         """The two corners (3,) as tensors with the dtype and device of ``like``; to be read only.
@@ -118,8 +120,10 @@ class Box:
         They are made once: a tensor made of Python's numbers at every step would make the device
         wait for the host.
         """
-        low, high = (constant(corner, like.dtype, like.device) for corner in (self.low, self.high))
-        return low, high
+        return (
+            constant(self.low, like.dtype, like.device),
+            constant(self.high, like.dtype, like.device),
+        )
 
     def to_grid(self, points: Tensor, shape: tuple[int, int, int]) -> Tensor:
         """Grid coordinates (..., 3): 0 on the low faces, shape − 1 on the high ones."""
@@ -143,7 +147,8 @@ class Box:
         A ray that misses has entry > exit; entry is negative for a ray that starts inside, if
         ``near`` is.
         """
-        return rays.crossing(*self.corners(rays.origins), near, far)
+        low, high = self.corners(rays.origins)
+        return rays.crossing(low, high, near, far)
 
     @staticmethod
     def of(low: Tensor | list[float], high: Tensor | list[float]) -> Box:

@@ -65,12 +65,12 @@ class Cameras:
 
     def joined(self, *others: Cameras) -> Cameras:
         """These cameras and ``others``, of the same image size."""
-        every = (self, *others)
+        parts = (self, *others)
         return replace(
             self,
-            camera_to_world=torch.cat([cameras.camera_to_world for cameras in every]),
-            focal=torch.cat([cameras.focal for cameras in every]),
-            center=torch.cat([cameras.center for cameras in every]),
+            camera_to_world=torch.cat([cameras.camera_to_world for cameras in parts]),
+            focal=torch.cat([cameras.focal for cameras in parts]),
+            center=torch.cat([cameras.center for cameras in parts]),
         )
 
     @property
@@ -121,14 +121,15 @@ class Cameras:
         return _on_image(local, self.focal[camera], self.center[camera])
 
     def project_into(self, camera: int, points: Tensor) -> tuple[Tensor, Tensor]:
-        """As :meth:`project`, of all ``points`` (M, 3) into one camera: a matrix product."""
+        """As :meth:`project`, for all ``points`` (M, 3) in one camera: a matrix product."""
         pose = self.camera_to_world[camera]
         local = (points - pose[:, 3]) @ pose[:, :3]
         return _on_image(local, self.focal[camera], self.center[camera])
 
     def pixel_grid(self) -> Tensor:
         """(H·W, 2) pixel centres x, y in row-major order."""
-        device, dtype = self.focal.device, self.focal.dtype
+        device = self.focal.device
+        dtype = self.focal.dtype
         y, x = torch.meshgrid(
             torch.arange(self.height, device=device, dtype=dtype),
             torch.arange(self.width, device=device, dtype=dtype),
@@ -139,13 +140,17 @@ class Cameras:
     def image_rays(self, camera: int) -> Rays:
         """All H·W rays of one camera, in row-major order.
 
-        Those of :meth:`rays`, from what columns and rows share: half the launches of a GPU.
+        They are those of :meth:`rays`, computed from what columns and rows share: a GPU has half
+        as many launches.
         """
-        device, dtype = self.focal.device, self.focal.dtype
+        device = self.focal.device
+        dtype = self.focal.dtype
         columns = torch.arange(0.5, self.width, device=device, dtype=dtype)
         rows = torch.arange(0.5, self.height, device=device, dtype=dtype)
-        center, focal = self.center[camera], self.focal[camera]
-        x, y = (columns - center[0]) / focal[0], (center[1] - rows) / focal[1]
+        center = self.center[camera]
+        focal = self.focal[camera]
+        x = (columns - center[0]) / focal[0]
+        y = (center[1] - rows) / focal[1]
         right, up, backward, position = self.camera_to_world[camera].unbind(-1)
         of_row = y[:, None] * up - backward
         directions = (x[:, None] * right + of_row[:, None]).view(-1, 3)
@@ -219,7 +224,7 @@ def _on_image(local: Tensor, focal: Tensor, center: Tensor) -> tuple[Tensor, Ten
 
 @dataclass(frozen=True)
 class Distortion:
-    """Where a real lens puts what a pinhole would put elsewhere (Brown 1966, as in OpenCV).
+    """How a real lens moves a pinhole's points in the image (Brown 1966, as in OpenCV).
 
     Points are (x/z, y/z) of a camera whose x points right and y down, before focal lengths and
     principal point. With r² = x² + y² and g = 1 + k1·r² + k2·r⁴ + k3·r⁶ + k4·r⁸,

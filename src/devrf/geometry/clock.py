@@ -31,7 +31,7 @@ class FrameClock:
     """The frames' times, in ascending order; frame 0 is at time 0, where nothing has moved.
 
     Attributes:
-        times: T times in [0, 1]; of a scene at rest 0 alone.
+        times: T times in [0, 1]; 0 alone for a scene at rest.
     """
 
     times: tuple[float, ...]
@@ -77,7 +77,7 @@ class FrameClock:
         return torch.searchsorted(middles, times.double().contiguous())
 
     def between(self, times: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """As :meth:`at`, of many times, without waiting for a device.
+        """As :meth:`at`, for many times, without waiting for a device.
 
         Args:
             times: (...,) of any shape.

@@ -20,10 +20,10 @@ from devrf.geometry.rays import Rays
 
 Xyz = tuple[float, float, float]
 
-# Points nearer to the outer faces than this share of the shell count as being there: in a float32
-# what is a million inner boxes away can still be told from infinity.
+# Points nearer to the outer faces than this share of the shell are taken to be at this distance: a
+# float32 can still tell what is a million inner boxes away from infinity.
 INFINITY = 1e-6
-# Contracted units that most rays move in a unit of their distance, at most.
+# The most contracted units that most rays move in a unit of their distance.
 PACE = 1.25
 
 
@@ -88,9 +88,11 @@ class ContractedSpace:
     def rays(self, rays: Rays) -> Rays:
         """World rays, whose points are in contracted space (:class:`ContractedRays`)."""
         center, half = self._frame(rays.origins)
-        origin, slope = (rays.origins - center) / half, rays.directions / half
+        origin = (rays.origins - center) / half
+        slope = rays.directions / half
         axis = slope.abs().argmax(dim=-1, keepdim=True)
-        along, pace = origin.gather(1, axis), slope.gather(1, axis)
+        along = origin.gather(1, axis)
+        pace = slope.gather(1, axis)
         # How fast a ray moves sideways in the shell, if it does not lead away from the centre.
         sideways = (slope * along - origin * pace).abs().amax(dim=-1) / pace[:, 0].abs()
         stretch = (0.5 * (1 + self.shell) * sideways).clamp(min=self.shell)

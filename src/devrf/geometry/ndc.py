@@ -16,8 +16,8 @@ from torch import Tensor
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 
-# What is exactly at z' = 1 counts as so much nearer, two million near planes away: at infinity its
-# pixel would be no number, and so would all that is learned from it.
+# A point at z' = 1 is moved so much nearer, to two million near planes: at infinity its pixel would
+# be no number, and so would all that is learned from it.
 BEFORE_INFINITY = 1e-6
 
 
@@ -71,7 +71,8 @@ class NormalizedDevice:
 
         The view directions stay those of the world.
         """
-        o, d = rays.origins, rays.directions
+        o = rays.origins
+        d = rays.directions
         start = o + d * (-(self.near + o[:, 2:]) / d[:, 2:])
         sx, sy = self.slopes
         origin = self.from_world(start)

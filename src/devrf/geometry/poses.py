@@ -58,7 +58,8 @@ def rigid_motion(points: Tensor, rotation: Tensor, velocity: Tensor) -> Tensor:
     # The branch that is not taken must have finite gradients, too.
     safe = torch.where(near, torch.ones_like(square), square)
     angle = safe.sqrt()
-    sine, cosine = angle.sin(), angle.cos()
+    sine = angle.sin()
+    cosine = angle.cos()
     a: Tensor = torch.where(near, _series(square, 1), sine / angle)
     b: Tensor = torch.where(near, _series(square, 2), (1 - cosine) / safe)
     c: Tensor = torch.where(near, _series(square, 3), (angle - sine) / (safe * angle))

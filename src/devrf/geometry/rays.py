@@ -61,14 +61,15 @@ class Rays:
         """
         d = self.directions
         d = torch.where(d.abs() < 1e-9, torch.full_like(d, 1e-9), d)
-        to_low, to_high = (low - self.origins) / d, (high - self.origins) / d
+        to_low = (low - self.origins) / d
+        to_high = (high - self.origins) / d
         entry = torch.minimum(to_low, to_high).amax(dim=-1)
         leave = torch.maximum(to_low, to_high).amin(dim=-1)
         return entry.clamp(min=near), leave.clamp(max=far)
 
     @property
     def pace(self) -> float:
-        """The most units of the fields' space that a unit of distance is, 0 without rays."""
+        """The most units of the fields' space in a unit of distance; 0 without rays."""
         return float(self.directions.norm(dim=1).amax()) if len(self) else 0.0
 
     def ends(self) -> Tensor | None:
@@ -86,6 +87,6 @@ class Rays:
         return replace(self, **{name: change(value) for name, value in self._tensors().items()})
 
     def _tensors(self) -> dict[str, Tensor]:
-        """What there is for each ray, by the attribute's name."""
+        """The tensors with a row for each ray, by the attribute's name."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: value for name, value in values.items() if isinstance(value, Tensor)}

@@ -30,7 +30,7 @@ class Space(Protocol):
 
     @property
     def side_factor(self) -> float:
-        """How many times longer a grid's side is here than the one that is asked for."""
+        """How many times longer a grid's side is here than the configured one."""
         ...
 
     def inner(self, box: Box) -> Box:

@@ -28,6 +28,6 @@ def depth_error(depth: Tensor, opacity: Tensor, truth: Tensor) -> float | None:
 def end_point_error(flow: Tensor, truth: Tensor) -> float | None:
     """Mean Euclidean length of the differences of two flows (P, 2), in their unit.
 
-    None of no vectors at all.
+    None if there are no vectors.
     """
     return float((flow - truth).norm(dim=-1).mean()) if len(truth) else None

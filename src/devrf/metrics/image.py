@@ -8,9 +8,11 @@ from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d
 from torchmetrics.functional.image import multiscale_structural_similarity_index_measure
 
-# Of SSIM: the window's side and Gaussian deviation in pixels; its constants for a range of 1.
-WINDOW, SIGMA = 11, 1.5
-C1, C2 = 0.01**2, 0.03**2
+# SSIM's window, its side and Gaussian deviation in pixels; SSIM's constants for a range of 1.
+WINDOW = 11
+SIGMA = 1.5
+C1 = 0.01**2
+C2 = 0.03**2
 # The coarsest of MS-SSIM's five scales, 1/16 of the image, must hold a whole window.
 MS_SSIM_SMALLEST = 16 * WINDOW
 
@@ -24,8 +26,8 @@ def psnr(prediction: Tensor, truth: Tensor) -> float:
 def ssim(prediction: Tensor, truth: Tensor) -> float:
     """Mean structural similarity of two (H, W, 3) images in [0, 1] (Wang et al. 2004).
 
-    Gaussian window of 11×11, σ 1.5; only pixels whose window lies inside the image count where
-    the image is large enough to have any.
+    Gaussian window of 11×11, σ 1.5; only pixels whose window lies inside the image count, if the
+    image is large enough to have any.
     """
     return float(ssim_map(prediction, truth).mean())
 
@@ -33,9 +35,10 @@ def ssim(prediction: Tensor, truth: Tensor) -> float:
 def ssim_map(prediction: Tensor, truth: Tensor) -> Tensor:
     """Structural similarity at each pixel that :func:`ssim` counts: (H − 10, W − 10, 3).
 
-    Of images smaller than a window (H, W, 3), with what is missing mirrored.
+    It is (H, W, 3) for images smaller than a window; what is missing is mirrored.
     """
-    a, b = (_batched(image) for image in (prediction, truth))
+    a = _batched(prediction)
+    b = _batched(truth)
     padding = "valid" if min(a.shape[-2:]) >= WINDOW else "same"
     similarity: Tensor = kornia_ssim(a, b, window_size=WINDOW, max_val=1.0, padding=padding)
     return similarity[0].permute(1, 2, 0)
@@ -47,7 +50,8 @@ def ms_ssim(prediction: Tensor, truth: Tensor) -> float | None:
     Five scales with the paper's exponents; each is the mean over all windows inside the image
     and all channels, negative ones counting as 0. None where a side is under 176 pixels.
     """
-    a, b = (_batched(image) for image in (prediction, truth))
+    a = _batched(prediction)
+    b = _batched(truth)
     if min(a.shape[-2:]) < MS_SSIM_SMALLEST:
         return None
     return float(multiscale_structural_similarity_index_measure(a, b, data_range=1.0))
@@ -75,32 +79,34 @@ def ssim_masked(prediction: Tensor, truth: Tensor, mask: Tensor) -> float | None
 def ssim_within(prediction: Tensor, truth: Tensor, mask: Tensor) -> float | None:
     """Mean SSIM of the windows of two (H, W, 3) images that lie inside ``mask`` (H, W).
 
-    What is beyond the mask has no part in it. None where no window lies inside.
+    Pixels outside the mask do not count. None where no window lies inside.
     """
     values = ssim_map(prediction, truth)
-    # Of images smaller than a window, what is missing is mirrored, and so not beyond the mask.
+    # What images smaller than a window lack is mirrored, and so not beyond the mask.
     padding = (WINDOW - 1) // 2 if values.shape[:2] == mask.shape else 0
     touched = max_pool2d((~mask).float()[None], WINDOW, 1, padding)[0] > 0
     return None if bool(touched.all()) else float(values[~touched].mean())
 
 
 def ssim_partial(prediction: Tensor, truth: Tensor, mask: Tensor) -> float | None:
-    """DyCheck's masked SSIM (mSSIM) of two (H, W, 3) images in [0, 1]: what ``mask`` (H, W) holds.
+    """DyCheck's masked SSIM (mSSIM) of two (H, W, 3) images in [0, 1], within ``mask`` (H, W).
 
     Windows are partial convolutions (Liu et al. 2018): along rows, then along columns, what is
     beyond the mask counts 0, and the sum is scaled by 11 over the number of pixels that count. The
     mean is over all windows inside the image; one without any such pixel has the similarity 1.
-    None of images smaller than a window, or where the mask is empty.
+    None for images smaller than a window, or if the mask is empty.
     """
     if min(mask.shape) < WINDOW or not bool(mask.any()):
         return None
-    a, b = (_batched(image) for image in (prediction, truth))
-    means = (_partial_blur(image, mask) for image in (a, b, a * a, b * b, a * b))
-    mean_a, mean_b, square_a, square_b, product = means
-    variance_a = (square_a - mean_a.square()).clamp(min=0)
-    variance_b = (square_b - mean_b.square()).clamp(min=0)
-    most = (variance_a * variance_b).sqrt()
-    covariance = (product - mean_a * mean_b).clamp(-most, most)
+    a = _batched(prediction)
+    b = _batched(truth)
+    mean_a = _partial_blur(a, mask)
+    mean_b = _partial_blur(b, mask)
+    variance_a = (_partial_blur(a * a, mask) - mean_a.square()).clamp(min=0)
+    variance_b = (_partial_blur(b * b, mask) - mean_b.square()).clamp(min=0)
+    max_covariance = (variance_a * variance_b).sqrt()
+    covariance = _partial_blur(a * b, mask) - mean_a * mean_b
+    covariance = covariance.clamp(-max_covariance, max_covariance)
     alike = (2 * mean_a * mean_b + C1) * (2 * covariance + C2)
     energy = (mean_a.square() + mean_b.square() + C1) * (variance_a + variance_b + C2)
     return float((alike / energy).mean())
@@ -114,7 +120,8 @@ def _partial_blur(image: Tensor, mask: Tensor) -> Tensor:
     for shape in ((1, 1, 1, WINDOW), (1, 1, WINDOW, 1)):
         total = conv2d(image * valid, kernel.view(shape).repeat(3, 1, 1, 1), groups=3)
         count = conv2d(valid, torch.ones(shape))
-        image, valid = WINDOW * total / count.clamp(min=1), (count > 0).float()
+        image = WINDOW * total / count.clamp(min=1)
+        valid = (count > 0).float()
     return image
 
 

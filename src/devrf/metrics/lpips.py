@@ -50,7 +50,8 @@ class Trunk:
 
     def build(self) -> nn.Sequential:
         """The layers, with weights yet to be loaded, numbered as torchvision's."""
-        channels, built = 3, nn.Sequential()
+        channels = 3
+        built = nn.Sequential()
         for layer in self.layers:
             if len(layer) == 2:
                 kernel, stride = layer
@@ -76,8 +77,13 @@ TRUNKS = {
     ),
     "alex": Trunk(
         layers=(
-            *((64, 11, 4, 2), (3, 2), (192, 5, 1, 2), (3, 2)),
-            *((384, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1)),
+            (64, 11, 4, 2),
+            (3, 2),
+            (192, 5, 1, 2),
+            (3, 2),
+            (384, 3, 1, 1),
+            (256, 3, 1, 1),
+            (256, 3, 1, 1),
         ),
         taps=(1, 4, 7, 9, 11),
         smallest=31,
@@ -131,7 +137,7 @@ class Lpips(nn.Module):
 
     @torch.no_grad()
     def maps(self, prediction: Tensor, truth: Tensor) -> list[Tensor] | None:
-        """Differences (1, 1, h, w) after each tap, or None of images that are too small."""
+        """Differences (1, 1, h, w) after each tap; None for images that are too small."""
         if min(truth.shape[:2]) < self.trunk.smallest:
             return None
         features = zip(self._features(prediction), self._features(truth), strict=True)

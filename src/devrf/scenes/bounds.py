@@ -15,7 +15,7 @@ from devrf.scenes.validation import FARTHEST, scene_error
 
 # Room for motion where nothing else is known: the published scenes use 1.05 to 2.
 FALLBACK_BOUND_SCALE = 1.5
-# At rest: as much as is left around the rest state where the room for motion is known.
+# Room around a scene at rest: as much as around the rest state where the room for motion is known.
 REST_BOUND_SCALE = 1.05
 STILL = "no motion: the scene is at rest"
 # Mean square sine of the angle between the axes and their common direction: about 2 degrees.
@@ -32,8 +32,8 @@ GIVE = "set data.box=[[x,y,z],[x,y,z]], data.near and data.far"
 def nearest_point(origins: Tensor, axes: Tensor, parallel: float) -> Tensor | None:
     """The point (3,) nearest to N lines through ``origins`` (N, 3) along unit ``axes`` (N, 3).
 
-    By least squares: solves Σ (I − d dᵀ) p = Σ (I − d dᵀ) o. None where the mean square sine of the
-    angle between the axes and their common direction is below ``parallel``.
+    It solves the least-squares problem Σ (I − d dᵀ) p = Σ (I − d dᵀ) o. None if the mean square
+    sine of the angle between the axes and their common direction is below ``parallel``.
     """
     across = torch.eye(3, dtype=axes.dtype) - axes[:, :, None] * axes[:, None, :]
     normal = across.mean(dim=0)
@@ -48,7 +48,8 @@ def axes_meet(cameras: Cameras) -> Tensor:
 
     DevrfError if the axes are nearly parallel, or meet behind the cameras.
     """
-    origin, axis = cameras.positions.double(), cameras.forwards.double()
+    origin = cameras.positions.double()
+    axis = cameras.forwards.double()
     point = nearest_point(origin, axis, NEARLY_PARALLEL)
     if point is None:
         raise scene_error("data.box", f"the static cameras look in nearly one direction; {GIVE}")
@@ -104,7 +105,7 @@ def resolved_box(low: Tensor, high: Tensor) -> Box:
 
 def box_of_frusta(cameras: Cameras, near: float, far: float) -> Box:
     """The box of all that the cameras see between two distances (world units) along their rays."""
-    # Ends of rays lie on a sphere, which bulges between its corners: so fine a grid sees it.
+    # Ends of rays lie on a sphere, which bulges between its corners: the grid has to be this fine.
     steps = torch.linspace(0, 1, 17).to(cameras.center)
     share = torch.cartesian_prod(steps, steps)
     pixels = share * share.new_tensor([cameras.width, cameras.height])
@@ -122,7 +123,8 @@ def depth_range(cameras: Cameras, box: Box) -> tuple[float, float]:
     low, high = box.corners(cameras.positions)
     half_diagonal = float((high - low).norm()) / 2
     distance = (cameras.positions - (low + high) / 2).norm(dim=1)
-    nearest, farthest = float(distance.min()), float(distance.max())
+    nearest = float(distance.min())
+    farthest = float(distance.max())
     return max(NEAR_SHARE * farthest, nearest - half_diagonal), farthest + half_diagonal
 
 
@@ -142,25 +144,29 @@ def inward_bounds(
     ``bound_scale="auto"`` silhouettes say where it moves, where there are alpha masks; else the
     given box, or a fixed scale, leaves room.
     """
-    given = box is not None
+    box_is_given = box is not None
     scale = FALLBACK_BOUND_SCALE if bound_scale == "auto" else float(bound_scale)
     box = box or box_from_cameras(static.cameras)
-    motion, source = None, f"canonical box x bound scale {scale:g}"
+    motion = None
+    source = f"canonical box x bound scale {scale:g}"
     if dynamic is None and bound_scale == "auto":
-        scale, source = REST_BOUND_SCALE, STILL
+        scale = REST_BOUND_SCALE
+        source = STILL
     elif dynamic is not None and bound_scale == "auto":
         motion = motion_box(dynamic, box)
         if motion is None:
             source += " (no alpha masks from two cameras at every time)"
         else:
-            views, frames = len(set(dynamic.view.tolist())), len(set(dynamic.times.tolist()))
+            views = len(set(dynamic.view.tolist()))
+            frames = len(set(dynamic.times.tolist()))
             source = f"silhouettes of {views} views x {frames} frames"
-    limited = given and motion is None and bound_scale == "auto"
+    limited = box_is_given and motion is None and bound_scale == "auto"
     if limited:
         source = "data.box (no alpha masks from two cameras at every time)"
     reach = box if motion is None else box.union(motion)
     ranges = [depth_range(views.cameras, reach) for views in everyone]
-    nearest, farthest = min(r[0] for r in ranges), max(r[1] for r in ranges)
+    nearest = min(r[0] for r in ranges)
+    farthest = max(r[1] for r in ranges)
     near = nearest if near is None else float(near)
     far = farthest if far is None else float(far)
     if not 0 <= near < far <= 4 * FARTHEST:
@@ -207,7 +213,8 @@ def box_between(
     reference camera.
     """
     ends = torch.cat([_seen(views, space, (front, back)) for views in everyone])
-    low, high = ends.amin(dim=0).tolist(), ends.amax(dim=0).tolist()
+    low = ends.amin(dim=0).tolist()
+    high = ends.amax(dim=0).tolist()
     return Box.of([low[0], low[1], front], [high[0], high[1], back])
 
 

@@ -53,7 +53,7 @@ def time_major(views: Views) -> Views:
     return views[by_view[torch.argsort(views.times[by_view], stable=True)]]
 
 
-# The layout has a validation split, which nothing here learns from: a few test images again.
+# The layout has a validation split, which nothing here uses: it gets a few of the test images.
 _VALIDATION_VIEWS = 4
 
 
@@ -114,12 +114,12 @@ def _write_split(views: Views, split: str, folder: Path) -> None:
     (folder / f"transforms_{split}.json").write_text(text + "\n", encoding="utf-8")
 
 
-# The published scenes are read at this factor, from folders images_4; larger images need not
-# be there, and are not.
+# The published scenes are read at this factor, from folders images_4; larger images are not needed,
+# and not written.
 FACTOR = 4
 # Readers hold out every eighth static image, the first one included.
 HOLDOUT = 8
-# The largest depth where none is known, in multiples of the least one.
+# The largest depth if none is known, in multiples of the least one.
 _FAR = 100.0
 
 Flags = np.ndarray[Any, np.dtype[np.bool_]]
@@ -155,8 +155,9 @@ def _by_camera(views: Views) -> list[Views]:
 
 def _check_times(views: list[Views]) -> None:
     frames = len(views[-1])
-    # Times are not written, but counted.
-    expected, near = torch.arange(frames) / (frames - 1), FrameClock.TOLERANCE
+    # The layout has no times: readers count frames.
+    expected = torch.arange(frames) / (frames - 1)
+    near = FrameClock.TOLERANCE
     for view in views:
         if len(view) != frames or bool(((view.times - expected).abs() > near).any()):
             raise scene_error(
@@ -181,11 +182,11 @@ def _intrinsics(views: Views, factor: int) -> Numbers:
 
 def _write_static(static: Capture, held_out: Tensor, bounds: Numbers, folder: Path) -> None:
     rows = np.empty((len(held_out), 17))
-    for views, own in ((static.train, ~held_out), (static.test, held_out)):
+    for views, mask in ((static.train, ~held_out), (static.test, held_out)):
         right, up, back, position = _double(views.cameras.camera_to_world).transpose(2, 0, 1)
         matrix = np.stack([-up, right, back, position, _intrinsics(views, FACTOR)], axis=2)
-        rows[own] = np.hstack([matrix.reshape(-1, 15), np.tile(bounds, (len(views), 1))])
-        _write_images(views, np.flatnonzero(own), folder / f"images_{FACTOR}")
+        rows[mask] = np.hstack([matrix.reshape(-1, 15), np.tile(bounds, (len(views), 1))])
+        _write_images(views, np.flatnonzero(mask), folder / f"images_{FACTOR}")
     np.save(folder / "poses_bounds.npy", rows)
 
 

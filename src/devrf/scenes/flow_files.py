@@ -49,11 +49,11 @@ def read_flow_file(
         # A member that is no array comes as bytes.
         arrays = {n: np.asarray(archive[n]) for n in ("flow", "mask") if n in archive}
     for name, shape in (("flow", (height, width, 2)), ("mask", (height, width))):
-        found = arrays.get(name, np.empty(0, "O"))
-        if found.shape != shape or found.dtype.kind not in "bfiu":
+        array = arrays.get(name, np.empty(0, "O"))
+        if array.shape != shape or array.dtype.kind not in "bfiu":
             raise scene_error(
                 path,
-                f'"{name}" has shape {found.shape} and type {found.dtype}, expected numbers of '
+                f'"{name}" has shape {array.shape} and type {array.dtype}, expected numbers of '
                 f"shape {shape} as the image has before downscaling; {REMEDY}",
             )
     with np.errstate(over="ignore"):  # infinite is as good as too long
@@ -79,7 +79,7 @@ def read_flow(
         expected: N flags: whether the image has an earlier frame (a later one), and so a file.
         source_size: (width, height) of the images before downscaling.
         size: (width, height) after downscaling: the flow's pixels.
-        direction: which of both.
+        direction: backward or forward.
 
     Returns:
         None when not one expected file is there.
@@ -117,6 +117,7 @@ def stacked_flow(
     pixels.
     """
     start = time.perf_counter()
+    source_width, source_height = source_size
     width, height = size
     folder = next(iter(files.values())).parent
     check_memory(count * width * height * _BYTES, folder, f"the flow of {count} images")
@@ -124,10 +125,11 @@ def stacked_flow(
     valid = np.zeros((count, height, width), dtype=np.bool_)
 
     def fill(row: int) -> None:
-        flow, mask = read_flow_file(files[row], *source_size)
+        flow, mask = read_flow_file(files[row], source_width, source_height)
         if size != source_size:
             flow, mask = shrink_flow(flow, mask, width, height)
-        vectors[row], valid[row] = flow, mask
+        vectors[row] = flow
+        valid[row] = mask
 
     in_threads(fill, files, source_size)
     log.info(
@@ -147,7 +149,7 @@ def write_flow(folder: Path, flow: OpticalFlow, images: Iterable[int]) -> None:
         )
 
 
-# Part of the key: a change of the estimate makes earlier files foreign.
+# Part of the key: a new version makes the files of earlier estimates invalid.
 VERSION = "2"
 
 
@@ -168,11 +170,13 @@ def load_flow(path: Path, key: str, shape: tuple[int, int, int]) -> OpticalFlow 
         return None
     try:
         with decoding(path, "npz", "it is written again"), np.load(path) as stored:
-            known, vectors, valid = (stored[name] for name in ("key", "vectors", "valid"))
+            stored_key = str(stored["key"])
+            vectors = stored["vectors"]
+            valid = stored["valid"]
     except DevrfError as error:
         log.warning("the flow is estimated again: %s", error)
         return None
-    if str(known) != key or vectors.shape != (*shape, 2) or not np.isfinite(vectors).all():
+    if stored_key != key or vectors.shape != (*shape, 2) or not np.isfinite(vectors).all():
         log.info("%s holds the flow of other images or of another method", path)
         return None
     return OpticalFlow(torch.from_numpy(vectors), torch.from_numpy(valid))

@@ -46,20 +46,21 @@ class FilmHeader:
 def film_header(path: Path) -> FilmHeader:
     """What a video says of itself, no frame decoded; DevrfError if it is none."""
     with _opened(path) as video:
-        keys = cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_COUNT
-        width, height, frames = (int(video.get(key)) for key in keys)
+        width = int(video.get(cv2.CAP_PROP_FRAME_WIDTH))
+        height = int(video.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        frames = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
     return FilmHeader((width, height), frames)
 
 
 def frame_count(path: Path) -> int:
-    """How many frames the footage says to have, at least 1: for progress, not to be relied on."""
+    """How many frames the footage claims to have, at least 1: for progress, not to rely on."""
     return max(1, len(listed_images(path)) if is_folder(path) else film_header(path).frames)
 
 
 def pictures(path: Path) -> Iterator[tuple[float, Picture]]:
     """Time in seconds since the first frame, and each frame, turned as its file says.
 
-    Of photographs the times are their positions. DevrfError if it is no footage.
+    The times of photographs are their positions. DevrfError if it is no footage.
     """
     if is_folder(path):
         for position, file in enumerate(listed_images(path)):
@@ -74,7 +75,8 @@ def chosen(path: Path, positions: Sequence[int]) -> Iterator[tuple[int, Picture]
 
     DevrfError if it is no footage, or ends before the last position.
     """
-    wanted, last = set(positions), max(positions)
+    wanted = set(positions)
+    last = max(positions)
     if is_folder(path):
         files = listed_images(path)
         for position in sorted(wanted):
@@ -82,10 +84,11 @@ def chosen(path: Path, positions: Sequence[int]) -> Iterator[tuple[int, Picture]
         return
     with _opened(path) as video:
         for position in range(last + 1):
-            found, image = video.grab(), None
-            if found and position in wanted:
-                found, image = video.retrieve()
-            if not found:
+            read = video.grab()
+            image = None
+            if read and position in wanted:
+                read, image = video.retrieve()
+            if not read:
                 raise scene_error(
                     path, f"ends after {position} frames, expected {last + 1}; convert it again"
                 )
@@ -96,7 +99,7 @@ def chosen(path: Path, positions: Sequence[int]) -> Iterator[tuple[int, Picture]
 @contextmanager
 def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
     existing_file(path, "give a video that is there")
-    # FFmpeg and OpenCV would complain on stderr of what is said here in a line.
+    # FFmpeg and OpenCV would print on stderr what is said here in a line.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
     video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
@@ -113,17 +116,19 @@ def _frames(path: Path, video: cv2.VideoCapture) -> Iterator[tuple[float, Pictur
     rate = float(video.get(cv2.CAP_PROP_FPS))
     if not 0 < rate < 10_000:
         raise scene_error(path, f"states no frame rate; {_REMEDY}")
-    position, last = 0, -1.0
+    position = 0
+    last = -1.0
     while True:
-        found, image = video.read()
-        if not found:
+        read, image = video.read()
+        if not read:
             break
-        # Phones do not keep their rate; a file without times of its frames is taken as even.
+        # Phones do not keep their rate; frames without times are taken to be evenly spaced.
         time = float(video.get(cv2.CAP_PROP_POS_MSEC)) / 1000
         if not time > last:
             time = last + 1 / rate if position else 0.0
         yield time, _rgb(image)
-        position, last = position + 1, time
+        position += 1
+        last = time
     if position < 2:
         raise scene_error(
             path,

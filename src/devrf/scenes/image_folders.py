@@ -1,4 +1,4 @@
-"""Folders of images: at several sizes, by which factor they are made smaller, what is absent."""
+"""Folders of images: which size to read, how much smaller to make it, which images are absent."""
 
 from __future__ import annotations
 
@@ -59,10 +59,10 @@ def image_folder(
             folders[int(match[1]) if match else 1] = path
     fitting = [factor for factor in folders if downscale % factor == 0]
     if not fitting:
-        wanted = full if downscale == 1 else f"{reduced.format(downscale)} or {full}"
-        found = ", ".join(sorted(path.name for path in folders.values())) or "none"
+        expected = full if downscale == 1 else f"{reduced.format(downscale)} or {full}"
+        present = ", ".join(sorted(path.name for path in folders.values())) or "none"
         raise scene_error(
-            parent, f"no folder {wanted} (found: {found}); add it, or change data.downscale"
+            parent, f"no folder {expected} (found: {present}); add it, or change data.downscale"
         )
     best = max(fitting)
     return ImageFolder(folders[best], downscale // best)
@@ -74,34 +74,34 @@ def listed_images(folder: Path, *, by_number: bool = False) -> list[Path]:
     ``by_number`` counts runs of digits as numbers, so that 10.png comes after 9.png; else names are
     compared by characters, which is the order of COLMAP's poses.
     """
-    found = [
+    images = [
         path
         for path in entries(folder)
         if path.suffix.lower() in SUFFIXES and path.name[0] != "." and os.path.isfile(path)
     ]
-    if not found:
+    if not images:
         raise scene_error(folder, f"no images (looked for {', '.join(SUFFIXES)}); add them")
-    return sorted(found, key=lambda path: _natural(path.name) if by_number else [path.name])
+    return sorted(images, key=lambda path: _natural(path.name) if by_number else [path.name])
 
 
 def _natural(name: str) -> list[object]:
-    """Text and numbers in turn: any two such lists compare."""
+    """Text and numbers in turn, so that any two such lists can be compared."""
     pieces = _DIGITS.split(name)
     return [int(piece) if k % 2 else piece for k, piece in enumerate(pieces)]
 
 
-# Of images with a shorter side of fewer pixels little can be learned.
+# Images with a shorter side of fewer pixels teach little.
 LEAST_SIDE = 64
-# ``cpu`` and ``gpu`` leave at most so many pixels of the longer side: the grids that a CPU learns
-# show no more; a GPU gets about what scenes are published at.
+# The longer side has at most so many pixels with ``cpu`` and ``gpu``: the grids that a CPU learns
+# show no more; scenes are published at about the size for a GPU.
 LONGEST = {"cpu": 640, "gpu": 1600}
 _UP_TO = re.compile(r"up_to_([1-9]\d{0,3})")
 
 
 def _downscale(value: object) -> object:
-    whole = isinstance(value, int) and not isinstance(value, bool) and value >= 1
-    known = isinstance(value, str) and (value in ("auto", *LONGEST) or _UP_TO.fullmatch(value))
-    if not whole and not known:
+    is_factor = isinstance(value, int) and not isinstance(value, bool) and value >= 1
+    is_choice = isinstance(value, str) and (value in ("auto", *LONGEST) or _UP_TO.fullmatch(value))
+    if not is_factor and not is_choice:
         raise ValueError(
             f"expected auto, a whole number of at least 1, or up_to_<number>, not {value!r}"
         )
@@ -116,37 +116,43 @@ SizeAt = Callable[[int], tuple[int, int] | None]
 def whole_factor(downscale: int | str, size_at: SizeAt) -> int:
     """The factor by which images are made smaller.
 
-    A number is obeyed. ``cpu`` and ``gpu`` take the least power of two that leaves no more than
-    such a device has a use for, ``auto`` that of this machine, ``up_to_<N>`` the largest factor up
-    to N; all keep 64 pixels of the shorter side, or else what leaves the most. ``size_at`` gives
-    (width, height) at a factor, None where there are no such images.
+    A number is taken as it is. ``cpu`` and ``gpu`` take the least power of two that leaves no more
+    than :data:`LONGEST`, ``auto`` that of this machine, ``up_to_<N>`` the largest factor up to N.
+    All keep 64 pixels of the shorter side; if no factor does, that counts which leaves the most.
+    ``size_at`` gives (width, height) at a factor, None where there are no such images.
     """
     if isinstance(downscale, int):
         return downscale
     device = "gpu" if downscale == "auto" and torch.cuda.is_available() else downscale
-    limit, factors = LONGEST.get(device, LONGEST["cpu"]), [1 << k for k in range(10)]
+    limit = LONGEST.get(device, LONGEST["cpu"])
+    factors = [1 << k for k in range(10)]
     if match := _UP_TO.fullmatch(downscale):
-        limit, factors = sys.maxsize, list(range(int(match[1]), 0, -1))
+        limit = sys.maxsize
+        factors = list(range(int(match[1]), 0, -1))
     sizes = {factor: size for factor in factors if (size := size_at(factor)) is not None}
     if not sizes:
         return factors[0]  # the reader of the files says what is missing
-    enough = [factor for factor, size in sizes.items() if min(size) >= LEAST_SIDE]
-    enough = enough or [max(sizes, key=lambda factor: (min(sizes[factor]), -factor))]
-    factor = next((factor for factor in enough if max(sizes[factor]) <= limit), enough[-1])
+    fitting = [factor for factor, size in sizes.items() if min(size) >= LEAST_SIDE]
+    fitting = fitting or [max(sizes, key=lambda factor: (min(sizes[factor]), -factor))]
+    factor = next((factor for factor in fitting if max(sizes[factor]) <= limit), fitting[-1])
+    width, height = sizes[factor]
     reason = f"data.downscale={downscale}" if match else f"chosen for a {device.upper()}"
     log.info(
         "images of %dx%d px, made smaller by %d (%s; data.downscale=NUMBER chooses otherwise)",
-        *(*sizes[factor], factor, reason),
+        width,
+        height,
+        factor,
+        reason,
     )
     return factor
 
 
-def folder_size(parent: Path, **names: str) -> SizeAt:
-    """The size at a factor of images in folders of several sizes; ``names`` as of image_folder."""
+def folder_size(parent: Path, *, full: str = "images", reduced: str = "images_{}") -> SizeAt:
+    """The size at a factor of images in folders of several sizes, named as for image_folder."""
 
     def size_at(factor: int) -> tuple[int, int] | None:
         try:
-            source = image_folder(parent, factor, **names)
+            source = image_folder(parent, factor, full=full, reduced=reduced)
         except DevrfError:
             return None
         width, height = image_size(listed_images(source.path)[0])
@@ -173,11 +179,11 @@ def present_images(
         DevrfError: an image is absent and must not be, or all are.
     """
     places = [inside(root, file.parent, name, file) for name in names]
-    found = {k: image for k, place in enumerate(places) if (image := image_at(place)) is not None}
-    absent = [place for k, place in enumerate(places) if k not in found]
-    if absent and (missing == "error" or not found):
+    present = {k: image for k, place in enumerate(places) if (image := image_at(place)) is not None}
+    absent = [place for k, place in enumerate(places) if k not in present]
+    if absent and (missing == "error" or not present):
         add = "add them" if len(absent) > 1 else "correct its name or add it"
-        skip = ", or leave out what is absent with data.missing=skip" if found else ""
+        skip = ", or leave out what is absent with data.missing=skip" if present else ""
         raise scene_error(
             absent[0],
             f"no such image (looked for {', '.join(SUFFIXES)}); {len(absent)} of the {len(names)} "
@@ -191,4 +197,4 @@ def present_images(
             len(names),
             absent[0].relative_to(root),
         )
-    return found
+    return present

@@ -1,8 +1,8 @@
 """Image files → uint8 tensors: measured, turned where they have to be, made smaller.
 
 A photo may carry an EXIF orientation: viewers turn it, most tools that find cameras do not. The
-camera's own size tells which of the two it was found on, if it tells anything: an image is turned
-where only the turned one has the camera's shape, and is else read as it is stored.
+camera's own size may tell which of the two it was found on: an image is turned if only the turned
+one has the camera's shape; otherwise it is read as it is stored.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ TURNS = {
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
 }
-# Of these, width and height change places.
+# Turns that exchange width and height.
 QUARTER_TURNS = (5, 6, 7, 8)
 
 Size = tuple[float, float]
@@ -126,7 +126,8 @@ def _turn(orientation: int, stored: Size, camera: Size | None) -> tuple[int, boo
     if camera is None:
         return 1, True
     turned = stored[::-1] if orientation in QUARTER_TURNS else stored
-    as_stored, as_seen = same_shape(stored, camera), same_shape(turned, camera)
+    as_stored = same_shape(stored, camera)
+    as_seen = same_shape(turned, camera)
     if as_seen and not as_stored:
         return orientation, False
     return 1, as_seen == as_stored
@@ -201,8 +202,8 @@ def load_images(
         paths: at least one existing file, 8 bits a channel, with or without alpha.
         downscale: integer factor ≥ 1; each side becomes floor(side / downscale), by area averages
             of premultiplied colours.
-        cameras: (width, height) of the images that each camera is for, of any scale; None where it
-            is unknown, or of all.
+        cameras: (width, height) of the images that each camera is for, of any scale; None if it
+            is unknown, for one image or for all.
         finish: what to make of each RGBA image, by its position, before it is made smaller; images
             without alpha come to it opaque.
 
@@ -213,10 +214,10 @@ def load_images(
     start = time.perf_counter()
     headers = _headers(paths, cameras or [None] * len(paths))
     first = headers[0]
-    size = reduced_size(first.width, first.height, downscale, paths[0])
+    width, height = reduced_size(first.width, first.height, downscale, paths[0])
     alpha = finish is not None or any(header.has_alpha for header in headers)
-    shape = (len(paths), size[1], size[0], 4 if alpha else 3)
-    what = f"{len(paths)} images of {size[0]}x{size[1]} px"
+    shape = (len(paths), height, width, 4 if alpha else 3)
+    what = f"{len(paths)} images of {width}x{height} px"
     check_memory(math.prod(shape), paths[0].parent, what)
     # NumPy in the threads: each would otherwise start a team of torch threads of its own.
     pixels = np.empty(shape, dtype=np.uint8)
@@ -225,8 +226,9 @@ def load_images(
         # An image without alpha in a set with alpha is opaque: WebP drops a full alpha channel.
         image = decode(paths[index], headers[index], "RGBA" if alpha else "RGB")
         image = image if finish is None else finish(index, image)
-        whole = size == (first.width, first.height)
-        pixels[index] = image if whole else shrink_pixels(image, *size)
+        if (width, height) != (first.width, first.height):
+            image = shrink_pixels(image, width, height)
+        pixels[index] = image
 
     in_threads(fill, range(len(paths)), (first.width, first.height))
     log.info("read %s from %s in %.1f s", what, paths[0].parent, time.perf_counter() - start)

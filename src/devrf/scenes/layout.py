@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from devrf.scenes.images import image_size
 from devrf.scenes.masks import Masks
@@ -35,7 +36,7 @@ class Layout:
     Attributes:
         static_train: images of the scene at rest.
         static_test: held-out images of the scene at rest.
-        dynamic_train: images of the scene in motion; of a scene at rest ``static_train`` itself.
+        dynamic_train: images of the scene in motion; ``static_train`` itself if it is at rest.
         dynamic_test: held-out images of the scene in motion.
         validation: images as those of ``dynamic_test``, by which settings are chosen, or None.
     """
@@ -53,39 +54,45 @@ class Layout:
 
     def size_at(self, factor: int) -> tuple[int, int]:
         """Width and height in pixels of the static images made smaller by ``factor``."""
-        transforms, first = self.static_train.transforms, int(self.static_train.index[0])
+        transforms = self.static_train.transforms
+        first = int(self.static_train.index[0])
         width, height = image_size(transforms.images[first], transforms.intrinsics[first].size)
         return width // factor, height // factor
 
     def with_validation(self, transforms: Transforms) -> Layout:
         """The layout with a validation split, of the images that are not learned from or tested on.
 
-        An image with the pose and the time of such a one is that image under another name.
+        An image with the pose and the time of one of these is that image under another name.
         """
         if not transforms.images:
             return self
         split = in_motion(transforms) if self.moves else at_one_moment(transforms)
-        own, *others = (
-            torch.cat([s.transforms.poses.flatten(1), s.times[:, None]], dim=1)
-            for s in (split, self.dynamic_train, self.dynamic_test)
+        used = torch.cat(
+            [_poses_and_times(self.dynamic_train), _poses_and_times(self.dynamic_test)]
         )
-        used = torch.cat(others)
+        own = _poses_and_times(split)
         split = split.where(torch.stack([(used != image).any(dim=1).all() for image in own]))
         return replace(self, validation=split) if len(split.index) else self
+
+
+def _poses_and_times(split: Split) -> Tensor:
+    """(N, 13): the pose of each image of the file, and its time."""
+    return torch.cat([split.transforms.poses.flatten(1), split.times[:, None]], dim=1)
 
 
 def static_alone(train: Transforms, test: Transforms, why: str) -> Layout:
     """The layout of a scene at rest, whose images all show one moment; ``why`` is for the log."""
     log.info("%s: %s: all images show one moment, the scene is at rest", train.file, why)
-    train_set, test_set = at_one_moment(train), at_one_moment(test)
+    train_set = at_one_moment(train)
+    test_set = at_one_moment(test)
     return Layout(train_set, test_set, train_set, test_set)
 
 
 def one_capture(train: Transforms, test: Transforms, static_until: float) -> Layout:
     """The layout of one capture: at rest without times, or with one, else without a static set."""
     if one_moment(train, test):
-        found = "no time" if train.times is None else "one time"
-        return static_alone(train, test, f"its frames have {found}")
+        times = "no time" if train.times is None else "one time"
+        return static_alone(train, test, f"its frames have {times}")
     return without_static_set(in_motion(train), in_motion(test), static_until)
 
 
@@ -94,7 +101,8 @@ def without_static_set(train: Split, test: Split, static_until: float) -> Layout
 
     DevrfError if no image to learn from is that early.
     """
-    early, early_test = (split.where(split.times <= static_until + 1e-6) for split in (train, test))
+    early = train.where(train.times <= static_until + 1e-6)
+    early_test = test.where(test.times <= static_until + 1e-6)
     if len(early.index) == 0:
         raise scene_error(
             train.transforms.file, "no image is as early as data.static_until; set it higher"
@@ -126,11 +134,11 @@ def fewer(layout: Layout, train_views: int | None, frames: int | None) -> tuple[
     or there are none.
     """
     if not layout.moves:
-        for key, asked in (("train_views", train_views), ("frames", frames)):
-            if asked is not None:
+        for key, count in (("train_views", train_views), ("frames", frames)):
+            if count is not None:
                 raise scene_error(
                     f"data.{key}",
-                    f"{asked} was asked for, but all images of "
+                    f"{count} was asked for, but all images of "
                     f"{layout.static_train.transforms.file} show one moment; leave it null",
                 )
         return layout, False
@@ -139,16 +147,22 @@ def fewer(layout: Layout, train_views: int | None, frames: int | None) -> tuple[
         raise scene_error(
             train.transforms.file, "all dynamic images have one time; give each frame its own"
         )
-    kept = None if frames is None else evenly_spread(train.used_times, frames)
-    if kept is None:
+    times = None if frames is None else evenly_spread(train.used_times, frames)
+    if times is None:
         return replace(layout, dynamic_train=train), False
-    splits = {"dynamic_train": at_times(train, kept)}
-    for name in ("dynamic_test", "validation"):
-        split = getattr(layout, name)
-        # Held-out times of their own (D-NeRF) need not meet the kept ones: then all stay.
-        if split is not None and len((same := at_times(split, kept)).index):
-            splits[name] = same
-    return replace(layout, **splits), True
+
+    def held_out(split: Split) -> Split:
+        thinned = at_times(split, times)
+        # Held-out times (D-NeRF's) need not be among the training times: then all stay.
+        return thinned if len(thinned.index) else split
+
+    thinner = replace(
+        layout,
+        dynamic_train=at_times(train, times),
+        dynamic_test=held_out(layout.dynamic_test),
+        validation=None if layout.validation is None else held_out(layout.validation),
+    )
+    return thinner, True
 
 
 def load_layout(
@@ -175,10 +189,11 @@ def load_layout(
         # Without a static set the captures share files: read them once.
         twin = next((v for s, v in loaded if _same_images(s, split)), None)
         loaded.append((split, twin or load_views(split, root, by, masks)))
-    a, b, c, d = (views for _, views in loaded)
-    held_back = layout.validation
-    validation = None if held_back is None else load_views(held_back, root, moving, masks)
-    return Capture(a, b), Capture(c, d, validation)
+    static_train, static_test, dynamic_train, dynamic_test = (views for _, views in loaded)
+    validation = None
+    if layout.validation is not None:
+        validation = load_views(layout.validation, root, moving, masks)
+    return Capture(static_train, static_test), Capture(dynamic_train, dynamic_test, validation)
 
 
 def _same_images(a: Split, b: Split) -> bool:

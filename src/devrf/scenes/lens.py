@@ -53,7 +53,8 @@ class Lens:
 
     def scaled(self, x: float, y: float) -> Lens:
         """The same lens for an image whose sides are ``x`` and ``y`` times as long."""
-        (fx, fy), (cx, cy) = self.focal, self.center
+        fx, fy = self.focal
+        cx, cy = self.center
         return Lens((fx * x, fy * y), (cx * x, cy * y), self.distortion, self.skew * x)
 
 
@@ -156,7 +157,8 @@ class Intrinsics:
         center = (w / 2 if cx is None else cx, h / 2 if cy is None else cy)
         lens = Lens(focal, center, self.distortion, self.skew).scaled(width / w, height / h)
         if not lens.fits(width, height):
-            (fx, fy), (x, y) = lens.focal, lens.center
+            fx, fy = lens.focal
+            x, y = lens.center
             raise scene_error(
                 where,
                 f"its camera cannot be one of {width}x{height} px: focal lengths {fx:g} and "

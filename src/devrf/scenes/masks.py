@@ -64,7 +64,7 @@ def read_mask(path: Path, image: tuple[int, int], camera: Size | None, name: obj
     if int(grey.max()) == 1:
         grey *= WHITE
     if size != image:
-        grey = shrink_pixels(grey, *image)
+        grey = shrink_pixels(grey, image[0], image[1])
     return grey[..., 0]
 
 
@@ -122,18 +122,19 @@ def valid_pixels(
     masked = [k for k, path in enumerate(paths) if path is not None]
     if not masked:
         return None
-    check_memory(len(paths) * size[0] * size[1], names[0].parent, f"{len(masked)} masks")
-    kept = np.full((len(paths), size[1], size[0], 1), WHITE, dtype=np.uint8)
+    width, height = size
+    check_memory(len(paths) * width * height, names[0].parent, f"{len(masked)} masks")
+    masks = np.full((len(paths), height, width, 1), WHITE, dtype=np.uint8)
 
     def fill(k: int) -> None:
         path = paths[k]
         assert path is not None
         light = read_mask(path, image, cameras[k], names[k]) > HALF
         sharp = light[..., None].astype(np.uint8) * np.uint8(WHITE)
-        kept[k] = sharp if size == image else shrink_pixels(sharp, *size)
+        masks[k] = sharp if size == image else shrink_pixels(sharp, width, height)
 
     in_threads(fill, masked, image)
-    pixels, _ = as_pinhole(torch.from_numpy(kept), lenses, names)
+    pixels, _ = as_pinhole(torch.from_numpy(masks), lenses, names)
     valid_mask = pixels[..., 0] == WHITE
     for k in masked:
         if not bool(valid_mask[k].any()):

@@ -1,4 +1,4 @@
-"""Optical flow where a scene brings none: estimated once, by DIS (OpenCV) or RAFT (torchvision)."""
+"""Optical flow for scenes without: estimated once, by DIS (OpenCV) or RAFT (torchvision)."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def _dis() -> Estimator:
     def flow(image: Tensor, other: Tensor) -> Tensor:
         height, width = image.shape[:2]
         factor = max(1.0, LEAST_SIDE / min(height, width))
-        size = math.ceil(width * factor), math.ceil(height * factor)
+        size = (math.ceil(width * factor), math.ceil(height * factor))
         grey = [cv2.cvtColor(i.numpy(), cv2.COLOR_RGB2GRAY) for i in (image, other)]
         if size != (width, height):
             grey = [cv2.resize(g, size, interpolation=cv2.INTER_CUBIC) for g in grey]
@@ -90,7 +90,7 @@ def _raft() -> Estimator:
     def flow(image: Tensor, other: Tensor) -> Tensor:
         height, width = image.shape[:2]
         # Edge pixels are repeated to the right and below, so that positions stay as they are.
-        margin = 0, _padded(width) - width, 0, _padded(height) - height
+        margin = (0, _padded(width) - width, 0, _padded(height) - height)
         pair = torch.stack([image, other]).to(device).permute(0, 3, 1, 2).float() / 127.5 - 1
         first, second = pad(pair, margin, mode="replicate").chunk(2)
         with torch.no_grad():
@@ -107,7 +107,7 @@ def _padded(side: int) -> int:
 
 FlowMethod = Literal["dis", "raft"]
 
-# A vector is trusted when going there and back ends this near: 1 px, and 5 % of its length.
+# A vector is trusted if the way there and back ends within 1 px + 5 % of its length.
 CLOSED_PIXELS = 1.0
 CLOSED_SHARE = 0.05
 ALPHA_THRESHOLD = 127
@@ -128,7 +128,7 @@ def estimate_flow(
         method: "dis" (OpenCV, on the CPU) or "raft" (torchvision, on the GPU if there is one).
         cache: an npz to read the flow from, or to write it to; ignored and written again when
             it belongs to other images or is damaged.
-        forward: the same with frames swapped: to the image a frame later.
+        forward: estimate forward flow instead, to the image a frame later.
 
     Raises:
         DevrfError: the library or weights are missing, the images have no
@@ -149,13 +149,13 @@ def estimate_flow(
     between = estimator(method)
     count = (len(views), views.height, views.width)
     flow = OpticalFlow(torch.zeros((*count, 2)), torch.zeros(count, dtype=torch.bool))
-    for done, pair in enumerate(pairs):
+    for number, pair in enumerate(pairs, 1):
         image, other = pair[::-1] if forward else pair
         vectors, valid = flow_between(views, image, other, between)
         flow.valid[image] = valid
         flow.vectors[image] = vectors * valid[..., None]
-        if (done + 1) % 100 == 0:
-            log.info("optical flow: %d of %d pairs", done + 1, len(pairs))
+        if number % 100 == 0:
+            log.info("optical flow: %d of %d pairs", number, len(pairs))
     seconds = time.perf_counter() - start
     log.info("estimated optical flow (%s) of %d pairs in %.1f s", method, len(pairs), seconds)
     if cache is not None:
@@ -165,8 +165,10 @@ def estimate_flow(
 
 def flow_between(views: Views, image: int, other: int, between: Estimator) -> tuple[Tensor, Tensor]:
     """Flow (H, W, 2) of an image to another, in pixels, and where it is valid, (H, W) bool."""
-    now, then = _on_white(views.pixels[image]), _on_white(views.pixels[other])
-    there, back = between(now, then), between(then, now)
+    now = _on_white(views.pixels[image])
+    then = _on_white(views.pixels[other])
+    there = between(now, then)
+    back = between(then, now)
     valid = consistent(there, back)
     if views.has_alpha:
         valid &= views.pixels[image, ..., 3].cpu() > ALPHA_THRESHOLD
@@ -198,11 +200,12 @@ def consistent(backward: Tensor, forward: Tensor) -> Tensor:
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     end = torch.stack([x, y], dim=-1) + backward
     inside = ((end >= 0) & (end <= end.new_tensor([width - 1, height - 1]))).all(dim=-1)
-    at_x, at_y = (np.ascontiguousarray(end[..., axis]) for axis in (0, 1))
-    found = cv2.remap(
+    at_x = np.ascontiguousarray(end[..., 0])
+    at_y = np.ascontiguousarray(end[..., 1])
+    looked_up = cv2.remap(
         forward.numpy(), at_x, at_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
-    back = torch.from_numpy(np.asarray(found, dtype=np.float32))
+    back = torch.from_numpy(np.asarray(looked_up, dtype=np.float32))
     miss: Tensor = torch.linalg.vector_norm(backward + back, dim=-1)
     length: Tensor = torch.linalg.vector_norm(backward, dim=-1)
     # NaN compares false: what is not a number is not trusted.

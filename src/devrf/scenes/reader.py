@@ -20,7 +20,7 @@ from devrf.scenes.transforms import SceneBounds
 from devrf.scenes.validation import LARGEST, Options, checked_box, scene_error
 
 FlowSource = Literal["auto", "files", "dis", "raft", "none"]
-# Of layouts that have no place for flow files.
+# The flow sources of layouts that have no place for flow files.
 EstimatedFlow = Literal["auto", "dis", "raft", "none"]
 
 Count = Annotated[int, Field(strict=True, ge=1)]
@@ -82,7 +82,7 @@ class SceneReader(Options, ABC):
     factor: ClassVar[int] = 1
 
     def choose_factor(self, size_at: SizeAt) -> int:
-        """By what images of such sizes are made smaller; :attr:`factor` from now on."""
+        """The factor by which images of such sizes are made smaller; sets :attr:`factor`."""
         self.__dict__["factor"] = factor = whole_factor(self.downscale, size_at)
         return factor
 
@@ -204,19 +204,20 @@ class PosedReader(InwardReader):
         if reader.space != "ndc":
             scene = reader.scene(folder, static, dynamic)
             reason = scene.bounds.reason if reader.space == self.space else source
-            found = self.box is None and reader.box is not None
-            box_source = source if found else scene.bounds.box_source
+            box_is_stated = self.box is None and reader.box is not None
+            box_source = source if box_is_stated else scene.bounds.box_source
             bounds = replace(scene.bounds, reason=reason, box_source=box_source)
             return replace(scene, bounds=bounds)
-        name, captures = self.name_of(folder), centred(static, dynamic)
+        name = self.name_of(folder)
+        static, dynamic = centred(static, dynamic)
         if reader.near is None or reader.near <= 0:
-            apart = float(captures[0].train.cameras.positions.norm(dim=1).max())
+            apart = float(static.train.cameras.positions.norm(dim=1).max())
             raise scene_error(
                 "data.near",
                 "data.space=ndc needs a near plane before all that is seen, in world units; try "
                 f"data.near={apart:.3g}, which is as far as cameras are from their middle",
             )
-        return forward_facing_scene(name, *captures, reader.near, self.background)
+        return forward_facing_scene(name, static, dynamic, reader.near, self.background)
 
 
 def _with_bounds(options: PosedReader, stated: SceneBounds | None) -> PosedReader:

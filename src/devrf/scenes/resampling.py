@@ -42,11 +42,12 @@ def look_up_pixels(image: Pixels, source: Array) -> Pixels:
     Alpha is not premultiplied; black where it is 0. Places outside take the nearest pixel of the
     border.
     """
-    x, y = (np.ascontiguousarray(source[..., axis] - np.float32(0.5)) for axis in (0, 1))
+    x = np.ascontiguousarray(source[..., 0] - np.float32(0.5))
+    y = np.ascontiguousarray(source[..., 1] - np.float32(0.5))
 
     def looked_up(values: Array) -> Array:
-        found = cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return np.asarray(found, dtype=np.float32).reshape(*x.shape, image.shape[2])
+        looked = cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(looked, dtype=np.float32).reshape(*x.shape, image.shape[2])
 
     return _weighted_by_alpha(image, looked_up)
 
@@ -55,14 +56,15 @@ def _weighted_by_alpha(image: Pixels, linear: Callable[[Array], Array]) -> Pixel
     """A linear filter of an 8-bit image, rounded."""
     values = image.astype(np.float32)
     if image.shape[2] != 4:
-        found = linear(values)
+        filtered = linear(values)
     else:
         # Colours behind a zero alpha are arbitrary: premultiplied, they cannot bleed in.
         values[..., :3] *= values[..., 3:]
-        found = linear(values)
-        color, alpha = found[..., :3], found[..., 3:]
-        found[..., :3] = np.divide(color, alpha, out=np.zeros_like(color), where=alpha > 0)
-    return (found + 0.5).clip(0, 255).astype(np.uint8)
+        filtered = linear(values)
+        color = filtered[..., :3]
+        alpha = filtered[..., 3:]
+        filtered[..., :3] = np.divide(color, alpha, out=np.zeros_like(color), where=alpha > 0)
+    return (filtered + 0.5).clip(0, 255).astype(np.uint8)
 
 
 def shrink_flow(
@@ -130,7 +132,8 @@ def _pinhole_view(lens: Lens, width: int, height: int) -> tuple[Lens, Tensor] | 
     zoom = _zoom(lens, centres)
     if zoom is None:
         return None
-    (fx, fy), center = lens.focal, lens.center
+    fx, fy = lens.focal
+    center = lens.center
     plain = Lens((fx * zoom, fy * zoom), center)
     directions = _directions(plain, centres)
     if not bool(lens.distortion.upright(directions).all()):
@@ -145,36 +148,43 @@ def _zoom(lens: Lens, centres: Tensor) -> float | None:
     directions = _directions(Lens(lens.focal, lens.center), border)
     size = border.new_tensor([width, height])
 
-    def seen(zoom: float) -> bool:
+    def fills(zoom: float) -> bool:
         source = _on_lens(lens, directions / zoom)
         upright = lens.distortion.upright(directions / zoom)
         return bool((((source >= 0) & (source <= size)).all(dim=-1) & upright).all())
 
-    if seen(1.0):
+    if fills(1.0):
         return 1.0
-    low, high = 1.0, _LONGEST
-    if not seen(high):
+    low = 1.0
+    high = _LONGEST
+    if not fills(high):
         return None
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
-        low, high = (low, middle) if seen(middle) else (middle, high)
+        if fills(middle):
+            high = middle
+        else:
+            low = middle
     return high
 
 
 def _centres(width: int, height: int) -> Tensor:
     """(H, W, 2) float64 x, y of the pixels' centres."""
-    x, y = torch.arange(width) + 0.5, torch.arange(height) + 0.5
+    x = torch.arange(width) + 0.5
+    y = torch.arange(height) + 0.5
     return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).double()
 
 
 def _directions(pinhole: Lens, pixels: Tensor) -> Tensor:
     """(..., 2) x/z and y/z of a pinhole's ``pixels`` (..., 2)."""
-    focal, center = pixels.new_tensor(pinhole.focal), pixels.new_tensor(pinhole.center)
+    focal = pixels.new_tensor(pinhole.focal)
+    center = pixels.new_tensor(pinhole.center)
     return (pixels - center) / focal
 
 
 def _on_lens(lens: Lens, directions: Tensor) -> Tensor:
     """Pixels (..., 2) on which ``directions`` (..., 2) fall."""
     x, y = lens.distortion.distort(directions).unbind(-1)
-    (fx, fy), (cx, cy) = lens.focal, lens.center
+    fx, fy = lens.focal
+    cx, cy = lens.center
     return torch.stack([fx * x + lens.skew * y + cx, fy * y + cy], dim=-1)

@@ -190,8 +190,8 @@ class Scene:
         name: short name for folders and tables.
         kind: ``inward`` (cameras around the scene) or ``forward`` (cameras before it, NDC).
         static: many views of the scene at rest (t = 0).
-        dynamic: a few fixed views of the scene as it deforms; of a scene that is always at rest the
-            static capture itself. It alone has validation views.
+        dynamic: a few fixed views of the scene as it deforms; the static capture itself if the
+            scene is always at rest. It alone has validation views.
         bounds: where the scene is.
         background: what is behind the alpha mask.
         space: the space that the fields live in, and in which ``bounds`` are given.
@@ -206,7 +206,8 @@ class Scene:
     space: Space = WORLD
 
     def __post_init__(self) -> None:
-        clock, numbered = self.clock, dict[int, Views]()
+        clock = self.clock
+        numbered = dict[int, Views]()
 
         def with_frames(views: Views) -> Views:
             # A moving camera's images may be both captures: they stay one.
@@ -221,18 +222,20 @@ class Scene:
     def at_rest(self) -> Views:
         """The static training views and the first frames of the dynamic ones, at time 0.
 
-        The static ones alone where the others are of another size or by a moving camera, or where
-        either alone have masks. An image from the place of a static one is left out.
+        The static ones alone, if the others are of another size or by a moving camera, or if only
+        one of both sets has masks. An image from the place of a static one is left out.
         """
-        static, moving = self.static.train, self.dynamic.train
+        static = self.static.train
+        moving = self.dynamic.train
         alike = static.pixels.shape[1:] == moving.pixels.shape[1:]
         masked = [views.valid_mask is not None for views in (static, moving)]
         if not alike or moving.by_moving_camera or masked[0] != masked[1]:
             return static
         assert static.frames is not None and moving.frames is not None
         first = moving[(moving.frames == 0).nonzero()[:, 0]]
-        here, there = (views.cameras.camera_to_world.flatten(1) for views in (first, static))
-        first = first[(torch.cdist(here, there) > 0).all(dim=1).nonzero()[:, 0]]
+        first_poses = first.cameras.camera_to_world.flatten(1)
+        static_poses = static.cameras.camera_to_world.flatten(1)
+        first = first[(torch.cdist(first_poses, static_poses) > 0).all(dim=1).nonzero()[:, 0]]
         assert first.frames is not None
         valid = [v.valid_mask for v in (static, first) if v.valid_mask is not None]
         return Views(
@@ -255,7 +258,7 @@ class Scene:
 
     @property
     def captures(self) -> dict[CaptureName, Capture]:
-        """The captures by name; of a scene at rest the static one alone."""
+        """The captures by name; the static one alone if the scene is at rest."""
         static: dict[CaptureName, Capture] = {"static": self.static}
         return {**static, "dynamic": self.dynamic} if self.moves else static
 

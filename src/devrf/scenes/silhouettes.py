@@ -1,4 +1,4 @@
-"""Visual hulls of alpha masks: the box of everything that moves, and of one state a grid.
+"""Visual hulls of alpha masks: the box of everything that moves, and a grid of one state.
 
 A hull from a few views holds the object and more: the box is an outer bound.
 """
@@ -21,7 +21,9 @@ from devrf.scenes.scene import Views
 # NumPy for the carving: hundreds of small steps, which torch's threads only slow down.
 Array = npt.NDArray[Any]
 
-OUTSIDE, INSIDE, UNSEEN = 0, 1, 2
+OUTSIDE = 0
+INSIDE = 1
+UNSEEN = 2
 # A pixel belongs to the silhouette when at least half of it is covered.
 ALPHA_THRESHOLD = 127
 
@@ -59,7 +61,7 @@ def motion_box(views: Views, box: Box, *, resolution: int = 64, search: float = 
     for images in frames:
         # Only points not yet in the union need a look; each view leaves fewer of them.
         left = np.flatnonzero(~hull)
-        seen = np.zeros(len(left), dtype=np.int64)
+        inside_views = np.zeros(len(left), dtype=np.int64)
         for image in images:
             number = int(views.view[image])
             if number not in cached:
@@ -68,12 +70,14 @@ def motion_box(views: Views, box: Box, *, resolution: int = 64, search: float = 
                 cached[number] = _pixel_index(views, image, points)
             verdict = masks[image][cached[number][left]]
             keep = verdict != OUTSIDE
-            left, seen = left[keep], seen[keep] + (verdict[keep] == INSIDE)
-        hull[left[seen >= 2]] = True
+            left = left[keep]
+            inside_views = inside_views[keep] + (verdict[keep] == INSIDE)
+        hull[left[inside_views >= 2]] = True
     if not hull.any():
         return None
     held = points[torch.from_numpy(hull).to(points.device)]
-    low, high = held.amin(dim=0) - cell, held.amax(dim=0) + cell
+    low = held.amin(dim=0) - cell
+    high = held.amax(dim=0) + cell
     return Box.of(low, high).clipped(area)
 
 
@@ -162,7 +166,7 @@ def visual_hull(
         solid = solid.to(points.device)
         grown = torch.nn.functional.max_pool2d(solid, 2 * reach + 1, 1, reach)[0]
         x, y = pixel.floor().long().unbind(-1)
-        seen = (depth > 0) & (x >= 0) & (x < views.width) & (y >= 0) & (y < views.height)
-        row = torch.where(seen, y * views.width + x, 0)
-        held[left[seen & (grown.view(-1)[row] == 0)]] = False
+        in_image = (depth > 0) & (x >= 0) & (x < views.width) & (y >= 0) & (y < views.height)
+        row = torch.where(in_image, y * views.width + x, 0)
+        held[left[in_image & (grown.view(-1)[row] == 0)]] = False
     return held.view(shape)

@@ -32,8 +32,8 @@ SpaceChoice = Literal["auto", "world", "contracted"]
 # Thickness of the shell in half edges of the inner box, as in the paper of contraction. In a
 # thinner one walls are a voxel or two deep, and are learned as fog before them (measured).
 SHELL = 1.0
-# Nothing is nearer to a camera than this share of its distance to what it looks at. With less, fog
-# before each lens explains its picture and spoils those of others (measured).
+# The near plane, as a share of a camera's distance to what it looks at. If it is nearer, fog before
+# each lens explains its picture and spoils those of others (measured).
 NEAR_SHARE = 0.25
 
 
@@ -64,23 +64,26 @@ def inward_space(
     Raises:
         DevrfError: the cameras do not say where the scene is, or near is not before far.
     """
-    given = "data.box is given" if box else ""
+    box_given = "data.box is given" if box else ""
     masks = "the images have alpha masks" if static.cut_out else "the images have no alpha masks"
     if choice == "world" or (choice == "auto" and (static.cut_out or box)):
         bounds = inward_bounds(
             static, dynamic, everyone, bound_scale=bound_scale, near=near, far=far, box=box
         )
-        why = "data.space=world" if choice == "world" else given or masks
-        where = given or "what the static cameras all see"
+        why = "data.space=world" if choice == "world" else box_given or masks
+        where = box_given or "what the static cameras all see"
         return WORLD, replace(bounds, reason=why, box_source=where)
-    inner, where = box or box_from_cameras(static.cameras), given
+    inner = box or box_from_cameras(static.cameras)
+    where = box_given
     if box is None:
         where = "what the static cameras all see"
         motion = motion_box(dynamic, inner) if dynamic is not None and dynamic.cut_out else None
         if motion is not None:
-            inner, where = inner.union(motion), where + ", and where the silhouettes move"
+            inner = inner.union(motion)
+            where += ", and where the silhouettes move"
         if bound_scale != "auto":
-            inner, where = inner.scaled(float(bound_scale)), where + f" x {float(bound_scale):g}"
+            inner = inner.scaled(float(bound_scale))
+            where += f" x {float(bound_scale):g}"
     space = ContractedSpace(inner.low, inner.high, SHELL)
     if near is None:
         middle = static.cameras.positions.new_tensor(inner.middle)
@@ -108,10 +111,8 @@ def forward_facing_scene(
     """
     space = reference_space(static.train.cameras, near)
     # The captures of a scene at rest, and of a video, share images.
-    learned, held_out = (
-        list({id(v): v for v in both}.values())
-        for both in ((static.train, dynamic.train), (static.test, dynamic.test))
-    )
+    learned = list({id(views): views for views in (static.train, dynamic.train)}.values())
+    held_out = list({id(views): views for views in (static.test, dynamic.test)}.values())
     moves = dynamic.train is not static.train or len(set(dynamic.train.times.tolist())) > 1
     bounds = forward_bounds(learned, space, SEEN if moves else STILL)
     # The held-out cameras need not see inside the box, but they have to look the same way.
@@ -150,11 +151,16 @@ def dynamic_only(scene: Scene) -> Scene:
     Bounds are found anew, from the dynamic training cameras alone; DevrfError if these do not
     tell.
     """
-    views, held_out = scene.dynamic.train, scene.dynamic.test
-    at_rest = [v[(v.times == v.times.min()).nonzero()[:, 0]] for v in (views, held_out)]
+    views = scene.dynamic.train
+    held_out = scene.dynamic.test
+    at_rest = Capture(train=_earliest(views), test=_earliest(held_out))
     if isinstance(scene.space, NormalizedDevice):
         bounds = forward_bounds([views], scene.space, "all that the dynamic cameras see")
-        return replace(scene, static=Capture(*at_rest), bounds=bounds)
+        return replace(scene, static=at_rest, bounds=bounds)
     choice: SpaceChoice = "world" if scene.space.is_linear else "contracted"
     space, bounds = inward_space(choice, views, views, [views, held_out])
-    return replace(scene, static=Capture(*at_rest), bounds=bounds, space=space)
+    return replace(scene, static=at_rest, bounds=bounds, space=space)
+
+
+def _earliest(views: Views) -> Views:
+    return views[(views.times == views.times.min()).nonzero()[:, 0]]

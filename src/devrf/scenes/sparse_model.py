@@ -42,7 +42,7 @@ class ModelImage:
         name: relative to the folder of images.
         camera: number of its camera.
         quaternion: w, x, y, z of the world-to-camera rotation, x right, y down, z ahead.
-        translation: of the same.
+        translation: translation of the same transform.
         points: (K,) int64, numbers of the points that it shows.
     """
 
@@ -75,12 +75,13 @@ class SparseModel:
     @cached_property
     def poses(self) -> Tensor:
         """(N, 3, 4) float64 camera-to-world, OpenGL axes, world units."""
-        quaternion = torch.tensor([one.quaternion for one in self.images], dtype=torch.float64)
-        to_camera = quaternion_to_rotation_matrix(quaternion)
-        moved = torch.tensor([one.translation for one in self.images], dtype=torch.float64)
+        quaternions = [image.quaternion for image in self.images]
+        translations = [image.translation for image in self.images]
+        to_camera = quaternion_to_rotation_matrix(torch.tensor(quaternions, dtype=torch.float64))
+        translation = torch.tensor(translations, dtype=torch.float64)
         # COLMAP's y points down and its z ahead; ours point up and back.
         axes = to_camera.mT * to_camera.new_tensor([1, -1, -1])
-        return torch.cat([axes, -(to_camera.mT @ moved[:, :, None])], dim=2)
+        return torch.cat([axes, -(to_camera.mT @ translation[:, :, None])], dim=2)
 
     @property
     def intrinsics(self) -> list[Intrinsics]:
@@ -112,18 +113,18 @@ def model_folder(root: Path) -> Path | None:
 def read_model(folder: Path) -> SparseModel:
     """The sparse model in a folder, as pycolmap reads it: binary where both forms are there.
 
-    DevrfError without pycolmap, of a missing or damaged file, or of a camera's model.
+    DevrfError without pycolmap, for a missing or damaged file, or an unknown camera model.
     """
     if find_spec("pycolmap") is None:
         raise scene_error(folder, 'pycolmap reads it; run pip install "devrf[capture]"')
     library: Any = importlib.import_module("pycolmap")
     library.logging.minloglevel = 3
     with decoding(folder, "COLMAP model", "run COLMAP's mapper again"):
-        found = library.Reconstruction(folder)
-        numbers = np.array(sorted(found.point3D_ids()), np.int64)
-        points = np.array([found.point3D(n).xyz for n in numbers.tolist()], np.float64)
-        cameras = {number: _camera(folder, camera) for number, camera in found.cameras.items()}
-        images = [_image(image) for image in found.images.values() if image.has_pose]
+        model = library.Reconstruction(folder)
+        numbers = np.array(sorted(model.point3D_ids()), np.int64)
+        points = np.array([model.point3D(n).xyz for n in numbers.tolist()], np.float64)
+        cameras = {number: _camera(folder, camera) for number, camera in model.cameras.items()}
+        images = [_image(image) for image in model.images.values() if image.has_pose]
     if not images:
         raise scene_error(folder, "poses no image; run COLMAP's mapper again")
     ordered = tuple(sorted(images, key=lambda image: image.name))
@@ -138,10 +139,11 @@ def _camera(folder: Path, camera: Any) -> dict[str, float]:
             f"camera model {model} is not supported, only {', '.join(PARAMETERS)}; run COLMAP's "
             "image_undistorter, and give its folder",
         )
-    given = dict(zip(PARAMETERS[model], camera.params.tolist(), strict=True))
-    focal = given.pop("f", 0.0)
-    fx, fy = (given.pop(name, focal) for name in ("fx", "fy"))
-    return {"fl_x": fx, "fl_y": fy, "w": camera.width, "h": camera.height, **given}
+    parameters = dict(zip(PARAMETERS[model], camera.params.tolist(), strict=True))
+    focal = parameters.pop("f", 0.0)
+    fx = parameters.pop("fx", focal)
+    fy = parameters.pop("fy", focal)
+    return {"fl_x": fx, "fl_y": fy, "w": camera.width, "h": camera.height, **parameters}
 
 
 def _image(image: Any) -> ModelImage:
@@ -157,9 +159,10 @@ Facing = Literal["auto", "forward", "inward"]
 
 # Cameras that all look within so many degrees of one direction face the scene from one side.
 ONE_SIDE = 45.0
-# From fewer points, each counted in every image that shows it, nothing is said.
+# The least number of points, each counted in every image that shows it, from which near and far are
+# found.
 LEAST_POINTS = 50
-# Of the points so many per cent on either side may be wrong.
+# So many per cent of the points on either side may be wrong.
 OUTLIERS = 1.0
 # In the forward-facing world, the unit that makes the nearest point's distance 1/0.75: LLFF's.
 NEAREST = 1 / 0.75
@@ -177,7 +180,7 @@ class World:
         space: ``ndc`` or ``contracted``.
         near: distance before which nothing is, world units.
         far: distance behind which no sparse point is, world units.
-        box: low and high corner of what is looked at; None of ``ndc``, and where the cameras' axes
+        box: low and high corner of what is looked at; None for ``ndc``, and if the cameras' axes
             meet: what all cameras see is then the better guess.
     """
 
@@ -194,7 +197,8 @@ def normalised(model: SparseModel, facing: Facing = "auto") -> World:
 
     ``facing`` says from where the cameras look. DevrfError if points or cameras do not tell.
     """
-    poses, points = model.poses, torch.from_numpy(model.points)
+    poses = model.poses
+    points = torch.from_numpy(model.points)
     depths = torch.cat([model.depths(k) for k in range(len(model.images))])
     depths = depths[depths > 0]
     if len(depths) < LEAST_POINTS:
@@ -203,7 +207,8 @@ def normalised(model: SparseModel, facing: Facing = "auto") -> World:
             f"its images show {len(depths)} sparse points, expected {LEAST_POINTS} or more; "
             "film it with more texture in sight",
         )
-    near, far = (float(np.percentile(depths.numpy(), p)) for p in (OUTLIERS, 100 - OUTLIERS))
+    near = float(np.percentile(depths.numpy(), OUTLIERS))
+    far = float(np.percentile(depths.numpy(), 100 - OUTLIERS))
     if facing == "auto":
         facing = "forward" if widest_angle(poses) <= ONE_SIDE else "inward"
     world = (_forward if facing == "forward" else _inward)(poses, points, near, far)
@@ -223,13 +228,15 @@ def widest_angle(poses: Tensor) -> float:
 
 
 def _forward(poses: Tensor, points: Tensor, near: float, far: float) -> World:
-    frame, scale = average_pose(poses), NEAREST / near
-    return World(*_moved(poses, points, frame, scale), "ndc", 1.0, far * scale, None)
+    frame = average_pose(poses)
+    scale = NEAREST / near
+    poses, points = _moved(poses, points, frame, scale)
+    return World(poses, points, space="ndc", near=1.0, far=far * scale, box=None)
 
 
 def _inward(poses: Tensor, points: Tensor, near: float, far: float) -> World:
-    met = nearest_point(poses[:, :, 3], poses[:, :, 2], 1e-2)
-    middle = points.median(dim=0).values if met is None else met
+    axes_meet = nearest_point(poses[:, :, 3], poses[:, :, 2], 1e-2)
+    middle = points.median(dim=0).values if axes_meet is None else axes_meet
     # z up, as far as the cameras were held upright.
     up = normalize(poses[:, :, 1].sum(dim=0), dim=0)
     aside = torch.eye(3, dtype=poses.dtype)[int(up.abs().argmin())]
@@ -237,19 +244,18 @@ def _inward(poses: Tensor, points: Tensor, near: float, far: float) -> World:
     frame = torch.stack([right, torch.linalg.cross(up, right), up, middle], dim=1)
     scale = AROUND / float((poses[:, :, 3] - middle).norm(dim=1).median())
     poses, points = _moved(poses, points, frame, scale)
-    near, far = 0.5 * near * scale, far * scale
-    if met is not None:
-        # Sparse points are on floor and walls, too: in their box the thing would have a fraction of
-        # the voxels.
+    near = 0.5 * near * scale
+    far = far * scale
+    if axes_meet is not None:
+        # Sparse points are on floor and walls, too: in their box what is looked at would have a
+        # fraction of the voxels.
         return World(poses, points, "contracted", near, far, None)
     # What the sparse points around the middle span, and no more than the cameras go round.
     around = points[points.norm(dim=1) < AROUND]
     if len(around) < 10:
         around = points
-    low, high = (
-        np.clip(np.percentile(around.numpy(), p, axis=0), -AROUND, AROUND)
-        for p in (2 * OUTLIERS, 100 - 2 * OUTLIERS)
-    )
+    low = np.percentile(around.numpy(), 2 * OUTLIERS, axis=0).clip(-AROUND, AROUND)
+    high = np.percentile(around.numpy(), 100 - 2 * OUTLIERS, axis=0).clip(-AROUND, AROUND)
     margin = 0.1 * np.maximum(high - low, 0.1 * AROUND)
     inner = Box.of((low - margin).tolist(), (high + margin).tolist())
     return World(poses, points, "contracted", near, far, (inner.low, inner.high))

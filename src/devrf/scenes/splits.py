@@ -27,16 +27,16 @@ log = logging.getLogger(__name__)
 def every_nth(count: int, holdout: int, start: int | None = None) -> tuple[list[int], list[int]]:
     """The positions to learn from and those to hold out, of ``count`` ≥ 2 images.
 
-    Every ``holdout``-th (≥ 2) is held out, of fewer images the last one; ``start`` is the first: 0
-    for images at rest, as LLFF's scenes are scored; None: the last of the first run, since a
-    sequence begins at rest.
+    Every ``holdout``-th (≥ 2) is held out, or the last one if there are fewer. ``start`` is the
+    first that is held out: 0 for images at rest, as LLFF's scenes are scored; None:
+    ``holdout`` − 1, since a sequence begins at rest.
     """
     start = holdout - 1 if start is None else start
     held_out = list(range(start, count, holdout)) or [count - 1]
     return sorted(set(range(count)) - set(held_out)), held_out
 
 
-# Two poses are one camera when no entry differs by more than this, relative to its distance.
+# Two poses are those of one camera if no entry differs by more than this, relative to its distance.
 SAME_POSE = 1e-4
 
 
@@ -49,7 +49,7 @@ class Split:
         times: (N,) float32 in [0, 1].
         view: (N,) int64: the fixed camera of each image, or the image's own number.
         fixed: whether the cameras stand still while time passes.
-        index: (K,) int64 the positions in the file that are used, ascending.
+        index: (K,) int64, the positions in the file that are used, ascending.
     """
 
     transforms: Transforms
@@ -72,9 +72,10 @@ def distinct_poses(poses: Tensor) -> Tensor:
     """(N,) int64: which of the distinct poses each of (N, 3, 4) is, in order of appearance."""
     near = SAME_POSE * (1 + float(poses[:, :, 3].norm(dim=1).median()))
     entries = poses.flatten(1).double().numpy()
-    # Poses that are near each other are near each other along any line: of many, few are compared.
+    # Poses that are near each other are so along any line, too: only few have to be compared.
     line = np.sqrt(np.arange(2.0, 2 + entries.shape[1]))
-    along, reach = entries @ line, near * line.sum()
+    along = entries @ line
+    reach = near * line.sum()
     order = along.argsort()
     ends = np.searchsorted(along[order], [along - reach, along + reach])
     numbers = np.full(len(entries), -1)
@@ -88,9 +89,9 @@ def distinct_poses(poses: Tensor) -> Tensor:
 
 
 def stand_still(pose: Tensor) -> bool:
-    """Whether cameras are fixed, by the number of each image's pose, (N,): two images of each.
+    """Whether cameras are fixed, by the number of each image's pose (N,).
 
-    On average: a camera that moves may come back to a place.
+    They are if a pose has two images or more in the mean: a moving camera may come back to a place.
     """
     return len(pose) >= 2 * (int(pose.max()) + 1)
 
@@ -103,7 +104,7 @@ def at_rest(transforms: Transforms) -> Split:
 
 
 def at_one_moment(transforms: Transforms) -> Split:
-    """A split of a scene that never moves: as :func:`at_rest`, whatever one time the file gives."""
+    """A split of a scene that never moves: as :func:`at_rest`, at time 0 whatever the file says."""
     return replace(at_rest(transforms), times=torch.zeros(len(transforms.images)))
 
 
@@ -122,7 +123,8 @@ def in_motion(transforms: Transforms) -> Split:
     """
     order = torch.arange(len(transforms.images))
     camera = distinct_poses(transforms.poses)
-    views, fixed = int(camera.max()) + 1, stand_still(camera)
+    views = int(camera.max()) + 1
+    fixed = stand_still(camera)
     if transforms.times is not None:
         times = torch.tensor(transforms.times)
     else:
@@ -190,22 +192,24 @@ def load_views(split: Split, root: Path, downscale: int, masks: Masks = "none") 
     """
     used = split.index
     files = [split.transforms.images[i] for i in used.tolist()]
-    known = [split.transforms.intrinsics[i] for i in used.tolist()]
-    sizes = [inner.size for inner in known]
-    listed = [split.transforms.masks[i] for i in used.tolist()] if split.transforms.masks else []
-    finish = cutting_out(listed, sizes, files) if masks == "alpha" else None
+    intrinsics = [split.transforms.intrinsics[i] for i in used.tolist()]
+    sizes = [known.size for known in intrinsics]
+    mask_files = (
+        [split.transforms.masks[i] for i in used.tolist()] if split.transforms.masks else []
+    )
+    finish = cutting_out(mask_files, sizes, files) if masks == "alpha" else None
     loaded = load_images(files, downscale, sizes, finish)
     height, width = loaded.pixels.shape[1:3]
     distorted = [
-        inner.lens(loaded.width, loaded.height, file).scaled(
+        known.lens(loaded.width, loaded.height, file).scaled(
             width / loaded.width, height / loaded.height
         )
-        for inner, file in zip(known, files, strict=True)
+        for known, file in zip(intrinsics, files, strict=True)
     ]
     valid_mask = None
     if masks == "ignore":
         valid_mask = valid_pixels(
-            listed, (loaded.width, loaded.height), (width, height), sizes, distorted, files
+            mask_files, (loaded.width, loaded.height), (width, height), sizes, distorted, files
         )
     # Undistorted after the images are made smaller: a tenth of the work for the same picture.
     pixels, lenses = as_pinhole(loaded.pixels, distorted, files)

@@ -51,11 +51,11 @@ FileNames = Annotated[list[Name], Field(fail_fast=True)]
 
 
 class SceneBounds(BaseModel):
-    """What devrf itself writes of a scene that it has captured; other programs pass it over.
+    """What devrf itself writes about a scene that it has captured; other programs ignore it.
 
     Attributes:
         space: in which the scene is learned: ``ndc`` for cameras that face it from one side.
-        near: distance before which nothing is, world units; of ``ndc`` the near plane's.
+        near: distance before which nothing is, world units; for ``ndc`` the near plane's.
         far: distance behind which nothing is, world units; None: unknown.
         box: the part that is looked at, low and high corner, world units; None: unknown.
     """
@@ -96,8 +96,8 @@ class Transforms:
         images: N existing files inside the scene's folder.
         poses: (N, 3, 4) float32 camera-to-world, OpenGL axes, world units.
         times: N times in [0, 1], or None when the file gives none.
-        masks: N existing files inside the scene's folder, or None of an image without one; None
-            where they were not asked for.
+        masks: N existing files inside the scene's folder, None for an image without one; None if
+            they were not asked for.
         skipped: how many images of the file are absent, and left out.
         bounds: where the scene is, if the file says so.
     """
@@ -136,7 +136,7 @@ def read_transforms(
             negative focal length …), a pose is no rigid transform, or only some frames have a time.
     """
     listing = read_json(file, TransformsFile, "every capture needs its posed images")
-    images = present_images([one.file_path for one in listing.frames], file, root, missing)
+    images = present_images([frame.file_path for frame in listing.frames], file, root, missing)
     frames = [listing.frames[index] for index in images]
     where = [f"{file}: frames[{index}]" for index in images]
     times = [frame.time for frame in frames]

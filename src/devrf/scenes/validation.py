@@ -42,26 +42,26 @@ def first_error(error: ValidationError, where: str) -> DevrfError:
         error: what a model or an adapter raised.
         where: what comes before the key: ``FILE: `` for values in a file, ``data.`` for options.
     """
-    found = error.errors(include_url=False)[0]
-    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in found["loc"])
+    first = error.errors(include_url=False)[0]
+    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"])
     place = f"{where}{key.removeprefix('.')}" if key else where.rstrip(": .")
-    if found["type"] == "json_invalid":
-        return scene_error(place, f"not valid JSON ({found['ctx']['error']}); write it again")
-    if found["type"] == "missing":
+    if first["type"] == "json_invalid":
+        return scene_error(place, f"not valid JSON ({first['ctx']['error']}); write it again")
+    if first["type"] == "missing":
         return scene_error(place, "is missing; add it")
-    if found["type"] == "unexpected_keyword_argument":
+    if first["type"] == "unexpected_keyword_argument":
         return scene_error(place, "no such option; correct its name")
-    if found["type"] == "value_error":  # raised by a validator of ours
-        return scene_error(place, str(found["ctx"]["error"]))
-    expected = found["msg"].removeprefix("Input ").replace(" after validation", "")
-    # Of lists that are too short or too long, the message says the length itself.
-    given = "" if ", not " in expected else f", not {abbreviated(found['input'])}"
-    return scene_error(place, f"{expected[0].lower()}{expected[1:]}{given}; correct it")
+    if first["type"] == "value_error":  # raised by a validator of ours
+        return scene_error(place, str(first["ctx"]["error"]))
+    expected = first["msg"].removeprefix("Input ").replace(" after validation", "")
+    # For lists that are too short or too long, the message says the length itself.
+    value = "" if ", not " in expected else f", not {abbreviated(first['input'])}"
+    return scene_error(place, f"{expected[0].lower()}{expected[1:]}{value}; correct it")
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class Options:
-    """Options of a scene, checked when they are given; a wrong one is a DevrfError of one line."""
+    """Options of a scene, checked when they are set; a wrong one is a DevrfError of one line."""
 
     @model_validator(mode="wrap")
     @classmethod
@@ -85,7 +85,8 @@ def _shortened(text: str, most: int) -> str:
 
 def reduced_size(width: int, height: int, downscale: int, where: object) -> tuple[int, int]:
     """(width, height) // downscale, or DevrfError if a side falls under 8 px."""
-    w, h = width // downscale, height // downscale
+    w = width // downscale
+    h = height // downscale
     if min(w, h) < MIN_SIDE:
         raise scene_error(
             where,
@@ -94,9 +95,9 @@ def reduced_size(width: int, height: int, downscale: int, where: object) -> tupl
     return w, h
 
 
-def same_shape(one: tuple[float, float], other: tuple[float, float]) -> bool:
+def same_shape(size: tuple[float, float], other: tuple[float, float]) -> bool:
     """Whether two (width, height) are those of one image at two scales, sides rounded."""
-    return abs(one[0] * other[1] / (one[1] * other[0]) - 1) <= SAME_SHAPE
+    return abs(size[0] * other[1] / (size[1] * other[0]) - 1) <= SAME_SHAPE
 
 
 def checked_box(value: object) -> Box:
@@ -117,13 +118,13 @@ def checked_box(value: object) -> Box:
 
 def check_memory(needed: int, where: object, what: str) -> None:
     """DevrfError if ``what``, which ``where`` asks for, takes more bytes than the machine has."""
-    there = psutil.virtual_memory().total
-    if needed > there:
+    total = psutil.virtual_memory().total
+    if needed > total:
         raise scene_error(
             where,
             f"{what} take {needed / 2**30:.1f} GiB, but this machine has "
-            f"{there / 2**30:.1f} GiB of memory; make data.downscale "
-            f"{math.ceil(math.sqrt(needed / there))} times as large, or give fewer data.frames",
+            f"{total / 2**30:.1f} GiB of memory; make data.downscale "
+            f"{math.ceil(math.sqrt(needed / total))} times as large, or give fewer data.frames",
         )
 
 

@@ -40,8 +40,9 @@ def chosen_dynamic(root: Path, chosen: str | None) -> Path:
     if chosen is not None:
         named = [folder for folder in folders if folder.name == chosen]
         if not named:
-            found = names or "none"
-            raise scene_error(root, f"no folder {chosen!r} (found: {found}); correct data.dynamic")
+            raise scene_error(
+                root, f"no folder {chosen!r} (found: {names or 'none'}); correct data.dynamic"
+            )
         return named[0]
     if not folders:
         raise scene_error(root, "no folder dynamic_<V>views; add the capture of the moving scene")
@@ -147,13 +148,13 @@ def fixed_views(
 def flow_files(
     views: list[ViewFolder], direction: FlowDirection = "bwd"
 ) -> dict[tuple[int, int], Path]:
-    """Which file holds the backward flow of (view, frame), which frame 0 has not.
+    """The file that holds the backward flow of (view, frame); frame 0 has none.
 
     Forward flow is in ``<frame>_fwd.npz``, and the last frame has none.
 
     ``<frame>_bwd.npz`` may name a frame in three ways: by its image's name (``0007`` for
     ``0007.png``), by the last number in it (``7`` for ``img_0007.png``), or by its position,
-    counted from 0. The way that finds the most files holds for all views; in doubt the first.
+    counted from 0. The way that finds the most files holds for all views; of equal ones the first.
     """
     suffix = f"_{direction}.npz"
     ways: tuple[Callable[[int, Path], str | int | None], ...] = (
@@ -168,11 +169,11 @@ def flow_files(
         for files in [_named(view.flow, suffix)]
         for k in (range(1, frames) if direction == "bwd" else range(frames - 1))
     ]
-    found = [
+    candidates = [
         {(v, k): files[name] for v, k, image, files in shots if (name := way(k, image)) in files}
         for way in ways
     ]
-    best = max(found, key=len)
+    best = max(candidates, key=len)
     if best:
         warn_of_missing(len(best), len(shots), views[0].flow)
     return best

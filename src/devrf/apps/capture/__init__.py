@@ -17,9 +17,9 @@
 ``footage`` and ``normalisation`` are in :mod:`devrf.scenes`, whose readers use them, too;
 ``picking`` is in ``survey``, ``frames`` in ``images``, and ``writing`` in ``pipeline``.
 
-What a step has found is kept in ``<into>/capture`` together with what it was found from: the same
-command again goes on behind the last step that still holds. ``transforms.json`` is written last:
-a folder with it is whole.
+Each step keeps its result in ``<into>/capture``, with a hash of what it was made from: the same
+command again continues after the last step whose inputs are unchanged. ``transforms.json`` is
+written last: a folder that has it is complete.
 
 World: OpenGL axes. Cameras that face the scene from one side get the world of their average pose
 (x right, y up, −z ahead), in which the nearest point is at 1/0.75; cameras around the scene one in

@@ -50,17 +50,20 @@ def timeline(
 ) -> Timeline:
     """Align the videos of the fixed views, ``offsets`` seconds after the first, or as they move.
 
-    The times are those of the frames of the video with the lowest rate, every n-th where it has
-    more of them than ``max_timesteps``; of the others the nearest frames are taken.
+    The times are those of the frames of the video with the lowest rate, every n-th if it has more
+    of them than ``max_timesteps``. The other videos give the frames nearest to these times.
 
     Raises:
         DevrfError: the offsets cannot be found, or the videos have too little time in common.
     """
     begun = list(map(float, offsets)) if offsets is not None else offsets_found(paths, surveys)
     clocks = [begin + np.array(s.times) for begin, s in zip(begun, surveys, strict=True)]
-    first, last = (np.array([clock[k] for clock in clocks]) for k in (0, -1))
-    start, end = first.max(), last.min()
-    shortest, longest = (last - first).min(), (last - first).max()
+    first = np.array([clock[0] for clock in clocks])
+    last = np.array([clock[-1] for clock in clocks])
+    start = first.max()
+    end = last.min()
+    shortest = (last - first).min()
+    longest = (last - first).max()
     if end - start < LEAST_OVERLAP * shortest:
         late = paths[int(first.argmax())]
         raise DevrfError(
@@ -71,7 +74,9 @@ def timeline(
     if end - start < 0.95 * longest:
         log.info(
             "videos of different lengths: %.2f to %.2f s; the %.2f s that all show are used",
-            *(shortest, longest, end - start),
+            shortest,
+            longest,
+            end - start,
         )
     slowest = int(np.argmin([survey.rate for survey in surveys]))
     slack = 0.5 / surveys[slowest].rate
@@ -121,7 +126,8 @@ def offset_between(first: Survey, second: Survey) -> tuple[float, float]:
     part that is large in one view from deciding alone.
     """
     step = 1 / (STEPS_A_FRAME * max(first.rate, second.rate))
-    (a, a_start), (b, b_start) = _sampled(first, step), _sampled(second, step)
+    a, a_start = _sampled(first, step)
+    b, b_start = _sampled(second, step)
     min_overlap = max(2, int(LEAST_OVERLAP * min(len(a), len(b))))
     lags = np.arange(min_overlap - len(b), len(a) - min_overlap + 1)
     values = np.array([_correlation(a, b, int(lag)) for lag in lags])
@@ -145,9 +151,11 @@ def _sampled(survey: Survey, step: float) -> tuple[Signal, float]:
 
 
 def _correlation(a: Signal, b: Signal, lag: int) -> float:
-    """Of the parts of two signals that overlap when the second is moved by ``lag`` samples."""
-    low, high = max(0, lag), min(len(a), len(b) + lag)
-    a, b = a[low:high], b[low - lag : high - lag]
+    """The correlation of what overlaps of two signals, the second moved by ``lag`` samples."""
+    low = max(0, lag)
+    high = min(len(a), len(b) + lag)
+    a = a[low:high]
+    b = b[low - lag : high - lag]
     return float(np.corrcoef(a, b)[0, 1]) if a.std() * b.std() > 0 else -1.0
 
 

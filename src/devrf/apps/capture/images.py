@@ -33,8 +33,8 @@ class Chosen:
 
     Attributes:
         label: the folder of its images: ``static``, ``view1`` …
-        positions: of its frames, ascending where distinct; a frame may be wanted twice.
-        masks: of all its frames, which become the images' alpha; None: the images have none.
+        positions: positions of its frames, ascending; one may appear twice.
+        masks: alpha masks of all its frames; None: the images have no alpha.
     """
 
     path: Path
@@ -93,8 +93,10 @@ def fitted(picture: Picture, size: Size) -> Picture:
     """A picture cropped in the middle to the proportions of ``size``, and brought to it."""
     height, width = picture.shape[:2]
     scale = max(size[0] / width, size[1] / height)
-    w, h = min(width, round(size[0] / scale)), min(height, round(size[1] / scale))
-    left, top = (width - w) // 2, (height - h) // 2
+    w = min(width, round(size[0] / scale))
+    h = min(height, round(size[1] / scale))
+    left = (width - w) // 2
+    top = (height - h) // 2
     part = picture[top : top + h, left : left + w]
     if (w, h) == size:
         return part
@@ -111,8 +113,8 @@ VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm")
 def alpha_masks_of(folder: Path, footage: Path, count: int) -> Path:
     """The alpha masks of some footage: ``<folder>/<its name without suffix>``, a folder or a video.
 
-    Of photographs it is a folder with a file of each one's name; of a video one with as many
-    images as it has frames (``count``), in the order of their names, or a video of as many frames.
+    For photographs it is a folder with a file of each one's name. For a video of ``count`` frames
+    it is a folder of as many images, in the order of their names, or a video of as many frames.
 
     Raises:
         DevrfError: there are none, or not of all frames.
@@ -181,12 +183,13 @@ def _of_photograph(masks: Path, photograph: Path) -> Path:
 
 log = logging.getLogger(__name__)
 
-# Silhouettes are found in images of so many pixels of the longer side: a box needs no more.
+# Longer side, in pixels, of the images in which silhouettes are found: a box needs no more.
 LONGER_SIDE = 320
-# Squared distance from the background, in its variances, from which a pixel moves; and the
-# variance that a pixel has at least, in grey levels squared (compression).
-_FAR, _LEAST_VARIANCE = 25.0, 16.0
-# What a pixel shows for this share of the pictures is background; of less, it moves.
+# A pixel moves from this squared distance to the background on, in units of its variance.
+_FAR = 25.0
+# The least variance of a pixel, in grey levels squared (compression).
+_LEAST_VARIANCE = 16.0
+# What a pixel shows in at least this share of the pictures is background.
 _MOST_OF_THE_TIME = 0.5
 # Connected pixels that are a smaller share of the image are noise.
 _SPECK = 5e-4
@@ -203,7 +206,7 @@ def silhouettes(pictures: Sequence[Picture]) -> list[Mask]:
     model.setVarInit(_LEAST_VARIANCE)
     model.setBackgroundRatio(_MOST_OF_THE_TIME)
     for picture in pictures:
-        # Of equal weight, whatever their order.
+        # All pictures have equal weight, whatever their order.
         model.apply(picture, learningRate=1 / len(pictures))
     return [_without_specks(model.apply(picture, learningRate=0)) for picture in pictures]
 
@@ -235,17 +238,17 @@ def box_of_motion(
     Raises:
         DevrfError: nothing moves in what two views see.
     """
-    shown: list[Mask] = []
+    masks: list[Mask] = []
     for view_names in names:
         pictures = [cv2.imread(str(images / name), cv2.IMREAD_COLOR) for name in view_names]
-        shown += silhouettes([shrunk(np.asarray(p, np.uint8), LONGER_SIDE) for p in pictures])
+        masks += silhouettes([shrunk(np.asarray(p, np.uint8), LONGER_SIDE) for p in pictures])
     count = len(names[0])
-    height, width = shown[0].shape
+    height, width = masks[0].shape
     keys = ("fl_x", "fl_y", "cx", "cy")
     intrinsics = [[lens[key] * (width / lens["w"]) for key in keys] for lens in lenses]
     focal, center = torch.split(torch.tensor(intrinsics, dtype=torch.float32), 2, dim=1)
     view = torch.arange(len(names)).repeat_interleave(count)
-    alpha = torch.from_numpy(np.stack(shown))[..., None]
+    alpha = torch.from_numpy(np.stack(masks))[..., None]
     views = Views(
         alpha.expand(-1, -1, -1, 4),
         Cameras(poses.float(), focal, center, width, height)[view],
@@ -253,7 +256,7 @@ def box_of_motion(
         view,
         tuple(name for view_names in names for name in view_names),
     )
-    # Coarsely where it is, then with a finer grid.
+    # A coarse search first, then one with a finer grid.
     coarse = motion_box(views, around)
     box = None if coarse is None else motion_box(views, coarse)
     if box is None:

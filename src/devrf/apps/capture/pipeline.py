@@ -33,10 +33,11 @@ from devrf.system.progress import followed
 
 log = logging.getLogger(__name__)
 
-# Part of every key: a change of a step makes what was kept before foreign.
+# Part of every key: a new version makes earlier results invalid.
 VERSION = 1
-# Below the scene's folder: what the steps have found, and the images.
-WORK, IMAGES = "capture", "images"
+# Folders below the scene's: the results of the steps, and the images.
+WORK = "capture"
+IMAGES = "images"
 
 
 def scene_from_footage(settings: CaptureSettings) -> Path:
@@ -82,8 +83,8 @@ def scene_from_footage(settings: CaptureSettings) -> Path:
         log.info("cameras look %s-facing; capture.facing says otherwise", facing)
     if settings.subtracts:
         world = _around_motion(world, model, into / IMAGES, fixed)
-    taken = surveys[static].times if settings.monocular else None
-    frames, test = _frames(model, world, moving, fixed, clock, settings, taken)
+    frame_seconds = surveys[static].times if settings.monocular else None
+    frames, test = _frames(model, world, moving, fixed, clock, settings, frame_seconds)
     names = [frame["file_path"] for frame in frames]
     bounds: dict[str, Any] = {"space": world.space, "near": world.near, "far": world.far}
     if world.box is not None:
@@ -104,7 +105,7 @@ def scene_from_footage(settings: CaptureSettings) -> Path:
 
 
 def kept(file: Path, source: Any, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """What ``make`` returns, or what the JSON ``file`` keeps that it made from the same source."""
+    """What ``make`` returns; read from the JSON ``file`` if that was made from the same source."""
     key = _digest(source)
     if file.is_file():
         stored = json.loads(file.read_text())
@@ -154,7 +155,13 @@ def _surveyed(path: Path, work: Path) -> Survey:
 
     slug = f"{path.stem}-{_digest(str(path.resolve()))[:6]}"
     values = kept(work / f"survey-{slug}.json", _stamp(path), make)
-    return Survey(*(tuple(values[key]) for key in ("size", "times", "sharpness", "motion")))
+    width, height = values["size"]
+    return Survey(
+        size=(width, height),
+        times=tuple(values["times"]),
+        sharpness=tuple(values["sharpness"]),
+        motion=tuple(values["motion"]),
+    )
 
 
 def _write_images(
@@ -165,14 +172,15 @@ def _write_images(
     filmed: dict[Path, tuple[int, int]],
 ) -> None:
     """The images, written again where anything has changed."""
-    images, file = into / IMAGES, work / "images.json"
+    images = into / IMAGES
+    file = work / "images.json"
     source = [
         [video.label, _stamp(video.path), video.positions, video.masks and _stamp(video.masks)]
         for video in footage
     ]
 
     def make() -> dict[str, Any]:
-        # What they belong to is no longer whole.
+        # The scene that they belong to is no longer complete.
         (into / FILE).unlink(missing_ok=True)
         shutil.rmtree(images, ignore_errors=True)
         for video in footage:
@@ -225,17 +233,19 @@ def _frames(
     fixed: Sequence[Chosen],
     clock: Timeline,
     settings: CaptureSettings,
-    taken: Sequence[float] | None,
+    frame_seconds: Sequence[float] | None,
 ) -> tuple[list[dict[str, Any]], set[str]]:
     """All images with cameras and times, as nerfstudio's file has them; which are held out.
 
-    ``taken`` are seconds of the moving camera's frames, if the scene moved before it.
+    ``frame_seconds`` are the times of the moving camera's frames, if the scene moved before it.
     """
     place = {image.name: k for k, image in enumerate(model.images)}
-    frames, test = list[dict[str, Any]](), set[str]()
+    frames = list[dict[str, Any]]()
+    test = set[str]()
 
     def add(name: str, camera: str, time: float, held_out: bool) -> None:
-        k, path = place[camera], f"{IMAGES}/{name}"
+        k = place[camera]
+        path = f"{IMAGES}/{name}"
         lens = model.cameras[model.images[k].camera]
         pose = [*world.poses[k].tolist(), [0.0, 0.0, 0.0, 1.0]]
         frames.append({"file_path": path, "time": time, **lens, "transform_matrix": pose})
@@ -243,16 +253,18 @@ def _frames(
             test.add(path)
 
     named = zip(moving.positions, moving.names, strict=True)
-    known = [(position, name) for position, name in named if name in place]
-    _, held_out = every_nth(len(known), settings.holdout)
-    first, last = known[0][0], known[-1][0]
-    for k, (position, name) in enumerate(known):
+    posed = [(position, name) for position, name in named if name in place]
+    _, held_out = every_nth(len(posed), settings.holdout)
+    first = posed[0][0]
+    last = posed[-1][0]
+    for k, (position, name) in enumerate(posed):
         time = 0.0
-        if taken is not None:
-            time = (taken[position] - taken[first]) / (taken[last] - taken[first])
+        if frame_seconds is not None:
+            duration = frame_seconds[last] - frame_seconds[first]
+            time = (frame_seconds[position] - frame_seconds[first]) / duration
         add(name, name, time, k in held_out)
     test_view = settings.test_view - (settings.test_view > 0)
-    _, held_out = every_nth(len(clock.times), settings.holdout) if fixed else ([], [])
+    held_out = every_nth(len(clock.times), settings.holdout)[1] if fixed else []
     for v, video in enumerate(fixed):
         for k, (name, time) in enumerate(zip(video.names, clock.times, strict=True)):
             is_test = v == test_view % len(fixed) if len(fixed) > 1 else k in held_out

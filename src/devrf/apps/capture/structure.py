@@ -21,10 +21,10 @@ from devrf.scenes.sparse_model import SparseModel, read_model
 
 log = logging.getLogger(__name__)
 
-# Of a video, an image is compared with so many that follow it, and then at doubling distances.
+# An image of a video is compared with so many that follow it, then with some at doubling distances.
 NEIGHBOURS = 10
-# Neighbouring frames of one video do not turn by more degrees than this, and so many times as much
-# as those in the middle: what looks alike has been taken for the same.
+# A camera that turns by more degrees than this between two frames of a video, and so many times the
+# median, has been placed wrongly: two places that look alike were taken for one.
 MOST_TURN = 45.0
 MOST_TURNS = 5.0
 # A model of a smaller share of a moving camera's images is not the scene.
@@ -72,13 +72,15 @@ def reconstruct(
     library: Any = importlib.import_module("pycolmap")
     library.logging.minloglevel = 3
     library.set_random_seed(0)
-    base, models, listed = work / "matches.db", work / "models", work / "pairs.txt"
+    base = work / "matches.db"
+    models = work / "models"
+    listed = work / "pairs.txt"
     base.unlink(missing_ok=True)
     shutil.rmtree(models, ignore_errors=True)
     models.mkdir(parents=True)
     names = [*dict.fromkeys([*moving.names, *fixed])]
     log.info("structure from motion: features of %d images", len(names))
-    modes, on_host = library.CameraMode, {"device": library.Device.cpu}
+    modes = library.CameraMode
     library.extract_features(
         base,
         images,
@@ -86,16 +88,16 @@ def reconstruct(
         camera_mode=modes.SINGLE if settings.intrinsics == "shared" else modes.PER_FOLDER,
         reader_options=library.ImageReaderOptions(camera_model=settings.camera),
         extraction_options=library.FeatureExtractionOptions(use_gpu=False),
-        **on_host,
+        device=library.Device.cpu,
     )
     compared = pairs(moving.names, [n for n in fixed if n not in moving.names], settings.matching)
     listed.write_text("".join(f"{a} {b}\n" for a, b in compared))
     log.info("structure from motion: matches of %d pairs", len(compared))
     matching = library.FeatureMatchingOptions(use_gpu=False)
-    wanted = library.ImportedPairingOptions(match_list_path=str(listed))
+    pairing = library.ImportedPairingOptions(match_list_path=str(listed))
     verification = library.TwoViewGeometryOptions()
     verification.ransac.random_seed = 0
-    library.match_image_pairs(base, matching, wanted, verification, **on_host)
+    library.match_image_pairs(base, matching, pairing, verification, device=library.Device.cpu)
     log.info("structure from motion: cameras and points")
     mapping = library.IncrementalPipelineOptions(random_seed=0, min_model_size=3)
     reconstructions = library.incremental_mapping(base, images, models, mapping)
@@ -116,19 +118,21 @@ def checked_model(folder: Path, moving: Chosen, fixed: dict[str, Path]) -> Spars
     """
     model = read_model(folder)
     placed = {image.name for image in model.images}
-    known = [name for name in moving.names if name in placed]
-    if len(known) < max(3, LEAST_SHARE * len(moving.names)):
+    posed = [name for name in moving.names if name in placed]
+    if len(posed) < max(3, LEAST_SHARE * len(moving.names)):
         raise DevrfError(
-            f"{moving.path}: cameras were found for {len(known)} of {len(moving.names)} frames "
+            f"{moving.path}: cameras were found for {len(posed)} of {len(moving.names)} frames "
             f"only, the others have too few matches with them; {_FILM}"
         )
-    if len(known) < len(moving.names):
+    if len(posed) < len(moving.names):
         log.warning(
             "%s: %d of %d frames could not be placed, and are left out",
-            *(moving.path, len(moving.names) - len(known), len(moving.names)),
+            moving.path,
+            len(moving.names) - len(posed),
+            len(moving.names),
         )
     if not is_folder(moving.path):
-        _check_turns(model, moving, known)
+        _check_turns(model, moving, posed)
     for name, path in fixed.items():
         if name not in placed:
             raise DevrfError(
@@ -139,16 +143,16 @@ def checked_model(folder: Path, moving: Chosen, fixed: dict[str, Path]) -> Spars
     return model
 
 
-def _check_turns(model: SparseModel, moving: Chosen, known: Sequence[str]) -> None:
+def _check_turns(model: SparseModel, moving: Chosen, posed: Sequence[str]) -> None:
     place = {image.name: k for k, image in enumerate(model.images)}
-    turns = model.poses[[place[name] for name in known], :, :3]
+    turns = model.poses[[place[name] for name in posed], :, :3]
     trace = (turns[1:] * turns[:-1]).sum(dim=(1, 2))
     degrees = torch.rad2deg(((trace - 1) / 2).clamp(-1, 1).acos())
     worst = int(degrees.argmax())
     turn = float(degrees[worst])
     if turn > max(MOST_TURN, MOST_TURNS * float(degrees.median())):
         raise DevrfError(
-            f"{moving.path}: between {Path(known[worst]).stem} and {Path(known[worst + 1]).stem}, "
+            f"{moving.path}: between {Path(posed[worst]).stem} and {Path(posed[worst + 1]).stem}, "
             f"frames that follow one another, its camera seems to turn by {turn:.0f} degrees: "
             "different places look alike; give more frames with capture.frames, or "
             "capture.matching=sequential, or film where there is more texture"

@@ -21,12 +21,13 @@ log = logging.getLogger(__name__)
 # Frames are looked at with so many pixels of the longer side: much smaller ones hide blur, larger
 # ones show the sensor's noise.
 LONGER_SIDE = 640
-# Motion is compared where noise and compression have been averaged away.
+# Longer side, in pixels, of the images in which motion is measured: noise and compression are
+# averaged away.
 MOTION_SIDE = 160
-# So many grey levels of change are noise.
+# A change of so many grey levels, or fewer, is noise.
 NOISE = 2.0
-# Below this, an image of a textured scene is blurred so far that few features are left. Of sharp
-# photographs the value is 0.5 and more; of strong blur up to 0.44, as H.264 makes blocks of it.
+# Below this, an image of a textured scene is blurred so far that few features are left. Sharp
+# photographs have 0.5 and more; strong blur has up to 0.44, as H.264 makes blocks of it.
 BLURRED = 0.45
 # From fewer images there is no structure from motion worth the name.
 MIN_IMAGES = 3
@@ -64,7 +65,9 @@ def survey(path: Path, frames: Iterable[tuple[float, Picture]] | None = None) ->
             several sizes.
     """
     size: tuple[int, int] | None = None
-    times, sharp, motion = list[float](), list[float](), list[float]()
+    times = list[float]()
+    sharp = list[float]()
+    motion = list[float]()
     before: Grey | None = None
     for time, picture in frames or pictures(path):
         height, width = picture.shape[:2]
@@ -73,7 +76,7 @@ def survey(path: Path, frames: Iterable[tuple[float, Picture]] | None = None) ->
                 f"{path}: image {len(times) + 1} has {width}x{height} px, those before it have "
                 f"{size}; bring all images to one size"
             )
-        size = width, height
+        size = (width, height)
         grey = shrunk(
             np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.float32), LONGER_SIDE
         )
@@ -90,8 +93,8 @@ def survey(path: Path, frames: Iterable[tuple[float, Picture]] | None = None) ->
 def sharpness(grey: Grey) -> float:
     """How sharp an image (H, W) is, from 0 (blurred) to 1, whatever it shows.
 
-    What a strong blur takes away of the differences between neighbouring pixels, as a share of
-    them: much of a sharp image, little of one that is blurred already (Crété et al., "The blur
+    It is the share of the differences between neighbouring pixels that a strong blur takes away:
+    large for a sharp image, small for one that is blurred already (Crété et al., "The blur
     effect", 2007). The less sharp of both directions counts.
     """
     shares = []

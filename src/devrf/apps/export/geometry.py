@@ -92,9 +92,12 @@ class UpFrame:
             mean = cameras.camera_to_world[:, :, 1].mean(dim=0)
             axis = int(mean.abs().argmax())
             up = cast(Up, "-" * bool(mean[axis] < 0) + "xyz"[axis])
-        axis, sign = "xyz".index(up[-1]), -1.0 if up.startswith("-") else 1.0
-        x, y = torch.zeros(3), torch.zeros(3)
-        x[1 if axis == 0 else 0], y[axis] = 1.0, sign
+        axis = "xyz".index(up[-1])
+        sign = -1.0 if up.startswith("-") else 1.0
+        x = torch.zeros(3)
+        y = torch.zeros(3)
+        x[1 if axis == 0 else 0] = 1.0
+        y[axis] = sign
         return cls(torch.stack([x, y, torch.linalg.cross(x, y)]), metres, up)
 
     def points(self, points: Tensor) -> Tensor:
@@ -103,10 +106,11 @@ class UpFrame:
 
     def pose(self, camera: Cameras) -> Tensor:
         """Camera-to-frame (4, 4) float64 of one camera of the world, OpenGL axes."""
-        pose, whole = camera.camera_to_world[0], torch.eye(4, dtype=torch.float64)
-        whole[:3, :3] = self.rotation @ pose[:, :3]
-        whole[:3, 3] = self.points(pose[:, 3])
-        return whole
+        pose = camera.camera_to_world[0]
+        camera_to_frame = torch.eye(4, dtype=torch.float64)
+        camera_to_frame[:3, :3] = self.rotation @ pose[:, :3]
+        camera_to_frame[:3, 3] = self.points(pose[:, 3])
+        return camera_to_frame
 
 
 @dataclass(frozen=True)
@@ -142,10 +146,11 @@ class MovingMesh:
 
 def carried(surface: Surface, model: Renderable, times: Sequence[float]) -> MovingMesh:
     """A surface at rest, carried through time: each canonical vertex q goes to x(q, t)."""
-    points, moved = surface.points.to(model.device), []
+    points = surface.points.to(model.device)
+    moved = []
     for time in times:
         forward = model.forward_map(time)
-        assert forward is not None  # who has a surface to export has it
+        assert forward is not None  # every model with a surface has one
         moved.append(model.space.to_world(forward(points)).float().cpu())
     return MovingMesh(tuple(times), torch.stack(moved), surface.faces, surface.colors)
 
@@ -156,7 +161,8 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     They point to where faces are counter-clockwise from; along z where all faces around are empty.
     """
     a, b, c = vertices[faces].unbind(dim=1)
-    across, normals = torch.linalg.cross(b - a, c - a), torch.zeros_like(vertices)
+    across = torch.linalg.cross(b - a, c - a)
+    normals = torch.zeros_like(vertices)
     for corner in range(3):
         normals.index_add_(0, faces[:, corner], across)
     lengths = normals.norm(dim=1, keepdim=True)
@@ -165,9 +171,11 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
 
 # Cameras that look at the scene, at most.
 CAMERAS = 24
-# Rows of the images that tell how much of them is filled, and of the largest ones.
-FIRST, LARGEST = 24, 2048
-# So many more pixels than the share that is filled asks for.
+# Rows of the first images, which tell what share of their pixels is filled.
+FIRST = 24
+# Rows of the largest images.
+LARGEST = 2048
+# The images have so many times the pixels that are expected to suffice.
 SPARE = 1.3
 
 
@@ -176,13 +184,13 @@ def seen_points(
 ) -> tuple[Tensor, Tensor]:
     """Points (N, 3) that the cameras see at ``time``, world units, and their sRGB colours (N, 3).
 
-    They are where rays end, in the mean. Of many cameras (world units) some are taken, evenly
-    chosen, and of many points ``count``. ``background`` is a grey level.
+    Each is at the mean depth of a ray. At most :data:`CAMERAS` cameras (world units) and ``count``
+    points are taken, evenly chosen. ``background`` is a grey level.
     """
-    some = cameras[_evenly(len(cameras), CAMERAS)].to(renderer.device)
-    filled = len(_seen(renderer, some.of_height(FIRST), time, background)[0])
-    rows = FIRST * (SPARE * count / max(filled, 1)) ** 0.5
-    points, colors = _seen(renderer, some.of_height(min(round(rows), LARGEST)), time, background)
+    cameras = cameras[_evenly(len(cameras), CAMERAS)].to(renderer.device)
+    filled = len(_seen(renderer, cameras.of_height(FIRST), time, background)[0])
+    rows = min(round(FIRST * (SPARE * count / max(filled, 1)) ** 0.5), LARGEST)
+    points, colors = _seen(renderer, cameras.of_height(rows), time, background)
     chosen = _evenly(len(points), count)
     return points[chosen], colors[chosen]
 
@@ -191,7 +199,8 @@ def _seen(
     renderer: Renderer, cameras: Cameras, time: float, background: float
 ) -> tuple[Tensor, Tensor]:
     """As :func:`seen_points`, of all pixels of the cameras."""
-    points, colors = [], []
+    points = []
+    colors = []
     for camera in range(len(cameras)):
         rays = cameras.image_rays(camera)
         image = renderer.picture(rays, time, background)

@@ -21,14 +21,20 @@ from devrf.apps.export.geometry import MovingMesh, UpFrame, vertex_normals
 from devrf.geometry.cameras import Cameras
 from devrf.system.files import atomic_write
 
-# Component types and buffer targets of the standard.
-FLOAT, UNSIGNED_INT, UNSIGNED_SHORT = 5126, 5125, 5123
+# Component types of the standard.
+FLOAT = 5126
+UNSIGNED_INT = 5125
+UNSIGNED_SHORT = 5123
 TYPES = {np.dtype("f4"): FLOAT, np.dtype("u4"): UNSIGNED_INT, np.dtype("u2"): UNSIGNED_SHORT}
-VERTICES, INDICES = 34962, 34963
+# Buffer targets of the standard.
+VERTICES = 34962
+INDICES = 34963
 KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
-# Chunks of the container, and its name.
-JSON, BIN, MAGIC = 0x4E4F534A, 0x004E4942, 0x46546C67
-# What a camera shows begins at this share of the scene's size.
+# Types of the container's chunks, and its magic number.
+JSON = 0x4E4F534A
+BIN = 0x004E4942
+MAGIC = 0x46546C67
+# The cameras' near plane, as a share of the scene's size.
 NEAREST = 1e-3
 
 Array = npt.NDArray[Any]
@@ -41,8 +47,8 @@ def write_gltf(
 
     The mesh is as it is at the first time; for each other time there is a morph target that leads
     there, and the animation goes from one to the next: linearly, as displacements are between
-    frames. Its colours are light that the cameras saw, so its material is unlit; normals are for
-    who gives it another.
+    frames. Its colours are light that the cameras saw, so its material is unlit; the normals serve
+    those who give it another material.
 
     Mesh and ``cameras``, one each by name, are in the capture's world; principal points are taken
     to be the centres. Time 0 to 1 takes ``seconds``.
@@ -65,17 +71,18 @@ def write_gltf(
         "material": 0,
     }
     if names:
-        moves = (vertices[1:] - vertices[0]).numpy(), (normals[1:] - normals[0]).numpy()
+        moves = (vertices[1:] - vertices[0]).numpy()
+        turns = (normals[1:] - normals[0]).numpy()
         primitive["targets"] = [
             {
                 "POSITION": content.array(move, VERTICES, limits=True),
                 "NORMAL": content.array(turn, VERTICES),
             }
-            for move, turn in zip(*moves, strict=True)
+            for move, turn in zip(moves, turns, strict=True)
         ]
-    shown: dict[str, Any] = {"name": "scene", "primitives": [primitive]}
+    mesh_entry: dict[str, Any] = {"name": "scene", "primitives": [primitive]}
     nodes: list[dict[str, Any]] = [{"name": "scene", "mesh": 0}]
-    whole: dict[str, Any] = {
+    document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": f"devrf {devrf.__version__}"},
         "scene": 0,
         "materials": [
@@ -87,14 +94,14 @@ def write_gltf(
             }
         ],
         "extensionsUsed": ["KHR_materials_unlit"],
-        "meshes": [shown],
+        "meshes": [mesh_entry],
         "nodes": nodes,
     }
     if names:
-        shown |= {"weights": [0.0] * len(names), "extras": {"targetNames": names}}
-        whole["animations"] = [_animation(content, mesh.times, seconds)]
+        mesh_entry |= {"weights": [0.0] * len(names), "extras": {"targetNames": names}}
+        document["animations"] = [_animation(content, mesh.times, seconds)]
     if cameras:
-        whole["cameras"] = [
+        document["cameras"] = [
             {"name": name, "type": "perspective", "perspective": _lens(camera, NEAREST * size)}
             for name, camera in cameras.items()
         ]
@@ -103,8 +110,8 @@ def write_gltf(
             matrix = frame.pose(camera).T.reshape(-1).tolist()
             nodes.append({"name": name, "camera": index, "matrix": matrix})
     extras = {"frame": f"y up ({frame.up} of the capture's world), metres"}
-    whole["scenes"] = [{"name": "scene", "nodes": list(range(len(nodes))), "extras": extras}]
-    content.write(path, whole)
+    document["scenes"] = [{"name": "scene", "nodes": list(range(len(nodes))), "extras": extras}]
+    content.write(path, document)
 
 
 def _animation(content: _Content, times: tuple[float, ...], seconds: float) -> dict[str, Any]:
@@ -161,9 +168,9 @@ class _Content:
         self._accessors.append(accessor)
         return len(self._accessors) - 1
 
-    def write(self, path: Path, whole: dict[str, Any]) -> None:
+    def write(self, path: Path, document: dict[str, Any]) -> None:
         """Write the file: a header, the description, the arrays."""
-        described = whole | {"buffers": [{"byteLength": len(self._bytes)}]}
+        described = document | {"buffers": [{"byteLength": len(self._bytes)}]}
         described |= {"bufferViews": self._views, "accessors": self._accessors}
         text = json.dumps(described, separators=(",", ":")).encode()
         text += b" " * (-len(text) % 4)

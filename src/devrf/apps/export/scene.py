@@ -41,7 +41,8 @@ def export_scene(
         surface = canonical_surface(model, viewpoints.static, settings)
         mesh = carried(surface, model, times)
         path = _write_mesh(folder, mesh, viewpoints, settings)
-        faces, vertices = len(mesh.faces), mesh.vertices.shape[1]
+        faces = len(mesh.faces)
+        vertices = mesh.vertices.shape[1]
         log.info(
             "%d faces, %d vertices at %d times written to %s", faces, vertices, len(times), path
         )
@@ -78,7 +79,8 @@ def _write_mesh(
 ) -> Path:
     """Write in the wanted format; the file, or the folder of files."""
     if settings.format not in SINGLE:
-        path, drawn = folder / settings.format, mesh_files(mesh)
+        path = folder / settings.format
+        drawn = mesh_files(mesh)
         write_sequence(path, settings.format, mesh.times, drawn, "surface", settings.seconds)
         return path
     name, write = SINGLE[settings.format]
@@ -95,7 +97,8 @@ def _write_points(
     times: tuple[float, ...],
 ) -> int:
     """Write what the static cameras see at each time; the points of the time with the most."""
-    renderer, behind = Renderer(model, times=1), background_value(viewpoints.background)
+    renderer = Renderer(model, times=1)
+    behind = background_value(viewpoints.background)
     max_points = 0
 
     def drawn() -> Iterator[Drawn]:

@@ -15,7 +15,7 @@ from devrf.system.files import atomic_write, write_json
 
 FRAME = "world: the axes and the unit of the capture"
 
-# What a moment's file holds: as trimesh writes it.
+# What the file of one time holds: a mesh or points of trimesh.
 Drawn = Any
 
 
@@ -23,7 +23,8 @@ def mesh_files(mesh: MovingMesh) -> Iterable[Drawn]:
     """The mesh at each of its times."""
     import trimesh  # an extra
 
-    colors, faces = _bytes(mesh.colors), mesh.faces.numpy()
+    colors = _bytes(mesh.colors)
+    faces = mesh.faces.numpy()
     for vertices in mesh.vertices:
         yield trimesh.Trimesh(vertices.numpy(), faces, vertex_colors=colors, process=False)
 

@@ -18,9 +18,9 @@ from devrf.geometry.space import Space
 from devrf.methods.base import Renderable
 from devrf.rendering.view import SurfaceField
 
-# Points at which a field is asked at once.
+# Points at which a field is evaluated at once.
 CHUNK = 2**18
-# A voxel with less optical depth counts as having so much: the logarithm ends here.
+# The least optical depth of a voxel, so that its logarithm is finite.
 LEAST = 1e-6
 # Rays of each camera, along each side of its image, that say where empty space begins.
 ENTRIES = 16
@@ -53,10 +53,11 @@ def isosurface(model: Renderable, outside: Tensor, threshold: float, side: int |
     from skimage import measure  # an extra
 
     field = _field(model)
-    box, shape = field.box, field.shape
+    box = field.box
+    shape = field.shape
     if side is not None:
         x, y, z = (max(2, round(edge / box.longest * (side - 1)) + 1) for edge in box.size)
-        shape = x, y, z
+        shape = (x, y, z)
     points = torch.split(box.grid_points(shape, torch.empty(0)).view(-1, 3), CHUNK)
     depth = torch.cat([_optical_depth(model, part) for part in points]).view(shape)
     level = _logit(torch.tensor(-math.log1p(-threshold))).item()
@@ -75,19 +76,22 @@ def isosurface(model: Renderable, outside: Tensor, threshold: float, side: int |
     hidden = empty & ~_reached(empty, box, outside)
     values[hidden] = 2 * abs(level) + values.max()
     vertices, faces, _, _ = measure.marching_cubes(values, level, gradient_direction="ascent")
-    low, size = np.array(box.low), np.array(box.size)
+    low = np.array(box.low)
+    size = np.array(box.size)
     points = low + vertices * (size / (np.array(shape) - 1))
     return points.astype(np.float32), faces.astype(np.int64)
 
 
 def entries(model: Renderable, cameras: Cameras) -> Tensor:
     """Points (K, 3) in the fields' space at which rays of the cameras begin to be sampled."""
-    space, box = model.space, _field(model).box
+    space = model.space
+    box = _field(model).box
     cameras = cameras.resized(ENTRIES, ENTRIES)
+    near, far = model.depth_limits
     points = []
     for camera in range(len(cameras)):
         rays = space.rays(cameras.image_rays(camera))
-        entry, leave = box.crossing(rays, *model.depth_limits)
+        entry, leave = box.crossing(rays, near, far)
         met = (entry < leave).nonzero()[:, 0]
         points.append(rays.at(met, entry[met]))
     return torch.cat(points)
@@ -95,12 +99,12 @@ def entries(model: Renderable, cameras: Cameras) -> Tensor:
 
 def _field(model: Renderable) -> SurfaceField:
     field = model.surface()
-    assert field is not None  # the export has asked
+    assert field is not None  # the export has checked
     return field
 
 
 def _optical_depth(model: Renderable, points: Tensor) -> Tensor:
-    """τ (M,) at ``points`` (M, 3) of the host, there."""
+    """τ (M,) at ``points`` (M, 3), both on the host."""
     return _field(model).optical_depth(points.to(model.device)).cpu()
 
 
@@ -117,9 +121,9 @@ def _reached(empty: npt.NDArray[np.bool_], box: Box, outside: Tensor) -> npt.NDA
     shape = torch.tensor(empty.shape)
     cells = box.to_grid(outside, empty.shape).round().long()
     inside = ((cells >= 0) & (cells < shape)).all(dim=1)
-    begun = np.unique(labels[tuple(cells[inside].t().numpy())])
-    reached: npt.NDArray[np.bool_] = np.isin(labels, begun[begun > 0])
-    # Where all cameras stand in fog there is nothing to go by.
+    seeds = np.unique(labels[tuple(cells[inside].t().numpy())])
+    reached: npt.NDArray[np.bool_] = np.isin(labels, seeds[seeds > 0])
+    # If all cameras stand in fog, nothing tells which empty cells are outside.
     return reached if reached.any() else empty
 
 
@@ -131,10 +135,11 @@ def canonical_surface(model: Renderable, cameras: Cameras, settings: ExportSetti
     """
     import trimesh  # an extra
 
-    space, outside = model.space, entries(model, cameras)
+    space = model.space
+    outside = entries(model, cameras)
     points, faces = isosurface(model, outside, settings.threshold, settings.side)
     mesh = trimesh.Trimesh(points, faces, process=False)
-    # Unbounded spaces reach to infinity: of a face all vertices have to be near enough.
+    # Unbounded spaces reach to infinity: all vertices of a face have to be near enough.
     away = (space.to_world(torch.from_numpy(points)) - cameras.positions.mean(dim=0)).norm(dim=1)
     near = (away <= settings.reach * away.median()).numpy()[faces].all(axis=1)
     if not near.any():
@@ -158,19 +163,23 @@ def canonical_surface(model: Renderable, cameras: Cameras, settings: ExportSetti
 
 def _mirrors(space: Space, box: Box) -> bool:
     """Whether the way to the world turns right-handed axes into left-handed ones."""
-    corner, steps = torch.tensor(box.middle), torch.diag(torch.tensor(box.size) / 100)
+    corner = torch.tensor(box.middle)
+    steps = torch.diag(torch.tensor(box.size) / 100)
     way = space.to_world(corner + steps) - space.to_world(corner)
     return bool(torch.linalg.det(way / way.norm(dim=1, keepdim=True)) < 0)
 
 
 # Vertices whose colour is found at once.
 VERTICES = 2**13
-# Where a ray begins and ends, in voxels behind the vertex, and how far its samples are apart.
-BEFORE, BEHIND, STEP = -1.0, 3.0, 0.25
+# Where a ray begins and ends behind the vertex, and how far its samples are apart, in voxels.
+BEFORE = -1.0
+BEHIND = 3.0
+STEP = 0.25
 # Samples with a smaller share of what is seen are left out.
 SIGNIFICANT = 0.01
-# Directions over which colours are averaged, and the widest, in degrees off the normal.
-DIRECTIONS, WIDEST = 16, 60.0
+# Directions over which colours are averaged, and their largest angle to the normal in degrees.
+DIRECTIONS = 16
+WIDEST = 60.0
 
 
 def vertex_colors(
@@ -188,8 +197,13 @@ def vertex_colors(
     voxel = points.new_tensor(field.box.size) / (points.new_tensor(field.shape) - 1)
     inward = -voxel * vertex_normals((points - low) / voxel, faces)
     eyes = _cap(DIRECTIONS, math.radians(WIDEST)) if averaged else torch.eye(3)[2:]
-    parts = zip(*(torch.split(part, VERTICES) for part in (points, inward, normals)), strict=True)
-    return torch.cat([_seen(model, p, way, n, eyes) for p, way, n in parts]).clamp(0, 1)
+    blocks = zip(
+        torch.split(points, VERTICES),
+        torch.split(inward, VERTICES),
+        torch.split(normals, VERTICES),
+        strict=True,
+    )
+    return torch.cat([_seen(model, p, way, n, eyes) for p, way, n in blocks]).clamp(0, 1)
 
 
 def _seen(
@@ -202,9 +216,13 @@ def _seen(
     weight = torch.exp(depth - depth.cumsum(dim=1)) * -torch.expm1(-depth)
     weight = weight / weight.sum(dim=1, keepdim=True).clamp(min=1e-9)
     vertex, sample = (weight > SIGNIFICANT).nonzero(as_tuple=True)
-    share, where = weight[vertex, sample, None], samples[vertex, sample]
-    field, device, frames = _field(model), model.device, _frames(normals)
-    colors, total = torch.zeros_like(points), toward_eyes[:, 2].sum()
+    share = weight[vertex, sample, None]
+    where = samples[vertex, sample]
+    field = _field(model)
+    device = model.device
+    frames = _frames(normals)
+    colors = torch.zeros_like(points)
+    total = toward_eyes[:, 2].sum()
     for direction in toward_eyes:
         viewdirs = -(frames @ direction)
         color = field.color(where.to(device), viewdirs[vertex].to(device)).cpu()

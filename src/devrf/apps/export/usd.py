@@ -41,7 +41,8 @@ def write_usd(
     shape.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces))
     colors = Vt.Vec3fArray.FromNumpy(linear(mesh.colors).numpy())
     shape.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(colors)
-    points, extent = shape.CreatePointsAttr(), shape.CreateExtentAttr()
+    points = shape.CreatePointsAttr()
+    extent = shape.CreateExtentAttr()
     normals = shape.CreateNormalsAttr()
     shape.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     for code, vertices in zip(codes, frame.points(mesh.vertices), strict=True):

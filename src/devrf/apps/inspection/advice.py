@@ -52,7 +52,17 @@ class Advice(NamedTuple):
 
 def advice_on(scene: Scene) -> list[Advice]:
     """Problems that cameras, images, masks, times and flow show."""
-    checks = _held_out, _box_unknown, _one_side, _images, _alpha, _masks, _times, _one_camera, _flow
+    checks = (
+        _held_out,
+        _box_unknown,
+        _one_side,
+        _images,
+        _alpha,
+        _masks,
+        _times,
+        _one_camera,
+        _flow,
+    )
     return [advice for check in checks for advice in check(scene)]
 
 
@@ -97,32 +107,35 @@ def _twins(test: Views, train: Views, middle: Tensor) -> list[str]:
     def along(views: Views) -> Tensor:
         return views.cameras.positions.double() @ LINE / reach + views.times
 
-    # Only what is near along a line of places and times may be the same: few are compared.
+    # Only views that are near along LINE and in time can be the same, so that few are compared.
     order = along(train).argsort()
     near = 2 * (SAME * float(LINE.norm()) + FrameClock.TOLERANCE)
     places = torch.stack([along(test) - near, along(test) + near], dim=1)
     ends = torch.searchsorted(along(train)[order], places)
     names = []
     for k, (start, stop) in enumerate(ends.tolist()):
-        pose, some = test.cameras.camera_to_world[k], order[start:stop]
-        turned = (poses[some, :, :3] - pose[:, :3]).abs().amax(dim=(1, 2))
-        moved = (poses[some, :, 3] - pose[:, 3]).norm(dim=1) / reach
-        apart = (train.times[some] - test.times[k]).abs()
+        pose = test.cameras.camera_to_world[k]
+        near_views = order[start:stop]
+        turned = (poses[near_views, :, :3] - pose[:, :3]).abs().amax(dim=(1, 2))
+        moved = (poses[near_views, :, 3] - pose[:, 3]).norm(dim=1) / reach
+        apart = (train.times[near_views] - test.times[k]).abs()
         if bool(((turned < SAME) & (moved < SAME) & (apart <= FrameClock.TOLERANCE)).any()):
             names.append(test.names[k])
     return names
 
 
 def _box_unknown(scene: Scene) -> Iterator[Advice]:
-    views, box = scene.static.train, scene.bounds.box
+    views = scene.static.train
+    box = scene.bounds.box
     if scene.kind != "inward" or not scene.space.is_linear or views.has_alpha:
         return
     try:
         guessed = box_from_cameras(views.cameras)
     except DevrfError:
         return  # the cameras tell no box: it was given
-    corners, guess = (torch.tensor([*b.low, *b.high]) for b in (box, guessed))
-    if float((corners - guess).abs().max()) <= 1e-4 * guessed.longest:
+    corners = torch.tensor([*box.low, *box.high])
+    guessed_corners = torch.tensor([*guessed.low, *guessed.high])
+    if float((corners - guessed_corners).abs().max()) <= 1e-4 * guessed.longest:
         yield Advice(
             "static training set",
             "has no alpha masks, and the box is only what the cameras all see",
@@ -142,7 +155,7 @@ def _one_side(scene: Scene) -> Iterator[Advice]:
 
 
 def mean_share(masks: Iterable[Tensor]) -> float:
-    """Mean of masks (H, W), one by one: a large scene's at once would be copied."""
+    """Mean of masks (H, W), read one by one: those of a large scene at once would be copied."""
     shares = [float(mask.float().mean()) for mask in masks]
     return sum(shares) / len(shares)
 
@@ -151,15 +164,15 @@ def _images(scene: Scene) -> Iterator[Advice]:
     """Problems of single images; sets may share files, and each is named once."""
     points = box_points(scene, scene.bounds.box, (9, 9, 9))
 
-    def project(views: Views, images: Tensor, some: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels (K, M, 2) and depths (K, M) of ``some`` points (M, 3) in K images."""
-        repeated = some.repeat(len(images), 1)
-        pixels, depth = views.cameras.project(images.repeat_interleave(len(some)), repeated)
+    def project(views: Views, images: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels (K, M, 2) and depths (K, M) of ``targets`` (M, 3) in K images."""
+        repeated = targets.repeat(len(images), 1)
+        pixels, depth = views.cameras.project(images.repeat_interleave(len(targets)), repeated)
         return pixels.view(len(images), -1, 2), depth.view(len(images), -1)
 
-    def sees(views: Views, images: Tensor, some: Tensor) -> Tensor:
-        """(K,) bool: whether any of the points is in the picture."""
-        pixels, depth = project(views, images, some)
+    def sees(views: Views, images: Tensor, targets: Tensor) -> Tensor:
+        """(K,) bool: whether any of the ``targets`` is in the picture."""
+        pixels, depth = project(views, images, targets)
         size = pixels.new_tensor([views.width, views.height])
         return ((depth > 0) & ((pixels >= 0) & (pixels <= size)).all(dim=2)).any(dim=1)
 
@@ -168,11 +181,12 @@ def _images(scene: Scene) -> Iterator[Advice]:
         return (project(views, torch.arange(len(views)), middle)[1][:, 0] <= 0).tolist()
 
     def beside(views: Views) -> list[bool]:
-        coarse, whole = points[::4, ::4, ::4].reshape(-1, 3), points.reshape(-1, 3)
-        seen = sees(views, torch.arange(len(views)), coarse) | torch.tensor(away(views))
-        for k in (~seen).nonzero()[:, 0]:
-            seen[k] = sees(views, k[None], whole)[0]
-        return (~seen).tolist()
+        coarse = points[::4, ::4, ::4].reshape(-1, 3)
+        fine = points.reshape(-1, 3)
+        in_picture = sees(views, torch.arange(len(views)), coarse) | torch.tensor(away(views))
+        for k in (~in_picture).nonzero()[:, 0]:
+            in_picture[k] = sees(views, k[None], fine)[0]
+        return (~in_picture).tolist()
 
     pose = "check the pose (camera-to-world, x right, y up, looking along -z), or set data.box"
     for test, problem, remedy in (
@@ -263,7 +277,8 @@ def _masks(scene: Scene) -> Iterator[Advice]:
 def _times(scene: Scene) -> Iterator[Advice]:
     if not scene.moves:
         return
-    views, clock = scene.dynamic.train, scene.clock
+    views = scene.dynamic.train
+    clock = scene.clock
     first = float(views.times.min())
     if first > FrameClock.TOLERANCE:
         yield Advice(
@@ -275,19 +290,20 @@ def _times(scene: Scene) -> Iterator[Advice]:
     numbers = set(views.view.tolist())
     if len(numbers) == len(views):
         return  # a moving camera: each image is a view of its own
-    seen, fewer = defaultdict[int, set[int]](set), []
+    views_at = defaultdict[int, set[int]](set)
+    incomplete = []
     for frame, number in zip(
         clock.frames_of(views.times).tolist(), views.view.tolist(), strict=True
     ):
-        seen[frame].add(number)
-    for frame in sorted(seen):
-        if missing := sorted(numbers - seen[frame]):
+        views_at[frame].add(number)
+    for frame in sorted(views_at):
+        if missing := sorted(numbers - views_at[frame]):
             without = ", ".join(map(str, missing))
-            fewer.append(f"time {clock.times[frame]:.3g} without view {without}")
-    if fewer:
+            incomplete.append(f"time {clock.times[frame]:.3g} without view {without}")
+    if incomplete:
         yield Advice(
             "dynamic training set",
-            f"not all views at every time: {listed(fewer)}",
+            f"not all views at every time: {listed(incomplete)}",
             "add the images, or leave these times or views out: motion is less certain there",
         )
 
@@ -304,7 +320,8 @@ def _one_camera(scene: Scene) -> Iterator[Advice]:
 
 
 def _flow(scene: Scene) -> Iterator[Advice]:
-    views, flow = scene.dynamic.train, scene.dynamic.train.flow
+    views = scene.dynamic.train
+    flow = scene.dynamic.train.flow
     longest = max(views.width, views.height)
     if flow is None:
         length = 0.0 if views.by_moving_camera else _frame_to_frame(views)
@@ -315,9 +332,12 @@ def _flow(scene: Scene) -> Iterator[Advice]:
                 "film more frames a second, or try data.flow=dis, which estimates it",
             )
         return
-    long, broken, covered = [], [], []
+    long = []
+    broken = []
+    covered = []
     for k, _ in frame_pairs(views):
-        vectors, valid = flow.vectors[k], flow.valid[k]
+        vectors = flow.vectors[k]
+        valid = flow.valid[k]
         inside = views.pixels[k, ..., 3] > OPAQUE if views.has_alpha else torch.ones_like(valid)
         covered.append(float((valid & inside).sum()) / max(int(inside.sum()), 1))
         length = vectors[valid].norm(dim=-1)
@@ -333,10 +353,8 @@ def _flow(scene: Scene) -> Iterator[Advice]:
             "or set data.flow=dis or data.flow=none",
         )
     if broken:
-        problem, remedy = (
-            "valid where it is not a number",
-            "mask these pixels, or set data.flow=none",
-        )
+        problem = "valid where it is not a number"
+        remedy = "mask these pixels, or set data.flow=none"
         yield Advice(f"flow of {listed(broken)}", problem, remedy)
     share = sum(covered) / max(len(covered), 1)
     if covered and share < MIN_FLOW:
@@ -349,8 +367,9 @@ def _flow(scene: Scene) -> Iterator[Advice]:
 
 
 def _frame_to_frame(views: Views) -> float:
-    """How far parts move between two frames, in pixels: of a few pairs, the 99th percentile."""
-    longest, between = 0.0, estimator("dis")
+    """How far parts move between two frames, in pixels: the 99th percentile of a few pairs."""
+    longest = 0.0
+    between = estimator("dis")
     pairs = frame_pairs(views)
     for image, earlier in (pairs[k] for k in evenly(len(pairs), SAMPLED_PAIRS)):
         vectors, valid = flow_between(views, image, earlier, between)

@@ -24,7 +24,7 @@ STEEP = 75.0
 def box_points(scene: Scene, box: Box, shape: tuple[int, int, int]) -> Tensor:
     """A grid (X, Y, Z, 3) over a box in the fields' space, faces included, in world units.
 
-    An NDC box is cut off before infinity, and of contracted space the inner box is taken.
+    An NDC box is cut off before infinity; in contracted space it is the inner box.
     """
     if scene.kind == "forward":
         box = Box.of(list(box.low), [*box.high[:2], min(box.high[2], NDC_CUT)])

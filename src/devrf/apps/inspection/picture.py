@@ -24,8 +24,11 @@ from devrf.scenes.optical_flow import frame_pairs
 from devrf.scenes.scene import OpticalFlow, Scene, Views
 from devrf.system.files import atomic_write
 
-# Inches, of which each is 100 pixels: the page's width; the heights of its parts.
-WIDTH, CAMERAS, HEADING, CAPTION = 16.0, 7.2, 0.55, 0.45
+# The page's width, and the heights of its parts, in inches of 100 pixels.
+WIDTH = 16.0
+CAMERAS = 7.2
+HEADING = 0.55
+CAPTION = 0.45
 # No image is higher, so that portrait images do not fill a page each.
 TALLEST = 2.8
 COLUMNS = 6
@@ -61,7 +64,7 @@ def inspection_figure(scene: Scene) -> Figure:
     """The page of a scene: 16 inches wide, 100 pixels each."""
     views = scene.static.train
     tiles = [(shown(views, k), short_name(views.names[k])) for k in evenly(len(views), COLUMNS)]
-    static = f"Static training set: {len(views)} images", [tiles]
+    static = (f"Static training set: {len(views)} images", [tiles])
     moving = _dynamic_sections(scene.dynamic.train) if scene.moves else []
     sections: list[Section] = [static, *moving]
     tile = min(TALLEST, WIDTH / COLUMNS * views.height / views.width)
@@ -104,13 +107,16 @@ def _dynamic_sections(views: Views) -> list[Section]:
     samples = sample_images(views)
     shown_images = [k for row in samples for k in row]
     label = {k: f"view {views.view[k]}, time {float(views.times[k]):.2f}" for k in shown_images}
-    numbers, times = len(set(views.view.tolist())), len(set(views.times.tolist()))
+    numbers = len(set(views.view.tolist()))
+    times = len(set(views.times.tolist()))
     motion = "a moving camera" if numbers == len(views) else f"{numbers} fixed views"
     rows: list[list[Tile]] = [[(shown(views, k), label[k]) for k in row] for row in samples]
     sections: list[Section] = [(f"Dynamic training set: {motion}, {times} times", rows)]
     if views.flow is None:
         return sections
-    longest, vectors, valid = flow_scale(views.flow), views.flow.vectors, views.flow.valid
+    longest = flow_scale(views.flow)
+    vectors = views.flow.vectors
+    valid = views.flow.valid
     images = {
         k: (_smaller(flow_colors(vectors[k], valid[k], longest)), label[k])
         for k, _ in frame_pairs(views)
@@ -131,8 +137,8 @@ def sample_images(views: Views) -> list[list[int]]:
     order = sorted(range(len(views)), key=lambda k: (float(views.times[k]), k))
     numbers = list(first_images(views))
     if len(numbers) == len(views):
-        some = [order[k] for k in evenly(len(order), 2 * COLUMNS)]
-        return [some[k : k + COLUMNS] for k in range(0, len(some), COLUMNS)]
+        images = [order[k] for k in evenly(len(order), 2 * COLUMNS)]
+        return [images[k : k + COLUMNS] for k in range(0, len(images), COLUMNS)]
     rows = []
     for k in evenly(len(numbers), MOST_VIEWS):
         of_view = [image for image in order if int(views.view[image]) == numbers[k]]
@@ -143,7 +149,8 @@ def sample_images(views: Views) -> list[list[int]]:
 def flow_scale(flow: OpticalFlow) -> float:
     """The length in pixels that is shown saturated: 99 % of the valid flow is shorter."""
     # Every ninth pixel is enough; all of a large scene's flow at once would be copied.
-    vectors, valid = flow.vectors[:, ::3, ::3], flow.valid[:, ::3, ::3]
+    vectors = flow.vectors[:, ::3, ::3]
+    valid = flow.valid[:, ::3, ::3]
     lengths = vectors[valid].norm(dim=-1)
     lengths = lengths[torch.isfinite(lengths)]
     return max(float(np.quantile(lengths.numpy(), 0.99)), 1e-3) if len(lengths) else 1.0
@@ -161,12 +168,13 @@ def shown(views: Views, image: int) -> np.ndarray:
 
 
 def _smaller(colors: Tensor) -> np.ndarray:
-    """Reduced by a whole factor to little more than is shown: a page of full images is large."""
+    """Colours reduced by a whole factor to little more than is shown, to keep the page small."""
     image = Image.fromarray(to_bytes(colors).numpy())
     return np.asarray(image.reduce(max(1, image.width // 300)))
 
 
-TRAIN_COLOR, TEST_COLOR = "#d9601a", "#b3204d"
+TRAIN_COLOR = "#d9601a"
+TEST_COLOR = "#b3204d"
 HALO = [withStroke(linewidth=3, foreground="white")]
 
 
@@ -184,7 +192,8 @@ def draw_cameras(scene: Scene, side: Any, plan: Axes) -> None:
 
     World units from the middle of the box, along east, north and up of the cameras.
     """
-    axes, middle = compass(scene), box_middle(scene)
+    axes = compass(scene)
+    middle = box_middle(scene)
     groups = scene_lines(scene)
     shown = [(group.ends - middle) @ axes.T for group in groups]
     for group, ends in zip(groups, shown, strict=True):
@@ -195,14 +204,23 @@ def draw_cameras(scene: Scene, side: Any, plan: Axes) -> None:
         plan.plot(x, y, color=group.color, linewidth=group.width, label=group.label)
     for name, number, position, color in _fixed_views(scene):
         x, y, z = ((position - middle) @ axes.T).tolist()
-        style: dict[str, Any] = {"color": color, "fontweight": "bold", "path_effects": HALO}
-        side.text(x, y, z, f"  {number}", **style)
+        side.text(x, y, z, f"  {number}", color=color, fontweight="bold", path_effects=HALO)
         if scene.kind == "inward":  # forward-facing cameras stand above one another
             outward = 26 / max(math.hypot(x, y), 1e-6)  # points
-            style |= {"textcoords": "offset points", "ha": "center", "va": "center"}
-            plan.annotate(f"{name} {number}", (x, y), xytext=(x * outward, y * outward), **style)
+            plan.annotate(
+                f"{name} {number}",
+                (x, y),
+                xytext=(x * outward, y * outward),
+                textcoords="offset points",
+                color=color,
+                fontweight="bold",
+                path_effects=HALO,
+                ha="center",
+                va="center",
+            )
     points = torch.cat([ends.reshape(-1, 3) for ends in shown])
-    low, high = points.amin(dim=0).tolist(), points.amax(dim=0).tolist()
+    low = points.amin(dim=0).tolist()
+    high = points.amax(dim=0).tolist()
     side.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     side.set_box_aspect([b - a for a, b in zip(low, high, strict=True)], zoom=1.15)
     side.locator_params(nbins=5)
@@ -222,7 +240,9 @@ def compass(scene: Scene) -> Tensor:
 
 def scene_lines(scene: Scene) -> list[Lines]:
     """Boxes and cameras as lines; each fixed camera once, not once a frame."""
-    size, bounds, unbounded = _camera_size(scene), scene.bounds, scene.kind == "forward"
+    size = _camera_size(scene)
+    bounds = scene.bounds
+    unbounded = scene.kind == "forward"
     lines = [
         Lines("box" + unbounded * " (unbounded, cut off)", box_edges(scene, bounds.box), "0.2", 2)
     ]
@@ -257,7 +277,8 @@ def box_edges(scene: Scene, box: Box) -> Tensor:
 
 def frusta(cameras: Cameras, depth: float) -> Tensor:
     """N cameras as pyramids ``depth`` high with a tick where up is: (10 · N, 2, 3), world units."""
-    w, h = cameras.width, cameras.height
+    w = cameras.width
+    h = cameras.height
     corners = cameras.center.new_tensor(
         [[0, 0], [w, 0], [w, h], [0, h], [0.35 * w, 0], [0.5 * w, -0.2 * h], [0.65 * w, 0]]
     )

@@ -77,7 +77,8 @@ def _titled_table(
 
 def scene_facts(scene: Scene) -> list[Row]:
     """What a scene is: space, bounds, times, motion and colours, as rows of a name and text."""
-    bounds, views = scene.bounds, scene.dynamic.train
+    bounds = scene.bounds
+    views = scene.dynamic.train
     unit = "NDC" if scene.kind == "forward" else "world units"
     space = "normalised device coordinates" if scene.kind == "forward" else "the world"
     if not scene.space.is_linear:
@@ -92,7 +93,8 @@ def scene_facts(scene: Scene) -> list[Row]:
         ("room for motion", f"{motion}{bounds.source}"),
         ("optical flow", flow_facts(views)),
     ]
-    change, drift = color_change(views), color_drift(views)
+    change = color_change(views)
+    drift = color_drift(views)
     if change is not None:
         text = f"differ by {100 * change:.1f} % over a few frames"
         if drift is not None:
@@ -158,15 +160,21 @@ def flow_facts(views: Views) -> str:
     if views.flow is None:
         return "none"
     images = [image for image, _ in frame_pairs(views)]
-    count, inside, covered, total, longest = 0, 0, 0, 0.0, 0.0
+    count = 0
+    inside = 0
+    covered = 0
+    total = 0.0
+    longest = 0.0
     for k in images:  # one by one: all of a large scene's flow at once would be copied
         valid = views.flow.valid[k]
         length = views.flow.vectors[k][valid].norm(dim=-1)
-        count, total = count + len(length), total + float(length.sum())
+        count += len(length)
+        total += float(length.sum())
         longest = max(longest, float(length.max())) if len(length) else longest
         if views.has_alpha:
             alpha = views.pixels[k, ..., 3] > OPAQUE
-            inside, covered = inside + int(alpha.sum()), covered + int((alpha & valid).sum())
+            inside += int(alpha.sum())
+            covered += int((alpha & valid).sum())
     share = _percent(count / max(len(images) * views.width * views.height, 1))
     in_alpha = f" ({_percent(covered / max(inside, 1))} of the alpha masks)" * views.has_alpha
     return (

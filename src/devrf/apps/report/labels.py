@@ -41,7 +41,8 @@ ABLATIONS = {
     "without_crop": "Ours w/o crop",
     "without_last_level": "Ours w/o last level",
 }
-CHOICES, SETTINGS = "run.choices.", "run.settings."
+CHOICES = "run.choices."
+SETTINGS = "run.settings."
 IGNORED = {"objective", "seed", "stage", "method"}
 # Without an experiment a run has the config of this one.
 DEFAULT_EXPERIMENT = "quickstart"
@@ -59,23 +60,24 @@ RECORDED: dict[str, Callable[[Any], str]] = {
     "run.git": lambda git: f"at {git[:9]}{'-dirty' * git.endswith('-dirty')}",
     "run.devrf": lambda version: f"devrf {version}",
 }
-# Of these every difference is said, before names and settings; the others come last.
+# A label says every difference in these, before names and settings; the others come last.
 SAID = list(RECORDED)[:5]
-# Settings of which the recorded numbers say enough.
+# Settings that a label does not repeat: the recorded numbers show them.
 IN_DATA = ["data.width", "data.height", "data.downscale", "data.frames", "data.train_views"]
 
 
 def labelled(runs: pd.DataFrame) -> pd.DataFrame:
     """The runs in the order of a table: scenes as they come, ablations as in the paper, then jobs.
 
-    A scene at rest is not the one of its name that moves; nor is one that was learned in so many
-    seconds (``budget``, NaN where there was no limit), or without priors. ``place`` is the scene
-    with its priors, without its budget. Further columns are ``label``, the same
-    for runs that share a row; ``name``, the label without the protocol; ``line``, the label without
-    the number of views; ``views``, the number of dynamic training views (NaN where unknown);
-    ``kind``, the same for runs of alike scenes with the same names and typed settings.
+    Runs of a scene at rest count as runs of another scene than that in motion. So do runs that were
+    learned in a limited time (``budget`` in seconds, NaN without a limit), or without priors.
+    ``place`` is the scene with its priors, without its budget. Further columns are ``label``, the
+    same for runs that share a row; ``name``, the label without the protocol; ``line``, the label
+    without the number of views; ``views``, the number of dynamic training views (NaN where
+    unknown); ``kind``, the same for runs of alike scenes with the same names and typed settings.
     """
-    names, settings = _names(runs), _settings(runs)
+    names = _names(runs)
+    settings = _settings(runs)
     settings.pop("schedule.seconds", None)  # said by the scene's title
     typed = _typed(settings, runs)
     scenes = runs["scene"].where(~runs["at_rest"].eq(True), runs["scene"] + " (at rest)")
@@ -111,8 +113,8 @@ def _rank(name: str, names: Iterable[str]) -> int:
 
 
 def _label(traits: pd.DataFrame, without: str = "") -> list[str]:
-    said = traits.drop(columns=without, errors="ignore")
-    return ["; ".join(filter(None, texts)) for texts in said.itertuples(index=False)]
+    columns = traits.drop(columns=without, errors="ignore")
+    return ["; ".join(filter(None, texts)) for texts in columns.itertuples(index=False)]
 
 
 def _distinguishing(
@@ -152,8 +154,9 @@ def _distinguishing(
 
 
 def _methods(runs: pd.DataFrame) -> list[str]:
-    """What methods and ablations are called; of a scene at rest no ablation is."""
-    names, ablations = [], _options(runs, "ablation")
+    """What methods and ablations are called; runs of a scene at rest have no ablation."""
+    names = []
+    ablations = _options(runs, "ablation")
     for method, ablation, at_rest in zip(runs["method"], ablations, runs["at_rest"], strict=True):
         name = METHODS.get(method, method)
         if at_rest is not True and method == DEFAULT_METHOD and ablation in ABLATIONS:
@@ -185,7 +188,7 @@ def _names(runs: pd.DataFrame) -> dict[str, pd.Series]:
 
 
 def _settings(runs: pd.DataFrame) -> dict[str, pd.Series]:
-    """The settings that runs were learned with, by key; of a run without one the text is empty.
+    """The settings that runs were learned with, by key; the text is empty for runs without one.
 
     Numbers have as few digits, three at least, as keep them apart.
     """

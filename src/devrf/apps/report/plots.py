@@ -27,11 +27,14 @@ COLORS = (
     "#4B0096 #96D21E #FF0069 #69001E #D200A5 #A587FF #0F3C00 #4B1E5A "
     "#00E178 #FFB496 #B4C369 #1E870F #D25A5A #006969 #5AD2D2 #D2001E"
 ).split()
-DASHES, ALIKE = ("-", "--", ":", "-."), 8
+DASHES = ("-", "--", ":", "-.")
+ALIKE = 8
 POINTS = "osD^"
 # Inches of a line of the legend: the figure grows by it, so that curves keep their room.
-LEGEND_LINE, MOST_COLUMNS = 0.19, 8
-PUBLISHED, GREY = ", published", "#9a9a9a"
+LEGEND_LINE = 0.19
+MOST_COLUMNS = 8
+PUBLISHED = ", published"
+GREY = "#9a9a9a"
 STYLE: dict[Any, Any] = {
     "figure.dpi": 160,
     "font.size": 9,
@@ -52,9 +55,9 @@ STYLE: dict[Any, Any] = {
 NAMES = ("DeVRF", "D-NeRF", "Nerfies", "HyperNeRF", "NSFF", "Neural Volumes")
 MARKERS = dict(zip(NAMES, "s^vDPX", strict=True))
 VARIANT = r"-2 ?stage$|-dynamic$| \(base\)$| w/ .*$"
-# Seconds to label on an axis: of these multiples the first that there is room for.
+# Seconds to label on an axis: the first of these multiples for which there is room.
 UNITS = (0.01, 0.1, 1, 10, 60, 600, 3600, 36000, 360000, math.inf)
-MULTIPLES = (1, 1.5, 2, 3, 4, 6), (1, 2, 3, 4, 6), (1, 2, 5), (1, 3), (1,)
+MULTIPLES = ((1, 1.5, 2, 3, 4, 6), (1, 2, 3, 4, 6), (1, 2, 5), (1, 3), (1,))
 MOST_TICKS = 5
 
 
@@ -92,8 +95,8 @@ def psnr_over_time(table: Table, scene: str) -> Figure | None:
     figure = Figure(figsize=(6.4, 3.6), layout="constrained")
     axes = figure.subplots()
     for label, runs in table.runs[table.runs["scene"] == scene].groupby("label", sort=False):
-        of_runs = [metric_over_time(path, "psnr") for path in runs["path"]]
-        curve = pd.concat(of_runs, axis=1, join="inner").mean(axis=1)
+        curves = [metric_over_time(path, "psnr") for path in runs["path"]]
+        curve = pd.concat(curves, axis=1, join="inner").mean(axis=1)
         if len(curve):
             color, dashes = _look(table, label)
             marker = "o" if len(curve) < 30 else ""
@@ -142,17 +145,27 @@ def against_budget(table: Table, place: str) -> Figure | None:
         return None
     columns = [column for column in (PSNR, SSIM, LPIPS) if runs[column.title].notna().any()]
     figure = Figure(figsize=(0.8 + 3.3 * len(columns), 4.0), layout="constrained")
-    methods, labels = list(runs["method"].unique()), runs.groupby("method")["label"].unique()
+    methods = list(runs["method"].unique())
+    labels = runs.groupby("method")["label"].unique()
     for axes, column in zip(
         figure.subplots(1, len(columns), squeeze=False)[0], columns, strict=True
     ):
         for (method, label), row in runs.groupby(["method", "label"], sort=False):
             values = row.groupby("budget")[column.title]
-            means, spread = values.mean(), values.std().fillna(0.0)
+            means = values.mean()
+            spread = values.std().fillna(0.0)
             dashes = DASHES[list(labels[method]).index(label) % len(DASHES)]
-            look: dict[str, Any] = {"color": COLORS[methods.index(method)], "linestyle": dashes}
-            look |= {"linewidth": 2.8 if method == DEFAULT_METHOD else 1.4, "marker": "o"}
-            axes.errorbar(means.index, means, spread, capsize=2, label=label, **look)
+            axes.errorbar(
+                means.index,
+                means,
+                spread,
+                color=COLORS[methods.index(method)],
+                linestyle=dashes,
+                linewidth=2.8 if method == DEFAULT_METHOD else 1.4,
+                marker="o",
+                capsize=2,
+                label=label,
+            )
         axes.set(title=place, xscale="log", xlabel="training time", ylabel=column.heading)
         axes.xaxis.set_major_locator(FixedLocator(budgets))
         axes.xaxis.set_minor_locator(NullLocator())
@@ -179,8 +192,9 @@ def against_views(table: Table) -> Figure | None:
             color, dashes = _style(k)
             known = group.dropna(subset=column.title)
             label = scene if one_line else f"{scene}: {line}"
-            points = known["views"], known[column.title]
-            axes.plot(*points, dashes, color=color, marker="o", label=label)
+            axes.plot(
+                known["views"], known[column.title], dashes, color=color, marker="o", label=label
+            )
         axes.set(xlabel="dynamic training views", ylabel=column.heading)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     _legend(figure)
@@ -195,12 +209,18 @@ def _points(axes: Axes, table: Table, block: Block) -> None:
         axes.plot(seconds, psnr, mark, color=color, markersize=6, label=label)
     for label, seconds, psnr in _seconds_and_psnr(block.published):
         method = re.sub(VARIANT, "", label)
-        look: dict[str, Any] = {"color": GREY, "markerfacecolor": "none"}
-        axes.plot(seconds, psnr, MARKERS[method], label=f"{method}{PUBLISHED}", **look)
+        axes.plot(
+            seconds,
+            psnr,
+            MARKERS[method],
+            color=GREY,
+            markerfacecolor="none",
+            label=f"{method}{PUBLISHED}",
+        )
     axes.set(title=block.title, xscale="log", xlabel="training time", ylabel=f"{PSNR.title} (dB)")
     low, high = axes.get_xlim()
-    axes.set_xlim(low / 1.5, high * 1.5)
-    axes.xaxis.set_major_locator(FixedLocator(_ticks(*axes.get_xlim())))
+    low, high = axes.set_xlim(low / 1.5, high * 1.5)
+    axes.xaxis.set_major_locator(FixedLocator(_ticks(low, high)))
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter(_time)
 
@@ -259,9 +279,13 @@ def _legend(figure: Figure) -> None:
         legend.remove()
 
 
-BATCHES, MEAN, PREVIEWS = "#9ec9e6", "#0072b2", "#d55e00"
-# The running mean is over so large a part of the curve; more labels of grids would overlap.
-WINDOW, MOST_GRIDS = 1 / 25, 8
+BATCHES = "#9ec9e6"
+MEAN = "#0072b2"
+PREVIEWS = "#d55e00"
+# The running mean is over this share of the curve.
+WINDOW = 1 / 25
+# More labels of grids would overlap.
+MOST_GRIDS = 8
 
 
 @mpl.rc_context(STYLE)
@@ -284,7 +308,8 @@ def write_training_curve(
     axes.plot(curve.index, curve, color=BATCHES, linewidth=0.9, label="batches")
     axes.plot(mean.index, mean, color=MEAN, linewidth=1.8, label="running mean")
     if previews:
-        axes.plot(*zip(*previews, strict=True), "o", color=PREVIEWS, label="held-out preview")
+        iterations, psnr = zip(*previews, strict=True)
+        axes.plot(iterations, psnr, "o", color=PREVIEWS, label="held-out preview")
     if 1 < len(grids) <= MOST_GRIDS:
         for iteration, shape in grids:
             axes.axvline(iteration, color="0.75", linewidth=0.8, linestyle=":")

@@ -15,11 +15,28 @@ from devrf.errors import DevrfError
 
 # What every run has; further columns are what its file holds, by dotted name.
 COLUMNS = (
-    *("folder", "status", "scene", "method", "protocol", "at_rest", "error", "mistake"),
-    *("train_seconds", "peak_gpu_gb", "dynamic.psnr", "dynamic.ssim", "dynamic.lpips"),
-    *("run.device", "run.overrides", "run.seed", "run.checkpoint", "run.date", "path"),
+    "folder",
+    "status",
+    "scene",
+    "method",
+    "protocol",
+    "at_rest",
+    "error",
+    "mistake",
+    "train_seconds",
+    "peak_gpu_gb",
+    "dynamic.psnr",
+    "dynamic.ssim",
+    "dynamic.lpips",
+    "run.device",
+    "run.overrides",
+    "run.seed",
+    "run.checkpoint",
+    "run.date",
+    "path",
 )
-DEFAULT_METHOD, DEFAULT_PROTOCOL = "devrf", "two_stage"
+DEFAULT_METHOD = "devrf"
+DEFAULT_PROTOCOL = "two_stage"
 
 
 @dataclass(frozen=True)
@@ -66,14 +83,15 @@ def collect(folder: Path) -> Collection:
                 skipped.append(f"{file}: skipped; it is damaged, or not as devrf writes it")
             else:
                 records[status].append({**record, "folder": name, "path": place, "status": status})
-    runs, failures = _frame(records["finished"]), _frame(records["failed"])
+    runs = _frame(records["finished"])
+    failures = _frame(records["failed"])
     return Collection(folder, runs, failures, tuple(skipped))
 
 
 def number(value: Any) -> float:
     """A recorded value as a number; NaN where it is none, or not finite."""
-    known = isinstance(value, int | float) and not isinstance(value, bool)
-    return float(value) if known and math.isfinite(value) else math.nan
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return float(value) if is_number and math.isfinite(value) else math.nan
 
 
 def metric_over_time(path: Path, metric: str) -> pd.Series:
@@ -96,13 +114,15 @@ def _natural(name: str) -> tuple[int, int, str]:
 
 
 def _finished(metrics: dict[str, Any]) -> dict[str, Any]:
-    at_rest, static = metrics.get("at_rest", False), metrics.get("static", {})
+    at_rest = metrics.get("at_rest", False)
+    static = metrics.get("static", {})
     # Other protocols may have no stage of their own for the static capture.
     stages = [] if at_rest else [metrics.get("dynamic", {})]
     if at_rest or static.get("seconds") is not None or metrics["protocol"] == DEFAULT_PROTOCOL:
         stages.append(static)
     frame = pd.DataFrame(stages, columns=["seconds", "peak_gpu_gb"], dtype=object).map(number)
-    seconds, memory = frame["seconds"].sum(skipna=False), frame["peak_gpu_gb"].max(skipna=False)
+    seconds = frame["seconds"].sum(skipna=False)
+    memory = frame["peak_gpu_gb"].max(skipna=False)
     head = {key: metrics[key] for key in ("scene", "method")}
     return metrics | head | {"at_rest": at_rest, "train_seconds": seconds, "peak_gpu_gb": memory}
 
@@ -117,6 +137,6 @@ def _failed(failure: dict[str, Any]) -> dict[str, Any]:
 def _frame(records: list[dict[str, Any]]) -> pd.DataFrame:
     flat = [pd.json_normalize(record).to_dict("records")[0] for record in records]
     names = dict.fromkeys([*COLUMNS, *(name for record in flat for name in record)])
-    # Of type object, so that numbers are written as they were read.
+    # Values are objects, so that numbers are written as they were read.
     frame = pd.DataFrame(flat, columns=list(names), dtype=object)
     return frame.assign(**{"run.overrides": [row.get("run.overrides") or [] for row in flat]})

@@ -199,15 +199,16 @@ def _is_of_published_data(run: Mapping[str, Any]) -> bool:
     data = {key: run.get(f"run.{key}") for key in ("image_size", "frames", "train_views")}
     if isinstance(data["image_size"], list):
         data["image_size"] = sorted(data["image_size"])
-    said = run.get("run.choices.data") == run["scene"]
-    return said and data == published().data.get(run["scene"])
+    is_named = run.get("run.choices.data") == run["scene"]
+    return is_named and data == published().data.get(run["scene"])
 
 
 def _values(runs: pd.DataFrame, column: Column) -> pd.Series:
-    """The values of a column, NaN where unknown; those of scenes at rest are of the static set."""
+    """The values of a column, NaN where unknown; scenes at rest have those of the static set."""
     values = runs[column.key].map(number).astype(float)
     section, _, name = column.key.partition(".")
-    at_rest, key = runs["at_rest"].eq(True), f"static.{name}"
+    at_rest = runs["at_rest"].eq(True)
+    key = f"static.{name}"
     if section == "dynamic" and key in runs:
         values = values.where(~at_rest, runs[key].map(number).astype(float))
     return values
@@ -217,7 +218,9 @@ def shown(value: float, column: Column, spread: float = math.nan) -> str:
     """A value with the digits of its column: ``29.42``, ``29.42 ± 0.11``, ``9.2 min``, ``–``."""
     if math.isnan(value):
         return UNKNOWN
-    size, digits, unit = 1, column.digits, ""
+    size = 1
+    digits = column.digits
+    unit = ""
     if digits is None:
         _, size, digits, unit = next(row for row in TIMES if value < row[0])
     text = f"{value / size:.{digits}f}"
@@ -247,7 +250,8 @@ def _cells(
 ) -> pd.DataFrame:
     """A block's rows; memory and time are ranked only if all ``devices`` agree, None ranks none."""
     titles = [column.title for column in columns]
-    texts, ranks = rows[titles].astype(object), pd.DataFrame(0, rows.index, titles)
+    texts = rows[titles].astype(object)
+    ranks = pd.DataFrame(0, rows.index, titles)
     for column in columns:
         both = zip(rows[column.title], spread[column.title], strict=True)
         texts[column.title] = [shown(value, column, deviation) for value, deviation in both]
@@ -261,8 +265,9 @@ def _cells(
 def _average(
     runs: pd.DataFrame, rows: pd.DataFrame, scenes: list[str], columns: Sequence[Column]
 ) -> pd.DataFrame:
-    """Means over all scenes, if they are alike, of what was run on all of them, without spread."""
-    groups, titles = rows.groupby("label", sort=False), [column.title for column in columns]
+    """Means over all scenes, if these are alike, of rows that every scene has; without spread."""
+    groups = rows.groupby("label", sort=False)
+    titles = [column.title for column in columns]
     means = _over_scenes(rows[titles], scenes).join(groups[["name", "protocol"]].first())
     alike = (groups.size() == len(scenes)) & (groups["kind"].nunique() == 1)
     means = means.assign(counts=groups["count"].agg(set))[alike]
@@ -273,8 +278,10 @@ def _average(
 def _gains(rows: pd.DataFrame, average: pd.DataFrame) -> pd.DataFrame:
     """What the rows of an average gain over its first: see :class:`Table`."""
     by_scene = rows[rows["label"].isin(average.index)].pivot(index="label", columns="scene")
-    psnr, seconds = (by_scene[title].reindex(average.index) for title in ("PSNR", "Time"))
-    gain, first = psnr - psnr.iloc[0], average["head", "name"].iloc[0]
+    psnr = by_scene["PSNR"].reindex(average.index)
+    seconds = by_scene["Time"].reindex(average.index)
+    gain = psnr - psnr.iloc[0]
+    first = average["head", "name"].iloc[0]
     least = zip(gain.min(axis=1), gain.idxmin(axis=1), strict=True)
     return pd.DataFrame(
         {
@@ -289,7 +296,7 @@ def _gains(rows: pd.DataFrame, average: pd.DataFrame) -> pd.DataFrame:
 
 
 def _published(scenes: list[str], columns: Sequence[Column]) -> pd.DataFrame:
-    """The paper's rows of a scene, or their means over several; of none, none."""
+    """The paper's rows of a scene, or their means over several; empty for no scene."""
     values = _over_scenes(_of(published().values, scenes), scenes).dropna()
     values = values.reindex(columns=[column.title for column in columns])
     rows = values.assign(name=values.index, protocol="", counts=[{1} for _ in values.index])
@@ -319,10 +326,8 @@ def _scored_again(runs: pd.DataFrame) -> pd.Series:
 def _sampled(runs: pd.DataFrame) -> list[str]:
     """How the methods that choose their samples took them, a sentence for each way."""
     absent = pd.Series(None, runs.index, dtype=object)
-    kind, hull = (
-        runs.get(f"run.settings.ray_stage.model.settings.{key}", absent)
-        for key in ("sampling", "hull")
-    )
+    kind = runs.get("run.settings.ray_stage.model.settings.sampling", absent)
+    hull = runs.get("run.settings.ray_stage.model.settings.hull", absent)
     # A hull of alpha masks counts with samples by occupancy only; Neural Volumes' always are.
     carved = hull.eq(True) & kind.fillna("occupancy").eq("occupancy")
     way = kind.where(kind.notna() | hull.isna(), "even steps")

@@ -146,7 +146,8 @@ def plain(table: Table) -> str:
 def _plain_block(table: Table, block: Block) -> str:
     frame = printed(table, [block], PLAIN).droplevel(0, axis=1)
     count = len(table.columns)
-    heads, cells = frame.iloc[:, :-count], frame.iloc[:, -count:]
+    heads = frame.iloc[:, :-count]
+    cells = frame.iloc[:, -count:]
     heads = heads.apply(lambda column: column.str.ljust(column.str.len().max()))
     cells.index = heads.agg("  ".join, axis=1)
     cells.columns = [f"{heading} " for heading in cells.columns]
@@ -198,7 +199,8 @@ def latex(table: Table) -> str:
 
 
 def _tables(table: Table, blocks: Sequence[Block], words: str) -> str:
-    frame, count = printed(table, blocks, STYLE), len(table.columns)
+    frame = printed(table, blocks, STYLE)
+    count = len(table.columns)
     left = len(frame.columns) - count * len(blocks)
     above = [rf"\multicolumn{{{count}}}{{c|}}{{{STYLE.escape(block.title)}}}" for block in blocks]
     above[-1] = above[-1].replace("{c|}", "{c}", 1)  # no rule at the right edge

@@ -33,7 +33,8 @@ def write_report(settings: ReportSettings) -> str:
     Raises:
         DevrfError: no such folder, or nothing below it that a run left; nothing is written.
     """
-    collection, folder = collect(Path(settings.runs)), settings.folder
+    collection = collect(Path(settings.runs))
+    folder = settings.folder
     if collection.runs.empty and collection.failures.empty:
         why = f" ({collection.skipped[0]})" if collection.skipped else ""
         raise DevrfError(
@@ -41,7 +42,8 @@ def write_report(settings: ReportSettings) -> str:
             "that were scored (stage=pipeline or stage=evaluate)"
         )
     table = tabulate(collection, settings.published)
-    figures, videos = _write_plots(table, folder), _write_videos(table, folder)
+    figures = _write_plots(table, folder)
+    videos = _write_videos(table, folder)
     _write(folder / "report.md", markdown(table, figures, videos))
     _write(folder / "report.tex", latex(table))
     _write(folder / "report.csv", csv(table))
@@ -95,8 +97,12 @@ def _write(path: Path, text: str) -> None:
 
 
 # What each run's video of the held-out views shows from left to right: truth, rendering, depth.
-COLUMNS, TRUTH, RENDERED = 3, 0, 1
-BAND, MARGIN = 22, 4  # pixels: above each picture for its label, and between them
+COLUMNS = 3
+TRUTH = 0
+RENDERED = 1
+# Pixels above each picture for its label, and between pictures.
+BAND = 22
+MARGIN = 4
 
 
 def scene_video(table: Table, scene: str) -> Iterator[np.ndarray] | None:
@@ -105,7 +111,8 @@ def scene_video(table: Table, scene: str) -> Iterator[np.ndarray] | None:
     The first run of a row that has a video stands for it. Pictures have the size of the first
     row's, and as many frames as the shortest video. None where fewer than two rows have a video.
     """
-    runs, videos = table.runs[table.runs["scene"] == scene], dict[str, Path]()
+    runs = table.runs[table.runs["scene"] == scene]
+    videos = dict[str, Path]()
     for label, folder in zip(runs["label"], runs["path"], strict=True):
         path = Path(folder) / "videos" / "held_out.mp4"
         if path.is_file():
@@ -115,7 +122,8 @@ def scene_video(table: Table, scene: str) -> Iterator[np.ndarray] | None:
 
 def _pictures(paths: Mapping[str, Path]) -> Iterator[np.ndarray]:
     videos = {label: list(iio.imiter(path)) for label, path in paths.items()}
-    count, first = min(map(len, videos.values())), next(iter(videos.values()))
+    count = min(map(len, videos.values()))
+    first = next(iter(videos.values()))
     size = _column(first, 0, RENDERED).size
     for time in np.linspace(0, 1, count):
         tiles = {"truth": _column(first, time, TRUTH)}
@@ -139,7 +147,8 @@ def _page(tiles: Mapping[str, Image.Image]) -> np.ndarray:
     page = Image.new("RGB", (across * (width + MARGIN), down * (height + BAND + MARGIN)), "white")
     pen = ImageDraw.Draw(page)
     for place, (label, tile) in enumerate(tiles.items()):
-        x, y = place % across * (width + MARGIN), place // across * (height + BAND + MARGIN)
+        x = place % across * (width + MARGIN)
+        y = place // across * (height + BAND + MARGIN)
         font = fitted_font(label, BAND // 2, width)
         pen.text((x + width / 2, y + BAND / 2), label, "black", font, "mm")
         page.paste(tile, (x, y + BAND))

@@ -27,13 +27,18 @@ if TYPE_CHECKING:
 
 # From OpenGL's camera axes (y up, z backwards) to OpenCV's (y down, z forwards), and back.
 FLIP = (1.0, -1.0, -1.0)
-# Rows of an image in a frustum, and the most frusta of a capture.
-ROWS, MAX_FRUSTA = 96, 60
-# A frustum is as deep as its neighbour is far, within these shares of the distance of the scene.
-MIN_DEPTH, MAX_DEPTH = 0.03, 0.12
-COLOR, THICKNESS = (40, 110, 170), 1.5
+# Rows of an image in a frustum.
+ROWS = 96
+# The most frusta of a capture.
+MAX_FRUSTA = 60
+# A frustum is as deep as its neighbour is far, within these shares of the distance to the scene.
+MIN_DEPTH = 0.03
+MAX_DEPTH = 0.12
+COLOR = (40, 110, 170)
+THICKNESS = 1.5
 # The angles of view in degrees, and windows (width over height), that are rendered as they are.
-FOVS, ASPECTS = (1.0, 179.0), (0.1, 10.0)
+FOVS = (1.0, 179.0)
+ASPECTS = (0.1, 10.0)
 
 
 def within(value: float, limits: tuple[float, float]) -> float:
@@ -80,7 +85,8 @@ def distance_ahead(cameras: Cameras) -> float:
 
     Axes that meet nowhere give the cameras' extent.
     """
-    origins, forwards = cameras.positions, cameras.forwards
+    origins = cameras.positions
+    forwards = cameras.forwards
     extent = float((origins - origins.mean(dim=0)).norm(dim=1).max()) or 1.0
     point = nearest_point(origins, forwards, parallel=1e-3)
     ahead = 0.0 if point is None else float(((point - origins) * forwards).sum(dim=1).mean())
@@ -124,7 +130,9 @@ class FrustaLayer:
 
     def __init__(self, server: viser.ViserServer, cameras: Cameras, scene: Scene | None) -> None:
         """Show none yet; ``cameras`` saw the scene at rest, their images are the ``scene``'s."""
-        self._server, self._cameras, self._scene = server, cameras, scene
+        self._server = server
+        self._cameras = cameras
+        self._scene = scene
         shown = cameras.positions[evenly(len(cameras), MAX_FRUSTA)]
         apart = torch.cdist(shown, shown).fill_diagonal_(math.inf).amin(dim=1).median()
         away = distance_ahead(cameras)
@@ -140,7 +148,7 @@ class FrustaLayer:
             nearest = float(times[int((times - time).abs().argmin())])
         if (static, nearest) == self._shown:
             return
-        self._shown = static, nearest
+        self._shown = (static, nearest)
         frusta = static_frusta(self._cameras, self._scene) if static else []
         if nearest is not None and self._scene is not None:
             frusta += dynamic_frusta(self._scene, nearest)

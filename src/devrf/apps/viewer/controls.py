@@ -72,7 +72,9 @@ class Controls:
 
     def __init__(self, server: viser.ViserServer, changed: Callable[[], None]) -> None:
         """Put them on the page; ``changed`` is called, from any thread, to render again."""
-        self.playback, self._lock, self._changed = Playback(), threading.Lock(), changed
+        self.playback = Playback()
+        self._lock = threading.Lock()
+        self._changed = changed
         gui = server.gui
         self._told = gui.add_markdown("", visible=False)
         self._timing = gui.add_folder("Time")
@@ -103,7 +105,8 @@ class Controls:
         self._loop.on_update(self._pace_set)
         self._speed.on_update(self._pace_set)
         # Frusta would not lie where two pictures show the scene.
-        scene, rest = server.scene, self._rest
+        scene = server.scene
+        rest = self._rest
         rest.on_update(lambda _: scene.set_global_visibility(not rest.value))
         boxes: list[Any] = [self._channel, rest, self.dynamic, self.static]
         crop: list[Any] = [self._crop, *self._sides]
@@ -144,9 +147,11 @@ class Controls:
         """
         crop = None
         if self._crop.value:
-            ends = min, max
             shares = [
-                [within(end(slider.value), (0, 100)) / 100 for end in ends]
+                (
+                    within(min(slider.value), (0, 100)) / 100,
+                    within(max(slider.value), (0, 100)) / 100,
+                )
                 for slider in self._sides
             ]
             corners = list(zip(box.low, box.size, shares, strict=True))
@@ -165,7 +170,8 @@ class Controls:
 
     def tell(self, text: str) -> None:
         """Say at the top of the page what the scene is going through."""
-        self._told.content, self._told.visible = text, True
+        self._told.content = text
+        self._told.visible = True
 
     def follow(self, time: float | None) -> None:
         """Show the time that is being learned, if it is one, and none was chosen on the page."""
@@ -206,5 +212,6 @@ class Controls:
         self._changed()
 
     def _pace_set(self, _: object) -> None:
-        loop, speed = bool(self._loop.value), float(choice_of(self._speed))
+        loop = bool(self._loop.value)
+        speed = float(choice_of(self._speed))
         self._change(lambda now: replace(now, loop=loop, speed=speed))

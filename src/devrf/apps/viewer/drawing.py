@@ -21,15 +21,19 @@ from devrf.rendering.output import RenderedImage
 from devrf.rendering.renderer import Renderer, points_at_depth
 from devrf.rendering.view import MovingView
 
-# Motion is shown as optical flow over so much time, and saturated at this share of the height.
-STEP, SATURATED = 0.05, 0.02
-# Seconds that a block of rays should take: between blocks a frame can be given up.
-BLOCK_SECONDS, MIN_RAYS = 0.08, 512
+# Motion is shown as optical flow over STEP of the time, saturated at this share of the height.
+STEP = 0.05
+SATURATED = 0.02
+# Seconds that a block of rays should take, and its fewest rays: a frame can be given up between
+# blocks.
+BLOCK_SECONDS = 0.08
+MIN_RAYS = 512
 # In empty space nothing hides what is drawn into the scene.
 NOWHERE = 1e3
-# A finer frame has at most so many times the rows of the one before; one that would be nearly
-# full is full at once.
-FINER, NEARLY = 3, 0.75
+# A finer frame has at most FINER times the rows of the one before. A frame with more than NEARLY of
+# all rows gets all at once.
+FINER = 3
+NEARLY = 0.75
 
 
 @dataclass(frozen=True)
@@ -70,7 +74,7 @@ class Drawing:
     """Draws shots of a learned scene, and knows how fast that goes.
 
     Attributes:
-        renderer: of the scene; another may take its place while the scene is learned.
+        renderer: renders the scene; it may be replaced while the scene is learned.
         channels: what can be shown of it.
         has_rest: whether it has a rest state beside others.
         at_rest: whether it looks the same at all times.
@@ -78,7 +82,8 @@ class Drawing:
 
     def __init__(self, renderer: Renderer, background: float) -> None:
         """``background``: the grey level behind the scene."""
-        self.renderer, self._background = renderer, background
+        self.renderer = renderer
+        self._background = background
         end = renderer.at(1.0)
         self.at_rest = end.at_rest
         self.has_rest = renderer.at(0.0).at_rest and not end.at_rest
@@ -100,16 +105,18 @@ class Drawing:
         times = [0.0, shown] if shot.beside_rest and self.has_rest else [shown]
         tangent = len(times) * math.tan(math.radians(shot.keyframe.fov) / 2)
         keyframe = replace(shot.keyframe, fov=2 * math.degrees(math.atan(tangent)))
-        parts, depth = [], None
-        for moment in times:
+        parts = []
+        depth = None
+        for current in times:
             camera = cameras_of([keyframe], shot.aspect / len(times), height)
             camera = camera.to(self.renderer.device)
             started = time.perf_counter()
             with torch.no_grad():
-                self.renderer.at(moment)  # cached, or it takes a while
+                self.renderer.at(current)  # cached, or it takes a while
             self._overhead += 0.3 * (time.perf_counter() - started - self._overhead)
-            started, blocks = time.perf_counter(), []
-            for block in self._blocks(shot, camera, moment):
+            started = time.perf_counter()
+            blocks = []
+            for block in self._blocks(shot, camera, current):
                 blocks.append(block)
                 yield None
             image = RenderedImage.joined([image for image, _ in blocks])
@@ -126,7 +133,8 @@ class Drawing:
         self, shot: Shot, camera: Cameras, time: float
     ) -> Iterator[tuple[RenderedImage, Tensor]]:
         """Consecutive pixels in row-major order, with the motion (K, 2) where it is shown."""
-        rays, pixels = camera.image_rays(0), camera.pixel_grid()
+        rays = camera.image_rays(0)
+        pixels = camera.pixel_grid()
         crop = shot.crop or self.renderer.reach(camera.positions[0])
         later = time + STEP if time + STEP <= 1 else time - STEP
         size = max(MIN_RAYS, int(BLOCK_SECONDS * self._rays_per_second))
@@ -144,7 +152,7 @@ class Drawing:
         self, channel: str, camera: Cameras, image: RenderedImage, vectors: Tensor
     ) -> Tensor:
         """The channel (H, W, 3) in [0, 1], on the host."""
-        shape = camera.height, camera.width
+        shape = (camera.height, camera.width)
         opacity = image.opacity.view(shape).cpu()
         if channel == "depth":
             model = self.renderer.model
@@ -160,7 +168,8 @@ class Drawing:
 
     def _axial(self, camera: Cameras, image: RenderedImage) -> Tensor:
         """(H, W) world distances along the camera's axis; far away where nothing is."""
-        space, rays = self.renderer.model.space, camera.image_rays(0)
+        space = self.renderer.model.space
+        rays = camera.image_rays(0)
         _, depth = camera.project_into(0, points_at_depth(space, rays, image.depth))
         depth = torch.where(image.opacity > SOLID, depth, NOWHERE)
         return depth.view(camera.height, camera.width).cpu()
@@ -195,8 +204,11 @@ class RenderScheduler:
         frame has, and about how long a first one takes. Once ``stop`` is set, the current frame is
         given up.
         """
-        self.drawing, self._stop, self._show = drawing, stop, show
-        self._height, self._move_seconds = settings.height, settings.move_seconds
+        self.drawing = drawing
+        self._stop = stop
+        self._show = show
+        self._height = settings.height
+        self._move_seconds = settings.move_seconds
         self._requests: dict[Hashable, _Request] = {}  # the one served last is at the end
         self._change = threading.Condition()
 
@@ -225,7 +237,9 @@ class RenderScheduler:
                 return False
             key, request = urgent
             self._requests[key] = self._requests.pop(key)
-        full, coarse, aspect = self._height, request.rows == 0, request.shot.aspect
+        full = self._height
+        coarse = request.rows == 0
+        aspect = request.shot.aspect
         rows = FINER * request.rows or self.drawing.height_within(self._move_seconds, aspect, full)
         rows = full if rows > NEARLY * full else rows
         try:
@@ -243,7 +257,7 @@ class RenderScheduler:
         return False
 
     def _most_urgent(self) -> tuple[Hashable, _Request] | None:
-        """Whose frame is the coarsest; of several the one that was served longest ago."""
+        """The browser with the coarsest frame; among equals the one served longest ago."""
         waiting = [item for item in self._requests.items() if item[1].rows < self._height]
         return min(waiting, key=lambda item: item[1].rows, default=None)
 

@@ -30,7 +30,8 @@ from devrf.geometry.cameras import Cameras
 from devrf.rendering.view import Viewable
 
 # Keyframes of a known path, and the seconds that it takes to go round.
-KEYFRAMES, SECONDS = 13, 8.0
+KEYFRAMES = 13
+SECONDS = 8.0
 # Points of the line that shows a path.
 POINTS = 120
 # Known paths of scenes that move.
@@ -42,7 +43,8 @@ Act = Callable[[viser.GuiEvent[Any]], None]
 
 def known_paths(cameras: Cameras, model: Callable[[], Viewable]) -> dict[str, Preset]:
     """The paths that ``video.path`` names, with the time, from the static ``cameras``."""
-    once, longer = VideoSettings(frames=KEYFRAMES), VideoSettings(frames=3 * KEYFRAMES)
+    once = VideoSettings(frames=KEYFRAMES)
+    longer = VideoSettings(frames=3 * KEYFRAMES)
     times = torch.linspace(0, 1, KEYFRAMES).tolist()
 
     def filmed(name: str, video: VideoSettings) -> Cameras:
@@ -59,10 +61,18 @@ def known_paths(cameras: Cameras, model: Callable[[], Viewable]) -> dict[str, Pr
     def ring(video: VideoSettings) -> Cameras:
         return filmed(default_way(model().space, closed=True), video)
 
+    def bullet(stop: float) -> tuple[Keyframe, ...]:
+        shots, shot_times = bullet_time(ring, stop, once)
+        return keyframes_of(shots, shot_times, SECONDS)
+
+    def freeze(stop: float) -> tuple[Keyframe, ...]:
+        shots, shot_times = time_freeze(ring, stop, longer)
+        return keyframes_of(shots, shot_times, 3 * SECONDS)
+
     return {
         **{name: partial(running, name) for name in WAYS},
-        "bullet time": lambda stop: keyframes_of(*bullet_time(ring, stop, once), SECONDS),
-        "time freeze": lambda stop: keyframes_of(*time_freeze(ring, stop, longer), 3 * SECONDS),
+        "bullet time": bullet,
+        "time freeze": freeze,
     }
 
 
@@ -92,8 +102,12 @@ class PathPanel:
         path appears in the scene, or vanishes.
         """
         self.keyframes: tuple[Keyframe, ...] = ()
-        self._server, self._folder, self._run, self._height = server, folder, run, height
-        self._time, self._changed = time, changed
+        self._server = server
+        self._folder = folder
+        self._run = run
+        self._height = height
+        self._time = time
+        self._changed = changed
         self._line: viser.LineSegmentsHandle | None = None
         gui = server.gui
         with gui.add_folder("Video", expand_by_default=False):

@@ -24,7 +24,7 @@ def open_server(settings: ViewerSettings) -> viser.ViserServer:
     """A server at the address of the settings, if it is free, with an empty page."""
     settings.check_free()
     logging.getLogger("websockets").setLevel(logging.WARNING)
-    # A probe of the port asks for no page: its traceback would tell nothing.
+    # A probe of the port asks for no page: its traceback would help nobody.
     logging.getLogger("websockets.server").addFilter(lambda r: r.msg != "opening handshake failed")
     names = {"localhost", settings.host, socket.gethostname(), socket.getfqdn()}
     serve = partial(_guarded, websockets_server.serve, {name.lower() for name in names})

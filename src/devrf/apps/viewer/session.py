@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 
 # Seconds between looks at the clock while nothing is to be rendered.
 TICK = 0.02
-# Of full frames, as JPEG. Coarse ones are enlarged, which would show JPEG's blocks and halos.
+# JPEG's quality for full frames. Coarse ones are enlarged, which would show its blocks and halos.
 QUALITY = 92
 
 
@@ -56,7 +56,8 @@ class Session:
         Raises:
             DevrfError: the address is in use, or not this machine's.
         """
-        self.settings, self.viewpoints = settings, viewpoints
+        self.settings = settings
+        self.viewpoints = viewpoints
         self.scheduler: RenderScheduler | None = None
         self.frames = 0
         self._stop = threading.Event()
@@ -119,7 +120,8 @@ class Session:
         """Let time run, and render one frame, waiting ``timeout`` seconds for its cause."""
         assert self.scheduler is not None
         now = time.monotonic()
-        seconds, self._ticked = now - self._ticked, now
+        seconds = now - self._ticked
+        self._ticked = now
         if self._flight is not None:
             self._follow(now)
         elif self.controls.advance(min(seconds, 1.0)):
@@ -185,9 +187,11 @@ class Session:
 
     def _place_camera(self) -> None:
         """Begin where the held-out camera is, with the cameras' mean up."""
-        static, held_out = self.viewpoints.static, self.viewpoints.held_out
+        static = self.viewpoints.static
+        held_out = self.viewpoints.held_out
         self.server.scene.set_up_direction(static.camera_to_world[:, :, 1].mean(dim=0).numpy())
-        start, target = self.server.initial_camera, held_out[[0]]
+        start = self.server.initial_camera
+        target = held_out[[0]]
         ahead = target.positions[0] + distance_ahead(static) * target.forwards[0]
         _, start.position, start.fov = in_browser(keyframes_of(target, [0.0], 0.0)[0])
         start.look_at = ahead.numpy()

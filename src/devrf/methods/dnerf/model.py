@@ -24,10 +24,12 @@ class TranslationField(nn.Module):
 
     def __init__(self, settings: DNeRFSettings) -> None:
         super().__init__()
-        width, depth = settings.deformation_width, settings.deformation_depth
+        width = settings.deformation_width
+        depth = settings.deformation_depth
         self.encode_position = SinusoidalEncoding(3, settings.bands)
         self.encode_time = SinusoidalEncoding(1, settings.time_bands)
-        position, time = self.encode_position.size, self.encode_time.size
+        position = self.encode_position.size
+        time = self.encode_time.size
         self.trunk = Trunk(position + time, width, depth, settings.skip, skipped=position)
         self.output = nn.Linear(width, 3)
         nn.init.uniform_(self.output.weight, -SMALL, SMALL)
@@ -36,7 +38,8 @@ class TranslationField(nn.Module):
     def forward(self, points: Tensor, time: Tensor) -> Tensor:
         """Displacements (S, 3) to canonical space of points (S, 3) at times (S,) in [0, 1]."""
         moving = (time > 0).nonzero()[:, 0]
-        place, when = points.index_select(0, moving), time.index_select(0, moving)
+        place = points.index_select(0, moving)
+        when = time.index_select(0, moving)
         encoded = torch.cat([self.encode_position(place), self.encode_time(when[:, None])], dim=-1)
         displacement = self.output(self.trunk(encoded))
         return torch.zeros_like(points).index_copy(0, moving, displacement.to(points.dtype))
@@ -84,7 +87,8 @@ class DNeRF(DeformableField):
         """``color``; ``temporal``: Σ |Δ(x, t) − Δ(x, t′)|², t′ towards a neighbouring frame."""
         terms = super().loss_terms(output, batch, names)
         if "temporal" in names:
-            points, time = output.extras["points"].detach(), output.extras["time"]
+            points = output.extras["points"].detach()
+            time = output.extras["time"]
             between = 1 / max(len(self.clock) - 1, 1)
             other = (time + between * (2 * torch.rand_like(time) - 1)).clamp(0, 1)
             change = self.deformation(points, time) - self.deformation(points, other)

@@ -32,7 +32,8 @@ class SlicingSurface(nn.Module):
 
     def __init__(self, settings: HyperNeRFSettings) -> None:
         super().__init__()
-        s, width = settings, settings.slicing_width
+        s = settings
+        width = settings.slicing_width
         self.encode = SinusoidalEncoding(3, s.slicing_bands, identity=False)
         self.trunk = Trunk(self.encode.size + s.code, width, s.slicing_depth, s.slicing_skip)
         self.output = nn.Linear(width, s.ambient)
@@ -122,7 +123,8 @@ class HyperNeRF(Nerfies):
         """Open the warp's octaves, and those of w: β grows evenly from 0 after a delay."""
         super().on_iteration(step, total)
         s = self.settings
-        since, share = step - s.ambient_delay * total, s.ambient_window * total
+        since = step - s.ambient_delay * total
+        share = s.ambient_window * total
         opened = min(max(since, 0.0) / share, 1.0) if share else float(since >= 0)
         self.opened.fill_(0.0 if self._shut else opened * s.ambient_bands)
 
@@ -134,5 +136,5 @@ class HyperNeRF(Nerfies):
         return self.warp(points, code), self.encode(w, window)
 
     def parts(self) -> dict[str, Iterable[nn.Parameter]]:
-        """Those of Nerfies; what slices; and, apart from T, the weights by which w enters it."""
+        """Nerfies' parts, the slicing network, and, apart from T, the weights by which w enters."""
         return {**super().parts(), "ambient": self.slicing.parameters()}

@@ -29,7 +29,7 @@ from devrf.rendering.output import RenderOutput
 class DeformableField(NeuralField):
     """(σ, c) = T(x′, w, d), where a deformation leads a point x at time t to x′ and w.
 
-    A method says what the deformation is (:meth:`deform`). T lives in normalised space.
+    A method defines the deformation (:meth:`deform`). T lives in normalised space.
 
     Attributes:
         canonical: T.
@@ -77,9 +77,9 @@ class DeformableField(NeuralField):
     ) -> RenderOutput:
         """What rays see, and samples.
 
-        ``extras`` has of the S samples ``points`` (S, 3) x in normalised space, ``time``, ``ray``
-        and ``weight`` (S,); and if a coarse field learns, ``coarse_color`` (R, 3) and the others
-        with ``coarse_`` before their names.
+        ``extras`` has ``points`` (S, 3) x in normalised space, ``time``, ``ray`` and ``weight``
+        (S,) of the S samples. If a coarse field learns, it also has ``coarse_color`` (R, 3), and
+        the same of the coarse samples with ``coarse_`` before their names.
         """
         if self.settings.sampling == "occupancy":
             samples = self.march(rays, time, jitter=jitter)
@@ -99,10 +99,11 @@ class DeformableField(NeuralField):
         time: Tensor,
         background: Tensor,
     ) -> RenderOutput:
-        """What samples of rays come to in a radiance field."""
+        """The render of samples in a radiance field."""
         if not self.space.is_linear:
             samples = samples.unbounded()
-        points, when = self.placement.normalised(samples.points), time.index_select(0, samples.ray)
+        points = self.placement.normalised(samples.points)
+        when = time.index_select(0, samples.ray)
         canonical, ambient = self.deform(points, when)
         density, color = field(canonical, rays.viewdirs, samples.ray, ambient)
         scaled = samples.scaled(self.placement.half_edge)
@@ -112,11 +113,13 @@ class DeformableField(NeuralField):
     def _by_weight(
         self, rays: Rays, time: Tensor, background: Tensor, *, jitter: bool
     ) -> tuple[RaySamples, RenderOutput | None]:
-        """Even samples, and more where these have weight; what a learning coarse field sees."""
-        s, field = self.settings, self.coarse or self.canonical
+        """Even samples and more where these have weight; the render of a learning coarse field."""
+        s = self.settings
+        field = self.coarse or self.canonical
         near, far = limits(rays, self.box, self.depth_limits)
         distance = stratified(near, far, s.coarse, jitter=jitter)
-        first, output = flattened(rays, distance, far), None
+        first = flattened(rays, distance, far)
+        output = None
         if self.coarse is not None and jitter:
             output = self._rendered(field, first, rays, time, background)
             weight = output.extras["weight"].detach()
@@ -130,15 +133,18 @@ class DeformableField(NeuralField):
     @torch.no_grad()
     def _weights(self, field: RadianceField, samples: RaySamples, time: Tensor) -> Tensor:
         """Weights (S,) of samples, from their densities alone."""
-        points, when = self.placement.normalised(samples.points), time.index_select(0, samples.ray)
-        density = field.sigma(*self.deform(points, when))
+        points = self.placement.normalised(samples.points)
+        when = time.index_select(0, samples.ray)
+        canonical, ambient = self.deform(points, when)
+        density = field.sigma(canonical, ambient)
         length = samples.length / self.placement.half_edge
         weight, _ = composite(density * length, samples.ray, samples.rays)
         return weight
 
     def optical_depth(self, points: Tensor, time: Tensor, length: float) -> Tensor:
         """τ (S,) of the canonical field, where the points lead."""
-        return self.canonical.sigma(*self.deform(points, time)) * length
+        canonical, ambient = self.deform(points, time)
+        return self.canonical.sigma(canonical, ambient) * length
 
     def loss_terms(
         self, output: RenderOutput, batch: RayBatch, names: Collection[str]

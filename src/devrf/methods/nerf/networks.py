@@ -103,7 +103,7 @@ class Trunk(nn.Module):
         )
 
     def forward(self, values: Tensor, beside: Tensor | None = None) -> Tensor:
-        """(M, width) of ``values`` (M, inputs), and ``beside`` (M, beside) where that enters."""
+        """(M, width) of ``values`` (M, inputs), and of ``beside`` (M, beside) if that enters."""
         x = values
         for k, layer in enumerate(self.layers):
             if k == self._skip:
@@ -128,7 +128,7 @@ def initialise(network: nn.Module, how: Initialisation) -> None:
                 nn.init.zeros_(layer.bias)
 
 
-# They begin uniform in [0, LARGEST).
+# Codes begin uniform in [0, LARGEST).
 LARGEST = 0.05
 
 
@@ -185,9 +185,10 @@ class RadianceField(nn.Module):
         initialise(self, s.initialisation)
 
     def reduced(self) -> AbstractContextManager[None]:
-        """Where the field computes in bfloat16 while it learns, if its settings say so."""
-        chosen, device = self._settings.precision, self.density.weight.device
-        reduced = multiplies_bfloat16(device) if chosen == "auto" else chosen == "bfloat16"
+        """A block in which the field computes in bfloat16 while it learns, if so configured."""
+        precision = self._settings.precision
+        device = self.density.weight.device
+        reduced = multiplies_bfloat16(device) if precision == "auto" else precision == "bfloat16"
         if not (reduced and self.training):
             return nullcontext()
         return torch.autocast(device.type, torch.bfloat16)
@@ -208,7 +209,8 @@ class RadianceField(nn.Module):
         """
         with self.reduced():
             raw, logits, _ = self.heads(points, viewdirs, ray, ambient)
-            density, color = self._activated(raw), torch.sigmoid(logits)
+            density = self._activated(raw)
+            color = torch.sigmoid(logits)
         return density.float(), color.float()
 
     def sigma(self, points: Tensor, ambient: Tensor | None = None) -> Tensor:

@@ -16,11 +16,16 @@ from devrf.rendering.sampling import steps_through
 from devrf.scenes.scene import Scene
 from devrf.scenes.silhouettes import visual_hull
 
-# A cell is empty below LEAST of opacity a step: what it is at a random place and time, or DECAY
-# of what it was. EVERY so many iterations a SHARE of all cells is looked at anew; the first time
-# all of them, at FIRST times.
-LEAST, DECAY, EVERY, SHARE, FIRST = 0.01, 0.9, 16, 0.5, 4
-# Points that a field is asked for at once.
+# A cell with less opacity a step than this is empty.
+LEAST = 0.01
+# A cell keeps this share of its opacity, unless that at a random place and time is larger.
+DECAY = 0.9
+# After so many iterations this share of the cells is evaluated again.
+EVERY = 16
+SHARE = 0.5
+# The first time all cells are evaluated, at so many times.
+FIRST = 4
+# Points at which a field is evaluated at once.
 CHUNK = 1 << 18
 
 
@@ -28,7 +33,7 @@ class LearnedOccupancy(StoredShape):
     """A decaying maximum over places and times of each cell's opacity, learned beside the field.
 
     Attributes:
-        opacity: (X, Y, Z) of a step; 1 until the field is asked. (0, 0, 0): nothing is left out.
+        opacity: (X, Y, Z) of a step; 1 until it is evaluated. (0, 0, 0): nothing is left out.
     """
 
     resizable = ("opacity",)
@@ -62,9 +67,9 @@ class LearnedOccupancy(StoredShape):
         """Look at cells again if iteration ``step`` is one to do so.
 
         Args:
-            step: of a stage, from 0; what another stage saw is forgotten there.
+            step: iteration of a stage, from 0; at 0 what another stage saw is forgotten.
             total: iterations of the stage.
-            share: of these, before which nothing is left out; None: nothing ever is.
+            share: share of these before which nothing is left out; None: nothing ever is.
             box: where the cells are, in the fields' space.
             opacity_at: the opacity (S,) of a step at points (S, 3) of that space and times (S,) in
                 [0, 1].
@@ -74,8 +79,10 @@ class LearnedOccupancy(StoredShape):
             return
         if step == 0:
             self.opacity.fill_(1)
-        start, previous = round(share * total), (step if self._step is None else self._step)
-        self._step, previous = step, min(previous, step - 1)
+        start = round(share * total)
+        previous = step if self._step is None else self._step
+        self._step = step
+        previous = min(previous, step - 1)
         if step < start or step // EVERY == previous // EVERY:
             return
         flat = self.opacity.view(-1)
@@ -134,7 +141,7 @@ class OccupancyFrames(StoredShape):
             box: in the fields' space.
             side: cells along an edge of a cube of the box's size.
             hull: whether to carve at all.
-            empty_from: share of a stage after which the field is asked; None: never.
+            empty_from: share of a stage after which the field is evaluated; None: never.
         """
         shape = box.grid_shape(side**3)
         masks = cls(len(scene.clock), shape)

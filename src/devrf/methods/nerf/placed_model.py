@@ -23,7 +23,8 @@ from devrf.rendering.output import RenderedImage, RenderOutput
 from devrf.scenes.scene import Scene
 
 # Rays of a view that are rendered at once, on a CPU and on a GPU.
-ON_CPU, ON_GPU = 2048, 2**14
+ON_CPU = 2048
+ON_GPU = 2**14
 
 
 class PlacedModel(RayTrainable):
@@ -54,7 +55,9 @@ class PlacedModel(RayTrainable):
 
     def set_place(self, box: Box, space: Space, depths: tuple[float, float]) -> None:
         """Take the box, the fields' space, and the distances between which rays are sampled."""
-        self.box, self.space, self.depth_limits = box, space, depths
+        self.box = box
+        self.space = space
+        self.depth_limits = depths
         self.placement = Placement(box, space)
 
     def set_times(self, times: tuple[float, ...]) -> None:
@@ -81,8 +84,9 @@ class PlacedModel(RayTrainable):
     def from_config(cls, config: Mapping[str, Any]) -> Self:
         """Networks of the same sizes in the same place."""
         model = cls(cls.settings_class(**config["settings"]))
+        low, high = config["box"]
         near, far = config["limits"]
-        model.set_place(Box.of(*config["box"]), space_from(config["space"]), (near, far))
+        model.set_place(Box.of(low, high), space_from(config["space"]), (near, far))
         model.set_times(tuple(config["times"]))
         for name in cls.remembered:
             setattr(model, name, config[name])
@@ -90,11 +94,12 @@ class PlacedModel(RayTrainable):
 
 
 class NeuralField(PlacedModel):
-    """Networks that are asked point by point, in normalised space."""
+    """Networks that are evaluated point by point, in normalised space."""
 
     def setup(self, scene: Scene) -> None:
         """Take the scene's bounds and times; carve the frames' occupancy from their alpha masks."""
-        bounds, s = scene.bounds, self.settings
+        bounds = scene.bounds
+        s = self.settings
         self.set_place(bounds.whole, scene.space, (bounds.near, bounds.far))
         self.set_times(scene.clock.times)
         if s.sampling == "occupancy":
@@ -137,7 +142,7 @@ class NeuralField(PlacedModel):
     def march(self, rays: Rays, time: Tensor, *, jitter: bool) -> RaySamples:
         """Even steps where something may be at the frames around each ray's time."""
         before, after, _ = self.clock.between(time)
-        # Of the box's diagonal, in units of the longest direction.
+        # A share of the box's diagonal, in units of the longest direction.
         longest = float(rays.directions.norm(dim=1).amax()) if len(rays) else 1.0
         step = self.box.diagonal / (self.settings.steps * longest)
         return self.occupancy.march(
@@ -174,7 +179,8 @@ class RayView:
             half: networks in half precision, on a CUDA device.
         """
         on_gpu = model.device.type == "cuda"
-        self._render_rays, self._time = render_rays, time
+        self._render_rays = render_rays
+        self._time = time
         self._half = half and on_gpu
         self.at_rest = model.clock.at(time).after == 0
         self.chunk = ON_GPU if on_gpu else ON_CPU

@@ -10,7 +10,7 @@ from devrf.geometry.box import Box
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.space import Space
 
-# Points beyond, which a flow may lead to, count as being there: infinity is at 1.
+# The largest z' of points in NDC, where infinity is at 1: a flow may lead them further.
 FURTHEST = 0.99
 
 

@@ -1,4 +1,4 @@
-"""Samples along rays: where they are drawn, and what they come to."""
+"""Samples along rays: where they are drawn, and how they are composited."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from devrf.geometry.rays import Rays
 from devrf.ops.compositing import color_and_depth, composite, sum_by_ray
 from devrf.rendering.output import RenderOutput
 
-# Opaque at any density that a softplus gives.
+# A length that is opaque at any density that a softplus gives.
 UNBOUNDED = 1e10
 
 
@@ -89,7 +89,8 @@ def accumulated(
         transmittance: (R,) T_end.
         background: (3,) or (R, 3) RGB.
     """
-    ray, rays = samples.ray, samples.rays
+    ray = samples.ray
+    rays = samples.rays
     weighted_color = sum_by_ray(color, ray, rays)
     with torch.no_grad():
         mass = sum_by_ray(weight, ray, rays)
@@ -103,8 +104,9 @@ def limits(rays: Rays, box: Box, depths: tuple[float, float]) -> tuple[Tensor, T
 
     A ray that misses the box is sampled in a stretch of no length.
     """
-    entry, leave = box.crossing(rays, *depths)
-    near = entry.clamp(max=depths[1])
+    nearest, farthest = depths
+    entry, leave = box.crossing(rays, nearest, farthest)
+    near = entry.clamp(max=farthest)
     return near, torch.maximum(leave, near)
 
 
@@ -146,9 +148,11 @@ def importance(
     wanted = stratified(torch.zeros_like(near), torch.ones_like(far), count, jitter=jitter)
     above = torch.searchsorted(reached, wanted.contiguous(), right=True)
     above = above.clamp(min=1, max=edge.shape[1] - 1)
-    low, high = reached.gather(1, above - 1), reached.gather(1, above)
+    low = reached.gather(1, above - 1)
+    high = reached.gather(1, above)
     within = ((wanted - low) / (high - low).clamp(min=1e-8)).clamp(0, 1)
-    start, stop = edge.gather(1, above - 1), edge.gather(1, above)
+    start = edge.gather(1, above - 1)
+    stop = edge.gather(1, above)
     return start + within * (stop - start)
 
 

@@ -10,12 +10,14 @@ from devrf.errors import expect
 Initialisation = Literal["uniform", "glorot"]
 Precision = Literal["auto", "float32", "bfloat16"]
 
-# Samples of a ray, and octaves of an encoding, at most.
-SAMPLES, BANDS = 1024, 32
+# The most samples of a ray.
+SAMPLES = 1024
+# The most octaves of an encoding.
+BANDS = 32
 
 
 class CheckedSettings:
-    """Settings of a method that refuse what cannot be."""
+    """Settings of a method that refuse impossible values."""
 
     key: ClassVar[str] = "ray_stage.model.settings"
 
@@ -28,12 +30,12 @@ class CheckedSettings:
         expect(holds, f"{self.key}.{name}", expected, getattr(self, name))
 
     def check_least(self, minimum: int, *names: str) -> None:
-        """Refuse settings that are less; raises as :meth:`check`."""
+        """Refuse settings below ``minimum``; raises as :meth:`check`."""
         for name in names:
             self.check(name, getattr(self, name) >= minimum, f"at least {minimum}")
 
     def check_samples(self, *names: str) -> None:
-        """Refuse numbers of a ray's samples that are none, or fill memory; raises likewise."""
+        """Refuse numbers of a ray's samples below 2 or above the most; raises likewise."""
         for name in names:
             self.check(name, 2 <= getattr(self, name) <= SAMPLES, f"2 to {SAMPLES}")
 
@@ -54,10 +56,10 @@ class PlacedSettings(CheckedSettings):
             ``auto`` (bfloat16 on a GPU that multiplies it). All else is in float32.
         steps: samples along the box's diagonal (occupancy).
         occupancy_side: the masks have about side³ cells (occupancy).
-        hull: whether these are the visual hulls of each frame's masks, where there are any, which
-            the published methods never had (occupancy).
-        empty_from: where there are no such hulls, space that the fields leave empty at all times
-            is left out after this share of a stage; None: never (occupancy).
+        hull: whether the masks are the visual hulls of each frame's alpha masks, if there are any;
+            the published methods never had these (occupancy).
+        empty_from: without such hulls, space that the fields leave empty at all times is left out
+            after this share of a stage; None: never (occupancy).
     """
 
     width: int = 256

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.func import jvp, vmap
 
-# Below this squared singular value nothing is told apart: log² stays finite.
+# The least squared singular value, so that log² stays finite.
 LEAST = 1e-12
 # c: strains above it count less and less.
 SCALE = 0.03
@@ -67,9 +67,11 @@ def drawn(weight: Tensor, ray: Tensor, rays: Tensor, count: int) -> tuple[Tensor
     total = torch.zeros(count, dtype=reached.dtype, device=weight.device).index_add(
         0, ray, weight.double()
     )
-    mass, start = total[rays], (total.cumsum(0) - total)[rays]
-    some = (mass > 0).nonzero()[:, 0]
-    mass, start = mass[some], start[some]
+    mass = total[rays]
+    start = (total.cumsum(0) - total)[rays]
+    visible = (mass > 0).nonzero()[:, 0]
+    mass = mass[visible]
+    start = start[visible]
     wanted = start + torch.rand_like(mass) * mass
     picked = torch.searchsorted(reached, wanted, right=True).clamp(max=max(len(weight) - 1, 0))
     return picked, mass.to(weight.dtype)

@@ -39,11 +39,13 @@ class RigidWarp(nn.Module):
 
     def __init__(self, settings: NerfiesSettings) -> None:
         super().__init__()
-        s, width = settings, settings.warp_width
+        s = settings
+        width = settings.warp_width
         self.bands = s.warp_bands
         self.encode = SinusoidalEncoding(3, s.warp_bands)
         self.trunk = Trunk(self.encode.size + s.code, width, s.warp_depth, s.warp_skip)
-        self.rotation, self.velocity = nn.Linear(width, 3), nn.Linear(width, 3)
+        self.rotation = nn.Linear(width, 3)
+        self.velocity = nn.Linear(width, 3)
         self.register_buffer("opened", torch.zeros(()))
         initialise(self.trunk, "glorot")
         for head in (self.rotation, self.velocity):
@@ -54,7 +56,8 @@ class RigidWarp(nn.Module):
         """Where points (S, 3) of normalised space lead; ``code`` (S, code) is of their times."""
         window = octave_window(self.opened, self.bands)
         x = self.trunk(torch.cat([self.encode(points, window), code], dim=-1))
-        rotation, velocity = self.rotation(x), self.velocity(x)
+        rotation = self.rotation(x)
+        velocity = self.velocity(x)
         return rigid_motion(points, rotation.to(points.dtype), velocity.to(points.dtype))
 
 
@@ -140,7 +143,7 @@ class Nerfies(DeformableField):
         self.warp.opened.fill_(opened * self.settings.warp_bands)
 
     def deform(self, points: Tensor, time: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Where points lead, and what enters T beside; nothing moves where rest is canonical."""
+        """Where points lead, and what enters T beside; nothing moves at a canonical rest state."""
         if not self.rest_is_canonical:
             return self.bend(points, time)
         moving = (time > 0).nonzero()[:, 0]
@@ -151,7 +154,7 @@ class Nerfies(DeformableField):
         return points.index_copy(0, moving, bent), ambient
 
     def bend(self, points: Tensor, time: Tensor) -> tuple[Tensor, Tensor | None]:
-        """As :meth:`deform`, at any time alike."""
+        """As :meth:`deform`, but time 0 is like any other time."""
         return self.warp(points, self.codes(time)), None
 
     def parts(self) -> dict[str, Iterable[nn.Parameter]]:
@@ -173,11 +176,12 @@ class Nerfies(DeformableField):
         return terms
 
     def _elastic(self, output: RenderOutput, rays: int) -> Tensor:
-        """Of the coarse samples where these have a field of their own, as published."""
-        first = "coarse_" if "coarse_points" in output.extras else ""
-        points, time, weight, ray = (
-            output.extras[first + name].detach() for name in ("points", "time", "weight", "ray")
-        )
+        """The term over the coarse samples if these have a field of their own, as published."""
+        prefix = "coarse_" if "coarse_points" in output.extras else ""
+        points = output.extras[f"{prefix}points"].detach()
+        time = output.extras[f"{prefix}time"].detach()
+        weight = output.extras[f"{prefix}weight"].detach()
+        ray = output.extras[f"{prefix}ray"].detach()
         count = min(self.settings.elastic_rays or rays, rays)
         chosen = torch.randperm(rays, device=ray.device)[:count]
         if self.settings.elastic == "drawn":
@@ -187,7 +191,8 @@ class Nerfies(DeformableField):
             mass = weight[sample]
         if self.rest_is_canonical:
             moving = (time[sample] > 0).nonzero()[:, 0]
-            sample, mass = sample[moving], mass[moving]
+            sample = sample[moving]
+            mass = mass[moving]
         code = self.codes(time[sample])
         stretch = strain(jacobians(lambda x: self.warp(x, code), points[sample]))
         return (mass * SCALE * robust(stretch, SCALE)).sum() / count

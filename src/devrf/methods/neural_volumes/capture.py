@@ -1,4 +1,4 @@
-"""What Neural Volumes asks of a scene, and the images that its encoder reads."""
+"""What Neural Volumes needs of a scene, and the images that its encoder reads."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ def check_scene(scene: Scene) -> None:
 def encoder_images(scene: Scene, settings: NeuralVolumesSettings) -> Tensor:
     """The images of each frame by cameras that are spread over the rig, on the host.
 
-    Images larger than the encoder's are made smaller; what is left around them is the background. A
-    frame that no camera has (time 0 of a capture that begins later) has the images of the next.
+    Images larger than the encoder's are made smaller; the background fills the rest. A frame that
+    no camera has (time 0 of a capture that begins later) gets the images of the next one.
 
     Returns:
         (T, K, 3, h, w) uint8.
@@ -48,7 +48,8 @@ def encoder_images(scene: Scene, settings: NeuralVolumesSettings) -> Tensor:
     Raises:
         DevrfError: too few fixed cameras have an image of every frame.
     """
-    views, wanted = scene.dynamic.train, settings.encoder_views
+    views = scene.dynamic.train
+    wanted = settings.encoder_views
     assert views.frames is not None
     cameras = cameras_of_every_frame(views)
     expected = (
@@ -57,8 +58,10 @@ def encoder_images(scene: Scene, settings: NeuralVolumesSettings) -> Tensor:
     settings.check("encoder_views", wanted <= len(cameras), expected + "image of every frame")
     height, width = settings.encoder_size
     scale = min(1.0, height / views.height, width / views.width)
-    rows, columns = round(views.height * scale), round(views.width * scale)
-    top, left = (height - rows) // 2, (width - columns) // 2
+    rows = round(views.height * scale)
+    columns = round(views.width * scale)
+    top = (height - rows) // 2
+    left = (width - columns) // 2
     behind = round(255 * background_value(scene.background))
     images = torch.full((len(scene.clock), wanted, 3, height, width), behind, dtype=torch.uint8)
     for k in range(wanted):
@@ -82,5 +85,5 @@ def cameras_of_every_frame(views: Views) -> list[int]:
     frames_of: dict[int, set[int]] = {}
     for camera, frame in zip(views.view.tolist(), views.frames.tolist(), strict=True):
         frames_of.setdefault(camera, set()).add(frame)
-    every = set().union(*frames_of.values())
-    return sorted(camera for camera, frames in frames_of.items() if frames == every)
+    all_frames = set().union(*frames_of.values())
+    return sorted(camera for camera, frames in frames_of.items() if frames == all_frames)

@@ -33,7 +33,7 @@ from devrf.methods.neural_volumes.volumes import (
 from devrf.rendering.output import RenderOutput
 from devrf.scenes.scene import Scene
 
-# Moments of a published batch; frames encoded at once.
+# The number of frames in a published batch, and of frames that are encoded at once.
 MOMENTS = 16
 
 
@@ -42,7 +42,7 @@ class NeuralVolumes(PlacedModel):
 
     name: ClassVar[str] = "neural_volumes"
     losses: ClassVar[tuple[str, ...]] = ("color", "kl", "opacity_prior", "tv")
-    cost_follows_rays: ClassVar[bool] = False  # of a moment's volume, whatever looks at it
+    cost_follows_rays: ClassVar[bool] = False  # a volume costs the same for any number of rays
     protocols: ClassVar[tuple[str, ...] | None] = ("joint", "dynamic")
     settings_class = NeuralVolumesSettings
     settings: NeuralVolumesSettings
@@ -78,7 +78,8 @@ class NeuralVolumes(PlacedModel):
                 cameras see all of it.
         """
         check_scene(scene)
-        bounds, s = scene.bounds, self.settings
+        bounds = scene.bounds
+        s = self.settings
         box = bounds.motion or bounds.box.scaled(bounds.scale)
         self.set_place(box, scene.space, (bounds.near, bounds.far))
         self.set_times(scene.clock.times)
@@ -104,7 +105,8 @@ class NeuralVolumes(PlacedModel):
         """Render rays; each moment among them is encoded and decoded once."""
         frames, moment = torch.unique(batch.frame, return_inverse=True)
         mean, log_deviation = self.encoded(frames)
-        jitter, pair = self.training, (batch.frame, batch.frame)
+        jitter = self.training
+        pair = (batch.frame, batch.frame)
         code = mean + log_deviation.exp() * torch.randn_like(mean) if jitter else mean
         volumes = self.decoded(code)
         output = self.render(batch.rays, volumes, moment, pair, batch.background, jitter=jitter)
@@ -120,7 +122,8 @@ class NeuralVolumes(PlacedModel):
     def decoded(self, code: Tensor) -> Volumes:
         """The volumes of codes (M, code)."""
         channels = self.template(code)
-        color, opacity = channels[:, :3].sigmoid(), nn.functional.softplus(channels[:, 3:])
+        color = channels[:, :3].sigmoid()
+        opacity = nn.functional.softplus(channels[:, 3:])
         template = torch.cat([color, self.settings.density_scale * opacity], dim=1)
         return Volumes(template, self.warp(code))
 
@@ -147,7 +150,8 @@ class NeuralVolumes(PlacedModel):
         if len(self.occupancy.mask) == 1:  # one mask for all frames, which excludes nothing
             frames = (torch.zeros_like(moment), torch.zeros_like(moment))
         half = self.box.longest / 2
-        step, depths = self.settings.step * half, self.depth_limits
+        step = self.settings.step * half
+        depths = self.depth_limits
         samples = self.occupancy.march(rays, frames, self.box, depths, step, jitter=jitter)
         low, high = self.box.corners(samples.points)
         points = (2 * samples.points - low - high) / (high - low)
@@ -181,7 +185,8 @@ class NeuralVolumes(PlacedModel):
     @torch.no_grad()
     def at(self, time: float, *, half: bool = False) -> RayView:
         """The scene at ``time``; its volume is decoded here, once for all pictures."""
-        moment, volumes = self.clock.at(time), self.decoded(self.code_at(time))
+        moment = self.clock.at(time)
+        volumes = self.decoded(self.code_at(time))
 
         def render_rays(rays: Rays, times: Tensor, background: Tensor) -> RenderOutput:
             first = torch.zeros_like(times, dtype=torch.long)

@@ -60,7 +60,8 @@ class VolumeDecoder(nn.Module):
         levels: list[nn.Module] = [nn.LeakyReLU(LEAK)]
         for read, made in zip(channels, channels[1:], strict=False):
             levels += [doubling(read, made), nn.LeakyReLU(LEAK)]
-        self.first, self.levels = xavier(nn.Linear(code, channels[0])), nn.Sequential(*levels)
+        self.first = xavier(nn.Linear(code, channels[0]))
+        self.levels = nn.Sequential(*levels)
         self.output = doubling(channels[-1], outputs, 1.0)
         self.side = 2 ** len(channels)
 
@@ -71,7 +72,8 @@ class VolumeDecoder(nn.Module):
 
 
 # Colours are standardised as published: mean 100 and deviation 25 of 255.
-MEAN, DEVIATION = 100 / 255, 25 / 255
+MEAN = 100 / 255
+DEVIATION = 25 / 255
 
 
 class TimeEncoder(nn.Module):
@@ -80,7 +82,8 @@ class TimeEncoder(nn.Module):
     def __init__(self, settings: NeuralVolumesSettings) -> None:
         """Build a stack of convolutions for each camera, and the layers that join them."""
         super().__init__()
-        s, stack = settings, [3, *settings.encoder_channels]
+        s = settings
+        stack = [3, *settings.encoder_channels]
         self.cameras = nn.ModuleList()
         for _ in range(s.encoder_views):
             layers: list[nn.Module] = []
@@ -105,9 +108,9 @@ class TimeEncoder(nn.Module):
         return 0.1 * self.mean(joined), 0.01 * self.log_deviation(joined)
 
 
-# A quaternion of this length or less counts as shorter than one: 0 is no rotation.
+# The least length that a quaternion is divided by, so that 0 is no rotation.
 LEAST_NORM = 1e-5**0.5
-# So small are the last layers of affine maps that begin next to the identity.
+# The last layers of affine maps that begin next to the identity begin in ±SMALL.
 SMALL = 1e-5
 
 
@@ -146,25 +149,30 @@ class AffineMixWarp(nn.Module):
 
     def __init__(self, settings: NeuralVolumesSettings) -> None:
         super().__init__()
-        code, side, maps = settings.code, settings.warp_side, settings.maps
-        self.side, self.maps = side, maps
-        self.scale, self.rotation, self.shift, self.weight = (
-            nn.Sequential(
-                xavier(nn.Linear(code, width)),
+        self.side = settings.warp_side
+        self.maps = settings.maps
+
+        def branch(width: int, outputs: int) -> nn.Sequential:
+            return nn.Sequential(
+                xavier(nn.Linear(settings.code, width)),
                 nn.LeakyReLU(LEAK),
-                xavier(nn.Linear(width, outputs * maps), 1.0),
+                xavier(nn.Linear(width, outputs * settings.maps), 1.0),
             )
-            for width, outputs in ((128, 3), (128, 4), (128, 3), (64, side**3))
-        )
+
+        self.scale = branch(128, 3)
+        self.rotation = branch(128, 4)
+        self.shift = branch(128, 3)
+        self.weight = branch(64, settings.warp_side**3)
         if settings.identity_start:
             for last in (self.scale[-1], self.rotation[-1], self.shift[-1]):
                 nn.init.uniform_(last.weight, -SMALL, SMALL)  # type: ignore[arg-type]
             nn.init.ones_(self.scale[-1].bias)  # type: ignore[arg-type]
-        self.register_buffer("grid", identity_grid(side), persistent=False)
+        self.register_buffer("grid", identity_grid(settings.warp_side), persistent=False)
 
     def forward(self, code: Tensor) -> Tensor:
         """Positions (M, 3, side, side, side) in the template, for codes (M, code)."""
-        count, side = len(code), self.side
+        count = len(code)
+        side = self.side
         scale = self.scale(code).view(count, self.maps, 3, 1)
         rotation = rotation_matrices(self.rotation(code).view(count, self.maps, 4))
         shift = 0.1 * self.shift(code).view(count, self.maps, 3, 1)

@@ -50,7 +50,7 @@ def _sampled(volume: Tensor, points: Tensor) -> Tensor:
 
 
 def added_opacity(amount: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
-    """Each sample's share of what is seen, and what is opaque of each ray.
+    """Each sample's share of what is seen, and each ray's opacity.
 
     A_i = min(1, A_{i−1} + a_i) and w_i = A_i − A_{i−1}: for example a = (0.75, 0.5, 1) on one ray
     gives w = (0.75, 0.25, 0) and A = 1 (docs/methods/neural_volumes.md#rendering).

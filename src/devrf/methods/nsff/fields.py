@@ -39,9 +39,9 @@ def shared(dynamic: Tensor, static: Tensor, share: Tensor) -> tuple[Tensor, Tens
         static: (S,) τ_s of the static field alone.
         share: (S,) v in [0, 1], the share of the dynamic part.
     """
-    opacities = share * torch.expm1(-dynamic), (1 - share) * torch.expm1(-static)
-    moving, still = (-torch.log1p(opacity.clamp(min=LEAST - 1)) for opacity in opacities)
-    return moving, still
+    moving = share * torch.expm1(-dynamic)
+    still = (1 - share) * torch.expm1(-static)
+    return -torch.log1p(moving.clamp(min=LEAST - 1)), -torch.log1p(still.clamp(min=LEAST - 1))
 
 
 def blended(dynamic: Tensor, static: Tensor, ray: Tensor, rays: int) -> Blend:
@@ -56,7 +56,8 @@ def blended(dynamic: Tensor, static: Tensor, ray: Tensor, rays: int) -> Blend:
         rays: R.
     """
     weight, transmittance = composite(dynamic + static, ray, rays)
-    opacity, other = -torch.expm1(-dynamic), -torch.expm1(-static)
+    opacity = -torch.expm1(-dynamic)
+    other = -torch.expm1(-static)
     moving = weight * opacity / (opacity + other).clamp(min=1e-10)
     return Blend(moving, weight - moving, transmittance)
 
@@ -83,7 +84,8 @@ def closed(blend: Blend, share: Tensor, ray: Tensor) -> Blend:
 
 # The flow's weights begin in ±SMALL, so that the first flows are next to zero.
 SMALL = 1e-4
-FORWARD, BACKWARD = 0, 1
+FORWARD = 0
+BACKWARD = 1
 
 
 @dataclass(frozen=True)
@@ -153,7 +155,8 @@ class DynamicField(RadianceField):
             raw, color, motion = self.heads(with_time(points, time), viewdirs, ray)
         motion = motion.float()
         flow = self.reach * torch.tanh(motion[:, :6]).view(-1, 2, 3)
-        color, occlusion = torch.sigmoid(color.float()), torch.sigmoid(motion[:, 6:])
+        color = torch.sigmoid(color.float())
+        occlusion = torch.sigmoid(motion[:, 6:])
         return DynamicSamples(raw.float(), color, flow, occlusion)
 
 
@@ -173,9 +176,11 @@ class TwoFields(nn.Module):
     def __init__(self, settings: NSFFSettings) -> None:
         """Build both networks."""
         super().__init__()
-        self.static, self.dynamic = StaticField(settings), DynamicField(settings)
+        self.static = StaticField(settings)
+        self.dynamic = DynamicField(settings)
         self.additive = settings.blend == "additive"
-        self._scale, self._noise = settings.density_scale, settings.density_noise
+        self._scale = settings.density_scale
+        self._noise = settings.density_noise
 
     def noise(self, raw: Tensor) -> Tensor | float:
         """Noise for densities like ``raw`` (S,) while they are learned; 0 otherwise."""
@@ -200,5 +205,6 @@ class TwoFields(nn.Module):
         """
         if self.additive:
             return blended(dynamic, static, ray, rays)
-        blend = blended(*shared(dynamic, static, v), ray, rays)
+        dynamic, static = shared(dynamic, static, v)
+        blend = blended(dynamic, static, ray, rays)
         return closed(blend, v, ray) if unbounded else blend

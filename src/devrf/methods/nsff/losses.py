@@ -13,7 +13,8 @@ from devrf.methods.nsff.renders import Renders
 from devrf.ops.compositing import sum_by_ray
 
 # Shares of the nearest depths whose flow is held smooth in space, and in time.
-SPACE_SHARE, TIME_SHARE = 0.95, 0.9
+SPACE_SHARE = 0.95
+TIME_SHARE = 0.9
 EPS = 1e-6
 
 
@@ -61,7 +62,8 @@ def cycle(r: Renders) -> Tensor:
 
 def small_flow(r: Renders) -> Tensor:
     """‖Σ w f‖₁ of the rendered flow, there and back: the mean over rays, the sum over x, y, z."""
-    weight, ray = r.seen[1][:, None, None], r.output.samples.ray
+    weight = r.seen[1][:, None, None]
+    ray = r.output.samples.ray
     rendered = sum_by_ray(weight * r.output.dynamic.flow, ray, r.rays)
     return rendered.abs().mean(dim=0).sum()
 
@@ -85,19 +87,26 @@ def smooth_time(r: Renders) -> Tensor:
 
     There the flow that led to the neighbour is chained with the one that leads on from it.
     """
-    own, near = r.output.points, r.near
-    there, back = (own + r.output.dynamic.flow[:, side] for side in (FORWARD, BACKWARD))
+    own = r.output.points
+    near = r.near
+    after = own + r.output.dynamic.flow[:, FORWARD]
+    before = own + r.output.dynamic.flow[:, BACKWARD]
     moved = torch.arange(len(near.sample), device=own.device)
     onward = near.points + near.dynamic.flow[moved, near.side[near.ray]]
-    bending = _bending(r, own, (there, own, back))
-    return 2 * bending + _bending(r, own[near.sample], (onward, near.points, own[near.sample]))
+    start = own[near.sample]
+    bending = _bending(r, own, after=after, middle=own, before=before)
+    chained_bending = _bending(r, start, after=onward, middle=near.points, before=start)
+    return 2 * bending + chained_bending
 
 
-def _bending(r: Renders, seen: Tensor, path: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-    """½‖X⁺ + X⁻ − 2X‖² () of a ``path`` X⁺, X, X⁻ (S, 3), where ``seen`` (S, 3) are near."""
-    after, middle, before = map(r.placement.euclidean, path)
-    bend = 0.5 * (after + before - 2 * middle).square()
-    return _mean(bend, r.placement.within(seen, TIME_SHARE)[:, None])
+def _bending(r: Renders, start: Tensor, *, after: Tensor, middle: Tensor, before: Tensor) -> Tensor:
+    """½‖X⁺ + X⁻ − 2X‖² () of paths (S, 3) ``after``, ``middle``, ``before``.
+
+    Only samples whose ``start`` (S, 3) is near count.
+    """
+    euclidean = r.placement.euclidean
+    bend = 0.5 * (euclidean(after) + euclidean(before) - 2 * euclidean(middle)).square()
+    return _mean(bend, r.placement.within(start, TIME_SHARE)[:, None])
 
 
 def _mean(values: Tensor, mask: Tensor) -> Tensor:
@@ -113,7 +122,8 @@ def depth(r: Renders) -> Tensor:
     known = truth.isfinite().nonzero()[:, 0]
     if len(known) < 2:
         return r.output.color.new_zeros(())
-    samples, weight = r.output.samples, r.seen[0]
+    samples = r.output.samples
+    weight = r.seen[0]
     mass = sum_by_ray(weight, samples.ray, r.rays).clamp(min=1e-3)
     rendered = sum_by_ray(weight * samples.distance, samples.ray, r.rays) / mass
     difference = normalised(rendered[known]) - normalised(truth[known])
@@ -129,7 +139,8 @@ def normalised(depth: Tensor) -> Tensor:
 def flow(r: Renders) -> Tensor:
     """‖proj_j(Σ w (x + f_{i→j})) − (p + flow)‖₁ in pixels, where flow is known."""
     assert r.priors is not None
-    out, ray = r.output, r.output.samples.ray
+    out = r.output
+    ray = r.output.samples.ray
     weight, moving = r.seen
     terms = []
     for side in (FORWARD, BACKWARD):
@@ -173,7 +184,7 @@ TERMS: Mapping[str, Callable[[Renders], Tensor]] = {
     "disocclusion": disocclusion,
     "blend_entropy": blend_entropy,
 }
-# Terms of what there is not where densities add.
+# Terms that do not exist if densities add.
 OF_A_SHARE = ("dynamic", "disocclusion")
 
 

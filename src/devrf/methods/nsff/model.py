@@ -32,7 +32,8 @@ from devrf.scenes.scene import Scene, Views
 log = logging.getLogger(__name__)
 
 # The most that a point moves along an axis from a frame to the next, in normalised space.
-REACH_IN_NDC, REACH_IN_A_BOX = 1.0, 0.2
+REACH_IN_NDC = 1.0
+REACH_IN_A_BOX = 0.2
 
 
 class NSFF(NeuralField):
@@ -57,12 +58,14 @@ class NSFF(NeuralField):
         """Build the networks, as published if no settings are given."""
         super().__init__(settings or NSFFSettings())
         self.fields = TwoFields(self.settings)
-        self._step, self._absent, self.cut_out = 0, frozenset[str](), True
+        self._step = 0
+        self._absent = frozenset[str]()
+        self.cut_out = True
         self._images: ImagePriors | None = None
         self.place()
 
     def set_place(self, box: Box, space: Space, depths: tuple[float, float]) -> None:
-        """As of every method; in NDC points may move further."""
+        """As for every method; in NDC points may move further."""
         super().set_place(box, space, depths)
         reach = REACH_IN_NDC if isinstance(space, NormalizedDevice) else REACH_IN_A_BOX
         self.fields.dynamic.reach = self.settings.flow_reach or reach
@@ -73,7 +76,7 @@ class NSFF(NeuralField):
         self.register_buffer("times", torch.tensor(times, device=self.device), persistent=False)
 
     def setup(self, scene: Scene) -> None:
-        """As of every method, and whether alpha masks cut the scene out."""
+        """As for every method, and find out whether alpha masks cut the scene out."""
         super().setup(scene)
         self.cut_out = scene.static.train.cut_out or scene.dynamic.train.cut_out
 
@@ -99,7 +102,7 @@ class NSFF(NeuralField):
         return self.settings.warmup.steps(len(self.clock))
 
     def learn_from(self, views: Sequence[Views], terms: Collection[str]) -> None:
-        """Look for priors; what is missing is said, and its terms are left out."""
+        """Look for priors; the log names missing ones, whose terms are left out."""
         self._images = ImagePriors(views, self.space)
         missing = missing_terms(self._images, terms, additive=self.fields.additive)
         self._absent = frozenset(missing)
@@ -122,7 +125,7 @@ class NSFF(NeuralField):
     def render_rays(
         self, rays: Rays, time: Tensor, background: Tensor, *, jitter: bool = False
     ) -> BlendedOutput:
-        """As of every method, and what it was made of."""
+        """As for every method, with what the render was made of."""
         if self.settings.sampling == "occupancy":
             samples = self.march(rays, time, jitter=jitter)
         else:
@@ -133,16 +136,17 @@ class NSFF(NeuralField):
         unbounded = not (self.cut_out and self.space.is_linear)
         samples = samples.unbounded() if unbounded else samples
         samples = samples.scaled(self.placement.half_edge)
-        ray, fields = samples.ray, self.fields
+        ray = samples.ray
+        fields = self.fields
         points = self.placement.normalised(samples.points)
         static = fields.static.at(points, rays.viewdirs, ray)
         dynamic = fields.dynamic.at(points, time.index_select(0, ray), rays.viewdirs, ray)
         noise = fields.noise(static.raw)
-        depths = (
-            fields.optical_depth(dynamic.raw, samples.length, noise),
-            fields.optical_depth(static.raw, samples.length, noise),
+        dynamic_depth = fields.optical_depth(dynamic.raw, samples.length, noise)
+        static_depth = fields.optical_depth(static.raw, samples.length, noise)
+        blend = fields.blended(
+            dynamic_depth, static_depth, static.blend, ray, len(rays), unbounded=unbounded
         )
-        blend = fields.blended(*depths, static.blend, ray, len(rays), unbounded=unbounded)
         weight = blend.dynamic + blend.static
         color = blend.dynamic[:, None] * dynamic.color + blend.static[:, None] * static.color
         output = accumulated(samples, weight, color, blend.transmittance, background)
@@ -154,7 +158,7 @@ class NSFF(NeuralField):
             points=points,
             static=static,
             dynamic=dynamic,
-            depths=depths,
+            depths=(dynamic_depth, static_depth),
             blend=blend,
         )
 
@@ -171,7 +175,8 @@ class NSFF(NeuralField):
             DevrfError: nothing that counts is there.
         """
         assert isinstance(output, BlendedOutput)
-        warmup, step = self.settings.warmup, self._step
+        warmup = self.settings.warmup
+        step = self._step
         renders = Renders(
             fields=self.fields,
             placement=self.placement,
@@ -195,7 +200,7 @@ class FlowingView(RayView):
     """NSFF at one time: what is dynamic goes where its flows lead, the rest stays."""
 
     def __init__(self, model: NSFF, time: float, *, half: bool) -> None:
-        """As of every method."""
+        """As for every method."""
         super().__init__(model, model.render_rays, time, half=half)
         self._model = model
 
@@ -203,15 +208,16 @@ class FlowingView(RayView):
     def induced_flow(
         self, rays: Rays, pixels: Tensor, cameras: Cameras, time: float
     ) -> tuple[Tensor, Tensor]:
-        """As of every :class:`~devrf.rendering.view.MovingView`."""
-        now, black = torch.full_like(pixels[:, 0], self._time), torch.zeros_like(rays.origins[0])
+        """As for every :class:`~devrf.rendering.view.MovingView`."""
+        now = torch.full_like(pixels[:, 0], self._time)
+        black = torch.zeros_like(rays.origins[0])
         out = self._model.render_rays(rays, now, black)
-        ray, blend = out.samples.ray, out.blend
-        places = self._moved(out.points, rays.viewdirs, ray, time), out.points
-        moving, still = (
-            cameras.project_into(0, self._model.placement.world(points))[0] - pixels[ray]
-            for points in places
-        )
+        ray = out.samples.ray
+        blend = out.blend
+        there = self._moved(out.points, rays.viewdirs, ray, time)
+        placement = self._model.placement
+        moving = cameras.project_into(0, placement.world(there))[0] - pixels[ray]
+        still = cameras.project_into(0, placement.world(out.points))[0] - pixels[ray]
         total = blend.dynamic[:, None] * moving + blend.static[:, None] * still
         mass = sum_by_ray(blend.dynamic + blend.static, ray, len(rays))
         return sum_by_ray(total, ray, len(rays)) / mass.clamp(min=1e-6)[:, None], mass
@@ -219,12 +225,16 @@ class FlowingView(RayView):
     def _moved(self, points: Tensor, viewdirs: Tensor, ray: Tensor, time: float) -> Tensor:
         """Where dynamic points (S, 3), normalised, are at ``time``: led on from frame to frame.
 
-        Of a step that ends between two frames as much of the flow counts.
+        If a step ends between two frames, that part of the flow counts.
         """
         clock = self._model.clock
-        frame, last = (m.before + m.weight for m in (clock.at(self._time), clock.at(time)))
+        own = clock.at(self._time)
+        other = clock.at(time)
+        frame = own.before + own.weight
+        last = other.before + other.weight
         while abs(last - frame) > clock.TOLERANCE:
-            side, step = FORWARD if last > frame else BACKWARD, min(abs(last - frame), 1.0)
+            side = FORWARD if last > frame else BACKWARD
+            step = min(abs(last - frame), 1.0)
             now = float(np.interp(frame, range(len(clock)), clock.times))
             when = torch.full_like(points[:, 0], now)
             flow = self._model.fields.dynamic.at(points, when, viewdirs, ray).flow

@@ -1,4 +1,4 @@
-"""What training images tell beside their colours: flow both ways, depth, and what moves."""
+"""What training images provide beside their colours: flow both ways, depth, and what moves."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class ImagePriors:
         cameras: of all images.
         neighbour: (N, 2) int64, the image one frame later and the one before in the same view; its
             own number where there is none.
-        moving: the pixels of fixed cameras that move; None where none is known to.
+        moving: the pixels of fixed cameras that move; None if no such pixel is known.
     """
 
     def __init__(self, views: Sequence[Views], space: Space) -> None:
@@ -34,7 +34,8 @@ class ImagePriors:
             views: of each capture, on one device.
             space: the fields' space.
         """
-        self._views, self._space = tuple(views), space
+        self._views = tuple(views)
+        self._space = space
         first, *others = (view_set.cameras for view_set in views)
         self.cameras = first.joined(*others)
         self.neighbour = torch.arange(len(self.cameras))[:, None].repeat(1, 2)

@@ -129,7 +129,7 @@ class Renders:
     def seen(self) -> tuple[Tensor, Tensor]:
         """Weights (S,) that depth and flow are rendered with, and the part of them that moves.
 
-        Those of the dynamic field alone, or of both where densities add.
+        They are those of the dynamic field alone, or of both fields if densities add.
         """
         if not self.fields.additive:
             return self.alone[1], self.alone[1]
@@ -146,10 +146,17 @@ class Renders:
             side = (torch.rand_like(self.batch.time) < 0.5).long()
             side = torch.where(self.batch.frame == 0, FORWARD, side)
             sides = [torch.where(self.batch.frame == len(self.times) - 1, BACKWARD, side)]
-        every = torch.arange(len(self.output.points), device=self.batch.time.device)
-        anyone = torch.ones_like(self.batch.time, dtype=torch.bool)
-        frame, points, dynamic = self.batch.frame, self.output.points, self.output.dynamic
-        return [self._warp(side, frame, anyone, every, points, dynamic) for side in sides]
+        return [
+            self._warp(
+                side,
+                frame=self.batch.frame,
+                exists=torch.ones_like(self.batch.time, dtype=torch.bool),
+                sample=torch.arange(len(self.output.points), device=self.batch.time.device),
+                points=self.output.points,
+                dynamic=self.output.dynamic,
+            )
+            for side in sides
+        ]
 
     @property
     def near(self) -> Warp:
@@ -160,12 +167,18 @@ class Renders:
         """The rays rendered from two frames away, flows chained, beyond :attr:`near`."""
         near = self.near
         return self._warp(
-            near.side, near.frame, near.exists, near.sample, near.points, near.dynamic
+            near.side,
+            frame=near.frame,
+            exists=near.exists,
+            sample=near.sample,
+            points=near.points,
+            dynamic=near.dynamic,
         )
 
     def _warp(
         self,
         side: Tensor,
+        *,
         frame: Tensor,
         exists: Tensor,
         sample: Tensor,
@@ -174,9 +187,10 @@ class Renders:
     ) -> Warp:
         """One frame further to each ray's ``side`` (R,) from ``frame`` (R,), where there is one.
 
-        Of ``frame`` the others tell what a :class:`Warp` would.
+        The other arguments describe the samples at ``frame``, as a :class:`Warp` does.
         """
-        samples, count = self.output.samples, len(self.times)
+        samples = self.output.samples
+        count = len(self.times)
         frame = frame + torch.where(side == FORWARD, 1, -1)
         exists = exists & (frame >= 0) & (frame < count)
         frame = frame.clamp(0, count - 1)
@@ -184,14 +198,25 @@ class Renders:
         sample = sample[going]
         ray = samples.ray[sample]
         toward = side[ray]
-        moved, occlusion = dynamic.flow[going, toward], dynamic.occlusion[going, toward]
+        moved = dynamic.flow[going, toward]
+        occlusion = dynamic.occlusion[going, toward]
         points = points[going] + moved
         warped = self.fields.dynamic.at(
             points, self.times[frame[ray]], self.batch.rays.viewdirs, ray
         )
         color, weight = self._composited(warped, sample, ray)
         return Warp(
-            exists, frame, side, sample, ray, moved, occlusion, points, warped, color, weight
+            exists=exists,
+            frame=frame,
+            side=side,
+            sample=sample,
+            ray=ray,
+            moved=moved,
+            occlusion=occlusion,
+            points=points,
+            dynamic=warped,
+            color=color,
+            weight=weight,
         )
 
     def _composited(
@@ -206,7 +231,8 @@ class Renders:
         if not self.fields.additive:
             weight, end = composite(depth, ray, self.rays)
             return self._color(weight, dynamic.color, ray, end), weight
-        static, v = self.output.depths[1][sample], self.output.static.blend[sample]
+        static = self.output.depths[1][sample]
+        v = self.output.static.blend[sample]
         blend = self.fields.blended(depth, static, v, ray, self.rays, unbounded=False)
         color = self._color(blend.dynamic, dynamic.color, ray, blend.transmittance)
         behind = blend.static[:, None] * self.output.static.color[sample]

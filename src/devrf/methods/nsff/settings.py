@@ -53,7 +53,7 @@ class NSFFSettings(PlacedSettings):
         blend: how static and dynamic densities join: ``v`` (a learned share) or ``additive``.
         sampling: ``stratified`` (one sample in each of equal stretches of a ray) or ``occupancy``
             (even steps where something may be).
-        samples: of a ray (stratified).
+        samples: number of a ray's samples (stratified).
         neighbours: whether a ray is rendered from ``both`` neighbouring frames in each iteration,
             or from ``one`` at random.
         hard_rays: rays within the motion masks that a batch has beside the others in the first N₀

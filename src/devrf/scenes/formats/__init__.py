@@ -30,15 +30,15 @@ class KnownLayout:
     remark: str = ""
 
     def missing(self, root: Path) -> list[str]:
-        """Those of ``files`` that are not in ``root``."""
+        """The ``files`` that are not in ``root``."""
         return [name for name in self.files if not any(map(os.path.isfile, root.glob(name)))]
 
 
 COLMAP = KnownLayout(
     "colmap", "COLMAP", ("sparse/**/cameras.*", "sparse/**/images.*", "sparse/**/points3D.*")
 )
-# Folders that hold files of several layouts have that of the first: of two captures before one,
-# of what says more about its images before what says less.
+# A folder with files of several layouts has the first of them: layouts of two captures come before
+# those of one, and files that say more about the images before files that say less.
 LAYOUTS = (
     KnownLayout("dycheck", "DyCheck", ("splits/train.json", "scene.json")),
     KnownLayout("nerfies", "Nerfies", ("dataset.json", "scene.json")),
@@ -53,7 +53,7 @@ LAYOUTS = (
     COLMAP,
     KnownLayout("forward", "LLFF", ("poses_bounds.npy",)),
 )
-# Of footage, which stage=capture makes scenes of.
+# Suffixes of footage, of which stage=capture makes scenes.
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 
 
@@ -72,11 +72,11 @@ def check_choice(root: str | Path, choice: str) -> None:
     """DevrfError that names the right option, if ``data=choice`` does not read such a folder."""
     folder, fitting = _fitting(root)
     if all(layout.choice != choice for layout in fitting):
-        known = fitting[0]
+        layout = fitting[0]
         raise scene_error(
             folder,
-            f"has the files of {known.name}, which data={choice} does not read; write "
-            f"data={known.choice}, or leave data= out",
+            f"has the files of {layout.name}, which data={choice} does not read; write "
+            f"data={layout.choice}, or leave data= out",
         )
 
 
@@ -93,14 +93,15 @@ def _fitting(root: str | Path) -> tuple[Path, list[KnownLayout]]:
 
 
 def _layouts(folder: Path) -> list[KnownLayout]:
-    """The layouts that a folder has, that of the first choice first; installed packages' before."""
+    """The layouts that a folder has, the preferred one first; installed packages' come before."""
     installed = [point.load() for point in entry_points(group="devrf.layouts")]
     return [layout for layout in (*installed, *LAYOUTS) if not layout.missing(folder)]
 
 
 def _of_no_layout(folder: Path) -> str:
     """What to do about a folder of no known layout: scenes, images or videos may be around it."""
-    above, inside = folder.absolute().parent, entries(folder)
+    above = folder.absolute().parent
+    inside = entries(folder)
     if _layouts(above):
         return f"is a part of a scene; write {shlex.quote(f'data.root={above}')}"
     for path in inside:
@@ -111,7 +112,7 @@ def _of_no_layout(folder: Path) -> str:
             return _footage(place)
     if videos := [path for path in inside if path.suffix.lower() in VIDEOS]:
         return _footage(*videos)
-    # Of layouts that begin alike, the one that lacks the least.
+    # A layout is left out if another one lacks only some of the same files.
     missing = {layout.name: layout.missing(folder) for layout in LAYOUTS}
     lacks = [
         f"{name}: no {files[0]}"
@@ -122,7 +123,7 @@ def _of_no_layout(folder: Path) -> str:
 
 
 def _footage(static: Path, *views: Path) -> str:
-    """What to type to make a scene of photographs or videos; of several the first is at rest."""
+    """What to type to make a scene of photographs or videos; the first one is taken at rest."""
     name = static.parent.name if static.name == "images" else static.stem
     listed = [f"capture.views=[{','.join(map(str, views))}]"] if views else []
     words = [f"capture.static={static}", *listed, f"capture.into=scenes/{name or 'mine'}"]

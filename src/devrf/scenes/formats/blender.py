@@ -46,35 +46,42 @@ class BlenderReader(InwardReader):
     def read(self) -> Scene:
         """See :meth:`devrf.scenes.reader.SceneReader.read`."""
         folder = scene_folder(self.root)
-        found = self._layout(folder)
-        static, dynamic = load_layout(found[0], folder, self.choose_factor(found[0].size_at))
-        if found[0].moves and self.wants_flow_files:
-            flow = self._flow(dynamic.train, *found, "bwd")
+        layout, thinned, flow_folder = self._layout(folder)
+        static, dynamic = load_layout(layout, folder, self.choose_factor(layout.size_at))
+        if layout.moves and self.wants_flow_files:
+            flow = self._flow(dynamic.train, layout, thinned, flow_folder, "bwd")
             dynamic = replace(dynamic, train=replace(dynamic.train, flow=flow))
         return self.scene(folder, static, dynamic)
 
     def forward_flow(self, views: Views) -> OpticalFlow | None:
         """See :meth:`devrf.scenes.reader.SceneReader.forward_flow`."""
-        found = self._layout(scene_folder(self.root))
-        return self._flow(views, *found, "fwd") if found[0].moves else None
+        layout, thinned, flow_folder = self._layout(scene_folder(self.root))
+        return self._flow(views, layout, thinned, flow_folder, "fwd") if layout.moves else None
 
     def _layout(self, root: Path) -> tuple[Layout, bool, Path]:
         """The splits, whether times were left out, and the folder where flow files would lie."""
-        static, flow_folder = root / "static", root / "train_flow"
+        static = root / "static"
+        flow_folder = root / "train_flow"
         if not os.path.isdir(static) and not dynamic_folders(root):
-            layout = one_capture(*_train_and_test(root, root, self.missing), self.static_until)
+            train, test = _train_and_test(root, root, self.missing)
+            layout = one_capture(train, test, self.static_until)
         elif self.dynamic is None and not dynamic_folders(root):
-            rest = _train_and_test(static, root, self.missing)
-            layout = static_alone(*rest, "there is no folder dynamic_<V>views")
+            train, test = _train_and_test(static, root, self.missing)
+            layout = static_alone(train, test, "there is no folder dynamic_<V>views")
         else:
             moving = chosen_dynamic(root, self.dynamic)
-            rest = _train_and_test(existing_folder(static), root, self.missing)
-            motion = _train_and_test(moving, root, self.missing)
-            layout = Layout(*map(at_rest, rest), *map(in_motion, motion))
+            train, test = _train_and_test(existing_folder(static), root, self.missing)
+            moving_train, moving_test = _train_and_test(moving, root, self.missing)
+            layout = Layout(
+                static_train=at_rest(train),
+                static_test=at_rest(test),
+                dynamic_train=in_motion(moving_train),
+                dynamic_test=in_motion(moving_test),
+            )
             flow_folder = moving / "train_flow"
-        test = layout.dynamic_test.transforms.file
-        val = test.with_name("transforms_val.json")
-        if self.validation and val != test and os.path.isfile(val):
+        test_file = layout.dynamic_test.transforms.file
+        val = test_file.with_name("transforms_val.json")
+        if self.validation and val != test_file and os.path.isfile(val):
             layout = layout.with_validation(read_transforms(val, root, missing=self.missing)[1])
         return *fewer(layout, self.train_views, self.frames), flow_folder
 
@@ -92,7 +99,9 @@ class BlenderReader(InwardReader):
         if any(not known.distortion.none for known in split.transforms.intrinsics):
             log.warning("flow files in %s left out: they are of images before undistortion", folder)
             return None
-        used, first, last = int(split.index[0]), split.times.min(), split.times.max()
+        used = int(split.index[0])
+        first = split.times.min()
+        last = split.times.max()
         expected = views.times > first + 1e-6 if direction == "bwd" else views.times < last - 1e-6
         return read_flow(
             folder,
@@ -106,7 +115,8 @@ class BlenderReader(InwardReader):
 
 def _train_and_test(folder: Path, root: Path, missing: Missing) -> tuple[Transforms, Transforms]:
     """The images of a capture to learn from, and those held out."""
-    test, val = folder / "transforms_test.json", folder / "transforms_val.json"
+    test = folder / "transforms_test.json"
+    val = folder / "transforms_val.json"
     held_out = val if os.path.isfile(val) and not os.path.isfile(test) else test
     _, train = read_transforms(folder / "transforms_train.json", root, missing=missing)
     return train, read_transforms(held_out, root, missing=missing)[1]

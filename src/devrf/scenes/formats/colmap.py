@@ -35,12 +35,12 @@ from devrf.scenes.view_folders import (
 )
 
 IMAGES = "images"
-# From where the cameras look, by ``data.space``; else inward.
+# How the cameras face the scene, by ``data.space``; other spaces: inward.
 FACING: dict[str, Facing] = {"auto": "auto", "ndc": "forward"}
 
 
 def images_of(model: SparseModel, root: Path, factor: int) -> ImageFolder:
-    """Where the model's images are, to be made smaller by ``factor`` in all; else DevrfError."""
+    """The folder of the model's images, which are read ``factor`` times smaller; or DevrfError."""
     source = image_folder(root, factor)
     # Smaller images that LLFF's tools have written have names of their own.
     renamed = image_at(source.path / model.images[0].name) is None
@@ -79,10 +79,10 @@ class ColmapReader(PosedReader, FixedViewsReader):
     in DeVRF's forward-facing layout; the model then poses an image of each, ``view1.png`` or in
     ``view1/``.
 
-    The world is that of :func:`devrf.scenes.sparse_model.normalised`: of cameras around a scene z
-    points up and the middle of what they look at is the origin; cameras that all look within 45° of
-    one direction make a forward-facing scene. The sparse points say near and far, and the box where
-    the cameras' axes do not meet. Lenses are undistorted.
+    The world is that of :func:`devrf.scenes.sparse_model.normalised`: for cameras around a scene, z
+    points up and the origin is the middle of what they look at; cameras that all look within 45° of
+    one direction make a forward-facing scene. The sparse points give near and far, and the box if
+    the cameras' axes do not meet. Images are undistorted.
 
     Attributes:
         space: as of :class:`~devrf.scenes.reader.PosedReader`; with alpha masks ``auto`` is
@@ -104,7 +104,8 @@ class ColmapReader(PosedReader, FixedViewsReader):
         model = read_model(place)
         world = normalised(model, FACING.get(self.space, "inward"))
         camera = model.cameras[model.images[0].camera]
-        width, height = int(camera["w"]), int(camera["h"])
+        width = int(camera["w"])
+        height = int(camera["h"])
         factor = self.choose_factor(lambda factor: (width // factor, height // factor))
         source = images_of(model, folder, factor)
         layout, smaller = self._layout(folder, model, world.poses, source.path, factor)
@@ -122,10 +123,15 @@ class ColmapReader(PosedReader, FixedViewsReader):
         present = present_images(names, model.folder / "images", folder, self.missing)
         if len(present) < 2:
             raise scene_error(model.folder, "poses one image, expected one more to hold out")
-        known = list(present)
-        used, files = tuple(lenses[k] for k in known), tuple(present.values())
-        images = Transforms(model.folder, used, files, poses[known].float(), None)
-        train, test = every_nth(len(known), self.holdout, 0)
+        positions = list(present)
+        images = Transforms(
+            model.folder,
+            tuple(lenses[k] for k in positions),
+            tuple(present.values()),
+            poses[positions].float(),
+            None,
+        )
+        train, test = every_nth(len(positions), self.holdout, 0)
         if self.dynamic is None and not dynamic_folders(folder):
             why = "there is no folder dynamic_<V>views"
             return static_alone(images[train], images[test], why), None
@@ -133,13 +139,20 @@ class ColmapReader(PosedReader, FixedViewsReader):
         views = view_folders(moving, factor)
         posed = fixed_cameras(model, moving, len(views))
         test_view = held_out_view(len(views), self.test_view)
-        used = tuple(lenses[k] for k in posed)
-        moving_sets = fixed_views(views, model.folder, poses[posed], used, test_view)
+        moving_train, moving_test = fixed_views(
+            views, model.folder, poses[posed], tuple(lenses[k] for k in posed), test_view
+        )
         # What the held-out camera saw of the scene at rest is held out, too.
-        unseen = {k for k, position in enumerate(known) if position == posed[test_view]}
-        train, test = [k for k in train if k not in unseen], sorted({*test, *unseen})
-        rest_sets = at_rest(images[train]), at_rest(images[test])
-        return Layout(*rest_sets, *moving_sets), views[0].downscale
+        unseen = {k for k, position in enumerate(positions) if position == posed[test_view]}
+        train = [k for k in train if k not in unseen]
+        test = sorted({*test, *unseen})
+        layout = Layout(
+            static_train=at_rest(images[train]),
+            static_test=at_rest(images[test]),
+            dynamic_train=moving_train,
+            dynamic_test=moving_test,
+        )
+        return layout, views[0].downscale
 
 
 def _bounds(world: World, cut_out: bool) -> SceneBounds:

@@ -21,8 +21,10 @@ from devrf.scenes.validation import abbreviated, scene_error
 
 log = logging.getLogger(__name__)
 
-SPLITS, COVISIBLE = "splits", "covisible"
-TRAIN, VAL = f"{SPLITS}/train.json", f"{SPLITS}/val.json"
+SPLITS = "splits"
+COVISIBLE = "covisible"
+TRAIN = f"{SPLITS}/train.json"
+VAL = f"{SPLITS}/val.json"
 
 
 class _Split(BaseModel):
@@ -52,14 +54,16 @@ class DycheckReader(ItemsReader):
 
     def listed(self, folder: Path) -> Listed:
         """The images in both splits."""
-        learned, held_out = (_read_split(folder / name) for name in (TRAIN, VAL))
+        learned = _read_split(folder / TRAIN)
+        held_out = _read_split(folder / VAL)
         both = [name for name in learned if name in held_out]
         if both:
             raise scene_error(
                 folder / VAL,
                 f"lists {abbreviated(both[0])}, as {TRAIN} does; list it in one of them",
             )
-        least, count = 1 if held_out else 2, len(learned)
+        least = 1 if held_out else 2
+        count = len(learned)
         if count < least:
             raise scene_error(
                 folder / TRAIN, f"lists {count} images, expected at least {least}; add some"
@@ -72,8 +76,8 @@ class DycheckReader(ItemsReader):
 
     def moments(self, folder: Path, ids: Sequence[str]) -> Sequence[float]:
         """The times in both splits."""
-        taken = {**_read_split(folder / TRAIN), **_read_split(folder / VAL)}
-        return [taken[item] for item in ids]
+        times = {**_read_split(folder / TRAIN), **_read_split(folder / VAL)}
+        return [times[item] for item in ids]
 
     def masks_of(
         self, folder: Path, ids: Sequence[str], images: ImageFolder

@@ -55,7 +55,7 @@ class LlffReader(FixedViewsReader):
         near: distance of the near plane from the average camera, in the world's unit; the nearest
             point of the static scene is at 1/0.75.
         monocular: whether LLFF's images are a video; None: where NR-NeRF's ``precomputed.json`` is.
-        static_until: of a video, the latest time of an image that counts as static.
+        static_until: in a video, the latest time of an image that counts as static.
     """
 
     _: KW_ONLY
@@ -88,7 +88,8 @@ class LlffReader(FixedViewsReader):
 
     def _layout(self, folder: Path) -> tuple[Layout, int, list[ViewFolder]]:
         """The splits, by what static images are made smaller, and the fixed views learned from."""
-        posed, moving = static_folder(folder), bool(dynamic_folders(folder)) or self.dynamic
+        posed = static_folder(folder)
+        moving = bool(dynamic_folders(folder)) or self.dynamic
         if moving and self.monocular:
             raise scene_error(
                 "data.monocular", f"{folder} has fixed views, so it is no video; leave it null"
@@ -105,7 +106,8 @@ class LlffReader(FixedViewsReader):
         if not moving:
             return static_alone(train, test, "there are no times"), source.downscale, []
         folder = chosen_dynamic(folder, self.dynamic)
-        views, cameras = view_folders(folder, factor), read_dynamic_poses(folder)
+        views = view_folders(folder, factor)
+        cameras = read_dynamic_poses(folder)
         count = len(views)
         if len(cameras) < count:
             raise scene_error(
@@ -113,10 +115,15 @@ class LlffReader(FixedViewsReader):
                 f"has {len(cameras)} cameras, but there are {count} folders view1 …; add some",
             )
         unseen = held_out_view(count, self.test_view)
-        moving_sets = fixed_views(
+        moving_train, moving_test = fixed_views(
             views, cameras.file, cameras.poses[-count:], cameras.intrinsics[-count:], unseen
         )
-        layout = Layout(at_rest(train), at_rest(test), *moving_sets)
+        layout = Layout(
+            static_train=at_rest(train),
+            static_test=at_rest(test),
+            dynamic_train=moving_train,
+            dynamic_test=moving_test,
+        )
         return layout, source.downscale, views[:unseen] + views[unseen + 1 :]
 
     def _video(self, images: Transforms) -> Layout:
@@ -126,15 +133,16 @@ class LlffReader(FixedViewsReader):
             raise scene_error(images.file, f"a video of {count} images; expected at least 3")
         timed = replace(images, times=tuple(k / (count - 1) for k in range(count)))
         train, test = (in_motion(timed[part]) for part in every_nth(count, self.holdout))
-        kept = None if self.frames is None else evenly_spread(train.times, self.frames)
-        # Of a video the static set is thinned out, too.
-        train = train if kept is None else at_times(train, kept)
+        times = None if self.frames is None else evenly_spread(train.times, self.frames)
+        # The static set of a video is thinned out, too.
+        train = train if times is None else at_times(train, times)
         return without_static_set(train, test, self.static_until)
 
 
 def static_folder(root: Path) -> Path:
     """Where the static cameras and images are: ``static/`` or ``root`` itself; else DevrfError."""
-    static, here = root / "static", (root / POSES, root / PRECOMPUTED)
+    static = root / "static"
+    here = (root / POSES, root / PRECOMPUTED)
     if not os.path.isdir(static) and any(map(os.path.isfile, here)) and not dynamic_folders(root):
         return root
     return existing_folder(static)
@@ -144,7 +152,8 @@ def _posed_images(folder: Path, source: Path) -> Transforms:
     """All images in ``source`` with the cameras of ``poses_bounds.npy``, or NR-NeRF's file."""
     alone = os.path.isfile(folder / PRECOMPUTED) and not os.path.isfile(folder / POSES)
     read = read_precomputed_poses if alone else read_static_poses
-    posed, images = read(folder).normalised(), listed_images(source)
+    posed = read(folder).normalised()
+    images = listed_images(source)
     if len(images) != len(posed):
         raise scene_error(
             posed.file,

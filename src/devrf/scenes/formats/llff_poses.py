@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 # The file of LLFF's cameras, and that of NR-NeRF's, whose images follow one another in time.
 POSES = "poses_bounds.npy"
 PRECOMPUTED = "precomputed.json"
-# The nearest point of the scene comes to rest at 1/0.75 of the near plane, as the field does it.
+# The nearest point of the scene is placed at 1/0.75 of the near plane's distance, as LLFF does.
 BOUND_FACTOR = 0.75
 # A camera's least depth below this share of their median is taken for that of a stray point.
 STRAY_SHARE = 0.5
@@ -60,8 +60,8 @@ class PosedSet:
         least = self.bounds[:, 0]
         agreed = least[least >= STRAY_SHARE * least.median()]
         if stray := len(least) - len(agreed):
-            known = f"the nearest depth is {float(agreed.min()):.3g}, not {float(least.min()):.3g}"
-            log.info("%s: %d cameras see stray points before them: %s", self.file, stray, known)
+            depths = f"the nearest depth is {float(agreed.min()):.3g}, not {float(least.min()):.3g}"
+            log.info("%s: %d cameras see stray points before them: %s", self.file, stray, depths)
         scale = 1 / (BOUND_FACTOR * float(agreed.min()))
         middle = average_pose(self.poses)
         # NaN compares false.
@@ -90,7 +90,8 @@ def read_static_poses(folder: Path) -> PosedSet:
     focal, cx, cy; or H, W, fx, fy, cx, cy; for all images. DevrfError if a file is missing or
     holds something else.
     """
-    file, inner = folder / POSES, folder / "hwf_cxcy.npy"
+    file = folder / POSES
+    inner = folder / "hwf_cxcy.npy"
     rows = read_numbers(file, "the static cameras, (N, 17) or (N, 14)")
     if rows.ndim != 2 or rows.shape[1] not in (14, 17) or len(rows) == 0:
         raise scene_error(
@@ -135,7 +136,8 @@ def read_dynamic_poses(folder: Path) -> PosedSet:
     A matrix holds axes [right, up, back], position, [H, W, focal]. DevrfError if a file is
     missing or holds something else.
     """
-    file, depths = folder / "poses.npy", folder / "bds.npy"
+    file = folder / "poses.npy"
+    depths = folder / "bds.npy"
     matrix = read_numbers(file, "the moving capture's cameras, (N, 3, 5)")
     if matrix.ndim != 3 or matrix.shape[1:] != (3, 5) or len(matrix) == 0:
         raise scene_error(file, f"has shape {matrix.shape}, expected (N, 3, 5); write it again")
@@ -155,7 +157,7 @@ def _of_matrices(file: Path, matrix: Numbers, depths: Path, bounds: Numbers) -> 
 
 def _of_columns(file: Path, columns: Numbers) -> tuple[Intrinsics, ...]:
     """The intrinsics in columns H, W, focal (N, 3)."""
-    return tuple(_intrinsics(file, *row) for row in columns.tolist())
+    return tuple(_intrinsics(file, h, w, focal) for h, w, focal in columns.tolist())
 
 
 def _shared(file: Path) -> Intrinsics:
@@ -169,7 +171,7 @@ def _shared(file: Path) -> Intrinsics:
 
 
 def _intrinsics(file: Path, h: float, w: float, fx: float, *more: float) -> Intrinsics:
-    """Of H, W, focal; H, W, focal, cx, cy; or H, W, fx, fy, cx, cy."""
+    """The intrinsics in H, W, focal; H, W, focal, cx, cy; or H, W, fx, fy, cx, cy."""
     fy = more[0] if len(more) == 3 else fx
     cx, cy = more[-2:] or (w / 2, h / 2)
     if min(h, w) < 1 or min(fx, fy) <= 0:

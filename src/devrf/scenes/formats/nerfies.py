@@ -51,7 +51,7 @@ class World(BaseModel):
     """The frame of reference, (position − center) · scale.
 
     Attributes:
-        center: of the world, in the cameras' units.
+        center: centre of the world, in the cameras' units.
         scale: world units in one of the cameras'.
         near: distance before which nothing is, world units.
         far: distance behind which nothing is, world units.
@@ -66,17 +66,18 @@ class World(BaseModel):
 def placed(
     reader: InwardReader, folder: Path, world: World, static: Capture, dynamic: Capture
 ) -> Scene:
-    """The scene of two captures, near and far as the options or else the world have them."""
+    """The scene of two captures; near and far are from the options, or else from the world."""
     near = world.near if reader.near is None else reader.near
     far = world.far if reader.far is None else reader.far
-    options, cameras = replace(reader, near=near, far=far), static.train.cameras
+    options = replace(reader, near=near, far=far)
+    cameras = static.train.cameras
     wide = reader.box is None and not static.train.cut_out and 0 <= near < far
     if not wide or (reader.space != "world" and axes_do_meet(cameras)):
         return options.scene(folder, static, dynamic)
     # Without alpha masks the backdrop is to be learned too.
-    seen = box_of_frusta(cameras, near, far)
+    frusta_box = box_of_frusta(cameras, near, far)
     scale = FALLBACK_BOUND_SCALE if reader.bound_scale == "auto" else reader.bound_scale
-    options = replace(options, box=seen, space="world", bound_scale=scale)
+    options = replace(options, box=frusta_box, space="world", bound_scale=scale)
     scene = options.scene(folder, static, dynamic)
     why = "data.space=world" if reader.space == "world" else "the cameras look in one direction"
     bounds = replace(scene.bounds, reason=why, box_source="all that the cameras see up to far")
@@ -88,7 +89,7 @@ class Camera(BaseModel):
 
     Attributes:
         orientation: rows of the world-to-camera rotation.
-        position: of the camera, in the file's units.
+        position: position of the camera, in the file's units.
         focal_length: pixels, horizontally.
         pixel_aspect_ratio: vertical over horizontal focal length.
         skew: pixels.
@@ -150,7 +151,7 @@ class ItemsReader(InwardReader):
     the box is all that they see between near and far.
 
     Attributes:
-        holdout: where no list says what is held out, one of so many images is.
+        holdout: one of so many images is held out, if no list says which.
         static_until: the latest time of an image that counts as static.
     """
 
@@ -183,9 +184,8 @@ class ItemsReader(InwardReader):
         world = read_json(
             folder / "scene.json", World, "it says where the scene is; set data.root to its folder"
         )
-        names = {"full": "1x", "reduced": "{}x"}
-        factor = self.choose_factor(folder_size(folder / "rgb", **names))
-        images = image_folder(folder / "rgb", factor, **names)
+        factor = self.choose_factor(folder_size(folder / "rgb", full="1x", reduced="{}x"))
+        images = image_folder(folder / "rgb", factor, full="1x", reduced="{}x")
         files = [f"rgb/{images.path.name}/{item}" for item in items]
         present = present_images(files, listing, folder, self.missing)
         ids = [items[position] for position in present]
@@ -196,8 +196,10 @@ class ItemsReader(InwardReader):
                 listing, "all images to learn from, or all that are held out, are absent; add them"
             )
         cameras = [read_camera(folder, item, world) for item in ids]
-        moments, masks = self.moments(folder, ids), self.masks_of(folder, ids, images)
-        first, span = min(moments), (max(moments) - min(moments)) or 1.0
+        moments = self.moments(folder, ids)
+        masks = self.masks_of(folder, ids, images)
+        first = min(moments)
+        span = (max(moments) - min(moments)) or 1.0
         posed = Transforms(
             listing,
             tuple(intrinsics for _, intrinsics in cameras),
@@ -209,8 +211,8 @@ class ItemsReader(InwardReader):
         layout = one_capture(posed[train], posed[test], self.static_until)
         layout, _ = fewer(layout, None, self.frames)
         ignored: Masks = "none" if masks is None else "ignore"
-        captures = load_layout(layout, folder, images.downscale, ignored)
-        return placed(self, folder, world, *captures)
+        static, dynamic = load_layout(layout, folder, images.downscale, ignored)
+        return placed(self, folder, world, static, dynamic)
 
 
 class _Dataset(BaseModel):
@@ -250,7 +252,9 @@ class NerfiesReader(ItemsReader):
         """The ids in ``dataset.json``."""
         file = folder / self.listing
         listed = read_json(file, _Dataset, "it lists the images; add it")
-        ids, train, val = listed.ids or [], listed.train_ids or [], listed.val_ids or []
+        ids = listed.ids or []
+        train = listed.train_ids or []
+        val = listed.val_ids or []
         items = ids or list(dict.fromkeys(train + val))
         position = {item: i for i, item in enumerate(items)}
         unknown = [item for item in train + val if item not in position]

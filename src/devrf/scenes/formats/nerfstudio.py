@@ -25,7 +25,7 @@ from devrf.scenes.validation import abbreviated, scene_error
 log = logging.getLogger(__name__)
 
 FILE = "transforms.json"
-# So many images at time 0 are a static set: from fewer no field can be learned.
+# The least number of images at time 0 that make a static set: fewer teach no field.
 _SEVERAL = 3
 
 
@@ -81,16 +81,24 @@ def _layout(root: Path, options: NerfstudioReader) -> Layout:
         if layout.static_train.transforms is not layout.dynamic_train.transforms:
             validation = validation[_seen_moving(validation)]
         return layout.with_validation(validation)
-    still, moving = root / "static" / FILE, root / "dynamic" / FILE
+    still = root / "static" / FILE
+    moving = root / "dynamic" / FILE
     train, test, validation = _splits(still, root, options)
     if not os.path.isfile(moving):
         layout = static_alone(train, test, f"there is no dynamic/{FILE}")
         return layout.with_validation(validation)
-    rest = at_rest(train), at_rest(test)
+    static_train = at_rest(train)
+    static_test = at_rest(test)
     train, test, validation = _splits(moving, root, options)
     if train.times is None:
         raise scene_error(moving, 'its frames have no "time"; give every frame its time in [0, 1]')
-    return Layout(*rest, in_motion(train), in_motion(test)).with_validation(validation)
+    layout = Layout(
+        static_train=static_train,
+        static_test=static_test,
+        dynamic_train=in_motion(train),
+        dynamic_test=in_motion(test),
+    )
+    return layout.with_validation(validation)
 
 
 def _splits(
@@ -125,7 +133,7 @@ def _splits(
 def _listed(names: list[str] | None, split: str, transforms: Transforms, root: Path) -> list[int]:
     """Positions in the file, ascending, of the images that it lists for a split."""
     position = {image: i for i, image in enumerate(transforms.images)}
-    found = list[int]()
+    positions = list[int]()
     for name in names or []:
         image = image_at(inside(root, transforms.file.parent, name, transforms.file))
         if image is None and transforms.skipped:
@@ -135,8 +143,8 @@ def _listed(names: list[str] | None, split: str, transforms: Transforms, root: P
                 transforms.file,
                 f"{split}_filenames lists {abbreviated(name)}, which is in no frame; correct it",
             )
-        found.append(position[image])
-    return sorted(set(found))
+        positions.append(position[image])
+    return sorted(set(positions))
 
 
 def _one_file(train: Transforms, test: Transforms, static_until: float | None) -> Layout:
@@ -151,7 +159,8 @@ def _one_file(train: Transforms, test: Transforms, static_until: float | None) -
         return one_capture(train, test, static_until)
     still = at_zero.nonzero()[:, 0].tolist()
     still_test = (_times(test) <= TIME_TOLERANCE).nonzero()[:, 0].tolist()
-    moving, moving_test = _seen_moving(train), _seen_moving(test)
+    moving = _seen_moving(train)
+    moving_test = _seen_moving(test)
     if not moving or not moving_test:
         raise scene_error(
             train.file,
@@ -161,7 +170,8 @@ def _one_file(train: Transforms, test: Transforms, static_until: float | None) -
     rest_test = test
     if not still_test:
         log.warning("no held-out image at time 0: the static scene is tested on one in training")
-        still_test, rest_test = still[:1], train
+        still_test = still[:1]
+        rest_test = train
     log.info("%d images at time 0 are the static set of %d", len(still), len(times))
     return Layout(
         at_rest(train[still]),
@@ -174,13 +184,13 @@ def _one_file(train: Transforms, test: Transforms, static_until: float | None) -
 def _seen_moving(transforms: Transforms) -> list[int]:
     """The images at later times, and those at time 0 by cameras that stay to see more.
 
-    What else there is at time 0 tells nothing of motion, and its many cameras would hide that
-    the others stand still.
+    Other images at time 0 tell nothing of motion, and their many cameras would hide that the
+    others stand still.
     """
     later = _times(transforms) > TIME_TOLERANCE
     camera = distinct_poses(transforms.poses)
-    kept: list[int] = (later | torch.isin(camera, camera[later])).nonzero()[:, 0].tolist()
-    return kept
+    images: list[int] = (later | torch.isin(camera, camera[later])).nonzero()[:, 0].tolist()
+    return images
 
 
 def _times(transforms: Transforms) -> Tensor:

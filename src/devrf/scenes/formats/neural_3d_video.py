@@ -55,17 +55,17 @@ def camera_videos(folder: Path) -> CameraVideos:
 
     DevrfError if they are fewer than two, one cannot be read, or they differ in length or size.
     """
-    found = {
+    numbers = {
         path: int(match[1])
         for path in entries(folder)
         if (match := _VIDEO.fullmatch(path.name)) and os.path.isfile(path)
     }
-    if len(found) < 2:
+    if len(numbers) < 2:
         raise scene_error(
             folder,
-            f"{len(found)} videos cam00.mp4, cam01.mp4, …, expected 2 or more; set data.root",
+            f"{len(numbers)} videos cam00.mp4, cam01.mp4, …, expected 2 or more; set data.root",
         )
-    headers = {path: film_header(path) for path in found}
+    headers = {path: film_header(path) for path in numbers}
     first, header = next(iter(headers.items()))
     for path, other in headers.items():
         if other != header or other.frames < 2:
@@ -73,7 +73,7 @@ def camera_videos(folder: Path) -> CameraVideos:
                 path,
                 f"{_in_words(other)}, but {first.name} has {_in_words(header)}; cut or convert it",
             )
-    return CameraVideos(tuple(found), tuple(found.values()), header)
+    return CameraVideos(tuple(numbers), tuple(numbers.values()), header)
 
 
 def _in_words(header: FilmHeader) -> str:
@@ -83,7 +83,7 @@ def _in_words(header: FilmHeader) -> str:
 def read_frames(
     paths: Sequence[Path], frames: Sequence[int], filmed: Size, downscale: int
 ) -> Tensor:
-    """The chosen ``frames`` (T, ascending) of K videos; of others nothing is kept in memory.
+    """The chosen ``frames`` (T, ascending) of K videos; no other frames are kept in memory.
 
     ``filmed`` is their (width, height); sides become floor(side / ``downscale``), by area averages.
 
@@ -93,10 +93,11 @@ def read_frames(
     Raises:
         DevrfError: a video is damaged, or they do not fit into memory.
     """
-    start, folder = time.perf_counter(), paths[0].parent
-    size = reduced_size(*filmed, downscale, paths[0])
-    shape = (len(frames), len(paths), size[1], size[0], 3)
-    what = f"{len(frames)} frames of {len(paths)} videos at {size[0]}x{size[1]} px"
+    start = time.perf_counter()
+    folder = paths[0].parent
+    width, height = reduced_size(filmed[0], filmed[1], downscale, paths[0])
+    shape = (len(frames), len(paths), height, width, 3)
+    what = f"{len(frames)} frames of {len(paths)} videos at {width}x{height} px"
     check_memory(math.prod(shape), folder, what)
     pixels = np.empty(shape, dtype=np.uint8)
 
@@ -107,7 +108,9 @@ def read_frames(
                     paths[column],
                     f"frame {frame} is not of {filmed[0]}x{filmed[1]} px; convert the video",
                 )
-            pixels[row, column] = picture if downscale == 1 else shrink_pixels(picture, *size)
+            if downscale != 1:
+                picture = shrink_pixels(picture, width, height)
+            pixels[row, column] = picture
 
     in_threads(fill, range(len(paths)), filmed)
     log.info("read %s from %s in %.1f s", what, folder, time.perf_counter() - start)
@@ -144,7 +147,8 @@ class Neural3DVideoReader(SceneReader):
     def read(self) -> Scene:
         """See :meth:`devrf.scenes.reader.SceneReader.read`."""
         folder = scene_folder(self.root)
-        posed, videos = read_static_poses(folder), camera_videos(folder)
+        posed = read_static_poses(folder)
+        videos = camera_videos(folder)
         if len(posed) != len(videos.paths):
             raise scene_error(
                 posed.file,
@@ -156,10 +160,10 @@ class Neural3DVideoReader(SceneReader):
         width, height = videos.header.size
         factor = self.choose_factor(lambda factor: (width // factor, height // factor))
         moving = Capture(
-            *(_views(videos, posed, chosen, frames, times, factor) for chosen in (train, [test]))
+            train=_views(videos, posed, train, frames, times, factor),
+            test=_views(videos, posed, [test], frames, times, factor),
         )
-        first = (views[(views.times == 0).nonzero()[:, 0]] for views in (moving.train, moving.test))
-        still = Capture(*first)
+        still = Capture(train=_first_frame(moving.train), test=_first_frame(moving.test))
         return forward_facing_scene(self.name_of(folder), still, moving, self.near, self.background)
 
     def _split(self, videos: CameraVideos) -> tuple[int, list[int]]:
@@ -188,6 +192,10 @@ class Neural3DVideoReader(SceneReader):
         count = total if self.frames is None else min(self.frames, total)
         frames = torch.linspace(0, total - 1, count, dtype=torch.float64).round().long()
         return frames.tolist(), (frames / (total - 1)).float()
+
+
+def _first_frame(views: Views) -> Views:
+    return views[(views.times == 0).nonzero()[:, 0]]
 
 
 def _views(

@@ -20,7 +20,7 @@ from devrf.scenes.procedural.solids import Material, Paint, PaintedParts, Xyz, r
 STILL = Swing(0.0, 1.0, 0.0)
 # The most that a ramp 3u² − 2u³ over the distance u shears, per radian: u · 6u (1 − u) at 2/3.
 BEND_SHEAR = 8 / 9
-# Beyond a part's ball by this much its distance is the ball's, plus this much.
+# Farther than this from a part's ball, the distance to the part is taken from the ball.
 SHELL = 0.05
 
 
@@ -86,7 +86,9 @@ class Part:
         x, y, z = local
         x, y = turn(x, y, self.spin(speed, time))
         factor = math.exp(self.squash(speed, time))
-        x, y, z = x / math.sqrt(factor), y / math.sqrt(factor), z * factor
+        x = x / math.sqrt(factor)
+        y = y / math.sqrt(factor)
+        z = z * factor
         x, y = turn(x, y, self.twist(speed, time) * (z / self.along).clamp(0, 1))
         z, x = turn(z, x, self.bend(speed, time) * self._ramp(x, y, z))
         return x, y, z
@@ -97,7 +99,9 @@ class Part:
         z, x = turn(z, x, -self.bend(speed, time) * self._ramp(x, y, z))
         x, y = turn(x, y, -self.twist(speed, time) * (z / self.along).clamp(0, 1))
         factor = math.exp(self.squash(speed, time))
-        x, y, z = x * math.sqrt(factor), y * math.sqrt(factor), z / factor
+        x = x * math.sqrt(factor)
+        y = y * math.sqrt(factor)
+        z = z / factor
         x, y = turn(x, y, -self.spin(speed, time))
         return x, y, z
 
@@ -122,7 +126,7 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Assembled:
-    """A :class:`~devrf.scenes.procedural.solids.Shape` of K parts.
+    """A :class:`~devrf.scenes.procedural.solids.Shape` made of K parts.
 
     Attributes:
         parts: its parts.
@@ -134,7 +138,8 @@ class Assembled:
 
     @cached_property
     def _painted(self) -> PaintedParts:
-        axes, base = (torch.stack([getattr(p, of) for p in self.parts]) for of in ("axes", "base"))
+        axes = torch.stack([part.axes for part in self.parts])
+        base = torch.stack([part.base for part in self.parts])
         return PaintedParts([part.paint for part in self.parts], base, axes)
 
     def distance(self, points: Tensor, time: float) -> Tensor:

@@ -78,7 +78,7 @@ def extent(shape: Body) -> Extent:
 
 
 def moved(shape: Shape, points: Tensor, time: float, to: float) -> Tensor:
-    """Where the material of surface ``points`` (M, 3) at ``time`` is at time ``to``: (M, 3)."""
+    """Positions (M, 3), at time ``to``, of the material of surface ``points`` at ``time``."""
     return shape.forward(shape.material(points, time), to)
 
 
@@ -96,7 +96,8 @@ def exact_flow(shape: Shape, views: Views, *, forward: bool = False) -> OpticalF
     valid = torch.zeros_like(views.depth, dtype=torch.bool)
     for time, other in pairs:
         at = (views.times == time).nonzero()[:, 0]
-        cameras, depth = views.cameras[at], views.depth[at]
+        cameras = views.cameras[at]
+        depth = views.depth[at]
         met = depth.isfinite()
         camera, row, column = met.nonzero().unbind(-1)
         pixels = torch.stack([column, row], dim=-1).to(depth) + 0.5
@@ -105,7 +106,8 @@ def exact_flow(shape: Shape, views: Views, *, forward: bool = False) -> OpticalF
         there, _ = cameras.project(camera, moved(shape, points, time, other))
         flow = depth.new_zeros(*depth.shape, 2)
         flow[met] = there - pixels
-        vectors[at], valid[at] = flow, met
+        vectors[at] = flow
+        valid[at] = met
     return OpticalFlow(vectors, valid)
 
 
@@ -138,13 +140,13 @@ class Filming:
     ) -> Capture:
         """All fixed cameras at frame 0, then all at frame 1, …, with the exact backward flow.
 
-        Of ``frames`` ≥ 2 frames, at times k / (T − 1), the cameras to learn from leave out
-        ``unseen``.
+        There are ``frames`` ≥ 2 frames, at times k / (T − 1); the cameras to learn from leave out
+        those in ``unseen``.
         """
-        every = range(frames)
-        seen = [frame for frame in every if frame not in unseen]
+        train_frames = [frame for frame in range(frames) if frame not in unseen]
         return Capture(
-            self._moving(train, seen, frames, "train"), self._moving(test, every, frames, "test")
+            train=self._moving(train, train_frames, frames, "train"),
+            test=self._moving(test, range(frames), frames, "test"),
         )
 
     def _still(self, cameras: Cameras, split: str) -> Views:
@@ -182,7 +184,8 @@ class Filming:
         start = block_starts(self.shape, cameras, time, self.reach)
         size = start.shape
         start = start.reshape(-1)
-        depth, image = torch.full_like(start, torch.inf), start.new_zeros(len(start), 4)
+        depth = torch.full_like(start, torch.inf)
+        image = start.new_zeros(len(start), 4)
         grid = cameras.pixel_grid()
         # From a pixel's centre to the centres of its n × n parts.
         steps = (torch.arange(self.supersample) + 0.5) / self.supersample - 0.5
@@ -190,7 +193,9 @@ class Filming:
         count = len(offsets)
         live = start.isfinite().nonzero().squeeze(-1)
         for pixel in torch.split(live, max(CHUNK // count, 1)):
-            camera, center, onset = pixel // len(grid), grid[pixel % len(grid)], start[pixel]
+            camera = pixel // len(grid)
+            center = grid[pixel % len(grid)]
+            onset = start[pixel]
             depth[pixel] = self._trace(cameras.rays(camera, center), time, onset)
             parts = (center[:, None] + offsets).reshape(-1, 2)
             rays = cameras.rays(camera.repeat_interleave(count), parts)

@@ -49,10 +49,12 @@ class Blade:
 
     def distance(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         """Distance (M,) of points along, across and above it."""
-        a, b = self.half_length, self.half_width
+        a = self.half_length
+        b = self.half_width
         # A disc with its centre on the y axis that passes the tip (a, 0) and the side (0, b).
         offset = (a**2 - b**2) / (2 * b)
-        ax, ay = (x - a).abs(), y.abs()
+        ax = (x - a).abs()
+        ay = y.abs()
         on_arc = torch.hypot(ax, ay + offset) - (offset + b)
         facing_arc = (ay + offset) * a >= offset * ax
         lens = torch.where(facing_arc, on_arc, torch.hypot(ax - a, ay))
@@ -146,10 +148,15 @@ BASE = -0.66  # height at which the stem leaves the soil: the centre of the bend
 HEAD = 0.30  # height of the blossom's middle
 STEM_RADIUS = 0.055
 HEART = 0.14  # radius of the ball in the blossom's middle
-POT_CENTER, POT_RADIUS, POT_HALF_HEIGHT, POT_ROUNDING = -0.83, 0.34, 0.19, 0.06
+POT_CENTER = -0.83
+POT_RADIUS = 0.34
+POT_HALF_HEIGHT = 0.19
+POT_ROUNDING = 0.06
 
 # Part numbers: pot, stem, heart, then the leaves, then the petals.
-POT, FIRST_LEAF, FIRST_PETAL = 0, 3, 6
+POT = 0
+FIRST_LEAF = 3
+FIRST_PETAL = 6
 
 MAGENTA: Rgb = (0.84, 0.10, 0.45)
 ROSE: Rgb = (0.98, 0.62, 0.75)
@@ -201,7 +208,8 @@ _RAMP = (0.05, 0.85)
 _BENDING = Bending(_RAMP, ((0, 1, Swing(0.6, 1.4, -0.4)), (2, 0, Swing(0.66, 1.2, -0.1))))
 _OPENING = Swing(1.0, 1.7, -0.5)
 _BASE = (0.0, 0.0, BASE)
-_STEM_MIDDLE, _STEM_HALF = (HEAD + BASE) / 2, (HEAD - BASE) / 2
+_STEM_MIDDLE = (HEAD + BASE) / 2
+_STEM_HALF = (HEAD - BASE) / 2
 
 
 def _painted() -> PaintedParts:
@@ -282,7 +290,9 @@ class Flower:
         middle = [(0.0, 0.0, 0.0)] * len(half)
         petals = [whorl.blade for whorl in WHORLS for _ in range(whorl.count)]
         for blade in [leaf.blade for leaf in LEAVES] + petals:
-            a, b, t = blade.half_length, blade.half_width, blade.thickness
+            a = blade.half_length
+            b = blade.half_width
+            t = blade.thickness
             half.append((a + t, b + t, t))
             # A blade's frame starts at its hinge.
             middle.append((a, 0.0, 0.0))
@@ -302,9 +312,11 @@ class Flower:
         heart = length(unbent - unbent.new_tensor([0.0, 0.0, HEAD])) - HEART
         leaves = []
         for number, leaf in enumerate(LEAVES, start=FIRST_LEAF):
-            axes, hinge = _PAINTED.rotation[number], _PAINTED.origin[number]
+            axes = _PAINTED.rotation[number]
+            hinge = _PAINTED.origin[number]
             local = (unbent - hinge.to(unbent)) @ axes.to(unbent)
-            leaves.append(leaf.blade.distance(*local.unbind(-1)))
+            x, y, z = local.unbind(-1)
+            leaves.append(leaf.blade.distance(x, y, z))
         petals = [whorl.distance(unbent, _OPENING(self.speed, time)) for whorl in WHORLS]
         bending = torch.stack([stem, heart, *leaves, *petals])
         # Beyond the ramp the motion is rigid: up to the ramp's end, distances hold as they are.

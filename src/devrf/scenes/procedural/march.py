@@ -32,15 +32,17 @@ def trace(
         time: in [0, 1].
         start: (M,) distances before which nothing is; +inf for a ray known to miss.
         reach: radius of a ball about the origin that holds the shape at ``time``.
-        steps: a ray that has met nothing after so many counts as a miss; where everything is
-            in front of something else, only many make sure that none does.
+        steps: a ray that has met nothing after so many counts as a miss; if every ray meets
+            something, many are needed so that none is missed.
     """
     result = torch.full_like(start, math.inf)
     entry, leave = _ball_crossing(rays, reach)
     distance = torch.maximum(start, entry)
     active = (distance < leave).nonzero().squeeze(-1)
-    origins, directions = rays.origins[active], rays.directions[active]
-    distance, leave = distance[active], leave[active]
+    origins = rays.origins[active]
+    directions = rays.directions[active]
+    distance = distance[active]
+    leave = leave[active]
     for _ in range(steps):
         if len(active) == 0:
             break
@@ -49,8 +51,11 @@ def trace(
         hit = step < HIT
         result[active[hit]] = distance[hit]
         onward = (~hit & (distance < leave)).nonzero().squeeze(-1)
-        active, distance, leave = active[onward], distance[onward], leave[onward]
-        origins, directions = origins[onward], directions[onward]
+        active = active[onward]
+        distance = distance[onward]
+        leave = leave[onward]
+        origins = origins[onward]
+        directions = directions[onward]
     return result
 
 
@@ -61,7 +66,8 @@ def block_starts(shape: Shape, cameras: Cameras, time: float, reach: float) -> T
     s·θ of its axis. From a free point at distance d to the surface all of them may go on to (s + d)
     / (1 + θ). ``reach`` is as of :func:`trace`.
     """
-    columns, rows = -(-cameras.width // BLOCK), -(-cameras.height // BLOCK)
+    columns = -(-cameras.width // BLOCK)
+    rows = -(-cameras.height // BLOCK)
     y, x = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
     centers = (torch.stack([x, y], dim=-1).reshape(-1, 2) + 0.5) * BLOCK
     camera = torch.arange(len(cameras)).repeat_interleave(len(centers))
@@ -96,8 +102,9 @@ def _march_cones(
         near = free < 2 * theta * distance
         result[active[near]] = distance[near]
         keep = (~near & (onward < leave[active])).nonzero().squeeze(-1)
-        active, distance = active[keep], onward[keep]
-    # Rays of cones that still creep along a silhouette start where these are.
+        active = active[keep]
+        distance = onward[keep]
+    # If a cone still creeps along a silhouette, its rays start where it is.
     result[active] = distance
     return result
 

@@ -48,7 +48,8 @@ def rotation(axis: tuple[float, float, float], angle: float) -> Tensor:
 def turn(a: Tensor, b: Tensor, angle: Tensor | float) -> tuple[Tensor, Tensor]:
     """Coordinates (a, b) turned in their plane by ``angle`` (radians), from a towards b."""
     angle = torch.as_tensor(angle, dtype=a.dtype, device=a.device)
-    cos, sin = angle.cos(), angle.sin()
+    cos = angle.cos()
+    sin = angle.sin()
     return cos * a - sin * b, sin * a + cos * b
 
 

@@ -23,12 +23,16 @@ from devrf.scenes.procedural.motion import Swing
 from devrf.scenes.procedural.rigs import STUDIO
 from devrf.scenes.procedural.solids import Material, Paint, Rgb, Xyz
 
-# Bodies that are drawn for a seed at most, and the share of points inside of other parts below
-# which one is taken at once.
-TRIES, ENTERED = 12, 0.02
-# Share of a picture that the square around a body covers, and the share of its longest edge at
-# rest that what moves most goes.
-COVERS, MOVES = (0.15, 0.7), (0.1, 0.8)
+# At most so many bodies are drawn for a seed.
+TRIES = 12
+# A body is taken at once if a smaller share of its points than this enters other parts.
+ENTERED = 0.02
+# The share of a picture that the square around a body covers.
+MIN_COVERED = 0.15
+MAX_COVERED = 0.7
+# How far the point goes that moves most, as a share of the body's longest edge at rest.
+MIN_MOVED = 0.1
+MAX_MOVED = 0.8
 # How round parts turn about themselves where texture slides.
 SPIN = Swing(1.5, 1.2, 0.0)
 TIMES = tuple(k / 12 for k in range(13))
@@ -36,23 +40,28 @@ TIMES = tuple(k / 12 for k in range(13))
 
 @lru_cache(maxsize=32)
 def random_body(seed: int, speed: float = 1.0, sliding: bool = False) -> Assembled:
-    """The body that a ``seed`` gives: of some, the one whose parts go least through each other.
+    """The body that a ``seed`` gives: the one drawn whose parts enter each other the least.
 
     ``sliding``: round parts spin, so that their texture slides over a silhouette that stays.
     """
-    best, least = Assembled(()), math.inf
+    best = Assembled(())
+    least = math.inf
     for attempt in range(TRIES):
         draw = Random(f"{seed}/{attempt}")
-        body = _fitted(_drawn(draw), draw.uniform(*COVERS), draw.uniform(*MOVES))
+        parts = _drawn(draw)
+        covers = draw.uniform(MIN_COVERED, MAX_COVERED)
+        moves = draw.uniform(MIN_MOVED, MAX_MOVED)
+        body = _fitted(parts, covers, moves)
         entered = _entered(body)
         if entered < least:
-            best, least = body, entered
+            best = body
+            least = entered
         if least < ENTERED:
             break
     round_parts = [part.half[0] == part.half[1] and part.kind != "box" for part in best.parts]
     spins = (SPIN if sliding and is_round else STILL for is_round in round_parts)
-    parts = (replace(part, spin=spin) for part, spin in zip(best.parts, spins, strict=True))
-    return Assembled(tuple(parts), speed)
+    spinning = (replace(part, spin=spin) for part, spin in zip(best.parts, spins, strict=True))
+    return Assembled(tuple(spinning), speed)
 
 
 def placed(body: Assembled, center: Xyz, reach: float) -> Assembled:
@@ -65,7 +74,8 @@ def placed(body: Assembled, center: Xyz, reach: float) -> Assembled:
 
 def _drawn(draw: Random) -> list[Part]:
     """Four to nine parts."""
-    style, count = draw.choice(("chain", "tree", "loop")), draw.randint(4, 9)
+    style = draw.choice(("chain", "tree", "loop"))
+    count = draw.randint(4, 9)
     parts = _loop(draw) if style == "loop" else []
     bars = len(parts)
     while len(parts) < count:
@@ -78,7 +88,8 @@ def _drawn(draw: Random) -> list[Part]:
 
 def _loop(draw: Random) -> list[Part]:
     """Four equal bars on hinges that stay closed: a rhombus that opens and shuts."""
-    along, thick = draw.uniform(0.2, 0.3), draw.uniform(0.03, 0.08)
+    along = draw.uniform(0.2, 0.3)
+    thick = draw.uniform(0.03, 0.08)
     side, normal, ahead = _axes(draw, _direction(draw)).unbind(1)
     angle = draw.uniform(0.3, 0.6)
     swing = _swing(draw, 0.2, 0.4)
@@ -110,8 +121,10 @@ def _carried(draw: Random, parts: Sequence[Part], parent: int) -> Part:
         "blade": (0.45 * along, 0.03, along),
     }[kind]
     swing = _swing(draw, 0.3, 1.1)
-    slides, amount = draw.random() < 0.2, draw.uniform(0.1, 0.3)
-    lead, base = _direction(draw), torch.zeros(3, dtype=torch.float64)
+    slides = draw.random() < 0.2
+    amount = draw.uniform(0.1, 0.3)
+    lead = _direction(draw)
+    base = torch.zeros(3, dtype=torch.float64)
     if parent >= 0:
         carrier = parts[parent]
         ahead = carrier.axes[:, 2]
@@ -145,8 +158,8 @@ def _fitted(parts: Sequence[Part], covers: float, moves: float) -> Assembled:
         motion *= min(max(moves * edge / max(went, 1e-6), 0.3), 2.0)
     points = paths.reshape(-1, 3)
     middle = (points.amin(dim=0) + points.amax(dim=0)) / 2
-    seen = 2 * STUDIO.distance * math.tan(STUDIO.field_of_view / 2)
-    size = math.sqrt(covers) * seen / edge
+    picture = 2 * STUDIO.distance * math.tan(STUDIO.field_of_view / 2)
+    size = math.sqrt(covers) * picture / edge
     placed = (replace(part, base=part.base - middle.double()) for part in body.parts)
     return Assembled(tuple(_scaled(part, size, 1.0) for part in placed))
 
@@ -160,7 +173,8 @@ def _scaled(part: Part, size: float, motion: float) -> Part:
     }
     slide = replace(part.slide, amplitude=size * motion * part.slide.amplitude)
     a, b, c = part.half
-    half, base = (size * a, size * b, size * c), size * part.base
+    half = (size * a, size * b, size * c)
+    base = size * part.base
     return replace(part, half=half, base=base, slide=slide, **moving)
 
 
@@ -191,7 +205,7 @@ def _swing(draw: Random, least: float, most: float) -> Swing:
 
 
 def _direction(draw: Random) -> Tensor:
-    """A unit vector (3,) float64, any as likely as any other."""
+    """A unit vector (3,) float64, uniformly distributed."""
     drawn = torch.tensor([draw.gauss(0, 1) for _ in range(3)], dtype=torch.float64)
     return torch.nn.functional.normalize(drawn, dim=0)
 
@@ -214,7 +228,8 @@ def _paint(draw: Random) -> Paint:
     def color() -> Rgb:
         return draw.uniform(0.05, 0.95), draw.uniform(0.05, 0.95), draw.uniform(0.05, 0.95)
 
-    base, accent = color(), color()
+    base = color()
+    accent = color()
     while math.dist(base, accent) < 0.4:
         accent = color()
     # Six pixels or more of an image of 64: finer texture would be lost in any small image.

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import KW_ONLY
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import torch
 from pydantic import Field, model_validator
@@ -36,8 +36,8 @@ from devrf.scenes.validation import MIN_SIDE, Options, scene_error
 Side = Annotated[int, Field(strict=True, ge=MIN_SIDE, le=4096)]
 Count = Annotated[int, Field(strict=True, ge=1, le=10_000)]
 Frames = Annotated[int, Field(strict=True, ge=2, le=10_000)]
-# Further than at speed 2 the flower folds into itself, the robot goes through its own body and the
-# toy is squashed to pieces.
+# Above speed 2 the flower folds into itself, the robot goes through its own body and the toy is
+# squashed to pieces.
 Speed = Annotated[float, Field(strict=True, ge=0, le=2)]
 Texture = Literal["soft", "fine"]
 
@@ -142,11 +142,19 @@ class ProceduralScene(Recipe):
         """Render everything."""
         where = extent(self.model())
         inside = self.surroundings == "room"
-        rig, surface = HAND_HELD if inside else STUDIO, self.filmed()
-        placed: dict[str, Any] = {"width": self.width, "height": self.height}
-        placed |= {"reach": where.reach, "rig": rig}
-        learned, tested = static_rig(self.static_views, self.static_test_views, **placed)
-        watching, unseen = dynamic_rig(self.train_views, **placed)
+        rig = HAND_HELD if inside else STUDIO
+        surface = self.filmed()
+        learned, tested = static_rig(
+            self.static_views,
+            self.static_test_views,
+            width=self.width,
+            height=self.height,
+            reach=where.reach,
+            rig=rig,
+        )
+        watching, unseen = dynamic_rig(
+            self.train_views, width=self.width, height=self.height, reach=where.reach, rig=rig
+        )
         film = Filming(surface, where.reach, self.supersample, self.light)
         if inside:
             film = Filming(surface, REACH, self.supersample, self.light, STEPS, opaque=True)
@@ -187,9 +195,10 @@ _REACH = 9.0
 # One static view in so many is held out, the first one included, as readers of LLFF do.
 HOLDOUT = 8
 NEAR = 1.0
-# Where a random body hangs, and the radius of a ball that it does not leave: it touches neither
-# wall nor floor.
-_HANGS, _STAYS_WITHIN = (0.0, 0.0, -2.6), 1.1
+# Where a random body hangs, and the radius of a ball that it does not leave, so that it touches
+# neither wall nor floor.
+_HANGS = (0.0, 0.0, -2.6)
+_STAYS_WITHIN = 1.1
 
 
 @dataclass(frozen=True)
@@ -217,13 +226,17 @@ class ProceduralForwardScene(Recipe):
     def __call__(self) -> Scene:
         """Render everything."""
         film = Filming(self.filmed(), _REACH, self.supersample, self.light, STEPS, opaque=True)
-        size = {"width": self.width, "height": self.height}
-        # Of each eight views seven are learned from.
+        # Seven of each eight views are learned from.
         held_out = -(-self.static_views // (HOLDOUT - 1))
-        static = facing_static_rig(self.static_views + held_out, **size)
+        static = facing_static_rig(
+            self.static_views + held_out, width=self.width, height=self.height
+        )
         order = torch.arange(len(static))
-        learned, tested = static[order % HOLDOUT != 0], static[order % HOLDOUT == 0]
-        watching, unseen = facing_dynamic_rig(self.train_views, **size)
+        learned = static[order % HOLDOUT != 0]
+        tested = static[order % HOLDOUT == 0]
+        watching, unseen = facing_dynamic_rig(
+            self.train_views, width=self.width, height=self.height
+        )
         at_rest = film.at_rest(learned, tested)
         moving = film.moving(watching, unseen, self.frames, self.unseen_frames)
         space = reference_space(static, NEAR)

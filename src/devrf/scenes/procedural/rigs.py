@@ -103,7 +103,8 @@ def facing_static_rig(count: int, *, width: int, height: int) -> Cameras:
     index = torch.arange(count, dtype=torch.float64)
     radius = ((index + 0.5) / count).sqrt()
     angle = math.pi * (3 - math.sqrt(5)) * index
-    x, y = _STATIC[0] * radius * angle.cos(), _STATIC[1] * radius * angle.sin()
+    x = _STATIC[0] * radius * angle.cos()
+    y = _STATIC[1] * radius * angle.sin()
     positions = torch.stack([x, y, _UNEVEN * (2.0 * index).sin()], dim=-1)
     return _facing(positions, width, height, centred=True)
 

@@ -15,7 +15,9 @@ from torch import Tensor
 from devrf.scenes.procedural.motion import Swing, rotation
 from devrf.scenes.procedural.solids import Material, Paint, Rgb, Solid, SolidTable, Xyz
 
-X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+X = (1.0, 0.0, 0.0)
+Y = (0.0, 1.0, 0.0)
+Z = (0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -197,4 +199,5 @@ class Robot:
         """Distance (K, M) to each solid."""
         matrix, offset = _into_solids(self.speed, time)
         local = torch.addmm(offset.to(points), matrix.to(points), points.T)
-        return _TABLE.distances(*local.view(3, len(SOLIDS), -1))
+        x, y, z = local.view(3, len(SOLIDS), -1)
+        return _TABLE.distances(x, y, z)

@@ -1,4 +1,4 @@
-"""What a shape can be asked, signed distances, solid textures, and painted rounded boxes."""
+"""The protocol of shapes, signed distances, solid textures, and painted rounded boxes."""
 
 from __future__ import annotations
 
@@ -70,7 +70,9 @@ def rounded_box(
     A rounding equal to the two smaller half edges makes a capsule, to all three a ball.
     """
     qx, qy, qz = (c.abs() - (h - rounding) for c, h in zip((x, y, z), half, strict=True))
-    px, py, pz = qx.clamp_min(0), qy.clamp_min(0), qz.clamp_min(0)
+    px = qx.clamp_min(0)
+    py = qy.clamp_min(0)
+    pz = qz.clamp_min(0)
     outside = (px * px + py * py + pz * pz).sqrt()
     inside = torch.maximum(torch.maximum(qx, qy), qz).clamp_max(0)
     return outside + inside - rounding
@@ -80,7 +82,8 @@ def rounded_cylinder(
     x: Tensor, y: Tensor, z: Tensor, radius: float, half_height: float, rounding: float
 ) -> Tensor:
     """An upright cylinder about z with outer ``radius`` and ``half_height``, rims rounded."""
-    across, up = torch.hypot(x, y) - (radius - rounding), z.abs() - (half_height - rounding)
+    across = torch.hypot(x, y) - (radius - rounding)
+    up = z.abs() - (half_height - rounding)
     outside = torch.hypot(across.clamp_min(0), up.clamp_min(0))
     return outside + torch.maximum(across, up).clamp_max(0) - rounding
 
@@ -141,7 +144,8 @@ class PaintedParts:
 
     def color(self, material: Material) -> Tensor:
         """Albedo (M, 3) of the material."""
-        rest, part = material.rest, material.part
+        rest = material.rest
+        part = material.part
         offset = rest - self.origin.to(rest)[part]
         local = torch.einsum("mji,mj->mi", self.rotation.to(rest)[part], offset)
         pattern = (local * self._wave.to(rest)[part]).cos().prod(dim=-1)
@@ -150,7 +154,7 @@ class PaintedParts:
         return torch.lerp(self._base.to(rest)[part], self._accent.to(rest)[part], share)
 
     def outline(self, half: Tensor, middle: Tensor) -> Material:
-        """A grid of points over the boxes around the parts, so that theirs holds the object.
+        """A grid of points over the boxes around the parts; the box of the points holds the object.
 
         Args:
             half: (K, 3) half edges along the parts' axes, world units.
@@ -207,7 +211,8 @@ class SolidTable:
 
     def distances_of(self, points: Tensor) -> Tensor:
         """Distance (K, M) at rest to each solid, of points (M, 3) relative to the base."""
-        return self.distances(*(points.T[:, None] - self.center.to(points).T[..., None]))
+        x, y, z = points.T[:, None] - self.center.to(points).T[..., None]
+        return self.distances(x, y, z)
 
     def outline(self) -> Material:
         """Points around the solids at rest."""

@@ -111,8 +111,9 @@ WEAVE = (
     ((11.9, 37.1, -43.7), 5.1, (0.6, 0.8, 0.9)),
     ((-33.1, -43.3, 31.7), 1.6, (0.7, 0.6, 0.5)),
 )
-# Paler than what stands before it.
-_DARKEST, _LIGHTEST = (0.42, 0.45, 0.52), (0.86, 0.88, 0.90)
+# The paint's darkest and lightest colour, paler than what stands before it.
+_DARKEST = (0.42, 0.45, 0.52)
+_LIGHTEST = (0.86, 0.88, 0.90)
 
 
 @dataclass(frozen=True)
@@ -152,16 +153,19 @@ def mural(points: Tensor, waves: Sequence[Wave]) -> Tensor:
     wave = points.new_tensor([w for w, _, _ in waves])
     phase = points.new_tensor([p for _, p, _ in waves])
     mixed = (points @ wave.T + phase).cos() @ points.new_tensor([c for _, _, c in waves])
-    dark, light = points.new_tensor(_DARKEST), points.new_tensor(_LIGHTEST)
+    dark = points.new_tensor(_DARKEST)
+    light = points.new_tensor(_LIGHTEST)
     return torch.lerp(dark, light, torch.sigmoid(1.5 * mixed))
 
 
 # Half width and depth of the room, and its height above the floor, world units.
-_ROOM_HALF, _HEIGHT = (6.0, 5.0), 5.2
+_ROOM_HALF = (6.0, 5.0)
+_HEIGHT = 5.2
 # Radius of a ball about the origin that holds the room.
 REACH = 10.0
-# Fine paint: so much of it is the mural, its waves so much longer than on the wall it was made for.
-_MURAL, _LONGER = 0.6, 1.6
+# The share of the mural in fine paint, and how much longer its waves are than on the wall.
+_MURAL = 0.6
+_LONGER = 1.6
 # Rays that creep past toy or furniture have to reach a wall; in 256 steps not all do.
 STEPS = 400
 
