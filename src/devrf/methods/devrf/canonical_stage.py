@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from devrf.data.batch import PixelPool, Pixels
-from devrf.engine.batches import static_pool
 from devrf.errors import DevrfError
 from devrf.methods.devrf.architecture import Architecture, fitted_to, resolved_voxels
 from devrf.methods.devrf.canonical_field import CanonicalField
@@ -25,6 +24,7 @@ from devrf.methods.devrf.losses import (
     total_variation_weight,
 )
 from devrf.methods.devrf.model import DeVRFModel
+from devrf.methods.devrf.pixel_pools import static_pool
 from devrf.methods.devrf.settings import FINE_LOSS, SEARCH_LOSS, CanonicalRates, Precision, Sampling
 from devrf.methods.devrf.voxel_stage import VoxelStage, field_optimizer
 from devrf.methods.weighted_loss import counted_weights

@@ -174,6 +174,20 @@ class DeformationSchedule:
         )
 
 
+def converged(losses: Sequence[float], min_rel_improvement: float) -> bool:
+    """Whether the last two steps of a visit lowered its best loss by too little.
+
+    Two, since one may have drawn difficult pixels; fewer than three steps never tell.
+
+    Args:
+        losses: mean loss of each Lightning step of a visit.
+        min_rel_improvement: the least decrease, a share of the loss in (0, 1].
+    """
+    if len(losses) < 3:
+        return False
+    return min(losses[-2:]) > (1 - min_rel_improvement) * min(losses[:-2])
+
+
 def _check_level(key: str, level: Level) -> None:
     """Check what holds for every level; ``key`` is that of its row."""
     for name, least in (("side", 2), ("iterations", 1)):

@@ -11,15 +11,18 @@ from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import Pixels
-from devrf.engine.active_frame import ActiveFrame
-from devrf.engine.batches import frame_pools
-from devrf.engine.convergence import converged
 from devrf.errors import DevrfError
+from devrf.methods.devrf.active_frame import ActiveFrame
 from devrf.methods.devrf.deformation_field import DeformationField, deformed_occupancy
-from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
+from devrf.methods.devrf.deformation_schedule import (
+    DeformationPhase,
+    DeformationSchedule,
+    converged,
+)
 from devrf.methods.devrf.extension import Extension, MotionLoss, MotionStage
 from devrf.methods.devrf.losses import FlowMean, MotionPrediction, batch_loss
 from devrf.methods.devrf.model import DeVRFModel
+from devrf.methods.devrf.pixel_pools import frame_pools
 from devrf.methods.devrf.settings import DEFORMATION_LOSS, MotionSettings, Precision
 from devrf.ops.adam import GridAdam
 from devrf.scenes.scene import Views

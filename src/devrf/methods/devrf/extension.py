@@ -13,10 +13,10 @@ from functools import cached_property
 from torch import Tensor
 
 from devrf.data.flow import previous_images
-from devrf.engine.active_frame import ActiveFrame
-from devrf.engine.frame_store import FrameField
 from devrf.errors import DevrfError
+from devrf.methods.devrf.active_frame import ActiveFrame
 from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
+from devrf.methods.devrf.frame_store import FrameField
 from devrf.methods.devrf.losses import (
     MOTION_TERMS,
     MotionPrediction,

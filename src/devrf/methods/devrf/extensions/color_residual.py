@@ -12,14 +12,14 @@ from torch import Tensor
 
 from devrf.checkpoints.stored_grids import StoredShape
 from devrf.data.color_change import CHANGING, color_drift
-from devrf.engine.active_frame import ActiveFrame
-from devrf.engine.frame_store import FrameField
 from devrf.errors import expect
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
+from devrf.methods.devrf.active_frame import ActiveFrame
 from devrf.methods.devrf.canonical_field import look_up
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
 from devrf.methods.devrf.extension import Extension, MotionStage, MotionTerm
+from devrf.methods.devrf.frame_store import FrameField
 from devrf.methods.devrf.losses import MotionPrediction, total_variation_weight
 from devrf.methods.devrf.model import ColorField
 from devrf.rendering.output import ColorChange

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from devrf.data.batch import PixelPool, all_pixels
-from devrf.engine.batches import gather_batch, images_of
+from devrf.engine.batches import gather_batch
 from devrf.engine.ddp import broadcast
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import WORLD, Space
@@ -19,6 +19,7 @@ from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
 from devrf.methods.devrf.extension import Extension, MotionStage
 from devrf.methods.devrf.model import DeVRFModel
+from devrf.methods.devrf.pixel_pools import images_of
 from devrf.methods.devrf.volume_rendering import render
 from devrf.ops.compositing import sum_by_ray
 from devrf.ops.trilinear import interpolate

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from devrf.engine.convergence import converged
 from devrf.errors import DevrfError
-from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level, converged
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.settings import MotionSettings
 

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from devrf.checkpoints.stored_grids import pack_bits, unpack_bits
 from devrf.data.batch import PixelPool
-from devrf.engine.batches import images_of
-from devrf.engine.frame_store import FrameField, FrameStore
+from devrf.methods.devrf.frame_store import FrameField, FrameStore
+from devrf.methods.devrf.pixel_pools import images_of
 from devrf.rendering.occupancy import Occupancy
 from devrf.scenes.scene import Views
 
