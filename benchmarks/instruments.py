@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from devrf.callbacks import Meter
-from devrf.engine.stage import ScheduledStage
+from devrf.engine.stage import Stage
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.system.device import wait
@@ -18,11 +18,11 @@ from devrf.system.device import wait
 Row = dict[str, Any]
 # Methods that are timed, with what is nested in them, by what their seconds go to.
 TIMED = {
-    "iterations": (ScheduledStage, "training_step"),
+    "iterations": (Stage, "training_step"),
     "logging": (Meter, "on_train_batch_end"),
     "visits, canonical": (CanonicalStage, "enter"),
     "visits, deformation": (DeformationStage, "enter"),
-    "packing": (ScheduledStage, "on_train_end"),
+    "packing": (Stage, "on_train_end"),
 }
 
 
@@ -34,7 +34,7 @@ class Stopwatch:
     """
 
     def __init__(self, device: torch.device) -> None:
-        self.stage: ScheduledStage | None = None
+        self.stage: Stage | None = None
         self._device, self._usual = device, dict[tuple[type, str], Any]()
         self._seconds: dict[str, float] = defaultdict(float)
         # By resolution: seconds and iterations.

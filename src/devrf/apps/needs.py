@@ -1,8 +1,8 @@
 """What it takes to learn a scene: an estimate of what is large.
 
 Counted are the images, the fields with their gradients and Adam's state, and a batch. The rest is
-small beside them; where memory runs out all the same, batches are split
-(:mod:`devrf.engine.micro_batching`).
+small beside them; where memory runs out all the same, batches are halved
+(:mod:`devrf.engine.stage`).
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ class StageNeeds:
     parts: Mapping[str, float]
     learned: float
 
-    def peak(self, pieces: int = 1) -> float:
-        """Bytes on the device, with each batch taken in ``pieces``."""
+    def peak(self, batch_share: float = 1.0) -> float:
+        """Bytes on the device, with ``batch_share`` of each batch."""
         batch = sum(size for key, size in self.parts.items() if key.endswith(".rays"))
-        return sum(self.parts.values()) - batch * (1 - 1 / pieces)
+        return sum(self.parts.values()) - batch * (1 - batch_share)
 
 
 def smaller(scene: Scene, by: float) -> Scene:

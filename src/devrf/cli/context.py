@@ -31,7 +31,7 @@ from devrf.cli.config import PIPELINE
 from devrf.cli.restore_config import present_command
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.ddp import ManualDDP
-from devrf.engine.stage import ScheduledStage
+from devrf.engine.stage import Stage
 from devrf.errors import DevrfError
 from devrf.evaluation.objective import VALIDATION
 from devrf.evaluation.suite import Evaluation
@@ -158,7 +158,7 @@ class RunContext:
         """The config key of a stage: its own name, or ``ray_stage``."""
         return name if name in self.config else "ray_stage"
 
-    def stage_builder(self, name: str) -> Callable[..., ScheduledStage]:
+    def stage_builder(self, name: str) -> Callable[..., Stage]:
         """A function that builds a stage, given ``rest`` if it builds on another.
 
         Raises:
@@ -170,9 +170,7 @@ class RunContext:
                 f"protocol: method={self.config.method} does not learn by "
                 f"protocol={self.protocol.name}; it has no stage {name!r}"
             )
-        build: partial[ScheduledStage] = instantiate(
-            self.config[key], _partial_=True, _convert_="all"
-        )
+        build: partial[Stage] = instantiate(self.config[key], _partial_=True, _convert_="all")
         if key == name:
             build.func.check_settings(**build.keywords)  # type: ignore[attr-defined]
             if self.protocol.freeze is not True:

@@ -13,8 +13,8 @@ from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import Pixels, RayBatch, concatenated
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.batches import FramePool, gather_batch
-from devrf.engine.learner import Phase
-from devrf.engine.stage import ScheduledStage
+from devrf.engine.phase import Phase
+from devrf.engine.stage import Stage
 from devrf.errors import expect
 from devrf.methods.base import RayTrainable
 from devrf.methods.protocol import ProtocolStage
@@ -70,7 +70,7 @@ class RaySchedule:
         expect(holds, f"{key}.curriculum", expected, self.curriculum)
 
 
-class RayStage(ScheduledStage):
+class RayStage(Stage):
     """Learns a :class:`~devrf.methods.base.RayTrainable` from random rays of all its images.
 
     A batch's rays have times of their own. Of a stage that learns from both captures a fixed share
@@ -164,9 +164,6 @@ class RayStage(ScheduledStage):
         if self.schedule.centre_crop:
             self._centres = [FramePool.of(view_set, centre=True) for view_set in views]
         self.scene_model.learn_from(views, self.weights)
-        fewer = self.schedule.rays_without_hull
-        rays = self.schedule.rays if fewer is None or self.scene_model.has_hull else fewer
-        self.loop.bind(rays)
 
     def prepare(self) -> None:
         """Let the model follow the schedule."""
@@ -178,7 +175,9 @@ class RayStage(ScheduledStage):
         Images are numbered through, the static ones first. Last are those the model asks for.
         """
         with span("batch"):
-            rays = self.loop.rays
+            fewer = self.schedule.rays_without_hull
+            whole = self.schedule.rays if fewer is None or self.scene_model.has_hull else fewer
+            rays = self.rays_to_draw(whole)
             static = round(rays * self.static_share)
             pools = self._centres if self.iteration < self.schedule.centre_crop else self.pools
             counts = [static, rays - static] if len(pools) > 1 else [rays]

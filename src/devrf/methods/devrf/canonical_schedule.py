@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
-from devrf.engine.learner import Phase
+from devrf.engine.phase import Phase
 from devrf.errors import DevrfError, expect
 from devrf.geometry.space import Space
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 from typing import Any
 
-from devrf.engine.learner import Phase
+from devrf.engine.phase import Phase
 from devrf.errors import DevrfError, expect
 
 # Motion grids of this side take Adam about as long as a batch of rays takes; estimated.

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from devrf.data.batch import PixelPool, all_pixels, wanted_pixels
+from devrf.engine.ddp import world_size
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.rendering.occupancy import Occupancy
@@ -18,6 +19,8 @@ BLOCK = 2
 # Images whose rays are made together: on a CPU what its caches hold, on a GPU what keeps it busy.
 IMAGES_ON_CPU = 1
 IMAGES_ON_GPU = 16
+# The fewest rays of a batch, however few pixels there are.
+MIN_RAYS = 64
 
 
 @torch.no_grad()
@@ -104,3 +107,8 @@ def images_of(views: Views, frame: int) -> Tensor:
     """The images (K,) int64 of a frame, ascending."""
     assert views.frames is not None
     return (views.frames == frame).nonzero()[:, 0]
+
+
+def rays_for_epochs(epochs: float, pixels: int, iterations: int) -> int:
+    """Rays of a batch of this process, of which ``iterations`` show each pixel ``epochs`` times."""
+    return max(round(epochs * pixels / iterations / world_size()), MIN_RAYS)

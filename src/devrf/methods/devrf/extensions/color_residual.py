@@ -18,10 +18,11 @@ from devrf.geometry.clock import FrameClock
 from devrf.methods.devrf.active_frame import ActiveFrame
 from devrf.methods.devrf.canonical_field import look_up
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
-from devrf.methods.devrf.extension import Extension, MotionStage, MotionTerm
+from devrf.methods.devrf.deformation_stage import DeformationStage, Extension
 from devrf.methods.devrf.frame_store import FrameField
 from devrf.methods.devrf.losses import MotionPrediction, total_variation_weight
 from devrf.methods.devrf.model import ColorField
+from devrf.methods.devrf.motion_loss import MotionTerm
 from devrf.rendering.output import ColorChange
 from devrf.scenes.scene import Views
 
@@ -129,7 +130,7 @@ class ColorResidual(Extension):
         """Those that ``loss_scale_if_color_drift`` names."""
         return self._scale_if_drift
 
-    def setup(self, stage: MotionStage) -> None:
+    def setup(self, stage: DeformationStage) -> None:
         """Build the residuals, zero, and their empty parameter group, if they are learned."""
         first, drifting = self._decide(stage.scene.dynamic.train)
         if first is None:
@@ -153,13 +154,13 @@ class ColorResidual(Extension):
         log.info("colours %s: their change is %s", how, learned)
         return first, drifting
 
-    def frame_fields(self, stage: MotionStage, level: int) -> Mapping[str, FrameField]:
+    def frame_fields(self, stage: DeformationStage, level: int) -> Mapping[str, FrameField]:
         """The residuals, if ``level`` learns them."""
         field = stage.scene_model.color_residual
         learned = self._first is not None and level >= self._first
         return {NAME: field} if learned and field is not None else {}
 
-    def begin_level(self, stage: MotionStage, level: int) -> None:
+    def begin_level(self, stage: DeformationStage, level: int) -> None:
         """Let the optimiser learn the active frame's residuals (X, Y, Z, 3).
 
         Within a visit their rate falls as that of the displacements does; from level to level it
@@ -178,7 +179,7 @@ class ColorResidual(Extension):
         """Where a texture may slide over the surface, some terms tell less."""
         return 1.0 if self._first is None or level < self._first else self._scale.get(term, 1.0)
 
-    def initialise(self, stage: MotionStage, phase: DeformationPhase) -> None:
+    def initialise(self, stage: DeformationStage, phase: DeformationPhase) -> None:
         """At the first level that learns it, start a frame from the one visited before it."""
         field = stage.scene_model.color_residual
         if isinstance(field, ResidualField) and phase.level == self._first:

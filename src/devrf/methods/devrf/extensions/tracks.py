@@ -17,7 +17,7 @@ from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import WORLD, Space
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
-from devrf.methods.devrf.extension import Extension, MotionStage
+from devrf.methods.devrf.deformation_stage import DeformationStage, Extension
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.pixel_pools import images_of
 from devrf.methods.devrf.volume_rendering import render
@@ -32,8 +32,6 @@ LIKENESS = 0.15
 FARTHEST = 16
 # Tracks of a frame at most, chosen at random, and optimiser steps of a fit to them.
 MOST_TRACKS, FIT_STEPS = 4096, 60
-# What a frame gets of these at least, under a time budget.
-LEAST_SHARE = 1 / 4
 # Weight of differences between neighbouring voxels' changes in a fit.
 SMOOTHNESS = 0.01
 
@@ -54,11 +52,11 @@ class StartAlongFlow(Extension):
         self._init_from = init_from
         self._tracks: FlowTracks | None = None
 
-    def begin_level(self, stage: MotionStage, level: int) -> None:
+    def begin_level(self, stage: DeformationStage, level: int) -> None:
         """Forget what the level before has seen."""
         self._tracks = None
 
-    def changes(self, stage: MotionStage, phase: DeformationPhase) -> bool:
+    def changes(self, stage: DeformationStage, phase: DeformationPhase) -> bool:
         """Whether a phase starts along the flow: at the coarsest level, where there is one."""
         recorded = stage.scene.dynamic.train
         # What a moving camera sees moves with it.
@@ -66,7 +64,7 @@ class StartAlongFlow(Extension):
         asked = self._init_from != "previous" and known
         return asked and phase.level == 0
 
-    def initialise(self, stage: MotionStage, phase: DeformationPhase) -> None:
+    def initialise(self, stage: DeformationStage, phase: DeformationPhase) -> None:
         """Fit the frame's displacements to where its pixels are followed back to."""
         if not self.changes(stage, phase):
             return
@@ -76,9 +74,9 @@ class StartAlongFlow(Extension):
             by_color = self._init_from == "tracks"
             self._tracks = FlowTracks(model, views, stage.previous_images, by_color=by_color)
         pool = all_pixels(views, images_of(views, frame))
-        # A time budget does less of everything, and no more of this.
-        share = max(1 / max(stage.stride, 1.0), LEAST_SHARE)
-        most, steps = round(share * MOST_TRACKS), round(share * FIT_STEPS)
+        # As much less as batches are smaller for want of time or memory.
+        most = round(stage.batch_share * MOST_TRACKS)
+        steps = round(stage.batch_share * FIT_STEPS)
         tracks = self._tracks.follow(frame, pool, stage.generator, most=most)
         start_from_tracks(field, frame, tracks, views.cameras, model.space, steps)
         # Each process has followed pixels of its own.
