@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import torch
+from lightning import Callback
 
 from devrf.callbacks import PeriodicCheckpoint
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
@@ -122,3 +123,30 @@ def test_one_of_several_processes_ends_with_an_error(fit, memory_for, monkeypatc
     monkeypatch.setattr("devrf.engine.stage.world_size", lambda: 2)
     with pytest.raises(DevrfError, match="one of 2 processes is out of memory"):
         fit(canonical())
+
+
+@pytest.mark.parametrize(
+    ("leap", "renewed"),
+    [
+        (0, [4, 12, 20, 28, 30]),
+        (2, [6, 12, 21, 30]),  # of 0, 3, 6, …
+        (-1, [4, 12, 20, 28, 30]),  # each but the first twice
+    ],
+)
+def test_what_is_due_comes_once_however_far_an_iteration_goes(fit, leap, renewed):
+    found = []
+
+    class Watched(CanonicalStage):
+        def update_occupancy(self) -> None:
+            found.append(self.iteration)
+            super().update_occupancy()
+
+    class Leap(Callback):
+        def on_before_optimizer_step(self, trainer: Any, stage: Any, optimizer: Any) -> None:
+            if leap > 0 or stage.iterations_done % 2:
+                stage.iteration += leap
+
+    schedule = CanonicalSchedule(0, 12, True, 30, 12, (), rays=16, occupancy_every=8)
+    stage = fit(Watched(schedule, SMALL, iterations_per_step=5), Leap())
+    assert found == renewed
+    assert stage.iterations_done == {0: 30, 2: 10, -1: 59}[leap]

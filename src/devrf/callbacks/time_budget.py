@@ -63,7 +63,8 @@ def running_mean(mean: float | None, value: float) -> float:
 
 def phases_of(stage: Stage) -> list[Phase]:
     """All phases of a stage that has been set up, in their order."""
-    phases, place = list[Phase](), 0
+    phases: list[Phase] = []
+    place = 0
     while place < stage.total_iterations:
         phases.append(stage.phase_at(place))
         place = phases[-1].stop
@@ -105,7 +106,8 @@ class TimeBudget(Callback):
         assert isinstance(pl_module, Stage)
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
         self._record = next(other for other in callbacks if isinstance(other, TrainingRecord))
-        self._phases, self._phase = phases_of(pl_module), pl_module.phase
+        self._phases = phases_of(pl_module)
+        self._phase = pl_module.phase
         self._budget = self.seconds * pl_module.time_share
         self._most_iterations = pl_module.iterations_per_step
         pl_module.iterations_per_step = 1  # whose time is not known yet
@@ -119,13 +121,15 @@ class TimeBudget(Callback):
             return
         assert isinstance(pl_module, Stage)
         wait(pl_module.device)
-        self._step_began, self._done = self._record.seconds, pl_module.iterations_done
+        self._step_began = self._record.seconds
+        self._done = pl_module.iterations_done
         phase = pl_module.phase
         if phase is not None and phase != self._phase:
             entering = running_mean(
                 self._entering.get(phase.kind), self._step_began - self._step_ended
             )
-            self._phase, self._entering[phase.kind] = phase, entering
+            self._phase = phase
+            self._entering[phase.kind] = entering
         if self._pace is not None:
             fitted = trainer.strategy.broadcast(self._fitted(pl_module))
             if isinstance(fitted, str):
@@ -138,9 +142,9 @@ class TimeBudget(Callback):
     def on_before_optimizer_step(
         self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer
     ) -> None:
-        """Move the stage by what its stride is more, or less, than the one that it goes itself.
+        """Move the stage in its schedule by the stride less the one iteration that it adds itself.
 
-        It stays within its phase; the next phase is owed what is missing to the stride.
+        It stays within its phase; what is left of the stride is made up for in the next.
         """
         if self.seconds is None:
             return
@@ -153,14 +157,16 @@ class TimeBudget(Callback):
     def _fitted(self, stage: Stage) -> tuple[float, int, float] | str:
         """Stride, iterations and share of batches from now on; or why the budget is too short."""
         assert self._pace is not None and stage.phase is not None
-        pace, left = self._pace, self._budget - self._step_began
+        pace = self._pace
+        left = self._budget - self._step_began
         later = [phase for phase in self._phases if phase.start > stage.iteration]
         # As long as an iteration, where no phase of the kind has been entered yet.
         entering = sum(self._entering.get(phase.kind, pace * phase.cost) for phase in later)
         # The first iteration is slow, and says little unless it has taken all the time.
         tried = self._step_began >= TRIAL_SHARE * self._budget and (self._warm or left < 0)
         if tried and not self._checked:
-            self._checked, least = True, entering + pace * sum(phase.cost for phase in later)
+            self._checked = True
+            least = entering + pace * sum(phase.cost for phase in later)
             if least > left:
                 return self._too_short(stage, self._step_began + least)
         place = stage.iteration + self._ahead
@@ -199,7 +205,8 @@ class TimeBudget(Callback):
             return
         assert isinstance(pl_module, Stage) and self._phase is not None
         wait(pl_module.device)
-        self._step_ended, done = self._record.seconds, pl_module.iterations_done - self._done
+        self._step_ended = self._record.seconds
+        done = pl_module.iterations_done - self._done
         if done > 0:  # none, if memory ran out
             pace = (self._step_ended - self._step_began) / (done * self._phase.cost)
             # The first step warms up.
@@ -213,7 +220,10 @@ class TimeBudget(Callback):
         assert isinstance(pl_module, Stage)
         log.info(
             "%s: %d iterations for its %d, on %.0f%% of their rays, in %.1f s of %.1f",
-            *(pl_module.name, pl_module.iterations_done, pl_module.iteration),
+            pl_module.name,
+            pl_module.iterations_done,
+            pl_module.iteration,
             100 * pl_module.batch_share,
-            *(self._record.seconds, self._budget),
+            self._record.seconds,
+            self._budget,
         )

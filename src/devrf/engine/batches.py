@@ -27,7 +27,8 @@ def gather_batch(
         space: the space that the fields live in.
     """
     assert views.frames is not None, "views of a scene know their frames"
-    cameras, flow = views.cameras, views.flow
+    cameras = views.cameras
+    flow = views.flow
     gathered = gather_pixels(
         image,
         flat,
@@ -76,7 +77,8 @@ class FramePool:
         pool = all_pixels(views, images)
         if centre:
             inside = torch.zeros(views.height, views.width, dtype=torch.bool, device=images.device)
-            top, left = views.height // 4, views.width // 4
+            top = views.height // 4
+            left = views.width // 4
             inside[top : views.height - top, left : views.width - left] = True
             middle = wanted_pixels(views, images, inside.flatten().repeat(len(views), 1))
             pool = middle if len(middle) else pool
@@ -91,7 +93,7 @@ class FramePool:
         return len(self.ends)
 
     def draw(
-        self, count: int, frames: int, generator: torch.Generator, *, moments: int | None = None
+        self, count: int, frames: int, generator: torch.Generator, *, times: int | None = None
     ) -> tuple[Tensor, Tensor]:
         """``count`` pixels with replacement: image and number, (count,) int64 each.
 
@@ -99,16 +101,17 @@ class FramePool:
             count: how many.
             frames: so many of the first frames are drawn from.
             generator: of the random choice, on the pool's device.
-            moments: so many frames alone, as many pixels of each, frame after frame; None: all.
+            times: so many frames alone, as many pixels of each, frame after frame; None: all.
         """
-        pool, device = self.pool, self.pool.pixels.device
-        if moments is None or moments >= frames:
+        pool = self.pool
+        device = pool.pixels.device
+        if times is None or times >= frames:
             last = self.ends[frames - 1]
             pick = torch.randint(last, (count,), device=device, generator=generator)
         else:
             ends = torch.tensor((0, *self.ends), device=device)
-            chosen = torch.randperm(frames, device=device, generator=generator)[:moments]
-            frame = chosen[torch.arange(count, device=device) * moments // count]
+            chosen = torch.randperm(frames, device=device, generator=generator)[:times]
+            frame = chosen[torch.arange(count, device=device) * times // count]
             size = ends[frame + 1] - ends[frame]
             part = torch.rand(count, dtype=torch.float64, device=device, generator=generator)
             pick = ends[frame] + (part * size).long()

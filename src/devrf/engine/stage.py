@@ -93,7 +93,7 @@ class Stage(LightningModule, ABC):
             has run out, or for want of time.
         generator: draws pixels, on the stage's device. Its state at the beginning of a Lightning
             step follows from the seed, the process, the iterations done and the rollbacks.
-        seed: see there.
+        seed: of the whole run.
         num_rollbacks: how often training diverged and was rolled back.
         lr_scale: factor of the scheduled learning rates; below 1 after a rollback.
         has_scheduled_rates: whether a ``LearningRateDecay`` sets the learning rates.
@@ -145,260 +145,7 @@ class Stage(LightningModule, ABC):
         self._progress: dict[str, Any] | None = None
         self._finished: dict[str, Any] | None = None
 
-    # What a subclass says.
-
-    @property
-    @abstractmethod
-    def total_iterations(self) -> int:
-        """Iterations of the whole schedule."""
-
-    @property
-    @abstractmethod
-    def resolution(self) -> tuple[int, ...]:
-        """Present shape of the grid that is learned; empty where there is none."""
-
-    @abstractmethod
-    def phase_at(self, iteration: int) -> Phase:
-        """The phase that contains ``iteration``."""
-
-    @abstractmethod
-    def learning_rate_factor(self, iteration: int) -> float:
-        """Factor of the base learning rates at ``iteration``."""
-
-    @abstractmethod
-    def enter(self, phase: Any) -> None:
-        """Make grids and optimiser ready for ``phase``."""
-
-    def prepare(self) -> None:
-        """Called before each iteration; may wait for the device."""
-
-    @abstractmethod
-    def draw(self) -> Pixels:
-        """The pixels of the next iteration, drawn with ``generator``."""
-
-    @abstractmethod
-    def loss(self, views: Any, pixels: Pixels) -> tuple[Tensor, dict[str, Tensor]]:
-        """The weighted loss () of pixels of ``views``, and its terms () by name."""
-
-    def converged(self, loss: Tensor) -> bool:
-        """Whether the rest of the present phase can be skipped.
-
-        Args:
-            loss: () mean over the last Lightning step.
-        """
-        return False
-
-    def phase_state(self) -> dict[str, Any]:
-        """State of the present phase that does not follow from schedule and model: plain data."""
-        return {}
-
-    @abstractmethod
-    def restore(self, phase: Any, state: dict[str, Any]) -> None:
-        """Continue ``phase`` with what :meth:`phase_state` gave; the model's tensors are loaded."""
-
-    def resize_to(self, state: dict[str, Tensor]) -> None:
-        """Give modules the shapes of a stored ``state`` that is about to be loaded."""
-
-    def current_model(self) -> LearnedModel:
-        """The model, with everything learned so far written back to it."""
-        return self.scene_model
-
-    @classmethod
-    def check_settings(cls, **settings: Any) -> None:
-        """Find errors in the arguments of the stage before what it builds on has been learned.
-
-        Raises:
-            DevrfError: one is wrong.
-        """
-
-    # What a subclass and callbacks ask.
-
-    @property
-    def scene(self) -> Scene:
-        """The scene of the trainer's datamodule."""
-        scene: Scene = self.trainer.datamodule.scene  # type: ignore[attr-defined]
-        return scene
-
-    def training_views(self, images: ImagesName) -> Views:
-        """The training views called so, on the stage's device."""
-        views: Views = self.trainer.datamodule.training_views(  # type: ignore[attr-defined]
-            images, self.device
-        )
-        return views
-
-    @property
-    def images(self) -> tuple[ImagesName, ...]:
-        """What is learned from: the training views of these names."""
-        return ("static", "dynamic") if self.capture == "both" else (self.capture,)
-
-    @property
-    def scored_capture(self) -> CaptureName:
-        """The capture whose held-out views measure what was learned."""
-        return "dynamic" if self.capture == "both" else self.capture
-
-    def rays_to_draw(self, rays: int) -> int:
-        """How many ``rays`` of a batch this process draws."""
-        return max(1, round(rays_per_rank(rays) * self.batch_share))
-
-    def background(self, image: Tensor) -> Tensor:
-        """What is behind the pixels of ``image`` (R,): (3,), always the same tensor, if plain.
-
-        Else (R, 3), drawn with ``generator``.
-        """
-        plain = self._plain_background
-        if plain is None or plain.device != image.device:
-            name = self.scene.background
-            if name == "random":
-                return background_color(name, len(image), self.generator)
-            plain = background_color(name, 0, self.generator).to(image.device)
-            self._plain_background = plain
-        return plain
-
-    def is_due(self, every: int, start: int) -> bool:
-        """Whether a multiple of ``every`` iterations after ``start`` has just been reached.
-
-        One that a time budget leaves out counts, and one at which it stays counts once.
-        """
-        before = max(self.previous_iteration - start, 0)
-        return (self.iteration - start) // every > before // every
-
-    def cost(self, first: int, last: int) -> float:
-        """How long iterations ``first`` to ``last`` take, in the unit of the phases' costs."""
-        cost = 0.0
-        while first < last:
-            phase = self.phase_at(first)
-            stop = min(phase.stop, last)
-            cost += (stop - first) * phase.cost
-            first = stop
-        return cost
-
-    def describe(self, iteration: int) -> str:
-        """An iteration of the present phase, with its frame and resolution, for messages."""
-        number = None if self.phase is None else self.phase.frame
-        frame = "" if number is None else f"frame {number}"
-        shape = "x".join(str(n) for n in self.resolution)
-        place = ", ".join(part for part in (frame, shape) if part)
-        return f"iteration {iteration} of {self.total_iterations}{place and f' ({place})'}"
-
-    def metadata(self) -> CheckpointMetadata:
-        """The metadata of a checkpoint of this stage."""
-        model = self.scene_model
-        return CheckpointMetadata(
-            scene=self.scene.name,
-            fingerprint=self.scene.fingerprint,
-            stage=self.name,
-            model={"class": class_path(type(model)), **model.config()},
-            protocol=self.protocol,
-            records={**self.earlier_records, self.name: self.record},
-            training_config=self.training_config,
-            earlier_configs=self.earlier_configs,
-            command=self.command,
-            complete=self.iteration >= self.total_iterations,
-            moves=self.scene.moves,
-        )
-
-    def result(self) -> LoadedCheckpoint:
-        """What a stage that builds on this one takes."""
-        return LoadedCheckpoint(self.metadata(), self.scene_model)
-
-    def abort(self, why: str) -> None:
-        """End the stage after the present step; the fit then raises an error that says ``why``."""
-        self.abort_reason = f"{self.name} stage: {why}"
-        self.trainer.should_stop = True
-
-    def rollback(self, iteration: int, iterations_done: int, lr_scale: float) -> None:
-        """Continue from an earlier iteration of the present phase, whose tensors are back in place.
-
-        Adam's state starts afresh, and other pixels are drawn than the first time.
-
-        Args:
-            iteration: where to continue.
-            iterations_done: iterations that had been carried out there.
-            lr_scale: further factor of all learning rates from now on.
-        """
-        self.iteration = iteration
-        self.previous_iteration = iteration - 1
-        self.iterations_done = iterations_done
-        self.num_rollbacks += 1
-        self.lr_scale *= lr_scale
-        self.optimizer.forget()
-        self._reseed()
-        self.trainer.should_stop = False
-
-    # Lightning's hooks, in the order in which they are called.
-
-    def setup(self, stage: str) -> None:
-        """Check the trainer and make the generator.
-
-        Raises:
-            DevrfError: the precision is not 32 bit, or several processes run with a strategy that
-                does not support growing grids.
-        """
-        if self.trainer.precision != "32-true":
-            raise DevrfError(
-                f"trainer.precision: expected 32-true, not {self.trainer.precision}: positions "
-                "need all their digits; decoder_precision=bfloat16 takes fewer for colours alone"
-            )
-        check_strategy(self.trainer)
-        self.began = time.perf_counter()
-        self.seed = torch.initial_seed()
-        # Lightning moves the stage to this device later.
-        self.generator = torch.Generator(self.trainer.strategy.root_device)
-
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Restore the position in the schedule and the tensors' shapes; tensors are loaded next.
-
-        What else a progress file holds is restored once they are: ``phase_state`` when the
-        optimiser is configured, ``random`` when training starts.
-
-        Raises:
-            DevrfError: the checkpoint is of another scene, stage, schedule or version.
-        """
-        path = Path(str(self.trainer.ckpt_path))
-        check_scene(path, metadata_in(path, checkpoint), self.scene)
-        self.resize_to(checkpoint["state_dict"])
-        self._progress = progress = checkpoint.get("progress")
-        if progress is None:
-            return
-        if (progress["stage"], progress["total"]) != (self.name, self.total_iterations):
-            raise DevrfError(
-                f"{path}: left by the {progress['stage']} stage on a schedule of "
-                f"{progress['total']} iterations, this is the {self.name} stage on one of "
-                f"{self.total_iterations}; give it its own schedule"
-            )
-        if not progress.keys() >= {*POSITION}:
-            raise DevrfError(
-                f"{path}: left by an earlier version, which this one cannot go on from; begin "
-                "afresh with resume=false"
-            )
-        for name in POSITION:
-            setattr(self, name, progress[name])
-        self.previous_iteration = self.iteration - 1
-        # A schedule is one epoch of a loader that never ends: what ended it there (max_time,
-        # limit_train_batches, fast_dev_run) has not ended it here.
-        fit = checkpoint["loops"]["fit_loop"]
-        for epochs in ("total", "current"):
-            fit["epoch_progress"][epochs].update(processed=0, completed=0)
-        fit["epoch_loop.batch_progress"]["is_last_batch"] = False
-        self.phase = None if progress["phase"] is None else self.phase_at(progress["phase"])
-
-    def configure_optimizers(self) -> GridAdam:
-        """The optimiser; in a resumed run with the parameters of the phase that was left."""
-        if self._progress is not None and self.phase is not None:
-            self.restore(self.phase, self._progress["phase_state"])
-        return self.optimizer
-
-    def on_fit_start(self) -> None:
-        """Give every process the same tensors."""
-        self._finished = None
-        broadcast([*self.parameters(), *self.buffers()])
-
-    def on_train_start(self) -> None:
-        """Restore the random state last, when nothing but iterations draws from it any more."""
-        if self._progress is not None:
-            set_rng_state(self._progress["random"], self.device)
-            self._progress = None
-        self._reseed()
+    # An iteration.
 
     def training_step(self, views: Any, batch_idx: int) -> dict[str, Tensor]:
         """Run up to ``iterations_per_step`` iterations, all of the present phase.
@@ -415,14 +162,17 @@ class Stage(LightningModule, ABC):
             count = min(count, self.trainer.max_steps - self.trainer.global_step)
         losses: list[dict[str, Tensor]] = []
         while len(losses) < count and self.iteration < stop:
+            present = self.iteration
             self.prepare()
             terms = self.find_gradients(views)
             if terms is None:
                 break
-            with span("optimiser"):
-                optimizer.step()  # LearningRateDecay sets the learning rates before it
             losses.append(terms)
-            self.previous_iteration = self.iteration
+            # Just before it steps, LearningRateDecay sets the learning rates, and a TimeBudget
+            # moves the iteration.
+            with span("optimiser"):
+                optimizer.step()
+            self.previous_iteration = present
             self.iteration += 1
             self.iterations_done += 1
         means = mean_terms(losses)
@@ -504,6 +254,263 @@ class Stage(LightningModule, ABC):
         place = [self.seed, self.global_rank, self.iterations_done, self.num_rollbacks]
         mixed = np.random.SeedSequence(place)
         self.generator.manual_seed(int(mixed.generate_state(1, np.uint64)[0]))
+
+    # What a subclass says.
+
+    @property
+    @abstractmethod
+    def total_iterations(self) -> int:
+        """Iterations of the whole schedule."""
+
+    @property
+    @abstractmethod
+    def resolution(self) -> tuple[int, ...]:
+        """Present shape of the grid that is learned; empty where there is none."""
+
+    @abstractmethod
+    def phase_at(self, iteration: int) -> Phase:
+        """The phase that contains ``iteration``."""
+
+    @abstractmethod
+    def learning_rate_factor(self, iteration: int) -> float:
+        """Factor of the base learning rates at ``iteration``."""
+
+    @abstractmethod
+    def enter(self, phase: Any) -> None:
+        """Make grids and optimiser ready for ``phase``."""
+
+    def prepare(self) -> None:
+        """Called before each iteration; may wait for the device."""
+
+    @abstractmethod
+    def draw(self) -> Pixels:
+        """The pixels of the next iteration, drawn with ``generator``."""
+
+    @abstractmethod
+    def loss(self, views: Any, pixels: Pixels) -> tuple[Tensor, dict[str, Tensor]]:
+        """The weighted loss () of pixels of ``views``, and its terms () by name."""
+
+    def converged(self, loss: Tensor) -> bool:
+        """Whether the rest of the present phase can be skipped.
+
+        Args:
+            loss: () mean over the last Lightning step.
+        """
+        return False
+
+    def phase_state(self) -> dict[str, Any]:
+        """State of the present phase that does not follow from schedule and model: plain data."""
+        return {}
+
+    @abstractmethod
+    def restore(self, phase: Any, state: dict[str, Any]) -> None:
+        """Continue ``phase`` with what :meth:`phase_state` gave; the model's tensors are loaded."""
+
+    def resize_to(self, state: dict[str, Tensor]) -> None:
+        """Give modules the shapes of a stored ``state`` that is about to be loaded."""
+
+    def current_model(self) -> LearnedModel:
+        """The model, with everything learned so far written back to it."""
+        return self.scene_model
+
+    @classmethod
+    def check_settings(cls, **settings: Any) -> None:
+        """Find errors in the arguments of the stage before what it builds on has been learned.
+
+        Raises:
+            DevrfError: one is wrong.
+        """
+
+    # What a subclass asks.
+
+    def rays_to_draw(self, rays: int) -> int:
+        """How many ``rays`` of a batch this process draws."""
+        return max(1, round(rays_per_rank(rays) * self.batch_share))
+
+    def background(self, image: Tensor) -> Tensor:
+        """What is behind the pixels of ``image`` (R,): (3,), always the same tensor, if plain.
+
+        Else (R, 3), drawn with ``generator``.
+        """
+        plain = self._plain_background
+        if plain is None or plain.device != image.device:
+            name = self.scene.background
+            if name == "random":
+                return background_color(name, len(image), self.generator)
+            plain = background_color(name, 0, self.generator).to(image.device)
+            self._plain_background = plain
+        return plain
+
+    def is_due(self, every: int, start: int) -> bool:
+        """Whether a multiple of ``every`` iterations after ``start`` has just been reached.
+
+        One that a time budget leaves out counts, and one at which it stays counts once.
+        """
+        before = max(self.previous_iteration - start, 0)
+        return (self.iteration - start) // every > before // every
+
+    @property
+    def scene(self) -> Scene:
+        """The scene of the trainer's datamodule."""
+        scene: Scene = self.trainer.datamodule.scene  # type: ignore[attr-defined]
+        return scene
+
+    def training_views(self, images: ImagesName) -> Views:
+        """The training views called so, on the stage's device."""
+        views: Views = self.trainer.datamodule.training_views(  # type: ignore[attr-defined]
+            images, self.device
+        )
+        return views
+
+    @property
+    def images(self) -> tuple[ImagesName, ...]:
+        """What is learned from: the training views of these names."""
+        return ("static", "dynamic") if self.capture == "both" else (self.capture,)
+
+    @property
+    def scored_capture(self) -> CaptureName:
+        """The capture whose held-out views measure what was learned."""
+        return "dynamic" if self.capture == "both" else self.capture
+
+    # What callbacks and commands ask.
+
+    def cost(self, first: int, last: int) -> float:
+        """How long iterations ``first`` to ``last`` take, in the unit of the phases' costs."""
+        cost = 0.0
+        while first < last:
+            phase = self.phase_at(first)
+            stop = min(phase.stop, last)
+            cost += (stop - first) * phase.cost
+            first = stop
+        return cost
+
+    def describe(self, iteration: int) -> str:
+        """An iteration of the present phase, with its frame and resolution, for messages."""
+        number = None if self.phase is None else self.phase.frame
+        frame = "" if number is None else f"frame {number}"
+        shape = "x".join(str(n) for n in self.resolution)
+        place = ", ".join(part for part in (frame, shape) if part)
+        return f"iteration {iteration} of {self.total_iterations}{place and f' ({place})'}"
+
+    def metadata(self) -> CheckpointMetadata:
+        """The metadata of a checkpoint of this stage."""
+        model = self.scene_model
+        return CheckpointMetadata(
+            scene=self.scene.name,
+            fingerprint=self.scene.fingerprint,
+            stage=self.name,
+            model={"class": class_path(type(model)), **model.config()},
+            protocol=self.protocol,
+            records={**self.earlier_records, self.name: self.record},
+            training_config=self.training_config,
+            earlier_configs=self.earlier_configs,
+            command=self.command,
+            complete=self.iteration >= self.total_iterations,
+            moves=self.scene.moves,
+        )
+
+    def result(self) -> LoadedCheckpoint:
+        """What a stage that builds on this one takes."""
+        return LoadedCheckpoint(self.metadata(), self.scene_model)
+
+    def abort(self, why: str) -> None:
+        """End the stage after the present step; the fit then raises an error that says ``why``."""
+        self.abort_reason = f"{self.name} stage: {why}"
+        self.trainer.should_stop = True
+
+    def rollback(self, iteration: int, iterations_done: int, lr_scale: float) -> None:
+        """Continue from an earlier iteration of the present phase, whose tensors are back in place.
+
+        Adam's state starts afresh, and other pixels are drawn than the first time.
+
+        Args:
+            iteration: where to continue.
+            iterations_done: iterations that had been carried out there.
+            lr_scale: further factor of all learning rates from now on.
+        """
+        self.iteration = iteration
+        self.previous_iteration = iteration - 1
+        self.iterations_done = iterations_done
+        self.num_rollbacks += 1
+        self.lr_scale *= lr_scale
+        self.optimizer.forget()
+        self._reseed()
+        self.trainer.should_stop = False
+
+    # Lightning's other hooks, in the order in which they are called.
+
+    def setup(self, stage: str) -> None:
+        """Check the trainer and make the generator.
+
+        Raises:
+            DevrfError: the precision is not 32 bit, or several processes run with a strategy that
+                does not support growing grids.
+        """
+        if self.trainer.precision != "32-true":
+            raise DevrfError(
+                f"trainer.precision: expected 32-true, not {self.trainer.precision}: positions "
+                "need all their digits; decoder_precision=bfloat16 takes fewer for colours alone"
+            )
+        check_strategy(self.trainer)
+        self.began = time.perf_counter()
+        self.seed = torch.initial_seed()
+        # Lightning moves the stage to this device later.
+        self.generator = torch.Generator(self.trainer.strategy.root_device)
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Restore the position in the schedule and the tensors' shapes; tensors are loaded next.
+
+        What else a progress file holds is restored once they are: ``phase_state`` when the
+        optimiser is configured, ``random`` when training starts.
+
+        Raises:
+            DevrfError: the checkpoint is of another scene, stage, schedule or version.
+        """
+        path = Path(str(self.trainer.ckpt_path))
+        check_scene(path, metadata_in(path, checkpoint), self.scene)
+        self.resize_to(checkpoint["state_dict"])
+        self._progress = progress = checkpoint.get("progress")
+        if progress is None:
+            return
+        if (progress["stage"], progress["total"]) != (self.name, self.total_iterations):
+            raise DevrfError(
+                f"{path}: left by the {progress['stage']} stage on a schedule of "
+                f"{progress['total']} iterations, this is the {self.name} stage on one of "
+                f"{self.total_iterations}; give it its own schedule"
+            )
+        if not progress.keys() >= {*POSITION}:
+            raise DevrfError(
+                f"{path}: left by an earlier version, which this one cannot go on from; begin "
+                "afresh with resume=false"
+            )
+        for name in POSITION:
+            setattr(self, name, progress[name])
+        self.previous_iteration = self.iteration - 1
+        # A schedule is one epoch of a loader that never ends: what ended it there (max_time,
+        # limit_train_batches, fast_dev_run) has not ended it here.
+        fit = checkpoint["loops"]["fit_loop"]
+        for epochs in ("total", "current"):
+            fit["epoch_progress"][epochs].update(processed=0, completed=0)
+        fit["epoch_loop.batch_progress"]["is_last_batch"] = False
+        self.phase = None if progress["phase"] is None else self.phase_at(progress["phase"])
+
+    def configure_optimizers(self) -> GridAdam:
+        """The optimiser; in a resumed run with the parameters of the phase that was left."""
+        if self._progress is not None and self.phase is not None:
+            self.restore(self.phase, self._progress["phase_state"])
+        return self.optimizer
+
+    def on_fit_start(self) -> None:
+        """Give every process the same tensors."""
+        self._finished = None
+        broadcast([*self.parameters(), *self.buffers()])
+
+    def on_train_start(self) -> None:
+        """Restore the random state last, when nothing but iterations draws from it any more."""
+        if self._progress is not None:
+            set_rng_state(self._progress["random"], self.device)
+            self._progress = None
+        self._reseed()
 
     def on_train_end(self) -> None:
         """Pack what was learned while it is on its GPU: Lightning moves the stage to the host."""

@@ -130,7 +130,8 @@ class DeformationSchedule:
 
     def grid(self, level: int) -> tuple[int, int | None]:
         """About how many voxels the motion grids of a level have, and their planes, if given."""
-        side, finest = self.levels[level].side, self.levels[-1].side
+        side = self.levels[level].side
+        finest = self.levels[-1].side
         return side**3, self.planes and round(self.planes * side / finest)
 
     def learning_rate_factor(self, level: int) -> float:
