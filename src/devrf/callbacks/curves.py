@@ -71,7 +71,8 @@ class Meter(Callback):
         every: int = trainer.log_every_n_steps  # type: ignore[attr-defined]
         if not (trainer.should_stop or (every > 0 and (batch_idx + 1) % every == 0)):
             return
-        now, done = time.perf_counter(), pl_module.iteration
+        now = time.perf_counter()
+        done = pl_module.iteration
         since, before = self._last
         self._last = (now, done)
         values = {"iterations_per_second": (done - before) / (now - since)}
@@ -85,7 +86,8 @@ class Meter(Callback):
             values["frame"] = pl_module.phase.frame
         if pl_module.device.type == "cuda":
             values["peak_gpu_gb"] = torch.cuda.max_memory_allocated(pl_module.device) / 2**30
-        means, psnr = outputs or {}, batch_psnr(outputs or {})
+        means = outputs or {}
+        psnr = batch_psnr(outputs or {})
         read = arriving(means if psnr is None else {**means, "psnr": psnr})
         self._flush()
         self._begun = trainer, pl_module.capture, done, values, read
@@ -141,7 +143,8 @@ class Previews(Callback):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Begin to count."""
         assert isinstance(pl_module, Stage)
-        self.seconds, self._shown = 0.0, self._due(pl_module)
+        self.seconds = 0.0
+        self._shown = self._due(pl_module)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -158,7 +161,8 @@ class Previews(Callback):
             scored = preview(
                 pl_module.current_model(), views, len(views) // 2, pl_module.scene.background
             )
-            done, capture = pl_module.iteration, pl_module.capture
+            done = pl_module.iteration
+            capture = pl_module.capture
             self.psnr = [point for point in self.psnr if point[0] < done] + [(done, scored.psnr)]
             for tracker in watching:
                 for name, image in scored.images.items():
@@ -206,7 +210,8 @@ class TrainingCurve(Callback):
     ) -> None:
         """Keep the step's PSNR, and the grid's size where it changes."""
         assert isinstance(pl_module, Stage)
-        psnr, done = batch_psnr(outputs or {}), pl_module.iteration
+        psnr = batch_psnr(outputs or {})
+        done = pl_module.iteration
         if psnr is None or not trainer.is_global_zero:
             return
         self._unread.append((done, psnr))

@@ -26,9 +26,11 @@ MIN_ITERATIONS = 20
 # An expected opacity (or transparency) below this is too small to judge by.
 FAINT = 0.02
 # Shares of the expected opacity: seen before, and as good as gone.
-THERE, GONE = 0.1, 0.01
+THERE = 0.1
+GONE = 0.01
 # Shares of the expected transparency. Much light passes beside the field whatever happens.
-CLEAR, BLOCKED = 0.8, 0.5
+CLEAR = 0.8
+BLOCKED = 0.5
 
 
 def emptied(opacity: float, highest: float, expected: float) -> bool:
@@ -87,7 +89,8 @@ class DivergenceGuard(Callback):
         self._good: Snapshot | None = None
         self._checked = 0
         # Of the opacity, since grids of this kind are learned.
-        self._kind, self._range = "", [1.0, 0.0]
+        self._kind = ""
+        self._range = [1.0, 0.0]
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Forget the stage before."""
@@ -99,7 +102,8 @@ class DivergenceGuard(Callback):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Compare with what :meth:`state_dict` gave."""
-        self._kind, self._range = state_dict["kind"], list(state_dict["range"])
+        self._kind = state_dict["kind"]
+        self._range = list(state_dict["range"])
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Count from here."""
@@ -136,9 +140,11 @@ class DivergenceGuard(Callback):
         """Roll the stage back, or end it, if it has diverged since the last check."""
         if not self._steps:
             return
-        iterations, since = [done for done, _ in self._steps], stage.iteration - self._checked
+        iterations = [done for done, _ in self._steps]
+        since = stage.iteration - self._checked
         *steps, fields = _read(stage, [means for _, means in self._steps])
-        self._steps, self._checked = [], stage.iteration
+        self._steps = []
+        self._checked = stage.iteration
         wrong = _not_finite(stage, iterations, steps, fields)
         wrong = wrong or self._collapsed(stage, steps, since)
         assert self._good is not None and stage.phase is not None
@@ -176,7 +182,8 @@ class DivergenceGuard(Callback):
     @torch.no_grad()
     def _rollback(self, stage: Stage, good: Snapshot, wrong: str) -> None:
         """Restore the last good state; the second time, end there."""
-        again, scale = stage.num_rollbacks > 0, stage.lr_scale
+        again = stage.num_rollbacks > 0
+        scale = stage.lr_scale
         for value, stored in zip(_trained(stage), good.values, strict=True):
             value.copy_(stored)
         stage.rollback(good.iteration, good.iterations_done, self.rate_factor)
@@ -190,7 +197,10 @@ class DivergenceGuard(Callback):
             return
         log.warning(
             "%s: %s: back to iteration %d, learning rates at %g of the schedule's",
-            *(stage.name, wrong, stage.iteration, stage.lr_scale),
+            stage.name,
+            wrong,
+            stage.iteration,
+            stage.lr_scale,
         )
 
 

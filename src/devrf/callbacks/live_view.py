@@ -30,14 +30,16 @@ class LiveView(Callback):
 
     def __init__(self, session: Session, share: float) -> None:
         """``share`` is the most of a stage's time that pictures may take."""
-        self.session, self.share = session, share
+        self.session = session
+        self.share = share
         self.seconds = 0.0
         self._began = self._last = 0.0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Show this stage."""
         assert isinstance(pl_module, Stage)
-        self.seconds, self._began = 0.0, time.perf_counter()
+        self.seconds = 0.0
+        self._began = time.perf_counter()
         self._first = pl_module.iteration
         with self.session.surviving():
             background = background_value(pl_module.scene.background)
@@ -49,13 +51,15 @@ class LiveView(Callback):
     ) -> None:
         """Render a picture, if one is due."""
         assert isinstance(pl_module, Stage)
-        scheduler, now = self.session.scheduler, time.perf_counter()
+        scheduler = self.session.scheduler
+        now = time.perf_counter()
         if scheduler is None or not scheduler.watched or now - self._last < PAUSE:
             return
         self._last = now
         controls = self.session.controls
         with self.session.surviving():
-            seconds, done = now - self._began, pl_module.iteration
+            seconds = now - self._began
+            done = pl_module.iteration
             pace = pl_module.cost(self._first, done) / seconds
             line = in_one_line(outputs or {}, pl_module, (done - self._first) / seconds, pace)
             controls.tell(f"**{pl_module.name}**: {line}")
@@ -74,7 +78,8 @@ class LiveView(Callback):
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Say that the stage has ended."""
         assert isinstance(pl_module, Stage)
-        done, total = pl_module.iteration, pl_module.total_iterations
+        done = pl_module.iteration
+        total = pl_module.total_iterations
         with self.session.surviving():
             self.session.controls.tell(
                 f"**{pl_module.name}** has ended after {done} of {total} iterations. The picture "

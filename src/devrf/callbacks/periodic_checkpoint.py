@@ -73,7 +73,8 @@ class PeriodicCheckpoint(Callback):
 
     def left_at(self, stage: Stage) -> str:
         """Where a stage has ended, and whether it can go on from there, in words."""
-        done, total = stage.iteration, stage.total_iterations
+        done = stage.iteration
+        total = stage.total_iterations
         where = f"iteration {done} of {total} of the {stage.name} stage"
         if done < total and done != (self.saved or 0):
             last = "there is none" if self.saved is None else f"the last is of {self.saved}"
@@ -96,7 +97,8 @@ class PeriodicCheckpoint(Callback):
     ) -> None:
         """Write a file if one is due, or if the stage is to stop."""
         assert isinstance(pl_module, Stage)
-        stopping, due = self._asked, time.monotonic() >= self._due
+        stopping = self._asked
+        due = time.monotonic() >= self._due
         if trainer.world_size > 1:  # what one process is asked, all must do
             stopping, due = self._agreed(trainer.is_global_zero, pl_module.device)
         if pl_module.iteration >= pl_module.total_iterations:
@@ -104,7 +106,8 @@ class PeriodicCheckpoint(Callback):
         if stopping or due:
             self._write(trainer, pl_module)
         if stopping:
-            self._asked, trainer.should_stop = False, True
+            self._asked = False
+            trainer.should_stop = True
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Write a file where something else has ended the stage before its schedule."""
@@ -130,7 +133,8 @@ class PeriodicCheckpoint(Callback):
                 guard.check(stage)  # rolls back first: a diverged state is never written
         if not trainer.is_global_zero or trainer.fast_dev_run:  # type: ignore[attr-defined]
             return
-        began, path = time.monotonic(), progress_file(self.folder, stage.name, stage.iteration)
+        began = time.monotonic()
+        path = progress_file(self.folder, stage.name, stage.iteration)
         try:
             save_checkpoint(trainer, path, weights_only=False)
         except OSError as error:
@@ -138,11 +142,14 @@ class PeriodicCheckpoint(Callback):
                 good = "there is none yet" if self.saved is None else f"iteration {self.saved}"
                 log.warning(
                     "%s: %s; training goes on, the last good progress file stays (%s)",
-                    *(path, error.strerror, good),
+                    path,
+                    error.strerror,
+                    good,
                 )
             self._failing = True
         else:
-            self.saved, self._failing = stage.iteration, False
+            self.saved = stage.iteration
+            self._failing = False
             files = progress_files(self.folder, stage.name)
             # Files further on are of a course that was rolled back.
             newest = files.index(path)

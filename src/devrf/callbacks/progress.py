@@ -35,14 +35,16 @@ class Progress(Callback):
     def __init__(self, line_every_seconds: float = 15.0) -> None:
         self.line_every_seconds = line_every_seconds
         self._bar: Bar | None = None
-        self._shown, self._pace = (0.0, 0), 0.0
+        self._shown = (0.0, 0)
+        self._pace = 0.0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Open the bar."""
         assert isinstance(pl_module, Stage)
         if not trainer.is_global_zero:
             return
-        self._shown, self._pace = (time.perf_counter(), pl_module.iteration), 0.0
+        self._shown = (time.perf_counter(), pl_module.iteration)
+        self._pace = 0.0
         console = Console()
         if console.is_terminal:
             self._bar = Bar(
@@ -66,11 +68,14 @@ class Progress(Callback):
         """Update the bar or write a line, if it is due."""
         assert isinstance(pl_module, Stage)
         now = time.perf_counter()
-        since, done = now - self._shown[0], pl_module.iteration
+        since = now - self._shown[0]
+        done = pl_module.iteration
         if since < (self.line_every_seconds if self._bar is None else BAR_EVERY_SECONDS):
             return
-        before, total = self._shown[1], pl_module.total_iterations
-        speed, pace = (done - before) / since, pl_module.cost(before, done) / since
+        before = self._shown[1]
+        total = pl_module.total_iterations
+        speed = (done - before) / since
+        pace = pl_module.cost(before, done) / since
         self._shown = (now, done)
         if self._bar is None:
             self._pace = pace if self._pace == 0 else self._pace + LATEST * (pace - self._pace)
@@ -101,7 +106,8 @@ def in_one_line(means: Mapping[str, Tensor], stage: Stage, speed: float, pace: f
 
     ``speed`` is in iterations a second, ``pace`` in their cost, which levels to come have more of.
     """
-    done, total = stage.iteration, stage.total_iterations
+    done = stage.iteration
+    total = stage.total_iterations
     left = f"  {time_left(stage.cost(done, total) / pace)}" if 0 < pace and done < total else ""
     return f"{stage.capture} {done}/{total}  {describe(means, stage, speed)}{left}"
 

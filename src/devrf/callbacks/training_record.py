@@ -53,7 +53,8 @@ class TrainingRecord(Callback):
         """
         assert isinstance(pl_module, Stage)
         wait(pl_module.device)
-        seconds, done = self.seconds, pl_module.iterations_done
+        seconds = self.seconds
+        done = pl_module.iterations_done
         allocated, reserved = self._peaks() or (None, None)
         pl_module.record = {
             "seconds": round(seconds, 2),

@@ -24,7 +24,8 @@ class Trial(GridUpscaling):
     """
 
     def __init__(self, most_seconds: float = 10.0) -> None:
-        self.most_seconds, self.pace = most_seconds, 0.0
+        self.most_seconds = most_seconds
+        self.pace = 0.0
         self._began: tuple[float, int] | None = None
 
     def on_train_batch_end(
@@ -32,7 +33,8 @@ class Trial(GridUpscaling):
     ) -> None:
         """Begin to count; stop when the time is over."""
         assert isinstance(pl_module, Stage)
-        now, done = time.perf_counter(), pl_module.iteration
+        now = time.perf_counter()
+        done = pl_module.iteration
         began, first = self._began = self._began or (now, done)
         if done > first:
             self.pace = pl_module.cost(first, done) / (now - began)
@@ -53,6 +55,7 @@ def seconds_to_learn(
     assert isinstance(stage, CanonicalStage)
     trial = Trial()
     trainer(callbacks=[trial, LearningRateDecay()], logger=False).fit(stage, datamodule=datamodule)
-    end, frames = stage.total_iterations, len(datamodule.scene.clock)
+    end = stage.total_iterations
+    frames = len(datamodule.scene.clock)
     batches = moving.total(frames) * moving.rays / stage.schedule.rays if frames > 1 else 0
     return (stage.cost(0, end) + batches * stage.phase_at(end).cost) / trial.pace

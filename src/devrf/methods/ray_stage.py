@@ -66,7 +66,8 @@ class RaySchedule:
             number = getattr(self, name)
             expect(number is None or number >= 1, f"{key}.{name}", "at least 1, or null", number)
         expect(self.centre_crop >= 0, f"{key}.centre_crop", "at least 0", self.centre_crop)
-        holds, expected = 0 <= self.curriculum < 1, "0 or more, below 1"
+        holds = 0 <= self.curriculum < 1
+        expected = "0 or more, below 1"
         expect(holds, f"{key}.curriculum", expected, self.curriculum)
 
 

@@ -241,7 +241,10 @@ class DeformationStage(Stage):
         if previous is not None and previous.level != phase.level:
             self._free()
             self.field.resize(*self.schedule.grid(phase.level))
-        self._initialise(phase)
+        if phase.init_from_previous:
+            self.field.frames.copy_previous(phase.frame)
+        for extension in self.extensions:
+            extension.initialise(self, phase)
         frame = self._activate(phase)
         self._update_occupancy()
         frame.pools = frame_pools(
@@ -258,13 +261,6 @@ class DeformationStage(Stage):
         self.active = None
         for group in range(len(self.optimizer.param_groups)):
             self.optimizer.replace(group, [])
-
-    def _initialise(self, phase: DeformationPhase) -> None:
-        """Give the phase's frame its first values, in the fields."""
-        if phase.init_from_previous:
-            self.field.frames.copy_previous(phase.frame)
-        for extension in self.extensions:
-            extension.initialise(self, phase)
 
     def _activate(self, phase: DeformationPhase) -> ActiveFrame:
         """Check out the phase's frame."""

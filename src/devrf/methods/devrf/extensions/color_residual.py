@@ -98,19 +98,24 @@ class ColorResidual(Extension):
             residual: weight of the squared residuals in the loss.
             tv: weight of their total variation.
         """
-        key, static = "schedule.extensions.color_residual", start_level_static_color
+        key = "schedule.extensions.color_residual"
+        static = start_level_static_color
         expect(start_level >= 1, f"{key}.start_level", "at least 1", start_level)
         good = static is None or static >= 1
         expect(good, f"{key}.start_level_static_color", "at least 1, or null", static)
         expect(side >= 2, f"{key}.side", "at least 2", side)
         expect(learning_rate > 0, f"{key}.learning_rate", "above 0", learning_rate)
-        self._learn, self._side, self._learning_rate = learn, side, learning_rate
-        self._start, self._start_if_static = start_level, start_level_static_color
+        self._learn = learn
+        self._side = side
+        self._learning_rate = learning_rate
+        self._start = start_level
+        self._start_if_static = start_level_static_color
         self._scale_if_drift = loss_scale_if_color_drift or {}
         for name, factor in self._scale_if_drift.items():
             place = f"{key}.loss_scale_if_color_drift.{name}"
             expect(factor >= 0, place, "at least 0", factor)
-        self._residual, self._tv = residual, tv
+        self._residual = residual
+        self._tv = tv
         # Once set up: the first level that learns it, from 0; factors of weights from it on.
         self._first: int | None = None
         self._scale: Mapping[str, float] = {}
@@ -138,7 +143,8 @@ class ColorResidual(Extension):
         self._scale = self._scale_if_drift if drifting else {}
         # The ablation without levels has one.
         self._first = min(first, len(stage.schedule.levels)) - 1
-        model, rate = stage.scene_model, self._learning_rate
+        model = stage.scene_model
+        rate = self._learning_rate
         model.color_residual = ResidualField(model.box, stage.field.clock, voxels=self._side**3)
         stage.optimizer.add_param_group({"params": [], "lr": rate, "base_lr": rate, "name": NAME})
 

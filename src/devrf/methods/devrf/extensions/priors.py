@@ -128,7 +128,8 @@ class MotionPrior(Extension):
 
         ``loss.deformation`` has its weight under ``name``.
         """
-        self.name, self.energy = name, energy
+        self.name = name
+        self.energy = energy
         self._occupied: Tensor | None = None
 
     @property
@@ -139,7 +140,8 @@ class MotionPrior(Extension):
     def begin_level(self, stage: DeformationStage, level: int) -> None:
         """Find the cells of the level's grids that are occupied at rest."""
         if self.name in stage.weights:
-            field, occupancy = stage.field, stage.scene_model.occupancy
+            field = stage.field
+            occupancy = stage.scene_model.occupancy
             self._occupied = occupied_cells(occupancy, field.box, field.shape)
 
     def _term(self, prediction: MotionPrediction) -> Tensor:
