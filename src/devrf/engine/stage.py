@@ -323,9 +323,17 @@ class Stage(LightningModule, ABC):
 
     # What a subclass asks.
 
-    def rays_to_draw(self, rays: int) -> int:
-        """How many ``rays`` of a batch this process draws."""
-        return max(1, round(rays_per_rank(rays) * self.batch_share))
+    def rays_to_draw(self, rays: int, most: int | None = None) -> int:
+        """How many rays of a batch this process draws.
+
+        Args:
+            rays: of the schedule's batches, over all processes.
+            most: of this process's batches, where these are smaller.
+        """
+        whole = rays_per_rank(rays)
+        if most is not None:
+            whole = min(whole, most)
+        return max(1, round(whole * self.batch_share))
 
     def background(self, image: Tensor) -> Tensor:
         """What is behind the pixels of ``image`` (R,): (3,), always the same tensor, if plain.

@@ -364,10 +364,10 @@ class CanonicalStage(Stage):
         """Random pixels of all images."""
         assert self.pool is not None and self.phase is not None
         schedule = self.schedule
-        rays = self.rays_to_draw(schedule.rays)
+        most = None
         if schedule.epochs is not None and self.phase.kind == "fine":
             most = rays_for_epochs(schedule.epochs, len(self.pool), schedule.iterations)
-            rays = min(rays, most)
+        rays = self.rays_to_draw(schedule.rays, most)
         with span("batch"):
             image, flat = self.pool.draw(rays, self.generator)
             return Pixels(image=image, flat=flat, background=self.background(image))

@@ -331,11 +331,11 @@ class DeformationStage(Stage):
         frame = self.active
         phase = self.phase
         assert frame is not None and phase is not None
-        rays = self.rays_to_draw(self.schedule.rays)
+        most = None
         if self.motion.epochs is not None:
             pixels = sum(len(pool) for pool in frame.pools)
             most = rays_for_epochs(self.motion.epochs, pixels, phase.stop - phase.start)
-            rays = min(rays, most)
+        rays = self.rays_to_draw(self.schedule.rays, most)
         pool = frame.pools[self.iterations_done % len(frame.pools)]
         with span("batch"):
             image, flat = pool.draw(rays, self.generator)
