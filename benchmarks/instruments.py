@@ -1,4 +1,4 @@
-"""Measures what a run spends its seconds on, while it runs."""
+"""Notes what a run does while it does it: seconds by what they go to."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from typing import Any
 import torch
 
 from devrf.callbacks import Meter
-from devrf.engine.stage import ScheduledStage
+from devrf.engine.stage import Stage
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.system.device import wait
 
 Row = dict[str, Any]
-# Methods that are timed, with what is nested in them, by what they do.
+# Methods that are timed, with what is nested in them, by what their seconds go to.
 TIMED = {
-    "iterations": (ScheduledStage, "training_step"),
+    "iterations": (Stage, "training_step"),
     "logging": (Meter, "on_train_batch_end"),
     "visits, canonical": (CanonicalStage, "enter"),
     "visits, deformation": (DeformationStage, "enter"),
-    "packing": (ScheduledStage, "on_train_end"),
+    "packing": (Stage, "on_train_end"),
 }
 
 
@@ -34,14 +34,12 @@ class Stopwatch:
     """
 
     def __init__(self, device: torch.device) -> None:
-        self.stage: ScheduledStage | None = None
-        self._device = device
-        self._usual = dict[tuple[type, str], Any]()
+        self.stage: Stage | None = None
+        self._device, self._usual = device, dict[tuple[type, str], Any]()
         self._seconds: dict[str, float] = defaultdict(float)
         # By resolution: seconds and iterations.
         self._levels: dict[tuple[int, ...], tuple[float, int]] = {}
-        self._since = time.perf_counter()
-        self._iteration = 0
+        self._since, self._iteration = time.perf_counter(), 0
 
     def __enter__(self) -> Stopwatch:
         for label, (owner, name) in TIMED.items():
@@ -56,7 +54,7 @@ class Stopwatch:
             setattr(owner, name, usual)
 
     def rows(self) -> Iterator[Row]:
-        """Seconds by what was done; then milliseconds of an iteration by resolution."""
+        """Seconds by what they went to; then milliseconds of an iteration by resolution."""
         yield {"seconds": dict(self._seconds)}
         for shape, (seconds, iterations) in self._levels.items():
             yield {
@@ -79,8 +77,7 @@ class Stopwatch:
             finally:
                 self._seconds[label] += time.perf_counter() - began
                 if label.startswith("visits"):
-                    self.stage = own
-                    self._since = time.perf_counter()
+                    self.stage, self._since = own, time.perf_counter()
 
         return method
 
@@ -92,6 +89,5 @@ class Stopwatch:
         shape = tuple(stage.resolution)
         seconds, iterations = self._levels.get(shape, (0.0, 0))
         seconds += time.perf_counter() - self._since
-        self._levels[shape] = (seconds, iterations + stage.iteration - self._iteration)
-        self._since = time.perf_counter()
-        self._iteration = stage.iteration
+        self._levels[shape] = seconds, iterations + stage.iteration - self._iteration
+        self._since, self._iteration = time.perf_counter(), stage.iteration

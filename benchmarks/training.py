@@ -23,8 +23,8 @@ from devrf.callbacks import LearningRateDecay
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.cli.context import RunContext
 from devrf.cli.messages import report_user_errors
-from devrf.engine.learner import Phase
-from devrf.engine.stage import ScheduledStage
+from devrf.engine.phase import Phase
+from devrf.engine.stage import Stage
 from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_schedule import CanonicalPhase
 from devrf.methods.devrf.canonical_stage import CanonicalStage
@@ -73,7 +73,7 @@ def deformation_rows(run: RunContext, stored: LoadedCheckpoint, seconds: float) 
 
 
 def measure(
-    run: RunContext, stage: ScheduledStage, kind: str, learned: DeVRFModel | None, seconds: float
+    run: RunContext, stage: Stage, kind: str, learned: DeVRFModel | None, seconds: float
 ) -> list[Row]:
     """The rows of a stage's phases whose name begins with ``kind``, coarse to fine."""
     measuring = MeasurePhases(kind, learned, seconds)
@@ -106,7 +106,7 @@ class MeasurePhases(Callback):
         self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int
     ) -> None:
         """Measure everything before the first step, which is also the last."""
-        assert isinstance(pl_module, ScheduledStage)
+        assert isinstance(pl_module, Stage)
         if self._learned is not None:
             give_fields(pl_module, copy.deepcopy(self._learned).to(pl_module.device))
         phases = one_phase_of_each_resolution(pl_module)
@@ -116,7 +116,7 @@ class MeasurePhases(Callback):
         trainer.should_stop = True
 
 
-def one_phase_of_each_resolution(stage: ScheduledStage) -> dict[str, Phase]:
+def one_phase_of_each_resolution(stage: Stage) -> dict[str, Phase]:
     """The middle one of a stage's phases at each resolution by its name, coarse to fine."""
     phases_by_name: dict[str, list[Phase]] = {}
     start = 0
@@ -130,7 +130,7 @@ def one_phase_of_each_resolution(stage: ScheduledStage) -> dict[str, Phase]:
     return {name: phases[len(phases) // 2] for name, phases in phases_by_name.items()}
 
 
-def give_fields(stage: ScheduledStage, learned: DeVRFModel) -> None:
+def give_fields(stage: Stage, learned: DeVRFModel) -> None:
     """Give a stage learned fields, as at the end of its last phase."""
     last = stage.phase_at(stage.total_iterations)
     model = stage.scene_model
@@ -146,7 +146,7 @@ def give_fields(stage: ScheduledStage, learned: DeVRFModel) -> None:
     stage.phase = last
 
 
-def measure_phase(stage: ScheduledStage, phase: Phase, views: Any, seconds: float) -> Row:
+def measure_phase(stage: Stage, phase: Phase, views: Any, seconds: float) -> Row:
     """Time and memory of an iteration of ``phase``; then, under a profiler, its time by part."""
     stage.iteration = phase.start
     stage.enter(phase)

@@ -38,7 +38,7 @@ from devrf.callbacks import GridUpscaling, LearningRateDecay
 from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, LoadedCheckpoint
 from devrf.cli.config import config_folder
 from devrf.data.datamodule import SceneDataModule
-from devrf.engine.stage import ScheduledStage
+from devrf.engine.stage import Stage
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
@@ -382,18 +382,16 @@ def trainer() -> Callable[..., Trainer]:
 
 
 @pytest.fixture
-def fit(
-    datamodule: SceneDataModule, trainer: Callable[..., Trainer]
-) -> Callable[..., ScheduledStage]:
+def fit(datamodule: SceneDataModule, trainer: Callable[..., Trainer]) -> Callable[..., Stage]:
     """``fit(stage, *callbacks)``: the stage, fitted; no row of the curves is due before the end."""
 
     def learn(
-        stage: ScheduledStage,
+        stage: Stage,
         *callbacks: Callback,
         data: SceneDataModule = datamodule,
         ckpt_path: Path | None = None,
         every: int = 1000,
-    ) -> ScheduledStage:
+    ) -> Stage:
         fitted = trainer(*callbacks, max_epochs=1, log_every_n_steps=every)
         fitted.strategy.checkpoint_io = ChecksummedCheckpointIO()
         fitted.fit(stage, datamodule=data, ckpt_path=ckpt_path and str(ckpt_path))

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from devrf import selfcheck
+from devrf.engine.stage import Stage
 from devrf.errors import DevrfError
-from devrf.methods.devrf.voxel_stage import VoxelStage
 from devrf.selfcheck import SmallScene, rendering, resume, small_scene
 
 
@@ -30,14 +30,14 @@ def scene() -> SmallScene:
 
 def test_a_stage_that_a_signal_stops_goes_on_to_equal_bits(scene, monkeypatch):
     assert resume(scene, "canonical").endswith("equal bits")
-    usual = VoxelStage._reseed
+    usual = Stage._reseed
 
-    def other(self: VoxelStage) -> None:
+    def other(self: Stage) -> None:
         usual(self)
         if self.trainer.ckpt_path:
             self.generator.manual_seed(5)
 
-    monkeypatch.setattr(VoxelStage, "_reseed", other)
+    monkeypatch.setattr(Stage, "_reseed", other)
     with pytest.raises(DevrfError, match="came to other fields"):
         resume(scene, "canonical")
 

@@ -26,7 +26,7 @@ from devrf.callbacks import GridUpscaling, LearningRateDecay, PeriodicCheckpoint
 from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, LoadedCheckpoint
 from devrf.checkpoints.progress import progress_files
 from devrf.data.rendered import ProceduralDataModule
-from devrf.engine.stage import ScheduledStage
+from devrf.engine.stage import Stage
 from devrf.errors import DevrfError, did_you_mean
 from devrf.evaluation.held_out import background_value
 from devrf.methods.devrf.architecture import Architecture
@@ -87,7 +87,7 @@ class SmallScene:
         self.learn(stage, PLAIN)
         return stage.result()
 
-    def stage(self, name: str, variant: Variant) -> ScheduledStage:
+    def stage(self, name: str, variant: Variant) -> Stage:
         """The canonical or the deformation stage."""
         if name == "canonical":
             return CanonicalStage(
@@ -113,7 +113,7 @@ class SmallScene:
 
     def learn(
         self,
-        stage: ScheduledStage,
+        stage: Stage,
         variant: Variant,
         *callbacks: Callback,
         resumed_from: str | None = None,

@@ -88,11 +88,15 @@ def test_the_first_time_is_rolled_back(fit, canonical, caplog, what):
 
 
 def test_iterations_that_a_budget_left_out_are_not_counted_again(fit, canonical):
+    class Leap(Callback):
+        def on_before_optimizer_step(self, trainer: Trainer, stage: Any, optimizer: Any) -> None:
+            stage.iteration += stage.iteration < stage.phase.stop - 1
+
     done = []
     for spoiled in ((), (14,)):
         stage = canonical(**SHORT)
-        stage.stride = 2.0  # as under a time budget: half of the iterations are left out
-        fit(stage, Spoil("inf", *spoiled), DivergenceGuard(every_iterations=4))
+        spoil, guard = Spoil("inf", *spoiled), DivergenceGuard(every_iterations=4)
+        fit(stage, spoil, guard, Leap())
         assert stage.num_rollbacks == len(spoiled)
         done.append(stage.iterations_done)
     assert done[0] == done[1] > 0

@@ -68,12 +68,12 @@ def test_batches_are_quartered_before_iterations_are_left_out(
     monkeypatch.setattr(DeformationStage, "cost_follows_rays", by_rays)
     stage, seconds, _ = timed(share * WHOLE)
     assert seconds == pytest.approx(share * WHOLE, rel=0.05)
-    assert stage.loop.rays == rays
+    assert stage.rays_to_draw(SCHEDULE.rays) == rays
 
 
 def test_too_little_time_is_refused_and_none_changes_nothing(timed) -> None:
     stage, seconds, visits = timed(None)
-    assert (seconds, stage.skipped) == (pytest.approx(WHOLE), 0)
+    assert (seconds, stage.iterations_done) == (pytest.approx(WHOLE), stage.iteration)
     assert dict(visits) == {(0, 1): 120, (0, 2): 60, (1, 1): 40, (1, 2): 20}
     for seconds in (0.2, 0.1):  # of which the first visit is entered in half, or in all
         with pytest.raises(DevrfError, match=rf"seconds: {seconds} is too little: .* 4 phases"):

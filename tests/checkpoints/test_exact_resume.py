@@ -21,16 +21,15 @@ from devrf.checkpoints.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
-from devrf.checkpoints.checkpoint_file import read_checkpoint_file
+from devrf.checkpoints.checkpoint_file import read_checkpoint_file, write_checkpoint_file
 from devrf.data.datamodule import SceneDataModule
-from devrf.engine.stage import ScheduledStage
+from devrf.engine.stage import Stage
 from devrf.errors import DevrfError
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
-from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.methods.devrf.extension import Extension
+from devrf.methods.devrf.deformation_stage import DeformationStage, Extension
 from devrf.methods.devrf.extensions.color_residual import ColorResidual
 from devrf.methods.devrf.extensions.priors import Elastic
 from devrf.methods.devrf.extensions.tracks import StartAlongFlow
@@ -73,11 +72,11 @@ def leave(path: Path, iteration: int) -> Callback:
     return LambdaCallback(on_train_batch_end=act)
 
 
-def canonical() -> ScheduledStage:
+def canonical() -> Stage:
     return CanonicalStage(SEARCHING, SMALL, iterations_per_step=1)
 
 
-def everything(stage: ScheduledStage) -> dict[str, Any]:
+def everything(stage: Stage) -> dict[str, Any]:
     """All that was learned, with the optimiser's state and the next random numbers."""
     return {
         "fields": copy.deepcopy(stage.state_dict()),
@@ -118,7 +117,7 @@ def learn(
     """Learn, leaving after each of some iterations and going on with a new stage each time."""
 
     def run(
-        build: Callable[[], ScheduledStage], *leaves: int, data: SceneDataModule = datamodule
+        build: Callable[[], Stage], *leaves: int, data: SceneDataModule = datamodule
     ) -> dict[str, Any]:
         begin_at(3)
         left: str | None = None
@@ -145,7 +144,7 @@ def test_the_canonical_stage_goes_on_exactly(learn):
 
 def deformation(
     rest: LoadedCheckpoint, *arguments: Any, each: int = 1, **extensions: Extension
-) -> Callable[[], ScheduledStage]:
+) -> Callable[[], Stage]:
     """Makes a deformation stage of ``each`` iterations a step."""
     return lambda: DeformationStage(
         copy.deepcopy(rest), *arguments, iterations_per_step=each, extensions=extensions
@@ -209,3 +208,15 @@ def test_another_schedule_is_refused(datamodule, trainer, tmp_path):
     fit.strategy.checkpoint_io = ChecksummedCheckpointIO()
     with pytest.raises(DevrfError, match=f"^{path}.*a schedule of 20 iterations, .* one of 21"):
         fit.fit(longer, datamodule=datamodule, ckpt_path=str(path))
+
+
+def test_a_file_of_an_earlier_version_is_refused(datamodule, trainer, tmp_path):
+    path = tmp_path / "left.ckpt"
+    trainer(leave(path, 2), max_epochs=1).fit(canonical(), datamodule=datamodule)
+    content = read_checkpoint_file(path)
+    del content["progress"]["batch_share"]
+    write_checkpoint_file(path, content)
+    fit = trainer(max_epochs=1)
+    fit.strategy.checkpoint_io = ChecksummedCheckpointIO()
+    with pytest.raises(DevrfError, match=rf"^{path}: left by an earlier version.*resume=false"):
+        fit.fit(canonical(), datamodule=datamodule, ckpt_path=str(path))

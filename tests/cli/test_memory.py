@@ -23,7 +23,7 @@ NEEDS = re.compile(
 
 def test_what_is_needed_by_hand(tiny_scene: Scene) -> None:
     stage = StageNeeds({"images": 50, "grid": 100, "schedule.rays": 800}, 40)
-    assert (stage.peak(), stage.peak(8)) == (950, 250)
+    assert (stage.peak(), stage.peak(0.5)) == (950, 550)
     moving = tiny_scene.dynamic.train
     assert moving.flow is not None
     assert tensor_bytes(moving.flow) == (2 * 4 + 1) * len(moving) * 24 * 18
@@ -128,9 +128,10 @@ def test_networks_too_wide_to_build_are_one_line(devrf, tiny_data) -> None:
     assert "out of memory" in outcome.err
 
 
-# Half of the fields and a small part of a batch fit into the memory left to the program.
+# Neither a batch nor half of one fits into the memory left to the program.
 LARGE = (
-    "schedule.canonical.rays=20000",
+    "schedule.canonical.rays=200000",
+    "schedule.canonical.epochs=null",
     "schedule.canonical.iterations=2",
     "schedule.canonical.upsample_at=[]",
     "stage=canonical",
@@ -139,10 +140,13 @@ LARGE = (
 
 
 @linux
-def test_a_stage_learns_in_parts_where_memory_is_short(warm, tiny, tmp_path) -> None:
+def test_memory_that_is_short_halves_batches_then_ends_the_stage(warm, tiny, tmp_path) -> None:
     outcome = warm(tmp_path, *tiny, *LARGE, most_memory=100 * 2**20)
-    assert outcome.status == 0, outcome.out
-    assert "out of memory (" in outcome.out
+    assert outcome.status == 2, outcome.out
+    *_, halved, ended = outcome.out.splitlines()
+    assert halved.startswith("out of memory (") and "half of their rays" in halved
+    assert ended.startswith("devrf: canonical stage: out of memory (")
+    assert "lower schedule.canonical.side or schedule.canonical.rays, or higher" in ended
 
 
 @linux

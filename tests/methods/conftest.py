@@ -13,7 +13,7 @@ from lightning import Callback
 from devrf.checkpoints.checkpoint import LoadedCheckpoint, load_checkpoint, save_checkpoint
 from devrf.data.batch import RayBatch
 from devrf.engine.batches import gather_batch
-from devrf.engine.stage import ScheduledStage
+from devrf.engine.stage import Stage
 from devrf.methods.base import RayTrainable
 from devrf.methods.protocol import ProtocolStage
 from devrf.methods.ray_stage import RaySchedule, RayStage
@@ -66,10 +66,10 @@ def learned_losses(ray_stage: Callable[..., RayStage], fit: Callable[..., RaySta
 
 
 @pytest.fixture
-def stored(tmp_path: Path) -> Callable[[ScheduledStage], LoadedCheckpoint]:
+def stored(tmp_path: Path) -> Callable[[Stage], LoadedCheckpoint]:
     """``stored(stage)``: what the checkpoint of a fitted stage holds."""
 
-    def store(stage: ScheduledStage) -> LoadedCheckpoint:
+    def store(stage: Stage) -> LoadedCheckpoint:
         path = tmp_path / f"{stage.name}.ckpt"
         save_checkpoint(stage.trainer, path)
         return load_checkpoint(path, stage.scene)

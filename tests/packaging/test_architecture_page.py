@@ -15,7 +15,7 @@ from torch import Tensor
 import devrf
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
-from devrf.engine.stage import ScheduledStage
+from devrf.engine.stage import Stage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 
@@ -36,9 +36,9 @@ def test_an_iteration_enters_the_files_that_are_listed_in_their_order(
         if event == "call" and path.is_relative_to(SOURCE):
             entered[str(path.relative_to(SOURCE))] = None
 
-    step = ScheduledStage.training_step
+    step = Stage.training_step
 
-    def noted(stage: ScheduledStage, *arguments: Any) -> dict[str, Tensor]:
+    def noted(stage: Stage, *arguments: Any) -> dict[str, Tensor]:
         before = sys.getprofile()
         sys.setprofile(note if stage.iteration == 3 else before)
         try:
@@ -46,7 +46,7 @@ def test_an_iteration_enters_the_files_that_are_listed_in_their_order(
         finally:
             sys.setprofile(before)
 
-    monkeypatch.setattr(ScheduledStage, "training_step", noted)
+    monkeypatch.setattr(Stage, "training_step", noted)
     schedule = DeformationSchedule((Level(4, 4),), rays=64)
     stage = DeformationStage(rest, schedule, iterations_per_step=1)
     trainer(max_steps=5).fit(stage, datamodule=datamodule)

@@ -16,7 +16,7 @@ from devrf.cli.config import config_folder, group_choices
 from devrf.cli.config_check import check_config
 from devrf.cli.context import RunContext
 from devrf.data.datamodule import SceneDataModule
-from devrf.engine.stage import ScheduledStage
+from devrf.engine.stage import Stage
 from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
@@ -136,7 +136,7 @@ def test_a_method_learns_by_the_protocols_that_it_has_stages_for(composed, tmp_p
                 with pytest.raises(DevrfError, match=f"method={method} .* protocol={protocol}"):
                     run.stage_builder(step.name)
             elif step.builds_on is None:
-                assert isinstance(run.stage_builder(step.name)(), ScheduledStage)
+                assert isinstance(run.stage_builder(step.name)(), Stage)
 
 
 @pytest.mark.parametrize("row", NAMES["comparison"])

@@ -38,11 +38,16 @@ def free_bytes(device: torch.device, folder: Path, *, resume: bool) -> Bytes:
 
 
 def needed_bytes(
-    scene: Scene, stages: Sequence[StageNeeds], processes: int, pieces: int, *, on_gpu: bool
+    scene: Scene,
+    stages: Sequence[StageNeeds],
+    processes: int,
+    batch_share: float,
+    *,
+    on_gpu: bool,
 ) -> Bytes:
-    """What stages need; on a GPU with each batch taken in ``pieces``, else in each process."""
+    """What stages need; on a GPU with ``batch_share`` of each batch, else in each process."""
     return {
-        "GPU memory": max(stage.peak(pieces) for stage in stages),
+        "GPU memory": max(stage.peak(batch_share) for stage in stages),
         "host memory": host_bytes(scene, stages, on_host=not on_gpu) * (1 if on_gpu else processes),
         "disk": FILES * max(stage.learned for stage in stages),
     }

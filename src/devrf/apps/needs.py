@@ -1,8 +1,8 @@
-"""An estimate of the memory that learning a scene takes.
+"""What it takes to learn a scene: an estimate of what is large.
 
-It counts the images, the fields with their gradients and Adam's state, and a batch. The rest is
-small beside them; if memory runs out all the same, batches are split
-(:mod:`devrf.engine.micro_batching`).
+Counted are the images, the fields with their gradients and Adam's state, and a batch. The rest is
+small beside them; where memory runs out all the same, batches are halved
+(:mod:`devrf.engine.stage`).
 """
 
 from __future__ import annotations
@@ -20,16 +20,13 @@ from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.scenes.scene import Scene
 
-# Bytes of Python and its libraries on the host, measured.
-PROGRAM = 600_000_000
-# Factor for the freed memory that the C library keeps, measured.
-FRAGMENTATION = 1.3
+# Python and its libraries on the host; measured, as is what the C library keeps of freed memory.
+PROGRAM, FRAGMENTATION = 600_000_000, 1.3
 # Values, gradients, Adam's two means, and the copy that a rollback returns to.
 LEARNED = 5
-# The share of a ray's samples that are occupied, measured around a free-standing object.
-OCCUPIED = 0.3
-# The share of occupied samples whose colour counts once surfaces have formed, measured there, too.
-COLOURED = 0.25
+# Measured around a free-standing object: the share of a ray's samples that are occupied, and of
+# these the share whose colour counts once surfaces have formed.
+OCCUPIED, COLOURED = 0.3, 0.25
 
 
 @dataclass(frozen=True)
@@ -37,22 +34,22 @@ class StageNeeds:
     """What a stage needs, in bytes.
 
     Attributes:
-        parts: bytes on the device that trains, by the config key that changes them most; the
-            batch's key is that of its rays.
+        parts: on the device that trains, by the config key that changes them most: the batch by
+            that of its rays.
         learned: the values of the fields.
     """
 
     parts: Mapping[str, float]
     learned: float
 
-    def peak(self, pieces: int = 1) -> float:
-        """Bytes on the device, with each batch taken in ``pieces``."""
+    def peak(self, batch_share: float = 1.0) -> float:
+        """Bytes on the device, with ``batch_share`` of each batch."""
         batch = sum(size for key, size in self.parts.items() if key.endswith(".rays"))
-        return sum(self.parts.values()) - batch * (1 - 1 / pieces)
+        return sum(self.parts.values()) - batch * (1 - batch_share)
 
 
 def smaller(scene: Scene, by: float) -> Scene:
-    """A scene that needs as much as one of images smaller by ``by``: it has their corners only."""
+    """What a scene of images smaller by ``by`` needs: corners of the images stand for them."""
 
     def corner(of_views: Any) -> Any:
         if not isinstance(of_views, Tensor) or of_views.ndim < 3:
@@ -65,12 +62,8 @@ def smaller(scene: Scene, by: float) -> Scene:
     ]
     space = scene.space
     if isinstance(space, NormalizedDevice):
-        space = replace(
-            space,
-            width=round(space.width / by),
-            height=round(space.height / by),
-            focal=(space.focal[0] / by, space.focal[1] / by),
-        )
+        size = {"width": round(space.width / by), "height": round(space.height / by)}
+        space = replace(space, **size, focal=(space.focal[0] / by, space.focal[1] / by))
     return replace(scene, static=captures[0], dynamic=captures[1], space=space)
 
 
@@ -110,7 +103,7 @@ def needs_of_networks(scene: Scene, model: RayTrainable, images: str, rays: floa
         scene: what it learns.
         model: its parameters, on any device.
         images: the config key that changes the images' size.
-        rays: rays of a batch, in each process.
+        rays: of a batch, in each process.
     """
     learned = tensor_bytes(model.parameters())
     parts = {
@@ -145,7 +138,7 @@ def needs_of_devrf(
     """
     schedule, sizes = fitted_to(scene, canonical.schedule, canonical.architecture)
     values = 4 * (1 + sizes.channels) * schedule.side**3
-    # Bytes of each sample whose colour counts, with the graph of its gradients; measured.
+    # With the graph of its gradients: measured, for each sample whose colour counts.
     sample = 600 + 24 * sizes.width + 96 * sizes.channels
     along = 2 / 3 * schedule.side * OCCUPIED if sizes.planes is None else sizes.planes
     ray = along / canonical.sampling.step * sample / processes
@@ -157,8 +150,7 @@ def needs_of_devrf(
         "schedule.canonical.rays": schedule.rays * ray,
     }
     # Displacements of a frame: three numbers in both directions. The active one is learned.
-    frame = 24 * moving.levels[-1].side ** 3
-    frames = len(scene.clock)
+    frame, frames = 24 * moving.levels[-1].side ** 3, len(scene.clock)
     held = 1 if offloaded else frames
     in_motion = {
         images: tensor_bytes(scene.dynamic.train),

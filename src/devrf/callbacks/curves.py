@@ -16,7 +16,7 @@ from torch import Tensor
 from devrf.apps.records import peak_host_memory
 from devrf.apps.still import preview
 from devrf.apps.trackers import trackers
-from devrf.engine.stage import ScheduledStage
+from devrf.engine.stage import Stage
 from devrf.system.device import arriving
 
 log = logging.getLogger(__name__)
@@ -50,7 +50,7 @@ class Meter(Callback):
     def __init__(self) -> None:
         self.row: Numbers = {}
         self._last = (0.0, 0)
-        # The row to come: its trainer, capture, iteration, numbers, and what reads the others.
+        # Of the row to come: its trainer, capture, iteration, numbers, and those on their way.
         self._begun: tuple[Trainer, str, int, Numbers, Callable[[], Numbers]] | None = None
 
     def state_dict(self) -> dict[str, Any]:
@@ -60,14 +60,14 @@ class Meter(Callback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the clock."""
-        assert isinstance(pl_module, ScheduledStage)
+        assert isinstance(pl_module, Stage)
         self._last = (time.perf_counter(), pl_module.iteration)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Begin a row every ``log_every_n_steps`` steps; nothing waits for the device."""
-        assert isinstance(pl_module, ScheduledStage)
+        assert isinstance(pl_module, Stage)
         every: int = trainer.log_every_n_steps  # type: ignore[attr-defined]
         if not (trainer.should_stop or (every > 0 and (batch_idx + 1) % every == 0)):
             return
@@ -90,7 +90,7 @@ class Meter(Callback):
         psnr = batch_psnr(outputs or {})
         read = arriving(means if psnr is None else {**means, "psnr": psnr})
         self._flush()
-        self._begun = (trainer, pl_module.capture, done, values, read)
+        self._begun = trainer, pl_module.capture, done, values, read
 
     def _flush(self) -> None:
         """Write the row that was begun."""
@@ -142,7 +142,7 @@ class Previews(Callback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Begin to count."""
-        assert isinstance(pl_module, ScheduledStage)
+        assert isinstance(pl_module, Stage)
         self.seconds = 0.0
         self._shown = self._due(pl_module)
 
@@ -150,7 +150,7 @@ class Previews(Callback):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Show the view, if a picture is due."""
-        assert isinstance(pl_module, ScheduledStage)
+        assert isinstance(pl_module, Stage)
         due = self._due(pl_module)
         if due == self._shown or not trainer.is_global_zero:
             return
@@ -171,7 +171,7 @@ class Previews(Callback):
                 logger.log_metrics({f"{capture}/held_out_psnr": scored.psnr}, done)
         self.seconds += time.perf_counter() - started
 
-    def _due(self, stage: ScheduledStage) -> int:
+    def _due(self, stage: Stage) -> int:
         return stage.iteration * self.times // stage.total_iterations
 
 
@@ -209,7 +209,7 @@ class TrainingCurve(Callback):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Keep the step's PSNR, and the grid's size where it changes."""
-        assert isinstance(pl_module, ScheduledStage)
+        assert isinstance(pl_module, Stage)
         psnr = batch_psnr(outputs or {})
         done = pl_module.iteration
         if psnr is None or not trainer.is_global_zero:
@@ -234,7 +234,7 @@ class TrainingCurve(Callback):
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Draw the curve, in one process; the stage's seconds have been taken."""
-        assert isinstance(pl_module, ScheduledStage)
+        assert isinstance(pl_module, Stage)
         self._read()
         # A resumed run gives every process the points so far.
         leads = trainer.is_global_zero

@@ -12,8 +12,8 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 from torch import Tensor
 
-from devrf.engine.learner import Phase
-from devrf.engine.stage import ScheduledStage
+from devrf.engine.phase import Phase
+from devrf.engine.stage import Stage
 from devrf.errors import DevrfError
 
 log = logging.getLogger(__name__)
@@ -25,7 +25,7 @@ SNAPSHOT_EVERY = 1000
 MIN_ITERATIONS = 20
 # An expected opacity (or transparency) below this is too small to judge by.
 FAINT = 0.02
-# Shares of the expected opacity: above THERE something was seen, below GONE nothing is left.
+# Shares of the expected opacity: seen before, and as good as gone.
 THERE = 0.1
 GONE = 0.01
 # Shares of the expected transparency. Much light passes beside the field whatever happens.
@@ -50,12 +50,12 @@ def filled(opacity: float, lowest: float, expected: float) -> bool:
 class Snapshot(NamedTuple):
     """Copies of the optimiser's parameters, in its order, at an iteration of a phase.
 
-    ``skipped`` iterations had been left out there.
+    ``iterations_done`` had been carried out there.
     """
 
     phase: Phase
     iteration: int
-    skipped: int
+    iterations_done: int
     values: tuple[Tensor, ...]
 
 
@@ -88,7 +88,7 @@ class DivergenceGuard(Callback):
         self._steps: list[tuple[int, dict[str, Tensor]]] = []
         self._good: Snapshot | None = None
         self._checked = 0
-        # The kind of grids that is learned, and the lowest and highest opacity since then.
+        # Of the opacity, since grids of this kind are learned.
         self._kind = ""
         self._range = [1.0, 0.0]
 
@@ -107,14 +107,14 @@ class DivergenceGuard(Callback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Count from here."""
-        assert isinstance(pl_module, ScheduledStage)
+        assert isinstance(pl_module, Stage)
         self._checked = pl_module.iteration
 
     def on_train_batch_start(
         self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int
     ) -> None:
         """Take a snapshot where a phase begins."""
-        assert isinstance(pl_module, ScheduledStage)
+        assert isinstance(pl_module, Stage)
         phase = pl_module.phase
         if phase is None or (self._good is not None and self._good.phase == phase):
             return
@@ -128,7 +128,7 @@ class DivergenceGuard(Callback):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Keep the step's losses; check, if it is due."""
-        assert isinstance(pl_module, ScheduledStage) and pl_module.phase is not None
+        assert isinstance(pl_module, Stage) and pl_module.phase is not None
         done = pl_module.iteration
         if outputs:
             self._steps.append((done, outputs))
@@ -136,7 +136,7 @@ class DivergenceGuard(Callback):
         if ends or done - self._checked >= self.every_iterations:
             self.check(pl_module)
 
-    def check(self, stage: ScheduledStage) -> None:
+    def check(self, stage: Stage) -> None:
         """Roll the stage back, or end it, if it has diverged since the last check."""
         if not self._steps:
             return
@@ -153,15 +153,13 @@ class DivergenceGuard(Callback):
         elif stage.phase.stop > stage.iteration >= self._good.iteration + SNAPSHOT_EVERY:
             self._snapshot(stage)
 
-    def _snapshot(self, stage: ScheduledStage) -> None:
+    def _snapshot(self, stage: Stage) -> None:
         assert stage.phase is not None
         self._good = None  # its memory is free before the next takes as much
         values = tuple(value.detach().clone() for value in _trained(stage))
-        self._good = Snapshot(stage.phase, stage.iteration, stage.skipped, values)
+        self._good = Snapshot(stage.phase, stage.iteration, stage.iterations_done, values)
 
-    def _collapsed(
-        self, stage: ScheduledStage, steps: Sequence[dict[str, float]], since: int
-    ) -> str | None:
+    def _collapsed(self, stage: Stage, steps: Sequence[dict[str, float]], since: int) -> str | None:
         """In words, that everything has become empty or opaque."""
         late = steps[len(steps) // 2 :]
         opacity = mean(means["opacity"] for means in late)
@@ -182,13 +180,13 @@ class DivergenceGuard(Callback):
         return None
 
     @torch.no_grad()
-    def _rollback(self, stage: ScheduledStage, good: Snapshot, wrong: str) -> None:
+    def _rollback(self, stage: Stage, good: Snapshot, wrong: str) -> None:
         """Restore the last good state; the second time, end there."""
         again = stage.num_rollbacks > 0
         scale = stage.lr_scale
         for value, stored in zip(_trained(stage), good.values, strict=True):
             value.copy_(stored)
-        stage.rollback(good.iteration, good.skipped, self.rate_factor)
+        stage.rollback(good.iteration, good.iterations_done, self.rate_factor)
         self._checked = stage.iteration
         if again:
             stage.abort(
@@ -206,12 +204,12 @@ class DivergenceGuard(Callback):
         )
 
 
-def _trained(stage: ScheduledStage) -> list[Tensor]:
+def _trained(stage: Stage) -> list[Tensor]:
     return [value for group in stage.optimizer.param_groups for value in group["params"]]
 
 
 @torch.no_grad()
-def _read(stage: ScheduledStage, steps: Sequence[Mapping[str, Tensor]]) -> list[dict[str, float]]:
+def _read(stage: Stage, steps: Sequence[Mapping[str, Tensor]]) -> list[dict[str, float]]:
     """The values of steps, then one row with the sum of each parameter group, by name.
 
     A sum is not finite if any value is not. This is the one place that waits for the device.
@@ -227,7 +225,7 @@ def _read(stage: ScheduledStage, steps: Sequence[Mapping[str, Tensor]]) -> list[
 
 
 def _not_finite(
-    stage: ScheduledStage,
+    stage: Stage,
     iterations: Sequence[int],
     steps: Sequence[Mapping[str, float]],
     fields: Mapping[str, float],

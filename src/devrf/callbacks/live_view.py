@@ -10,7 +10,7 @@ from lightning import Callback, LightningModule, Trainer
 from devrf.apps.viewer.drawing import Drawing
 from devrf.apps.viewer.session import Session
 from devrf.callbacks.progress import in_one_line
-from devrf.engine.stage import ScheduledStage
+from devrf.engine.stage import Stage
 from devrf.evaluation.held_out import background_value
 from devrf.rendering.renderer import Renderer
 
@@ -37,7 +37,7 @@ class LiveView(Callback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Show this stage."""
-        assert isinstance(pl_module, ScheduledStage)
+        assert isinstance(pl_module, Stage)
         self.seconds = 0.0
         self._began = time.perf_counter()
         self._first = pl_module.iteration
@@ -50,7 +50,7 @@ class LiveView(Callback):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Render a picture, if one is due."""
-        assert isinstance(pl_module, ScheduledStage)
+        assert isinstance(pl_module, Stage)
         scheduler = self.session.scheduler
         now = time.perf_counter()
         if scheduler is None or not scheduler.watched or now - self._last < PAUSE:
@@ -77,7 +77,7 @@ class LiveView(Callback):
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Say that the stage has ended."""
-        assert isinstance(pl_module, ScheduledStage)
+        assert isinstance(pl_module, Stage)
         done = pl_module.iteration
         total = pl_module.total_iterations
         with self.session.surviving():
@@ -88,6 +88,6 @@ class LiveView(Callback):
             )
 
 
-def _renderer(stage: ScheduledStage) -> Renderer:
+def _renderer(stage: Stage) -> Renderer:
     """Renders what has been learned so far; it has no views of before."""
     return Renderer(stage.current_model(), times=2)

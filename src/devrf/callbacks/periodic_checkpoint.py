@@ -21,7 +21,7 @@ from devrf.callbacks.divergence_guard import DivergenceGuard
 from devrf.checkpoints.checkpoint import save_checkpoint
 from devrf.checkpoints.progress import progress_file, progress_files
 from devrf.engine.ddp import largest
-from devrf.engine.stage import ScheduledStage
+from devrf.engine.stage import Stage
 from devrf.errors import DevrfError
 from devrf.system.process import Interrupted, handle_signals
 
@@ -71,7 +71,7 @@ class PeriodicCheckpoint(Callback):
         """End the training after the present Lightning step, with a progress file written."""
         self._asked = True
 
-    def left_at(self, stage: ScheduledStage) -> str:
+    def left_at(self, stage: Stage) -> str:
         """Where a stage has ended, and whether it can go on from there, in words."""
         done = stage.iteration
         total = stage.total_iterations
@@ -83,7 +83,7 @@ class PeriodicCheckpoint(Callback):
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the clock, and remove half-written files of a process that was killed."""
-        assert isinstance(pl_module, ScheduledStage)
+        assert isinstance(pl_module, Stage)
         self._failing = False
         self.saved = pl_module.iteration or None
         self._due = time.monotonic() + self.every_seconds
@@ -96,7 +96,7 @@ class PeriodicCheckpoint(Callback):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Write a file if one is due, or if the stage is to stop."""
-        assert isinstance(pl_module, ScheduledStage)
+        assert isinstance(pl_module, Stage)
         stopping = self._asked
         due = time.monotonic() >= self._due
         if trainer.world_size > 1:  # what one process is asked, all must do
@@ -111,7 +111,7 @@ class PeriodicCheckpoint(Callback):
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Write a file where something else has ended the stage before its schedule."""
-        assert isinstance(pl_module, ScheduledStage)
+        assert isinstance(pl_module, Stage)
         if self.saved != pl_module.iteration < pl_module.total_iterations:
             self._write(trainer, pl_module)
 
@@ -126,7 +126,7 @@ class PeriodicCheckpoint(Callback):
         stopping, due = largest([self._asked, leads and time.monotonic() >= self._due], device)
         return bool(stopping), bool(due)
 
-    def _write(self, trainer: Trainer, stage: ScheduledStage) -> None:
+    def _write(self, trainer: Trainer, stage: Stage) -> None:
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
         for guard in callbacks:
             if isinstance(guard, DivergenceGuard):

@@ -14,7 +14,7 @@ from rich.progress import Progress as Bar
 from torch import Tensor
 
 from devrf.callbacks.curves import batch_psnr
-from devrf.engine.stage import ScheduledStage
+from devrf.engine.stage import Stage
 from devrf.system.progress import time_left
 
 log = logging.getLogger(__name__)
@@ -29,7 +29,7 @@ class Progress(Callback):
     """Shows a bar on a terminal, else a line every ``line_every_seconds``.
 
     The time left comes from the pace so far and from what the phases to come cost
-    (:meth:`~devrf.engine.learner.Learner.cost`).
+    (:meth:`~devrf.engine.stage.Stage.cost`).
     """
 
     def __init__(self, line_every_seconds: float = 15.0) -> None:
@@ -40,7 +40,7 @@ class Progress(Callback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Open the bar."""
-        assert isinstance(pl_module, ScheduledStage)
+        assert isinstance(pl_module, Stage)
         if not trainer.is_global_zero:
             return
         self._shown = (time.perf_counter(), pl_module.iteration)
@@ -66,7 +66,7 @@ class Progress(Callback):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Update the bar or write a line, if it is due."""
-        assert isinstance(pl_module, ScheduledStage)
+        assert isinstance(pl_module, Stage)
         now = time.perf_counter()
         since = now - self._shown[0]
         done = pl_module.iteration
@@ -101,9 +101,7 @@ class Progress(Callback):
             self._bar = None
 
 
-def in_one_line(
-    means: Mapping[str, Tensor], stage: ScheduledStage, speed: float, pace: float
-) -> str:
+def in_one_line(means: Mapping[str, Tensor], stage: Stage, speed: float, pace: float) -> str:
     """Where a stage is, what :func:`describe` says, and the time left.
 
     ``speed`` is in iterations a second, ``pace`` in their cost, which levels to come have more of.
@@ -114,7 +112,7 @@ def in_one_line(
     return f"{stage.capture} {done}/{total}  {describe(means, stage, speed)}{left}"
 
 
-def describe(means: Mapping[str, Tensor], stage: ScheduledStage, speed: float) -> str:
+def describe(means: Mapping[str, Tensor], stage: Stage, speed: float) -> str:
     """PSNR of the last batches, iterations a second, resolution, and the frame if any."""
     psnr = batch_psnr(means)
     parts = [] if psnr is None else [f"{float(psnr):.1f} dB"]

@@ -3,7 +3,8 @@
 The schedule stays as it is. ``stage.iteration`` is the place in it, and all that follows from a
 place (levels, growths, decays, curricula) follows as before. What a budget changes is the
 *stride*, how far an optimiser iteration goes in the schedule: with a stride of 3 a visit of 18
-iterations takes 6, with one of 0.5 it takes 36. Every phase keeps one iteration at least.
+iterations takes 6, with one of 0.5 it takes 36. Every phase keeps one iteration at least. The
+stage itself always goes one further; this callback adds the rest of the stride.
 
 * The budget is that of the whole method. A stage has a share of it, in proportion to what its
   protocol calls ``iterations``, among the stages that are learned.
@@ -16,11 +17,11 @@ iterations takes 6, with one of 0.5 it takes 36. Every phase keeps one iteration
 
   ``pace`` is measured, in seconds for a unit of cost, and so is what it takes to enter a phase
   (grids that grow, a frame's occupancy and pixels). What an iteration of a phase costs beside one
-  of another is the stage's own estimate (:meth:`~devrf.engine.learner.Learner.cost`): where it is
+  of another is the stage's own estimate (:meth:`~devrf.engine.stage.Stage.cost`): where it is
   wrong, levels get other shares of the time, but the end is where it should be.
-* Where the stride would be more than 1, batches are halved first, to a quarter at the least: more
+* Where the stride would be more than 1, ``stage.batch_share`` is halved first, to a quarter: more
   iterations learn more than larger ones. What takes as long with fewer rays keeps its batches
-  (:attr:`~devrf.engine.learner.Learner.cost_follows_rays`).
+  (:attr:`~devrf.engine.stage.Stage.cost_follows_rays`).
 * Of several processes rank 0's clock decides.
 * A progress file holds the seconds so far: a run that was interrupted goes on with those left. What
   it learns then is not bit for bit what it would have learned: a clock never gives the same twice.
@@ -33,10 +34,11 @@ import math
 from typing import Any
 
 from lightning import Callback, LightningModule, Trainer
+from torch.optim import Optimizer
 
 from devrf.callbacks.training_record import TrainingRecord
-from devrf.engine.learner import Phase
-from devrf.engine.stage import ScheduledStage
+from devrf.engine.phase import Phase
+from devrf.engine.stage import Stage
 from devrf.errors import DevrfError, expect
 from devrf.system.device import wait
 
@@ -50,18 +52,18 @@ TRIAL_SHARE = 0.25
 LEAST_BATCH = 1 / 4
 # Added to the last strides, whose sum would else fall short of the end.
 ROUNDING = 1e-6
-# The weight of the latest measurement in an average.
+# How much of an average the latest measurement is.
 LATEST = 0.3
 
 
 def running_mean(mean: float | None, value: float) -> float:
-    """The mean with a further ``value``; the value alone if there is no ``mean``."""
+    """``mean`` with a further ``value``; alone where there is none."""
     return value if mean is None else mean + LATEST * (value - mean)
 
 
-def phases_of(stage: ScheduledStage) -> list[Phase]:
+def phases_of(stage: Stage) -> list[Phase]:
     """All phases of a stage that has been set up, in their order."""
-    phases = list[Phase]()
+    phases: list[Phase] = []
     place = 0
     while place < stage.total_iterations:
         phases.append(stage.phase_at(place))
@@ -73,7 +75,11 @@ class TimeBudget(Callback):
     """Has a stage end its schedule when its share of ``seconds`` is over.
 
     It needs a :class:`~devrf.callbacks.TrainingRecord` among the trainer's callbacks, and a place
-    behind :class:`~devrf.callbacks.GridUpscaling`.
+    behind :class:`~devrf.callbacks.GridUpscaling` and :class:`~devrf.callbacks.LearningRateDecay`.
+
+    Attributes:
+        seconds: for all stages of the method together; None: the schedule's iterations.
+        stride: how far an optimiser iteration goes in the schedule.
     """
 
     def __init__(self, seconds: float | None = None) -> None:
@@ -84,9 +90,12 @@ class TimeBudget(Callback):
         self._pace: float | None = None  # seconds for a unit of cost
         self._entering: dict[str, float] = {}  # seconds to enter a phase of a kind
         self._warm = self._checked = False
-        self._step_began = self._step_ended = 0.0
+        self._step_began = 0.0
+        self._step_ended = 0.0
         self._done = 0
         self._most_iterations = 1
+        self.stride = 1.0
+        self._ahead = 0.0  # of ``stage.iteration``: where the strides have led
         self._phase: Phase | None = None
         self._phases: list[Phase] = []
 
@@ -94,7 +103,7 @@ class TimeBudget(Callback):
         """Look at the schedule and the clock."""
         if self.seconds is None:
             return
-        assert isinstance(pl_module, ScheduledStage)
+        assert isinstance(pl_module, Stage)
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
         self._record = next(other for other in callbacks if isinstance(other, TrainingRecord))
         self._phases = phases_of(pl_module)
@@ -110,7 +119,7 @@ class TimeBudget(Callback):
         """Fit the stride of the coming step, and its number of iterations."""
         if self.seconds is None:
             return
-        assert isinstance(pl_module, ScheduledStage)
+        assert isinstance(pl_module, Stage)
         wait(pl_module.device)
         self._step_began = self._record.seconds
         self._done = pl_module.iterations_done
@@ -125,12 +134,27 @@ class TimeBudget(Callback):
             fitted = trainer.strategy.broadcast(self._fitted(pl_module))
             if isinstance(fitted, str):
                 raise DevrfError(fitted)
-            pl_module.stride, pl_module.iterations_per_step, share = fitted
+            self.stride, pl_module.iterations_per_step, share = fitted
             # An iteration takes about as long as its rays; it is measured again.
-            self._pace *= share / pl_module.loop.batch_share
-            pl_module.loop.batch_share = share
+            self._pace *= share / pl_module.batch_share
+            pl_module.batch_share = share
 
-    def _fitted(self, stage: ScheduledStage) -> tuple[float, int, float] | str:
+    def on_before_optimizer_step(
+        self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer
+    ) -> None:
+        """Move the stage in its schedule by the stride less the one iteration that it adds itself.
+
+        It stays within its phase; what is left of the stride is made up for in the next.
+        """
+        if self.seconds is None:
+            return
+        assert isinstance(pl_module, Stage) and pl_module.phase is not None
+        place = pl_module.iteration + self._ahead + self.stride
+        following = min(math.floor(place), pl_module.phase.stop)
+        self._ahead = min(place - following, max(self.stride, 1.0))
+        pl_module.iteration = following - 1
+
+    def _fitted(self, stage: Stage) -> tuple[float, int, float] | str:
         """Stride, iterations and share of batches from now on; or why the budget is too short."""
         assert self._pace is not None and stage.phase is not None
         pace = self._pace
@@ -145,25 +169,25 @@ class TimeBudget(Callback):
             least = entering + pace * sum(phase.cost for phase in later)
             if least > left:
                 return self._too_short(stage, self._step_began + least)
-        needed = pace * sum(
-            phase.cost * max(0.0, phase.stop - max(phase.start, stage.position))
+        place = stage.iteration + self._ahead
+        whole = pace * sum(
+            phase.cost * max(0.0, phase.stop - max(phase.start, place))
             for phase in (stage.phase, *later)
         )
         # Out of time, what is left gets an iteration a phase.
-        stride = needed / (left - entering) if left > entering else float(stage.total_iterations)
-        share = stage.loop.batch_share
-        divisible = stage.cost_follows_rays
-        if stride > 1 and share > LEAST_BATCH and divisible:
+        stride = whole / (left - entering) if left > entering else float(stage.total_iterations)
+        share = stage.batch_share
+        if stride > 1 and share > LEAST_BATCH and stage.cost_follows_rays:
             stride /= 2
             pace /= 2
             share /= 2
         if not later:  # whole iterations are left: as many as end nearest to the budget
             iterations = max(1, round(left / (pace * stage.phase.cost)))
-            stride = (stage.phase.stop - stage.position) / iterations + ROUNDING
+            stride = (stage.phase.stop - place) / iterations + ROUNDING
         most = STEP_SHARE * self._budget / (pace * stage.phase.cost)
         return stride, max(1, min(self._most_iterations, int(most))), share
 
-    def _too_short(self, stage: ScheduledStage, least: float) -> str:
+    def _too_short(self, stage: Stage, least: float) -> str:
         assert self.seconds is not None
         needed = 1.2 * least / stage.time_share
         digits = max(0, 1 - math.floor(math.log10(needed)))
@@ -179,7 +203,7 @@ class TimeBudget(Callback):
         """Measure the step."""
         if self.seconds is None:
             return
-        assert isinstance(pl_module, ScheduledStage) and self._phase is not None
+        assert isinstance(pl_module, Stage) and self._phase is not None
         wait(pl_module.device)
         self._step_ended = self._record.seconds
         done = pl_module.iterations_done - self._done
@@ -193,13 +217,13 @@ class TimeBudget(Callback):
         """Say what the time was enough for."""
         if self.seconds is None or not trainer.is_global_zero:
             return
-        assert isinstance(pl_module, ScheduledStage)
+        assert isinstance(pl_module, Stage)
         log.info(
             "%s: %d iterations for its %d, on %.0f%% of their rays, in %.1f s of %.1f",
             pl_module.name,
             pl_module.iterations_done,
             pl_module.iteration,
-            100 * pl_module.loop.batch_share,
+            100 * pl_module.batch_share,
             self._record.seconds,
             self._budget,
         )

@@ -9,7 +9,7 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 
 from devrf.callbacks.curves import Previews
-from devrf.engine.stage import ScheduledStage
+from devrf.engine.stage import Stage
 from devrf.system.device import wait
 
 
@@ -17,7 +17,7 @@ class TrainingRecord(Callback):
     """Measures a stage's training into its ``record``, over all resumed runs."""
 
     def __init__(self) -> None:
-        self._stage: ScheduledStage | None = None
+        self._stage: Stage | None = None
         self._seconds_before = 0.0
         self._peaks_before: tuple[float, float] | None = None
         self._device: torch.device | None = None
@@ -27,7 +27,7 @@ class TrainingRecord(Callback):
         """Note the stage, and what its clock leaves out."""
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
         self._previews = [other for other in callbacks if isinstance(other, Previews)]
-        assert isinstance(pl_module, ScheduledStage)
+        assert isinstance(pl_module, Stage)
         self._stage = pl_module
         self._device = trainer.strategy.root_device
 
@@ -51,7 +51,7 @@ class TrainingRecord(Callback):
         ``peak_gpu_gb`` is what tensors took, ``peak_reserved_gb`` what torch's allocator held, with
         its caches.
         """
-        assert isinstance(pl_module, ScheduledStage)
+        assert isinstance(pl_module, Stage)
         wait(pl_module.device)
         seconds = self.seconds
         done = pl_module.iterations_done

@@ -10,7 +10,7 @@ from lightning import LightningModule, Trainer
 
 from devrf.callbacks.schedule import GridUpscaling, LearningRateDecay
 from devrf.data.datamodule import SceneDataModule
-from devrf.engine.stage import ScheduledStage
+from devrf.engine.stage import Stage
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 
@@ -20,7 +20,7 @@ class Trial(GridUpscaling):
 
     Attributes:
         most_seconds: after which it ends; the first step, which warms up, does not count.
-        pace: the cost of iterations in a second (:meth:`~devrf.engine.learner.Learner.cost`).
+        pace: the cost of iterations in a second (:meth:`~devrf.engine.stage.Stage.cost`).
     """
 
     def __init__(self, most_seconds: float = 10.0) -> None:
@@ -32,7 +32,7 @@ class Trial(GridUpscaling):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Begin to count; stop when the time is over."""
-        assert isinstance(pl_module, ScheduledStage)
+        assert isinstance(pl_module, Stage)
         now = time.perf_counter()
         done = pl_module.iteration
         began, first = self._began = self._began or (now, done)
@@ -42,7 +42,7 @@ class Trial(GridUpscaling):
 
 
 def seconds_to_learn(
-    stage: ScheduledStage,
+    stage: Stage,
     moving: DeformationSchedule,
     datamodule: SceneDataModule,
     trainer: Callable[..., Trainer],

@@ -22,7 +22,6 @@ from devrf.apps.inspection.advice import Advice
 from devrf.apps.needs import StageNeeds, needs_of_devrf, needs_of_networks, smaller
 from devrf.cli.context import RunContext
 from devrf.cli.messages import as_own_errors
-from devrf.engine.micro_batching import MicroBatching
 from devrf.scenes.scene import Scene
 
 log = logging.getLogger(__name__)
@@ -62,19 +61,19 @@ def compare(run: RunContext, names: Sequence[str]) -> tuple[str, Advice | None, 
     processes = int(getattr(run.strategy, "num_processes", 1))
     free = free_bytes(run.device, run.folder, resume=run.config.resume)
 
-    def needed(key: str = "", value: int = 0, pieces: int = MicroBatching.MOST) -> Bytes:
+    def needed(key: str = "", value: int = 0, batch_share: float = 0.5) -> Bytes:
         config, less = run.config.copy(), smaller(scene, value / by) if key == SIZE else scene
         if key:
             OmegaConf.update(config, key, value)
         with as_own_errors():
             every = needs(run, config, less)
         stages = [every[name] for name in names]
-        return needed_bytes(less, stages, processes, pieces, on_gpu=run.device.type == "cuda")
+        return needed_bytes(less, stages, processes, batch_share, on_gpu=run.device.type == "cuda")
 
-    whole = needed(pieces=1)
+    whole = needed(batch_share=1.0)
     line, lacks = f"needs about {in_words(whole, free)}", lacking(needed(), free)
     if not lacks:
-        return line + "; batches will be split, slower" * bool(lacking(whole, free)), None, []
+        return line + "; batches will be halved" * bool(lacking(whole, free)), None, []
     every = needs(run, run.config, scene)
     parts = max((every[name] for name in names), key=StageNeeds.peak).parts
     present = {key: OmegaConf.select(run.config, key) for key in parts} | {SIZE: by}
@@ -89,5 +88,5 @@ def compare(run: RunContext, names: Sequence[str]) -> tuple[str, Advice | None, 
         run.config.data.downscale = value
         del run.datamodule  # the images are read again
         return compare(run, names)
-    then = in_words(needed(key, value, 1), {lacks[0]: free[lacks[0]]})
+    then = in_words(needed(key, value, 1.0), {lacks[0]: free[lacks[0]]})
     return line, Advice(key, problem, f"give {key}={value} ({then})"), [f"{key}={value}"]

@@ -18,7 +18,7 @@ from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, save_checkpoin
 from devrf.checkpoints.progress import progress_files
 from devrf.cli.context import RunContext
 from devrf.cli.resume import ResumePoint, beginning, remove_progress
-from devrf.engine.stage import ScheduledStage
+from devrf.engine.stage import Stage
 from devrf.errors import DevrfError
 from devrf.system.files import atomic_write
 from devrf.system.process import Interrupted
@@ -54,7 +54,7 @@ def learn(run: RunContext, name: str) -> None:
     _fit(run, stage, begin)
 
 
-def _fit(run: RunContext, stage: ScheduledStage, begin: ResumePoint) -> None:
+def _fit(run: RunContext, stage: Stage, begin: ResumePoint) -> None:
     if run.leads:
         _ = run.scene  # errors in it come before a logger writes files
     stage.training_config = begin.training_config
@@ -104,7 +104,7 @@ def _fit(run: RunContext, stage: ScheduledStage, begin: ResumePoint) -> None:
         )
 
 
-def _keep(run: RunContext, trainer: Trainer, stage: ScheduledStage) -> None:
+def _keep(run: RunContext, trainer: Trainer, stage: Stage) -> None:
     """Write the stage's checkpoint, and the config that it was learned with."""
     path = run.own_checkpoint(stage.name)
     # Goes into the checkpoint, so without the time of writing it.

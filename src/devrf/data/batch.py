@@ -101,12 +101,6 @@ class Pixels:
     def __len__(self) -> int:
         return self.image.shape[0]
 
-    def between(self, start: int, stop: int) -> Pixels:
-        """The pixels from ``start`` up to ``stop``, sharing memory."""
-        part = slice(start, stop)
-        behind = self.background if self.background.dim() == 1 else self.background[part]
-        return Pixels(self.image[part], self.flat[part], behind)
-
 
 @dataclass(frozen=True)
 class RayBatch:

@@ -19,7 +19,8 @@ from devrf.errors import DevrfError
 
 # A grid of so many values or more exchanges only the points that were reached, if these are at
 # most a share of all: finding and gathering them costs time, too.
-LARGE, MOST_REACHED = 2**18, 0.5
+LARGE = 2**18
+MOST_REACHED = 0.5
 
 
 class ManualDDP(DDPStrategy):

@@ -1,19 +1,19 @@
-"""A stage: a part of training that follows a schedule, run by Lightning.
-
-What is learned in each phase is defined by a subclass (:mod:`devrf.engine.learner`); how an
-iteration is carried out is in :mod:`devrf.engine.loop`.
-"""
+"""A stage: a part of training that follows a schedule, run by Lightning."""
 
 from __future__ import annotations
 
-import math
+import logging
 import time
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from functools import reduce
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
 import torch
+from lightning import LightningModule
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
 
@@ -28,74 +28,312 @@ from devrf.checkpoints.checkpoint import (
 )
 from devrf.checkpoints.progress import rng_state, set_rng_state
 from devrf.checkpoints.stored_class import class_path
-from devrf.data.batch import background_color
-from devrf.engine.ddp import assert_replicas_equal, broadcast, check_strategy
-from devrf.engine.learner import Learner
-from devrf.engine.loop import Loop
+from devrf.data.batch import Pixels, background_color
+from devrf.engine.ddp import (
+    assert_replicas_equal,
+    average,
+    average_gradients,
+    broadcast,
+    check_strategy,
+    rays_per_rank,
+    world_size,
+)
+from devrf.engine.phase import Phase
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import score
 from devrf.ops.adam import GridAdam
 from devrf.rendering.renderer import Renderer
-from devrf.system.memory import OutOfMemoryError
+from devrf.rendering.view import Viewable
+from devrf.scenes.scene import CaptureName, ImagesName, Scene, Views
+from devrf.system.memory import free_cache, is_oom, numbers
+from devrf.system.profiling import span
 
-# Attributes of a stage that a progress file holds by name: where it is in its schedule.
-POSITION = ("iteration", "skipped", "seed", "num_rollbacks", "lr_scale")
+log = logging.getLogger(__name__)
+
+# Attributes of a stage that a progress file holds by name: where it is in its schedule, and how it
+# goes on.
+POSITION = ("iteration", "iterations_done", "seed", "num_rollbacks", "lr_scale", "batch_share")
 
 
-class ScheduledStage(Learner):
-    """A stage whose schedule says what each iteration learns.
+class LearnedModel(Viewable, Protocol):
+    """What a stage learns: a :class:`~devrf.methods.base.Renderable`."""
 
-    One Lightning step runs several optimiser iterations, so that Lightning's overhead is
-    negligible. The callback ``GridUpscaling`` calls :meth:`enter` at the beginning of each phase;
-    ``LearningRateDecay`` sets the learning rates before each optimiser step.
+    def config(self) -> dict[str, Any]:
+        """Plain data to build it from."""
+        ...
+
+    def stored_state(self) -> dict[str, Any]:
+        """The state for a finished checkpoint."""
+        ...
+
+
+class Stage(LightningModule, ABC):
+    """Learns by a schedule of phases; a subclass says what is drawn and what the loss is.
+
+    One iteration draws pixels (:meth:`draw`), renders their rays and weighs the loss terms
+    (:meth:`loss`), goes back to the gradients (:meth:`find_gradients`), and steps
+    (:meth:`training_step`). One Lightning step runs several iterations, so that Lightning's
+    overhead is negligible. The callback ``GridUpscaling`` calls :meth:`enter` at the beginning of
+    each phase; ``LearningRateDecay`` sets the learning rates before each optimiser step.
 
     Attributes:
-        iteration: position in the schedule: optimiser iterations done or skipped.
-        skipped: iterations left out because a phase had converged, or for want of time; below 0
-            where a time budget has them done more than once.
-        stride: how far an optimiser iteration goes in the schedule; other than 1 under a
-            ``TimeBudget``.
+        name: what files, messages and protocols call the stage.
+        capture: the part of the scene that is learned from.
+        memory_keys: the config keys of what to lower when memory runs out.
+        rate_keys: the config keys of what to lower when training diverges.
+        cost_follows_rays: whether an iteration on fewer rays takes less time.
+        scene_model: what is learned.
+        optimizer: steps over everything that is learned; the same object throughout.
+        phase: the phase that grids and optimiser are ready for; None before the first.
+        iteration: position in the schedule. A phase that has converged is left for the next; a
+            time budget moves it further, or less far, than the iterations that are carried out.
+        previous_iteration: the position of the iteration before.
+        iterations_done: optimiser iterations that were carried out.
+        batch_share: the part of the schedule's batches that is drawn: less than 1 after memory
+            has run out, or for want of time.
+        generator: draws pixels, on the stage's device. Its state at the beginning of a Lightning
+            step follows from the seed, the process, the iterations done and the rollbacks.
+        seed: of the whole run.
+        num_rollbacks: how often training diverged and was rolled back.
+        lr_scale: factor of the scheduled learning rates; below 1 after a rollback.
+        has_scheduled_rates: whether a ``LearningRateDecay`` sets the learning rates.
+        abort_reason: why the stage ended before its schedule; None while it has not.
         time_share: the part of the whole method's seconds that is this stage's.
         began: when the stage was set up, by ``time.perf_counter``.
         record: what training took, once a ``TrainingRecord`` callback has measured it.
         earlier_records: the same for the stages that this one builds on, by name.
-        seed: of the generator, whose state at the beginning of a Lightning step follows from the
-            seed, the process, the iteration and the number of rollbacks.
         training_config: the settings that decide what is learned, by config key; empty for a
             stage that was not built from a config.
         earlier_configs: the same of the stages that this one builds on, by name.
         command: what the command chose and set that learns, as its checkpoints hold it.
         protocol: the name of the protocol that the stage is a part of, if any.
-        num_rollbacks: how often training diverged and was rolled back.
-        lr_scale: factor of the scheduled learning rates; below 1 after a rollback.
-        has_scheduled_rates: whether a ``LearningRateDecay`` sets the learning rates.
-        abort_reason: why the stage ended before its schedule; None while it has not.
-        loop: carries the iterations out.
     """
+
+    name: str
+    capture: CaptureName | Literal["both"]
+    memory_keys: tuple[str, ...] = ()
+    rate_keys: ClassVar[str] = "the learning rates"
+    cost_follows_rays: bool = True
+    scene_model: LearnedModel
+    optimizer: GridAdam
+    phase: Phase | None
 
     def __init__(self, iterations_per_step: int) -> None:
         super().__init__()
         self.automatic_optimization = False
-        self.loop = Loop()
         self.iterations_per_step = iterations_per_step
-        self.iteration = self.skipped = self.seed = self.num_rollbacks = 0
-        self.stride, self.time_share, self.began = 1.0, 1.0, 0.0
         self.phase = None
+        self.iteration = 0
+        self.previous_iteration = -1
+        self.iterations_done = 0
+        self.batch_share = 1.0
+        self.generator = torch.Generator()
+        self.seed = 0
+        self.num_rollbacks = 0
+        self.lr_scale = 1.0
+        self.has_scheduled_rates = False
+        self.abort_reason: str | None = None
+        self.time_share = 1.0
+        self.began = 0.0
         self.record: TrainingFigures = {}
         self.earlier_records: dict[str, TrainingFigures] = {}
-        self.generator = torch.Generator()
         self.training_config: dict[str, Any] = {}
         self.earlier_configs: dict[str, dict[str, Any]] = {}
         self.command: dict[str, Any] = {}
         self.protocol: str | None = None
-        self.lr_scale = 1.0
-        self.has_scheduled_rates = False
-        self.abort_reason: str | None = None
-        # How far the last iteration went, and what it went less than its stride.
-        self._advance, self._owed = 1, 0.0
         self._plain_background: Tensor | None = None
         self._progress: dict[str, Any] | None = None
         self._finished: dict[str, Any] | None = None
+
+    # An iteration.
+
+    def training_step(self, views: Any, batch_idx: int) -> dict[str, Tensor]:
+        """Run up to ``iterations_per_step`` iterations, all of the present phase.
+
+        Returns:
+            Means () of the loss and of its terms by name, over these iterations;
+            empty if memory ran out in the first.
+        """
+        stop = min(self._entered_phase().stop, self.total_iterations)
+        optimizer = self.optimizers()
+        assert isinstance(optimizer, LightningOptimizer)
+        count = self.iterations_per_step
+        if self.trainer.max_steps > 0:
+            count = min(count, self.trainer.max_steps - self.trainer.global_step)
+        losses: list[dict[str, Tensor]] = []
+        while len(losses) < count and self.iteration < stop:
+            present = self.iteration
+            self.prepare()
+            terms = self.find_gradients(views)
+            if terms is None:
+                break
+            losses.append(terms)
+            # Just before it steps, LearningRateDecay sets the learning rates, and a TimeBudget
+            # moves the iteration.
+            with span("optimiser"):
+                optimizer.step()
+            self.previous_iteration = present
+            self.iteration += 1
+            self.iterations_done += 1
+        means = mean_terms(losses)
+        if losses and self.iteration < stop and self.converged(means["loss"]):
+            self.iteration = stop
+        self._reseed()
+        if self.iteration >= self.total_iterations:
+            self.trainer.should_stop = True
+        return means
+
+    def find_gradients(self, views: Any) -> dict[str, Tensor] | None:
+        """Draw pixels of ``views``, render them, weigh the loss terms, and go back to gradients.
+
+        Returns:
+            The loss () and its terms () by name, detached; None where memory has run out even for
+            half a batch, and the stage is to end. No parameter has changed.
+        """
+        try:
+            self.optimizer.make_gradients()  # Lightning drops them where a run is resumed
+            pixels = self.draw()
+            loss, terms = self.loss(views, pixels)
+            if loss.requires_grad:  # it has no gradient where no ray meets anything
+                with span("backward"):
+                    self.manual_backward(loss)
+            average_gradients(p for group in self.optimizer.param_groups for p in group["params"])
+            return {"loss": loss.detach(), **terms}
+        except (RuntimeError, MemoryError) as error:
+            if not is_oom(error):
+                raise
+            shortage = f"out of memory ({numbers(str(error), self.device)})"
+        # Outside the handler, where the error's traceback no longer holds the batch.
+        self.optimizer.zero_grad()
+        free_cache(self.device)
+        return self.find_gradients(views) if self._halve_batches(shortage) else None
+
+    def _halve_batches(self, shortage: str) -> bool:
+        """Draw half of the rays from now on; end the stage if that was done before.
+
+        Raises:
+            DevrfError: there are several processes: the others already wait for this one.
+        """
+        if world_size() > 1:
+            raise DevrfError(
+                f"schedule: one of {world_size()} processes is {shortage}; fewer rays, smaller "
+                "grids or more processes"
+            )
+        if self.batch_share < 1:
+            lower = " or ".join(self.memory_keys)
+            self.abort(
+                f"{shortage} at {self.describe(self.iteration)}; the same command goes on where "
+                "there is more memory; with less, begin afresh (resume=false) with "
+                f"{f'lower {lower}, or ' if lower else ''}higher data.downscale"
+            )
+            return False
+        self.batch_share = 0.5
+        log.warning("%s: batches have half of their rays from now on", shortage)
+        return True
+
+    def _entered_phase(self) -> Phase:
+        """The present phase, for whose iterations grids and learning rates are ready.
+
+        Raises:
+            DevrfError: the callback that makes them so is missing.
+        """
+        if self.phase is None or self.phase != self.phase_at(self.iteration):
+            raise DevrfError(
+                f"{type(self).__name__}: the phase of iteration {self.iteration} was not "
+                "entered: add devrf.callbacks.GridUpscaling to the trainer's callbacks"
+            )
+        if not self.has_scheduled_rates:
+            raise DevrfError(
+                f"{type(self).__name__}: the learning rates of its schedule are not set: add "
+                "devrf.callbacks.LearningRateDecay to the trainer's callbacks"
+            )
+        return self.phase
+
+    def _reseed(self) -> None:
+        """Seed the generator for the next step, differently in each process."""
+        place = [self.seed, self.global_rank, self.iterations_done, self.num_rollbacks]
+        mixed = np.random.SeedSequence(place)
+        self.generator.manual_seed(int(mixed.generate_state(1, np.uint64)[0]))
+
+    # What a subclass says.
+
+    @property
+    @abstractmethod
+    def total_iterations(self) -> int:
+        """Iterations of the whole schedule."""
+
+    @property
+    @abstractmethod
+    def resolution(self) -> tuple[int, ...]:
+        """Present shape of the grid that is learned; empty where there is none."""
+
+    @abstractmethod
+    def phase_at(self, iteration: int) -> Phase:
+        """The phase that contains ``iteration``."""
+
+    @abstractmethod
+    def learning_rate_factor(self, iteration: int) -> float:
+        """Factor of the base learning rates at ``iteration``."""
+
+    @abstractmethod
+    def enter(self, phase: Any) -> None:
+        """Make grids and optimiser ready for ``phase``."""
+
+    def prepare(self) -> None:
+        """Called before each iteration; may wait for the device."""
+
+    @abstractmethod
+    def draw(self) -> Pixels:
+        """The pixels of the next iteration, drawn with ``generator``."""
+
+    @abstractmethod
+    def loss(self, views: Any, pixels: Pixels) -> tuple[Tensor, dict[str, Tensor]]:
+        """The weighted loss () of pixels of ``views``, and its terms () by name."""
+
+    def converged(self, loss: Tensor) -> bool:
+        """Whether the rest of the present phase can be skipped.
+
+        Args:
+            loss: () mean over the last Lightning step.
+        """
+        return False
+
+    def phase_state(self) -> dict[str, Any]:
+        """State of the present phase that does not follow from schedule and model: plain data."""
+        return {}
+
+    @abstractmethod
+    def restore(self, phase: Any, state: dict[str, Any]) -> None:
+        """Continue ``phase`` with what :meth:`phase_state` gave; the model's tensors are loaded."""
+
+    def resize_to(self, state: dict[str, Tensor]) -> None:
+        """Give modules the shapes of a stored ``state`` that is about to be loaded."""
+
+    def current_model(self) -> LearnedModel:
+        """The model, with everything learned so far written back to it."""
+        return self.scene_model
+
+    @classmethod
+    def check_settings(cls, **settings: Any) -> None:
+        """Find errors in the arguments of the stage before what it builds on has been learned.
+
+        Raises:
+            DevrfError: one is wrong.
+        """
+
+    # What a subclass asks.
+
+    def rays_to_draw(self, rays: int, most: int | None = None) -> int:
+        """How many rays of a batch this process draws.
+
+        Args:
+            rays: of the schedule's batches, over all processes.
+            most: of this process's batches, where these are smaller.
+        """
+        whole = rays_per_rank(rays)
+        if most is not None:
+            whole = min(whole, most)
+        return max(1, round(whole * self.batch_share))
 
     def background(self, image: Tensor) -> Tensor:
         """What is behind the pixels of ``image`` (R,): (3,), always the same tensor, if plain.
@@ -111,28 +349,56 @@ class ScheduledStage(Learner):
             self._plain_background = plain
         return plain
 
-    @property
-    def iterations_done(self) -> int:
-        """Optimiser iterations that were carried out."""
-        return self.iteration - self.skipped
+    def is_due(self, every: int, start: int) -> bool:
+        """Whether a multiple of ``every`` iterations after ``start`` has just been reached.
 
-    @property
-    def position(self) -> float:
-        """Where a time budget has the stage in its schedule; ``iteration`` follows by phases."""
-        return self.iteration + self._owed
-
-    @property
-    def turn(self) -> int:
-        """Counts iterations for what takes turns in them; under a time budget those done."""
-        return self.iteration if self.stride == 1 else self.iterations_done
-
-    def passes(self, every: int, start: int) -> bool:
-        """Whether this iteration is the first at or beyond a multiple of ``every`` after ``start``.
-
-        A multiple that a time budget leaves out counts, and one at which it stays counts once.
+        One that a time budget leaves out counts, and one at which it stays counts once.
         """
-        since = self.iteration - start
-        return since // every > max(since - self._advance, 0) // every
+        before = max(self.previous_iteration - start, 0)
+        return (self.iteration - start) // every > before // every
+
+    @property
+    def scene(self) -> Scene:
+        """The scene of the trainer's datamodule."""
+        scene: Scene = self.trainer.datamodule.scene  # type: ignore[attr-defined]
+        return scene
+
+    def training_views(self, images: ImagesName) -> Views:
+        """The training views called so, on the stage's device."""
+        views: Views = self.trainer.datamodule.training_views(  # type: ignore[attr-defined]
+            images, self.device
+        )
+        return views
+
+    @property
+    def images(self) -> tuple[ImagesName, ...]:
+        """What is learned from: the training views of these names."""
+        return ("static", "dynamic") if self.capture == "both" else (self.capture,)
+
+    @property
+    def scored_capture(self) -> CaptureName:
+        """The capture whose held-out views measure what was learned."""
+        return "dynamic" if self.capture == "both" else self.capture
+
+    # What callbacks and commands ask.
+
+    def cost(self, first: int, last: int) -> float:
+        """How long iterations ``first`` to ``last`` take, in the unit of the phases' costs."""
+        cost = 0.0
+        while first < last:
+            phase = self.phase_at(first)
+            stop = min(phase.stop, last)
+            cost += (stop - first) * phase.cost
+            first = stop
+        return cost
+
+    def describe(self, iteration: int) -> str:
+        """An iteration of the present phase, with its frame and resolution, for messages."""
+        number = None if self.phase is None else self.phase.frame
+        frame = "" if number is None else f"frame {number}"
+        shape = "x".join(str(n) for n in self.resolution)
+        place = ", ".join(part for part in (frame, shape) if part)
+        return f"iteration {iteration} of {self.total_iterations}{place and f' ({place})'}"
 
     def metadata(self) -> CheckpointMetadata:
         """The metadata of a checkpoint of this stage."""
@@ -160,24 +426,26 @@ class ScheduledStage(Learner):
         self.abort_reason = f"{self.name} stage: {why}"
         self.trainer.should_stop = True
 
-    def rollback(self, iteration: int, skipped: int, lr_scale: float) -> None:
+    def rollback(self, iteration: int, iterations_done: int, lr_scale: float) -> None:
         """Continue from an earlier iteration of the present phase, whose tensors are back in place.
 
         Adam's state starts afresh, and other pixels are drawn than the first time.
 
         Args:
             iteration: where to continue.
-            skipped: iterations that had been left out there.
+            iterations_done: iterations that had been carried out there.
             lr_scale: further factor of all learning rates from now on.
         """
-        self.iteration, self.skipped, self._owed = iteration, skipped, 0.0
+        self.iteration = iteration
+        self.previous_iteration = iteration - 1
+        self.iterations_done = iterations_done
         self.num_rollbacks += 1
         self.lr_scale *= lr_scale
         self.optimizer.forget()
         self._reseed()
         self.trainer.should_stop = False
 
-    # Lightning's hooks, in the order in which they are called.
+    # Lightning's other hooks, in the order in which they are called.
 
     def setup(self, stage: str) -> None:
         """Check the trainer and make the generator.
@@ -204,7 +472,7 @@ class ScheduledStage(Learner):
         optimiser is configured, ``random`` when training starts.
 
         Raises:
-            DevrfError: the checkpoint is of another scene, stage or schedule.
+            DevrfError: the checkpoint is of another scene, stage, schedule or version.
         """
         path = Path(str(self.trainer.ckpt_path))
         check_scene(path, metadata_in(path, checkpoint), self.scene)
@@ -218,15 +486,20 @@ class ScheduledStage(Learner):
                 f"{progress['total']} iterations, this is the {self.name} stage on one of "
                 f"{self.total_iterations}; give it its own schedule"
             )
+        if not progress.keys() >= {*POSITION}:
+            raise DevrfError(
+                f"{path}: left by an earlier version, which this one cannot go on from; begin "
+                "afresh with resume=false"
+            )
         for name in POSITION:
             setattr(self, name, progress[name])
+        self.previous_iteration = self.iteration - 1
         # A schedule is one epoch of a loader that never ends: what ended it there (max_time,
         # limit_train_batches, fast_dev_run) has not ended it here.
         fit = checkpoint["loops"]["fit_loop"]
         for epochs in ("total", "current"):
             fit["epoch_progress"][epochs].update(processed=0, completed=0)
         fit["epoch_loop.batch_progress"]["is_last_batch"] = False
-        self.loop.micro_batching.count = progress["micro_batches"]
         self.phase = None if progress["phase"] is None else self.phase_at(progress["phase"])
 
     def configure_optimizers(self) -> GridAdam:
@@ -246,73 +519,6 @@ class ScheduledStage(Learner):
             set_rng_state(self._progress["random"], self.device)
             self._progress = None
         self._reseed()
-
-    def training_step(self, views: Any, batch_idx: int) -> dict[str, Tensor]:
-        """Run up to ``iterations_per_step`` iterations, all of the present phase.
-
-        Returns:
-            Means () of the loss and of its terms by name, over these iterations;
-            empty if memory ran out in the first.
-        """
-        if self.phase != self.phase_at(self.iteration):
-            raise DevrfError(
-                f"{type(self).__name__}: the phase of iteration {self.iteration} was not "
-                "entered: add devrf.callbacks.GridUpscaling to the trainer's callbacks"
-            )
-        if not self.has_scheduled_rates:
-            raise DevrfError(
-                f"{type(self).__name__}: the learning rates of its schedule are not set: add "
-                "devrf.callbacks.LearningRateDecay to the trainer's callbacks"
-            )
-        assert self.phase is not None
-        before, stop = self.iterations_done, min(self.phase.stop, self.total_iterations)
-        self._iterate(views, stop)
-        means: dict[str, Tensor] = {}
-        if done := self.iterations_done - before:
-            means = self.loop.metrics.take(done, self.loop.processes)
-            if self.iteration < stop and self.converged(means["loss"]):
-                self.skipped += stop - self.iteration
-                self.iteration = stop
-        self._reseed()
-        if self.iteration >= self.total_iterations:
-            self.trainer.should_stop = True
-        return means
-
-    def _iterate(self, views: Any, stop: int) -> None:
-        """Run a step's iterations, up to ``stop``; abort if memory runs out."""
-        optimizer = self.optimizers()
-        assert isinstance(optimizer, LightningOptimizer)
-        count = self.iterations_per_step
-        if self.trainer.max_steps > 0:
-            count = min(count, self.trainer.max_steps - self.trainer.global_step)
-        for _ in range(count):
-            if self.iteration >= stop:
-                return
-            self.prepare()
-            try:
-                self.loop.step(self, views, optimizer)
-            except OutOfMemoryError as shortage:
-                lower = " or ".join(self.memory_keys)
-                self.abort(
-                    f"{shortage} at {self.describe(self.iteration)}; the same command goes on "
-                    "where there is more memory; with less, begin afresh (resume=false) with "
-                    f"{f'lower {lower}, or ' if lower else ''}higher data.downscale"
-                )
-                return
-            self._go_on(stop)
-
-    def _go_on(self, stop: int) -> None:
-        """Advance by the stride, to ``stop`` at most; the next phase is owed what is missing."""
-        position = self.position + self.stride
-        self._advance = min(math.floor(position), stop) - self.iteration
-        self.iteration += self._advance
-        self.skipped += self._advance - 1
-        self._owed = min(position - self.iteration, max(self.stride, 1.0))
-
-    def _reseed(self) -> None:
-        """Seed the generator for the next step, differently in each process."""
-        mixed = np.random.SeedSequence([self.seed, self.global_rank, self.turn, self.num_rollbacks])
-        self.generator.manual_seed(int(mixed.generate_state(1, np.uint64)[0]))
 
     def on_train_end(self) -> None:
         """Pack what was learned while it is on its GPU: Lightning moves the stage to the host."""
@@ -338,7 +544,6 @@ class ScheduledStage(Learner):
                 "phase": None if self.phase is None else self.phase.start,
                 "phase_state": {} if self.phase is None else self.phase_state(),
                 "random": rng_state(self.device),
-                "micro_batches": self.loop.micro_batching.count,
             }
         elif self.iteration >= self.total_iterations:
             compact = self._finished or self.current_model().stored_state()
@@ -369,3 +574,11 @@ class ScheduledStage(Learner):
         means = {f"test/{self.scored_capture}/{k}": v for k, v in scores.items()}
         self.log_dict(means, batch_size=1, sync_dist=True)
         return {"view": view}
+
+
+def mean_terms(iterations: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
+    """The means () of terms () by name, over iterations that have the same, and all processes."""
+    if not iterations:
+        return {}
+    total = reduce(torch.add, (torch.stack(list(terms.values())) for terms in iterations))
+    return dict(zip(iterations[0], (average(total) / len(iterations)).unbind(), strict=True))

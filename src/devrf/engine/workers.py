@@ -4,9 +4,11 @@ Rank 0 is the process that the user started. It alone composes the config, write
 the others take part in the stages that learn. Where a launcher such as torchrun has started all of
 them, none is started here.
 
-Lightning's own launchers do not fit: one runs the command line again in each process, which would
-compose every job of a sweep anew; the other moves rank 0 to a process of its own, away from the
-run's files, lock and signals.
+Other launchers do not fit. Lightning's script launcher and torchrun run the command line again in
+each process: each composes the config, a mistake is reported once a process, with torchrun's
+traceback behind it, and Ctrl-C ends torchrun with status 1. Lightning's other launcher, and
+torchrun's for functions, move rank 0 to a process of its own, away from the run's loggers, viewer,
+files, lock and signals.
 """
 
 from __future__ import annotations
@@ -77,7 +79,8 @@ def launch_workers(strategy: ManualDDP, work: Work, arguments: Sequence[Any]) ->
 @contextmanager
 def _restored() -> Iterator[None]:
     """Restore afterwards what launching and Lightning change in this process."""
-    environment, threads = dict(os.environ), torch.get_num_threads()
+    environment = dict(os.environ)
+    threads = torch.get_num_threads()
     try:
         yield
     finally:

@@ -13,8 +13,8 @@ from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import Pixels, RayBatch, concatenated
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.batches import FramePool, gather_batch
-from devrf.engine.learner import Phase
-from devrf.engine.stage import ScheduledStage
+from devrf.engine.phase import Phase
+from devrf.engine.stage import Stage
 from devrf.errors import expect
 from devrf.methods.base import RayTrainable
 from devrf.methods.protocol import ProtocolStage
@@ -66,11 +66,12 @@ class RaySchedule:
             number = getattr(self, name)
             expect(number is None or number >= 1, f"{key}.{name}", "at least 1, or null", number)
         expect(self.centre_crop >= 0, f"{key}.centre_crop", "at least 0", self.centre_crop)
-        holds, expected = 0 <= self.curriculum < 1, "0 or more, below 1"
+        holds = 0 <= self.curriculum < 1
+        expected = "0 or more, below 1"
         expect(holds, f"{key}.curriculum", expected, self.curriculum)
 
 
-class RayStage(ScheduledStage):
+class RayStage(Stage):
     """Learns a :class:`~devrf.methods.base.RayTrainable` from random rays of all its images.
 
     A batch's rays have times of their own. Of a stage that learns from both captures a fixed share
@@ -101,8 +102,11 @@ class RayStage(ScheduledStage):
             rest: what an earlier stage learned, to go on with.
         """
         super().__init__(schedule.iterations_per_step)
-        self.name, self.capture, self.step_of_protocol = step.name, step.capture, step
-        self.schedule, self.static_share = schedule, static_share
+        self.name = step.name
+        self.capture = step.capture
+        self.step_of_protocol = step
+        self.schedule = schedule
+        self.static_share = static_share
         self.scene_model = model
         self._ready = rest is not None
         if rest is not None:
@@ -129,8 +133,8 @@ class RayStage(ScheduledStage):
 
     def learning_rate_factor(self, iteration: int) -> float:
         """(final / initial)^(n / (N − 1)) at iteration n of N."""
-        schedule, last = self.schedule, max(self.total_iterations - 1, 1)
-        ratio = schedule.final_learning_rate / schedule.learning_rate
+        last = max(self.total_iterations - 1, 1)
+        ratio = self.schedule.final_learning_rate / self.schedule.learning_rate
         return float(ratio ** (min(iteration, last) / last))
 
     def setup(self, stage: str) -> None:
@@ -148,25 +152,21 @@ class RayStage(ScheduledStage):
         self.scene_model.follow(self.step_of_protocol)
         if hasattr(self, "optimizer"):
             return
-        schedule, groups = self.schedule, self.scene_model.param_groups()
+        groups = self.scene_model.param_groups()
         for group in groups:
-            rate = schedule.learning_rate * group.pop("rate", 1.0)
+            rate = self.schedule.learning_rate * group.pop("rate", 1.0)
             group.update(lr=rate, base_lr=rate)
-        first, second = schedule.betas
-        self.optimizer = GridAdam(groups, betas=(first, second), eps=schedule.eps)
+        first, second = self.schedule.betas
+        self.optimizer = GridAdam(groups, betas=(first, second), eps=self.schedule.eps)
 
     def enter(self, phase: Phase) -> None:
         """Gather the pixels to draw from."""
         self.phase = phase
-        static = [self.training_views("static")] if self.capture != "dynamic" else []
-        views = static + ([self.training_views("dynamic")] if self.capture != "static" else [])
+        views = [self.training_views(images) for images in self.images]
         self.pools = [FramePool.of(view_set) for view_set in views]
         if self.schedule.centre_crop:
             self._centres = [FramePool.of(view_set, centre=True) for view_set in views]
         self.scene_model.learn_from(views, self.weights)
-        fewer = self.schedule.rays_without_hull
-        rays = self.schedule.rays if fewer is None or self.scene_model.has_hull else fewer
-        self.loop.bind(rays)
 
     def prepare(self) -> None:
         """Let the model follow the schedule."""
@@ -177,27 +177,33 @@ class RayStage(ScheduledStage):
 
         Images are numbered through, the static ones first. Last are those the model asks for.
         """
+        schedule = self.schedule
+        rays = schedule.rays
+        if schedule.rays_without_hull is not None and not self.scene_model.has_hull:
+            rays = schedule.rays_without_hull
+        rays = self.rays_to_draw(rays)
+        pools = self._centres if self.iteration < schedule.centre_crop else self.pools
+        static = round(rays * self.static_share)
+        counts = [static, rays - static] if len(pools) > 1 else [rays]
         with span("batch"):
-            rays = self.loop.rays
-            static = round(rays * self.static_share)
-            pools = self._centres if self.iteration < self.schedule.centre_crop else self.pools
-            counts = [static, rays - static] if len(pools) > 1 else [rays]
-            images, flats, offset = [], [], 0
-            left = self.schedule.times_per_batch
+            images: list[Tensor] = []
+            flats: list[Tensor] = []
+            offset = 0
+            times_left = schedule.times_per_batch
             for pool, count in zip(pools, counts, strict=True):
-                shown = self._shown_frames(pool)
-                image, flat = pool.draw(count, shown, self.generator, moments=left)
+                frames = self._shown_frames(pool)
+                image, flat = pool.draw(count, frames, self.generator, times=times_left)
                 images.append(image + offset)
                 flats.append(flat)
                 offset += pool.images
-                left = None if left is None else max(1, left - pool.frames)
+                times_left = None if times_left is None else max(1, times_left - pool.frames)
             further = self.scene_model.further_pixels(self.generator)
             if further is not None:
-                images.append(further[0])
-                flats.append(further[1])
+                image, flat = further
+                images.append(image)
+                flats.append(flat)
             image = torch.cat(images)
-            background = self.background(image)
-            return Pixels(image, torch.cat(flats), background)
+            return Pixels(image, flat=torch.cat(flats), background=self.background(image))
 
     def _shown_frames(self, pool: FramePool) -> int:
         """How many frames the curriculum shows by now."""
@@ -211,29 +217,32 @@ class RayStage(ScheduledStage):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Render a batch and weigh the method's loss terms."""
         with span("batch"):
-            rays = self._gather(views, pixels)
-        output = self.scene_model(rays)
+            batch = self._gather(views, pixels)
+        output = self.scene_model(batch)
         with span("losses"):
-            values = self.scene_model.loss_terms(output, rays, self.weights)
+            values = self.scene_model.loss_terms(output, batch, self.weights)
             total, terms = weighted_sum(values, self.weights)
-            return total, terms | visibility(output.transmittance, rays.alpha)
+            return total, terms | visibility(output.transmittance, batch.alpha)
 
     def _gather(self, views: Views | tuple[Views, ...], pixels: Pixels) -> RayBatch:
         """The batch of pixels, in the order of their images' captures."""
-        space, parts, offset = self.scene_model.space, [], 0
+        background = pixels.background
+        batches: list[RayBatch] = []
+        offset = 0
         for view_set in views if isinstance(views, tuple) else (views,):
             in_capture = (pixels.image >= offset) & (pixels.image < offset + len(view_set))
-            place, background = in_capture.nonzero()[:, 0], pixels.background
-            part = gather_batch(
+            index = in_capture.nonzero()[:, 0]
+            image = pixels.image[index]
+            batch = gather_batch(
                 view_set,
-                pixels.image[place] - offset,
-                pixels.flat[place],
-                background if background.dim() == 1 else background[place],
-                space,
+                image=image - offset,
+                flat=pixels.flat[index],
+                background=background if background.dim() == 1 else background[index],
+                space=self.scene_model.space,
             )
-            parts.append(replace(part, image=pixels.image[place]))
+            batches.append(replace(batch, image=image))
             offset += len(view_set)
-        return parts[0] if len(parts) == 1 else concatenated(parts)
+        return batches[0] if len(batches) == 1 else concatenated(batches)
 
     def restore(self, phase: Phase, state: dict[str, Any]) -> None:
         """Go on with ``phase``: the images tell which pixels there are."""

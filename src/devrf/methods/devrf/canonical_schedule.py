@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
-from devrf.engine.learner import Phase
+from devrf.engine.phase import Phase
 from devrf.errors import DevrfError, expect
 from devrf.geometry.space import Space
 
@@ -89,13 +89,15 @@ class CanonicalSchedule:
     phases: tuple[CanonicalPhase, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        key, limit = "schedule.canonical", self.voxels_per_pixel
+        key = "schedule.canonical"
+        limit = self.voxels_per_pixel
         for name, least in LEAST.items():
             value = getattr(self, name)
             expect(value is None or value >= least, f"{key}.{name}", f"at least {least}", value)
         fits = limit is None or 0 < limit <= 4
         expect(fits, f"{key}.voxels_per_pixel", "above 0, at most 4, or null", limit)
-        doublings, edges = len(self.upsample_at), [0, *self.upsample_at, self.iterations]
+        doublings = len(self.upsample_at)
+        edges = [0, *self.upsample_at, self.iterations]
         if self.side**3 < 8 * 2**doublings:
             raise DevrfError(
                 f"{key}.upsample_at: {doublings} of them are too many for side {self.side}; start "
@@ -104,12 +106,14 @@ class CanonicalSchedule:
         ascend = all(a < b for a, b in pairwise(edges))
         between = f"ascending numbers between 0 and iterations ({self.iterations})"
         expect(ascend, f"{key}.upsample_at", between, list(self.upsample_at))
-        offset, phases = self.search_iterations, []
+        offset = self.search_iterations
+        phases = []
         if offset:
             voxels = self.search_side**3
             phases.append(CanonicalPhase(kind="search", start=0, stop=offset, voxels=voxels))
         for k, (start, stop) in enumerate(pairwise(edges)):
-            first, last = offset + start, offset + stop
+            first = offset + start
+            last = offset + stop
             voxels = round(self.side**3) // 2 ** (doublings - k)
             phases.append(CanonicalPhase(kind="fine", start=first, stop=last, voxels=voxels))
         object.__setattr__(self, "phases", tuple(phases))
@@ -135,7 +139,8 @@ class CanonicalSchedule:
         """The schedule with what contracted space changes (docs/method.md#scene-contraction)."""
         if space.is_linear:
             return self
-        side, upsample_at = self.side * space.side_factor, self.upsample_at
+        side = self.side * space.side_factor
+        upsample_at = self.upsample_at
         if self.unbounded_initial_side is not None:
             count = max(0, round(3 * math.log2(side / self.unbounded_initial_side)))
             upsample_at = [3 * self.iterations * k // (4 * count) for k in range(1, count + 1)]

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from devrf.data.batch import PixelPool, Pixels
-from devrf.engine.batches import static_pool
+from devrf.engine.batches import gather_batch
+from devrf.engine.stage import Stage
 from devrf.errors import DevrfError
 from devrf.methods.devrf.architecture import Architecture, fitted_to, resolved_voxels
 from devrf.methods.devrf.canonical_field import CanonicalField
@@ -25,9 +27,18 @@ from devrf.methods.devrf.losses import (
     total_variation_weight,
 )
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.settings import FINE_LOSS, SEARCH_LOSS, CanonicalRates, Precision, Sampling
-from devrf.methods.devrf.voxel_stage import VoxelStage, field_optimizer
+from devrf.methods.devrf.pixel_pools import rays_for_epochs, static_pool
+from devrf.methods.devrf.settings import (
+    FINE_LOSS,
+    SEARCH_LOSS,
+    CanonicalRates,
+    Precision,
+    Sampling,
+    decoder_dtype,
+)
+from devrf.methods.devrf.volume_rendering import render
 from devrf.methods.weighted_loss import counted_weights
+from devrf.ops.adam import GridAdam
 from devrf.ops.photometric import distortion
 from devrf.rendering.occupancy import Occupancy, bounding_box, dilate
 from devrf.rendering.sampling import RenderSettings
@@ -37,10 +48,19 @@ from devrf.system.profiling import span
 log = logging.getLogger(__name__)
 
 
-class CanonicalStage(VoxelStage):
-    """Learns the canonical field from the static views (docs/method.md#canonical-stage)."""
+class CanonicalStage(Stage):
+    """Learns the canonical field from the static views (docs/method.md#canonical-stage).
 
-    schedule: CanonicalSchedule
+    Attributes:
+        scene_model: the canonical field and its occupancy.
+        schedule: resolutions and iterations.
+        weights: of the loss terms, by the kind of the phase.
+        tv: ω of the total variation, by the kind of the phase.
+        pool: the pixels that batches are drawn from.
+    """
+
+    scene_model: DeVRFModel
+    phase: CanonicalPhase | None
     name = "canonical"
     capture: CaptureName = "static"
     memory_keys = ("schedule.canonical.side", "schedule.canonical.rays")
@@ -66,18 +86,20 @@ class CanonicalStage(VoxelStage):
             sampling: how rays are sampled.
             search_loss: weights of the geometry search's terms; ``tv`` is that of both grids.
             fine_loss: of the radiance field's.
-            iterations_per_step: as of every :class:`VoxelStage`.
-            decoder_precision: likewise.
+            iterations_per_step: optimiser iterations in one Lightning step.
+            decoder_precision: of the colour network while it learns; ``auto``: as the GPU allows.
         """
-        super().__init__(iterations_per_step, decoder_precision)
+        super().__init__(iterations_per_step)
         self.schedule = schedule or CanonicalSchedule()
         self.architecture = architecture or Architecture()
         self.rates = rates or CanonicalRates()
         self.sampling = sampling or Sampling()
-        self.weights, self.tv = {}, {}
-        for kind, given in (("search", search_loss), ("fine", fine_loss)):
+        self.decoder_precision = decoder_precision
+        self.weights: dict[str, dict[str, float]] = {}
+        self.tv: dict[str, float] = {}
+        for kind, loss in (("search", search_loss), ("fine", fine_loss)):
             key = f"loss.{kind}"
-            weights, self.tv[kind] = apart_from_total_variation(given, key)
+            weights, self.tv[kind] = apart_from_total_variation(loss, key)
             self.weights[kind] = counted_weights(weights, PHOTOMETRIC_TERMS, key)
         self.pool: PixelPool | None = None
 
@@ -90,6 +112,11 @@ class CanonicalStage(VoxelStage):
     def images(self) -> tuple[ImagesName, ...]:
         """The static views, with the dynamic ones' first frames if the schedule says so."""
         return ("at_rest" if self.schedule.first_frames else "static",)
+
+    @property
+    def views(self) -> Views:
+        """The images that are learned from, on the stage's device."""
+        return self.training_views(self.images[0])
 
     @property
     def resolution(self) -> tuple[int, ...]:
@@ -109,11 +136,13 @@ class CanonicalStage(VoxelStage):
         super().setup(stage)
         if hasattr(self, "scene_model"):
             return
-        asked = self.schedule
-        self.schedule, self.architecture = fitted_to(self.scene, asked, self.architecture)
-        if self.schedule.side != asked.side:
-            log.info("schedule.canonical.side: %g is %.4g here", asked.side, self.schedule.side)
-        schedule, box = self.schedule, self.scene.bounds.box
+        side = self.schedule.side
+        schedule, architecture = fitted_to(self.scene, self.schedule, self.architecture)
+        self.schedule = schedule
+        self.architecture = architecture
+        if schedule.side != side:
+            log.info("schedule.canonical.side: %g is %.4g here", side, schedule.side)
+        box = self.scene.bounds.box
         views = self.scene.training_views(self.images[0])
         if schedule.first_frames and self.scene.moves and views is self.scene.static.train:
             log.info(
@@ -141,18 +170,33 @@ class CanonicalStage(VoxelStage):
             self.render_settings(first),
             space=self.scene.space,
         )
-        self.optimizer = field_optimizer(canonical, self.rates)
+        # Density, features and decoder, in this order of groups.
+        self.optimizer = GridAdam(
+            {
+                "name": name,
+                "params": list(canonical.get_submodule(name).parameters()),
+                "lr": rate,
+                "base_lr": rate,
+            }
+            for name, rate in asdict(self.rates).items()
+        )
 
     def render_settings(self, phase: CanonicalPhase) -> RenderSettings:
         """How rays are sampled in a phase."""
-        bounds, sampling = self.scene.bounds, self.sampling
+        sampling = self.sampling
         searching = phase.kind == "search"
         threshold = sampling.search_alpha_threshold if searching else sampling.alpha_threshold
-        return RenderSettings(sampling.step, threshold, bounds.near, bounds.far)
+        return RenderSettings(
+            step=sampling.step,
+            alpha_threshold=threshold,
+            near=self.scene.bounds.near,
+            far=self.scene.bounds.far,
+        )
 
     def enter(self, phase: CanonicalPhase) -> None:
         """Make grids, occupancy, rays and optimiser ready for ``phase``."""
-        previous, self.phase = self.phase, phase
+        previous = self.phase
+        self.phase = phase
         if previous is not None and previous.kind != phase.kind:
             self._begin_fine(phase)
         elif previous is not None:
@@ -168,9 +212,8 @@ class CanonicalStage(VoxelStage):
     def _choose_pixels(self) -> None:
         """Those whose rays meet occupied space; in the search, all."""
         assert self.phase is not None
-        model, searching = self.scene_model, self.phase.kind == "search"
-        occupancy = None if searching else model.occupancy
-        self.pool = static_pool(self.views, model, occupancy)
+        occupancy = None if self.phase.kind == "search" else self.scene_model.occupancy
+        self.pool = static_pool(self.views, self.scene_model, occupancy)
         if not len(self.pool):
             raise DevrfError(
                 f"the field has become empty by iteration {self.iteration}: check data.background, "
@@ -185,14 +228,15 @@ class CanonicalStage(VoxelStage):
             assert self.pool is not None
             crop_to_visible(self.scene_model, self.scene, self.views, self.pool)
         # Cropping leaves a share of the voxels that the field was built for.
-        kept = field.base_voxels / round(self.schedule.side**3)
-        field.resize(round(phase.voxels * kept))
+        share = field.base_voxels / round(self.schedule.side**3)
+        field.resize(round(phase.voxels * share))
         self.update_occupancy()
         field.density.values.data.sub_(self.schedule.density_drop)
 
     def _begin_fine(self, phase: CanonicalPhase) -> None:
         """Keep what the search found as the occupancy, and start the radiance field."""
-        search, occupancy = self.scene_model.canonical, self.scene_model.occupancy
+        search = self.scene_model.canonical
+        occupancy = self.scene_model.occupancy
         opaque = search.voxel_alpha(self.sampling.step) > self.sampling.occupancy_threshold
         occupancy.replace(dilate(opaque & occupancy.mask, 1))
         self.scene_model.canonical = self._radiance_field(occupancy, phase).to(self.device)
@@ -228,7 +272,8 @@ class CanonicalStage(VoxelStage):
     @torch.no_grad()
     def update_occupancy(self) -> None:
         """Find the occupancy at rest on the field's own grid, within the one before."""
-        sampling, field = self.sampling, self.scene_model.canonical
+        sampling = self.sampling
+        field = self.scene_model.canonical
         threshold = sampling.occupancy_threshold
         if not self.scene_model.space.is_linear:
             # Fog in unbounded space clears until it is not coloured, and no further.
@@ -237,7 +282,8 @@ class CanonicalStage(VoxelStage):
 
     def _keep_occupied(self, where: Tensor) -> None:
         """Keep of the occupancy what is within a voxel of ``where`` (X, Y, Z)."""
-        occupancy, field = self.scene_model.occupancy, self.scene_model.canonical
+        occupancy = self.scene_model.occupancy
+        field = self.scene_model.canonical
         points = field.box.grid_points(field.density.shape, field.density.values)
         before = occupancy.at(points.view(-1, 3)).view(where.shape)
         occupancy.replace(dilate(where, 1) & before, field.box)
@@ -246,7 +292,7 @@ class CanonicalStage(VoxelStage):
     def _forget_hidden(self) -> None:
         """In contracted space, occupy only what this phase's rays have reached.
 
-        That has a second moment.
+        A voxel that no ray has reached had no gradient: Adam's second moment of it is still zero.
         """
         state = self.optimizer.state.get(self.scene_model.canonical.density.values)
         if state and not self.scene_model.space.is_linear:
@@ -255,10 +301,11 @@ class CanonicalStage(VoxelStage):
     def setup_optimizer(self) -> None:
         """Give the optimiser the present grids (docs/method.md#optimiser)."""
         assert self.phase is not None
-        searching, field = self.phase.kind == "search", self.scene_model.canonical
-        shape, rays = field.density.shape, self.schedule.rays
+        searching = self.phase.kind == "search"
+        field = self.scene_model.canonical
+        shape = field.density.shape
         side = max(shape if field.planes is None else shape[:2])
-        smoothing = total_variation_weight(self.tv[self.phase.kind], side, rays)
+        smoothing = total_variation_weight(self.tv[self.phase.kind], side, self.schedule.rays)
         along_z = 1.0 if field.planes is None else shape[2] / side
         per_voxel_lr = None
         if searching:
@@ -276,15 +323,16 @@ class CanonicalStage(VoxelStage):
                 touched_only=not self.schedule.smooths_all(self.iteration),
             )
         self._look_for_gradients()
-        decoder, groups = list(field.decoder.parameters()), self.optimizer.param_groups
-        learns_them = [id(p) for p in decoder] == [id(p) for p in groups[2]["params"]]
-        if self.schedule.restart_at_growth or not learns_them:
+        decoder = list(field.decoder.parameters())
+        learned = self.optimizer.param_groups[2]["params"]
+        is_learned = [id(parameter) for parameter in decoder] == [id(p) for p in learned]
+        if self.schedule.restart_at_growth or not is_learned:
             self.optimizer.replace(2, decoder)
-        self.loop.bind(rays)
 
     def _look_for_gradients(self) -> None:
         """Have the optimiser read gradients only where samples may be, unless all are smoothed."""
-        field, occupancy = self.scene_model.canonical, self.scene_model.occupancy
+        field = self.scene_model.canonical
+        occupancy = self.scene_model.occupancy
         groups = self.optimizer.param_groups[:2]
         reached = None
         if groups[0]["skip_zero"] and (groups[0]["touched_only"] or not groups[0]["smoothing"]):
@@ -295,10 +343,12 @@ class CanonicalStage(VoxelStage):
 
     def prepare(self) -> None:
         """At the schedule's iterations renew the occupancy, smooth less, and learn directions."""
-        schedule, groups = self.schedule, self.optimizer.param_groups[:2]
-        every, begin = schedule.occupancy_every, schedule.search_iterations
-        begin = begin if self.iteration >= begin else 0
-        if renews := every is not None and self.passes(every, begin - every // 2):
+        schedule = self.schedule
+        groups = self.optimizer.param_groups[:2]
+        every = schedule.occupancy_every
+        begin = schedule.search_iterations if self.iteration >= schedule.search_iterations else 0
+        renews = every is not None and self.is_due(every, begin - every // 2)
+        if renews:
             self.update_occupancy()
             self._choose_pixels()
         touched_only = not schedule.smooths_all(self.iteration)
@@ -314,23 +364,41 @@ class CanonicalStage(VoxelStage):
         """Random pixels of all images."""
         assert self.pool is not None and self.phase is not None
         schedule = self.schedule
-        epochs = None if self.phase.kind == "search" else schedule.epochs
-        return self.draw_pixels(self.pool, epochs and epochs * len(self.pool) / schedule.iterations)
+        most = None
+        if schedule.epochs is not None and self.phase.kind == "fine":
+            most = rays_for_epochs(schedule.epochs, len(self.pool), schedule.iterations)
+        rays = self.rays_to_draw(schedule.rays, most)
+        with span("batch"):
+            image, flat = self.pool.draw(rays, self.generator)
+            return Pixels(image=image, flat=flat, background=self.background(image))
 
     def loss(self, views: Views, pixels: Pixels) -> tuple[Tensor, dict[str, Tensor]]:
         """Render a batch of pixels and compare it with the images."""
         assert self.phase is not None
-        model, schedule = self.scene_model, self.schedule
-        prediction = Prediction(*self.render_pixels(views, pixels, model.occupancy))
+        model = self.scene_model
+        with span("batch"):
+            batch = gather_batch(
+                views, pixels.image, pixels.flat, pixels.background, space=model.space
+            )
+        output = render(
+            batch.rays,
+            model.canonical,
+            model.occupancy,
+            model.settings,
+            batch.background,
+            precision=decoder_dtype(self.decoder_precision, self.device),
+        )
         with span("losses"):
+            prediction = Prediction(output=output, batch=batch)
             total, terms = batch_loss(prediction, PHOTOMETRIC_TERMS, self.weights[self.phase.kind])
             if model.space.is_linear:
                 return total, terms
-            seen, edges = prediction.output, model.space.inner(model.box).size
-            distance = seen.samples.distance / (sum(edges) / 6)  # in half edges
-            spread = distortion(seen.weight, distance, seen.samples.ray, len(seen.color))
-            if schedule.learns_directions(self.iteration):
-                total = total + schedule.unbounded_distortion * spread
+            # In unbounded space surfaces are drawn together; distances are in half edges.
+            half_edge = sum(model.space.inner(model.box).size) / 6
+            distance = output.samples.distance / half_edge
+            spread = distortion(output.weight, distance, output.samples.ray, len(output.color))
+            if self.schedule.learns_directions(self.iteration):
+                total = total + self.schedule.unbounded_distortion * spread
             return total, {**terms, "distortion": spread.detach()}
 
     @torch.no_grad()

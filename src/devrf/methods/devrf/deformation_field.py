@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from devrf.engine.frame_store import FrameField, FrameStore
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
+from devrf.methods.devrf.frame_store import FrameField, FrameStore
 from devrf.ops.corners import shape_of, to_grid
 from devrf.ops.trilinear import interpolate, kept_gradient
 from devrf.rendering.occupancy import Occupancy, dilate

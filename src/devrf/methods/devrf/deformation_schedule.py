@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 from typing import Any
 
-from devrf.engine.learner import Phase
+from devrf.engine.phase import Phase
 from devrf.errors import DevrfError, expect
 
 # Motion grids of this side take Adam about as long as a batch of rays takes; estimated.
@@ -130,7 +130,8 @@ class DeformationSchedule:
 
     def grid(self, level: int) -> tuple[int, int | None]:
         """About how many voxels the motion grids of a level have, and their planes, if given."""
-        side, finest = self.levels[level].side, self.levels[-1].side
+        side = self.levels[level].side
+        finest = self.levels[-1].side
         return side**3, self.planes and round(self.planes * side / finest)
 
     def learning_rate_factor(self, level: int) -> float:
@@ -172,6 +173,20 @@ class DeformationSchedule:
             lr_final_factor=row.lr_final_factor,
             init_from_previous=level == 0 and frame > 1,
         )
+
+
+def converged(losses: Sequence[float], min_rel_improvement: float) -> bool:
+    """Whether the last two steps of a visit lowered its best loss by too little.
+
+    Two, since one may have drawn difficult pixels; fewer than three steps never tell.
+
+    Args:
+        losses: mean loss of each Lightning step of a visit.
+        min_rel_improvement: the least decrease, a share of the loss in (0, 1].
+    """
+    if len(losses) < 3:
+        return False
+    return min(losses[-2:]) > (1 - min_rel_improvement) * min(losses[:-2])
 
 
 def _check_level(key: str, level: Level) -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -11,32 +12,100 @@ from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import Pixels
-from devrf.engine.active_frame import ActiveFrame
-from devrf.engine.batches import frame_pools
-from devrf.engine.convergence import converged
+from devrf.data.flow import previous_images
+from devrf.engine.batches import gather_batch
+from devrf.engine.stage import Stage
 from devrf.errors import DevrfError
+from devrf.methods.devrf.active_frame import ActiveFrame
 from devrf.methods.devrf.deformation_field import DeformationField, deformed_occupancy
-from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
-from devrf.methods.devrf.extension import Extension, MotionLoss, MotionStage
+from devrf.methods.devrf.deformation_schedule import (
+    DeformationPhase,
+    DeformationSchedule,
+    converged,
+)
+from devrf.methods.devrf.frame_store import FrameField
 from devrf.methods.devrf.losses import FlowMean, MotionPrediction, batch_loss
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.settings import DEFORMATION_LOSS, MotionSettings, Precision
+from devrf.methods.devrf.motion_loss import MotionLoss, MotionTerm
+from devrf.methods.devrf.pixel_pools import frame_pools, rays_for_epochs
+from devrf.methods.devrf.settings import (
+    DEFORMATION_LOSS,
+    MotionSettings,
+    Precision,
+    decoder_dtype,
+)
+from devrf.methods.devrf.volume_rendering import render
 from devrf.ops.adam import GridAdam
-from devrf.scenes.scene import Views
+from devrf.rendering.output import ColorChange
+from devrf.scenes.scene import CaptureName, Views
 from devrf.system.profiling import span
 
 log = logging.getLogger(__name__)
 
 
-class DeformationStage(MotionStage):
+class Extension:
+    """Adds to the deformation stage; what is not overridden adds nothing.
+
+    An extension is one file of ``extensions/`` and one block of ``schedule.extensions``; without
+    both, all else runs as before. Hooks are called in the order in which they stand here.
+    """
+
+    @property
+    def terms(self) -> Mapping[str, MotionTerm]:
+        """Further loss terms, by name."""
+        return {}
+
+    @property
+    def weights(self) -> Mapping[str, float]:
+        """How much they count, where ``loss.deformation`` does not say."""
+        return {}
+
+    @property
+    def scaled_terms(self) -> Collection[str]:
+        """The loss terms that :meth:`weight_factor` may change."""
+        return ()
+
+    def setup(self, stage: DeformationStage) -> None:
+        """Add fields to the model and groups to the optimiser, before learning starts."""
+
+    def frame_fields(self, stage: DeformationStage, level: int) -> Mapping[str, FrameField]:
+        """Fields whose frames are learned at ``level`` as the displacements are, by name."""
+        return {}
+
+    def begin_level(self, stage: DeformationStage, level: int) -> None:
+        """Memory of the active frame is ready; give the optimiser what is learned of it."""
+
+    def weight_factor(self, term: str, level: int) -> float:
+        """Factor of the weight of any loss term at ``level``."""
+        return 1.0
+
+    def initialise(self, stage: DeformationStage, phase: DeformationPhase) -> None:
+        """Give the phase's frame its first values, in the fields, before a visit."""
+
+    def color_change(self, frame: ActiveFrame) -> ColorChange | None:
+        """What is added to the colours' logits of an active frame; None: nothing."""
+        return None
+
+
+class DeformationStage(Stage):
     """Learns from the dynamic views how the scene deforms (docs/method.md#deformation-stage).
 
     Coarse to fine, frames are learned one after another. Only the two slices of the present frame
     are trained, and what extensions add; all else is frozen.
+
+    Attributes:
+        scene_model: the canonical field, its occupancy, and how it deforms.
+        schedule: levels, iterations and rays.
+        motion: learning rate and how batches are drawn.
+        motion_loss: the loss terms, and their weights at each level.
+        weights: of the loss terms that count at the present level.
+        active: the frame that is trained; None before the first, and after the last.
     """
 
+    scene_model: DeVRFModel
     phase: DeformationPhase | None
     name = "deformation"
+    capture: CaptureName = "dynamic"
     rate_keys = "schedule.motion.learning_rate or the weights of loss.deformation"
 
     def __init__(
@@ -59,23 +128,31 @@ class DeformationStage(MotionStage):
             loss: weights of the loss terms; ``tv`` is the total variation of both fields.
             flow_mean: what the flow loss is a mean over (docs/method.md#flow).
             extensions: what is added beyond the paper, by name.
-            iterations_per_step: as of every :class:`VoxelStage`.
-            decoder_precision: likewise.
+            iterations_per_step: optimiser iterations in one Lightning step.
+            decoder_precision: of the colour network while it learns; ``auto``: as the GPU allows.
         """
-        super().__init__(iterations_per_step, decoder_precision)
+        super().__init__(iterations_per_step)
         self.schedule = schedule or DeformationSchedule()
         self.motion = motion or MotionSettings()
         self.flow_mean = flow_mean
+        self.decoder_precision = decoder_precision
         self.extensions = tuple((extensions or {}).values())
         self.motion_loss = MotionLoss(loss, self.extensions, self.schedule)
         self.weights = self.motion_loss.weights_at(0)
-        still = rest.model
-        fields = still.architecture, still.canonical, still.occupancy, still.settings
-        self.scene_model = DeVRFModel(*fields, space=still.space).requires_grad_(False)
+        canonical = rest.model
+        self.scene_model = DeVRFModel(
+            canonical.architecture,
+            canonical.canonical,
+            canonical.occupancy,
+            canonical.settings,
+            space=canonical.space,
+        ).requires_grad_(False)
         self.earlier_records = rest.metadata.records
-        placeholder, rate = torch.zeros(2, 2, 2, 3, requires_grad=True), self.motion.learning_rate
-        self.optimizer = GridAdam([{"params": [placeholder], "lr": rate, "name": "motion"}])
-        self.active = None
+        placeholder = torch.zeros(2, 2, 2, 3, requires_grad=True)
+        self.optimizer = GridAdam(
+            [{"params": [placeholder], "lr": self.motion.learning_rate, "name": "motion"}]
+        )
+        self.active: ActiveFrame | None = None
         # The state holds what the active frame has learned.
         self.register_state_dict_pre_hook(  # type: ignore[no-untyped-call]
             lambda *_: self._write_back()
@@ -91,6 +168,22 @@ class DeformationStage(MotionStage):
         """Check the loss, before what the stage builds on has been learned."""
         extensions = tuple(settings.get("extensions", {}).values())
         MotionLoss(settings["loss"], extensions, settings["schedule"])
+
+    @property
+    def field(self) -> DeformationField:
+        """The deformation field; what the active frame learns may not be written back yet."""
+        assert self.scene_model.deformation is not None, "the stage has not been set up"
+        return self.scene_model.deformation
+
+    @property
+    def views(self) -> Views:
+        """The dynamic training views, on the stage's device."""
+        return self.training_views("dynamic")
+
+    @cached_property
+    def previous_images(self) -> Tensor:
+        """(N,) for each image the same view's image one frame earlier; itself without one."""
+        return previous_images(self.views)
 
     @property
     def total_iterations(self) -> int:
@@ -111,7 +204,7 @@ class DeformationStage(MotionStage):
         return self.phase_at(iteration).learning_rate_at(iteration)
 
     def setup(self, stage: str) -> None:
-        """Build the field at rest, at the coarsest resolution; refuse a scene that is at rest."""
+        """Build a field of no motion at the coarsest resolution; refuse a scene without motion."""
         super().setup(stage)
         if not self.scene.moves:
             raise DevrfError(f"{self.scene.name}: is at rest; the canonical stage is all it takes")
@@ -126,23 +219,32 @@ class DeformationStage(MotionStage):
 
     def _build_field(self) -> None:
         """The field over the canonical field's box; in contracted space, over the inner box."""
-        model, motion, schedule = self.scene_model, self.motion, self.schedule
-        box, clock = model.space.inner(model.box), self.scene.clock
-        still_outside, finest = box != model.box, box.grid_shape(*schedule.grid(-1))
-        coarsest = schedule.grid(0)
-        model.deformation = DeformationField(box, clock, *coarsest, still_outside=still_outside)
+        model = self.scene_model
+        box = model.space.inner(model.box)
+        voxels, planes = self.schedule.grid(0)
+        model.deformation = DeformationField(
+            box, self.scene.clock, voxels, planes, still_outside=box != model.box
+        )
         device = self.trainer.strategy.root_device
-        half = motion.stored_half(device)
-        model.deformation.frames.keep(motion.store, device, finest, half=half)
+        model.deformation.frames.keep(
+            self.motion.store,
+            device,
+            shape=box.grid_shape(*self.schedule.grid(-1)),
+            half=self.motion.stored_half(device),
+        )
 
     def enter(self, phase: DeformationPhase) -> None:
         """Go to the phase's frame: grow the grids if a level begins, fresh Adam if asked for."""
-        previous, self.phase = self.phase, phase
+        previous = self.phase
+        self.phase = phase
         self._write_back()
         if previous is not None and previous.level != phase.level:
             self._free()
             self.field.resize(*self.schedule.grid(phase.level))
-        self._initialise(phase)
+        if phase.init_from_previous:
+            self.field.frames.copy_previous(phase.frame)
+        for extension in self.extensions:
+            extension.initialise(self, phase)
         frame = self._activate(phase)
         self._update_occupancy()
         frame.pools = frame_pools(
@@ -160,13 +262,6 @@ class DeformationStage(MotionStage):
         for group in range(len(self.optimizer.param_groups)):
             self.optimizer.replace(group, [])
 
-    def _initialise(self, phase: DeformationPhase) -> None:
-        """Give the phase's frame its first values, in the fields."""
-        if phase.init_from_previous:
-            self.field.frames.copy_previous(phase.frame)
-        for extension in self.extensions:
-            extension.initialise(self, phase)
-
     def _activate(self, phase: DeformationPhase) -> ActiveFrame:
         """Check out the phase's frame."""
         if self.active is None:
@@ -183,7 +278,9 @@ class DeformationStage(MotionStage):
         """Make memory for a frame at the fields' resolutions, and let Adam learn it."""
         self._free()
         level = phase.level
-        further = {k: v for e in self.extensions for k, v in e.frame_fields(self, level).items()}
+        further: dict[str, FrameField] = {}
+        for extension in self.extensions:
+            further |= extension.frame_fields(self, level)
         frame = ActiveFrame.of(self.field.frames, self.scene_model.occupancy, further)
         self.active = frame
         self.weights = self.motion_loss.weights_at(level)
@@ -191,7 +288,6 @@ class DeformationStage(MotionStage):
         self.optimizer.replace(0, frame.slices, smoothing=smoothing)
         for extension in self.extensions:
             extension.begin_level(self, level)
-        self.loop.bind(self.schedule.rays)
         return frame
 
     def _write_back(self) -> None:
@@ -217,7 +313,8 @@ class DeformationStage(MotionStage):
 
     def _update_occupancy(self) -> None:
         """Find the occupancy of the active frame under its present displacements."""
-        model, frame = self.scene_model, self.active
+        model = self.scene_model
+        frame = self.active
         assert frame is not None
         warp = self.field.warp_by(frame.backward)
         frame.occupancy.refill(deformed_occupancy(model.occupancy, model.box, warp))
@@ -225,41 +322,66 @@ class DeformationStage(MotionStage):
     def prepare(self) -> None:
         """Update the frame's occupancy every ``occupancy_every`` iterations."""
         assert self.phase is not None
-        if self.passes(self.motion.occupancy_every, self.phase.start):
+        if self.is_due(self.motion.occupancy_every, self.phase.start):
             with span("sampling"):
                 self._update_occupancy()
 
     def draw(self) -> Pixels:
         """Random pixels of the frame, of its views in turn or of all."""
-        frame, phase, epochs = self.active, self.phase, self.motion.epochs
+        frame = self.active
+        phase = self.phase
         assert frame is not None and phase is not None
-        pools = frame.pools
-        most = epochs and epochs * sum(map(len, pools)) / (phase.stop - phase.start)
-        return self.draw_pixels(pools[self.turn % len(pools)], most)
+        most = None
+        if self.motion.epochs is not None:
+            pixels = sum(len(pool) for pool in frame.pools)
+            most = rays_for_epochs(self.motion.epochs, pixels, phase.stop - phase.start)
+        rays = self.rays_to_draw(self.schedule.rays, most)
+        pool = frame.pools[self.iterations_done % len(frame.pools)]
+        with span("batch"):
+            image, flat = pool.draw(rays, self.generator)
+            return Pixels(image=image, flat=flat, background=self.background(image))
 
     def loss(self, views: Views, pixels: Pixels) -> tuple[Tensor, dict[str, Tensor]]:
         """Render a batch of the frame through its warp; compare images and motion."""
-        frame, field = self.active, self.field
+        model = self.scene_model
+        field = self.field
+        frame = self.active
         assert frame is not None
-        before = [frame.before] if frame.number > 1 else []  # before frame 1 nothing has moved
-        changes = (extension.color_change(frame) for extension in self.extensions)
-        color_change = next((change for change in changes if change is not None), None)
-        warp = field.warp_by(frame.backward)
-        output, rays = self.render_pixels(views, pixels, frame.occupancy, warp, color_change)
-        prediction = MotionPrediction(
-            output,
-            rays,
-            unwarp=field.warp_by(frame.forward),
-            unwarp_previous=field.warp_by(*before),
-            cameras=views.cameras,
-            previous_image=self.previous_images,
-            forward_slice=frame.forward,
-            box=field.box,
-            space=self.scene_model.space,
-            flow_mean=self.flow_mean,
+        with span("batch"):
+            batch = gather_batch(
+                views, pixels.image, pixels.flat, pixels.background, space=model.space
+            )
+        output = render(
+            batch.rays,
+            model.canonical,
+            frame.occupancy,
+            model.settings,
+            batch.background,
+            warp=field.warp_by(frame.backward),
+            precision=decoder_dtype(self.decoder_precision, self.device),
+            color_change=self._color_change(frame),
         )
+        # Before frame 1 nothing has moved.
+        unwarp_previous = field.warp_by(frame.before) if frame.number > 1 else field.warp_by()
         with span("losses"):
+            prediction = MotionPrediction(
+                output=output,
+                batch=batch,
+                unwarp=field.warp_by(frame.forward),
+                unwarp_previous=unwarp_previous,
+                cameras=views.cameras,
+                previous_image=self.previous_images,
+                forward_slice=frame.forward,
+                box=field.box,
+                space=model.space,
+                flow_mean=self.flow_mean,
+            )
             return batch_loss(prediction, self.motion_loss.terms, self.weights)
+
+    def _color_change(self, frame: ActiveFrame) -> ColorChange | None:
+        """What an extension adds to the colours' logits; None: nothing."""
+        changes = (extension.color_change(frame) for extension in self.extensions)
+        return next((change for change in changes if change is not None), None)
 
     def converged(self, loss: Tensor) -> bool:
         """Whether the frame's loss has stopped falling, if the schedule asks for that."""
@@ -269,9 +391,9 @@ class DeformationStage(MotionStage):
         self._losses.append(float(loss))
         return converged(self._losses, gain)
 
-    def rollback(self, iteration: int, skipped: int, lr_scale: float) -> None:
+    def rollback(self, iteration: int, iterations_done: int, lr_scale: float) -> None:
         """Go on from an earlier iteration of the present frame, with an occupancy found anew."""
-        super().rollback(iteration, skipped, lr_scale)
+        super().rollback(iteration, iterations_done, lr_scale)
         self._losses = []
         self._update_occupancy()
 

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from devrf.checkpoints.stored_class import StoredClass, class_path, stored_class
 from devrf.checkpoints.stored_grids import packed, unpacked
-from devrf.engine.frame_store import NAMES, FrameField, fits_on_device
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.space import WORLD, Space, space_config, space_from
@@ -20,6 +19,7 @@ from devrf.methods.base import Renderable
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField, ColorDecoder
 from devrf.methods.devrf.deformation_field import DeformationField, deformed_occupancy
+from devrf.methods.devrf.frame_store import NAMES, FrameField, fits_on_device
 from devrf.methods.devrf.view import CanonicalSurface, DeVRFView
 from devrf.methods.devrf.volume_rendering import Warp
 from devrf.ops.corners import shape_of

@@ -8,9 +8,18 @@ from typing import Literal
 import torch
 
 from devrf.errors import expect
+from devrf.system.device import multiplies_bfloat16
 
 # What the colour network computes in.
 Precision = Literal["auto", "float32", "bfloat16"]
+
+
+def decoder_dtype(precision: Precision, device: torch.device) -> torch.dtype:
+    """What the colour network computes in on ``device``; ``auto``: bfloat16 where it is fast."""
+    if precision == "auto":
+        precision = "bfloat16" if multiplies_bfloat16(device) else "float32"
+    return torch.bfloat16 if precision == "bfloat16" else torch.float32
+
 
 SEARCH_LOSS = {"color": 1.0, "per_sample_color": 0.1, "entropy": 0.01}
 FINE_LOSS = {

@@ -12,16 +12,17 @@ from torch import Tensor
 
 from devrf.checkpoints.stored_grids import StoredShape
 from devrf.data.color_change import CHANGING, color_drift
-from devrf.engine.active_frame import ActiveFrame
-from devrf.engine.frame_store import FrameField
 from devrf.errors import expect
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
+from devrf.methods.devrf.active_frame import ActiveFrame
 from devrf.methods.devrf.canonical_field import look_up
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
-from devrf.methods.devrf.extension import Extension, MotionStage, MotionTerm
+from devrf.methods.devrf.deformation_stage import DeformationStage, Extension
+from devrf.methods.devrf.frame_store import FrameField
 from devrf.methods.devrf.losses import MotionPrediction, total_variation_weight
 from devrf.methods.devrf.model import ColorField
+from devrf.methods.devrf.motion_loss import MotionTerm
 from devrf.rendering.output import ColorChange
 from devrf.scenes.scene import Views
 
@@ -97,19 +98,24 @@ class ColorResidual(Extension):
             residual: weight of the squared residuals in the loss.
             tv: weight of their total variation.
         """
-        key, static = "schedule.extensions.color_residual", start_level_static_color
+        key = "schedule.extensions.color_residual"
+        static = start_level_static_color
         expect(start_level >= 1, f"{key}.start_level", "at least 1", start_level)
         good = static is None or static >= 1
         expect(good, f"{key}.start_level_static_color", "at least 1, or null", static)
         expect(side >= 2, f"{key}.side", "at least 2", side)
         expect(learning_rate > 0, f"{key}.learning_rate", "above 0", learning_rate)
-        self._learn, self._side, self._learning_rate = learn, side, learning_rate
-        self._start, self._start_if_static = start_level, start_level_static_color
+        self._learn = learn
+        self._side = side
+        self._learning_rate = learning_rate
+        self._start = start_level
+        self._start_if_static = start_level_static_color
         self._scale_if_drift = loss_scale_if_color_drift or {}
         for name, factor in self._scale_if_drift.items():
             place = f"{key}.loss_scale_if_color_drift.{name}"
             expect(factor >= 0, place, "at least 0", factor)
-        self._residual, self._tv = residual, tv
+        self._residual = residual
+        self._tv = tv
         # Once set up: the first level that learns it, from 0; factors of weights from it on.
         self._first: int | None = None
         self._scale: Mapping[str, float] = {}
@@ -129,7 +135,7 @@ class ColorResidual(Extension):
         """Those that ``loss_scale_if_color_drift`` names."""
         return self._scale_if_drift
 
-    def setup(self, stage: MotionStage) -> None:
+    def setup(self, stage: DeformationStage) -> None:
         """Build the residuals, zero, and their empty parameter group, if they are learned."""
         first, drifting = self._decide(stage.scene.dynamic.train)
         if first is None:
@@ -137,7 +143,8 @@ class ColorResidual(Extension):
         self._scale = self._scale_if_drift if drifting else {}
         # The ablation without levels has one.
         self._first = min(first, len(stage.schedule.levels)) - 1
-        model, rate = stage.scene_model, self._learning_rate
+        model = stage.scene_model
+        rate = self._learning_rate
         model.color_residual = ResidualField(model.box, stage.field.clock, voxels=self._side**3)
         stage.optimizer.add_param_group({"params": [], "lr": rate, "base_lr": rate, "name": NAME})
 
@@ -153,13 +160,13 @@ class ColorResidual(Extension):
         log.info("colours %s: their change is %s", how, learned)
         return first, drifting
 
-    def frame_fields(self, stage: MotionStage, level: int) -> Mapping[str, FrameField]:
+    def frame_fields(self, stage: DeformationStage, level: int) -> Mapping[str, FrameField]:
         """The residuals, if ``level`` learns them."""
         field = stage.scene_model.color_residual
         learned = self._first is not None and level >= self._first
         return {NAME: field} if learned and field is not None else {}
 
-    def begin_level(self, stage: MotionStage, level: int) -> None:
+    def begin_level(self, stage: DeformationStage, level: int) -> None:
         """Let the optimiser learn the active frame's residuals (X, Y, Z, 3).
 
         Within a visit their rate falls as that of the displacements does; from level to level it
@@ -178,7 +185,7 @@ class ColorResidual(Extension):
         """Where a texture may slide over the surface, some terms tell less."""
         return 1.0 if self._first is None or level < self._first else self._scale.get(term, 1.0)
 
-    def initialise(self, stage: MotionStage, phase: DeformationPhase) -> None:
+    def initialise(self, stage: DeformationStage, phase: DeformationPhase) -> None:
         """At the first level that learns it, start a frame from the one visited before it."""
         field = stage.scene_model.color_residual
         if isinstance(field, ResidualField) and phase.level == self._first:

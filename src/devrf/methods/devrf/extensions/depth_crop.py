@@ -20,13 +20,15 @@ from devrf.scenes.scene import Scene, Views
 log = logging.getLogger(__name__)
 
 # As many rays are looked along, so many at a time.
-RAYS, CHUNK = 8192, 2048
+RAYS = 8192
+CHUNK = 2048
 # This share of all that is seen may lie in front of the box, and as much behind it: remains of fog.
 FOG = 0.1
 # So may the surfaces of this share of the rays: specks.
 SPECKS = 1e-3
 # Room in front, into which things may move, and behind, in shares of the depth that is seen.
-IN_FRONT, BEHIND = 0.25, 0.05
+IN_FRONT = 0.25
+BEHIND = 0.05
 
 
 def crop_to_visible(model: DeVRFModel, scene: Scene, views: Views, pool: PixelPool) -> None:
@@ -40,7 +42,8 @@ def crop_to_visible(model: DeVRFModel, scene: Scene, views: Views, pool: PixelPo
         views: what the field is learned from, on the model's device.
         pool: the pixels of ``views`` that are drawn from.
     """
-    space, field = scene.space, model.canonical
+    space = scene.space
+    field = model.canonical
     if not isinstance(space, NormalizedDevice):
         return
     ends = visible_depths(*seen_along_rays(model, views, pool))
@@ -61,10 +64,12 @@ def crop(field: CanonicalField, box: Box) -> None:
     """
     assert field.planes is not None, "only fields with planes are cropped"
     before = field.box
-    (width, height, depth), (whole_width, whole_height, whole_depth) = box.size, before.size
+    width, height, depth = box.size
+    whole_width, whole_height, whole_depth = before.size
     planes = max(2, round((field.planes - 1) * depth / whole_depth) + 1)
     share = width * height * planes / (whole_width * whole_height * field.planes)
-    field.box, field.planes = box, planes
+    field.box = box
+    field.planes = planes
     field.voxels = round(field.voxels * share)
     field.base_voxels = round(field.base_voxels * share)
     points = box.grid_points(field.grid_shape(field.voxels), field.density.values)
@@ -78,17 +83,21 @@ def seen_along_rays(
     model: DeVRFModel, views: Views, pool: PixelPool
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Samples on rays through pixels of ``pool``: depths z', weights, and rays, each (S,)."""
-    # Evenly spread, not random: several processes have to find the same.
+    # Evenly spread, not random: several processes have to find the same depths.
     chosen = torch.linspace(0, len(pool) - 1, min(RAYS, len(pool)), dtype=torch.float64)
-    found: list[tuple[Tensor, Tensor, Tensor]] = []
+    depths: list[Tensor] = []
+    weights: list[Tensor] = []
+    rays_of_samples: list[Tensor] = []
     for k, part in enumerate(torch.split(chosen.long().to(pool.image.device), CHUNK)):
-        image, flat = pool.image[part].long(), pool.flat[part].long()
+        image = pool.image[part].long()
+        flat = pool.flat[part].long()
         black = torch.zeros(3, device=model.device)
         rays = gather_batch(views, image, flat, black, model.space).rays
-        seen = render(rays, model.canonical, model.occupancy, model.settings, black)
-        found.append((seen.samples.points[:, 2], seen.weight, seen.samples.ray + k * CHUNK))
-    depths, weights, rays_of = (torch.cat(parts) for parts in zip(*found, strict=True))
-    return depths, weights, rays_of
+        output = render(rays, model.canonical, model.occupancy, model.settings, black)
+        depths.append(output.samples.points[:, 2])
+        weights.append(output.weight)
+        rays_of_samples.append(output.samples.ray + k * CHUNK)
+    return torch.cat(depths), torch.cat(weights), torch.cat(rays_of_samples)
 
 
 def visible_depths(depths: Tensor, weights: Tensor, ray: Tensor) -> tuple[float, float]:

@@ -12,8 +12,9 @@ from torch import Tensor
 from torch.nn.functional import adaptive_max_pool3d, max_pool3d
 
 from devrf.geometry.box import Box
-from devrf.methods.devrf.extension import Extension, MotionStage, MotionTerm
+from devrf.methods.devrf.deformation_stage import DeformationStage, Extension
 from devrf.methods.devrf.losses import MotionPrediction
+from devrf.methods.devrf.motion_loss import MotionTerm
 from devrf.rendering.occupancy import Occupancy
 
 # c of docs/method.md#elastic and #bending: beyond it a place counts as torn or jointed, not as
@@ -127,7 +128,8 @@ class MotionPrior(Extension):
 
         ``loss.deformation`` has its weight under ``name``.
         """
-        self.name, self.energy = name, energy
+        self.name = name
+        self.energy = energy
         self._occupied: Tensor | None = None
 
     @property
@@ -135,10 +137,11 @@ class MotionPrior(Extension):
         """The energy, under its name."""
         return {self.name: self._term}
 
-    def begin_level(self, stage: MotionStage, level: int) -> None:
+    def begin_level(self, stage: DeformationStage, level: int) -> None:
         """Find the cells of the level's grids that are occupied at rest."""
         if self.name in stage.weights:
-            field, occupancy = stage.field, stage.scene_model.occupancy
+            field = stage.field
+            occupancy = stage.scene_model.occupancy
             self._occupied = occupied_cells(occupancy, field.box, field.shape)
 
     def _term(self, prediction: MotionPrediction) -> Tensor:

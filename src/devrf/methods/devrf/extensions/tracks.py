@@ -11,14 +11,15 @@ import torch
 from torch import Tensor
 
 from devrf.data.batch import PixelPool, all_pixels
-from devrf.engine.batches import gather_batch, images_of
+from devrf.engine.batches import gather_batch
 from devrf.engine.ddp import broadcast
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import WORLD, Space
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
-from devrf.methods.devrf.extension import Extension, MotionStage
+from devrf.methods.devrf.deformation_stage import DeformationStage, Extension
 from devrf.methods.devrf.model import DeVRFModel
+from devrf.methods.devrf.pixel_pools import images_of
 from devrf.methods.devrf.volume_rendering import render
 from devrf.ops.compositing import sum_by_ray
 from devrf.ops.trilinear import interpolate
@@ -30,9 +31,8 @@ LIKENESS = 0.15
 # Frames that a pixel is followed back at most; drift adds up, and memory holds so many occupancies.
 FARTHEST = 16
 # Tracks of a frame at most, chosen at random, and optimiser steps of a fit to them.
-MOST_TRACKS, FIT_STEPS = 4096, 60
-# What a frame gets of these at least, under a time budget.
-LEAST_SHARE = 1 / 4
+MOST_TRACKS = 4096
+FIT_STEPS = 60
 # Weight of differences between neighbouring voxels' changes in a fit.
 SMOOTHNESS = 0.01
 
@@ -53,11 +53,11 @@ class StartAlongFlow(Extension):
         self._init_from = init_from
         self._tracks: FlowTracks | None = None
 
-    def begin_level(self, stage: MotionStage, level: int) -> None:
+    def begin_level(self, stage: DeformationStage, level: int) -> None:
         """Forget what the level before has seen."""
         self._tracks = None
 
-    def changes(self, stage: MotionStage, phase: DeformationPhase) -> bool:
+    def changes(self, stage: DeformationStage, phase: DeformationPhase) -> bool:
         """Whether a phase starts along the flow: at the coarsest level, where there is one."""
         recorded = stage.scene.dynamic.train
         # What a moving camera sees moves with it.
@@ -65,23 +65,24 @@ class StartAlongFlow(Extension):
         asked = self._init_from != "previous" and known
         return asked and phase.level == 0
 
-    def initialise(self, stage: MotionStage, phase: DeformationPhase) -> None:
+    def initialise(self, stage: DeformationStage, phase: DeformationPhase) -> None:
         """Fit the frame's displacements to where its pixels are followed back to."""
         if not self.changes(stage, phase):
             return
-        views, model, field = stage.views, stage.scene_model, stage.field
+        views = stage.views
+        model = stage.scene_model
         frame = phase.frame
         if self._tracks is None:
             by_color = self._init_from == "tracks"
             self._tracks = FlowTracks(model, views, stage.previous_images, by_color=by_color)
         pool = all_pixels(views, images_of(views, frame))
-        # A time budget does less of everything, and no more of this.
-        share = max(1 / max(stage.stride, 1.0), LEAST_SHARE)
-        most, steps = round(share * MOST_TRACKS), round(share * FIT_STEPS)
+        # As much less as batches are smaller for want of time or memory.
+        most = round(stage.batch_share * MOST_TRACKS)
+        steps = round(stage.batch_share * FIT_STEPS)
         tracks = self._tracks.follow(frame, pool, stage.generator, most=most)
-        start_from_tracks(field, frame, tracks, views.cameras, model.space, steps)
+        start_from_tracks(stage.field, frame, tracks, views.cameras, model.space, steps)
         # Each process has followed pixels of its own.
-        broadcast([field.to_canonical[frame], field.to_time[frame]])
+        broadcast([stage.field.to_canonical[frame], stage.field.to_time[frame]])
 
 
 @dataclass(frozen=True)
@@ -121,7 +122,9 @@ class FlowTracks:
             by_color: whether what is met must have the pixel's colour; else each pixel ends one
                 frame back, whatever it meets there.
         """
-        self.model, self.views, self.previous = model, views, previous
+        self.model = model
+        self.views = views
+        self.previous = previous
         self.likeness = LIKENESS if by_color else math.inf
         self.farthest = FARTHEST if by_color else 1
         self._occupancies: dict[int, Occupancy] = {}
@@ -146,25 +149,35 @@ class FlowTracks:
         views = self.views
         assert views.flow is not None
         valid = views.flow.valid.flatten()[pool.image.long() * self._area + pool.flat.long()]
-        kept = valid.nonzero()[:, 0]
-        order = torch.randperm(len(kept), device=kept.device, generator=generator)
-        kept = kept[order[:most]]
-        here, flat = pool.image[kept].long(), pool.flat[kept].long()
-        now = gather_batch(views, here, flat, torch.ones(3, device=here.device))
-        place, waiting = now.pixel, torch.arange(len(here), device=here.device)
-        found: list[tuple[Tensor, Tensor]] = []
+        valid_pixels = valid.nonzero()[:, 0]
+        order = torch.randperm(len(valid_pixels), device=valid.device, generator=generator)
+        chosen = valid_pixels[order[:most]]
+        image = pool.image[chosen].long()
+        flat = pool.flat[chosen].long()
+        batch = gather_batch(views, image, flat, torch.ones(3, device=image.device))
+        # Of the pixels that are still followed: their numbers in the batch, and where they are.
+        number = torch.arange(len(image), device=image.device)
+        place = batch.pixel
+        ended: list[Tensor] = []
+        points: list[Tensor] = []
         for step in range(1, min(frame, self.farthest) + 1):
-            going, place = self._back(here, place)
-            waiting, here = waiting[going], self.previous[here[going]]
-            point, color, mass = self._look(frame - step, here, place)
-            unlike = (color - now.color[waiting]).abs().amax(dim=1)
-            right = (mass > 0.5) & (unlike < self.likeness)
-            found.append((waiting[right], point[right]))
-            waiting, here, place = waiting[~right], here[~right], place[~right]
-            if len(waiting) == 0:
+            followed, place = self._back(image, place)
+            number = number[followed]
+            image = self.previous[image[followed]]
+            point, color, mass = self._look(frame - step, image, place)
+            difference = (color - batch.color[number]).abs().amax(dim=1)
+            matches = (mass > 0.5) & (difference < self.likeness)
+            ended.append(number[matches])
+            points.append(point[matches])
+            number = number[~matches]
+            image = image[~matches]
+            place = place[~matches]
+            if len(number) == 0:
                 break
-        index, points = (torch.cat(column) for column in zip(*found, strict=True))
-        return Tracks(points, now.image[index], now.pixel[index])
+        index = torch.cat(ended)
+        return Tracks(
+            canonical=torch.cat(points), camera=batch.image[index], pixel=batch.pixel[index]
+        )
 
     @property
     def _area(self) -> int:
@@ -192,7 +205,8 @@ class FlowTracks:
         Returns:
             The mean canonical point (N, 3), the colour (N, 3) on white, and Σ w_i (N,).
         """
-        model, deformation = self.model, self.model.deformation
+        model = self.model
+        deformation = self.model.deformation
         assert deformation is not None
         time = deformation.clock.times[frame]
         seen = render(
@@ -203,7 +217,8 @@ class FlowTracks:
             torch.ones(3, device=image.device),
             model.warp(time),
         )
-        count, ray = len(image), seen.samples.ray
+        count = len(image)
+        ray = seen.samples.ray
         mass = sum_by_ray(seen.weight, ray, count)
         point = sum_by_ray(seen.weight[:, None] * seen.canonical, ray, count)
         return point / mass[:, None], seen.color, mass
@@ -243,7 +258,8 @@ def start_from_tracks(
     if len(tracks) == 0:
         return
     scale = _pixels_per_unit(tracks, cameras, space, 1e-3 * field.box.longest)
-    backward, forward = (field.frames.here.new_empty(*field.shape, 3) for _ in range(2))
+    backward = field.frames.here.new_empty(*field.shape, 3)
+    forward = field.frames.here.new_empty(*field.shape, 3)
     field.frames.read(frame, (backward, forward))
     coords = field.box.to_grid(tracks.canonical, field.shape)
 
@@ -285,7 +301,8 @@ def _fit(residual: Callable[[Tensor], Tensor], like: Tensor, scale: float, steps
         scale: pixels per unit of the grid's values.
         steps: Adam steps; the rate falls linearly from half a pixel a step.
     """
-    change, fastest = torch.zeros_like(like).requires_grad_(), 0.5 / scale
+    change = torch.zeros_like(like).requires_grad_()
+    fastest = 0.5 / scale
     optimizer = torch.optim.Adam([change], lr=fastest)
     for number in range(steps):
         optimizer.param_groups[0]["lr"] = fastest * (1 - number / steps)

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from devrf.checkpoints.stored_grids import pack_bits, unpack_bits
 from devrf.data.batch import PixelPool
-from devrf.engine.batches import images_of
-from devrf.engine.frame_store import FrameField, FrameStore
+from devrf.methods.devrf.frame_store import FrameField, FrameStore
+from devrf.methods.devrf.pixel_pools import images_of
 from devrf.rendering.occupancy import Occupancy
 from devrf.scenes.scene import Views
 
@@ -56,14 +56,19 @@ class ActiveFrame:
             occupancy: at rest; the frame's is as large.
             fields: further fields whose frames are learned, by name.
         """
-        backward, forward, before = (store.here.new_zeros(*store.shape, 3) for _ in range(3))
-        empty = Occupancy(torch.zeros_like(occupancy.mask), occupancy.box)
-        learned = backward.requires_grad_(), forward.requires_grad_()
-        further = {
-            name: torch.zeros_like(field.values[0]).requires_grad_()
-            for name, field in fields.items()
-        }
-        return ActiveFrame(store, *learned, before, empty, fields, further)
+        zeros = store.here.new_zeros(*store.shape, 3)
+        return ActiveFrame(
+            store=store,
+            backward=zeros.clone().requires_grad_(),
+            forward=zeros.clone().requires_grad_(),
+            before=zeros,
+            occupancy=Occupancy(torch.zeros_like(occupancy.mask), occupancy.box),
+            fields=fields,
+            further={
+                name: torch.zeros_like(field.values[0]).requires_grad_()
+                for name, field in fields.items()
+            },
+        )
 
     @property
     def slices(self) -> tuple[Tensor, Tensor]:
@@ -99,7 +104,8 @@ class ActiveFrame:
             views: what is learned from.
             exact: add the displacements, which the field would round.
         """
-        images, area = images_of(views, self.number), views.height * views.width
+        images = images_of(views, self.number)
+        area = views.height * views.width
         return {
             "occupancy": pack_bits(self.occupancy.mask),
             "pixels": [pack_bits(pool.mask(images, area)) for pool in self.pools],
@@ -109,11 +115,12 @@ class ActiveFrame:
     @torch.no_grad()
     def load_state(self, state: dict[str, Any], views: Views) -> None:
         """Restore what :meth:`state` gave; the frame has been checked out."""
-        images, area = images_of(views, self.number), views.height * views.width
+        images = images_of(views, self.number)
+        area = views.height * views.width
         for tensor, value in zip(self.slices, state["displacements"], strict=False):
             tensor.copy_(value)
-        device, shape = self.backward.device, self.occupancy.mask.shape
-        mask = unpack_bits(state["occupancy"], shape, device)
+        device = self.backward.device
+        mask = unpack_bits(state["occupancy"], self.occupancy.mask.shape, device)
         self.occupancy.refill(Occupancy(mask, self.occupancy.box))
         masks = [unpack_bits(bits, (len(images), area), device) for bits in state["pixels"]]
         self.pools = [PixelPool.of_mask(images, mask) for mask in masks]

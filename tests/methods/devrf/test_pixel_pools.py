@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import torch
 
-from devrf.engine.batches import rays_hit_occupied
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.model import DeVRFModel
+from devrf.methods.devrf.pixel_pools import rays_hit_occupied
 from devrf.rendering.occupancy import Occupancy, dilate
 from devrf.rendering.sampling import RenderSettings, march
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from devrf.engine.frame_store import FrameStore, fits_on_device
+from devrf.methods.devrf.frame_store import FrameStore, fits_on_device
 
 SHAPE = (3, 2, 4)
 OTHERS = [0, 1, 3]

@@ -53,8 +53,11 @@ class FrameField(nn.Module):
 
     def get_extra_state(self) -> dict[str, Any]:
         """Box and clock, as plain numbers."""
-        low, high = list(self.box.low), list(self.box.high)
-        return {"low": low, "high": high, "times": list(self.clock.times)}
+        return {
+            "low": list(self.box.low),
+            "high": list(self.box.high),
+            "times": list(self.clock.times),
+        }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_extra_state` gave."""
@@ -134,7 +137,8 @@ class FrameStore(nn.Module):
 
     def take(self, to_canonical: Tensor, to_time: Tensor) -> None:
         """Hold these (T, X, Y, Z, 3) where they are; on the host they stay there."""
-        self.to_canonical, self.to_time = to_canonical, to_time
+        self.to_canonical = to_canonical
+        self.to_time = to_time
         self.on_host = to_time.device != self.here.device
 
     def keep(
@@ -181,7 +185,8 @@ class FrameStore(nn.Module):
         self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
     ) -> None:
         for name in NAMES:
-            stored, frames = state_dict.get(prefix + name), getattr(self, name)
+            stored = state_dict.get(prefix + name)
+            frames = getattr(self, name)
             if stored is not None and stored.shape != frames.shape:
                 setattr(self, name, self._empty(stored.shape, frames.dtype))
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)

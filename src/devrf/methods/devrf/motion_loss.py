@@ -1,0 +1,108 @@
+"""The deformation stage's loss: which terms count at each level, and how much."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Protocol
+
+from torch import Tensor
+
+from devrf.errors import DevrfError
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule
+from devrf.methods.devrf.losses import (
+    MOTION_TERMS,
+    MotionPrediction,
+    apart_from_total_variation,
+    total_variation_weight,
+)
+from devrf.methods.weighted_loss import counted_weights
+
+# An unweighted loss term: prediction → ().
+MotionTerm = Callable[[MotionPrediction], Tensor]
+
+
+class LossExtension(Protocol):
+    """What an extension of the deformation stage adds to its loss."""
+
+    @property
+    def terms(self) -> Mapping[str, MotionTerm]:
+        """Further loss terms, by name."""
+        ...
+
+    @property
+    def weights(self) -> Mapping[str, float]:
+        """How much they count, where ``loss.deformation`` does not say."""
+        ...
+
+    @property
+    def scaled_terms(self) -> Collection[str]:
+        """The loss terms that :meth:`weight_factor` may change."""
+        ...
+
+    def weight_factor(self, term: str, level: int) -> float:
+        """Factor of the weight of any loss term at ``level``."""
+        ...
+
+
+class MotionLoss:
+    """Weights of Σ weight · factor · term; the factors are those of a level.
+
+    Attributes:
+        terms: what can be computed, by name.
+    """
+
+    def __init__(
+        self,
+        loss: Mapping[str, float],
+        extensions: Sequence[LossExtension],
+        schedule: DeformationSchedule,
+    ) -> None:
+        """Merge the weights, and check all names.
+
+        Args:
+            loss: weights by the terms' names; ``tv`` is the total variation of both fields.
+            extensions: add terms, weights and factors.
+            schedule: has a factor for each level, of all terms in ``loss`` but ``render``.
+
+        Raises:
+            DevrfError: a weight, or a factor of an extension, is of no term.
+        """
+        self.terms: dict[str, MotionTerm] = dict(MOTION_TERMS)
+        weights, self._total_variation = apart_from_total_variation(loss, "loss.deformation")
+        for extension in extensions:
+            self.terms |= extension.terms
+            weights |= extension.weights
+        known = ", ".join(sorted(self.terms))
+        for extension in extensions:
+            for name in sorted(set(extension.scaled_terms) - self.terms.keys()):
+                raise DevrfError(
+                    f"schedule.extensions: {name} is no term of loss.deformation; the terms are "
+                    f"{known}"
+                )
+        self._weights = counted_weights(weights, self.terms, "loss.deformation")
+        self._scaled_by_level = loss.keys() - {"render"}
+        self._extensions = extensions
+        self._schedule = schedule
+
+    def leave_out(self, term: str) -> bool:
+        """Let a term count no more; whether it did."""
+        return bool(self._weights.pop(term, 0.0))
+
+    def weights_at(self, level: int) -> dict[str, float]:
+        """The weights of the terms that count at ``level``."""
+        weights = {
+            name: weight * self._factor(name, level) for name, weight in self._weights.items()
+        }
+        return {name: weight for name, weight in weights.items() if weight}
+
+    def _factor(self, term: str, level: int) -> float:
+        scaled = term in self._scaled_by_level
+        of_level = self._schedule.levels[level].other_terms if scaled else 1.0
+        factors = (extension.weight_factor(term, level) for extension in self._extensions)
+        return math.prod(factors, start=of_level)
+
+    def smoothing(self, level: int, shape: tuple[int, int, int]) -> float:
+        """The optimiser's weight of the total variation of grids of ``shape`` at ``level``."""
+        weight = self._total_variation * self._schedule.levels[level].other_terms
+        return total_variation_weight(weight, max(shape), self._schedule.rays)

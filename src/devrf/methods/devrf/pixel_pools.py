@@ -1,0 +1,114 @@
+"""Which pixels of a stage's images are worth drawing: those whose rays meet occupied space."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from devrf.data.batch import PixelPool, all_pixels, wanted_pixels
+from devrf.engine.ddp import world_size
+from devrf.errors import DevrfError
+from devrf.geometry.cameras import Cameras
+from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.sampling import hits
+from devrf.rendering.view import Viewable
+from devrf.scenes.scene import Views
+
+# One ray is followed for a block of so many pixels a side.
+BLOCK = 2
+# Images whose rays are made together: on a CPU what its caches hold, on a GPU what keeps it busy.
+IMAGES_ON_CPU = 1
+IMAGES_ON_GPU = 16
+# The fewest rays of a batch, however few pixels there are.
+MIN_RAYS = 64
+
+
+@torch.no_grad()
+def rays_hit_occupied(
+    cameras: Cameras, images: Tensor, model: Viewable, occupancy: Occupancy
+) -> Tensor:
+    """Mask (K, H·W): the pixels of images whose rays pass near anything occupied.
+
+    One ray stands for a block of pixels: what is near it reaches far enough for its neighbours too.
+
+    Args:
+        cameras: all cameras, on the model's device.
+        images: (K,) int64, which of them.
+        model: gives box, space, near and far.
+        occupancy: where something may be at the time of the images.
+    """
+    width = -(-cameras.width // BLOCK)
+    height = -(-cameras.height // BLOCK)
+    coarse = cameras.resized(width, height)
+    pixels = coarse.pixel_grid()
+    near, far = model.depth_limits
+    masks = []
+    together = IMAGES_ON_GPU if images.is_cuda else IMAGES_ON_CPU
+    for start in range(0, len(images), together):
+        some = images[start : start + together]
+        rays = coarse.rays(some.repeat_interleave(len(pixels)), pixels.repeat(len(some), 1))
+        hit = hits(model.space.rays(rays), model.box, occupancy, near=near, far=far)
+        rows = hit.view(-1, height, width).repeat_interleave(BLOCK, dim=1)[:, : cameras.height]
+        masks.append(rows.repeat_interleave(BLOCK, dim=2)[:, :, : cameras.width].flatten(1))
+    return torch.cat(masks)
+
+
+def static_pool(views: Views, model: Viewable, occupancy: Occupancy | None) -> PixelPool:
+    """The static training images' pixels: all, or those that hit something in ``occupancy``."""
+    device = model.device
+    images = torch.arange(len(views), device=device)
+    if occupancy is None:
+        return all_pixels(views, images)
+    hit = rays_hit_occupied(views.cameras.to(device), images, model, occupancy)
+    return wanted_pixels(views, images, hit)
+
+
+@torch.no_grad()
+def frame_pools(
+    views: Views,
+    frame: int,
+    model: Viewable,
+    occupancy: Occupancy,
+    *,
+    occupied_only: bool,
+    join_views: bool,
+) -> list[PixelPool]:
+    """The pixels to learn a frame from: pools that batches are drawn from in turn.
+
+    Args:
+        views: the dynamic training views, on the model's device.
+        frame: the frame.
+        model: gives box, space, near and far.
+        occupancy: where something is at the frame's time.
+        occupied_only: only pixels on the alpha mask, or whose rays hit something occupied; all
+            those of an image that has none.
+        join_views: one pool of all views; else one pool a view.
+
+    Raises:
+        DevrfError: no image shows the frame.
+    """
+    images = images_of(views, frame)
+    if len(images) == 0:
+        raise DevrfError(f"dynamic training set: no image at frame {frame}")
+    pools = [all_pixels(views, image[None]) for image in images]
+    if occupied_only:
+        wanted = rays_hit_occupied(views.cameras, images, model, occupancy)
+        if views.has_alpha:
+            wanted |= views.pixels[images][..., 3].flatten(1) > 0
+        for k, whole in enumerate(pools):
+            pool = wanted_pixels(views, images[k : k + 1], wanted[k : k + 1])
+            pools[k] = pool if len(pool) else whole
+    if not join_views:
+        return pools
+    return [PixelPool(torch.cat([pool.pixels for pool in pools], dim=1))]
+
+
+def images_of(views: Views, frame: int) -> Tensor:
+    """The images (K,) int64 of a frame, ascending."""
+    assert views.frames is not None
+    return (views.frames == frame).nonzero()[:, 0]
+
+
+def rays_for_epochs(epochs: float, pixels: int, iterations: int) -> int:
+    """Rays of a batch of this process, of which ``iterations`` show each pixel ``epochs`` times."""
+    return max(round(epochs * pixels / iterations / world_size()), MIN_RAYS)
