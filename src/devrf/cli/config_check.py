@@ -34,6 +34,7 @@ ROOT: dict[str, Any] = {
     "objective": str,
     "scene": str | None,
     "decoder_precision": Literal["auto", "float32", "bfloat16"],
+    "kernels": Literal["auto", "torch"],
 }
 # What cannot be loaded ends the command with one line; Hydra would log it before.
 logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)

@@ -9,7 +9,6 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import torch
 from hydra.utils import instantiate
 from lightning import Trainer
 from lightning.pytorch.strategies import Strategy
@@ -27,7 +26,7 @@ from devrf.checkpoints.checkpoint import (
 )
 from devrf.checkpoints.checkpoint_file import digest_of
 from devrf.checkpoints.progress import progress_files
-from devrf.cli.config import PIPELINE
+from devrf.cli.config import PIPELINE, scene_name
 from devrf.cli.restore_config import present_command
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.ddp import ManualDDP
@@ -51,38 +50,40 @@ class RunContext:
         config: a composed config (``conf/config.yaml``).
         folder: gets ``checkpoints/<stage>.ckpt``, ``metrics.json``, ``frames.csv``, ``images/`` and
             ``videos/``, next to Hydra's config and log.
-        chooses_size: whether the images' size is left to this run.
+        place: the folder as a command names it: relative, where it is below the working folder.
+        command: what this run is learned with, as it was composed.
+        protocol: which data trains which part of the method.
+        learning_stages: names of the protocol's stages, in their order.
+        evaluation: what is measured on held-out views.
+        strategy: the configured trainer's: its device, rank and number of processes.
+        leads: whether this process writes files and logs: rank 0, or the only one.
+        device: the trainer's.
+        is_trial: whether ``trainer.fast_dev_run`` asks for a step of each stage, with nothing kept.
         tried: what the stages of a trial came to, by name.
+        chooses_size: whether the images' size is left to this run.
+        step_began: when the step before ended; of the first step, when the run began.
     """
 
     def __init__(self, config: DictConfig, folder: Path) -> None:
-        self.config = config
-        self._composed = config.copy()
-        self.folder = folder
-        self.step_began = time.perf_counter()
-        self.chooses_size = False
+        self.command = present_command(config)
+        config.scene = scene_name(config)
+        self.config, self.folder = config, folder
+        self.place = folder.relative_to(Path.cwd()) if Path.cwd() in folder.parents else folder
+        self.protocol: Protocol = instantiate(config.protocol, _convert_="all")
+        self.learning_stages = tuple(self.protocol.stages)
+        self.evaluation: Evaluation = instantiate(config.evaluation, _convert_="all")
+        self.strategy = _strategy(config)
+        self.leads = bool(self.strategy.is_global_zero)
+        self.device = self.strategy.root_device
+        self.is_trial = bool(config.trainer.get("fast_dev_run"))
         self.tried: dict[str, LoadedCheckpoint] = {}
-
-    @property
-    def place(self) -> Path:
-        """The folder as a command names it: relative, where it is below the working folder."""
-        inside = self.folder.is_relative_to(Path.cwd())
-        return self.folder.relative_to(Path.cwd()) if inside else self.folder
-
-    @property
-    def is_trial(self) -> bool:
-        """Whether ``trainer.fast_dev_run`` asks for a step of each stage, with nothing kept."""
-        return bool(self.config.trainer.get("fast_dev_run"))
+        self.chooses_size = False
+        self.step_began = time.perf_counter()
 
     @property
     def step_seconds(self) -> float:
         """Wall clock since the step before ended; of the first step, since the run began."""
         return round(time.perf_counter() - self.step_began, 2)
-
-    @cached_property
-    def command(self) -> dict[str, Any]:
-        """What this run is learned with, as it was composed."""
-        return present_command(self._composed)
 
     @cached_property
     def datamodule(self) -> SceneDataModule:
@@ -105,17 +106,6 @@ class RunContext:
         if self.chooses_size:
             self.config.data.downscale = self.datamodule.downscale
         return scene
-
-    @cached_property
-    def protocol(self) -> Protocol:
-        """Which data trains which part of the method."""
-        protocol: Protocol = instantiate(self.config.protocol, _convert_="all")
-        return protocol
-
-    @property
-    def learning_stages(self) -> tuple[str, ...]:
-        """Names of the protocol's stages, in their order."""
-        return tuple(self.protocol.stages)
 
     @property
     def stages_with_images(self) -> tuple[str, ...]:
@@ -140,23 +130,14 @@ class RunContext:
             DevrfError: there is none.
         """
         known = self.stages_with_images
-        left = tuple(name for name in names if name in known)
-        if left:
+        if left := tuple(name for name in names if name in known):
             return left
+        what, instead = f"stage={names[0]}: learns motion", "stage=pipeline"
+        if not known:
+            what = f"protocol={self.protocol.name}: learns from images in motion"
+            instead = "protocol=two_stage"
         at_rest = f"{self.config.scene} is at rest: all its images show one moment"
-        if known:
-            raise DevrfError(
-                f"stage={names[0]}: learns motion, but {at_rest}; use stage={known[0]} or "
-                "stage=pipeline"
-            )
-        raise DevrfError(
-            f"protocol={self.protocol.name}: learns from images in motion, but {at_rest}; use "
-            "protocol=two_stage"
-        )
-
-    def stage_key(self, name: str) -> str:
-        """The config key of a stage: its own name, or ``ray_stage``."""
-        return name if name in self.config else "ray_stage"
+        raise DevrfError(f"{what}, but {at_rest}; use {instead}")
 
     def stage_builder(self, name: str) -> Callable[..., Stage]:
         """A function that builds a stage, given ``rest`` if it builds on another.
@@ -164,23 +145,23 @@ class RunContext:
         Raises:
             DevrfError: the method has no such stage, or the protocol asks what it cannot do.
         """
-        key = self.stage_key(name)
+        key = name if name in self.config else "ray_stage"
         if key not in self.config:
             raise DevrfError(
                 f"protocol: method={self.config.method} does not learn by "
                 f"protocol={self.protocol.name}; it has no stage {name!r}"
             )
         build: partial[Stage] = instantiate(self.config[key], _partial_=True, _convert_="all")
-        if key == name:
-            build.func.check_settings(**build.keywords)  # type: ignore[attr-defined]
-            if self.protocol.freeze is not True:
-                raise DevrfError(
-                    f"protocol.freeze: method={self.config.method} has stages of its own, which "
-                    f"freeze what they build on; expected true, not {self.protocol.freeze}"
-                )
-            return build
-        build.keywords["model"].check_protocol(self.protocol.name)
-        return partial(build, step=self.protocol[name], static_share=self.protocol.static_share)
+        if key == "ray_stage":
+            build.keywords["model"].check_protocol(self.protocol.name)
+            return partial(build, step=self.protocol[name], static_share=self.protocol.static_share)
+        build.func.check_settings(**build.keywords)  # type: ignore[attr-defined]
+        if self.protocol.freeze is not True:
+            raise DevrfError(
+                f"protocol.freeze: method={self.config.method} has stages of its own, which "
+                f"freeze what they build on; expected true, not {self.protocol.freeze}"
+            )
+        return build
 
     @cached_property
     def logger(self) -> Any:
@@ -212,53 +193,16 @@ class RunContext:
         log.info("the scene is at %s while it is learned", settings.address)
         return session
 
-    def close(self, *, failed: bool) -> None:
-        """End the tracking of the run, and the viewer's page, if they began."""
+    def __enter__(self) -> RunContext:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        # End the viewer's page, and the tracking of the run, if they began.
         if "page" in self.__dict__:
             self.page.close()
         if "logger" in self.__dict__:
             for tracker in self.trackers:
-                tracker.close(failed=failed)
-
-    @cached_property
-    def strategy(self) -> Strategy:
-        """The configured trainer's strategy: its device, rank and number of processes.
-
-        Raises:
-            DevrfError: several processes without ``trainer=ddp``, or what only Lightning's own
-                optimiser steps have.
-        """
-        trainer: Trainer = instantiate(self.config.trainer, logger=False)
-        own = "stages take optimiser steps of their own; leave it out"
-        if trainer.accumulate_grad_batches != 1:
-            rays = "schedule.canonical.rays, schedule.deformation.rays or ray_stage.schedule.rays"
-            raise DevrfError(f"trainer.accumulate_grad_batches: {own}; {rays} sizes batches")
-        if trainer.gradient_clip_val:
-            raise DevrfError(
-                f"trainer.gradient_clip_val: {own}; where a loss diverges, "
-                "callbacks.divergence_guard lowers the learning rates"
-            )
-        if trainer.world_size > 1 and not isinstance(trainer.strategy, ManualDDP):
-            raise DevrfError(
-                f"trainer.devices: {trainer.world_size} processes need trainer=ddp; give both"
-            )
-        return trainer.strategy
-
-    @property
-    def leads(self) -> bool:
-        """Whether this process writes files and logs: rank 0, or the only one."""
-        return bool(self.strategy.is_global_zero)
-
-    @property
-    def device(self) -> torch.device:
-        """The trainer's device."""
-        return self.strategy.root_device
-
-    @cached_property
-    def evaluation(self) -> Evaluation:
-        """What is measured on held-out views."""
-        chosen: Evaluation = instantiate(self.config.evaluation, _convert_="all")
-        return chosen
+                tracker.close(failed=kind is not None)
 
     def own_checkpoint(self, name: str) -> Path:
         """The run's checkpoint of the stage ``name``, whether it exists or not."""
@@ -276,15 +220,13 @@ class RunContext:
             if not Path(self.config.ckpt).is_file():
                 raise DevrfError(f"{self.config.ckpt}: no such checkpoint; set ckpt to a file")
             return Path(self.config.ckpt)
-        names = self.learning_stages[::-1] if name is None else (name,)
-        for path in map(self.own_checkpoint, names):
-            left = progress_files(path.parent, path.stem) if name is None else []
-            if path.exists() or left:
-                return path if path.exists() else left[0]
-        raise DevrfError(
-            f"{self.own_checkpoint(names[-1])}: no such checkpoint; run stage={names[-1]} "
-            "first, or give ckpt=PATH"
-        )
+        for stage in self.learning_stages[::-1] if name is None else (name,):
+            path = self.own_checkpoint(stage)
+            left = progress_files(path.parent, stage) if name is None else []
+            for found in [path, *left]:
+                if found.exists():
+                    return found
+        raise DevrfError(f"{path}: no such checkpoint; run stage={stage} first, or give ckpt=PATH")
 
     def load(self, name: str | None = None, scene: Scene | None = None) -> LoadedCheckpoint:
         """Load :meth:`checkpoint`; one that builds on another than the run's is passed over.
@@ -292,12 +234,36 @@ class RunContext:
         It has to be of the ``scene``; None takes any.
         """
         path = self.checkpoint(name)
-        loaded = load_checkpoint(path, scene, self.device)
-        if self.config.ckpt is None and loaded.metadata.stage in self.learning_stages:
-            below = self.protocol[loaded.metadata.stage].builds_on
-            rest = loaded.metadata.training_config.get(OWN_REST)
-            base = None if below is None else self.own_checkpoint(below)
-            if rest and base is not None and base.is_file() and digest_of(base) != rest:
+        metadata = metadata_of(path)
+        if self.config.ckpt is None and metadata.stage in self.learning_stages:
+            below = self.protocol[metadata.stage].builds_on
+            base = self.own_checkpoint(str(below))
+            rest = metadata.training_config.get(OWN_REST)
+            if rest and base.is_file() and digest_of(base) != rest:
                 log.info("%s: left out, it belongs to another %s.ckpt than the run's", path, below)
-                return load_checkpoint(base, scene, self.device)
-        return loaded
+                path = base
+        return load_checkpoint(path, scene, self.device)
+
+
+def _strategy(config: DictConfig) -> Strategy:
+    """The configured trainer's strategy.
+
+    Raises:
+        DevrfError: several processes without ``trainer=ddp``, or what only Lightning's own
+            optimiser steps have.
+    """
+    trainer: Trainer = instantiate(config.trainer, logger=False)
+    own = "stages take optimiser steps of their own; leave it out"
+    if trainer.accumulate_grad_batches != 1:
+        rays = "schedule.canonical.rays, schedule.deformation.rays or ray_stage.schedule.rays"
+        raise DevrfError(f"trainer.accumulate_grad_batches: {own}; {rays} sizes batches")
+    if trainer.gradient_clip_val:
+        raise DevrfError(
+            f"trainer.gradient_clip_val: {own}; where a loss diverges, "
+            "callbacks.divergence_guard lowers the learning rates"
+        )
+    if trainer.world_size > 1 and not isinstance(trainer.strategy, ManualDDP):
+        raise DevrfError(
+            f"trainer.devices: {trainer.world_size} processes need trainer=ddp; give both"
+        )
+    return trainer.strategy

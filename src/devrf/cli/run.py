@@ -36,6 +36,8 @@ from devrf.engine.ddp import ManualDDP
 from devrf.engine.workers import launch_workers
 from devrf.errors import DevrfError, did_you_mean
 from devrf.evaluation.objective import check_objective, objective
+from devrf.kernels import runtime
+from devrf.kernels.ahead import compile_ahead
 from devrf.system.folder_lock import PLACE
 from devrf.system.memory import shortage_in_words
 
@@ -94,8 +96,11 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
     Raises:
         DevrfError: the input is wrong.
     """
+    runtime.choose(config.kernels, deterministic=config.deterministic)
     with RunContext(config, folder) as run:
         learning, steps = plan(config.stage, run.learning_stages)
+        if learning and "field" in config:  # while the scene is read
+            compile_ahead({config.field.channels}, run.device)
         if learning and run.is_trial:
             steps = ()  # nothing of it is worth a score or a video
         with shortage_in_words(config.stage, run.device, None):  # of networks that are too wide

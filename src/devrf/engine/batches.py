@@ -7,10 +7,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from devrf.data.batch import PixelPool, RayBatch, all_pixels, wanted_pixels
-from devrf.geometry.rays import Rays
+from devrf.data.batch import (
+    PixelPool,
+    RayBatch,
+    all_pixels,
+    pixel_positions,
+    wanted_pixels,
+)
 from devrf.geometry.space import WORLD, Space
-from devrf.ops.pixel_rays import gather_pixels
 from devrf.scenes.scene import Views
 
 
@@ -27,31 +31,29 @@ def gather_batch(
         space: the space that the fields live in.
     """
     assert views.frames is not None, "views of a scene know their frames"
-    cameras = views.cameras
-    flow = views.flow
-    gathered = gather_pixels(
-        image,
-        flat,
-        views.pixels,
-        cameras.camera_to_world,
-        cameras.focal,
-        cameras.center,
-        background,
-        views.times,
-        views.frames,
-        None if flow is None else (flow.vectors, flow.valid),
-    )
+    place = image * (views.height * views.width) + flat
+    pixel = pixel_positions(flat, views.width)
+    shown = views.pixels.flatten(0, 2).index_select(0, place).float() / 255
+    color = shown[:, :3]
+    alpha = shown[:, 3] if views.has_alpha else None
+    if alpha is not None:
+        color = background + alpha[:, None] * (color - background)
+    flow = flow_valid = None
+    if views.flow is not None:
+        flow_valid = views.flow.valid.flatten()[place]
+        # What was observed where it is not valid may be anything, NaN included.
+        flow = torch.where(flow_valid[:, None], views.flow.vectors.flatten(0, 2)[place], 0.0)
     return RayBatch(
-        rays=space.rays(Rays(gathered.origins, gathered.directions, gathered.directions)),
-        color=gathered.color,
-        alpha=gathered.alpha,
+        rays=space.rays(views.cameras.rays(image, pixel)),
+        color=color,
+        alpha=alpha,
         background=background,
-        time=gathered.time,
-        frame=gathered.frame,
+        time=views.times[image],
+        frame=views.frames[image],
         image=image,
-        pixel=gathered.pixel,
-        flow=gathered.flow,
-        flow_valid=gathered.flow_valid,
+        pixel=pixel,
+        flow=flow,
+        flow_valid=flow_valid,
     )
 
 

@@ -38,10 +38,10 @@ from devrf.engine.ddp import (
     rays_per_rank,
     world_size,
 )
+from devrf.engine.grid_adam import GridAdam
 from devrf.engine.phase import Phase
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import score
-from devrf.ops.adam import GridAdam
 from devrf.rendering.renderer import Renderer
 from devrf.rendering.view import Viewable
 from devrf.scenes.scene import CaptureName, ImagesName, Scene, Views

@@ -98,10 +98,12 @@ class Cameras:
         Returns:
             M rays with unit directions that start at the camera centres.
         """
-        x, y = ((pixels - self.center[camera]) / self.focal[camera]).unbind(-1)
-        local = torch.stack([x, -y, -torch.ones_like(x)], dim=-1)
-        pose = self.camera_to_world[camera]
-        directions = (pose[:, :, :3] * local[:, None, :]).sum(dim=-1)
+        center = self.center.index_select(0, camera)
+        place = (pixels - center) / self.focal.index_select(0, camera)
+        x, y = place[..., None].unbind(1)
+        pose = self.camera_to_world.index_select(0, camera)
+        right, up, backward, _ = pose.unbind(-1)
+        directions = right * x - up * y - backward
         directions = torch.nn.functional.normalize(directions, dim=-1)
         return Rays(pose[:, :, 3], directions, directions)
 
@@ -116,9 +118,12 @@ class Cameras:
             pixels (M, 2) as x, y, and the depth (M,) along the optical axis in world units;
             a point with depth ≤ 0 is behind the camera and its pixel means nothing.
         """
-        pose = self.camera_to_world[camera]
-        local = (pose[:, :, :3] * (points - pose[:, :, 3])[:, :, None]).sum(dim=-2)
-        return _on_image(local, self.focal[camera], self.center[camera])
+        pose = self.camera_to_world.index_select(0, camera)
+        x, y, z = (points - pose[:, :, 3])[..., None].unbind(1)
+        # Not by bmm, whose sums depend on the number of threads.
+        local = pose[:, 0, :3] * x + pose[:, 1, :3] * y + pose[:, 2, :3] * z
+        focal = self.focal.index_select(0, camera)
+        return _on_image(local, focal, self.center.index_select(0, camera))
 
     def project_into(self, camera: int, points: Tensor) -> tuple[Tensor, Tensor]:
         """As :meth:`project`, for all ``points`` (M, 3) in one camera: a matrix product."""

@@ -13,13 +13,13 @@ from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import Pixels, RayBatch, concatenated
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.batches import FramePool, gather_batch
+from devrf.engine.grid_adam import GridAdam
 from devrf.engine.phase import Phase
 from devrf.engine.stage import Stage
 from devrf.errors import expect
 from devrf.methods.base import RayTrainable
 from devrf.methods.protocol import ProtocolStage
 from devrf.methods.weighted_loss import counted_weights, visibility, weighted_sum
-from devrf.ops.adam import GridAdam
 from devrf.scenes.scene import Views
 from devrf.scenes.space import dynamic_only
 from devrf.system.profiling import span

@@ -1,156 +1,93 @@
-"""Adam for voxel grids: skips entries without gradient, allows a rate for each voxel."""
+"""One step of Adam on a tensor, and the gradient of a grid's total variation."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from devrf.ops.adam_step import AdamRule, adam_step, add_total_variation_gradient
 
+@dataclass(frozen=True)
+class AdamRule:
+    """Settings of a step of Adam (Kingma & Ba 2015), with additions for voxel grids.
 
-class GridAdam(torch.optim.Optimizer):
-    """Adam (Kingma & Ba 2015) with additions for voxel grids.
-
-    Each parameter group takes, beside ``lr``, ``betas`` and ``eps``:
-
-    * ``skip_zero``: an entry whose gradient is exactly zero keeps its value *and its moments*:
-      momentum does not move a voxel that no sample of this batch touched. Its gradient stays in the
-      same memory: to make one anew takes longer than to clear the few rows that were touched.
-    * ``rows``: None, or the voxels (K,) outside which no gradient of these grids is read.
-    * ``per_voxel_lr``: None, or a tensor (X, Y, Z, 1) of factors of the learning rate.
-    * ``smoothing``: weight of the total variation of each grid, whose gradient is added to that
-      of the backward pass; ``along_z`` times as much between neighbours along z.
-    * ``touched_only``: add it only to entries that have a gradient.
-
+    Attributes:
+        rate: learning rate.
+        step: number of this step, 1 for the first.
+        betas: decay of the mean and of the square.
+        eps: added to the root of the square.
+        skip_zero: an entry whose gradient is exactly zero keeps its value *and its moments*.
+        per_voxel_lr: None, or factors (X, Y, Z, 1) of the learning rate.
     """
 
-    def __init__(
-        self,
-        params: Iterable[Any],
-        lr: float = 1e-3,
-        betas: tuple[float, float] = (0.9, 0.99),
-        eps: float = 1e-8,
-    ) -> None:
-        defaults = {
-            "lr": lr,
-            "betas": betas,
-            "eps": eps,
-            "skip_zero": False,
-            "per_voxel_lr": None,
-            "rows": None,
-            "smoothing": 0.0,
-            "along_z": 1.0,
-            "touched_only": False,
-        }
-        super().__init__(params, defaults)
+    rate: float
+    step: int
+    betas: tuple[float, float] = (0.9, 0.99)
+    eps: float = 1e-8
+    skip_zero: bool = False
+    per_voxel_lr: Tensor | None = None
 
-    def step(self, closure: Callable[[], Any] | None = None) -> Any:
-        """One step on every parameter that has a gradient, after ``closure``.
+    @property
+    def corrections(self) -> tuple[float, float]:
+        """1 − β₁ᵗ and 1 − β₂ᵗ."""
+        beta1, beta2 = self.betas
+        return 1 - beta1**self.step, 1 - beta2**self.step
 
-        Gradients are zero afterwards where they are kept, and gone elsewhere.
-        """
-        result = None
-        if closure is not None:
-            with torch.enable_grad():
-                result = closure()
-        for group in self.param_groups:
-            self._step(group)
-        return result
 
-    @torch.no_grad()
-    def _step(self, group: dict[str, Any]) -> None:
-        """One step on the parameters of a group."""
-        names = "betas", "eps", "skip_zero", "per_voxel_lr", "rows"
-        options = {name: group[name] for name in names}
-        kept = group["skip_zero"]
-        for parameter in self._learned(group):
-            gradient, state = parameter.grad, self._state_of(parameter)
-            assert gradient is not None
-            if group["smoothing"]:
-                add_total_variation_gradient(
-                    parameter,
-                    gradient,
-                    group["smoothing"],
-                    along_z=group["along_z"],
-                    touched_only=group["touched_only"],
-                )
-            state["steps"] += 1
-            rule = AdamRule(group["lr"], state["steps"], **options)
-            adam_step(parameter, gradient, state["mean"], state["square"], rule, clear=kept)
-            if not kept:
-                parameter.grad = None
+def adam_step(
+    values: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, rule: AdamRule
+) -> None:
+    """Step in place.
 
-    def _learned(self, group: dict[str, Any]) -> list[Tensor]:
-        """The group's parameters that have a gradient, or get one from their total variation."""
-        learned = []
-        for parameter in group["params"]:
-            if parameter.grad is None:
-                if not group["smoothing"] or group["touched_only"]:
-                    continue
-                parameter.grad = torch.zeros_like(parameter)
-            learned.append(parameter)
-        return learned
+    ``m ← β₁m + (1 − β₁)g``, ``s ← β₂s + (1 − β₂)g²``,
+    ``v ← v − rate·per_voxel_lr · (m / (1 − β₁ᵗ)) / (√(s / (1 − β₂ᵗ)) + ε)``.
 
-    def _state_of(self, parameter: Tensor) -> dict[str, Any]:
-        """The parameter's number of steps () and its moments; zero at first."""
-        state: dict[str, Any] = self.state[parameter]
-        if not state:
-            # Not "step": torch leaves a loaded entry of that name on the device it was loaded to.
-            state["steps"] = torch.zeros((), dtype=torch.float64, device=parameter.device)
-            state["mean"] = torch.zeros_like(parameter)
-            state["square"] = torch.zeros_like(parameter)
-        return state
+    Args:
+        values: of any shape; (X, Y, Z, C) with ``per_voxel_lr``.
+        gradient: the same shape; zero afterwards.
+        mean: first moments m, the same shape, changed in place.
+        square: second moments s, likewise.
+        rule: the settings.
+    """
+    beta1, beta2 = rule.betas
+    first, second = rule.corrections
+    stepped = gradient != 0 if rule.skip_zero else torch.ones_like(gradient, dtype=torch.bool)
+    mean.copy_(torch.where(stepped, beta1 * mean + (1 - beta1) * gradient, mean))
+    square.copy_(torch.where(stepped, beta2 * square + (1 - beta2) * gradient**2, square))
+    move = rule.rate * (mean / first) / ((square / second).sqrt() + rule.eps)
+    if rule.per_voxel_lr is not None:
+        move = move * rule.per_voxel_lr
+    values.sub_(torch.where(stepped, move, 0.0))
+    gradient.zero_()
 
-    def zero_grad(self, set_to_none: bool = True) -> None:
-        """Remove all gradients; those that are kept are set to zero."""
-        for group in self.param_groups:
-            for parameter in group["params"]:
-                if group["skip_zero"] and parameter.grad is not None:
-                    parameter.grad.zero_()
-                else:
-                    parameter.grad = None
 
-    def make_gradients(self) -> None:
-        """Make those gradients that are kept and are not there yet, before a backward pass."""
-        for group in self.param_groups:
-            for parameter in group["params"] if group["skip_zero"] else ():
-                if parameter.grad is None:
-                    parameter.grad = torch.zeros_like(parameter)
+def add_total_variation_gradient(
+    grid: Tensor,
+    gradient: Tensor,
+    weight: float,
+    *,
+    along_z: float = 1.0,
+    touched_only: bool = False,
+) -> None:
+    """Add ``weight`` times the gradient of a grid's total variation to ``gradient`` in place.
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore a state, on the parameters' device."""
-        super().load_state_dict(state_dict)
-        for state in self.state.values():
-            # torch has converted it to the parameter's type.
-            state["steps"] = state["steps"].double()
-        for group in self.param_groups:
-            group.setdefault("rows", None)  # all of them, as before there was a choice
-            for name in ("per_voxel_lr", "rows"):
-                if group[name] is not None:
-                    group[name] = group[name].to(group["params"][0].device)
+    The total variation is Σ over pairs of neighbours of h(v − v'), with the Huber penalty
+    h(d) = d²/2 for |d| ≤ 1 and |d| − 1/2 beyond. Its derivative at a voxel is
+    Σ_neighbours clamp(v − v', −1, 1).
 
-    def replace(self, group: int, parameters: Sequence[Tensor], **settings: Any) -> None:
-        """Give a group other parameters, such as a resized grid, with zero moments.
-
-        Args:
-            group: its index.
-            parameters: the new parameters.
-            settings: further settings of the group; ``per_voxel_lr`` and ``rows`` are None unless
-                given.
-        """
-        for old in self.param_groups[group]["params"]:
-            self.state.pop(old, None)
-        self.param_groups[group]["params"] = list(parameters)
-        self.param_groups[group].update({"per_voxel_lr": None, "rows": None, **settings})
-        self.make_gradients()
-
-    def forget(self) -> None:
-        """Zero all moments, step counts and gradients; the parameters stay."""
-        for parameter in (each for group in self.param_groups for each in group["params"]):
-            for value in self.state.get(parameter, {}).values():
-                value.zero_()
-            if parameter.grad is not None:
-                parameter.grad.zero_()
+    Args:
+        grid: (X, Y, Z, C).
+        gradient: the same shape.
+        weight: factor of the penalty.
+        along_z: further factor between neighbours along z.
+        touched_only: add only to entries that are not zero.
+    """
+    slopes = torch.zeros_like(grid)
+    for axis in range(3):
+        factor = weight * along_z if axis == 2 else weight
+        slope = factor * grid.diff(dim=axis).clamp(-1, 1)
+        length = grid.shape[axis] - 1
+        slopes.narrow(axis, 1, length).add_(slope)
+        slopes.narrow(axis, 0, length).sub_(slope)
+    gradient.add_(torch.where(gradient != 0, slopes, 0.0) if touched_only else slopes)

@@ -5,11 +5,10 @@ See docs/method.md#colour.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd.function import FunctionCtx
 from torch.nn.functional import linear
 
 
@@ -47,23 +46,22 @@ def decode(
 ) -> Tensor:
     """RGB (S, 3) in [0, 1] of samples.
 
-    The first layer is split: its direction part is computed once a ray, not once a sample.
-
     Args:
         features: (S, C) interpolated features.
         viewdirs: (R, 3) unit directions of the rays, in world space.
-        ray: (S,) int64, the ray of each sample.
+        ray: (S,) int64, ascending, the ray of each sample.
         network: the network.
         precision: what the hidden layers and their gradients are computed in. Weights,
             sums, and the last layer stay in single precision, so that colours do.
         residual: (S, 3) what is added before the sigmoid; None: nothing.
     """
-    encoded = _encode(viewdirs, network.octaves)
-    by_ray = _linear(encoded, network.direction_weight, None, precision)
-    from_ray: Tensor = RowOfRay.apply(by_ray, ray)  # type: ignore[no-untyped-call]
+    # Most rays of a picture have no samples: their directions are not encoded.
+    seen, place = torch.unique_consecutive(ray, return_inverse=True)
+    encoded = _encode(viewdirs.index_select(0, seen), network.octaves).index_select(0, place)
+    first = torch.cat([network.feature_weight, network.direction_weight], dim=1)
     # In place: no layer's gradient needs what it gave before its activation.
-    x = _linear(features, network.feature_weight, network.feature_bias, precision)
-    x = x.add_(from_ray).relu_()
+    x = torch.cat([features, encoded], dim=1)
+    x = _linear(x, first, network.feature_bias, precision).relu_()
     x = _linear(x, network.hidden_weight, network.hidden_bias, precision).relu_()
     logits = linear(x.to(network.output_weight.dtype), network.output_weight, network.output_bias)
     if residual is not None:
@@ -76,31 +74,8 @@ def _encode(viewdirs: Tensor, octaves: Tensor) -> Tensor:
     return torch.cat([viewdirs, angles.sin(), angles.cos()], dim=-1)
 
 
-def _linear(x: Tensor, weight: Tensor, bias: Tensor | None, precision: torch.dtype) -> Tensor:
+def _linear(x: Tensor, weight: Tensor, bias: Tensor, precision: torch.dtype) -> Tensor:
     """A layer of ``x`` (S, C), computed in ``precision``; float32 leaves it its own."""
     if precision == torch.float32:
         return linear(x, weight, bias)
-    reduced = None if bias is None else bias.to(precision)
-    return linear(x.to(precision), weight.to(precision), reduced)
-
-
-class RowOfRay(torch.autograd.Function):
-    """rows[ray] (S, C) of ``rows`` (R, C); its gradient is summed over a ray in single precision.
-
-    Many samples add to one row: sums of bfloat16 lose digits, and GPUs before sm_90 add them in
-    loops of compare and swap.
-    """
-
-    @staticmethod
-    def forward(ctx: FunctionCtx, rows: Tensor, ray: Tensor) -> Tensor:
-        """Look the rows up."""
-        ctx.save_for_backward(ray)
-        ctx.rays = len(rows)  # type: ignore[attr-defined]
-        return rows.index_select(0, ray)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        """Sum over the samples of each ray."""
-        (ray,) = ctx.saved_tensors
-        sums = gradient.new_zeros((ctx.rays, gradient.shape[1]), dtype=torch.float32)
-        return sums.index_add_(0, ray, gradient.float()).to(gradient.dtype), None
+    return linear(x.to(precision), weight.to(precision), bias.to(precision))

@@ -6,11 +6,8 @@ T_i = Π_{j<i} (1 − α_j) = exp(−Σ_{j<i} τ_j), without logarithms of numbe
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 
 def composite(depth: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
@@ -25,17 +22,19 @@ def composite(depth: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
         rays: R; a ray may have no sample.
 
     Returns:
-        weights (S,) and end transmittance (R,), differentiable once in ``depth``.
+        weights (S,) and end transmittance (R,), differentiable in ``depth``.
     """
-    weights, end = _Composite.apply(depth, ray, rays)  # type: ignore[no-untyped-call]
-    return weights, end
+    edges = firsts(ray, rays)
+    passed = running_sum(depth)
+    before = torch.exp(passed[edges[ray]] - passed[:-1]).to(depth.dtype)
+    end = torch.exp(passed[edges[:-1]] - passed[edges[1:]]).to(depth.dtype)
+    return before * -torch.expm1(-depth), end
 
 
 def transmittances(depth: Tensor, ray: Tensor, rays: int) -> Tensor:
     """Transmittance T_i (S,) before each sample; arguments as for :func:`composite`."""
-    first = firsts(ray, rays)[:-1]
-    reached = running_sum(depth)
-    return torch.exp(reached[first[ray]] - reached[:-1]).to(depth.dtype)
+    passed = running_sum(depth)
+    return torch.exp(passed[firsts(ray, rays)[ray]] - passed[:-1]).to(depth.dtype)
 
 
 def sum_by_ray(values: Tensor, ray: Tensor, rays: int) -> Tensor:
@@ -59,28 +58,6 @@ def color_and_depth(
         background: (3,) or (R, 3) RGB.
     """
     return weighted_color + transmittance[:, None] * background, reached / mass.clamp(min=1e-6)
-
-
-class _Composite(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, depth: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
-        edges = firsts(ray, rays)
-        first, last = edges[:-1], edges[1:]
-        reached = running_sum(depth)
-        transmittance = torch.exp(reached[first[ray]] - reached[:-1]).to(depth.dtype)
-        weights = transmittance * -torch.expm1(-depth)
-        end = torch.exp(reached[first] - reached[last]).to(depth.dtype)
-        ctx.save_for_backward(depth, ray, first, last, transmittance, weights, end)
-        return weights, end
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad_weights: Tensor, grad_end: Tensor) -> tuple[Tensor, None, None]:
-        depth, ray, first, last, transmittance, weights, end = ctx.saved_tensors
-        shadowed = running_sum(grad_weights * weights)
-        behind = (shadowed[last][ray] - shadowed[1:]).to(depth.dtype)
-        transmitted = grad_weights * transmittance * torch.exp(-depth)
-        return transmitted - behind - (grad_end * end)[ray], None, None
 
 
 def firsts(ray: Tensor, rays: int) -> Tensor:

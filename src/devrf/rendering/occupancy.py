@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from devrf.geometry.box import Box
+from devrf.ops.march import Surroundings
 
 
 class Occupancy(nn.Module):
@@ -19,16 +20,16 @@ class Occupancy(nn.Module):
     """
 
     mask: Tensor
-    _vicinity: Tensor | None
+    _distances: Tensor | None
 
-    # Grid points by which the vicinity exceeds the mask.
-    REACH = 2
+    # Distances to occupied cells are counted up to this many.
+    FARTHEST = 8
 
     def __init__(self, mask: Tensor, box: Box) -> None:
         super().__init__()
         self.box = box
         self.register_buffer("mask", mask)
-        self.register_buffer("_vicinity", None, persistent=False)
+        self.register_buffer("_distances", None, persistent=False)
 
     @staticmethod
     def full(shape: tuple[int, int, int], box: Box) -> Occupancy:
@@ -36,17 +37,20 @@ class Occupancy(nn.Module):
         return Occupancy(torch.ones(shape, dtype=torch.bool), box)
 
     @property
-    def vicinity(self) -> Tensor:
-        """The mask dilated by ``REACH`` grid points, to test segments of a ray at once."""
-        if self._vicinity is None:  # lists are made without it
-            self._vicinity = dilate(self.mask, self.REACH)
-        return self._vicinity
+    def surroundings(self) -> Surroundings:
+        """How many cells away something may be, so that rays can skip what is empty."""
+        if self._distances is None:
+            grown, away = self.mask, (~self.mask).to(torch.uint8)
+            for _ in range(self.FARTHEST - 1):
+                grown = dilate(grown, 1)
+                away += ~grown
+            self._distances = away
+        return Surroundings(self._distances, self.box)
 
     @property
-    def reach(self) -> float:
-        """Distance in the box's units by which the vicinity exceeds the mask at least."""
-        cells = zip(self.box.size, self.mask.shape, strict=True)
-        return (self.REACH - 0.5) * min(edge / (n - 1) for edge, n in cells)
+    def cell(self) -> float:
+        """The shortest edge of a cell, in the box's units."""
+        return min(edge / (n - 1) for edge, n in zip(self.box.size, self.mask.shape, strict=True))
 
     @property
     def share(self) -> float:
@@ -55,11 +59,15 @@ class Occupancy(nn.Module):
 
     def at(self, points: Tensor) -> Tensor:
         """Mask (M,): whether something may be at ``points`` (M, 3)."""
-        return self._look_up(self.mask, points)
-
-    def near(self, points: Tensor) -> Tensor:
-        """Mask (M,): whether something may be within :attr:`reach` of ``points`` (M, 3)."""
-        return self._look_up(self.vicinity, self.box.nearest(points))
+        x, y, z = self.mask.shape
+        # Axis by axis: several times faster than rows of three.
+        along = self.box.to_grid(points, (x, y, z)).round_().to(torch.int32).t().contiguous()
+        inside = torch.ones_like(along[0], dtype=torch.bool)
+        row = torch.zeros_like(along[0])
+        for cell, count in zip(along, self.mask.shape, strict=True):
+            inside &= (cell >= 0) & (cell < count)
+            row.mul_(count).add_(cell)
+        return self.mask.view(-1).index_select(0, row.mul_(inside)) & inside
 
     def points_near(self, shape: tuple[int, int, int], box: Box) -> Tensor:
         """The points of a grid over ``box`` that interpolation near anything occupied reads."""
@@ -70,27 +78,16 @@ class Occupancy(nn.Module):
         points = box.grid_points(shape, torch.empty(0, device=self.mask.device))
         return dilate(grown.at(points.view(-1, 3)).view(shape), 1)
 
-    def _look_up(self, mask: Tensor, points: Tensor) -> Tensor:
-        x, y, z = mask.shape
-        # Axis by axis: several times faster than rows of three.
-        along = self.box.to_grid(points, (x, y, z)).round_().to(torch.int32).t().contiguous()
-        inside = torch.ones_like(along[0], dtype=torch.bool)
-        row = torch.zeros_like(along[0])
-        for cell, count in zip(along, mask.shape, strict=True):
-            inside &= (cell >= 0) & (cell < count)
-            row.mul_(count).add_(cell)
-        return mask.view(-1).index_select(0, row.mul_(inside)) & inside
-
     def replace(self, mask: Tensor, box: Box | None = None) -> None:
         """Replace the mask by one of any shape, and the box if one is given."""
         self.mask = mask
-        self._vicinity = None
+        self._distances = None
         self.box = box or self.box
 
     def refill(self, other: Occupancy) -> None:
         """Copy another occupancy of the same shape and box into the same memory."""
         self.mask.copy_(other.mask)
-        self._vicinity = other._vicinity
+        self._distances = other._distances
 
     def _load_from_state_dict(
         self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any

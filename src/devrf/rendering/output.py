@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from devrf.rendering.sampling import Samples
+from devrf.ops.march import Samples
 
 # Canonical points (M, 3) → what is added to the logits of their colours, (M, 3).
 ColorChange = Callable[[Tensor], Tensor]
@@ -67,16 +67,12 @@ class VoxelOutput(RenderOutput):
     """What R rays see, and the K samples whose colour was computed.
 
     Attributes:
-        samples: at their positions x_i at the rays' time.
-        canonical: (K, 3) their canonical positions q_i.
-        weight: (K,) their weights w_i.
+        samples: their positions x_i at the rays' time and q_i in canonical space, and weights w_i.
         sample_color: (K, 3) their colours c_i.
         residual: (K, 3) A_t(q_i) in logits; None without one.
     """
 
     samples: Samples
-    canonical: Tensor
-    weight: Tensor
     sample_color: Tensor
     residual: Tensor | None = None
 
@@ -92,4 +88,4 @@ class VoxelOutput(RenderOutput):
         """Ray (S,), position q (S, 3) and weight (S,) of the samples on ``chosen`` (R,) rays."""
         ray = self.samples.ray
         index = chosen[ray].nonzero()[:, 0]
-        return ray[index], self.canonical[index], self.weight[index]
+        return ray[index], self.samples.canonical[index], self.samples.weight[index]

@@ -10,8 +10,6 @@ from torch.autograd import profiler
 Part = Literal[
     "batch",
     "sampling",
-    "warp",
-    "density",
     "decoder",
     "compositing",
     "losses",

@@ -10,21 +10,12 @@ from torch import Tensor, nn
 
 from devrf.checkpoints.stored_grids import StoredShape
 from devrf.geometry.box import Box
+from devrf.kernels.look_up import look_up
 from devrf.ops.color_network import ColorNetwork, decode
-from devrf.ops.corners import shape_of, to_grid
-from devrf.ops.trilinear import interpolate, kept_gradient, resample
+from devrf.ops.trilinear import resample
 
 # What a checkpoint holds beside the tensors and the box.
 SIZES = ("voxels", "base_voxels", "alpha_init", "planes", "aspect")
-
-
-def look_up(grid: Tensor, points: Tensor, box: Box) -> Tensor:
-    """Trilinear values (M, C) of a ``grid`` (X, Y, Z, C) over ``box`` at ``points`` (M, 3).
-
-    Outside they are the border's. Differentiable in both.
-    """
-    coords = to_grid(points, box, shape_of(grid))
-    return interpolate(grid, coords, gradient=kept_gradient(grid))
 
 
 class VoxelGrid(StoredShape):
@@ -48,7 +39,7 @@ class VoxelGrid(StoredShape):
         return x, y, z
 
     def forward(self, points: Tensor, box: Box) -> Tensor:
-        """:func:`look_up` at ``points`` (M, 3)."""
+        """Values (M, C) at ``points`` (M, 3), trilinear; outside ``box`` they are the border's."""
         return look_up(self.values, points, box)
 
     @torch.no_grad()

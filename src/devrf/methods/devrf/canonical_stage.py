@@ -12,6 +12,7 @@ from torch import Tensor
 
 from devrf.data.batch import PixelPool, Pixels
 from devrf.engine.batches import gather_batch
+from devrf.engine.grid_adam import GridAdam
 from devrf.engine.stage import Stage
 from devrf.errors import DevrfError
 from devrf.methods.devrf.architecture import Architecture, fitted_to, resolved_voxels
@@ -38,7 +39,6 @@ from devrf.methods.devrf.settings import (
 )
 from devrf.methods.devrf.volume_rendering import render
 from devrf.methods.weighted_loss import counted_weights
-from devrf.ops.adam import GridAdam
 from devrf.ops.photometric import distortion
 from devrf.rendering.occupancy import Occupancy, bounding_box, dilate
 from devrf.rendering.sampling import RenderSettings
@@ -396,7 +396,9 @@ class CanonicalStage(Stage):
             # In unbounded space surfaces are drawn together; distances are in half edges.
             half_edge = sum(model.space.inner(model.box).size) / 6
             distance = output.samples.distance / half_edge
-            spread = distortion(output.weight, distance, output.samples.ray, len(output.color))
+            spread = distortion(
+                output.samples.weight, distance, output.samples.ray, len(output.color)
+            )
             if self.schedule.learns_directions(self.iteration):
                 total = total + self.schedule.unbounded_distortion * spread
             return total, {**terms, "distortion": spread.detach()}

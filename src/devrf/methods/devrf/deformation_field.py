@@ -11,10 +11,12 @@ from torch import Tensor
 
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
+from devrf.kernels.look_up import look_up
 from devrf.methods.devrf.frame_store import FrameField, FrameStore
-from devrf.ops.corners import shape_of, to_grid
-from devrf.ops.trilinear import interpolate, kept_gradient
 from devrf.rendering.occupancy import Occupancy, dilate
+
+# Points (M, 3) → where they move to, (M, 3).
+Warp = Callable[[Tensor], Tensor]
 
 
 @dataclass(frozen=True)
@@ -34,12 +36,19 @@ class GridWarp:
     weight: float = 0.0
     still_outside: bool = False
 
+    @property
+    def displacement(self) -> Tensor | None:
+        """Δ as one grid (X, Y, Z, 3): one look-up a point; None: the identity."""
+        if not self.slices:
+            return None
+        first, *second = self.slices
+        return first.lerp(second[0], self.weight) if second else first
+
     def __call__(self, points: Tensor) -> Tensor:
         """The points (M, 3) moved, (M, 3); differentiable in the slices and the points."""
         if not self.slices:
             return points
-        coords = to_grid(points, self.box, shape_of(self.slices[0]))
-        moves = [interpolate(frame, coords, gradient=kept_gradient(frame)) for frame in self.slices]
+        moves = [look_up(frame, points, self.box) for frame in self.slices]
         move = moves[0] if len(moves) == 1 else moves[0].lerp(moves[1], self.weight)
         if self.still_outside:
             move = torch.where(self.box.contains(points)[:, None], move, 0.0)

@@ -14,6 +14,7 @@ from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import Pixels
 from devrf.data.flow import previous_images
 from devrf.engine.batches import gather_batch
+from devrf.engine.grid_adam import GridAdam
 from devrf.engine.stage import Stage
 from devrf.errors import DevrfError
 from devrf.methods.devrf.active_frame import ActiveFrame
@@ -35,7 +36,6 @@ from devrf.methods.devrf.settings import (
     decoder_dtype,
 )
 from devrf.methods.devrf.volume_rendering import render
-from devrf.ops.adam import GridAdam
 from devrf.rendering.output import ColorChange
 from devrf.scenes.scene import CaptureName, Views
 from devrf.system.profiling import span

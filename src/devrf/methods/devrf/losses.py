@@ -13,7 +13,7 @@ from devrf.errors import expect
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import WORLD, Space
-from devrf.methods.devrf.volume_rendering import Warp
+from devrf.methods.devrf.deformation_field import Warp
 from devrf.methods.weighted_loss import visibility, weighted_sum
 from devrf.ops.motion import cycle_error, flow_error
 from devrf.ops.photometric import (
@@ -44,7 +44,10 @@ Predicted = TypeVar("Predicted", bound=Prediction)
 PHOTOMETRIC_TERMS: dict[str, Callable[[Prediction], Tensor]] = {
     "color": lambda seen: color_error(seen.output.color, seen.batch.color),
     "per_sample_color": lambda seen: per_sample_color(
-        seen.output.weight, seen.output.sample_color, seen.output.samples.ray, seen.batch.color
+        seen.output.samples.weight,
+        seen.output.sample_color,
+        seen.output.samples.ray,
+        seen.batch.color,
     ),
     "entropy": lambda seen: background_entropy(seen.output.transmittance),
     "alpha_mask": lambda seen: alpha_mask_error(seen.output.transmittance, seen.batch.alpha),
@@ -79,7 +82,7 @@ class MotionPrediction(Prediction):
 def cycle(prediction: MotionPrediction) -> Tensor:
     """L_cycle = mean_i ½ |x_i − (q_i + Δ_f(q_i, t))|² (docs/method.md#cycle)."""
     output = prediction.output
-    returned = prediction.unwarp(output.canonical)
+    returned = prediction.unwarp(output.samples.canonical)
     return output.mean_over_samples(cycle_error(output.samples.points, returned))
 
 
@@ -91,7 +94,7 @@ def flow(prediction: MotionPrediction) -> Tensor:
     """
     batch, output = prediction.batch, prediction.output
     if batch.flow is None or batch.flow_valid is None:
-        return output.canonical.new_zeros(())
+        return output.color.new_zeros(())
     ray, canonical, weight = output.on_rays(batch.flow_valid)
     induced = induced_flow(
         canonical,

@@ -18,11 +18,14 @@ from devrf.geometry.space import WORLD, Space, space_config, space_from
 from devrf.methods.base import Renderable
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField, ColorDecoder
-from devrf.methods.devrf.deformation_field import DeformationField, deformed_occupancy
+from devrf.methods.devrf.deformation_field import (
+    DeformationField,
+    GridWarp,
+    deformed_occupancy,
+)
 from devrf.methods.devrf.frame_store import NAMES, FrameField, fits_on_device
 from devrf.methods.devrf.view import CanonicalSurface, DeVRFView
-from devrf.methods.devrf.volume_rendering import Warp
-from devrf.ops.corners import shape_of
+from devrf.ops.trilinear import shape_of
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import ColorChange
 from devrf.rendering.sampling import RenderSettings
@@ -115,7 +118,7 @@ class DeVRFModel(Renderable):
             residual and residual(box, clock, voxels=8),
         )
 
-    def warp(self, time: float) -> Warp | None:
+    def warp(self, time: float) -> GridWarp | None:
         """x → x + Δ_b(x, t), points (M, 3) at ``time`` → canonical space; None is the identity."""
         warp = None if self.deformation is None else self.deformation.warp_at(time)
         return warp if warp is not None and warp.slices else None

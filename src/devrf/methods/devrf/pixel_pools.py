@@ -9,8 +9,9 @@ from devrf.data.batch import PixelPool, all_pixels, wanted_pixels
 from devrf.engine.ddp import world_size
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
+from devrf.kernels.march import rays_that_hit
+from devrf.ops.march import Path
 from devrf.rendering.occupancy import Occupancy
-from devrf.rendering.sampling import hits
 from devrf.rendering.view import Viewable
 from devrf.scenes.scene import Views
 
@@ -47,7 +48,15 @@ def rays_hit_occupied(
     for start in range(0, len(images), together):
         some = images[start : start + together]
         rays = coarse.rays(some.repeat_interleave(len(pixels)), pixels.repeat(len(some), 1))
-        hit = hits(model.space.rays(rays), model.box, occupancy, near=near, far=far)
+        field_rays = model.space.rays(rays)
+        path = Path(
+            box=model.box,
+            surroundings=occupancy.surroundings,
+            step=occupancy.cell / max(field_rays.pace, 1e-9),
+            near=near,
+            far=far,
+        )
+        hit = rays_that_hit(field_rays, path)
         rows = hit.view(-1, height, width).repeat_interleave(BLOCK, dim=1)[:, : cameras.height]
         masks.append(rows.repeat_interleave(BLOCK, dim=2)[:, :, : cameras.width].flatten(1))
     return torch.cat(masks)

@@ -17,14 +17,15 @@ from devrf.methods.devrf.losses import induced_flow
 from devrf.methods.devrf.volume_rendering import render
 from devrf.ops.compositing import sum_by_ray
 from devrf.ops.trilinear import resample
-from devrf.rendering.front_to_back import picture
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import ColorChange, RenderedImage
 from devrf.rendering.sampling import RenderSettings
 
 # Rays at once: on a CPU what its caches hold (in unbounded scenes a ray has tens of samples to
 # colour), on a GPU what keeps it busy and fits.
-ON_CPU, UNBOUNDED_ON_CPU, ON_GPU = 8192, 4096, 2**15
+ON_CPU = 8192
+UNBOUNDED_ON_CPU = 4096
+ON_GPU = 2**15
 # Samples of unbounded scenes' pictures are so much further apart than while they are learned: what
 # is far away is blurred over many voxels. Their PSNR stays, and a fifth of the time is saved.
 UNBOUNDED_STEP = 1.5
@@ -86,15 +87,16 @@ class DeVRFView:
         settings = self.settings
         if not self.space.is_linear:
             settings = replace(settings, step=UNBOUNDED_STEP * settings.step)
-        return picture(
+        output = render(
             rays,
             self.canonical,
             self.occupancy,
             settings,
             background,
             self._warp,
-            self.color_change,
+            color_change=self.color_change,
         )
+        return RenderedImage.of(output)
 
     @torch.no_grad()
     def induced_flow(
@@ -110,9 +112,9 @@ class DeVRFView:
         def unwarp(points: Tensor) -> Tensor:
             return points if motion is None else motion.unwarp(points, time)
 
-        ray, weight = seen.samples.ray, seen.weight
+        ray, weight = seen.samples.ray, seen.samples.weight
         moved = induced_flow(
-            seen.canonical, unwarp, cameras, torch.zeros_like(ray), pixels[ray], self.space
+            seen.samples.canonical, unwarp, cameras, torch.zeros_like(ray), pixels[ray], self.space
         )
         mass = sum_by_ray(weight, ray, len(rays))
         total = sum_by_ray(weight[:, None] * moved, ray, len(rays))

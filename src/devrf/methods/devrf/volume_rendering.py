@@ -1,25 +1,23 @@
-"""Volume rendering of a canonical field, at rest or through a warp.
+"""Volume rendering of a canonical field, at rest or through a warp: batches and pictures alike.
 
 The samples of each ray, docs/method.md#rays, composited: docs/method.md#compositing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
 from devrf.geometry.rays import Rays
+from devrf.kernels.march import march
 from devrf.methods.devrf.canonical_field import CanonicalField
-from devrf.ops.compositing import color_and_depth, composite, sum_by_ray, transmittances
-from devrf.rendering.front_to_back import behind
+from devrf.methods.devrf.deformation_field import GridWarp
+from devrf.ops.compositing import color_and_depth, sum_by_ray
+from devrf.ops.march import Medium, Path
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import ColorChange, VoxelOutput
-from devrf.rendering.sampling import STOP, RenderSettings, Samples, march
+from devrf.rendering.sampling import RenderSettings
 from devrf.system.profiling import span
-
-Warp = Callable[[Tensor], Tensor]
 
 
 def render(
@@ -28,7 +26,7 @@ def render(
     occupancy: Occupancy,
     settings: RenderSettings,
     background: Tensor,
-    warp: Warp | None = None,
+    warp: GridWarp | None = None,
     precision: torch.dtype = torch.float32,
     color_change: ColorChange | None = None,
 ) -> VoxelOutput:
@@ -40,84 +38,60 @@ def render(
         occupancy: where something may be, in the space of the rays.
         settings: step length and thresholds.
         background: (3,) or (R, 3) RGB behind all; the field's own where the space holds infinity.
-        warp: x → q = x + Δ_b(x, t), points (M, 3) to canonical space; None is the identity.
+        warp: x → q = x + Δ_b(x, t); None is the identity.
         precision: what the colour network works in.
         color_change: q → A_t(q), added to the colours' logits; None: nothing is.
 
     Returns:
         What the rays see; differentiable in the parameters of field, warp and colour change.
     """
-    delta = field.step_in_base_voxels(settings.step)
     with span("sampling"):
-        samples = march(
-            rays,
-            field.box,
-            occupancy,
-            step=field.step_length(settings.step),
-            near=settings.near,
-            far=settings.far,
-        )
-    # Most samples are empty or hidden. A first pass without gradients leaves them out; a second
-    # warps the others again, since its results have a graph to the warp and the field.
-    with torch.no_grad():
-        samples, canonical, tau = _visible(samples, field, delta, settings.alpha_threshold, warp)
-    if torch.is_grad_enabled():
-        canonical, tau = _optical_depths(samples, field, delta, warp)
-    with span("compositing"):
-        weight, transmittance = composite(tau, samples.ray, len(rays))
-    with span("sampling"):
-        significant = _at_least(weight.detach(), settings.alpha_threshold)
-        samples, canonical = samples[significant], canonical.index_select(0, significant)
-        weight = weight.index_select(0, significant)
+        samples = march(rays, medium(field, occupancy, settings, warp))
     with span("decoder"):
-        residual = None if color_change is None else color_change(canonical)
-        color = field.rgb(canonical, rays.viewdirs, samples.ray, precision, residual)
-        background = behind(rays, field, background, precision)
+        residual = None if color_change is None else color_change(samples.canonical)
+        color = field.rgb(samples.canonical, rays.viewdirs, samples.ray, precision, residual)
+        ends = rays.ends()
+        if ends is not None:
+            every = torch.arange(len(rays), device=ends.device)
+            background = field.rgb(ends, rays.viewdirs, every, precision)
     with span("compositing"):
-        seen = sum_by_ray(weight[:, None] * color, samples.ray, len(rays))
+        weighted = sum_by_ray(samples.weight[:, None] * color, samples.ray, len(rays))
         with torch.no_grad():
-            mass = sum_by_ray(weight, samples.ray, len(rays))
-            reached = sum_by_ray(weight * samples.distance, samples.ray, len(rays))
-        image, depth = color_and_depth(seen, reached, mass, transmittance, background)
+            mass = sum_by_ray(samples.weight, samples.ray, len(rays))
+            reached = sum_by_ray(samples.weight * samples.distance, samples.ray, len(rays))
+        image, depth = color_and_depth(weighted, reached, mass, samples.transmittance, background)
     return VoxelOutput(
         color=image,
         depth=depth,
-        transmittance=transmittance,
+        transmittance=samples.transmittance,
         samples=samples,
-        canonical=canonical,
-        weight=weight,
         sample_color=color,
         residual=residual,
     )
 
 
-def _visible(
-    samples: Samples, field: CanonicalField, delta: float, threshold: float, warp: Warp | None
-) -> tuple[Samples, Tensor, Tensor]:
-    """The samples that are neither empty nor hidden, their canonical positions, and their τ."""
-    canonical, tau = _optical_depths(samples, field, delta, warp)
-    with span("sampling"):
-        opaque = _at_least(-torch.expm1(-tau), threshold)
-        ray, tau = samples.ray.index_select(0, opaque), tau.index_select(0, opaque)
-    with span("compositing"):
-        left = transmittances(tau, ray, samples.rays)
-    with span("sampling"):
-        reached = _at_least(left, STOP)
-        kept = opaque.index_select(0, reached)
-        return samples[kept], canonical.index_select(0, kept), tau.index_select(0, reached)
-
-
-def _optical_depths(
-    samples: Samples, field: CanonicalField, delta: float, warp: Warp | None
-) -> tuple[Tensor, Tensor]:
-    """Canonical positions of samples, and their τ."""
-    canonical = samples.points
-    if warp is not None:
-        with span("warp"):
-            canonical = warp(canonical)
-    with span("density"):
-        return canonical, field.optical_depth(canonical, delta)
-
-
-def _at_least(values: Tensor, threshold: float) -> Tensor:
-    return (values >= threshold).nonzero()[:, 0]
+def medium(
+    field: CanonicalField,
+    occupancy: Occupancy,
+    settings: RenderSettings,
+    warp: GridWarp | None = None,
+) -> Medium:
+    """What rays are followed through: a field, where it is occupied, and its warp."""
+    displacement = None if warp is None else warp.displacement
+    path = Path(
+        box=field.box,
+        surroundings=occupancy.surroundings,
+        step=field.step_length(settings.step),
+        near=settings.near,
+        far=settings.far,
+    )
+    return Medium(
+        path=path,
+        density=field.density.values,
+        shift=field.shift,
+        delta=field.step_in_base_voxels(settings.step),
+        threshold=settings.alpha_threshold,
+        displacement=displacement,
+        motion_box=None if warp is None or displacement is None else warp.box,
+        still_outside=warp is not None and warp.still_outside,
+    )

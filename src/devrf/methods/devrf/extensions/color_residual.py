@@ -15,8 +15,8 @@ from devrf.data.color_change import CHANGING, color_drift
 from devrf.errors import expect
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
+from devrf.kernels.look_up import look_up
 from devrf.methods.devrf.active_frame import ActiveFrame
-from devrf.methods.devrf.canonical_field import look_up
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
 from devrf.methods.devrf.deformation_stage import DeformationStage, Extension
 from devrf.methods.devrf.frame_store import FrameField
@@ -203,5 +203,5 @@ def squared_residual(prediction: MotionPrediction) -> Tensor:
     output = prediction.output
     if output.residual is None:
         return output.color.new_zeros(())
-    large = (output.weight.detach() * output.residual.square().sum(dim=1)).sum()
+    large = (output.samples.weight.detach() * output.residual.square().sum(dim=1)).sum()
     return large / len(prediction.batch.rays)

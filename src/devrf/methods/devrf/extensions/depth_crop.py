@@ -95,7 +95,7 @@ def seen_along_rays(
         rays = gather_batch(views, image, flat, black, model.space).rays
         output = render(rays, model.canonical, model.occupancy, model.settings, black)
         depths.append(output.samples.points[:, 2])
-        weights.append(output.weight)
+        weights.append(output.samples.weight)
         rays_of_samples.append(output.samples.ray + k * CHUNK)
     return torch.cat(depths), torch.cat(weights), torch.cat(rays_of_samples)
 

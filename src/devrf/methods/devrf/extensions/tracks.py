@@ -13,8 +13,10 @@ from torch import Tensor
 from devrf.data.batch import PixelPool, all_pixels
 from devrf.engine.batches import gather_batch
 from devrf.engine.ddp import broadcast
+from devrf.engine.grid_adam import GridAdam
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import WORLD, Space
+from devrf.kernels.look_up import look_up
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
 from devrf.methods.devrf.deformation_stage import DeformationStage, Extension
@@ -22,7 +24,6 @@ from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.pixel_pools import images_of
 from devrf.methods.devrf.volume_rendering import render
 from devrf.ops.compositing import sum_by_ray
-from devrf.ops.trilinear import interpolate
 from devrf.rendering.occupancy import Occupancy
 from devrf.scenes.scene import Views
 
@@ -219,8 +220,9 @@ class FlowTracks:
         )
         count = len(image)
         ray = seen.samples.ray
-        mass = sum_by_ray(seen.weight, ray, count)
-        point = sum_by_ray(seen.weight[:, None] * seen.canonical, ray, count)
+        weight = seen.samples.weight
+        mass = sum_by_ray(weight, ray, count)
+        point = sum_by_ray(weight[:, None] * seen.samples.canonical, ray, count)
         return point / mass[:, None], seen.color, mass
 
     def _occupancy(self, frame: int, time: float) -> Occupancy:
@@ -261,19 +263,17 @@ def start_from_tracks(
     backward = field.frames.here.new_empty(*field.shape, 3)
     forward = field.frames.here.new_empty(*field.shape, 3)
     field.frames.read(frame, (backward, forward))
-    coords = field.box.to_grid(tracks.canonical, field.shape)
 
     def misses(change: Tensor) -> Tensor:
-        points = tracks.canonical + interpolate(forward + change, coords)
+        points = tracks.canonical + look_up(forward + change, tracks.canonical, field.box)
         pixel, _ = cameras.project(tracks.camera, space.to_world(points))
         return pixel - tracks.pixel
 
     forward += _fit(misses, forward, scale, steps)
-    arrived = tracks.canonical + interpolate(forward, coords)
-    there = field.box.to_grid(arrived, field.shape)
+    arrived = tracks.canonical + look_up(forward, tracks.canonical, field.box)
 
     def errs(change: Tensor) -> Tensor:
-        returned = arrived + interpolate(backward + change, there)
+        returned = arrived + look_up(backward + change, arrived, field.box)
         return (returned - tracks.canonical) * scale
 
     backward += _fit(errs, backward, scale, steps)
@@ -303,7 +303,7 @@ def _fit(residual: Callable[[Tensor], Tensor], like: Tensor, scale: float, steps
     """
     change = torch.zeros_like(like).requires_grad_()
     fastest = 0.5 / scale
-    optimizer = torch.optim.Adam([change], lr=fastest)
+    optimizer = GridAdam([change], lr=fastest, betas=(0.9, 0.999))
     for number in range(steps):
         optimizer.param_groups[0]["lr"] = fastest * (1 - number / steps)
         optimizer.zero_grad()

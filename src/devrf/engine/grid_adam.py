@@ -1,0 +1,160 @@
+"""Adam for voxel grids: skips entries without gradient, allows a rate for each voxel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from devrf.kernels.adam import adam_step, add_total_variation_gradient
+from devrf.ops.adam import AdamRule
+
+
+class GridAdam(torch.optim.Optimizer):
+    """Adam (Kingma & Ba 2015) with additions for voxel grids.
+
+    Each parameter group takes, beside ``lr``, ``betas`` and ``eps``:
+
+    * ``skip_zero``: an entry whose gradient is exactly zero keeps its value *and its moments*:
+      momentum does not move a voxel that no sample of this batch touched. Its gradient stays in the
+      same memory: to make one anew takes longer than to clear the few rows that were touched.
+    * ``rows``: None, or the voxels (K,) outside which no gradient of these grids is read.
+    * ``per_voxel_lr``: None, or a tensor (X, Y, Z, 1) of factors of the learning rate.
+    * ``smoothing``: weight of the total variation of each grid, whose gradient is added to that
+      of the backward pass; ``along_z`` times as much between neighbours along z.
+    * ``touched_only``: add it only to entries that have a gradient.
+
+    """
+
+    def __init__(
+        self,
+        params: Iterable[Any],
+        lr: float = 1e-3,
+        betas: tuple[float, float] = (0.9, 0.99),
+        eps: float = 1e-8,
+    ) -> None:
+        defaults = {
+            "lr": lr,
+            "betas": betas,
+            "eps": eps,
+            "skip_zero": False,
+            "per_voxel_lr": None,
+            "rows": None,
+            "smoothing": 0.0,
+            "along_z": 1.0,
+            "touched_only": False,
+        }
+        super().__init__(params, defaults)
+
+    def step(self, closure: Callable[[], Any] | None = None) -> Any:
+        """One step on every parameter that has a gradient, after ``closure``.
+
+        Gradients are zero afterwards where they are kept, and gone elsewhere.
+        """
+        result = None
+        if closure is not None:
+            with torch.enable_grad():
+                result = closure()
+        for group in self.param_groups:
+            self._step(group)
+        return result
+
+    @torch.no_grad()
+    def _step(self, group: dict[str, Any]) -> None:
+        """One step on the parameters of a group."""
+        for parameter in self._learned(group):
+            gradient, state = parameter.grad, self._state_of(parameter)
+            assert gradient is not None
+            if group["smoothing"]:
+                add_total_variation_gradient(
+                    parameter,
+                    gradient,
+                    group["smoothing"],
+                    along_z=group["along_z"],
+                    touched_only=group["touched_only"],
+                )
+            state["steps"] += 1
+            rule = AdamRule(
+                rate=group["lr"],
+                step=state["steps"],
+                betas=group["betas"],
+                eps=group["eps"],
+                skip_zero=group["skip_zero"],
+                per_voxel_lr=group["per_voxel_lr"],
+            )
+            adam_step(
+                parameter,
+                gradient,
+                mean=state["mean"],
+                square=state["square"],
+                rule=rule,
+                rows=group["rows"],
+            )
+            if not group["skip_zero"]:
+                parameter.grad = None
+
+    def _learned(self, group: dict[str, Any]) -> list[Tensor]:
+        """The group's parameters that have a gradient, or get one from their total variation."""
+        learned = []
+        for parameter in group["params"]:
+            if parameter.grad is None:
+                if not group["smoothing"] or group["touched_only"]:
+                    continue
+                parameter.grad = torch.zeros_like(parameter)
+            learned.append(parameter)
+        return learned
+
+    def _state_of(self, parameter: Tensor) -> dict[str, Any]:
+        """The parameter's number of steps and its moments; zero at first."""
+        state: dict[str, Any] = self.state[parameter]
+        if not state:
+            state["steps"] = 0
+            state["mean"] = torch.zeros_like(parameter)
+            state["square"] = torch.zeros_like(parameter)
+        return state
+
+    def zero_grad(self, set_to_none: bool = True) -> None:
+        """Remove all gradients; those that are kept are set to zero."""
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                if group["skip_zero"] and parameter.grad is not None:
+                    parameter.grad.zero_()
+                else:
+                    parameter.grad = None
+
+    def make_gradients(self) -> None:
+        """Make those gradients that are kept and are not there yet, before a backward pass."""
+        for group in self.param_groups:
+            for parameter in group["params"] if group["skip_zero"] else ():
+                if parameter.grad is None:
+                    parameter.grad = torch.zeros_like(parameter)
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore a state, on the parameters' device."""
+        super().load_state_dict(state_dict)
+        for group in self.param_groups:
+            for name in ("per_voxel_lr", "rows"):
+                if group[name] is not None:
+                    group[name] = group[name].to(group["params"][0].device)
+
+    def replace(self, group: int, parameters: Sequence[Tensor], **settings: Any) -> None:
+        """Give a group other parameters, such as a resized grid, with zero moments.
+
+        Args:
+            group: its index.
+            parameters: the new parameters.
+            settings: further settings of the group; ``per_voxel_lr`` and ``rows`` are None unless
+                given.
+        """
+        for old in self.param_groups[group]["params"]:
+            self.state.pop(old, None)
+        self.param_groups[group]["params"] = list(parameters)
+        self.param_groups[group].update({"per_voxel_lr": None, "rows": None, **settings})
+        self.make_gradients()
+
+    def forget(self) -> None:
+        """Forget all moments, step counts and gradients; the parameters stay."""
+        self.state.clear()
+        self.zero_grad()

@@ -1,0 +1,191 @@
+"""One step of Adam on a tensor, and the gradient of a grid's total variation.
+
+See docs/method.md#optimiser and #total-variation.
+"""
+
+from functools import cache
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from devrf.kernels.runtime import array, by_channels, launch, take
+from devrf.ops import adam as definition
+from devrf.ops.adam import AdamRule
+
+
+def adam_step(
+    values: Tensor,
+    gradient: Tensor,
+    mean: Tensor,
+    square: Tensor,
+    rule: AdamRule,
+    rows: Tensor | None = None,
+) -> None:
+    """As :func:`devrf.ops.adam.adam_step`; all tensors are contiguous.
+
+    Outside the voxels ``rows`` (K,), int32, if they are given, the gradient is zero and so is not
+    read; with ``skip_zero``.
+    """
+    if not take(values):
+        definition.adam_step(values, gradient, mean, square, rule)
+        return
+    first, second = rule.corrections
+    step = AdamStep()
+    step.rate = rule.rate / first
+    step.beta1, step.beta2 = rule.betas
+    step.second = 1.0 / second
+    step.eps = rule.eps
+    step.skip_zero = int(rule.skip_zero)
+    # A thread steps one voxel of a grid, or one number of a network.
+    channels = values.shape[-1] if values.ndim == 4 else 1
+    tables = [
+        wp.from_torch(each.detach().view(-1, channels), dtype=_numbers(channels))
+        for each in (values, gradient, mean, square)
+    ]
+    # Arrays that are not read stand in for those that are not there.
+    indices = array(torch.empty(0, dtype=torch.int32, device=values.device))
+    rates = array(values.view(-1))
+    count = values.numel() // channels
+    if rows is not None:
+        step.has_rows = 1
+        indices = array(rows)
+        count = len(rows)
+    if rule.per_voxel_lr is not None:
+        step.has_rates = 1
+        rates = array(rule.per_voxel_lr.reshape(-1))
+    launch(adam_kernel(channels), count, [step, *tables, indices, rates], values.device)
+
+
+def add_total_variation_gradient(
+    grid: Tensor,
+    gradient: Tensor,
+    weight: float,
+    *,
+    along_z: float = 1.0,
+    touched_only: bool = False,
+) -> None:
+    """As :func:`devrf.ops.adam.add_total_variation_gradient`; both tensors are contiguous."""
+    if not take(grid):
+        definition.add_total_variation_gradient(
+            grid, gradient, weight, along_z=along_z, touched_only=touched_only
+        )
+        return
+    x, y, z, channels = grid.shape
+    inputs = [x, y, z, channels, weight, along_z, int(touched_only)]
+    inputs += [array(grid.view(-1)), array(gradient.view(-1))]
+    launch(add_total_variation, x * y * z, inputs, grid.device)
+
+
+@wp.struct
+class AdamStep:
+    """Settings of a step.
+
+    Attributes:
+        rate: the learning rate / (1 − β₁ᵗ).
+        second: 1 / (1 − β₂ᵗ).
+        has_rows: 1 where only some voxels are looked at, else 0.
+        has_rates: 1 where each voxel has a factor of the rate, else 0.
+        beta1, beta2, eps, skip_zero: as of an ``AdamRule``.
+    """
+
+    rate: float
+    second: float
+    beta1: float
+    beta2: float
+    eps: float
+    skip_zero: int
+    has_rows: int
+    has_rates: int
+
+
+@cache
+def _numbers(channels: int) -> Any:
+    return wp.types.vector(length=channels, dtype=wp.float32)
+
+
+@by_channels
+def adam_kernel(channels: int) -> wp.Kernel:
+    """A step on voxels of so many numbers."""
+    numbers = _numbers(channels)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def adam_step(
+        first: int,
+        step: AdamStep,
+        values: wp.array(dtype=numbers),
+        gradient: wp.array(dtype=numbers),
+        mean: wp.array(dtype=numbers),
+        square: wp.array(dtype=numbers),
+        rows: wp.array(dtype=int),
+        rates: wp.array(dtype=float),
+    ):
+        """A step on the numbers of one voxel."""
+        row = first + wp.tid()
+        if step.has_rows == 1:
+            row = rows[row]
+        g = gradient[row]
+        if step.skip_zero == 1 and g == numbers():
+            return
+        rate = step.rate
+        if step.has_rates == 1:
+            rate *= rates[row]
+        m = mean[row]
+        s = square[row]
+        v = values[row]
+        new_m = step.beta1 * m + (1.0 - step.beta1) * g
+        new_s = step.beta2 * s + (1.0 - step.beta2) * wp.cw_mul(g, g)
+        for c in range(wp.static(channels)):
+            keep = step.skip_zero == 1 and g[c] == 0.0
+            m[c] = wp.where(keep, m[c], new_m[c])
+            s[c] = wp.where(keep, s[c], new_s[c])
+            move = rate * new_m[c] / (wp.sqrt(new_s[c] * step.second) + step.eps)
+            v[c] = wp.where(keep, v[c], v[c] - move)
+        mean[row] = m
+        square[row] = s
+        values[row] = v
+        gradient[row] = numbers()
+
+    return adam_step
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def add_total_variation(
+    first: int,
+    x: int,
+    y: int,
+    z: int,
+    channels: int,
+    weight: float,
+    along_z: float,
+    touched_only: int,
+    grid: wp.array(dtype=float),
+    gradient: wp.array(dtype=float),
+):
+    """∂/∂v of Σ h(v − v') over the neighbours v' of the numbers v of one voxel."""
+    row = first + wp.tid()
+    k = row % z
+    j = (row / z) % y
+    i = row / (y * z)
+    next_z = channels
+    next_y = z * channels
+    next_x = y * next_y
+    for channel in range(channels):
+        place = row * channels + channel
+        if touched_only == 0 or gradient[place] != 0.0:
+            value = grid[place]
+            slope = float(0.0)
+            if i > 0:
+                slope += wp.clamp(value - grid[place - next_x], -1.0, 1.0)
+            if i < x - 1:
+                slope += wp.clamp(value - grid[place + next_x], -1.0, 1.0)
+            if j > 0:
+                slope += wp.clamp(value - grid[place - next_y], -1.0, 1.0)
+            if j < y - 1:
+                slope += wp.clamp(value - grid[place + next_y], -1.0, 1.0)
+            if k > 0:
+                slope += along_z * wp.clamp(value - grid[place - next_z], -1.0, 1.0)
+            if k < z - 1:
+                slope += along_z * wp.clamp(value - grid[place + next_z], -1.0, 1.0)
+            gradient[place] = gradient[place] + weight * slope

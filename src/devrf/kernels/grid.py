@@ -1,0 +1,128 @@
+"""What kernels know of a grid: where it lies, and which cell a point is in."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import warp as wp
+
+from devrf.geometry.box import Box
+
+Shape = tuple[int, int, int]
+
+
+@wp.struct
+class Grid:
+    """A grid of x · y · z points, z first in memory, whose outer points lie on a box.
+
+    Attributes:
+        low: the box's corner with the smallest coordinates.
+        high: the one with the largest.
+        scale: grid points to a unit of length, along each axis.
+    """
+
+    low: wp.vec3
+    high: wp.vec3
+    scale: wp.vec3
+    x: int
+    y: int
+    z: int
+
+
+@lru_cache(maxsize=256)
+def grid_over(box: Box, shape: Shape) -> Grid:
+    """The grid of ``shape`` (X, Y, Z) over ``box``."""
+    grid = Grid()
+    grid.low, grid.high = wp.vec3(*box.low), wp.vec3(*box.high)
+    grid.scale = wp.vec3(*((n - 1) / edge for n, edge in zip(shape, box.size, strict=True)))
+    grid.x, grid.y, grid.z = shape
+    return grid
+
+
+@wp.func
+def coordinates(grid: Grid, point: wp.vec3):
+    """0 on the low faces, x − 1, y − 1, z − 1 on the high ones."""
+    return wp.cw_mul(point - grid.low, grid.scale)
+
+
+@wp.func
+def cell(grid: Grid, point: wp.vec3):
+    """The row of a cell's lowest corner, and where in the cell the point is, in [0, 1]³.
+
+    For a point outside the grid, of the nearest point on its border.
+    """
+    at = coordinates(grid, point)
+    x = wp.clamp(at[0], 0.0, float(grid.x - 1))
+    y = wp.clamp(at[1], 0.0, float(grid.y - 1))
+    z = wp.clamp(at[2], 0.0, float(grid.z - 1))
+    i = wp.min(int(x), grid.x - 2)
+    j = wp.min(int(y), grid.y - 2)
+    k = wp.min(int(z), grid.z - 2)
+    return (i * grid.y + j) * grid.z + k, wp.vec3(x - float(i), y - float(j), z - float(k))
+
+
+@wp.func
+def inside(grid: Grid, point: wp.vec3):
+    """For each axis 1 where the point lies in the grid along it, else 0."""
+    at = coordinates(grid, point)
+    return wp.vec3(
+        wp.where(at[0] >= 0.0 and at[0] <= float(grid.x - 1), 1.0, 0.0),
+        wp.where(at[1] >= 0.0 and at[1] <= float(grid.y - 1), 1.0, 0.0),
+        wp.where(at[2] >= 0.0 and at[2] <= float(grid.z - 1), 1.0, 0.0),
+    )
+
+
+@wp.func
+def interpolate(values: wp.array(dtype=Any), grid: Grid, row: int, f: wp.vec3):
+    """Σ over a cell's corners of weight · value: trilinear, at the place ``f`` in the cell."""
+    next_y = grid.z
+    next_x = grid.y * grid.z
+    total = values[row] * ((1.0 - f[0]) * (1.0 - f[1]) * (1.0 - f[2]))
+    total += values[row + 1] * ((1.0 - f[0]) * (1.0 - f[1]) * f[2])
+    total += values[row + next_y] * ((1.0 - f[0]) * f[1] * (1.0 - f[2]))
+    total += values[row + next_y + 1] * ((1.0 - f[0]) * f[1] * f[2])
+    total += values[row + next_x] * (f[0] * (1.0 - f[1]) * (1.0 - f[2]))
+    total += values[row + next_x + 1] * (f[0] * (1.0 - f[1]) * f[2])
+    total += values[row + next_x + next_y] * (f[0] * f[1] * (1.0 - f[2]))
+    total += values[row + next_x + next_y + 1] * (f[0] * f[1] * f[2])
+    return total
+
+
+@wp.func
+def product(a: float, b: float):
+    """a · b, of two numbers or rows."""
+    return a * b
+
+
+@wp.func
+def product(a: Any, b: Any):  # noqa: D103, F811
+    return wp.dot(a, b)
+
+
+@wp.func
+def slope(values: wp.array(dtype=Any), factor: Any, grid: Grid, row: int, f: wp.vec3):
+    """∂/∂ position of the scalar product of :func:`interpolate`'s value and ``factor``.
+
+    Per unit of length, at the place ``f`` in the cell.
+    """
+    next_y = grid.z
+    next_x = grid.y * grid.z
+    v000 = product(values[row], factor)
+    v001 = product(values[row + 1], factor)
+    v010 = product(values[row + next_y], factor)
+    v011 = product(values[row + next_y + 1], factor)
+    v100 = product(values[row + next_x], factor)
+    v101 = product(values[row + next_x + 1], factor)
+    v110 = product(values[row + next_x + next_y], factor)
+    v111 = product(values[row + next_x + next_y + 1], factor)
+    x_low = wp.lerp(v100 - v000, v101 - v001, f[2])
+    x_high = wp.lerp(v110 - v010, v111 - v011, f[2])
+    y_low = wp.lerp(v010 - v000, v011 - v001, f[2])
+    y_high = wp.lerp(v110 - v100, v111 - v101, f[2])
+    z_low = wp.lerp(v001 - v000, v011 - v010, f[1])
+    z_high = wp.lerp(v101 - v100, v111 - v110, f[1])
+    change = wp.vec3(
+        wp.lerp(x_low, x_high, f[1]), wp.lerp(y_low, y_high, f[0]), wp.lerp(z_low, z_high, f[0])
+    )
+    return wp.cw_mul(change, grid.scale)

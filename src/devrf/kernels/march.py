@@ -1,0 +1,604 @@
+"""The march along rays: samples in occupied space, warped and composited, and its adjoint.
+
+See docs/method.md#rays, #warp, #density and #compositing. A thread follows one ray; empty space is
+skipped by the distances to what is occupied.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from devrf.geometry.contraction import INFINITY, ContractedRays
+from devrf.geometry.rays import Rays
+from devrf.kernels.grid import Grid, cell, coordinates, grid_over, inside, interpolate, slope
+from devrf.kernels.look_up import add_to_grid
+from devrf.kernels.runtime import array, launch, take
+from devrf.ops import march as definition
+from devrf.ops.march import HIT_CELLS, STOP, Medium, Path, Samples
+from devrf.ops.trilinear import shape_of
+
+# Half edges of the inner box that a ray moves along any axis while its distance grows by what one
+# takes along the axis that it crosses fastest, at most (sideways through the shell).
+CONTRACTED_PACE = 3.0
+
+
+def march(rays: Rays, medium: Medium) -> Samples:
+    """As :func:`devrf.ops.march.march`, differentiable once.
+
+    A leaf of densities that has a gradient is added to there.
+    """
+    if not take(rays.origins):
+        return definition.march(rays, medium)
+    kept = medium.density.grad if medium.density.is_leaf else None
+    results = _March.apply(  # type: ignore[no-untyped-call]
+        medium.density, medium.displacement, rays, medium, kept
+    )
+    return Samples(*results)
+
+
+@torch.no_grad()
+def rays_that_hit(rays: Rays, path: Path) -> Tensor:
+    """As :func:`devrf.ops.march.rays_that_hit`."""
+    if not take(rays.origins):
+        return definition.rays_that_hit(rays, path)
+    hits = torch.empty(len(rays), dtype=torch.uint8, device=rays.origins.device)
+    inputs = [_geometry(rays, path), _arrays(rays), _distances(path), array(hits)]
+    launch(rays_that_hit_kernel, len(rays), inputs, hits.device)
+    return hits.bool()
+
+
+class _March(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        density: Tensor,
+        displacement: Tensor | None,
+        rays: Rays,
+        medium: Medium,
+        kept: Tensor | None,
+    ) -> tuple[Tensor, ...]:
+        device = density.device
+        geometry = _geometry(rays, medium.path)
+        _add_field(geometry, medium)
+        lines, distances = _arrays(rays), _distances(medium.path)
+        counts = torch.empty(len(rays), dtype=torch.int32, device=device)
+        launch(count_samples_kernel, len(rays), [geometry, lines, array(counts)], device)
+
+        # Room for all of a ray's samples; how many are visible is known afterwards.
+        start, length = _starts(counts)
+        visible_count = torch.empty_like(counts)
+        significant_count = torch.empty_like(counts)
+        transmittance = torch.empty(len(rays), device=device)
+        visible = VisibleSamples()
+        visible.start = array(start)
+        visible.count = array(visible_count)
+        visible.distance = array(torch.empty(length, device=device))
+        visible.canonical = array(torch.empty(length, 3, device=device))
+        visible.tau = array(torch.empty(length, device=device))
+        visible.weight = array(torch.empty(length, device=device))
+        # Without displacements an array that is not read stands in for them.
+        moves = lines.origins if displacement is None else array(displacement)
+        inputs = [geometry, lines, distances, array(density), moves, visible]
+        inputs += [array(significant_count), array(transmittance)]
+        launch(march_kernel, len(rays), inputs, device)
+
+        start, length = _starts(significant_count)
+        ray = torch.empty(length, dtype=torch.int64, device=device)
+        distance = torch.empty(length, device=device)
+        points = torch.empty(length, 3, device=device)
+        canonical = torch.empty(length, 3, device=device)
+        weight = torch.empty(length, device=device)
+        significant = SignificantSamples()
+        significant.start = array(start)
+        significant.ray = array(ray)
+        significant.distance = array(distance)
+        significant.points = array(points)
+        significant.canonical = array(canonical)
+        significant.weight = array(weight)
+        launch(keep_significant_kernel, len(rays), [geometry, lines, visible, significant], device)
+
+        ctx.mark_non_differentiable(ray, distance, points)
+        if displacement is None or not displacement.requires_grad:
+            ctx.mark_non_differentiable(canonical)
+        ctx.save_for_backward(density, displacement, visible_count, start, transmittance)
+        ctx.geometry, ctx.lines, ctx.visible = geometry, lines, visible
+        ctx.medium, ctx.kept = medium, kept
+        return ray, distance, points, canonical, weight, transmittance
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        density, displacement, visible_count, start, transmittance = ctx.saved_tensors
+        medium, device = ctx.medium, density.device
+        given = OutputGradients()
+        given.start = array(start)
+        given.canonical = array(gradients[3].contiguous())
+        given.weight = array(gradients[4].contiguous())
+        given.transmittance = array(gradients[5].contiguous())
+        given.reached = array(transmittance)
+        start, length = _starts(visible_count)
+        raw = torch.empty(length, 1, device=device)
+        moved = torch.empty(length, 3, device=device)
+        points = torch.empty(length, 3, device=device)
+        canonical = torch.empty(length, 3, device=device)
+        result = SampleGradients()
+        result.start = array(start)
+        result.raw = array(raw)
+        result.moved = array(moved)
+        result.points = array(points)
+        result.canonical = array(canonical)
+        inputs = [ctx.geometry, ctx.lines, array(density), ctx.visible, given, result]
+        launch(adjoint_kernel, len(visible_count), inputs, device)
+
+        of_density = of_displacement = None
+        if ctx.needs_input_grad[0]:
+            of_density = torch.zeros_like(density) if ctx.kept is None else None
+            into = ctx.kept if of_density is None else of_density
+            add_to_grid(into, canonical, raw, medium.path.box)
+        if ctx.needs_input_grad[1]:
+            of_displacement = torch.zeros_like(displacement)
+            add_to_grid(of_displacement, points, moved, medium.motion_box)
+        return of_density, of_displacement, None, None, None
+
+
+def _starts(counts: Tensor) -> tuple[Tensor, int]:
+    """Where each ray's samples begin, (R,) int64, if they lie one after another; and their sum."""
+    stops = counts.cumsum(0)
+    return stops - counts, int(stops[-1]) if len(stops) else 0
+
+
+def _arrays(rays: Rays) -> RayArrays:
+    arrays = RayArrays()
+    arrays.origins = array(rays.origins.contiguous())
+    arrays.directions = array(rays.directions.contiguous())
+    # Straight rays have no course; their origins stand in for it.
+    course = rays.course if isinstance(rays, ContractedRays) else rays.origins
+    arrays.courses = array(course.contiguous())
+    return arrays
+
+
+def _distances(path: Path) -> wp.array:
+    return array(path.surroundings.distances.flatten())
+
+
+def _geometry(rays: Rays, path: Path) -> Geometry:
+    """Where ``rays`` are sampled."""
+    geometry = Geometry()
+    geometry.low, geometry.high = wp.vec3(*path.box.low), wp.vec3(*path.box.high)
+    surroundings = path.surroundings
+    geometry.occupancy = grid_over(surroundings.box, shape_of(surroundings.distances))
+    if isinstance(rays, ContractedRays):
+        inner = rays.space.inner()
+        geometry.contracted = 1
+        geometry.center = wp.vec3(*inner.middle)
+        geometry.half = wp.vec3(*(edge / 2 for edge in inner.size))
+        geometry.shell = rays.space.shell
+    geometry.step = path.step
+    geometry.near = path.near
+    geometry.far = path.far
+    return geometry
+
+
+def _add_field(geometry: Geometry, medium: Medium) -> None:
+    """Add the densities that rays are followed through, and how they move."""
+    geometry.density = grid_over(medium.path.box, shape_of(medium.density))
+    if medium.displacement is not None and medium.motion_box is not None:
+        geometry.moves = 1
+        geometry.motion = grid_over(medium.motion_box, shape_of(medium.displacement))
+        geometry.still_outside = int(medium.still_outside)
+    geometry.shift = medium.shift
+    geometry.delta = medium.delta
+    geometry.threshold = medium.threshold
+    # α ≥ threshold where v + b ≥ softplus⁻¹(τ / δ).
+    geometry.faintest = -math.inf
+    if medium.threshold > 0:
+        tau = -math.log1p(-medium.threshold)
+        geometry.faintest = math.log(math.expm1(tau / medium.delta)) - medium.shift
+
+
+@wp.struct
+class Geometry:
+    """What rays are followed through.
+
+    Attributes:
+        low: the corner of the field's box with the smallest coordinates.
+        high: the one with the largest.
+        density: where the grid of raw densities is.
+        occupancy: where the grid of distances to occupied cells is.
+        motion: where the grid of displacements is.
+        moves: 1 where there are displacements, else 0.
+        still_outside: 1 where nothing moves outside the motion's grid, else 0.
+        contracted: 1 in contracted space, else 0.
+        center: of the contracted space's inner box.
+        half: its half edges.
+        shell: its shell's thickness in half edges.
+        faintest: the raw density whose opacity is the threshold.
+        step, near, far, shift, delta, threshold: as of a ``Medium`` and its ``Path``.
+    """
+
+    low: wp.vec3
+    high: wp.vec3
+    density: Grid
+    occupancy: Grid
+    motion: Grid
+    moves: int
+    still_outside: int
+    contracted: int
+    center: wp.vec3
+    half: wp.vec3
+    shell: float
+    faintest: float
+    step: float
+    near: float
+    far: float
+    shift: float
+    delta: float
+    threshold: float
+
+
+@wp.struct
+class RayArrays:
+    """R rays; ``courses`` are those of ``ContractedRays``."""
+
+    origins: wp.array(dtype=wp.vec3)
+    directions: wp.array(dtype=wp.vec3)
+    courses: wp.array(dtype=wp.vec3)
+
+
+@wp.struct
+class VisibleSamples:
+    """Samples that are opaque enough and not hidden: ``count`` of each ray, from ``start`` on."""
+
+    start: wp.array(dtype=wp.int64)
+    count: wp.array(dtype=int)
+    distance: wp.array(dtype=float)
+    canonical: wp.array(dtype=wp.vec3)
+    tau: wp.array(dtype=float)
+    weight: wp.array(dtype=float)
+
+
+@wp.struct
+class SignificantSamples:
+    """The visible samples of enough weight, without gaps; a ray's begin at ``start``."""
+
+    start: wp.array(dtype=wp.int64)
+    ray: wp.array(dtype=wp.int64)
+    distance: wp.array(dtype=float)
+    points: wp.array(dtype=wp.vec3)
+    canonical: wp.array(dtype=wp.vec3)
+    weight: wp.array(dtype=float)
+
+
+@wp.struct
+class OutputGradients:
+    """∂L/∂q and ∂L/∂w of significant samples, which begin at ``start``; ∂L/∂T_end, and T_end."""
+
+    start: wp.array(dtype=wp.int64)
+    canonical: wp.array(dtype=wp.vec3)
+    weight: wp.array(dtype=float)
+    transmittance: wp.array(dtype=float)
+    reached: wp.array(dtype=float)
+
+
+@wp.struct
+class SampleGradients:
+    """∂L/∂v and ∂L/∂Δ that visible samples have seen, and where: at q, and at x.
+
+    They lie without gaps; a ray's begin at ``start``.
+    """
+
+    start: wp.array(dtype=wp.int64)
+    raw: wp.array(dtype=float)
+    moved: wp.array(dtype=wp.vec3)
+    points: wp.array(dtype=wp.vec3)
+    canonical: wp.array(dtype=wp.vec3)
+
+
+@wp.struct
+class Ray:
+    """One ray.
+
+    Attributes:
+        entry: the distance of its first sample.
+        count: the number of its samples up to its exit.
+        samples_per_cell: samples in which it moves by a cell of the occupancy, at least.
+    """
+
+    origin: wp.vec3
+    direction: wp.vec3
+    course: wp.vec3
+    entry: float
+    count: int
+    samples_per_cell: float
+
+
+@wp.func
+def position(geometry: Geometry, ray: Ray, distance: float):
+    """The point at a distance along a ray; in contracted space as ``ContractedRays.at``."""
+    if geometry.contracted == 0:
+        return ray.origin + ray.direction * distance
+    world = distance
+    y = ray.course[0] + ray.course[1] * distance
+    if wp.abs(y) > 1.0:
+        left = wp.max(1.0 - (wp.abs(y) - 1.0) / ray.course[2], wp.static(INFINITY))
+        world = (wp.sign(y) / left - ray.course[0]) / ray.course[1]
+    point = ray.origin + ray.direction * world
+    u = wp.cw_div(point - geometry.center, geometry.half)
+    m = wp.max(wp.abs(u))
+    if m > 1.0:
+        squeezed = (1.0 + geometry.shell - geometry.shell / m) / m
+        point = geometry.center + wp.cw_mul(geometry.half, u) * squeezed
+    return point
+
+
+@wp.func
+def own_distance(course: wp.vec3, world: float):
+    """A contracted ray's distance of a world distance."""
+    x = course[0] + course[1] * world
+    if wp.abs(x) <= 1.0:
+        return world
+    y = wp.sign(x) * (1.0 + course[2] * (1.0 - 1.0 / wp.abs(x)))
+    return (y - course[0]) / course[1]
+
+
+@wp.func
+def ray_of(geometry: Geometry, rays: RayArrays, number: int):
+    """A ray, from its entry into the field's box to its exit, within near and far."""
+    ray = Ray()
+    ray.origin = rays.origins[number]
+    ray.direction = rays.directions[number]
+    ray.course = rays.courses[number]
+    entry = geometry.near
+    leave = geometry.far
+    if geometry.contracted == 1:
+        cells = wp.max(wp.cw_mul(geometry.half, geometry.occupancy.scale))
+        pace = wp.static(CONTRACTED_PACE) * ray.course[1] * cells
+        entry = own_distance(ray.course, geometry.near)
+        leave = own_distance(ray.course, geometry.far)
+    else:
+        for axis in range(3):
+            d = ray.direction[axis]
+            if wp.abs(d) < 1.0e-9:
+                d = 1.0e-9
+            to_low = (geometry.low[axis] - ray.origin[axis]) / d
+            to_high = (geometry.high[axis] - ray.origin[axis]) / d
+            entry = wp.max(entry, wp.min(to_low, to_high))
+            leave = wp.min(leave, wp.max(to_low, to_high))
+        pace = wp.max(wp.abs(wp.cw_mul(ray.direction, geometry.occupancy.scale)))
+    ray.entry = entry
+    if leave >= entry:
+        ray.count = int(wp.floor((leave - entry) / geometry.step + 1.0e-3)) + 1
+    # A little less: positions are rounded.
+    ray.samples_per_cell = 0.999 / wp.max(pace * geometry.step, 1.0e-9)
+    return ray
+
+
+@wp.func
+def clearance(geometry: Geometry, distances: wp.array(dtype=wp.uint8), point: wp.vec3):
+    """How many cells away something is occupied, at least; 0 in an occupied cell."""
+    grid = geometry.occupancy
+    at = coordinates(grid, point)
+    i = int(wp.rint(at[0]))
+    j = int(wp.rint(at[1]))
+    k = int(wp.rint(at[2]))
+    if i < 0 or j < 0 or k < 0 or i >= grid.x or j >= grid.y or k >= grid.z:
+        return 1
+    return int(distances[(i * grid.y + j) * grid.z + k])
+
+
+@wp.func
+def next_sample(geometry: Geometry, distances: wp.array(dtype=wp.uint8), ray: Ray, number: int):
+    """The first sample from ``number`` on in an occupied cell; the ray's count if none is."""
+    k = int(number)
+    while k < ray.count:
+        point = position(geometry, ray, ray.entry + float(k) * geometry.step)
+        cells = clearance(geometry, distances, point)
+        if cells == 0:
+            return k
+        # In cells - 1 cells' way the nearest cell changes by less than that and one.
+        k += int(float(cells - 1) * ray.samples_per_cell) + 1
+    return ray.count
+
+
+@wp.func
+def warped(geometry: Geometry, displacements: wp.array(dtype=wp.vec3), point: wp.vec3):
+    """q = x + Δ(x)."""
+    if geometry.moves == 0:
+        return point
+    if geometry.still_outside == 1:
+        if wp.min(inside(geometry.motion, point)) == 0.0:
+            return point
+    row, fraction = cell(geometry.motion, point)
+    return point + interpolate(displacements, geometry.motion, row, fraction)
+
+
+@wp.func
+def softplus(x: float):
+    """log(1 + exp(x)), exact where it is small, too."""
+    if x > 15.0:
+        return x
+    e = wp.exp(x)
+    if e < 0.01:
+        return e * (1.0 - e * (0.5 - e / 3.0))
+    return wp.log(1.0 + e)
+
+
+@wp.func
+def opacity(tau: float):
+    """α = 1 − exp(−τ), exact where it is small, too."""
+    if tau < 0.01:
+        return tau * (1.0 - tau * (0.5 - tau / 6.0))
+    return 1.0 - wp.exp(-tau)
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def count_samples_kernel(
+    first: int, geometry: Geometry, rays: RayArrays, counts: wp.array(dtype=int)
+):
+    """How many samples of each ray lie in the field's box, in empty space or not."""
+    number = first + wp.tid()
+    counts[number] = ray_of(geometry, rays, number).count
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def march_kernel(
+    first: int,
+    geometry: Geometry,
+    rays: RayArrays,
+    distances: wp.array(dtype=wp.uint8),
+    density: wp.array(dtype=float),
+    displacements: wp.array(dtype=wp.vec3),
+    visible: VisibleSamples,
+    significant_count: wp.array(dtype=int),
+    transmittance: wp.array(dtype=float),
+):
+    """τ_i and w_i = T_i α_i of each ray's visible samples, and T_end."""
+    number = first + wp.tid()
+    ray = ray_of(geometry, rays, number)
+    start = int(visible.start[number])
+    count = int(0)
+    significant = int(0)
+    left = float(1.0)
+    k = next_sample(geometry, distances, ray, 0)
+    while k < ray.count:
+        distance = ray.entry + float(k) * geometry.step
+        canonical = warped(geometry, displacements, position(geometry, ray, distance))
+        row, fraction = cell(geometry.density, canonical)
+        raw = interpolate(density, geometry.density, row, fraction)
+        if raw >= geometry.faintest:
+            tau = softplus(raw + geometry.shift) * geometry.delta
+            weight = left * opacity(tau)
+            visible.distance[start + count] = distance
+            visible.canonical[start + count] = canonical
+            visible.tau[start + count] = tau
+            visible.weight[start + count] = weight
+            count += 1
+            if weight >= geometry.threshold:
+                significant += 1
+            left *= wp.exp(-tau)
+            if left < wp.static(STOP):
+                k = ray.count
+        k = next_sample(geometry, distances, ray, k + 1)
+    visible.count[number] = count
+    significant_count[number] = significant
+    transmittance[number] = left
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def keep_significant_kernel(
+    first: int,
+    geometry: Geometry,
+    rays: RayArrays,
+    visible: VisibleSamples,
+    result: SignificantSamples,
+):
+    """The visible samples of enough weight."""
+    number = first + wp.tid()
+    ray = ray_of(geometry, rays, number)
+    start = int(visible.start[number])
+    into = int(result.start[number])
+    for k in range(visible.count[number]):
+        sample = start + k
+        if visible.weight[sample] >= geometry.threshold:
+            distance = visible.distance[sample]
+            result.ray[into] = wp.int64(number)
+            result.distance[into] = distance
+            result.points[into] = position(geometry, ray, distance)
+            result.canonical[into] = visible.canonical[sample]
+            result.weight[into] = visible.weight[sample]
+            into += 1
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def adjoint_kernel(
+    first: int,
+    geometry: Geometry,
+    rays: RayArrays,
+    density: wp.array(dtype=float),
+    visible: VisibleSamples,
+    given: OutputGradients,
+    result: SampleGradients,
+):
+    """From gradients of what the march gives to those of raw densities and displacements.
+
+    Back to front ∂L/∂τ_i = ∂L/∂w_i T_i exp(−τ_i) − Σ_{j>i} ∂L/∂w_j w_j − ∂L/∂T_end T_end.
+    """
+    number = first + wp.tid()
+    ray = ray_of(geometry, rays, number)
+    start = int(visible.start[number])
+    count = visible.count[number]
+    significant = int(given.start[number])
+    for k in range(count):
+        if visible.weight[start + k] >= geometry.threshold:
+            significant += 1
+    after = given.reached[number]
+    behind = given.transmittance[number] * after
+    for back in range(count):
+        sample = start + count - 1 - back
+        into = int(result.start[number]) + count - 1 - back
+        tau = visible.tau[sample]
+        weight = visible.weight[sample]
+        canonical = visible.canonical[sample]
+        of_tau = -behind
+        of_canonical = wp.vec3()
+        if weight >= geometry.threshold:
+            significant -= 1
+            of_weight = given.weight[significant]
+            of_tau += of_weight * after
+            behind += of_weight * weight
+            of_canonical = given.canonical[significant]
+        # T_i, from T_i exp(−τ_i) or from w_i = T_i α_i, whichever is not a small number's ratio.
+        if tau < 1.0:
+            after *= wp.exp(tau)
+        else:
+            after = weight / opacity(tau)
+        # ∂τ/∂v = δ · sigmoid(v + b), and sigmoid = 1 − exp(−softplus).
+        of_raw = of_tau * geometry.delta * opacity(tau / geometry.delta)
+        result.raw[into] = of_raw
+        result.canonical[into] = canonical
+        if geometry.moves == 1:
+            point = position(geometry, ray, visible.distance[sample])
+            row, fraction = cell(geometry.density, canonical)
+            change = slope(density, of_raw, geometry.density, row, fraction)
+            of_canonical += wp.cw_mul(change, inside(geometry.density, canonical))
+            if geometry.still_outside == 1:
+                of_canonical *= wp.min(inside(geometry.motion, point))
+            result.points[into] = point
+            result.moved[into] = of_canonical
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def rays_that_hit_kernel(
+    first: int,
+    geometry: Geometry,
+    rays: RayArrays,
+    distances: wp.array(dtype=wp.uint8),
+    hits: wp.array(dtype=wp.uint8),
+):
+    """Whether each ray has a sample within so many cells of an occupied one."""
+    number = first + wp.tid()
+    ray = ray_of(geometry, rays, number)
+    hits[number] = wp.uint8(0)
+    k = int(0)
+    while k < ray.count:
+        point = position(geometry, ray, ray.entry + float(k) * geometry.step)
+        cells = clearance(geometry, distances, point)
+        if cells <= wp.static(HIT_CELLS):
+            hits[number] = wp.uint8(1)
+            k = ray.count
+        k += int(float(wp.max(cells - wp.static(HIT_CELLS + 1), 0)) * ray.samples_per_cell) + 1
+
+
+KERNELS = (
+    count_samples_kernel,
+    march_kernel,
+    keep_significant_kernel,
+    adjoint_kernel,
+    rays_that_hit_kernel,
+)

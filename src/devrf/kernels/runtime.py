@@ -1,0 +1,186 @@
+"""Where the kernels run, and how they are launched.
+
+NVIDIA Warp compiles a kernel's Python source when it is first launched, and keeps the result on
+disk, in ``WARP_CACHE_PATH`` or the user's cache folder. A kernel has a thread for each ray, sample
+or voxel. On a CPU Warp runs these one after another; so each of torch's threads takes a part.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from functools import cache, wraps
+from itertools import pairwise
+from threading import RLock, local
+from typing import Any, Literal
+
+import torch
+import warp as wp
+from torch import Tensor
+
+# What computes the hot operations: Warp's kernels or their definitions in PyTorch; auto: Warp's
+# kernels where they run.
+Kernels = Literal["auto", "torch"]
+_chosen: Kernels = "auto"
+# Held by whoever makes, compiles or loads a kernel.
+compiling = RLock()
+_of_thread = local()
+
+
+def choose(kernels: Kernels, *, deterministic: bool = False) -> None:
+    """Say what computes the hot operations of this process, before it computes the first.
+
+    Args:
+        kernels: Warp's where they run, or PyTorch.
+        deterministic: on a GPU, have atomic additions in the same order each time; slower.
+    """
+    global _chosen
+    _chosen = kernels
+    if deterministic:
+        wp.config.deterministic = wp.DeterministicMode.RUN_TO_RUN
+
+
+def take(tensor: Tensor) -> bool:
+    """Whether kernels take ``tensor``: single precision, on a CPU or one of NVIDIA's GPUs."""
+    here = tensor.is_cpu or (tensor.is_cuda and torch.version.hip is None)
+    wanted = _chosen == "auto" and here and tensor.dtype == torch.float32
+    if wanted:
+        with compiling:
+            _begin()
+    return wanted
+
+
+def launch(kernel: wp.Kernel, count: int, inputs: Sequence[Any], device: torch.device) -> None:
+    """Run ``kernel(first, *inputs)`` with ``count`` threads, of which thread k is ``first`` + k.
+
+    No two threads of such a kernel write to the same place.
+    """
+    parts = _parts(device)
+    edges = [count * part // parts for part in range(parts + 1)]
+    counts = [stop - first for first, stop in pairwise(edges)]
+    _launch(kernel, counts, [[first, *inputs] for first in edges[:-1]], device)
+
+
+def launch_by_owner(
+    kernel: wp.Kernel, count: int, inputs: Sequence[Any], device: torch.device
+) -> None:
+    """Run ``kernel(owner, owners, *inputs)`` with ``count`` threads for each owner.
+
+    Threads of such a kernel add to the same places, each to those of its owner alone. So no two of
+    torch's threads add to one place, and sums are the same for any number of them. On a GPU there
+    is one owner, and additions are atomic.
+    """
+    owners = _parts(device)
+    inputs_of = [[owner, owners, *inputs] for owner in range(owners)]
+    _launch(kernel, [count] * owners, inputs_of, device)
+
+
+def array(tensor: Tensor) -> wp.array:
+    """A tensor (N,) of numbers, or (…, C) of rows of floats, as Warp's array; memory is shared."""
+    tensor = tensor.detach()
+    if tensor.ndim == 1:
+        return wp.from_torch(tensor)
+    channels = tensor.shape[-1]
+    count = tensor.shape[:-1].numel()
+    # Without rows a tensor may have any strides.
+    rows = tensor.reshape(count, channels) if count else tensor.new_empty(0, channels)
+    return wp.from_torch(rows[:, 0] if channels == 1 else rows, dtype=row_type(channels))
+
+
+def by_channels(factory: Callable[[int], wp.Kernel]) -> Callable[[int], wp.Kernel]:
+    """The kernels that a ``factory`` makes for so many channels, each made once."""
+    made: dict[int, wp.Kernel] = {}
+
+    @wraps(factory)
+    def kernel(channels: int) -> wp.Kernel:
+        if channels not in made:
+            with compiling:
+                if channels not in made:
+                    made[channels] = factory(channels)
+        return made[channels]
+
+    return kernel
+
+
+@cache
+def row_type(channels: int) -> Any:
+    """Warp's type of a row of ``channels`` floats."""
+    if channels == 1:
+        return wp.float32
+    return wp.vec3 if channels == 3 else wp.types.vector(length=channels, dtype=wp.float32)
+
+
+def _launch(
+    kernel: wp.Kernel, counts: Sequence[int], inputs: Sequence[list[Any]], device: torch.device
+) -> None:
+    """Launch a kernel for each part side by side, the first one in this thread."""
+    others = [
+        _pool(len(counts)).submit(_run, kernel, count, values, device)
+        for count, values in zip(counts[1:], inputs[1:], strict=True)
+    ]
+    _run(kernel, counts[0], inputs[0], device)
+    for other in others:
+        other.result()
+
+
+def _run(kernel: wp.Kernel, count: int, inputs: list[Any], device: torch.device) -> None:
+    """Launch a kernel in this thread, by a command of the thread's own that is made once.
+
+    Warp finds, compiles and loads a kernel in one thread at a time.
+    """
+    if count == 0:
+        return
+    commands = _of_thread.__dict__.setdefault("commands", {})
+    command = commands.get((kernel, device))
+    if command is None:
+        with compiling:
+            command = wp.launch(kernel, 1, inputs=inputs, device=str(device), record_cmd=True)
+        commands[kernel, device] = command
+    for index, value in enumerate(inputs):
+        command.set_param_at_index(index, value)
+    command.set_dim(count)
+    if device.type == "cuda":
+        command.launch(wp.stream_from_torch(torch.cuda.current_stream(device)))
+    else:
+        command.launch()
+
+
+def _parts(device: torch.device) -> int:
+    """Into how many parts a launch is divided."""
+    return torch.get_num_threads() if device.type == "cpu" else 1
+
+
+@cache
+def _pool(parts: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(parts - 1, thread_name_prefix="devrf-kernels")
+
+
+@cache
+def _begin() -> None:
+    """Start Warp, with a cache of compiled kernels that can be written."""
+    wp.config.log_level = wp.LOG_ERROR
+    with _silent():
+        try:
+            wp.init()
+        except OSError:
+            wp.config.kernel_cache_dir = tempfile.mkdtemp(prefix="devrf-kernels-")
+            wp.init()
+    if not os.access(wp.config.kernel_cache_dir, os.W_OK):
+        wp.config.kernel_cache_dir = tempfile.mkdtemp(prefix="devrf-kernels-")
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Without what libraries write to the standard error: Warp's, where there is no GPU."""
+    kept = os.dup(2)
+    nothing = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nothing, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nothing)
