@@ -56,7 +56,7 @@ def test_training_at_each_resolution_with_what_was_learned(
     assert sides[1] < sides[2] and sides[3] < sides[4]
     for row in rows:
         assert row["ms"] > 0 and row["backward"] > 0 and row["optimiser"] > 0
-        assert (row["warp"] > 0) == (row["stage"] == "deformation")
+        assert row["sampling"] > 0 and row["decoder"] > 0
     assert "| fine" in capsys.readouterr().out
     # Nothing was learned on the way.
     assert (tmp_path / "run" / "checkpoints" / "deformation.ckpt").read_bytes() == before
@@ -96,13 +96,13 @@ def test_a_part_counts_without_the_parts_inside_it(monkeypatch):
     def work():
         with training.record_function("losses"):
             time.sleep(0.01)
-            with training.record_function("warp"):
+            with training.record_function("decoder"):
                 time.sleep(0.04)
         time.sleep(0.02)
 
     spent = training.parts(work, cuda=False)
-    assert spent["losses"] < spent["overhead"] < spent["warp"]
-    assert spent["losses"] >= 9 and spent["warp"] >= 39 and spent["backward"] == 0
+    assert spent["losses"] < spent["overhead"] < spent["decoder"]
+    assert spent["losses"] >= 9 and spent["decoder"] >= 39 and spent["backward"] == 0
 
 
 def test_what_cannot_be_measured_is_said_in_one_line(benchmark, tmp_path, capsys):

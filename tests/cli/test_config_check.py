@@ -42,6 +42,7 @@ scene: robot
 method: devrf
 objective: dynamic.psnr
 decoder_precision: auto
+kernels: auto
 sizes: {{inner: {{_target_: {__name__}.Inner, size: 2}}}}
 loss: {{fine: {{color: 1.0}}}}
 outer:

@@ -37,7 +37,8 @@ import devrf.callbacks
 import devrf.cli.run
 from devrf.__main__ import entry
 from devrf.checkpoints import checkpoint_file
-from devrf.ops.adam import GridAdam
+from devrf.engine.grid_adam import GridAdam
+from devrf.kernels.runtime import take
 
 
 class Fuse:
@@ -124,6 +125,7 @@ def hang(context: Any) -> None:
 def main() -> None:
     """Fork for each command that is asked for."""
     torch.set_num_threads(1)
+    assert take(torch.empty(0))  # loads Warp
     Plugins.instance()
     gc.freeze()  # what is there stays shared with the children
     print("ready", flush=True)

@@ -1,4 +1,4 @@
-"""GridAdam against torch's Adam, and its additions by hand."""
+"""One step of Adam, and the gradient of the total variation: by hand, and by autograd."""
 
 from __future__ import annotations
 
@@ -8,155 +8,57 @@ import pytest
 import torch
 from torch import Tensor
 
-from devrf.ops.adam import GridAdam
-from devrf.ops.adam_step import add_total_variation_gradient
-
-SHAPE = (2, 3, 2, 2)
+from devrf.ops.adam import AdamRule, adam_step, add_total_variation_gradient
 
 
-def gradients(rng: torch.Generator, count: int) -> list[Tensor]:
-    """Gradients without any zero."""
-    return [torch.randn(SHAPE, generator=rng, dtype=torch.float64) + 0.01 for _ in range(count)]
+def peak() -> Tensor:
+    """Zero everywhere but at one voxel, which exceeds its neighbours by 5."""
+    grid = torch.zeros(2, 2, 2, 1)
+    grid[1, 1, 1] = 5.0
+    return grid
 
 
-def run(optimizer: torch.optim.Optimizer, parameter: Tensor, grads: list[Tensor]) -> Tensor:
-    for grad in grads:
-        parameter.grad = grad.clone()
-        optimizer.step()
-    return parameter.detach()
-
-
-@pytest.mark.parametrize("skip_zero", [False, True])
-def test_is_adam_except_where_entries_are_skipped(rng: torch.Generator, skip_zero: bool) -> None:
-    start, grads = torch.randn(SHAPE, generator=rng, dtype=torch.float64), gradients(rng, 12)
-    if not skip_zero:
-        grads = [grad.clamp(min=0) for grad in grads]
-    ours, theirs = (start.clone().requires_grad_() for _ in range(2))
-    grid = GridAdam([{"params": [ours], "skip_zero": skip_zero}], lr=0.1)
-    adam = torch.optim.Adam([theirs], lr=0.1, betas=(0.9, 0.99), eps=1e-8)
-    torch.testing.assert_close(run(grid, ours, grads), run(adam, theirs, grads))
-
-
-def test_an_entry_without_gradient_keeps_value_and_moments() -> None:
-    parameter = torch.zeros(1, 1, 2, 2, requires_grad=True)
-    optimizer = GridAdam([{"params": [parameter], "skip_zero": True}], lr=0.1)
-    # Entry (0, 1) shares its row with a touched one; the second row is not touched at all.
-    run(optimizer, parameter, [torch.full((1, 1, 2, 2), 2.0)])
-    before = {k: v.clone() for k, v in optimizer.state[parameter].items() if k != "steps"}
-    value = parameter.detach().clone()
-    run(optimizer, parameter, [torch.tensor([[3.0, 0.0], [0.0, 0.0]]).view(1, 1, 2, 2)])
-    state = optimizer.state[parameter]
-    still = torch.tensor([[False, True], [True, True]]).view(1, 1, 2, 2)
-    assert torch.equal(parameter[still], value[still])
-    for name in ("mean", "square"):
-        assert torch.equal(state[name][still], before[name][still])
-    # The touched one by hand: m = 0.9·0.2 + 0.1·3, v = 0.99·0.04 + 0.01·9, second step.
-    assert state["mean"][0, 0, 0, 0].item() == pytest.approx(0.48)
-    assert state["square"][0, 0, 0, 0].item() == pytest.approx(0.1296)
-    move = 0.1 * (0.48 / (1 - 0.9**2)) / math.sqrt(0.1296 / (1 - 0.99**2))
-    assert parameter[0, 0, 0, 0].item() == pytest.approx(-0.1 - move, rel=1e-5)
-    # The memory of its gradient is cleared, not given back.
-    assert parameter.grad is not None and not parameter.grad.any()
+def test_a_step_clears_the_gradient() -> None:
+    values, gradient = torch.zeros(3), torch.tensor([1.0, -2.0, 0.0])
+    adam_step(values, gradient, torch.zeros(3), torch.zeros(3), AdamRule(0.1, 1))
+    torch.testing.assert_close(values, torch.tensor([-0.1, 0.1, 0.0]))
+    assert not gradient.any()
 
 
 @pytest.mark.parametrize("skip_zero", [False, True])
-def test_the_rate_of_each_voxel_is_scaled(rng: torch.Generator, skip_zero: bool) -> None:
-    factors = torch.rand(*SHAPE[:3], 1, generator=rng, dtype=torch.float64)
-    grads = gradients(rng, 5)
-    scaled, plain = (torch.zeros(SHAPE, dtype=torch.float64, requires_grad=True) for _ in range(2))
-    slow = GridAdam([{"params": [scaled], "per_voxel_lr": factors, "skip_zero": skip_zero}], lr=0.1)
-    # The moments do not depend on the values, so each move is the plain one times its factor.
-    moved = run(slow, scaled, grads)
-    torch.testing.assert_close(moved, factors * run(GridAdam([plain], lr=0.1), plain, grads))
+def test_a_second_step_by_hand(skip_zero: bool) -> None:
+    values, gradient = torch.tensor([1.0, 1.0]), torch.tensor([3.0, 0.0])
+    mean, square = torch.tensor([0.2, 0.2]), torch.tensor([0.04, 0.04])
+    adam_step(values, gradient, mean, square, AdamRule(0.1, 2, skip_zero=skip_zero))
+    # m = 0.9·0.2 + 0.1·3, s = 0.99·0.04 + 0.01·9; with no gradient 0.9·0.2 and 0.99·0.04.
+    still = (0.2, 0.04) if skip_zero else (0.18, 0.0396)
+    assert mean.tolist() == pytest.approx([0.48, still[0]])
+    assert square.tolist() == pytest.approx([0.1296, still[1]])
+    moves = [
+        0.1 * (m / (1 - 0.9**2)) / (math.sqrt(s / (1 - 0.99**2)) + 1e-8)
+        for m, s in ((0.48, 0.1296), (0.18, 0.0396))
+    ]
+    assert values.tolist() == pytest.approx([1 - moves[0], 1.0 if skip_zero else 1 - moves[1]])
 
 
-def test_outside_the_rows_no_gradient_is_read(rng: torch.Generator) -> None:
-    grads, rows = gradients(rng, 3), torch.tensor([1, 4, 11], dtype=torch.int32)
-    inside = torch.zeros(12, 1, dtype=torch.bool).index_fill_(0, rows.long(), True).view(2, 3, 2, 1)
-    ours, theirs = (torch.zeros(SHAPE, dtype=torch.float64, requires_grad=True) for _ in range(2))
-    some = GridAdam([{"params": [ours], "skip_zero": True, "rows": rows}])
-    every = GridAdam([{"params": [theirs], "skip_zero": True}])
-    run(every, theirs, [grad * inside for grad in grads])
-    assert torch.equal(run(some, ours, grads), theirs) and ours.any()
-    restored = GridAdam([{"params": [ours], "skip_zero": True}])
-    restored.load_state_dict(some.state_dict())
-    assert torch.equal(restored.param_groups[0]["rows"], rows)
+def total_variation(grid: Tensor) -> Tensor:
+    """The Huber penalty of the differences along each axis."""
+    pairs = [
+        (grid.narrow(k, 1, grid.shape[k] - 1), grid.narrow(k, 0, grid.shape[k] - 1))
+        for k in range(3)
+    ]
+    return sum(torch.nn.functional.huber_loss(*pair, reduction="sum") for pair in pairs)
 
 
-def test_a_parameter_without_gradient_is_not_moved_and_the_closure_is_called() -> None:
-    parameter = torch.ones(1, 1, 1, 1, requires_grad=True)
-    other = torch.ones(1, 1, 1, 1, requires_grad=True)
-    optimizer = GridAdam([parameter, other], lr=0.1)
-
-    def closure() -> Tensor:
-        loss = 2 * parameter.sum()
-        loss.backward()
-        return loss
-
-    assert optimizer.step(closure).item() == 2.0
-    assert parameter.item() == pytest.approx(0.9) and other.item() == 1.0
-
-
-@pytest.mark.parametrize("touched_only", [False, True])
-def test_smoothing_adds_the_gradient_of_the_total_variation(
-    rng: torch.Generator, touched_only: bool
-) -> None:
-    start, grads = torch.randn(SHAPE, generator=rng, dtype=torch.float64), gradients(rng, 5)
-    grads = [grad.clamp(min=0) for grad in grads]
-    ours, theirs = (start.clone().requires_grad_() for _ in range(2))
-    settings = {"smoothing": 0.4, "along_z": 0.5, "touched_only": touched_only}
-    smooth = GridAdam([{"params": [ours], **settings}], lr=0.1)
-    plain = GridAdam([theirs], lr=0.1)
-    for grad in grads:
-        more = torch.zeros_like(grad)
-        add_total_variation_gradient(theirs.detach(), more, 0.4, along_z=0.5)
-        run(plain, theirs, [grad + (more * (grad != 0) if touched_only else more)])
-        run(smooth, ours, [grad])
-    torch.testing.assert_close(ours, theirs)
-
-
-def test_gradients_of_skipping_groups_stay_where_they_are_and_are_zero_after_a_step() -> None:
-    kept, other = (torch.ones(1, 1, 1, 2, requires_grad=True) for _ in range(2))
-    optimizer = GridAdam([{"params": [kept], "skip_zero": True}, {"params": [other]}])
-    optimizer.make_gradients()
-    place = kept.grad
-    assert place is not None and other.grad is None
-    (2 * kept.sum() + other.sum()).backward()
-    assert kept.grad is place and place.flatten().tolist() == [2, 2]
-    optimizer.step()
-    assert kept.grad is place and not place.any() and other.grad is None
-    assert kept[0, 0, 0, 0].item() == pytest.approx(1 - 1e-3)
-    (kept.sum() + other.sum()).backward()
-    optimizer.zero_grad()
-    assert kept.grad is place and not place.any() and other.grad is None
-    larger = torch.ones(1, 1, 2, 2, requires_grad=True)
-    optimizer.replace(0, [larger])
-    assert larger.grad is not None
-
-
-def test_what_is_replaced_or_forgotten_starts_afresh() -> None:
-    old, new = (torch.zeros(1, 1, 1, 1, requires_grad=True) for _ in range(2))
-    optimizer = GridAdam([old], lr=0.1)
-    run(optimizer, old, [torch.ones(1, 1, 1, 1)] * 3)
-    optimizer.replace(0, [new])
-    assert old not in optimizer.state
-    optimizer.forget()
-    run(optimizer, new, [torch.full((1, 1, 1, 1), -5.0)])
-    assert new.item() == pytest.approx(0.1) and old.item() == pytest.approx(-0.3)
-    moments = optimizer.state[new]["mean"]
-    optimizer.forget()
-    run(optimizer, new, [torch.full((1, 1, 1, 1), 5.0)])
-    assert optimizer.state[new]["mean"] is moments
-    assert new.item() == pytest.approx(0.0, abs=1e-7)
-
-
-def test_the_rate_may_be_set_by_the_closure() -> None:
-    parameter = torch.zeros(1, 1, 1, 1, requires_grad=True)
-    optimizer = GridAdam([parameter], lr=0.5)
-
-    def closure() -> None:
-        optimizer.param_groups[0]["lr"] = 0.25
-        parameter.grad = torch.ones(1, 1, 1, 1)
-
-    optimizer.step(closure)
-    assert parameter.item() == pytest.approx(-0.25) and parameter.grad is None
+def test_the_gradient_of_the_total_variation(rng: torch.Generator) -> None:
+    grid = torch.randn(4, 3, 5, 2, generator=rng, dtype=torch.float64).mul_(1.5).requires_grad_()
+    (truth,) = torch.autograd.grad(total_variation(grid), grid)
+    ours = torch.zeros_like(grid)
+    add_total_variation_gradient(grid.detach(), ours, 1.0)
+    torch.testing.assert_close(ours, truth)
+    values = peak()
+    touched = torch.zeros(2, 2, 2, 1)
+    touched[1, 1, 1] = 1.0
+    add_total_variation_gradient(values, touched, 0.5, along_z=3.0, touched_only=True)
+    # 1 of each of three neighbours, of the one along z three times.
+    assert touched[1, 1, 1].item() == 3.5 and touched.count_nonzero() == 1

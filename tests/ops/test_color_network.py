@@ -1,22 +1,87 @@
-"""What the colour network gets from a ray, and gives back to it."""
+"""The colour network: what a sample's feature and its ray's direction become."""
 
 from __future__ import annotations
 
+import math
+
+import pytest
 import torch
 
-from devrf.ops.color_network import RowOfRay
+from devrf.ops.color_network import ColorNetwork, decode
 
 
-def test_a_rays_gradient_is_summed_without_losing_digits() -> None:
-    # 256 + 1 is 256 in bfloat16: a running sum of ones stays there.
-    rows = torch.zeros(2, 1, dtype=torch.bfloat16, requires_grad=True)
+def network(*, dtype: torch.dtype = torch.float64) -> ColorNetwork:
+    """One feature, one octave, two hidden units, whose first looks at sin(d_x) alone."""
+    direction = torch.zeros(2, 9, dtype=dtype)
+    direction[0, 3] = 2.0  # after d itself come the sines
+    return ColorNetwork(
+        feature_weight=torch.tensor([[1.0], [-1.0]], dtype=dtype),
+        feature_bias=torch.tensor([0.5, 0.0], dtype=dtype),
+        direction_weight=direction,
+        hidden_weight=torch.eye(2, dtype=dtype),
+        hidden_bias=torch.zeros(2, dtype=dtype),
+        output_weight=torch.tensor([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]], dtype=dtype),
+        output_bias=torch.zeros(3, dtype=dtype),
+        octaves=torch.ones(1, dtype=dtype),
+    )
+
+
+def test_a_color_by_hand() -> None:
+    viewdirs = torch.tensor([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
+    color = decode(
+        torch.tensor([[0.25]], dtype=torch.float64), viewdirs, torch.tensor([1]), network()
+    )
+    first = 0.25 + 0.5 + 2 * math.sin(1.0)  # the second unit, −0.25, is cut off
+    expected = [1 / (1 + math.exp(-logit)) for logit in (first, 0.0, first)]
+    assert color.tolist() == [pytest.approx(expected)]
+
+
+def test_rays_without_samples_do_not_matter_and_no_sample_is_no_color() -> None:
+    viewdirs = torch.nn.functional.normalize(torch.randn(4, 3, dtype=torch.float64), dim=1)
+    features = torch.randn(3, 1, dtype=torch.float64)
+    among_others = decode(features, viewdirs, torch.tensor([1, 1, 3]), network())
+    alone = decode(features, viewdirs[[1, 3]], torch.tensor([0, 0, 1]), network())
+    assert torch.equal(among_others, alone)
+    assert decode(features[:0], viewdirs, torch.zeros(0, dtype=torch.int64), network()).shape == (
+        0,
+        3,
+    )
+
+
+def test_gradients() -> None:
+    viewdirs = torch.nn.functional.normalize(torch.randn(2, 3, dtype=torch.float64), dim=1)
+    features = torch.randn(3, 1, dtype=torch.float64, requires_grad=True)
+    residual = torch.randn(3, 3, dtype=torch.float64, requires_grad=True)
+    weights = network()._replace(
+        direction_weight=torch.randn(2, 9, dtype=torch.float64, requires_grad=True),
+        hidden_weight=torch.randn(2, 2, dtype=torch.float64, requires_grad=True),
+    )
+    ray = torch.tensor([0, 0, 1])
+
+    def colors(f: torch.Tensor, r: torch.Tensor, d: torch.Tensor, h: torch.Tensor) -> torch.Tensor:
+        varied = weights._replace(direction_weight=d, hidden_weight=h)
+        return decode(f, viewdirs, ray, varied, torch.float32, r)
+
+    inputs = (features, residual, weights.direction_weight, weights.hidden_weight)
+    assert torch.autograd.gradcheck(colors, inputs)
+
+
+def test_gradients_of_many_samples_are_summed_without_losing_digits() -> None:
+    # 256 + 1 is 256 in bfloat16: a running sum of equal numbers stays there.
+    features, viewdirs = torch.full((2051, 1), 0.25), torch.eye(3)[:2]
     ray = torch.tensor([0] * 2048 + [1] * 3)
-    RowOfRay.apply(rows, ray).sum().backward()
-    assert rows.grad is not None and rows.grad.dtype == torch.bfloat16
-    assert rows.grad.flatten().tolist() == [2048.0, 3.0]
+    gradients = []
+    for precision in (torch.bfloat16, torch.float32):
+        layers = network(dtype=torch.float32)
+        layers.direction_weight.requires_grad_()
+        decode(features, viewdirs, ray, layers, precision).sum().backward()
+        gradients.append(layers.direction_weight.grad)
+    assert gradients[1].abs().max() > 256
+    torch.testing.assert_close(gradients[0], gradients[1], rtol=0.05, atol=1e-3)
 
 
-def test_its_gradient_is_right() -> None:
-    rows = torch.randn(3, 2, dtype=torch.float64, requires_grad=True)
-    ray = torch.tensor([0, 0, 2, 2, 2])
-    assert torch.autograd.gradcheck(lambda r: RowOfRay.apply(r, ray), (rows,), atol=1e-4)
+def test_without_samples_gradients_are_zero() -> None:
+    features, layers = torch.zeros(0, 1, requires_grad=True), network(dtype=torch.float32)
+    layers.direction_weight.requires_grad_()
+    decode(features, torch.eye(3), torch.zeros(0, dtype=torch.int64), layers).sum().backward()
+    assert features.grad.shape == (0, 1) and not layers.direction_weight.grad.any()

@@ -8,8 +8,9 @@ from torch import Tensor
 from torch.autograd import gradcheck
 
 from devrf.geometry.box import Box
-from devrf.ops.corners import to_grid
-from devrf.ops.trilinear import interpolate
+from devrf.ops.trilinear import look_up
+
+UNIT = Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
 
 
 def corner_grid() -> Tensor:
@@ -31,58 +32,64 @@ def corner_grid() -> Tensor:
     ],
 )
 def test_interpolates_between_eight_corners(at: tuple[float, float, float], value: float) -> None:
-    assert interpolate(corner_grid(), torch.tensor([at])).item() == pytest.approx(value, rel=1e-6)
+    found = look_up(corner_grid(), torch.tensor([at]), UNIT).item()
+    assert found == pytest.approx(value, rel=1e-6)
 
 
 def test_is_exact_at_every_grid_point_of_a_grid_with_unequal_sides(rng: torch.Generator) -> None:
     grid = torch.randn(3, 4, 5, 2, generator=rng)
     points = torch.cartesian_prod(torch.arange(3.0), torch.arange(4.0), torch.arange(5.0))
-    assert torch.equal(interpolate(grid, points), grid.reshape(-1, 2))
+    box = Box((0.0, 0.0, 0.0), (2.0, 3.0, 4.0))
+    assert torch.equal(look_up(grid, points, box), grid.reshape(-1, 2))
+
+
+def test_the_grid_lies_on_the_box() -> None:
+    box = Box((-1.1, 0.3, -0.7), (0.9, 2.2, 1.3))
+    shape = (7, 160, 33)
+    # A grid of its own coordinates.
+    grid = torch.stack(torch.meshgrid(*map(torch.arange, shape), indexing="ij"), dim=-1).float()
+    points = torch.tensor([box.low, box.middle, box.high])
+    expected = torch.tensor([[0.0, 0.0, 0.0], [3.0, 79.5, 16.0], [6.0, 159.0, 32.0]])
+    torch.testing.assert_close(look_up(grid, points, box), expected)
 
 
 def test_outside_the_border_goes_on(rng: torch.Generator) -> None:
     grid = torch.randn(3, 3, 3, 1, generator=rng)
-    coords = torch.tensor([[-5.0, 1.0, 1.0], [9.0, 1.0, 1.0], [1.0, -0.01, 7.0]])
+    points = torch.tensor([[-5.0, 1.0, 1.0], [9.0, 1.0, 1.0], [1.0, -0.01, 7.0]])
     expected = torch.stack([grid[0, 1, 1], grid[2, 1, 1], grid[1, 0, 2]])
-    torch.testing.assert_close(interpolate(grid, coords), expected)
+    torch.testing.assert_close(look_up(grid, points, Box((0.0,) * 3, (2.0,) * 3)), expected)
 
 
 def test_gradients_of_values_and_positions(rng: torch.Generator) -> None:
     grid = torch.randn(3, 4, 3, 2, generator=rng, dtype=torch.float64, requires_grad=True)
     # Off the grid planes, where the slope jumps; two points in one cell, one outside.
-    coords = torch.tensor(
+    points = torch.tensor(
         [[0.3, 1.2, 0.7], [1.6, 2.9, 1.1], [0.2, 1.4, 0.9], [1.4, -0.5, 2.6]],
         dtype=torch.float64,
         requires_grad=True,
     )
-    assert gradcheck(interpolate, (grid, coords))
+    box = Box((0.0, 0.0, 0.0), (2.0, 6.0, 1.0))
+    points = (points.detach() * torch.tensor([1.0, 2.0, 0.5])).requires_grad_()
+    assert gradcheck(lambda grid, points: look_up(grid, points, box), (grid, points))
 
 
 @pytest.mark.parametrize("channels", [1, 4])
 def test_no_points_is_no_values_and_no_gradient(channels: int) -> None:
     grid = torch.ones(2, 3, 2, channels, requires_grad=True)
-    coords = torch.zeros(0, 3, requires_grad=True)
-    out = interpolate(grid, coords)
+    points = torch.zeros(0, 3, requires_grad=True)
+    out = look_up(grid, points, UNIT)
     assert out.shape == (0, channels)
     out.sum().backward()
     assert grid.grad is not None and not grid.grad.any()
-    assert coords.grad is not None and coords.grad.shape == (0, 3)
+    assert points.grad is not None and points.grad.shape == (0, 3)
 
 
-def test_the_gradient_of_a_grid_may_be_added_to_a_buffer() -> None:
-    grid, into = torch.zeros(2, 2, 2, 1, requires_grad=True), torch.ones(2, 2, 2, 1)
-    interpolate(grid, torch.tensor([[0.25, 0.0, 0.0]]), gradient=into).sum().backward()
-    assert grid.grad is None
-    assert into[0, 0, 0].item() == pytest.approx(1.75)
-    assert into[1, 0, 0].item() == pytest.approx(1.25)
-    assert into[:, 1].eq(1).all()
-
-
-def test_a_shape_first_met_in_inference_mode_can_be_trained() -> None:
+def test_a_box_first_met_in_inference_mode_can_be_trained_in() -> None:
     grid, box = torch.zeros(2, 3, 9, 1), Box((0.0, 0.0, 0.0), (1.0, 1.0, 8.0))
+    grid[1] = 1.0
+    grid[:, :, -1] += 5.0
     with torch.inference_mode():
-        interpolate(grid, to_grid(torch.ones(1, 3), box, (2, 3, 9)))
-    points = torch.ones(1, 3, requires_grad=True)
-    coords = to_grid(points, box, (2, 3, 9))
-    (interpolate(grid, coords).sum() + coords.sum()).backward()
-    assert points.grad is not None and points.grad.tolist() == [[1.0, 2.0, 1.0]]
+        look_up(grid, torch.ones(1, 3), box)
+    points = torch.tensor([[0.5, 0.5, 7.5]], requires_grad=True)
+    look_up(grid, points, box).sum().backward()
+    assert points.grad is not None and points.grad.tolist() == [[1.0, 0.0, 5.0]]

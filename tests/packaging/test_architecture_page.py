@@ -51,6 +51,6 @@ def test_an_iteration_enters_the_files_that_are_listed_in_their_order(
     stage = DeformationStage(rest, schedule, iterations_per_step=1)
     trainer(max_steps=5).fit(stage, datamodule=datamodule)
     section = PAGE.read_text().split("{ #one-iteration }")[1]
-    listed = re.findall(r"`((?:engine|methods/devrf)/\w+\.py)`", section)
-    inner = [name for name in entered if name.startswith(("engine/", "methods/devrf/"))]
+    listed = re.findall(r"`((?:engine|methods/devrf|kernels)/\w+\.py)`", section)
+    inner = [n for n in entered if n.startswith(("engine/", "methods/devrf/", "kernels/"))]
     assert inner == listed

@@ -32,17 +32,39 @@ def test_dilate_grows_a_cube_and_stops_at_the_border():
     assert torch.equal(dilate(expected, 0), expected)
 
 
-def test_nothing_within_reach_of_a_point_means_no_occupied_cell_is(rng):
+def test_distances_are_those_along_the_farthest_axis_up_to_eight(cube):
+    occupancy = Occupancy(single((20, 7, 9), (3, 2, 8)) | single((20, 7, 9), (19, 6, 0)), cube)
+    cells = torch.cartesian_prod(torch.arange(20), torch.arange(7), torch.arange(9))
+    away = [(cells - torch.tensor(one)).abs().amax(dim=1) for one in ((3, 2, 8), (19, 6, 0))]
+    expected = torch.minimum(*away).clamp(max=8).view(20, 7, 9)
+    surroundings = occupancy.surroundings
+    assert surroundings.box == cube and surroundings.distances.dtype == torch.uint8
+    assert torch.equal(surroundings.distances.long(), expected)
+    assert Occupancy.FARTHEST == expected.max() == 8
+
+
+def test_nothing_nearer_than_its_distance_is_occupied(rng):
     # What strides along a ray rely on; a grid with cells of unequal sides, points outside too.
     box = Box((0.0, 0.0, 0.0), (1.0, 2.0, 4.0))
-    occupancy = Occupancy(torch.rand(9, 9, 9, generator=rng) < 0.02, box)
+    occupancy = Occupancy(torch.rand(9, 9, 9, generator=rng) < 0.012, box)
     points = torch.rand(400, 3, generator=rng) * torch.tensor([1.6, 2.6, 4.6]) - 0.3
-    around = torch.nn.functional.normalize(torch.randn(400, 300, 3, generator=rng), dim=2)
-    length = occupancy.reach * torch.rand(400, 300, 1, generator=rng)
-    probes = points[:, None] + around * length
-    found = occupancy.at(probes.view(-1, 3)).view(400, 300).any(dim=1)
-    assert found.any() and not found.all()
-    assert occupancy.near(points)[found].all()
+    cells = occupancy.surroundings.at(points)
+    assert torch.equal(cells == 0, occupancy.at(points))
+    assert set(cells.tolist()) >= {0, 1, 2, 3} and cells.max() <= 8
+    assert (cells[~box.scaled(1.3).contains(points)] == 1).all()
+    # In so many cells less one along every axis nothing is met, and in a few more something is.
+    edges = torch.tensor(box.size) / 8
+    around = torch.rand(400, 300, 3, generator=rng) * 2 - 1
+    empty = cells > 0
+    for more, met in ((-1, False), (0.9, True)):
+        reach = (cells[empty] + more)[:, None, None] * edges * 0.999
+        probes = points[empty][:, None] + around[empty] * reach
+        assert bool(occupancy.at(probes.view(-1, 3)).any()) == met
+
+
+def test_the_shortest_edge_of_a_cell():
+    mask = torch.ones(5, 5, 5, dtype=torch.bool)
+    assert Occupancy(mask, Box((0.0, 0.0, 0.0), (1.0, 2.0, 4.0))).cell == 0.25
 
 
 @pytest.mark.parametrize(
@@ -64,13 +86,14 @@ def test_bounding_box_by_hand(cube, cells, expected):
     assert bounding_box(mask, cube) == (expected and Box(*expected))
 
 
-def test_a_stored_mask_of_other_shape_and_box_loads_with_its_vicinity(cube, rng):
+def test_a_stored_mask_of_other_shape_and_box_loads_with_its_distances(cube, rng):
     box = Box((-2.0, 0.0, 0.0), (2.0, 1.0, 3.0))
     stored = Occupancy(torch.rand(6, 4, 5, generator=rng) < 0.1, box)
     fresh = Occupancy.full((2, 2, 2), cube)
+    assert not fresh.surroundings.distances.any()
     fresh.load_state_dict(stored.state_dict())
-    assert fresh.box == box
+    assert fresh.box == fresh.surroundings.box == box
     assert torch.equal(fresh.mask, stored.mask)
-    assert torch.equal(fresh.vicinity, stored.vicinity)
+    assert torch.equal(fresh.surroundings.distances, stored.surroundings.distances)
     points = torch.rand(200, 3, generator=rng) * 5 - 2.5
     assert torch.equal(fresh.at(points), stored.at(points))

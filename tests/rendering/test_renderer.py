@@ -89,7 +89,7 @@ def test_an_image_is_the_same_with_less_memory(rest, tiny_scene, same, monkeypat
     rays = tiny_scene.static.test.cameras.image_rays(0)
     rays = rays[torch.arange(len(rays)).repeat(2)]
     whole = Renderer(rest.model).picture(rays, 0.0, 1.0)
-    usual, tried = module.picture, []
+    usual, tried = module.render, []
 
     def render(some, *others, **named):
         tried.append(len(some))
@@ -97,7 +97,7 @@ def test_an_image_is_the_same_with_less_memory(rest, tiny_scene, same, monkeypat
             raise torch.OutOfMemoryError("CUDA out of memory.")
         return usual(some, *others, **named)
 
-    monkeypatch.setattr(module, "picture", render)
+    monkeypatch.setattr(module, "render", render)
     same(Renderer(rest.model).picture(rays, 0.0, 1.0), whole)
     assert tried == [864, 432, 432]
     assert caplog.messages[-1].startswith("out of memory: pictures are rendered 432 rays")

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
+from devrf.kernels.march import march
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import (
     CanonicalField,
@@ -17,9 +18,10 @@ from devrf.methods.devrf.canonical_field import (
     SigmoidColor,
     VoxelGrid,
 )
+from devrf.methods.devrf.volume_rendering import medium
 from devrf.ops.compositing import composite
 from devrf.rendering.occupancy import Occupancy
-from devrf.rendering.sampling import march
+from devrf.rendering.sampling import RenderSettings
 
 SMALL = Architecture(channels=4, width=8, frequencies=2)
 
@@ -150,7 +152,11 @@ def test_samples_are_evenly_spaced_from_the_first_plane_to_the_last():
     # From the near plane at z = −1 to infinity at z = 1, as rays in NDC are.
     ray = Rays(*(torch.tensor([v]) for v in ([0.2, 0.1, -1.0], [0.0, 0.0, 2.0], [0.0, 0.0, -1.0])))
     everywhere = Occupancy.full(field.density.shape, AHEAD)
-    samples = march(ray, AHEAD, everywhere, step=field.step_length(0.5), near=0.0, far=1.0)
-    assert len(samples) == (PLANES - 1) * 2 + 1
+    settings = RenderSettings(step=0.5, alpha_threshold=0.0, near=0.0, far=1.0)
+    with torch.no_grad():
+        field.density.values.fill_(-60.0)  # nothing is hidden
+        samples = march(ray, medium(field, everywhere, settings))
+    count = (PLANES - 1) * 2 + 1
+    assert len(samples.ray) == count
     depth = samples.points[:, 2]
-    torch.testing.assert_close(depth, torch.linspace(-1, 1, len(samples)), atol=1e-5, rtol=0)
+    torch.testing.assert_close(depth, torch.linspace(-1, 1, count), atol=1e-5, rtol=0)

@@ -17,7 +17,7 @@ from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.extensions.priors import Elastic
 from devrf.methods.devrf.extensions.tracks import StartAlongFlow
 from devrf.methods.devrf.settings import MotionSettings
-from devrf.ops.adam_step import add_total_variation_gradient
+from devrf.ops.adam import add_total_variation_gradient
 from devrf.rendering.renderer import Renderer
 
 SHORT = DeformationSchedule(levels=(Level(4, 20), Level(8, 10)), rays=256)

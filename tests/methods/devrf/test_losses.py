@@ -27,9 +27,9 @@ from devrf.methods.devrf.losses import (
     induced_flow,
 )
 from devrf.methods.weighted_loss import counted_weights
+from devrf.ops.march import Samples
 from devrf.ops.photometric import distortion
 from devrf.rendering.output import VoxelOutput
-from devrf.rendering.sampling import Samples
 from devrf.scenes.procedural import Material, ProceduralScene
 from devrf.scenes.scene import Scene
 
@@ -60,13 +60,12 @@ def prediction() -> Prediction:
     sample_color = torch.tensor(
         [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.5, 0.5, 0.5]], requires_grad=True
     )
+    left = torch.tensor([0.25, 1.0, 0.2])
     output = VoxelOutput(
         color=torch.tensor([[0.5, 0.25, 0.0], [0.0, 0.0, 0.0], [0.4, 0.4, 0.4]]),
         depth=torch.zeros(3),
-        transmittance=torch.tensor([0.25, 1.0, 0.2]),
-        samples=Samples(RAY, torch.ones(3), torch.zeros(3, 3), 3),
-        canonical=torch.zeros(3, 3),
-        weight=weight,
+        transmittance=left,
+        samples=Samples(RAY, torch.ones(3), torch.zeros(3, 3), torch.zeros(3, 3), weight, left),
         sample_color=sample_color,
     )
     batch = batch_of(
@@ -84,7 +83,7 @@ def test_color_and_per_sample_color_by_hand(prediction):
     assert PHOTOMETRIC_TERMS["per_sample_color"](prediction).item() == pytest.approx(expected)
     # Its gradient stops at the weights.
     PHOTOMETRIC_TERMS["per_sample_color"](prediction).backward()
-    assert prediction.output.weight.grad is None
+    assert prediction.output.samples.weight.grad is None
     # 2 · w · (c − C) / R of the first sample's green.
     assert prediction.output.sample_color.grad is not None
     assert prediction.output.sample_color.grad[0, 1].item() == pytest.approx(2 * 0.5 * -0.25 / 3)
@@ -142,14 +141,12 @@ def seen(
     batch: RayBatch, ray: Tensor, points: Tensor, canonical: Tensor, weight: Tensor
 ) -> VoxelOutput:
     """An output that holds what the motion terms look at."""
-    rays = len(batch.rays)
+    none = torch.zeros(len(batch.rays))
     return VoxelOutput(
-        color=torch.zeros(rays, 3),
-        depth=torch.zeros(rays),
-        transmittance=torch.zeros(rays),
-        samples=Samples(ray, torch.zeros(len(ray)), points, rays),
-        canonical=canonical,
-        weight=weight,
+        color=torch.zeros(len(none), 3),
+        depth=none,
+        transmittance=none,
+        samples=Samples(ray, torch.zeros(len(ray)), points, canonical, weight, none),
         sample_color=torch.zeros(len(ray), 3),
     )
 
@@ -261,7 +258,7 @@ def test_induced_flow_of_the_exact_motion_is_the_exact_flow(tiny_scene, tiny_rec
     batch, output = prediction.batch, prediction.output
     assert batch.flow is not None and len(batch.flow) > 100
     induced = induced_flow(
-        output.canonical,
+        output.samples.canonical,
         prediction.unwarp_previous,
         prediction.cameras,
         prediction.previous_image[batch.image],

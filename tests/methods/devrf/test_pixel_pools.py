@@ -9,8 +9,9 @@ from devrf.geometry.cameras import Cameras
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.pixel_pools import rays_hit_occupied
+from devrf.ops.march import Path, samples_in_box
 from devrf.rendering.occupancy import Occupancy, dilate
-from devrf.rendering.sampling import RenderSettings, march
+from devrf.rendering.sampling import RenderSettings
 
 
 def test_no_pixel_that_meets_matter_is_left_out(cube: Box) -> None:
@@ -31,9 +32,10 @@ def test_no_pixel_that_meets_matter_is_left_out(cube: Box) -> None:
     together = rays_hit_occupied(cameras, torch.tensor([0, 0, 0]), model, occupancy)
     found = together[0]
     assert torch.equal(together, found.expand(3, -1))
-    samples = march(cameras.image_rays(0), cube, occupancy, step=0.03, near=0.1, far=9.0)
+    path = Path(cube, occupancy.surroundings, step=0.03, near=0.1, far=9.0)
+    ray, _, points = samples_in_box(cameras.image_rays(0), path)
     seen = torch.zeros(width * height, dtype=torch.bool)
-    seen[samples.ray] = True
+    seen[ray[occupancy.at(points)]] = True
     assert found.shape == seen.shape
     assert 40 < seen.sum() and found[seen].all()
     # A rim of a few pixels around them, no more.

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -10,9 +12,14 @@ from torch import Tensor
 from torch.autograd import gradcheck
 
 from devrf.geometry.box import Box
+from devrf.geometry.clock import FrameClock
 from devrf.geometry.rays import Rays
+from devrf.geometry.space import WORLD
+from devrf.kernels.look_up import look_up
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
+from devrf.methods.devrf.deformation_field import DeformationField, GridWarp
+from devrf.methods.devrf.view import DeVRFView
 from devrf.methods.devrf.volume_rendering import render
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.sampling import RenderSettings
@@ -60,7 +67,7 @@ def test_a_slab_by_its_geometric_series(cube: Box) -> None:
     expected = torch.stack([(1 - left) * GREEN + left * backgrounds[0], backgrounds[1]])
     torch.testing.assert_close(out.color, expected)
     weights = [0.1 * 0.9**k for k in range(COUNT)]
-    torch.testing.assert_close(out.weight, torch.tensor(weights))
+    torch.testing.assert_close(out.samples.weight, torch.tensor(weights))
     distance = [2 + (FIRST + k) * STEP for k in range(COUNT)]
     torch.testing.assert_close(out.samples.distance, torch.tensor(distance))
     mean = sum(w * d for w, d in zip(weights, distance, strict=True)) / sum(weights)
@@ -70,14 +77,14 @@ def test_a_slab_by_its_geometric_series(cube: Box) -> None:
 
 def test_samples_too_faint_are_not_there_at_all(cube: Box) -> None:
     out = render(along_x(0.0), fog(cube, 0.1), slab(cube), settings(0.11), WHITE / 2)
-    assert len(out.samples) == len(out.weight) == len(out.sample_color) == 0
+    assert len(out.samples.ray) == len(out.samples.weight) == len(out.sample_color) == 0
     assert torch.equal(out.color, torch.full((1, 3), 0.5))
     assert out.transmittance.item() == 1 and out.depth.item() == 0
 
 
 def test_samples_of_too_little_weight_shade_but_have_no_colour(cube: Box) -> None:
     out = render(along_x(0.0), fog(cube, 0.5), slab(cube), settings(0.2), torch.zeros(3))
-    torch.testing.assert_close(out.weight, torch.tensor([0.5, 0.25]))
+    torch.testing.assert_close(out.samples.weight, torch.tensor([0.5, 0.25]))
     torch.testing.assert_close(out.color[0], 0.75 * GREEN)
     assert out.transmittance.item() == pytest.approx(0.5**COUNT, rel=1e-4)
 
@@ -99,10 +106,9 @@ def test_a_warp_looks_up_samples_elsewhere_but_leaves_them_in_place(cube: Box) -
     with torch.no_grad():
         field.color.values.copy_(ramp.expand(-1, -1, -1, 3))
     shift = torch.tensor([0.3, 0.1, 0.0])
-    out = render(
-        along_x(0.0), field, slab(cube), settings(1e-3), WHITE, lambda points: points + shift
-    )
-    torch.testing.assert_close(out.canonical, out.samples.points + shift)
+    warp = GridWarp((shift.expand(2, 2, 2, 3),), cube)
+    out = render(along_x(0.0), field, slab(cube), settings(1e-3), WHITE, warp)
+    torch.testing.assert_close(out.samples.canonical, out.samples.points + shift)
     x = -1 + FIRST * STEP
     assert out.samples.points[0, 0].item() == pytest.approx(x, abs=1e-5)
     # What is seen at x has the colour of the place x + 0.3.
@@ -119,12 +125,54 @@ def test_gradients_of_field_and_warp(cube: Box, rng: torch.Generator) -> None:
     )
     rays = Rays(torch.tensor([[-3.0, 0.05, 0.1]], dtype=torch.float64).expand(2, 3), d, d)
 
-    def seen(density: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
+    def seen(density: Tensor, move: Tensor) -> tuple[Tensor, Tensor]:
         del field.density.values
         field.density.values = density  # type: ignore[assignment]
-        out = render(rays, field, full, settings(), d.new_ones(3), lambda points: points + shift)
+        out = render(rays, field, full, settings(), d.new_ones(3), GridWarp((move,), cube))
         return out.color, out.transmittance
 
     density = torch.randn(3, 3, 3, 1, generator=rng, dtype=torch.float64, requires_grad=True)
-    shift = torch.tensor([0.011, -0.023, 0.017], dtype=torch.float64, requires_grad=True)
-    assert gradcheck(seen, (density, shift))
+    move = torch.randn(2, 2, 2, 3, generator=rng, dtype=torch.float64).mul_(0.02)
+    assert gradcheck(seen, (density, move.requires_grad_()))
+
+
+@pytest.mark.parametrize("time", [0.5, 0.7])
+def test_a_picture_is_the_same_as_a_batch(cube: Box, rng: torch.Generator, time: float) -> None:
+    def draw(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=rng)
+
+    sizes = Architecture(channels=4, width=8, frequencies=1, alpha_init=0.1)
+    field = sizes.radiance_field(cube, 7**3, 9**3)
+    motion = DeformationField(cube, FrameClock((0.0, 0.5, 1.0)), voxels=4**3)
+    with torch.no_grad():
+        field.density.values.copy_(4 * draw(*field.density.values.shape))
+        field.color.values.copy_(draw(*field.color.values.shape))
+        motion.to_canonical[1:] = 0.1 * draw(2, 4, 4, 4, 3)
+    occupancy = Occupancy(torch.rand(9, 9, 9, generator=rng) < 0.1, cube)
+    residual = draw(3, 4, 3, 3)
+    how = RenderSettings(step=0.5, alpha_threshold=0.02, near=0.2, far=9.0)
+    color_change = partial(look_up, residual, box=cube)
+    view = DeVRFView(field, occupancy, how, motion, WORLD, time, color_change)
+    d = torch.nn.functional.normalize(0.3 * draw(200, 3) + torch.tensor([1.0, 0.0, 0.0]), dim=1)
+    rays = Rays(0.3 * draw(200, 3) - torch.tensor([3.0, 0.0, 0.0]), d, d)
+    seen = view.render(rays, WHITE)
+    warp = motion.warp_at(time)
+    assert len(warp.slices) == (1 if time == 0.5 else 2)
+    # While it is learned, gradients flow through the slices, which are blended anew.
+    slices = tuple(frame.clone().requires_grad_() for frame in warp.slices)
+    batch = render(
+        rays,
+        field,
+        view.occupancy,
+        how,
+        WHITE,
+        replace(warp, slices=slices),
+        color_change=color_change,
+    )
+    assert batch.color.requires_grad and not seen.color.requires_grad
+    torch.testing.assert_close(seen.color, batch.color)
+    torch.testing.assert_close(seen.depth, batch.depth)
+    torch.testing.assert_close(seen.opacity, 1 - batch.transmittance)
+    assert 0.2 < (seen.opacity > 0.5).float().mean() < 0.9
+    batch.color.sum().backward()
+    assert all(frame.grad.any() for frame in slices)

@@ -1,0 +1,69 @@
+"""Every kernel compiles for NVIDIA's GPUs, whether there is one or not."""
+
+from __future__ import annotations
+
+import inspect
+import pkgutil
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+import torch
+import warp as wp
+
+import devrf.kernels
+from devrf.kernels.runtime import take
+
+# Densities, displacements, features.
+CHANNELS = (1, 3, 12)
+# Of generations of GPUs from Ampere to Blackwell.
+ARCHITECTURES = (80, 90, 120)
+
+
+def every_kernel() -> dict[str, wp.Kernel]:
+    """All kernels by names of their own: those made for so many channels, for each number."""
+    found: dict[str, wp.Kernel] = {}
+    for info in pkgutil.iter_modules(devrf.kernels.__path__):
+        module = import_module(f"devrf.kernels.{info.name}")
+        for name, value in vars(module).items():
+            if getattr(value, "__module__", module.__name__) != module.__name__:
+                continue  # another module's
+            if isinstance(value, wp.Kernel):
+                if value.func.__module__ == module.__name__:
+                    found[f"{info.name}.{name}"] = value
+            elif hasattr(value, "__wrapped__"):
+                if inspect.signature(value).return_annotation in (wp.Kernel, "wp.Kernel"):
+                    found |= {f"{info.name}.{name}_{count}": value(count) for count in CHANNELS}
+    return found
+
+
+@pytest.fixture(scope="module")
+def together() -> wp.Module:
+    """All kernels in one module: the compiler reads Warp's own functions once, not for each."""
+    assert take(torch.zeros(1))  # starts Warp
+    module = wp.get_module("devrf_kernels_together")
+    module.made = [
+        wp.Kernel(kernel.func, key=name.replace(".", "_"), module=module, options=kernel.options)
+        for name, kernel in every_kernel().items()
+    ]
+    return module
+
+
+def test_all_are_found() -> None:
+    look_ups = ("look_up_kernel", "slope_kernel", "add_kernel")
+    names = {f"look_up.{one}_{n}" for one in look_ups for n in CHANNELS}
+    names |= {f"adam.adam_kernel_{n}" for n in CHANNELS} | {"adam.add_total_variation"}
+    names |= {"march.march_kernel", "march.adjoint_kernel", "march.rays_that_hit_kernel"}
+    names |= {"march.count_samples_kernel", "march.keep_significant_kernel"}
+    assert set(every_kernel()) == names
+
+
+@pytest.mark.skipif(sys.platform == "darwin", reason="Warp has no compiler for CUDA there")
+@pytest.mark.parametrize("architecture", ARCHITECTURES)
+def test_every_kernel_compiles(together: wp.Module, architecture: int, tmp_path: Path) -> None:
+    (made,) = wp.compile_aot_module(together, arch=architecture, module_dir=tmp_path, use_ptx=False)
+    code = made.read_bytes()
+    assert made.suffix == ".cubin" and together.made
+    for kernel in together.made:
+        assert f"{kernel.get_mangled_name()}_cuda_kernel_forward".encode() in code, kernel.key

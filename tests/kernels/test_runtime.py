@@ -1,0 +1,175 @@
+"""Which tensors kernels take, and that the number of threads changes no bit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from devrf.geometry.box import Box
+from devrf.geometry.rays import Rays
+from devrf.kernels.adam import adam_step, add_total_variation_gradient
+from devrf.kernels.look_up import add_to_grid, look_up
+from devrf.kernels.march import march, rays_that_hit
+from devrf.kernels.runtime import choose, take
+from devrf.ops import adam, trilinear
+from devrf.ops import march as definition
+from devrf.ops.adam import AdamRule
+from devrf.ops.march import Medium, Path
+from devrf.rendering.occupancy import Occupancy
+
+BOX = Box((-1.0, -0.5, 0.0), (1.0, 1.5, 1.0))
+
+
+@pytest.fixture
+def in_torch() -> Iterator[None]:
+    """Kernels are not used."""
+    choose("torch")
+    yield
+    choose("auto")
+
+
+@pytest.fixture
+def threads() -> Iterator[Callable[[int], None]]:
+    """Sets the number of threads of the rest of the test."""
+    usual = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(usual)
+
+
+def scene(rng: torch.Generator, count: int = 500) -> tuple[Rays, Medium]:
+    """Random rays through a random medium that moves."""
+    origins, targets = torch.randn(2, count, 3, generator=rng)
+    directions = torch.nn.functional.normalize(targets - 2 * origins, dim=1)
+    occupancy = Occupancy(torch.rand(9, 8, 7, generator=rng) < 0.4, BOX)
+    medium = Medium(
+        Path(BOX, occupancy.surroundings, 0.05, 0.1, 6.0),
+        density=4 * torch.randn(6, 7, 5, 1, generator=rng),
+        shift=-1.5,
+        delta=0.4,
+        threshold=0.01,
+        displacement=0.15 * torch.randn(7, 3, 5, 3, generator=rng),
+        motion_box=BOX.scaled(0.7),
+        still_outside=True,
+    )
+    return Rays(2 * origins, directions, directions), medium
+
+
+def test_kernels_take_single_precision_where_they_run() -> None:
+    assert take(torch.zeros(1)) and take(torch.zeros(0, 3))
+    for other in (torch.float64, torch.float16, torch.bfloat16, torch.int32):
+        assert not take(torch.zeros(1, dtype=other))
+    assert not take(torch.zeros(1, device="meta"))
+
+
+def test_kernels_can_be_left_out(in_torch: None) -> None:
+    assert not take(torch.zeros(1))
+    choose("auto")
+    assert take(torch.zeros(1))
+
+
+def everything(given: tuple[Rays, Medium], points: Tensor, grid: Tensor) -> list[Any]:
+    """What all functions of the kernels give."""
+    rays, medium = given
+    stepped = [grid.clone(), grid.clone(), grid.clone(), grid.abs()]
+    adam_step(*stepped, AdamRule(0.1, 2))
+    smoothed = torch.zeros_like(grid)
+    add_total_variation_gradient(grid, smoothed, 0.5)
+    samples = march(rays, medium)
+    looked_up = look_up(grid, points, BOX)
+    return [
+        *vars(samples).values(),
+        rays_that_hit(rays, medium.path),
+        looked_up,
+        smoothed,
+        *stepped,
+    ]
+
+
+def by_definition(given: tuple[Rays, Medium], points: Tensor, grid: Tensor) -> list[Any]:
+    """The same, by the definitions."""
+    rays, medium = given
+    stepped = [grid.clone(), grid.clone(), grid.clone(), grid.abs()]
+    adam.adam_step(*stepped, AdamRule(0.1, 2))
+    smoothed = torch.zeros_like(grid)
+    adam.add_total_variation_gradient(grid, smoothed, 0.5)
+    samples = definition.march(rays, medium)
+    hits = definition.rays_that_hit(rays, medium.path)
+    looked_up = trilinear.look_up(grid, points, BOX)
+    return [*vars(samples).values(), hits, looked_up, smoothed, *stepped]
+
+
+def test_without_kernels_everything_is_the_definition_to_the_bit(
+    in_torch: None, rng: torch.Generator
+) -> None:
+    given = scene(rng), torch.randn(900, 3, generator=rng), torch.randn(6, 7, 5, 3, generator=rng)
+    expected = by_definition(*given)
+    ours = everything(*given)
+    assert all(torch.equal(one, other) for one, other in zip(ours, expected, strict=True))
+    choose("auto")
+    ours = everything(*given)
+    same = [torch.equal(one, other) for one, other in zip(ours, expected, strict=True)]
+    assert not all(same)  # rounded differently
+
+
+def test_doubles_are_taken_by_the_definition(rng: torch.Generator) -> None:
+    grid, points = torch.randn(6, 7, 5, 3, generator=rng), torch.randn(50, 3, generator=rng)
+    double = look_up(grid.double(), points.double(), BOX)
+    assert torch.equal(double, trilinear.look_up(grid.double(), points.double(), BOX))
+    # As every definition it can be differentiated twice.
+    places = points[:4].double().requires_grad_()
+    values = (look_up(grid.double(), places, BOX) ** 2).sum()
+    (slope,) = torch.autograd.grad(values, places, create_graph=True)
+    slope.sum().backward()
+    assert places.grad.abs().max() > 0
+
+
+def with_gradients(given: tuple[Rays, Medium], points: Tensor, grid: Tensor) -> list[Tensor]:
+    """What all functions give, and all gradients."""
+    rays, medium = given
+    results = everything(given, points, grid)
+    leaves = [medium.density, medium.displacement, grid, points]
+    for leaf in leaves:
+        leaf.grad = None
+        leaf.requires_grad_()
+    samples = march(rays, medium)
+    loss = (samples.canonical**2).sum() + (samples.weight**2).sum()
+    loss = loss + (samples.transmittance**2).sum() + (look_up(grid, points, BOX) ** 2).sum()
+    loss.backward()
+    # Once more, added to the gradients that are there.
+    (march(rays, medium).weight.sum() + look_up(grid, points, BOX).sum()).backward()
+    results += [leaf.grad for leaf in leaves]
+    for leaf in leaves:
+        leaf.requires_grad_(False)
+    return results
+
+
+@pytest.mark.parametrize("channels", [1, 3, 12])
+@pytest.mark.parametrize("count", [1, 500])
+def test_results_are_the_same_to_the_bit_with_any_number_of_threads(
+    channels: int, count: int, rng: torch.Generator, threads: Callable[[int], None]
+) -> None:
+    given = scene(rng, count)
+    # Many points a cell: the order of their sums would show.
+    points = 0.7 * torch.randn(20 * count, 3, generator=rng)
+    grid = torch.randn(6, 7, 5, channels, generator=rng)
+    alone = with_gradients(given, points, grid)
+    assert all(gradient is not None and gradient.any() for gradient in alone[-2:])
+    for number in (2, 3):
+        threads(number)
+        together = with_gradients(given, points, grid)
+        assert all(torch.equal(one, other) for one, other in zip(alone, together, strict=True))
+
+
+def test_every_plane_has_an_owner_with_more_threads_than_planes(
+    rng: torch.Generator, threads: Callable[[int], None]
+) -> None:
+    points, values = torch.randn(200, 3, generator=rng), torch.randn(200, 3, generator=rng)
+    alone, together = torch.zeros(2, 3, 2, 3), torch.zeros(2, 3, 2, 3)
+    add_to_grid(alone, points, values, BOX)
+    threads(5)
+    add_to_grid(together, points, values, BOX)
+    assert alone.all() and torch.equal(alone, together)
