@@ -17,6 +17,8 @@ log = logging.getLogger(__name__)
 
 # With compiled kernels on disk, loading them takes less.
 WAITED = 1.0
+# Of a block, as launches have them: kernels are compiled for their number.
+THREADS = {"cpu": 1, "cuda": 256}
 
 
 def compile_ahead(channels: Collection[int], device: torch.device) -> None:
@@ -42,7 +44,7 @@ def _compile(kernels: Sequence[wp.Kernel], device: torch.device) -> None:
     began = time.perf_counter()
     for number, kernel in enumerate(kernels):
         with compiling:
-            kernel.module.load(wp.get_device(str(device)))
+            kernel.module.load(wp.get_device(str(device)), THREADS[device.type])
         if number == 0 and time.perf_counter() - began > WAITED:
             folder = wp.config.kernel_cache_dir
             log.info("kernels are being compiled for this machine, once: %s keeps them", folder)
