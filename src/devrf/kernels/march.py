@@ -24,7 +24,8 @@ from devrf.ops.march import HIT_CELLS, STOP, Medium, Path, Samples
 from devrf.ops.trilinear import shape_of
 
 # Half edges of the inner box that a ray moves along any axis while its distance grows by what one
-# takes along the axis that it crosses fastest, at most (sideways through the shell).
+# takes along the axis that it crosses fastest, at most; more in a thick shell, and where a ray
+# crosses several axes about as fast.
 CONTRACTED_PACE = 3.0
 
 
@@ -357,8 +358,11 @@ def ray_of(geometry: Geometry, rays: RayArrays, number: int):
     entry = geometry.near
     leave = geometry.far
     if geometry.contracted == 1:
-        cells = wp.max(wp.cw_mul(geometry.half, geometry.occupancy.scale))
-        pace = wp.static(CONTRACTED_PACE) * ray.course[1] * cells
+        slopes = wp.abs(wp.cw_div(ray.direction, geometry.half))
+        fastest = ray.course[1]
+        pace = 2.0 * (slopes[0] + slopes[1] + slopes[2]) - fastest
+        pace = wp.max(pace, wp.max(wp.static(CONTRACTED_PACE), geometry.shell) * fastest)
+        pace *= wp.max(wp.cw_mul(geometry.half, geometry.occupancy.scale))
         entry = own_distance(ray.course, geometry.near)
         leave = own_distance(ray.course, geometry.far)
     else:
