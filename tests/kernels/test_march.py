@@ -15,7 +15,7 @@ from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.rays import Rays
 from devrf.kernels.march import march, rays_that_hit
 from devrf.ops import march as definition
-from devrf.ops.march import STOP, Medium, Path, Samples
+from devrf.ops.march import STOP, Medium, Path, Samples, Surroundings
 from devrf.ops.trilinear import shape_of
 from devrf.rendering.occupancy import Occupancy
 
@@ -365,6 +365,39 @@ def test_curved_rays_never_skip_what_is_occupied(
     torch.testing.assert_close(ours.distance.double(), theirs.distance, atol=1e-4, rtol=1e-5)
     hits = rays_that_hit(rays, path)
     assert torch.equal(hits, definition.rays_that_hit(doubled(rays), path)) and not hits.all()
+
+
+@pytest.mark.parametrize("shell", [0.5, 1.0])
+@pytest.mark.parametrize("edges", [(1.0, 1.0, 1.0), (1.0, 0.4, 2.0)])
+def test_the_fastest_curved_rays_skip_nothing(
+    edges: tuple[float, float, float], shell: float
+) -> None:
+    space = ContractedSpace(tuple(-edge for edge in edges), edges, shell)
+    half = torch.tensor(edges)
+    # Along diagonals, past the centre: far away they move sideways almost five half edges while
+    # they move one along the axis that they cross fastest.
+    origins = torch.tensor([[-0.2, 2.1, 1.0], [-1.4, 0.0, 2.5]]) * half
+    directions = torch.tensor([[0.98, 0.99, 1.0], [-1.0, 0.99, 0.98]]) * half
+    directions = torch.nn.functional.normalize(directions, dim=1)
+    rays = space.rays(Rays(origins, directions, directions))
+    cell, around = 0.015 * half, torch.arange(-30, 31)
+    away = torch.stack(torch.meshgrid(around, around, around, indexing="ij")).abs().amax(dim=0)
+    distances = away.clamp(max=Occupancy.FARTHEST).to(torch.uint8)
+    step, (entry, leave) = 0.005, rays.crossing(*space.box.corners(half), 0.05, math.inf)
+    for k in range(2):
+        ray = rays[k : k + 1]
+        places = torch.arange(float(entry[k]), float(leave[k]), step)[-150:]
+        points = ray.at(torch.zeros(len(places), dtype=torch.long), places)
+        for number, point in enumerate(points):
+            # One cell is occupied, that of a sample, in the middle of a grid. Outside it the ray
+            # skips nothing, so that the grid's size decides where its strides begin.
+            reach = 10 + number % 20
+            box = Box.of(point - reach * cell, point + reach * cell)
+            part = slice(30 - reach, 31 + reach)
+            surroundings = Surroundings(distances[part, part, part].contiguous(), box)
+            path = Path(space.box, surroundings, step, 0.05, math.inf)
+            clear = Medium(path, torch.full((2, 2, 2, 1), -30.0), 0.0, 1.0, 0.0)
+            assert len(march(ray, clear).ray) > 0
 
 
 @pytest.mark.parametrize("share", [1e-3, 1e-2])
