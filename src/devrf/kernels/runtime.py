@@ -39,8 +39,8 @@ def choose(kernels: Kernels, *, deterministic: bool = False) -> None:
     """
     global _chosen
     _chosen = kernels
-    if deterministic:
-        wp.config.deterministic = wp.DeterministicMode.RUN_TO_RUN
+    modes = wp.DeterministicMode
+    wp.config.deterministic = modes.RUN_TO_RUN if deterministic else modes.NOT_GUARANTEED
 
 
 def take(tensor: Tensor) -> bool:
