@@ -41,7 +41,7 @@ def adam_step(
     # A thread steps one voxel of a grid, or one number of a network.
     channels = values.shape[-1] if values.ndim == 4 else 1
     tables = [
-        wp.from_torch(each.detach().view(-1, channels), dtype=_numbers(channels))
+        array(each.view(-1, channels), _numbers(channels))
         for each in (values, gradient, mean, square)
     ]
     # Arrays that are not read stand in for those that are not there.

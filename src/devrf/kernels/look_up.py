@@ -35,6 +35,7 @@ def look_up(grid: Tensor, points: Tensor, box: Box) -> Tensor:
 class _LookUp(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, grid: Tensor, points: Tensor, box: Box, kept: Tensor | None) -> Tensor:
+        grid = grid.contiguous()
         points = points.contiguous()
         ctx.save_for_backward(grid, points)
         ctx.box, ctx.kept = box, kept

@@ -18,9 +18,9 @@ from devrf.geometry.contraction import INFINITY, ContractedRays
 from devrf.geometry.rays import Rays
 from devrf.kernels.grid import Grid, cell, coordinates, grid_over, inside, interpolate, slope
 from devrf.kernels.look_up import add_to_grid
-from devrf.kernels.runtime import array, launch, take
+from devrf.kernels.runtime import array, launch, room, take
 from devrf.ops import march as definition
-from devrf.ops.march import HIT_CELLS, STOP, Medium, Path, Samples
+from devrf.ops.march import HIT_CELLS, Medium, Path, Samples
 from devrf.ops.trilinear import shape_of
 
 # Half edges of the inner box that a ray moves along any axis while its distance grows by what one
@@ -79,13 +79,10 @@ class _March(torch.autograd.Function):
         visible = VisibleSamples()
         visible.start = array(start)
         visible.count = array(visible_count)
-        visible.distance = array(torch.empty(length, device=device))
-        visible.canonical = array(torch.empty(length, 3, device=device))
-        visible.tau = array(torch.empty(length, device=device))
-        visible.weight = array(torch.empty(length, device=device))
+        visible.samples = room(VisibleSample, length, device)
         # Without displacements an array that is not read stands in for them.
-        moves = lines.origins if displacement is None else array(displacement)
-        inputs = [geometry, lines, distances, array(density), moves, visible]
+        moves = lines.origins if displacement is None else array(displacement.contiguous())
+        inputs = [geometry, lines, distances, array(density.contiguous()), moves, visible]
         inputs += [array(significant_count), array(transmittance)]
         launch(march_kernel, len(rays), inputs, device)
 
@@ -134,7 +131,7 @@ class _March(torch.autograd.Function):
         result.moved = array(moved)
         result.points = array(points)
         result.canonical = array(canonical)
-        inputs = [ctx.geometry, ctx.lines, array(density), ctx.visible, given, result]
+        inputs = [ctx.geometry, ctx.lines, array(density.contiguous()), ctx.visible, given, result]
         launch(adjoint_kernel, len(visible_count), inputs, device)
 
         of_density = of_displacement = None
@@ -196,6 +193,7 @@ def _add_field(geometry: Geometry, medium: Medium) -> None:
     geometry.shift = medium.shift
     geometry.delta = medium.delta
     geometry.threshold = medium.threshold
+    geometry.stop = medium.stop
     # α ≥ threshold where v + b ≥ softplus⁻¹(τ / δ).
     geometry.faintest = -math.inf
     if medium.threshold > 0:
@@ -220,7 +218,7 @@ class Geometry:
         half: its half edges.
         shell: its shell's thickness in half edges.
         faintest: the raw density whose opacity is the threshold.
-        step, near, far, shift, delta, threshold: as of a ``Medium`` and its ``Path``.
+        step, near, far, shift, delta, threshold, stop: as of a ``Medium`` and its ``Path``.
     """
 
     low: wp.vec3
@@ -241,6 +239,7 @@ class Geometry:
     shift: float
     delta: float
     threshold: float
+    stop: float
 
 
 @wp.struct
@@ -253,15 +252,22 @@ class RayArrays:
 
 
 @wp.struct
+class VisibleSample:
+    """A sample at a distance along its ray, and at q in canonical space: τ, and w = T α."""
+
+    distance: float
+    canonical: wp.vec3
+    tau: float
+    weight: float
+
+
+@wp.struct
 class VisibleSamples:
     """Samples that are opaque enough and not hidden: ``count`` of each ray, from ``start`` on."""
 
     start: wp.array(dtype=wp.int64)
     count: wp.array(dtype=int)
-    distance: wp.array(dtype=float)
-    canonical: wp.array(dtype=wp.vec3)
-    tau: wp.array(dtype=float)
-    weight: wp.array(dtype=float)
+    samples: wp.array(dtype=VisibleSample)
 
 
 @wp.struct
@@ -397,20 +403,6 @@ def clearance(geometry: Geometry, distances: wp.array(dtype=wp.uint8), point: wp
 
 
 @wp.func
-def next_sample(geometry: Geometry, distances: wp.array(dtype=wp.uint8), ray: Ray, number: int):
-    """The first sample from ``number`` on in an occupied cell; the ray's count if none is."""
-    k = int(number)
-    while k < ray.count:
-        point = position(geometry, ray, ray.entry + float(k) * geometry.step)
-        cells = clearance(geometry, distances, point)
-        if cells == 0:
-            return k
-        # In cells - 1 cells' way the nearest cell changes by less than that and one.
-        k += int(float(cells - 1) * ray.samples_per_cell) + 1
-    return ray.count
-
-
-@wp.func
 def warped(geometry: Geometry, displacements: wp.array(dtype=wp.vec3), point: wp.vec3):
     """q = x + Δ(x)."""
     if geometry.moves == 0:
@@ -469,26 +461,32 @@ def march_kernel(
     count = int(0)
     significant = int(0)
     left = float(1.0)
-    k = next_sample(geometry, distances, ray, 0)
+    k = int(0)
     while k < ray.count:
         distance = ray.entry + float(k) * geometry.step
-        canonical = warped(geometry, displacements, position(geometry, ray, distance))
-        row, fraction = cell(geometry.density, canonical)
-        raw = interpolate(density, geometry.density, row, fraction)
-        if raw >= geometry.faintest:
-            tau = softplus(raw + geometry.shift) * geometry.delta
-            weight = left * opacity(tau)
-            visible.distance[start + count] = distance
-            visible.canonical[start + count] = canonical
-            visible.tau[start + count] = tau
-            visible.weight[start + count] = weight
-            count += 1
-            if weight >= geometry.threshold:
-                significant += 1
-            left *= wp.exp(-tau)
-            if left < wp.static(STOP):
-                k = ray.count
-        k = next_sample(geometry, distances, ray, k + 1)
+        point = position(geometry, ray, distance)
+        cells = clearance(geometry, distances, point)
+        if cells > 0:
+            # In cells - 1 cells' way the nearest cell changes by less than that and one.
+            k += int(float(cells - 1) * ray.samples_per_cell)
+        else:
+            canonical = warped(geometry, displacements, point)
+            row, fraction = cell(geometry.density, canonical)
+            raw = interpolate(density, geometry.density, row, fraction)
+            if raw >= geometry.faintest:
+                sample = VisibleSample()
+                sample.distance = distance
+                sample.canonical = canonical
+                sample.tau = softplus(raw + geometry.shift) * geometry.delta
+                sample.weight = left * opacity(sample.tau)
+                visible.samples[start + count] = sample
+                count += 1
+                if sample.weight >= geometry.threshold:
+                    significant += 1
+                left -= sample.weight
+                if left < geometry.stop:
+                    k = ray.count
+        k += 1
     visible.count[number] = count
     significant_count[number] = significant
     transmittance[number] = left
@@ -508,14 +506,13 @@ def keep_significant_kernel(
     start = int(visible.start[number])
     into = int(result.start[number])
     for k in range(visible.count[number]):
-        sample = start + k
-        if visible.weight[sample] >= geometry.threshold:
-            distance = visible.distance[sample]
+        sample = visible.samples[start + k]
+        if sample.weight >= geometry.threshold:
             result.ray[into] = wp.int64(number)
-            result.distance[into] = distance
-            result.points[into] = position(geometry, ray, distance)
-            result.canonical[into] = visible.canonical[sample]
-            result.weight[into] = visible.weight[sample]
+            result.distance[into] = sample.distance
+            result.points[into] = position(geometry, ray, sample.distance)
+            result.canonical[into] = sample.canonical
+            result.weight[into] = sample.weight
             into += 1
 
 
@@ -539,16 +536,15 @@ def adjoint_kernel(
     count = visible.count[number]
     significant = int(given.start[number])
     for k in range(count):
-        if visible.weight[start + k] >= geometry.threshold:
+        if visible.samples[start + k].weight >= geometry.threshold:
             significant += 1
     after = given.reached[number]
     behind = given.transmittance[number] * after
     for back in range(count):
-        sample = start + count - 1 - back
+        sample = visible.samples[start + count - 1 - back]
         into = int(result.start[number]) + count - 1 - back
-        tau = visible.tau[sample]
-        weight = visible.weight[sample]
-        canonical = visible.canonical[sample]
+        tau = sample.tau
+        weight = sample.weight
         of_tau = -behind
         of_canonical = wp.vec3()
         if weight >= geometry.threshold:
@@ -565,12 +561,12 @@ def adjoint_kernel(
         # ∂τ/∂v = δ · sigmoid(v + b), and sigmoid = 1 − exp(−softplus).
         of_raw = of_tau * geometry.delta * opacity(tau / geometry.delta)
         result.raw[into] = of_raw
-        result.canonical[into] = canonical
+        result.canonical[into] = sample.canonical
         if geometry.moves == 1:
-            point = position(geometry, ray, visible.distance[sample])
-            row, fraction = cell(geometry.density, canonical)
+            point = position(geometry, ray, sample.distance)
+            row, fraction = cell(geometry.density, sample.canonical)
             change = slope(density, of_raw, geometry.density, row, fraction)
-            of_canonical += wp.cw_mul(change, inside(geometry.density, canonical))
+            of_canonical += wp.cw_mul(change, inside(geometry.density, sample.canonical))
             if geometry.still_outside == 1:
                 of_canonical *= wp.min(inside(geometry.motion, point))
             result.points[into] = point

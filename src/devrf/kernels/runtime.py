@@ -78,16 +78,28 @@ def launch_by_owner(
     _launch(kernel, [count] * owners, inputs_of, device)
 
 
-def array(tensor: Tensor) -> wp.array:
-    """A tensor (N,) of numbers, or (…, C) of rows of floats, as Warp's array; memory is shared."""
-    tensor = tensor.detach()
-    if tensor.ndim == 1:
-        return wp.from_torch(tensor)
-    channels = tensor.shape[-1]
-    count = tensor.shape[:-1].numel()
-    # Without rows a tensor may have any strides.
-    rows = tensor.reshape(count, channels) if count else tensor.new_empty(0, channels)
-    return wp.from_torch(rows[:, 0] if channels == 1 else rows, dtype=row_type(channels))
+def array(tensor: Tensor, kind: Any = None) -> wp.array:
+    """A contiguous tensor (N,) of numbers, or (…, C) of rows, as Warp's array of N; not a copy.
+
+    ``kind`` is Warp's type of a row; None: of so many floats. Made from the address, which takes a
+    fifth of the time of ``wp.from_torch``: 6 µs in place of 30, two dozen times a launch of all.
+    """
+    assert tensor.is_contiguous()
+    if kind is None:
+        is_row = tensor.ndim > 1
+        kind = row_type(tensor.shape[-1]) if is_row else wp.dtype_from_torch(tensor.dtype)
+    count = tensor.shape[:-1].numel() if tensor.ndim > 1 else len(tensor)
+    made = wp.array(
+        ptr=tensor.data_ptr(), dtype=kind, shape=(count,), device=str(tensor.device), copy=False
+    )
+    made.tensor = tensor  # the memory lives as long
+    return made
+
+
+def room(kind: Any, count: int, device: torch.device) -> wp.array:
+    """Memory for ``count`` of one of Warp's structs of floats, from torch's allocator."""
+    floats = wp.types.type_size_in_bytes(kind) // 4
+    return array(torch.empty(count, floats, device=device), kind)
 
 
 def by_channels(factory: Callable[[int], wp.Kernel]) -> Callable[[int], wp.Kernel]:

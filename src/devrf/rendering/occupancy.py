@@ -75,8 +75,14 @@ class Occupancy(nn.Module):
         # A cell of the grid may span several of the occupancy's cells.
         reach = max(1, *(-(-(theirs - 1) // max(ours - 1, 1)) for theirs, ours in cells))
         grown = Occupancy(dilate(self.mask, reach), self.box)
+        return dilate(grown.on(shape, box), 1)
+
+    def on(self, shape: tuple[int, int, int], box: Box) -> Tensor:
+        """The mask at the points of a grid of ``shape`` over ``box``."""
+        if shape == tuple(self.mask.shape) and box == self.box:
+            return self.mask
         points = box.grid_points(shape, torch.empty(0, device=self.mask.device))
-        return dilate(grown.at(points.view(-1, 3)).view(shape), 1)
+        return self.at(points.view(-1, 3)).view(shape)
 
     def replace(self, mask: Tensor, box: Box | None = None) -> None:
         """Replace the mask by one of any shape, and the box if one is given."""

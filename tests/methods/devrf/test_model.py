@@ -76,9 +76,24 @@ def test_at_rest_nothing_is_warped(model):
 
 def test_deformed_occupancy_by_hand(model):
     shift = torch.tensor([0.0, 0.4, 0.0])
-    found = deformed_occupancy(model.occupancy, model.box, lambda points: points + shift)
-    assert torch.equal(found.mask, dilate(torch.roll(model.occupancy.mask, -2, dims=1), 1))
+    visible = model.visible_occupancy
+    found = deformed_occupancy(visible, lambda points: points + shift)
+    assert torch.equal(found.mask, torch.roll(visible.mask, -2, dims=1))
     assert found.box == model.canonical.box
+
+
+def test_what_is_visible_at_rest_by_hand(model):
+    """The opaque points that are occupied, grown by one."""
+    opaque = model.canonical.voxel_alpha(model.settings.step) >= model.settings.alpha_threshold
+    some = opaque.nonzero()[len(opaque.nonzero()) // 2].tolist()
+    model.occupancy.mask.zero_()
+    model.occupancy.mask[*some] = True
+    x, y, z = some
+    expected = torch.zeros_like(opaque)
+    expected[x - 1 : x + 2, y - 1 : y + 2, z - 1 : z + 2] = True
+    assert torch.equal(model.visible_occupancy.mask, expected)
+    model.canonical.density.values.data[*some] = -50.0
+    assert not model.visible_occupancy.mask.any()
 
 
 @pytest.mark.parametrize("space", [WORLD, NormalizedDevice(8, 6, (40.0, 40.0), near=2.0)])

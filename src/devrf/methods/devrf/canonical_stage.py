@@ -284,8 +284,7 @@ class CanonicalStage(Stage):
         """Keep of the occupancy what is within a voxel of ``where`` (X, Y, Z)."""
         occupancy = self.scene_model.occupancy
         field = self.scene_model.canonical
-        points = field.box.grid_points(field.density.shape, field.density.values)
-        before = occupancy.at(points.view(-1, 3)).view(where.shape)
+        before = occupancy.on(field.density.shape, field.box)
         occupancy.replace(dilate(where, 1) & before, field.box)
 
     @torch.no_grad()

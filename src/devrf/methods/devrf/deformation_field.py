@@ -12,8 +12,10 @@ from torch import Tensor
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.kernels.look_up import look_up
+from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.frame_store import FrameField, FrameStore
 from devrf.rendering.occupancy import Occupancy, dilate
+from devrf.rendering.sampling import RenderSettings
 
 # Points (M, 3) → where they move to, (M, 3).
 Warp = Callable[[Tensor], Tensor]
@@ -145,19 +147,27 @@ class DeformationField(FrameField):
 
 
 @torch.no_grad()
-def deformed_occupancy(
-    occupancy: Occupancy, box: Box, warp: Callable[[Tensor], Tensor]
-) -> Occupancy:
-    """The occupancy at a time: the grid points whose canonical position is occupied, grown by one.
-
-    The rim of one grid point is for what lies between the points.
+def deformed_occupancy(visible: Occupancy, warp: Callable[[Tensor], Tensor]) -> Occupancy:
+    """The occupancy at a time: the grid points whose canonical position is occupied.
 
     Args:
-        occupancy: where something is at rest.
-        box: the canonical field's.
+        visible: at rest, with a rim for what lies between the points (:func:`visible_occupancy`).
         warp: x → x + Δ_b(x, t), the points (M, 3) of the occupancy's grid into canonical space.
     """
-    x, y, z = occupancy.mask.shape
-    points = box.grid_points((x, y, z), torch.empty(0, device=occupancy.mask.device))
-    occupied = occupancy.at(warp(points.view(-1, 3))).view(x, y, z)
-    return Occupancy(dilate(occupied, 1), box)
+    x, y, z = visible.mask.shape
+    points = visible.box.grid_points((x, y, z), torch.empty(0, device=visible.mask.device))
+    return Occupancy(visible.at(warp(points.view(-1, 3))).view(x, y, z), visible.box)
+
+
+@torch.no_grad()
+def visible_occupancy(
+    field: CanonicalField, occupancy: Occupancy, settings: RenderSettings
+) -> Occupancy:
+    """Where a sample at rest may be opaque enough to count, on the density's grid.
+
+    Those grid points that are, grown by one: a sample that moves with a grid point lies within half
+    a cell of it, and so does the grid point that the occupancy is looked up at.
+    """
+    opaque = field.voxel_alpha(settings.step) >= settings.alpha_threshold
+    mask = opaque & occupancy.on(field.density.shape, field.box)
+    return Occupancy(dilate(mask, 1), field.box)

@@ -36,6 +36,7 @@ from devrf.methods.devrf.settings import (
     decoder_dtype,
 )
 from devrf.methods.devrf.volume_rendering import render
+from devrf.rendering.occupancy import Occupancy, dilate
 from devrf.rendering.output import ColorChange
 from devrf.scenes.scene import CaptureName, Views
 from devrf.system.profiling import span
@@ -281,7 +282,8 @@ class DeformationStage(Stage):
         further: dict[str, FrameField] = {}
         for extension in self.extensions:
             further |= extension.frame_fields(self, level)
-        frame = ActiveFrame.of(self.field.frames, self.scene_model.occupancy, further)
+        visible = self.scene_model.visible_occupancy
+        frame = ActiveFrame.of(self.field.frames, visible, further)
         self.active = frame
         self.weights = self.motion_loss.weights_at(level)
         smoothing = self.motion_loss.smoothing(level, self.field.shape)
@@ -317,7 +319,9 @@ class DeformationStage(Stage):
         frame = self.active
         assert frame is not None
         warp = self.field.warp_by(frame.backward)
-        frame.occupancy.refill(deformed_occupancy(model.occupancy, model.box, warp))
+        found = deformed_occupancy(model.visible_occupancy, warp)
+        # Grown by one, since the displacements change until it is found anew.
+        frame.occupancy.refill(Occupancy(dilate(found.mask, 1), found.box))
 
     def prepare(self) -> None:
         """Update the frame's occupancy every ``occupancy_every`` iterations."""

@@ -22,6 +22,7 @@ from devrf.methods.devrf.deformation_field import (
     DeformationField,
     GridWarp,
     deformed_occupancy,
+    visible_occupancy,
 )
 from devrf.methods.devrf.frame_store import NAMES, FrameField, fits_on_device
 from devrf.methods.devrf.view import CanonicalSurface, DeVRFView
@@ -132,7 +133,12 @@ class DeVRFModel(Renderable):
         warp = self.warp(time)
         if warp is None:
             return self.occupancy
-        return deformed_occupancy(self.occupancy, self.canonical.box, warp)
+        return deformed_occupancy(self.visible_occupancy, warp)
+
+    @property
+    def visible_occupancy(self) -> Occupancy:
+        """Where something is opaque enough to be seen at rest."""
+        return visible_occupancy(self.canonical, self.occupancy, self.settings)
 
     def at(self, time: float, *, half: bool = False) -> DeVRFView:
         """The scene at ``time``: its occupancy and its displacements, ready."""

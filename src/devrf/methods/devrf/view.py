@@ -12,7 +12,12 @@ from devrf.geometry.cameras import Cameras
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import Space
 from devrf.methods.devrf.canonical_field import CanonicalField
-from devrf.methods.devrf.deformation_field import DeformationField, GridWarp, deformed_occupancy
+from devrf.methods.devrf.deformation_field import (
+    DeformationField,
+    GridWarp,
+    deformed_occupancy,
+    visible_occupancy,
+)
 from devrf.methods.devrf.losses import induced_flow
 from devrf.methods.devrf.volume_rendering import render
 from devrf.ops.compositing import sum_by_ray
@@ -65,14 +70,15 @@ class DeVRFView:
             return
         displacement = motion.blended(self.time)
         self._warp = warp = motion.warp_by(displacement)
-        x, y, z = self.occupancy.mask.shape
+        visible = visible_occupancy(self.canonical, self.occupancy, self.picture_settings)
+        x, y, z = visible.mask.shape
 
         def resampled(points: Tensor) -> Tensor:
             """Interpolation at the points of a grid over the same box, several times faster."""
             return points + resample(displacement, (x, y, z)).view(-1, 3)
 
         whole = resampled if not motion.still_outside else warp
-        self.occupancy = deformed_occupancy(self.occupancy, self.canonical.box, whole)
+        self.occupancy = deformed_occupancy(visible, whole)
 
     @property
     def chunk(self) -> int:
@@ -81,17 +87,21 @@ class DeVRFView:
             return ON_GPU
         return ON_CPU if self.space.is_linear else UNBOUNDED_ON_CPU
 
+    @property
+    def picture_settings(self) -> RenderSettings:
+        """How the rays of pictures are sampled."""
+        if self.space.is_linear:
+            return self.settings
+        return replace(self.settings, step=UNBOUNDED_STEP * self.settings.step)
+
     @torch.no_grad()
     def render(self, rays: Rays, background: Tensor) -> RenderedImage:
         """What R rays in the fields' space see."""
-        settings = self.settings
-        if not self.space.is_linear:
-            settings = replace(settings, step=UNBOUNDED_STEP * settings.step)
         output = render(
             rays,
             self.canonical,
             self.occupancy,
-            settings,
+            self.picture_settings,
             background,
             self._warp,
             color_change=self.color_change,
