@@ -15,7 +15,7 @@ from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.rays import Rays
 from devrf.kernels.march import march, rays_that_hit
 from devrf.ops import march as definition
-from devrf.ops.march import Medium, Path, Samples, Surroundings
+from devrf.ops.march import STOP, Medium, Path, Samples, Surroundings
 from devrf.ops.trilinear import shape_of
 from devrf.rendering.occupancy import Occupancy
 
@@ -153,7 +153,7 @@ def test_samples_and_gradients_are_those_of_the_definition(
     assert_same(ours, theirs)
     # Rays that miss, that end, and that see through.
     left = theirs.transmittance
-    assert (left == 1).any() and (left < moving.stop).any() and ((left > 0.1) & (left < 0.9)).any()
+    assert (left == 1).any() and (left < STOP).any() and ((left > 0.1) & (left < 0.9)).any()
     inside = moving.motion_box.contains(theirs.points)
     assert inside.any() and not inside.all()
     assert torch.equal(ours.canonical[~inside], ours.points[~inside]) == still_outside

@@ -20,7 +20,7 @@ from devrf.kernels.grid import Grid, cell, coordinates, grid_over, inside, inter
 from devrf.kernels.look_up import add_to_grid
 from devrf.kernels.runtime import array, launch, room, take
 from devrf.ops import march as definition
-from devrf.ops.march import HIT_CELLS, Medium, Path, Samples
+from devrf.ops.march import HIT_CELLS, STOP, Medium, Path, Samples
 from devrf.ops.trilinear import shape_of
 
 # Half edges of the inner box that a ray moves along any axis while its distance grows by what one
@@ -193,7 +193,6 @@ def _add_field(geometry: Geometry, medium: Medium) -> None:
     geometry.shift = medium.shift
     geometry.delta = medium.delta
     geometry.threshold = medium.threshold
-    geometry.stop = medium.stop
     # α ≥ threshold where v + b ≥ softplus⁻¹(τ / δ).
     geometry.faintest = -math.inf
     if medium.threshold > 0:
@@ -218,7 +217,7 @@ class Geometry:
         half: its half edges.
         shell: its shell's thickness in half edges.
         faintest: the raw density whose opacity is the threshold.
-        step, near, far, shift, delta, threshold, stop: as of a ``Medium`` and its ``Path``.
+        step, near, far, shift, delta, threshold: as of a ``Medium`` and its ``Path``.
     """
 
     low: wp.vec3
@@ -239,7 +238,6 @@ class Geometry:
     shift: float
     delta: float
     threshold: float
-    stop: float
 
 
 @wp.struct
@@ -484,7 +482,7 @@ def march_kernel(
                 if sample.weight >= geometry.threshold:
                     significant += 1
                 left -= sample.weight
-                if left < geometry.stop:
+                if left < wp.static(STOP):
                     k = ray.count
         k += 1
     visible.count[number] = count

@@ -16,7 +16,7 @@ from devrf.geometry.rays import Rays
 from devrf.ops.compositing import composite, transmittances
 from devrf.ops.trilinear import look_up
 
-# A ray ends where its transmittance is less, at the latest: what is behind cannot be seen.
+# A ray ends where its transmittance is less: what is behind cannot be seen.
 STOP = 1e-4
 # A ray hits what is so many cells away from it, or fewer.
 HIT_CELLS = 2
@@ -89,11 +89,6 @@ class Medium:
     motion_box: Box | None = None
     still_outside: bool = False
 
-    @property
-    def stop(self) -> float:
-        """The transmittance behind which no sample can have the weight that is worth a colour."""
-        return max(STOP, self.threshold)
-
 
 @dataclass(frozen=True)
 class Samples:
@@ -120,7 +115,7 @@ def march(rays: Rays, medium: Medium) -> Samples:
     """Samples every step from a ray's entry into the box to its exit, in occupied cells.
 
     The k-th of a ray is at entry + k·step. Those of too low an opacity count as empty, and what is
-    behind a transmittance of ``medium.stop`` is left out. Differentiable in the densities and the
+    behind a transmittance of ``STOP`` is left out. Differentiable in the densities and the
     displacements, through ``canonical``, ``weight`` and ``transmittance``.
 
     Args:
@@ -137,7 +132,7 @@ def march(rays: Rays, medium: Medium) -> Samples:
     with torch.no_grad():
         visible = (-torch.expm1(-tau) >= medium.threshold).nonzero()[:, 0]
         left = transmittances(tau[visible], ray[visible], len(rays))
-        visible = visible[left >= medium.stop]
+        visible = visible[left >= STOP]
     weight, transmittance = composite(tau[visible], ray[visible], len(rays))
     significant = (weight >= medium.threshold).nonzero()[:, 0]
     kept = visible[significant]
