@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -43,8 +44,10 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-class RunContext:
+class RunContext(ExitStack):
     """A composed config, the run's folder, and parts that are built when first used.
+
+    As a context manager it ends the viewer's page, and the tracking of the run, if they began.
 
     Attributes:
         config: a composed config (``conf/config.yaml``).
@@ -66,6 +69,7 @@ class RunContext:
 
     def __init__(self, config: DictConfig, folder: Path) -> None:
         self.command = present_command(config)
+        super().__init__()
         config.scene = scene_name(config)
         self.config, self.folder = config, folder
         self.place = folder.relative_to(Path.cwd()) if Path.cwd() in folder.parents else folder
@@ -110,9 +114,8 @@ class RunContext:
     @property
     def stages_with_images(self) -> tuple[str, ...]:
         """The protocol's stages; of a scene at rest those that learn from the static set alone."""
-        if self.moves:
-            return self.learning_stages
-        return tuple(step.name for step in self.protocol.steps if step.capture == "static")
+        steps = self.protocol.steps
+        return tuple(step.name for step in steps if step.capture == "static" or self.moves)
 
     @property
     def moves(self) -> bool:
@@ -173,9 +176,8 @@ class RunContext:
             return False
         logger = instantiate(self.config.logger)
         for tracker in trackers([logger]):
-            settings = OmegaConf.to_container(self.config, resolve=True)
-            assert isinstance(settings, dict)
-            tracker.log_hyperparams({str(key): value for key, value in settings.items()})
+            self.push(lambda error, *_, ends=tracker: ends.close(failed=error is not None))
+            tracker.log_hyperparams(OmegaConf.to_container(self.config, resolve=True))
         return logger
 
     @property
@@ -190,19 +192,9 @@ class RunContext:
 
         settings = instantiate(self.config.viewer)
         session = Session(settings, Viewpoints.of(self.scene), self.scene, self.folder)
+        self.callback(session.close)
         log.info("the scene is at %s while it is learned", settings.address)
         return session
-
-    def __enter__(self) -> RunContext:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        # End the viewer's page, and the tracking of the run, if they began.
-        if "page" in self.__dict__:
-            self.page.close()
-        if "logger" in self.__dict__:
-            for tracker in self.trackers:
-                tracker.close(failed=kind is not None)
 
     def own_checkpoint(self, name: str) -> Path:
         """The run's checkpoint of the stage ``name``, whether it exists or not."""
@@ -253,15 +245,14 @@ def _strategy(config: DictConfig) -> Strategy:
             optimiser steps have.
     """
     trainer: Trainer = instantiate(config.trainer, logger=False)
-    own = "stages take optimiser steps of their own; leave it out"
-    if trainer.accumulate_grad_batches != 1:
-        rays = "schedule.canonical.rays, schedule.deformation.rays or ray_stage.schedule.rays"
-        raise DevrfError(f"trainer.accumulate_grad_batches: {own}; {rays} sizes batches")
-    if trainer.gradient_clip_val:
-        raise DevrfError(
-            f"trainer.gradient_clip_val: {own}; where a loss diverges, "
-            "callbacks.divergence_guard lowers the learning rates"
-        )
+    rays = "schedule.canonical.rays, schedule.deformation.rays or ray_stage.schedule.rays"
+    for key, usual, instead in (
+        ("accumulate_grad_batches", 1, f"{rays} sizes batches"),
+        ("gradient_clip_val", 0, "callbacks.divergence_guard lowers the learning rates"),
+    ):
+        if getattr(trainer, key) not in (None, usual):
+            own = "stages take optimiser steps of their own"
+            raise DevrfError(f"trainer.{key}: {own}; leave it out: {instead}")
     if trainer.world_size > 1 and not isinstance(trainer.strategy, ManualDDP):
         raise DevrfError(
             f"trainer.devices: {trainer.world_size} processes need trainer=ddp; give both"

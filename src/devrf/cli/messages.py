@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from hydra.core.override_parser.types import QuotedString, Quote
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf.errors import OmegaConfBaseException
 
@@ -101,18 +102,15 @@ def _not_understood(argument: str) -> str:
     if is_set:
         as_text = shlex.quote(f"{key}={in_quotes(value)}")
         return f"{argument}: not understood; as text write {as_text}, else see that brackets close"
-    words = [f"data.root={shlex.quote(argument)}"] if Path(argument).is_dir() else []
-    words += [
-        f"{group}={argument}" for group, names in group_choices().items() if argument in names
-    ]
-    meant = f"; did you mean {' or '.join(words)}?" if words else ""
-    meant = meant or did_you_mean(argument, known_stages(), "stage=")
+    meant = did_you_mean(argument, known_stages(), "stage=")
+    for group, names in group_choices().items():
+        if argument in names:
+            meant = f"; did you mean {group}={argument}?"
+    if Path(argument).is_dir():
+        meant = f"; did you mean data.root={shlex.quote(argument)}?"
     return f"{argument}: not understood{meant or '; write KEY=VALUE, or --help for what there is'}"
 
 
 def in_quotes(text: str) -> str:
     """``text`` as Hydra's grammar takes it for text, whatever it holds."""
-    mark = "'" if '"' in text and "'" not in text else '"'
-    # Backslashes count as escapes only before a quotation mark and at the end.
-    escaped = re.sub(rf"(\\*)({mark}|$)", lambda m: m[1] * 2 + (m[2] and f"\\{mark}"), text)
-    return f"{mark}{escaped}{mark}"
+    return QuotedString(text=text, quote=Quote.double).with_quotes()
