@@ -64,8 +64,9 @@ def completed(arguments: Sequence[str]) -> list[str]:
     roots, overrides = values(typed, "data.root"), parsed([*before, *texts])
     if not roots or value(overrides, "stage") in APART or any("${" in root for root in roots):
         return [*flags, *before, *texts]
-    options = values(overrides, "data") or _of_experiments(overrides, known.config_dir) or [None]
-    words = [_told_by_scene(option, root, overrides) for option, root in product(options, roots)]
+    readers: list[str | None] = [*values(overrides, "data")]
+    readers = readers or _of_experiments(overrides, known.config_dir)
+    words = [_told_by_scene(reader, root, overrides) for reader, root in product(readers, roots)]
     if any(other != words[0] for other in words):
         needed = " and ".join(dict.fromkeys(" ".join(other) or "neither" for other in words))
         raise DevrfError(f"data.root: the scenes need {needed}; sweep over those of each apart")
@@ -123,9 +124,9 @@ def _told_by_scene(option: str | None, root: str, overrides: Sequence[Override])
     return words
 
 
-def _of_experiments(overrides: Sequence[Override], config_dir: str | None) -> list[str]:
-    """The options of ``data`` that experiments choose, which may lie in other folders."""
-    texts = [text.input_line for text in overrides if text.key_or_group == "hydra.searchpath"]
+def _of_experiments(overrides: Sequence[Override], config_dir: str | None) -> list[str | None]:
+    """The options of ``data`` that experiments choose, which may lie in other folders; or None."""
+    texts = [str(o.input_line) for o in overrides if o.key_or_group == "hydra.searchpath"]
     if config_dir:
         texts.append(f"hydra.searchpath=[{in_quotes(f'file://{os.path.abspath(config_dir)}')}]")
     options: list[str | list[str] | None] = []
@@ -136,4 +137,4 @@ def _of_experiments(overrides: Sequence[Override], config_dir: str | None) -> li
                 words = [f"experiment={name}", *texts]
                 found = loader.compute_defaults_list("config", words, RunMode.RUN)
                 options.append(found.overrides.override_choices.get("data"))
-    return [str(option) for option in options if option is not None]
+    return [str(option) for option in options if option is not None] or [None]

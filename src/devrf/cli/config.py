@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shlex
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +96,6 @@ def job_folder(_root_: Any) -> str:
     return scene_folder_name("_".join([str(hydra.job.num), scene_name(_root_), *words]))[:150]
 
 
-@cache  # for the whole process
 def register_config() -> None:
     """Make the names of folders known to Hydra, ``${devrf.run_folder:}``."""
     for word in (run_folder, job_folder):

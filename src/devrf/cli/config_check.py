@@ -77,7 +77,8 @@ def check_config(config: DictConfig) -> None:
         for issue in sorted(issues, key=lambda issue: issue["type"] not in UNKNOWN):
             where, beside = _place(raw, issue["loc"])
             if issue["type"] in UNKNOWN:
-                raise unknown_key(where, beside) from None
+                lacking = [other["loc"][-1] for other in error.errors() if other["type"] in LEFT]
+                raise unknown_key(where, [*beside, *lacking]) from None
             alike = [other["msg"] for other in issues if _place(raw, other["loc"])[0] == where]
             expected = " or ".join(message.removeprefix("Input should be ") for message in alike)
             if issue["type"] in BUILT:

@@ -32,7 +32,7 @@ from devrf.cli.restore_config import present_command
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.ddp import ManualDDP
 from devrf.engine.stage import Stage
-from devrf.errors import DevrfError
+from devrf.errors import DevrfError, expect
 from devrf.evaluation.objective import VALIDATION
 from devrf.evaluation.suite import Evaluation
 from devrf.methods.protocol import Protocol
@@ -68,8 +68,8 @@ class RunContext(ExitStack):
     """
 
     def __init__(self, config: DictConfig, folder: Path) -> None:
-        self.command = present_command(config)
         super().__init__()
+        self.command = present_command(config)
         config.scene = scene_name(config)
         self.config, self.folder = config, folder
         self.place = folder.relative_to(Path.cwd()) if Path.cwd() in folder.parents else folder
@@ -132,15 +132,13 @@ class RunContext(ExitStack):
         Raises:
             DevrfError: there is none.
         """
-        known = self.stages_with_images
-        if left := tuple(name for name in names if name in known):
+        if left := tuple(name for name in names if name in self.stages_with_images):
             return left
-        what, instead = f"stage={names[0]}: learns motion", "stage=pipeline"
-        if not known:
-            what = f"protocol={self.protocol.name}: learns from images in motion"
-            instead = "protocol=two_stage"
         at_rest = f"{self.config.scene} is at rest: all its images show one moment"
-        raise DevrfError(f"{what}, but {at_rest}; use {instead}")
+        if self.stages_with_images:
+            raise DevrfError(f"stage={names[0]}: learns motion, but {at_rest}; use stage=pipeline")
+        what = f"protocol={self.protocol.name}: learns from images in motion"
+        raise DevrfError(f"{what}, but {at_rest}; use protocol=two_stage")
 
     def stage_builder(self, name: str) -> Callable[..., Stage]:
         """A function that builds a stage, given ``rest`` if it builds on another.
@@ -148,22 +146,18 @@ class RunContext(ExitStack):
         Raises:
             DevrfError: the method has no such stage, or the protocol asks what it cannot do.
         """
+        method, protocol = self.config.method, self.protocol
         key = name if name in self.config else "ray_stage"
         if key not in self.config:
-            raise DevrfError(
-                f"protocol: method={self.config.method} does not learn by "
-                f"protocol={self.protocol.name}; it has no stage {name!r}"
-            )
+            does = f"method={method} does not learn by protocol={protocol.name}"
+            raise DevrfError(f"protocol: {does}; it has no stage {name!r}")
         build: partial[Stage] = instantiate(self.config[key], _partial_=True, _convert_="all")
         if key == "ray_stage":
-            build.keywords["model"].check_protocol(self.protocol.name)
-            return partial(build, step=self.protocol[name], static_share=self.protocol.static_share)
+            build.keywords["model"].check_protocol(protocol.name)
+            return partial(build, step=protocol[name], static_share=protocol.static_share)
         build.func.check_settings(**build.keywords)  # type: ignore[attr-defined]
-        if self.protocol.freeze is not True:
-            raise DevrfError(
-                f"protocol.freeze: method={self.config.method} has stages of its own, which "
-                f"freeze what they build on; expected true, not {self.protocol.freeze}"
-            )
+        own = f"true, as the stages of method={method} freeze what they build on"
+        expect(protocol.freeze is True, "protocol.freeze", own, protocol.freeze)
         return build
 
     @cached_property
@@ -177,7 +171,8 @@ class RunContext(ExitStack):
         logger = instantiate(self.config.logger)
         for tracker in trackers([logger]):
             self.push(lambda error, *_, ends=tracker: ends.close(failed=error is not None))
-            tracker.log_hyperparams(OmegaConf.to_container(self.config, resolve=True))
+            settings: Any = OmegaConf.to_container(self.config, resolve=True)
+            tracker.log_hyperparams(settings)
         return logger
 
     @property
@@ -208,10 +203,10 @@ class RunContext(ExitStack):
         Raises:
             DevrfError: there is none.
         """
-        if self.config.ckpt is not None:
-            if not Path(self.config.ckpt).is_file():
-                raise DevrfError(f"{self.config.ckpt}: no such checkpoint; set ckpt to a file")
-            return Path(self.config.ckpt)
+        if (given := self.config.ckpt) is not None:
+            if not Path(given).is_file():
+                raise DevrfError(f"{given}: no such checkpoint; set ckpt to a file")
+            return Path(given)
         for stage in self.learning_stages[::-1] if name is None else (name,):
             path = self.own_checkpoint(stage)
             left = progress_files(path.parent, stage) if name is None else []
