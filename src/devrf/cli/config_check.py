@@ -80,7 +80,8 @@ def check_config(config: DictConfig) -> None:
                 lacking = [other["loc"][-1] for other in error.errors() if other["type"] in LEFT]
                 raise unknown_key(where, [*beside, *lacking]) from None
             alike = [other["msg"] for other in issues if _place(raw, other["loc"])[0] == where]
-            expected = " or ".join(message.removeprefix("Input should be ") for message in alike)
+            wanted = [message.removeprefix("Input should be ") for message in alike]
+            expected = " or ".join(dict.fromkeys(wanted))
             if issue["type"] in BUILT:
                 expected = "a section with _target_"
             value = issue["input"]
@@ -101,12 +102,14 @@ def _type_of(raw: Node, resolved: Node, path: str, read: tuple[str, ...]) -> Any
     hints = _settings(resolved, path) if _is_part(raw) else {} if path else dict(ROOT)
     for key, value in raw.items():
         where = f"{path}{key}."
-        if isinstance(value, Mapping) and (_is_part(value) or not _is_part(raw)):
+        if _is_part(raw) and key not in hints:
+            hints |= {key: Any} if "**" in hints else {}
+        elif isinstance(value, Mapping) and (_is_part(value) or not _is_part(raw)):
             hints[key] = _type_of(value, resolved[key], where, read)
         elif _is_part(resolved[key]):
             hints[key] = Any  # checked in its own place
-        elif "**" in hints or (not _is_part(raw) and (value is None or where.startswith(read))):
-            hints.setdefault(key, Any)
+        elif key not in hints and (value is None or where.startswith(read)):
+            hints[key] = Any
     made = cast(Any, TypedDict)(path, hints, total=False)
     made.__pydantic_config__ = {"extra": "forbid", "arbitrary_types_allowed": True}
     return made

@@ -102,12 +102,12 @@ def _not_understood(argument: str) -> str:
     if is_set:
         as_text = shlex.quote(f"{key}={in_quotes(value)}")
         return f"{argument}: not understood; as text write {as_text}, else see that brackets close"
-    meant = did_you_mean(argument, known_stages(), "stage=")
-    for group, names in group_choices().items():
-        if argument in names:
-            meant = f"; did you mean {group}={argument}?"
-    if Path(argument).is_dir():
-        meant = f"; did you mean data.root={shlex.quote(argument)}?"
+    words = [f"data.root={shlex.quote(argument)}"] if Path(argument).is_dir() else []
+    words += [
+        f"{group}={argument}" for group, names in group_choices().items() if argument in names
+    ]
+    meant = f"; did you mean {' or '.join(words)}?" if words else ""
+    meant = meant or did_you_mean(argument, known_stages(), "stage=")
     return f"{argument}: not understood{meant or '; write KEY=VALUE, or --help for what there is'}"
 
 

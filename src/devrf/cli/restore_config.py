@@ -75,7 +75,7 @@ def present_command(config: DictConfig) -> Command:
         elif not override.is_delete():
             said |= leaves(OmegaConf.select(config, key), key)
     for key in RELATIVE & {*said}:
-        if (path := Path(str(said[key]))).exists():
+        if isinstance(said[key], str) and (path := Path(said[key])).exists():
             said[key] = str(path.absolute())
     return {key: value for key, value in said.items() if _is_known(key, value)}
 
