@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -38,6 +40,27 @@ def threads() -> Iterator[Callable[[int], None]]:
     usual = torch.get_num_threads()
     yield torch.set_num_threads
     torch.set_num_threads(usual)
+
+
+# Leaves the process less memory than Warp's library takes.
+SHORT = """
+import resource, sys, torch
+from devrf.errors import DevrfError
+from devrf.kernels.runtime import take
+pages = int(open("/proc/self/statm").read().split()[0])
+resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + 20 * 2**20,) * 2)
+try:
+    take(torch.empty(0))
+except DevrfError as error:
+    print(error)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="memory as Linux limits it")
+def test_memory_too_short_for_warp_is_one_line():
+    done = subprocess.run([sys.executable, "-c", SHORT], capture_output=True, text=True)
+    assert done.stdout.startswith("kernels: Warp cannot be loaded (") and done.stderr == ""
+    assert done.stdout.endswith("; free memory, or give kernels=torch\n")
 
 
 def scene(rng: torch.Generator, count: int = 500) -> tuple[Rays, Medium]:

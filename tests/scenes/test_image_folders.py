@@ -74,6 +74,13 @@ def test_the_factor(downscale: int | str, height: int, factor: int) -> None:
     assert whole_factor(downscale, partial(_photograph, height)) == factor
 
 
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a machine without a GPU")
+def test_auto_says_for_which_device_it_chose(caplog):
+    with caplog.at_level(logging.INFO):
+        assert whole_factor("auto", partial(_photograph, 3024)) == 8
+    assert "made smaller by 8 (chosen for a CPU;" in caplog.text
+
+
 def test_the_folder_that_is_there_is_taken(llff_folder, caplog):
     """With images_4 alone nothing larger can be read; beside images these are."""
     assert LlffReader(llff_folder.root).read().static.train.width == 24

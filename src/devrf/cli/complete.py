@@ -61,12 +61,16 @@ def completed(arguments: Sequence[str]) -> list[str]:
             line = override.input_line
             raise DevrfError(f"{line}: choose one of {', '.join(options)}, or leave it out")
     before = of_named_run(typed, known.multirun)
-    searched = [text for text in texts if text.startswith("hydra.searchpath=")]
-    if known.config_dir:
-        folder = in_quotes(f"file://{Path(known.config_dir).absolute()}")
-        searched.append(f"hydra.searchpath=[{folder}]")
-    added = _told_by_files(values(typed, "data.root"), parsed([*before, *texts]), searched)
-    return [*flags, *before, *texts, *added]
+    roots, overrides = values(typed, "data.root"), parsed([*before, *texts])
+    if not roots or value(overrides, "stage") in APART or any("${" in root for root in roots):
+        return [*flags, *before, *texts]
+    readers: list[str | None] = [*values(overrides, "data")]
+    readers = readers or _of_experiments(overrides, known.config_dir)
+    words = [_told_by_scene(reader, root, overrides) for reader, root in product(readers, roots)]
+    if any(other != words[0] for other in words):
+        needed = " and ".join(dict.fromkeys(" ".join(other) or "neither" for other in words))
+        raise DevrfError(f"data.root: the scenes need {needed}; sweep over those of each apart")
+    return [*flags, *before, *texts, *words[0]]
 
 
 def quoted_path(argument: str, multirun: bool) -> str:
@@ -74,43 +78,27 @@ def quoted_path(argument: str, multirun: bool) -> str:
 
     In a multirun a comma separates paths, as it does other values.
     """
-    parts = KEY_VALUE.fullmatch(argument)
-    if not parts or parts[2] not in PATHS or "${" in parts[3]:
+    found = KEY_VALUE.fullmatch(argument)
+    if not found or found[2] not in PATHS or "${" in argument:
         return argument
-    try:
+    start, _, text = found.groups()
+    paths = text.split(",") if multirun else [text]
+    with suppress(HydraException):
         (override,) = parsed([argument])
-    except HydraException:
-        paths = parts[3].split(",") if multirun else [parts[3]]
-        return parts[1] + ",".join(in_quotes(os.path.expanduser(path)) for path in paths)
-    read = override.value()
-    if override.is_sweep_override() or read in (None, ""):
-        return argument
-    # A folder's name may look like a number or a list.
-    path = os.path.expanduser(read if isinstance(read, str) else parts[3])
-    return argument if read == path else parts[1] + in_quotes(path)
-
-
-def _told_by_files(
-    roots: Sequence[str], overrides: Sequence[Override], searched: Sequence[str]
-) -> list[str]:
-    """What the files of the scenes in ``roots`` say that no override says.
-
-    Raises:
-        DevrfError: a layout is unknown, or the scenes need different options.
-    """
-    if not roots or value(overrides, "stage") in APART or any("${" in root for root in roots):
-        return []
-    options: Sequence[str | None] = values(overrides, "data")
-    options = options or _of_experiments(values(overrides, "experiment"), searched) or [None]
-    words = [_told_by_scene(option, root, overrides) for option, root in product(options, roots)]
-    if any(other != words[0] for other in words):
-        needed = " and ".join(dict.fromkeys(" ".join(other) or "neither" for other in words))
-        raise DevrfError(f"data.root: the scenes need {needed}; sweep over those of each apart")
-    return words[0]
+        read = override.value()
+        if override.is_sweep_override() or read in (None, "", text):
+            return argument
+        # A folder's name may look like a number or a list.
+        paths = [read if isinstance(read, str) else text]
+    return start + ",".join(in_quotes(os.path.expanduser(path)) for path in paths)
 
 
 def _told_by_scene(option: str | None, root: str, overrides: Sequence[Override]) -> list[str]:
-    """What the files of the scene in ``root`` say, which ``data=option`` reads, if it is known."""
+    """What the files of a scene say, which ``data=option`` reads, and no override does.
+
+    Raises:
+        DevrfError: ``option`` is None, and no reader knows the layout.
+    """
     # Imported here: they load torch.
     from devrf.data.kind import by_one_camera, faces_forward
     from devrf.scenes.formats import recognise
@@ -136,16 +124,17 @@ def _told_by_scene(option: str | None, root: str, overrides: Sequence[Override])
     return words
 
 
-def _of_experiments(names: Sequence[str], searched: Sequence[str]) -> list[str]:
-    """The options of ``data`` that experiments choose, which may lie in other folders."""
-    chosen: list[str | list[str] | None] = []
-    if not names:
-        return []
+def _of_experiments(overrides: Sequence[Override], config_dir: str | None) -> list[str | None]:
+    """The options of ``data`` that experiments choose, which may lie in other folders; or None."""
+    texts = [str(o.input_line) for o in overrides if o.key_or_group == "hydra.searchpath"]
+    if config_dir:
+        texts.append(f"hydra.searchpath=[{in_quotes(f'file://{os.path.abspath(config_dir)}')}]")
+    options: list[str | list[str] | None] = []
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         loader = GlobalHydra.instance().config_loader()
-        for name in names:
+        for name in values(overrides, "experiment"):
             with suppress(HydraException):  # reported when Hydra composes it
-                words = [f"experiment={name}", *searched]
+                words = [f"experiment={name}", *texts]
                 found = loader.compute_defaults_list("config", words, RunMode.RUN)
-                chosen.append(found.overrides.override_choices.get("data"))
-    return [str(option) for option in chosen if option is not None]
+                options.append(found.overrides.override_choices.get("data"))
+    return [str(option) for option in options if option is not None] or [None]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shlex
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -41,19 +40,17 @@ def group_choices() -> dict[str, list[str]]:
 
 def known_stages() -> list[str]:
     """Every stage there is, of all protocols."""
-    learning: dict[str, None] = {}  # in order, each once
-    for path in sorted((config_folder() / "protocol").glob("*.yaml"), reverse=True):
-        learning |= dict.fromkeys(OmegaConf.select(OmegaConf.load(path), "stages"))
-    return [PIPELINE, *learning, *STEPS]
+    files = sorted((config_folder() / "protocol").glob("*.yaml"), reverse=True)
+    learning = [stage for file in files for stage in OmegaConf.load(file).stages]
+    return [PIPELINE, *dict.fromkeys(learning), *STEPS]
 
 
 def scene_name(config: DictConfig) -> str:
     """The scene's name for folders and tables: typed, that of its data, else its folder's."""
     data = config.data
-    if OmegaConf.is_missing(data, "root"):
-        return config.scene or "scene"
-    named = config.scene or data.get("name") or data.get("shape")
-    return scene_folder_name(str(named or Path(str(data.get("root"))).resolve().name))
+    root = "scene" if OmegaConf.is_missing(data, "root") else str(data.get("root"))
+    named = config.scene or data.get("name") or data.get("shape") or Path(root).resolve().name
+    return scene_folder_name(str(named))
 
 
 def scene_folder_name(scene: str) -> str:
@@ -99,7 +96,6 @@ def job_folder(_root_: Any) -> str:
     return scene_folder_name("_".join([str(hydra.job.num), scene_name(_root_), *words]))[:150]
 
 
-@cache  # for the whole process
 def register_config() -> None:
     """Make the names of folders known to Hydra, ``${devrf.run_folder:}``."""
     for word in (run_folder, job_folder):

@@ -7,12 +7,13 @@ import json
 import logging
 import re
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import is_dataclass
 from functools import reduce
 from importlib.util import find_spec
 from operator import getitem
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, cast, get_type_hints
 
 from annotated_types import Ge, Lt
 from hydra.utils import get_object
@@ -66,49 +67,49 @@ def check_config(config: DictConfig) -> None:
         raise DevrfError(f"{key}: required; give {key}={value}")
     raw: Any = OmegaConf.to_container(config)
     resolved: Any = OmegaConf.to_container(config, resolve=True)
-    read = set(REFERENCE.findall(OmegaConf.to_yaml(config)))
+    read = tuple(f"{key}." for key in REFERENCE.findall(OmegaConf.to_yaml(config)))
     # A key that is missing is wrong in its type, too.
     content = json.dumps(dict.fromkeys(ROOT) | resolved, default=str)
     try:
         TypeAdapter(_type_of(raw, resolved, "", read)).validate_json(content, strict=True)
     except ValidationError as error:
-        issues = sorted(error.errors(), key=lambda issue: issue["type"] not in UNKNOWN)
-        for issue in issues:
+        issues = [issue for issue in error.errors() if not _is_left_to_the_part(issue)]
+        for issue in sorted(issues, key=lambda issue: issue["type"] not in UNKNOWN):
             where, beside = _place(raw, issue["loc"])
-            kind, value = issue["type"], issue["input"]
-            if kind in UNKNOWN:
-                lacking = [other["loc"][-1] for other in issues if other["type"] in LEFT]
+            if issue["type"] in UNKNOWN:
+                lacking = [other["loc"][-1] for other in error.errors() if other["type"] in LEFT]
                 raise unknown_key(where, [*beside, *lacking]) from None
-            if kind in LEFT or (kind in BUILT and _is_part(value)):
-                continue
             alike = [other["msg"] for other in issues if _place(raw, other["loc"])[0] == where]
             wanted = [message.removeprefix("Input should be ") for message in alike]
             expected = " or ".join(dict.fromkeys(wanted))
-            if kind in BUILT:
+            if issue["type"] in BUILT:
                 expected = "a section with _target_"
+            value = issue["input"]
             meant = did_you_mean(value, re.findall("'([^']+)'", expected), f"{where}=")
             raise DevrfError(f"{where}: expected {expected}, not {value!r}{meant}") from None
 
 
-def _type_of(raw: Node, resolved: Node, path: str, read: set[str]) -> Any:
+def _is_left_to_the_part(issue: Mapping[str, Any]) -> bool:
+    """Whether pydantic objects to what only building tells: a row's keys, what a part becomes."""
+    return issue["type"] in LEFT or (issue["type"] in BUILT and _is_part(issue["input"]))
+
+
+def _type_of(raw: Node, resolved: Node, path: str, read: tuple[str, ...]) -> Any:
     """The type of a node: that of a part has its settings, another what a part reads of it.
 
     A value outside any part counts as read when some part refers to it: ``${loss.search}``.
     """
-    is_part = "_target_" in raw
-    hints = dict.fromkeys(RESERVED, Any) | (_settings(resolved, path) if is_part else {})
-    hints |= {} if path else ROOT
+    hints = _settings(resolved, path) if _is_part(raw) else {} if path else dict(ROOT)
     for key, value in raw.items():
-        where = f"{path}{key}"
-        if is_part and key not in hints:
+        where = f"{path}{key}."
+        if _is_part(raw) and key not in hints:
             hints |= {key: Any} if "**" in hints else {}
-        elif isinstance(value, Mapping) and (_is_part(value) or not is_part):
-            hints[key] = _type_of(value, resolved[key], f"{where}.", read)
+        elif isinstance(value, Mapping) and (_is_part(value) or not _is_part(raw)):
+            hints[key] = _type_of(value, resolved[key], where, read)
         elif _is_part(resolved[key]):
             hints[key] = Any  # checked in its own place
-        elif not is_part and key not in hints:
-            if value is None or any(f"{where}.".startswith(f"{name}.") for name in read):
-                hints[key] = Any
+        elif key not in hints and (value is None or where.startswith(read)):
+            hints[key] = Any
     made = cast(Any, TypedDict)(path, hints, total=False)
     made.__pydantic_config__ = {"extra": "forbid", "arbitrary_types_allowed": True}
     return made
@@ -116,15 +117,15 @@ def _type_of(raw: Node, resolved: Node, path: str, read: set[str]) -> Any:
 
 def _place(raw: Node, names: Iterable[object]) -> tuple[str, Node]:
     """The key at which the user sets the value in a place of a config, and what is beside it."""
-    keys, node, beside = list[str](), cast(Any, raw), raw
+    where, node, beside = "", cast(Any, raw), raw
     for name in map(str, names):  # some name one of several types
         if isinstance(node, Mapping) and name in node:
             beside, node = node, node[name]
-            keys.append(name)
+            where = f"{where}.{name}".lstrip(".")
             if isinstance(node, str) and (reference := REFERENCE.fullmatch(node)):
-                keys = reference[1].split(".")
-                node = reduce(getitem, keys, raw)
-    return ".".join(keys), beside
+                where = reference[1]
+                node = reduce(getitem, where.split("."), raw)
+    return where, beside
 
 
 def _settings(part: Node, path: str) -> dict[str, Any]:
@@ -135,7 +136,7 @@ def _settings(part: Node, path: str) -> dict[str, Any]:
             # It is made later, of the keys beside it.
             del settings["**"]
             settings = {**_parameters(str(below["_target_"]), path), **settings}
-    return settings
+    return settings | dict.fromkeys(RESERVED, Any)
 
 
 def _parameters(target: str, path: str) -> dict[str, Any]:
@@ -144,12 +145,11 @@ def _parameters(target: str, path: str) -> dict[str, Any]:
         parameters = inspect.signature(part).parameters.values()
     except Exception as error:
         raise DevrfError(f"{path}_target_: cannot load {target!r} ({error})") from None
-    try:
-        # A dataclass may inherit fields whose types only its base's module knows.
-        own_init = inspect.isclass(part) and not is_dataclass(part)
+    # A dataclass may inherit fields whose types only its base's module knows.
+    own_init = inspect.isclass(part) and not is_dataclass(part)
+    hints: dict[str, Any] = {}
+    with suppress(NameError, TypeError):  # names imported only for a type checker
         hints = get_type_hints(part.__init__ if own_init else part)
-    except (NameError, TypeError):  # names imported only for a type checker
-        hints = {}
     types = {
         "**" if p.kind is p.VAR_KEYWORD else p.name: hints.get(p.name, Any) for p in parameters
     }
@@ -171,25 +171,6 @@ def unknown_key(where: str, known: Iterable[object]) -> DevrfError:
     having = ", ".join(path.stem for path in files if name in list(OmegaConf.load(path)))
     instead = f"it belongs to {group}={having}" if having else "--cfg job shows every key there is"
     return DevrfError(f"{where}: no such key{meant or f'; {instead}'}")
-
-
-def choices_of(hint: Any) -> tuple[object, ...]:
-    """The values that a hint enumerates, as they are typed; none where it does not."""
-    if hint is bool:
-        return "true", "false"
-    if get_origin(hint) is Literal:
-        return get_args(hint)
-    return tuple(value for argument in get_args(hint) for value in choices_of(argument))
-
-
-def choices_at(config: DictConfig, key: str) -> tuple[object, ...]:
-    """The values that the part with ``key`` in a composed config enumerates for it."""
-    parent, _, name = key.rpartition(".")
-    part = OmegaConf.select(config, parent)
-    if not isinstance(part, DictConfig) or "_target_" not in part:
-        return ()
-    node: Any = OmegaConf.to_container(part)
-    return choices_of(_settings(node, f"{parent}.").get(name))
 
 
 def check_extras(config: DictConfig) -> None:

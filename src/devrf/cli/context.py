@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,7 +32,7 @@ from devrf.cli.restore_config import present_command
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.ddp import ManualDDP
 from devrf.engine.stage import Stage
-from devrf.errors import DevrfError
+from devrf.errors import DevrfError, expect
 from devrf.evaluation.objective import VALIDATION
 from devrf.evaluation.suite import Evaluation
 from devrf.methods.protocol import Protocol
@@ -43,8 +44,10 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-class RunContext:
+class RunContext(ExitStack):
     """A composed config, the run's folder, and parts that are built when first used.
+
+    As a context manager it ends the viewer's page, and the tracking of the run, if they began.
 
     Attributes:
         config: a composed config (``conf/config.yaml``).
@@ -65,6 +68,7 @@ class RunContext:
     """
 
     def __init__(self, config: DictConfig, folder: Path) -> None:
+        super().__init__()
         self.command = present_command(config)
         config.scene = scene_name(config)
         self.config, self.folder = config, folder
@@ -110,9 +114,8 @@ class RunContext:
     @property
     def stages_with_images(self) -> tuple[str, ...]:
         """The protocol's stages; of a scene at rest those that learn from the static set alone."""
-        if self.moves:
-            return self.learning_stages
-        return tuple(step.name for step in self.protocol.steps if step.capture == "static")
+        steps = self.protocol.steps
+        return tuple(step.name for step in steps if step.capture == "static" or self.moves)
 
     @property
     def moves(self) -> bool:
@@ -129,15 +132,13 @@ class RunContext:
         Raises:
             DevrfError: there is none.
         """
-        known = self.stages_with_images
-        if left := tuple(name for name in names if name in known):
+        if left := tuple(name for name in names if name in self.stages_with_images):
             return left
-        what, instead = f"stage={names[0]}: learns motion", "stage=pipeline"
-        if not known:
-            what = f"protocol={self.protocol.name}: learns from images in motion"
-            instead = "protocol=two_stage"
         at_rest = f"{self.config.scene} is at rest: all its images show one moment"
-        raise DevrfError(f"{what}, but {at_rest}; use {instead}")
+        if self.stages_with_images:
+            raise DevrfError(f"stage={names[0]}: learns motion, but {at_rest}; use stage=pipeline")
+        what = f"protocol={self.protocol.name}: learns from images in motion"
+        raise DevrfError(f"{what}, but {at_rest}; use protocol=two_stage")
 
     def stage_builder(self, name: str) -> Callable[..., Stage]:
         """A function that builds a stage, given ``rest`` if it builds on another.
@@ -145,22 +146,18 @@ class RunContext:
         Raises:
             DevrfError: the method has no such stage, or the protocol asks what it cannot do.
         """
+        method, protocol = self.config.method, self.protocol
         key = name if name in self.config else "ray_stage"
         if key not in self.config:
-            raise DevrfError(
-                f"protocol: method={self.config.method} does not learn by "
-                f"protocol={self.protocol.name}; it has no stage {name!r}"
-            )
+            does = f"method={method} does not learn by protocol={protocol.name}"
+            raise DevrfError(f"protocol: {does}; it has no stage {name!r}")
         build: partial[Stage] = instantiate(self.config[key], _partial_=True, _convert_="all")
         if key == "ray_stage":
-            build.keywords["model"].check_protocol(self.protocol.name)
-            return partial(build, step=self.protocol[name], static_share=self.protocol.static_share)
+            build.keywords["model"].check_protocol(protocol.name)
+            return partial(build, step=protocol[name], static_share=protocol.static_share)
         build.func.check_settings(**build.keywords)  # type: ignore[attr-defined]
-        if self.protocol.freeze is not True:
-            raise DevrfError(
-                f"protocol.freeze: method={self.config.method} has stages of its own, which "
-                f"freeze what they build on; expected true, not {self.protocol.freeze}"
-            )
+        own = f"true, as the stages of method={method} freeze what they build on"
+        expect(protocol.freeze is True, "protocol.freeze", own, protocol.freeze)
         return build
 
     @cached_property
@@ -173,9 +170,9 @@ class RunContext:
             return False
         logger = instantiate(self.config.logger)
         for tracker in trackers([logger]):
-            settings = OmegaConf.to_container(self.config, resolve=True)
-            assert isinstance(settings, dict)
-            tracker.log_hyperparams({str(key): value for key, value in settings.items()})
+            self.push(lambda error, *_, ends=tracker: ends.close(failed=error is not None))
+            settings: Any = OmegaConf.to_container(self.config, resolve=True)
+            tracker.log_hyperparams(settings)
         return logger
 
     @property
@@ -190,19 +187,9 @@ class RunContext:
 
         settings = instantiate(self.config.viewer)
         session = Session(settings, Viewpoints.of(self.scene), self.scene, self.folder)
+        self.callback(session.close)
         log.info("the scene is at %s while it is learned", settings.address)
         return session
-
-    def __enter__(self) -> RunContext:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        # End the viewer's page, and the tracking of the run, if they began.
-        if "page" in self.__dict__:
-            self.page.close()
-        if "logger" in self.__dict__:
-            for tracker in self.trackers:
-                tracker.close(failed=kind is not None)
 
     def own_checkpoint(self, name: str) -> Path:
         """The run's checkpoint of the stage ``name``, whether it exists or not."""
@@ -216,10 +203,10 @@ class RunContext:
         Raises:
             DevrfError: there is none.
         """
-        if self.config.ckpt is not None:
-            if not Path(self.config.ckpt).is_file():
-                raise DevrfError(f"{self.config.ckpt}: no such checkpoint; set ckpt to a file")
-            return Path(self.config.ckpt)
+        if (given := self.config.ckpt) is not None:
+            if not Path(given).is_file():
+                raise DevrfError(f"{given}: no such checkpoint; set ckpt to a file")
+            return Path(given)
         for stage in self.learning_stages[::-1] if name is None else (name,):
             path = self.own_checkpoint(stage)
             left = progress_files(path.parent, stage) if name is None else []
@@ -253,15 +240,14 @@ def _strategy(config: DictConfig) -> Strategy:
             optimiser steps have.
     """
     trainer: Trainer = instantiate(config.trainer, logger=False)
-    own = "stages take optimiser steps of their own; leave it out"
-    if trainer.accumulate_grad_batches != 1:
-        rays = "schedule.canonical.rays, schedule.deformation.rays or ray_stage.schedule.rays"
-        raise DevrfError(f"trainer.accumulate_grad_batches: {own}; {rays} sizes batches")
-    if trainer.gradient_clip_val:
-        raise DevrfError(
-            f"trainer.gradient_clip_val: {own}; where a loss diverges, "
-            "callbacks.divergence_guard lowers the learning rates"
-        )
+    rays = "schedule.canonical.rays, schedule.deformation.rays or ray_stage.schedule.rays"
+    for key, usual, instead in (
+        ("accumulate_grad_batches", 1, f"{rays} sizes batches"),
+        ("gradient_clip_val", 0, "callbacks.divergence_guard lowers the learning rates"),
+    ):
+        if getattr(trainer, key) not in (None, usual):
+            own = "stages take optimiser steps of their own"
+            raise DevrfError(f"trainer.{key}: {own}; leave it out: {instead}")
     if trainer.world_size > 1 and not isinstance(trainer.strategy, ManualDDP):
         raise DevrfError(
             f"trainer.devices: {trainer.world_size} processes need trainer=ddp; give both"

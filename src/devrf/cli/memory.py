@@ -31,25 +31,24 @@ def needs(run: RunContext, config: DictConfig, scene: Scene) -> dict[str, StageN
     """What each stage of a configured run needs; several processes share a batch."""
     processes = int(getattr(run.strategy, "world_size", 1))
     images = SIZE if "downscale" in config.data else "data.frames"
-    if "canonical" in config:
-        stages = needs_of_devrf(
-            scene,
-            instantiate(config.canonical, _convert_="all"),
-            instantiate(config.deformation.schedule, _convert_="all"),
-            images,
-            [name for name, row in config.schedule.deformation.levels.items() if row][-1],
-            offloaded=config.schedule.motion.store == "host",
-            processes=processes,
-        )
-    else:
+    # A scene at rest that the protocol has no stage for can be looked at all the same.
+    names = run.stages_with_images or run.learning_stages
+    if "canonical" not in config:
         with torch.device("meta"):
             model = instantiate(config.ray_stage.model, _convert_="all")
         schedule = config.ray_stage.schedule
         rays = max(schedule.rays, schedule.get("rays_without_hull") or 0) / processes
-        networks = needs_of_networks(scene, model, images, rays)
-        stages = dict.fromkeys(run.learning_stages, networks)
-    # A scene at rest that the protocol has no stage for can be looked at all the same.
-    return {name: stages[name] for name in run.stages_with_images or run.learning_stages}
+        return dict.fromkeys(names, needs_of_networks(scene, model, images, rays))
+    stages = needs_of_devrf(
+        scene,
+        instantiate(config.canonical, _convert_="all"),
+        instantiate(config.deformation.schedule, _convert_="all"),
+        images,
+        [name for name, row in config.schedule.deformation.levels.items() if row][-1],
+        offloaded=config.schedule.motion.store == "host",
+        processes=processes,
+    )
+    return {name: stages[name] for name in names}
 
 
 def compare(run: RunContext, names: Sequence[str]) -> tuple[str, Advice | None, list[str]]:

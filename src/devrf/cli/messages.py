@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf.errors import OmegaConfBaseException
 
@@ -112,7 +113,4 @@ def _not_understood(argument: str) -> str:
 
 def in_quotes(text: str) -> str:
     """``text`` as Hydra's grammar takes it for text, whatever it holds."""
-    mark = "'" if '"' in text and "'" not in text else '"'
-    # Backslashes count as escapes only before a quotation mark and at the end.
-    escaped = re.sub(rf"(\\*)({mark}|$)", lambda m: m[1] * 2 + (m[2] and f"\\{mark}"), text)
-    return f"{mark}{escaped}{mark}"
+    return QuotedString(text=text, quote=Quote.double).with_quotes()

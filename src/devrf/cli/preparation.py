@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 from functools import partial
+from pathlib import Path
 
 from hydra import compose
 from hydra.utils import instantiate
@@ -65,15 +66,13 @@ def capture(run: RunContext) -> None:
 
 def prepare(run: RunContext) -> None:
     """Write the scene to ``data.export`` in the published layout."""
-    if not hasattr(run.datamodule, "export"):
-        raise DevrfError(
-            "stage=prepare: writes an embedded scene; choose data=procedural or "
-            "data=procedural_forward, and give data.export=PATH"
-        )
-    folder = run.datamodule.export
+    if "export" not in run.config.data:
+        embedded = "choose data=procedural or data=procedural_forward"
+        raise DevrfError(f"stage=prepare: writes an embedded scene; {embedded}")
+    folder = run.config.data.export
     if folder is None:
         raise DevrfError("data.export: stage=prepare needs a folder; give data.export=PATH")
-    export(run.scene, folder)
+    export(run.scene, Path(folder))
     log.info("scene written to %s", folder)
 
 

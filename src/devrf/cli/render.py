@@ -39,12 +39,10 @@ def render(run: RunContext) -> list[Path] | None:
     """Write the videos that ``video`` asks for; return their files, None if one was left out."""
     settings: VideoSettings = instantiate(run.config.video)
     model, viewpoints = _learned(run)
-    scene = (
-        _with_images(run, "held_out.mp4, which shows its images, is left out")
-        if settings.path is None
-        else None
-    )
-    held_out = None if scene is None else (scene.dynamic if scene.moves else scene.static).test
+    held_out = None
+    without = "held_out.mp4, which shows its images, is left out"
+    if settings.path is None and (scene := _with_images(run, without)) is not None:
+        held_out = (scene.dynamic if scene.moves else scene.static).test
     renderer, paths = Renderer(model, half=settings.half), []
     for video in videos(renderer, viewpoints, settings, held_out):
         path = run.folder / "videos" / f"{video.name}.mp4"

@@ -46,8 +46,8 @@ OF_A_SCENE = {"data", "facing", "seed"}
 # What is set without a section.
 ALONE = {"seed", "priors", "deterministic", "decoder_precision"}
 # An option's name leads to no other folder than its group's; a key is a path of plain names.
-NAME = re.compile(r"(?!null$)[\w-]+", re.ASCII | re.IGNORECASE)
-DEEPEST = 16
+OPTION = re.compile(r"(?!null$)[\w-]+", re.ASCII | re.IGNORECASE)
+KEY = re.compile(r"/?[\w-]+([./][\w-]+){0,15}", re.ASCII)
 # Text that is more than text.
 CODE = re.compile(rf"\$\{{|^\?\?\?$|{'|'.join(RESERVED)}")
 # Values that are relative to the folder in which they were typed.
@@ -75,7 +75,7 @@ def present_command(config: DictConfig) -> Command:
         elif not override.is_delete():
             said |= leaves(OmegaConf.select(config, key), key)
     for key in RELATIVE & {*said}:
-        if isinstance(said[key], str) and (path := Path(said[key]).expanduser()).exists():
+        if isinstance(said[key], str) and (path := Path(said[key])).exists():
             said[key] = str(path.absolute())
     return {key: value for key, value in said.items() if _is_known(key, value)}
 
@@ -95,12 +95,11 @@ def checked(path: Path, command: Mapping[str, Any]) -> Command:
 
 def _is_known(key: str, value: object) -> bool:
     """Whether a run may have been learned with it: an option by name, or a plain value by key."""
-    names = re.split("[./]", key.lstrip("/"))
-    if _of_a_command(key) or len(names) > DEEPEST or not all(map(NAME.fullmatch, names)):
+    if not KEY.fullmatch(key) or _of_a_command(key):
         return False
     if key.startswith("/"):
-        return isinstance(value, str) and NAME.fullmatch(value) is not None
-    return (len(names) > 1 or key in ALONE) and _is_plain(value)
+        return isinstance(value, str) and OPTION.fullmatch(value) is not None
+    return ("." in key or key in ALONE) and _is_plain(value)
 
 
 def _is_plain(value: object, depth: int = 8) -> bool:
@@ -128,11 +127,6 @@ def as_typed(command: Mapping[str, Any]) -> list[str]:
     return [f"{key.lstrip('/')}={value}" for key, value in said.items()]
 
 
-def _override(key: str, value: Any) -> str:
-    """What sets an option of a group, or a key, to just this value."""
-    return f"{key[1:]}={value}" if key[0] == "/" else f"++{key}={_literal(value)}"
-
-
 def _literal(value: Any) -> str:
     """A plain value in Hydra's grammar."""
     if isinstance(value, list):
@@ -148,8 +142,7 @@ def parsed(overrides: Iterable[str]) -> list[Override]:
     Raises:
         HydraException: one is not understood.
     """
-    read: list[Override] = OverridesParser.create().parse_overrides(list(overrides))
-    return read
+    return list(OverridesParser.create().parse_overrides(list(overrides)))
 
 
 def values(overrides: Sequence[Override], key: str) -> list[str]:
@@ -199,12 +192,13 @@ def of_named_run(typed: Sequence[Override], multirun: bool) -> list[str]:
     command = _beneath(typed, shared)
     said = f"as it was learned, with {' '.join(as_typed(command))}"
     if {} in commands:
-        said = (
-            "does not say how it was learned; data and settings are those typed, and the defaults"
-        )
+        said = "does not say how it was learned; what is typed and the defaults apply"
     if command or {} in commands:
         told.append(f"{', '.join(map(str, checkpoints))}: {said}")
-    put = [_override(key, setting) for key, setting in command.items()]
+    put = [
+        f"{key[1:]}={setting}" if key[0] == "/" else f"++{key}={_literal(setting)}"
+        for key, setting in command.items()
+    ]
     if multirun:
         # The sweep is the one that is typed, not that of an experiment.
         return put if values(typed, "hparams_search") else [*put, "hydra.sweeper.params=null"]
@@ -222,8 +216,7 @@ def _beneath(typed: Sequence[Override], command: Command) -> Command:
     """
     keys = {override.key_or_group for override in typed}
     other = tuple(f"{k}." for k in keys if value(typed, k) != command.get(f"/{k}"))
-    method = value(typed, "method")
-    another = method not in (None, command.get("/method", "devrf"))
+    another = value(typed, "method") not in (None, command.get("/method", "devrf"))
     return {
         key: setting
         for key, setting in command.items()

@@ -144,16 +144,14 @@ def _agrees(path: Path, metadata: CheckpointMetadata, training_config: Mapping[s
         log.info("%s: belongs to another canonical field; learned anew", path)
         return False
     key = next(k for k in [*training_config, *old] if old.get(k) != training_config.get(k))
-    before, now = (_shown(settings, key) for settings in (old, training_config))
+    before, now = (
+        json.dumps(settings[key])[:40] if key in settings else "nothing"
+        for settings in (old, training_config)
+    )
     raise DevrfError(
         f"{key}: {path} was made with {before}, now it is {now}; give resume=false to begin "
         "afresh (what is there is kept in previous-<n>/), or hydra.run.dir=FOLDER for another run"
     )
-
-
-def _shown(settings: Mapping[str, Any], key: str) -> str:
-    text = json.dumps(settings[key]) if key in settings else "nothing"
-    return text if len(text) <= 40 else f"{text[:37]}..."
 
 
 def remove_progress(folder: Path, stage: str) -> None:
@@ -165,14 +163,10 @@ def remove_progress(folder: Path, stage: str) -> None:
 def unfinished(run: RunContext) -> str | None:
     """Where the run's last stage stands, and how to go on; None if there is nothing left of it."""
     path = run.checkpoint()
-    progress = read_description(path).get("progress")
-    if progress is None:
+    if (at := read_description(path).get("progress")) is None:
         return None
-    again = command_line(f"hydra.run.dir={run.place}")
-    return (
-        f"{path}: iteration {progress['iteration']} of {progress['total']} of the "
-        f"{progress['stage']} stage; {again} goes on"
-    )
+    stands = f"iteration {at['iteration']} of {at['total']} of the {at['stage']} stage"
+    return f"{path}: {stands}; {command_line(f'hydra.run.dir={run.place}')} goes on"
 
 
 def done(run: RunContext, step: str) -> bool:
@@ -193,21 +187,15 @@ def note_done(run: RunContext, step: str, files: Sequence[Path] | None) -> None:
 
 
 def _made_with(run: RunContext, step: str) -> str:
-    """A digest of what decides a step's results; empty without a checkpoint."""
-    try:
-        checkpoint = digest_of(run.checkpoint())
-    except (DevrfError, OSError):
-        return ""
-    data = leaves(run.config.data, "data")
-    if (root := data.get("data.root")) is not None:
-        data["data.root"] = Path(root).resolve()
-    keyframes = Path(str(run.config.video.path)) if step == "render" else Path()
+    """A digest of what decides a step's results."""
+    data = {k: v for k, v in leaves(run.config.data, "data").items() if k not in PLACES}
+    root, keyframes = data.pop("data.root", None), Path(str(run.config.video.path))
     made = (
-        *(step, checkpoint, devrf.__version__, run.config.logger._target_),
-        {key: value for key, value in data.items() if key not in PLACES},
+        *(step, digest_of(run.checkpoint()), devrf.__version__, run.config.logger._target_),
+        *(data, root and Path(root).resolve()),
         leaves(run.config[DECIDES[step]], step),
         step == "evaluate" and run.datamodule.validation,
-        keyframes.read_bytes() if keyframes.is_file() else None,
+        step == "render" and keyframes.is_file() and keyframes.read_bytes(),
     )
     return sha256(repr(made).encode()).hexdigest()
 

@@ -21,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from devrf.apps.render import camera_path
 from devrf.apps.settings import ViewerSettings
-from devrf.cli.config import APART, OF_A_CHECKPOINT, in_sweep
+from devrf.cli.config import APART, OF_A_CHECKPOINT, PIPELINE, in_sweep
 from devrf.cli.context import RunContext
 from devrf.cli.evaluate import evaluate
 from devrf.cli.memory import compare
@@ -34,7 +34,7 @@ from devrf.cli.sweep import report
 from devrf.cli.train import learn
 from devrf.engine.ddp import ManualDDP
 from devrf.engine.workers import launch_workers
-from devrf.errors import DevrfError, did_you_mean
+from devrf.errors import DevrfError, did_you_mean, expect
 from devrf.evaluation.objective import check_objective, objective
 from devrf.kernels import runtime
 from devrf.kernels.ahead import compile_ahead
@@ -76,15 +76,14 @@ def plan(stage: str, protocol: Sequence[str]) -> tuple[Names, Names]:
     Raises:
         DevrfError: there is no such stage.
     """
-    if stage == "pipeline":
+    if stage == PIPELINE:
         return tuple(protocol), AFTER_LEARNING
     if stage in protocol:
         return (stage,), ()
-    if stage in STEPS:
-        return (), (stage,)
-    known = ["pipeline", *protocol, *STEPS]
+    known = [PIPELINE, *protocol, *STEPS]
     meant = did_you_mean(stage, known, "stage=")
-    raise DevrfError(f"stage: expected one of {', '.join(known)}, not {stage!r}{meant}")
+    expect(stage in STEPS, "stage", f"one of {', '.join(known)}", f"{stage!r}{meant}")
+    return (), (stage,)
 
 
 def run_stage(config: DictConfig, folder: Path) -> float | None:
@@ -124,9 +123,8 @@ def _prepare_to_learn(run: RunContext, requested: Names, steps: Names) -> None:
         log.info("%s is at rest: %s; no motion is learned", run.config.scene, left)
     resume = run.config.resume
     names = [name for name in learning if not (resume and run.own_checkpoint(name).is_file())]
-    needed, shortage = None, None
-    if names and run.config.memory_check:
-        needed, shortage, _ = compare(run, names)
+    looks = names and run.config.memory_check
+    needed, shortage, _ = compare(run, names) if looks else (None, None, [])
     if shortage is not None:
         raise DevrfError(f"{shortage}, or try all the same with memory_check=false")
     if not resume and not run.is_trial:
@@ -172,11 +170,9 @@ def _learn(run: RunContext, learning: Names) -> None:
     with together, as_own_errors():
         # Rank 0 has made it. Checkpoints that a later stage or a resumed one needs are read by all.
         there = (run.folder / PLACE).is_dir()
-        if isinstance(strategy, ManualDDP) and not strategy.reduce_boolean_decision(there):
-            raise DevrfError(
-                f"{run.folder}: not there on every node; give hydra.run.dir=FOLDER in a file "
-                "system that all nodes share"
-            )
+        if not strategy.reduce_boolean_decision(there):
+            shared = "give hydra.run.dir=FOLDER in a file system that all nodes share"
+            raise DevrfError(f"{run.folder}: not there on every node; {shared}")
         for name in run.learnable(learning):
             _take(run, name, partial(learn, name=name))
             # What a stage's trainer holds in circles would count as the next stage's memory.
@@ -200,10 +196,8 @@ def _check(run: RunContext, learning: Names, steps: Names) -> None:
     config = run.config
     begins = learning and run.protocol[learning[0]].builds_on is None
     if config.ckpt is not None and (begins or not {*steps} <= {*OF_A_CHECKPOINT}):
-        raise DevrfError(
-            f"ckpt: stage={config.stage} starts from nothing; with ckpt=PATH give a stage that "
-            "builds on another, stage=evaluate, render, still, view or export"
-        )
+        instead = f"a stage that builds on another, stage={', '.join(OF_A_CHECKPOINT)}"
+        raise DevrfError(f"ckpt: stage={config.stage} starts from nothing; give {instead}")
     if not learning and not set(APART).isdisjoint(steps):
         return
     _ = run.datamodule
@@ -214,9 +208,8 @@ def _check(run: RunContext, learning: Names, steps: Names) -> None:
         check_objective(config.objective, run.evaluation.metrics)
     # A sweeper with a direction optimises, and so needs the objective of each job.
     if in_sweep() and "direction" in HydraConfig.get().sweeper and "evaluate" not in steps:
-        raise DevrfError(
-            f"stage: a search needs the objective, which stage={config.stage} does not score"
-        )
+        lacks = f"which stage={config.stage} does not score"
+        raise DevrfError(f"stage: a search needs the objective, {lacks}")
     if learning or "render" in steps:
         camera_path(instantiate(config.video))
     instantiate(config.still)

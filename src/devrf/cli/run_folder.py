@@ -45,15 +45,11 @@ class RunFolderLock(Callback):
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Lock the folder of a run; :func:`working_in` releases it."""
-        hydra = HydraConfig.instance()
-        before = hydra.cfg
         try:
-            hydra.set_config(config)  # Hydra does so later, and the folder may refer to it
+            HydraConfig.instance().set_config(config)  # as Hydra does later: the folder may need it
             folder = Path(config.hydra.run.dir)
         except OmegaConfBaseException:
             return  # Hydra will report what is wrong with the config
-        finally:
-            hydra.cfg = before
         with report_user_errors():
             make_folder(folder)  # as Hydra does next, with a traceback where it cannot
             refuse_links(folder)

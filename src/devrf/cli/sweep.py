@@ -58,35 +58,30 @@ def record_failure(config: DictConfig, folder: Path) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        _record(error, config, folder)
+        message, where, scene = one_line(error), "", None
+        if not is_user_error(error):
+            message = f"{type(error).__name__}: {message}"
+            where = f"; the traceback is in {folder / 'run.log'}"
+            faults.error("the job failed", exc_info=error)
+        with suppress(OmegaConfBaseException):
+            scene = scene_name(config)
+        failure = {
+            "scene": scene,
+            "choices": choices(),
+            "overrides": overrides(),
+            "seed": config.get("seed"),
+            "error": message,
+            "mistake": is_user_error(error),
+            "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        }
+        write_json(folder / FAILURE, failure)
+        print(f"devrf: job {folder.name}: {message}{where}", file=sys.stderr)
     finally:
         gc.collect()  # so that the next job does not start with the memory of this one
 
 
-def _record(error: Exception, config: DictConfig, folder: Path) -> None:
-    """Report why a job failed: in its folder, and in one line on stderr."""
-    message, where, scene = one_line(error), "", None
-    if not is_user_error(error):
-        message = f"{type(error).__name__}: {message}"
-        where = f"; the traceback is in {folder / 'run.log'}"
-        faults.error("the job failed", exc_info=error)
-    with suppress(OmegaConfBaseException):
-        scene = scene_name(config)
-    failure = {
-        "scene": scene,
-        "choices": choices(),
-        "overrides": overrides(),
-        "seed": config.get("seed"),
-        "error": message,
-        "mistake": is_user_error(error),
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-    }
-    write_json(folder / FAILURE, failure)
-    print(f"devrf: job {folder.name}: {message}{where}", file=sys.stderr)
-
-
 class SweepMonitor(Callback):
-    """Hydra callback that has a sweep's folder to itself, and names the jobs that failed."""
+    """Hydra callback that has a sweep's folder to itself."""
 
     started: SweepMonitor | None = None
 
@@ -106,38 +101,34 @@ class SweepMonitor(Callback):
         SweepMonitor.started = self
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        """End the program if jobs failed; other callbacks have ended before this one."""
-        SweepMonitor.started = None
+        """Release the folder."""
         release_folder(self.folder)
-        if self.name_failures():
-            raise SystemExit(JOBS_FAILED)
-
-    def name_failures(self) -> bool:
-        """Print which jobs failed, if any did."""
-        records = [f for f in self.folder.rglob(FAILURE) if f.stat().st_mtime >= self.began]
-        if failed := sorted(str(file.parent.relative_to(self.folder)) for file in records):
-            why = f"{FAILURE} in each folder below {self.folder} says why"
-            print(f"devrf: jobs failed: {', '.join(failed)}; {why}", file=sys.stderr)
-        return bool(failed)
 
 
 @contextmanager
 def naming_failures() -> Iterator[None]:
-    """Name the failed jobs of a sweep that an error ends, or remove its unused folder.
+    """Name the failed jobs at the end of a sweep; remove its folder if an error left it unused.
 
     Raises:
-        SystemExit: with status 3: a search ends so when none of its jobs was scored.
+        SystemExit: with status 3: jobs failed. A search ends by an error if all of them did.
     """
     SweepMonitor.started = None
+    problem: Exception | None = None
     try:
         yield
     except Exception as error:
-        if (sweep := SweepMonitor.started) is not None:
-            if is_user_error(error):
-                remove_if_only(sweep.folder, OF_SWEEP)
-            if sweep.name_failures() and "No trials are completed" in str(error):
-                raise SystemExit(JOBS_FAILED) from None
-        raise
+        problem = error
+    if (sweep := SweepMonitor.started) is not None:
+        if problem is not None and is_user_error(problem):
+            remove_if_only(sweep.folder, OF_SWEEP)
+        records = [f for f in sweep.folder.rglob(FAILURE) if f.stat().st_mtime >= sweep.began]
+        if failed := sorted(str(file.parent.relative_to(sweep.folder)) for file in records):
+            why = f"{FAILURE} in each folder below {sweep.folder} says why"
+            print(f"devrf: jobs failed: {', '.join(failed)}; {why}", file=sys.stderr)
+            if problem is None or "No trials are completed" in str(problem):
+                raise SystemExit(JOBS_FAILED)
+    if problem is not None:
+        raise problem
 
 
 class SweepReport(Callback):

@@ -98,10 +98,8 @@ def _fit(run: RunContext, stage: Stage, begin: ResumePoint) -> None:
     elif not finished:
         asked = run.config.trainer
         limits = [f"trainer.{k}={asked[k]}" for k, v in LIMITS.items() if asked.get(k, v) != v]
-        raise DevrfError(
-            f"{', '.join(limits) or 'callbacks'}: learning has ended at {where}; the same command "
-            "without it goes on"
-        )
+        ended = f"learning has ended at {where}; the same command without it goes on"
+        raise DevrfError(f"{', '.join(limits) or 'callbacks'}: {ended}")
 
 
 def _keep(run: RunContext, trainer: Trainer, stage: Stage) -> None:
@@ -116,9 +114,7 @@ def _keep(run: RunContext, trainer: Trainer, stage: Stage) -> None:
     except OSError as error:
         left = progress_files(path.parent, stage.name)
         stays = f"the last good progress file stays ({left[0].name}); " if left else ""
-        raise DevrfError(
-            f"{error.filename or path}: {error.strerror}; {stays}make it possible to write there, "
-            "and run the same command again"
-        ) from error
+        again = f"{stays}make it possible to write there, and run the same command again"
+        raise DevrfError(f"{error.filename or path}: {error.strerror}; {again}") from error
     remove_progress(path.parent, stage.name)
     log.info("%s: %s; written to %s", stage.name, in_words(stage.record), path)

@@ -29,10 +29,9 @@ def faces_forward(choice: str, root: str | Path, space: str | None) -> bool:
         return space == "ndc"
     folder = Path(root).expanduser()
     if choice == "nerfstudio":
-        files = (
-            _transforms(folder / place) for place in ("transforms.json", "static/transforms.json")
-        )
-        return any(f and f.scene_bounds and f.scene_bounds.space == "ndc" for f in files)
+        listings = [_transforms(folder / place / "transforms.json") for place in ("", "static")]
+        bounds = [listing.scene_bounds for listing in listings if listing is not None]
+        return any(known is not None and known.space == "ndc" for known in bounds)
     with suppress(DevrfError):
         place = model_folder(folder)
         return place is not None and widest_angle(read_model(place).poses) <= ONE_SIDE

@@ -21,6 +21,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from devrf.errors import DevrfError
+
 # What computes the hot operations: Warp's kernels or their definitions in PyTorch; auto: Warp's
 # kernels where they run.
 Kernels = Literal["auto", "torch"]
@@ -172,7 +174,11 @@ def _pool(parts: int) -> ThreadPoolExecutor:
 
 @cache
 def _begin() -> None:
-    """Start Warp, with a cache of compiled kernels that can be written."""
+    """Start Warp, with a cache of compiled kernels that can be written.
+
+    Raises:
+        DevrfError: its library cannot be loaded, as where memory is short.
+    """
     wp.config.log_level = wp.LOG_ERROR
     with _silent():
         try:
@@ -180,6 +186,10 @@ def _begin() -> None:
         except OSError:
             wp.config.kernel_cache_dir = tempfile.mkdtemp(prefix="devrf-kernels-")
             wp.init()
+        except RuntimeError as error:
+            why = error.__cause__ or error
+            instead = "free memory, or give kernels=torch"
+            raise DevrfError(f"kernels: Warp cannot be loaded ({why}); {instead}") from error
     if not os.access(wp.config.kernel_cache_dir, os.W_OK):
         wp.config.kernel_cache_dir = tempfile.mkdtemp(prefix="devrf-kernels-")
 

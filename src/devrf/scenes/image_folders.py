@@ -123,7 +123,9 @@ def whole_factor(downscale: int | str, size_at: SizeAt) -> int:
     """
     if isinstance(downscale, int):
         return downscale
-    device = "gpu" if downscale == "auto" and torch.cuda.is_available() else downscale
+    device = downscale
+    if downscale == "auto":
+        device = "gpu" if torch.cuda.is_available() else "cpu"
     limit = LONGEST.get(device, LONGEST["cpu"])
     factors = [1 << k for k in range(10)]
     if match := _UP_TO.fullmatch(downscale):

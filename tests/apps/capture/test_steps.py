@@ -18,6 +18,7 @@ from devrf.apps.capture.images import (
     fitted,
     write_frames,
 )
+from devrf.apps.capture.pipeline import kept
 from devrf.apps.capture.structure import checked_model, pairs
 from devrf.apps.capture.survey import BLURRED, check_sharp, moved, sharpest, sharpness, survey
 from devrf.errors import DevrfError
@@ -26,6 +27,15 @@ from devrf.geometry.cameras import Cameras
 
 SIZE = (64, 48)
 PATHS = [Path("a.mp4"), Path("b.mp4")]
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"key": 1}', "[" * 100_000])
+def test_a_damaged_record_of_a_step_is_one_line(tmp_path, text):
+    (tmp_path / "survey.json").write_text(text)
+    with pytest.raises(
+        DevrfError, match=r"survey\.json: damaged; remove it, and it is made again$"
+    ):
+        kept(tmp_path / "survey.json", "videos", dict)
 
 
 # Survey.

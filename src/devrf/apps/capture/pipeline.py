@@ -105,13 +105,21 @@ def scene_from_footage(settings: CaptureSettings) -> Path:
 
 
 def kept(file: Path, source: Any, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """What ``make`` returns; read from the JSON ``file`` if that was made from the same source."""
+    """What ``make`` returns; read from the JSON ``file`` if that was made from the same source.
+
+    Raises:
+        DevrfError: the file is damaged.
+    """
     key = _digest(source)
     if file.is_file():
-        stored = json.loads(file.read_text())
-        if stored["key"] == key:
+        try:
+            stored = json.loads(file.read_bytes())
+            same, found = stored["key"] == key, dict(stored["result"])
+        except (ValueError, LookupError, TypeError, RecursionError):
+            raise DevrfError(f"{file}: damaged; remove it, and it is made again") from None
+        if same:
             log.info("%s: found before", file.stem)
-            return dict(stored["result"])
+            return found
     result = make()
     write_json(file, {"key": key, "result": result})
     return result

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -121,20 +121,30 @@ def scene_video(table: Table, scene: str) -> Iterator[np.ndarray] | None:
 
 
 def _pictures(paths: Mapping[str, Path]) -> Iterator[np.ndarray]:
-    videos = {label: list(iio.imiter(path)) for label, path in paths.items()}
-    count = min(map(len, videos.values()))
-    first = next(iter(videos.values()))
-    size = _column(first, 0, RENDERED).size
-    for time in np.linspace(0, 1, count):
-        tiles = {"truth": _column(first, time, TRUTH)}
-        for label, frames in videos.items():
-            tiles[label] = _column(frames, time, RENDERED).resize(size)
-        yield _page(tiles)
+    counts = [sum(1 for _ in iio.imiter(path)) for path in paths.values()]
+    times = np.linspace(0, 1, min(counts))
+    videos = (
+        _frames_at([round(time * (count - 1)) for time in times], path)
+        for path, count in zip(paths.values(), counts, strict=True)
+    )
+    for frames in zip(*videos, strict=True):
+        truth = _column(frames[0], TRUTH)
+        shown = (_column(frame, RENDERED).resize(truth.size) for frame in frames)
+        yield _page({"truth": truth, **dict(zip(paths, shown, strict=True))})
 
 
-def _column(frames: Sequence[np.ndarray], time: float, column: int) -> Image.Image:
-    """A column of the video's frame at a time in [0, 1]."""
-    picture = frames[round(time * (len(frames) - 1))]
+def _frames_at(places: Iterable[int], path: Path) -> Iterator[np.ndarray]:
+    """A video's frames at increasing ``places``, of which one at a time is in memory."""
+    frames = enumerate(iio.imiter(path))
+    at, frame = next(frames)
+    for place in places:
+        while at < place:
+            at, frame = next(frames)
+        yield frame
+
+
+def _column(picture: np.ndarray, column: int) -> Image.Image:
+    """A column of a video's frame."""
     width = picture.shape[1] / COLUMNS
     return Image.fromarray(picture[:, round(column * width) : round((column + 1) * width)])
 
