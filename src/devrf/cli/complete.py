@@ -61,7 +61,8 @@ def completed(arguments: Sequence[str]) -> list[str]:
             line = override.input_line
             raise DevrfError(f"{line}: choose one of {', '.join(options)}, or leave it out")
     before = of_named_run(typed, known.multirun)
-    roots, overrides = values(typed, "data.root"), parsed([*before, *texts])
+    roots = values(typed, "data.root")
+    overrides = parsed([*before, *texts])
     if not roots or value(overrides, "stage") in APART or any("${" in root for root in roots):
         return [*flags, *before, *texts]
     readers: list[str | None] = [*values(overrides, "data")]
@@ -103,10 +104,14 @@ def _told_by_scene(option: str | None, root: str, overrides: Sequence[Override])
     from devrf.data.kind import by_one_camera, faces_forward
     from devrf.scenes.formats import recognise
 
-    words, why, remark = [], "its cameras", ""
+    words = []
+    why = "its cameras"
+    remark = ""
     if option is None:
         layout = recognise(root)
-        option, why, remark = layout.choice, f"the layout of {layout.name}", layout.remark
+        option = layout.choice
+        why = f"the layout of {layout.name}"
+        remark = layout.remark
         words.append(f"data={option}")
     space = value(overrides, "data.space")
     if not values(overrides, "facing") and faces_forward(option, root, space):

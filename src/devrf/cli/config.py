@@ -64,7 +64,9 @@ def run_folder(_root_: Any) -> str:
     It is named after scene and experiment, and what else is chosen beside the usual. Without an
     experiment DeVRF learns as by ``experiment=quickstart``: they are one run.
     """
-    stage, report, chosen = _root_.stage, _root_.report, _root_.hydra.runtime.choices
+    stage = _root_.stage
+    report = _root_.report
+    chosen = _root_.hydra.runtime.choices
     if stage in ("fetch", "selfcheck"):
         return f"outputs/{stage}"
     if stage == "capture":
@@ -104,7 +106,8 @@ def register_config() -> None:
 
 def command_line(*words: str) -> str:
     """A command to type next; the present one's own folders of configs are named again."""
-    options, folders = list[str](), list[str]()
+    options = list[str]()
+    folders = list[str]()
     for source in HydraConfig.get().runtime.config_sources if HydraConfig.initialized() else ():
         if source.provider == "command-line":
             options += ["--config-dir", source.path]

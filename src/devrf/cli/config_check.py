@@ -117,10 +117,13 @@ def _type_of(raw: Node, resolved: Node, path: str, read: tuple[str, ...]) -> Any
 
 def _place(raw: Node, names: Iterable[object]) -> tuple[str, Node]:
     """The key at which the user sets the value in a place of a config, and what is beside it."""
-    where, node, beside = "", cast(Any, raw), raw
+    where = ""
+    node = cast(Any, raw)
+    beside = raw
     for name in map(str, names):  # some name one of several types
         if isinstance(node, Mapping) and name in node:
-            beside, node = node, node[name]
+            beside = node
+            node = node[name]
             where = f"{where}.{name}".lstrip(".")
             if isinstance(node, str) and (reference := REFERENCE.fullmatch(node)):
                 where = reference[1]
@@ -176,7 +179,8 @@ def unknown_key(where: str, known: Iterable[object]) -> DevrfError:
 def check_extras(config: DictConfig) -> None:
     """Refuse by a DevrfError settings for which an extra of devrf is not installed."""
     tensorboard = "TensorBoard" in config.logger.get("_target_", "")
-    exports, meshes = config.stage == "export", "skimage trimesh fast_simplification"
+    exports = config.stage == "export"
+    meshes = "skimage trimesh fast_simplification"
     usd = exports and config.export.format == "usd"
     for chosen, setting, packages, extra, instead in (
         (tensorboard, "logger=tensorboard", "tensorboard", "tensorboard", "logger=csv"),

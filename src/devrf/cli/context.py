@@ -71,7 +71,8 @@ class RunContext(ExitStack):
         super().__init__()
         self.command = present_command(config)
         config.scene = scene_name(config)
-        self.config, self.folder = config, folder
+        self.config = config
+        self.folder = folder
         self.place = folder.relative_to(Path.cwd()) if Path.cwd() in folder.parents else folder
         self.protocol: Protocol = instantiate(config.protocol, _convert_="all")
         self.learning_stages = tuple(self.protocol.stages)
@@ -146,7 +147,8 @@ class RunContext(ExitStack):
         Raises:
             DevrfError: the method has no such stage, or the protocol asks what it cannot do.
         """
-        method, protocol = self.config.method, self.protocol
+        method = self.config.method
+        protocol = self.protocol
         key = name if name in self.config else "ray_stage"
         if key not in self.config:
             does = f"method={method} does not learn by protocol={protocol.name}"

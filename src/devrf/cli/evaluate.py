@@ -44,7 +44,9 @@ def evaluate(run: RunContext) -> list[Path]:
     if standing is not None and run.config.ckpt is None:
         raise DevrfError(f"{standing}, stage=evaluate ckpt=FILE scores that file as it stands")
     loaded = run.load(scene=run.scene)
-    model, metadata, scene = loaded.model, loaded.metadata, run.scene
+    model = loaded.model
+    metadata = loaded.metadata
+    scene = run.scene
     suite = run.evaluation.suite(run.device)
     # The stage that learns the scene at rest.
     rest = next((step.name for step in run.protocol.steps if step.capture == "static"), None)
@@ -90,8 +92,10 @@ def _score(
     run: RunContext, model: Renderable, capture: CaptureName, suite: MetricSuite
 ) -> list[HeldOutView]:
     """Score a capture's held-out views; the static ones show the rest state at any time."""
-    views, background = run.scene.capture(capture).test, run.scene.background
-    name, time = f"held-out images, {capture}", 0.0 if capture == "static" else None
+    views = run.scene.capture(capture).test
+    background = run.scene.background
+    name = f"held-out images, {capture}"
+    time = 0.0 if capture == "static" else None
     scored = score_all(model, views, background, suite, name, time=time)
     sheet = write_contact_sheet(run.folder / "images" / f"{capture}.png", scored)
     for tracker in run.trackers:

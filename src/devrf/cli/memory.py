@@ -56,12 +56,14 @@ def compare(run: RunContext, names: Sequence[str]) -> tuple[str, Advice | None, 
 
     Where the images' size was left to the run, it is changed at once.
     """
-    scene, by = run.scene, run.datamodule.downscale
+    scene = run.scene
+    by = run.datamodule.downscale
     processes = int(getattr(run.strategy, "num_processes", 1))
     free = free_bytes(run.device, run.folder, resume=run.config.resume)
 
     def needed(key: str = "", value: int = 0, batch_share: float = 0.5) -> Bytes:
-        config, less = run.config.copy(), smaller(scene, value / by) if key == SIZE else scene
+        config = run.config.copy()
+        less = smaller(scene, value / by) if key == SIZE else scene
         if key:
             OmegaConf.update(config, key, value)
         with as_own_errors():
@@ -70,7 +72,8 @@ def compare(run: RunContext, names: Sequence[str]) -> tuple[str, Advice | None, 
         return needed_bytes(less, stages, processes, batch_share, on_gpu=run.device.type == "cuda")
 
     whole = needed(batch_share=1.0)
-    line, lacks = f"needs about {in_words(whole, free)}", lacking(needed(), free)
+    line = f"needs about {in_words(whole, free)}"
+    lacks = lacking(needed(), free)
     if not lacks:
         return line + "; batches will be halved" * bool(lacking(whole, free)), None, []
     every = needs(run, run.config, scene)

@@ -63,7 +63,8 @@ def is_user_error(error: BaseException) -> bool:
 
 def _cause(error: BaseException) -> BaseException:
     """The first DevrfError in a chain of causes, else what Hydra failed to build."""
-    cause, built = error.__cause__, str(error).startswith("Error in call to target")
+    cause = error.__cause__
+    built = str(error).startswith("Error in call to target")
     if isinstance(error, DevrfError) or cause is None:
         return error
     found = _cause(cause)

@@ -43,7 +43,8 @@ def render(run: RunContext) -> list[Path] | None:
     without = "held_out.mp4, which shows its images, is left out"
     if settings.path is None and (scene := _with_images(run, without)) is not None:
         held_out = (scene.dynamic if scene.moves else scene.static).test
-    renderer, paths = Renderer(model, half=settings.half), []
+    renderer = Renderer(model, half=settings.half)
+    paths = []
     for video in videos(renderer, viewpoints, settings, held_out):
         path = run.folder / "videos" / f"{video.name}.mp4"
         pictures = (to_bytes(picture).numpy() for picture in video.pictures)
@@ -59,7 +60,8 @@ def still(run: RunContext) -> None:
     """Render the scene from one camera at one time; earlier pictures stay."""
     settings: StillSettings = instantiate(run.config.still)
     model, viewpoints = _learned(run)
-    camera, behind = settings.camera(viewpoints), background_value(viewpoints.background)
+    camera = settings.camera(viewpoints)
+    behind = background_value(viewpoints.background)
     renderer = Renderer(model, half=settings.half)
     color, depth = rendered(renderer, camera, settings.time, behind)
     write_still(run.folder / "images" / f"{settings.name(model.moves)}.png", color, depth)

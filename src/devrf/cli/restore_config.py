@@ -174,7 +174,8 @@ def of_named_run(typed: Sequence[Override], multirun: bool) -> list[str]:
         DevrfError: a checkpoint says what is no option or plain value.
     """
     checkpoints = [Path(path) for path in values(typed, "ckpt")]
-    folder, sweep = value(typed, "hydra.run.dir"), value(typed, "hydra.sweep.dir")
+    folder = value(typed, "hydra.run.dir")
+    sweep = value(typed, "hydra.sweep.dir")
     if value(typed, "stage") == "report":
         return []
     if not checkpoints and sweep is not None:

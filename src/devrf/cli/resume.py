@@ -118,7 +118,8 @@ def beginning(run: RunContext, stage: str) -> ResumePoint | None:
     for progress in progress_files(path.parent, stage):
         try:
             content = read_checkpoint_file(progress)
-            metadata, iteration = metadata_in(progress, content), content["progress"]["iteration"]
+            metadata = metadata_in(progress, content)
+            iteration = content["progress"]["iteration"]
         except DevrfError as error:
             log.warning("%s; the file before it is taken", error)
             progress.unlink()
@@ -189,7 +190,8 @@ def note_done(run: RunContext, step: str, files: Sequence[Path] | None) -> None:
 def _made_with(run: RunContext, step: str) -> str:
     """A digest of what decides a step's results."""
     data = {k: v for k, v in leaves(run.config.data, "data").items() if k not in PLACES}
-    root, keyframes = data.pop("data.root", None), Path(str(run.config.video.path))
+    root = data.pop("data.root", None)
+    keyframes = Path(str(run.config.video.path))
     made = (
         *(step, digest_of(run.checkpoint()), devrf.__version__, run.config.logger._target_),
         *(data, root and Path(root).resolve()),

@@ -58,7 +58,9 @@ def record_failure(config: DictConfig, folder: Path) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        message, where, scene = one_line(error), "", None
+        message = one_line(error)
+        where = ""
+        scene = None
         if not is_user_error(error):
             message = f"{type(error).__name__}: {message}"
             where = f"; the traceback is in {folder / 'run.log'}"
@@ -87,7 +89,8 @@ class SweepMonitor(Callback):
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Lock the sweep's folder; each job locks its own. Refuse SLURM where there is none."""
-        self.folder, self.began = Path(config.hydra.sweep.dir), time.time()
+        self.folder = Path(config.hydra.sweep.dir)
+        self.began = time.time()
         with report_user_errors():
             missing = [name for name in ("srun", "sbatch") if which(name) is None]
             if config.hydra.launcher._target_.endswith(".SlurmLauncher") and missing:

@@ -37,7 +37,8 @@ def learn(run: RunContext, name: str) -> None:
         begin = run.strategy.broadcast(beginning(run, name) if run.leads else None)
     if begin is None:
         return
-    build, below = run.stage_builder(name), run.protocol[name].builds_on
+    build = run.stage_builder(name)
+    below = run.protocol[name].builds_on
     if below is None:
         stage = build()
     else:
@@ -93,7 +94,8 @@ def _fit(run: RunContext, stage: Stage, begin: ResumePoint) -> None:
     if run.is_trial:
         run.tried[stage.name] = stage.result()
         if run.leads:
-            tried, total = stage.iteration, stage.total_iterations
+            tried = stage.iteration
+            total = stage.total_iterations
             log.info("%s: a trial, %d of %d iterations; nothing is kept", stage.name, tried, total)
     elif not finished:
         asked = run.config.trainer
