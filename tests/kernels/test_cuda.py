@@ -55,7 +55,7 @@ def test_all_are_found() -> None:
     names = {f"look_up.{one}_{n}" for one in look_ups for n in CHANNELS}
     names |= {f"adam.adam_kernel_{n}" for n in CHANNELS} | {"adam.add_total_variation"}
     names |= {"march.march_kernel", "march.adjoint_kernel", "march.rays_that_hit_kernel"}
-    names |= {"march.count_samples_kernel", "march.keep_significant_kernel"}
+    names |= {"march.keep_significant_kernel"}
     assert set(every_kernel()) == names
 
 

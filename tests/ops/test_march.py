@@ -12,9 +12,8 @@ from torch.autograd import gradcheck
 from devrf.geometry.box import Box
 from devrf.geometry.contraction import ContractedSpace
 from devrf.geometry.rays import Rays
-from devrf.ops.march import HIT_CELLS, STOP, Medium, Path, march, rays_that_hit
+from devrf.ops.march import HIT_CELLS, STOP, Medium, Path, march, rays_that_hit, steps_through
 from devrf.rendering.occupancy import Occupancy
-from devrf.rendering.sampling import steps_through
 
 BOX = Box((-1.0, -0.5, 0.0), (1.0, 1.5, 1.0))
 

@@ -20,7 +20,7 @@ from devrf.kernels.grid import Grid, cell, coordinates, grid_over, inside, inter
 from devrf.kernels.look_up import add_to_grid
 from devrf.kernels.runtime import array, launch, room, take
 from devrf.ops import march as definition
-from devrf.ops.march import HIT_CELLS, STOP, Medium, Path, Samples
+from devrf.ops.march import HIT_CELLS, STOP, Medium, Path, Samples, steps_through
 from devrf.ops.trilinear import shape_of
 
 # Half edges of the inner box that a ray moves along any axis while its distance grows by what one
@@ -49,7 +49,7 @@ def rays_that_hit(rays: Rays, path: Path) -> Tensor:
     if not take(rays.origins):
         return definition.rays_that_hit(rays, path)
     hits = torch.empty(len(rays), dtype=torch.uint8, device=rays.origins.device)
-    inputs = [_geometry(rays, path), _arrays(rays), _distances(path), array(hits)]
+    inputs = [_geometry(rays, path), _arrays(rays, path)[0], _distances(path), array(hits)]
     launch(rays_that_hit_kernel, len(rays), inputs, hits.device)
     return hits.bool()
 
@@ -67,14 +67,13 @@ class _March(torch.autograd.Function):
         device = density.device
         geometry = _geometry(rays, medium.path)
         _add_field(geometry, medium)
-        lines, distances = _arrays(rays), _distances(medium.path)
-        counts = torch.empty(len(rays), dtype=torch.int32, device=device)
-        launch(count_samples_kernel, len(rays), [geometry, lines, array(counts)], device)
+        lines, counts = _arrays(rays, medium.path)
+        distances = _distances(medium.path)
 
         # Room for all of a ray's samples; how many are visible is known afterwards.
         start, length = _starts(counts)
-        visible_count = torch.empty_like(counts)
-        significant_count = torch.empty_like(counts)
+        visible_count = torch.empty(len(rays), dtype=torch.int32, device=device)
+        significant_count = torch.empty_like(visible_count)
         transmittance = torch.empty(len(rays), device=device)
         visible = VisibleSamples()
         visible.start = array(start)
@@ -151,14 +150,18 @@ def _starts(counts: Tensor) -> tuple[Tensor, int]:
     return stops - counts, int(stops[-1]) if len(stops) else 0
 
 
-def _arrays(rays: Rays) -> RayArrays:
+def _arrays(rays: Rays, path: Path) -> tuple[RayArrays, Tensor]:
+    """Rays as kernels take them, and how many samples (R,) each has, in empty space or not."""
+    entry, count = steps_through(rays, path.box, step=path.step, near=path.near, far=path.far)
     arrays = RayArrays()
+    arrays.entries = array(entry)
+    arrays.counts = array(count)
     arrays.origins = array(rays.origins.contiguous())
     arrays.directions = array(rays.directions.contiguous())
     # Straight rays have no course; their origins stand in for it.
     course = rays.course if isinstance(rays, ContractedRays) else rays.origins
     arrays.courses = array(course.contiguous())
-    return arrays
+    return arrays, count
 
 
 def _distances(path: Path) -> wp.array:
@@ -168,7 +171,6 @@ def _distances(path: Path) -> wp.array:
 def _geometry(rays: Rays, path: Path) -> Geometry:
     """Where ``rays`` are sampled."""
     geometry = Geometry()
-    geometry.low, geometry.high = wp.vec3(*path.box.low), wp.vec3(*path.box.high)
     surroundings = path.surroundings
     geometry.occupancy = grid_over(surroundings.box, shape_of(surroundings.distances))
     if isinstance(rays, ContractedRays):
@@ -178,8 +180,6 @@ def _geometry(rays: Rays, path: Path) -> Geometry:
         geometry.half = wp.vec3(*(edge / 2 for edge in inner.size))
         geometry.shell = rays.space.shell
     geometry.step = path.step
-    geometry.near = path.near
-    geometry.far = path.far
     return geometry
 
 
@@ -205,8 +205,6 @@ class Geometry:
     """What rays are followed through.
 
     Attributes:
-        low: the corner of the field's box with the smallest coordinates.
-        high: the one with the largest.
         density: where the grid of raw densities is.
         occupancy: where the grid of distances to occupied cells is.
         motion: where the grid of displacements is.
@@ -217,11 +215,9 @@ class Geometry:
         half: its half edges.
         shell: its shell's thickness in half edges.
         faintest: the raw density whose opacity is the threshold.
-        step, near, far, shift, delta, threshold: as of a ``Medium`` and its ``Path``.
+        step, shift, delta, threshold: as of a ``Medium`` and its ``Path``.
     """
 
-    low: wp.vec3
-    high: wp.vec3
     density: Grid
     occupancy: Grid
     motion: Grid
@@ -233,8 +229,6 @@ class Geometry:
     shell: float
     faintest: float
     step: float
-    near: float
-    far: float
     shift: float
     delta: float
     threshold: float
@@ -242,11 +236,21 @@ class Geometry:
 
 @wp.struct
 class RayArrays:
-    """R rays; ``courses`` are those of ``ContractedRays``."""
+    """R rays.
+
+    Attributes:
+        origins: in the fields' space; of contracted rays in the world.
+        directions: likewise.
+        courses: of ``ContractedRays``.
+        entries: the distance of each ray's first sample.
+        counts: the number of its samples up to its exit.
+    """
 
     origins: wp.array(dtype=wp.vec3)
     directions: wp.array(dtype=wp.vec3)
     courses: wp.array(dtype=wp.vec3)
+    entries: wp.array(dtype=float)
+    counts: wp.array(dtype=wp.int64)
 
 
 @wp.struct
@@ -307,13 +311,7 @@ class SampleGradients:
 
 @wp.struct
 class Ray:
-    """One ray.
-
-    Attributes:
-        entry: the distance of its first sample.
-        count: the number of its samples up to its exit.
-        samples_per_cell: samples in which it moves by a cell of the occupancy, at least.
-    """
+    """One of ``RayArrays``; in ``samples_per_cell`` or more it moves by a cell of the occupancy."""
 
     origin: wp.vec3
     direction: wp.vec3
@@ -343,45 +341,21 @@ def position(geometry: Geometry, ray: Ray, distance: float):
 
 
 @wp.func
-def own_distance(course: wp.vec3, world: float):
-    """A contracted ray's distance of a world distance."""
-    x = course[0] + course[1] * world
-    if wp.abs(x) <= 1.0:
-        return world
-    y = wp.sign(x) * (1.0 + course[2] * (1.0 - 1.0 / wp.abs(x)))
-    return (y - course[0]) / course[1]
-
-
-@wp.func
 def ray_of(geometry: Geometry, rays: RayArrays, number: int):
-    """A ray, from its entry into the field's box to its exit, within near and far."""
+    """One of the rays."""
     ray = Ray()
     ray.origin = rays.origins[number]
     ray.direction = rays.directions[number]
     ray.course = rays.courses[number]
-    entry = geometry.near
-    leave = geometry.far
+    ray.entry = rays.entries[number]
+    ray.count = int(rays.counts[number])
+    pace = wp.max(wp.abs(wp.cw_mul(ray.direction, geometry.occupancy.scale)))
     if geometry.contracted == 1:
         slopes = wp.abs(wp.cw_div(ray.direction, geometry.half))
         fastest = ray.course[1]
         pace = 2.0 * (slopes[0] + slopes[1] + slopes[2]) - fastest
         pace = wp.max(pace, wp.max(wp.static(CONTRACTED_PACE), geometry.shell) * fastest)
         pace *= wp.max(wp.cw_mul(geometry.half, geometry.occupancy.scale))
-        entry = own_distance(ray.course, geometry.near)
-        leave = own_distance(ray.course, geometry.far)
-    else:
-        for axis in range(3):
-            d = ray.direction[axis]
-            if wp.abs(d) < 1.0e-9:
-                d = 1.0e-9
-            to_low = (geometry.low[axis] - ray.origin[axis]) / d
-            to_high = (geometry.high[axis] - ray.origin[axis]) / d
-            entry = wp.max(entry, wp.min(to_low, to_high))
-            leave = wp.min(leave, wp.max(to_low, to_high))
-        pace = wp.max(wp.abs(wp.cw_mul(ray.direction, geometry.occupancy.scale)))
-    ray.entry = entry
-    if leave >= entry:
-        ray.count = int(wp.floor((leave - entry) / geometry.step + 1.0e-3)) + 1
     # A little less: positions are rounded.
     ray.samples_per_cell = 0.999 / wp.max(pace * geometry.step, 1.0e-9)
     return ray
@@ -429,15 +403,6 @@ def opacity(tau: float):
     if tau < 0.01:
         return tau * (1.0 - tau * (0.5 - tau / 6.0))
     return 1.0 - wp.exp(-tau)
-
-
-@wp.kernel(module="unique", enable_backward=False)
-def count_samples_kernel(
-    first: int, geometry: Geometry, rays: RayArrays, counts: wp.array(dtype=int)
-):
-    """How many samples of each ray lie in the field's box, in empty space or not."""
-    number = first + wp.tid()
-    counts[number] = ray_of(geometry, rays, number).count
 
 
 @wp.kernel(module="unique", enable_backward=False)
@@ -594,7 +559,6 @@ def rays_that_hit_kernel(
 
 
 KERNELS = (
-    count_samples_kernel,
     march_kernel,
     keep_significant_kernel,
     adjoint_kernel,

@@ -157,8 +157,7 @@ def rays_that_hit(rays: Rays, path: Path) -> Tensor:
 
 def samples_in_box(rays: Rays, path: Path) -> tuple[Tensor, Tensor, Tensor]:
     """Ray (S,), distance (S,) and position (S, 3) of all samples, in empty space, too."""
-    entry, leave = path.box.crossing(rays, path.near, path.far)
-    count = steps_between(entry, leave, path.step)
+    entry, count = steps_through(rays, path.box, step=path.step, near=path.near, far=path.far)
     ray = torch.repeat_interleave(count)
     number = torch.arange(len(ray), device=ray.device) - (count.cumsum(0) - count)[ray]
     distance = entry[ray] + path.step * number
@@ -175,9 +174,13 @@ def warped(points: Tensor, medium: Medium) -> Tensor:
     return points + move
 
 
-def steps_between(entry: Tensor, leave: Tensor, step: float) -> Tensor:
-    """Number (R,) int64 of samples every ``step`` from ``entry`` (R,) up to ``leave`` (R,).
+def steps_through(
+    rays: Rays, box: Box, *, step: float, near: float, far: float
+) -> tuple[Tensor, Tensor]:
+    """Distance (R,) of each ray's first sample, and number (R,) int64 of samples up to its exit.
 
     A sample exactly at the exit counts: in NDC it is the last plane, behind the whole scene.
     """
-    return torch.where(leave >= entry, ((leave - entry) / step + 1e-3).floor() + 1, 0.0).long()
+    entry, leave = box.crossing(rays, near, far)
+    count = torch.where(leave >= entry, ((leave - entry) / step + 1e-3).floor() + 1, 0.0)
+    return entry, count.long()

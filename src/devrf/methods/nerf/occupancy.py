@@ -11,8 +11,8 @@ from devrf.checkpoints.stored_grids import StoredShape
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 from devrf.methods.nerf.samples import RaySamples
+from devrf.ops.march import steps_through
 from devrf.rendering.occupancy import dilate
-from devrf.rendering.sampling import steps_through
 from devrf.scenes.scene import Scene
 from devrf.scenes.silhouettes import visual_hull
 
