@@ -4,7 +4,7 @@
 # make house        lines and files of each folder, the longest files, circles of imports
 # make gpu-check    install into .venv and check what this machine's GPU does, in minutes;
 #                   with INSTALL_FIRST=no by $(PYTHON) and the packages that it has
-# make fuzz         what is too long for make test: the readers' fuzz tests with 100 000 inputs
+# make fuzz         what is too long for make test: fuzz tests of files with many inputs
 #                   (make test has 60)
 # make format       format the code and mend what the linter can
 # make shell        a shell in which .venv is active
@@ -50,6 +50,7 @@ gpu-check: $(if $(filter no,$(INSTALL_FIRST)),,$(VENV)/.installed)
 
 fuzz: $(VENV)/.installed-dev
 	DEVRF_FUZZ_INPUTS=100000 $(PYTEST) tests/scenes/test_damaged_files.py
+	DEVRF_FUZZ_INPUTS=5000 $(PYTEST) tests/checkpoints/test_contradictions.py
 
 format: $(VENV)/.installed-dev
 	$(BIN)/ruff check --fix .

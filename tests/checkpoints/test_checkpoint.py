@@ -112,11 +112,22 @@ def test_checkpoints_of_others_are_refused(tmp_path):
 
 
 MASK, SIZES = "scene_model.occupancy.mask", "scene_model.canonical._extra_state"
+COLOR = "scene_model.canonical.color.values"
 CONTRADICTIONS: dict[str, Callable[[dict[str, Any]], object]] = {
     "no scene": lambda data: data["devrf"].pop("scene"),
     "other size": lambda data: data["devrf"]["model"]["architecture"].update(channels=5),
     "text for mask": lambda data: data["state_dict"].update({MASK: "all"}),
     "no box": lambda data: data["state_dict"][SIZES].update(low=[9, 9, 9]),
+    "no number of voxels": lambda data: data["state_dict"][SIZES].update(base_voxels=0),
+    "text for a threshold": lambda data: data["devrf"]["model"]["settings"].update(
+        alpha_threshold="x"
+    ),
+    "no class of a field": lambda data: data["devrf"]["model"].update(color_residual=0),
+    "a mask of other rank": lambda data: data["state_dict"].update({MASK: torch.ones(2, 2) > 0}),
+    "colours of one point": lambda data: data["state_dict"].update({COLOR: torch.ones(1, 1, 1, 4)}),
+    "cameras of double precision": lambda data: data["viewpoints"]["held_out"].update(
+        focal=torch.ones(1, 2).double()
+    ),
 }
 
 
@@ -212,4 +223,4 @@ def test_damage_that_has_the_right_checksum_is_one_line(tmp_path):
 )
 def test_a_file_names_no_class_but_one_that_is_stored(canonical, path):
     change = edit(canonical, lambda data: data["devrf"]["model"].update({"class": path}))
-    assert f"was learned by {path}, which is not known here" in refusal(change)
+    assert f"was learned by {path!r}, which is not known here" in refusal(change)

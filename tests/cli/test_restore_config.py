@@ -297,7 +297,17 @@ def test_a_sweep_goes_on_with_all_kinds_of_values(tmp_path, monkeypatch):
 
 
 WRITTEN = ["run.log", ".hydra", ".devrf", ".hydra/config.yaml", ".devrf/process.txt"]
-WRITTEN += ["images", "videos", "logs", "logs/pipeline", "export", "export/points", "paths"]
+WRITTEN += [
+    "metrics.json",
+    "frames.csv",
+    "images",
+    "videos",
+    "logs",
+    "logs/pipeline",
+    "export",
+    "export/points",
+    "paths",
+]
 
 
 DEEP = "[" * 200_000

@@ -81,9 +81,21 @@ def test_only_rows_that_are_given_move(rng: torch.Generator, dtype: torch.dtype)
     run(every, theirs, grads)
     assert torch.equal(run(some, ours, grads), theirs)
     assert torch.equal(ours != 0, inside.expand(SHAPE))
-    restored = GridAdam([{"params": [ours], "skip_zero": True}])
-    restored.load_state_dict(some.state_dict())
-    assert torch.equal(restored.param_groups[0]["rows"], rows)
+
+
+def test_a_stored_state_chooses_no_memory(rng: torch.Generator) -> None:
+    """Kernels check no index and no shape, so both come from the optimiser and its parameters."""
+    parameter, rows = torch.zeros(SHAPE, requires_grad=True), torch.tensor([1, 4]).int()
+    optimizer = GridAdam([{"params": [parameter], "skip_zero": True, "rows": rows}])
+    run(optimizer, parameter, [grad.float() for grad in gradients(rng, 1)])
+    stored = optimizer.state_dict()
+    stored["param_groups"][0]["rows"] = torch.tensor([2**30])
+    optimizer.load_state_dict(stored)
+    assert optimizer.param_groups[0]["rows"] is rows
+    for name in ("mean", "square"):
+        smaller = {**stored["state"][0], name: torch.zeros(1, 3)}
+        with pytest.raises(ValueError, match="moments of another shape"):
+            optimizer.load_state_dict({**stored, "state": {0: smaller}})
 
 
 def test_a_parameter_without_gradient_is_not_moved_and_the_closure_is_called() -> None:

@@ -11,6 +11,7 @@ from lightning import Callback, LightningModule, Trainer
 from devrf.callbacks.curves import Previews
 from devrf.engine.stage import Stage
 from devrf.system.device import wait
+from devrf.system.plain_data import built
 
 
 class TrainingRecord(Callback):
@@ -42,8 +43,9 @@ class TrainingRecord(Callback):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Count on from what :meth:`state_dict` gave."""
-        self._seconds_before = state_dict["seconds"]
-        self._peaks_before = state_dict.get("peaks")
+        peaks = state_dict["peaks"]
+        self._seconds_before = float(state_dict["seconds"])
+        self._peaks_before = None if peaks is None else built(tuple[float, float], peaks)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Fill the record: wall-clock seconds without previews, memory in GiB (None on a CPU).

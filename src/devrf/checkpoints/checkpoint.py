@@ -11,19 +11,22 @@ from typing import Any
 import torch
 from lightning import Trainer
 from lightning.fabric.plugins import CheckpointIO
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 
 from devrf.checkpoints.checkpoint_file import (
     read_checkpoint_file,
     read_description,
     write_checkpoint_file,
 )
+from devrf.checkpoints.progress import Progress
 from devrf.checkpoints.stored_class import StoredClass, stored_class
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
+from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Background, Scene
-from devrf.system.memory import OutOfMemoryError
+from devrf.system.memory import OutOfMemoryError, is_oom
+from devrf.system.plain_data import Line, built
 
 # The stage's attribute that holds the model: what its entries of a state begin with.
 MODEL = "scene_model."
@@ -42,6 +45,7 @@ UNFIT: tuple[type[Exception], ...] = (
     TypeError,
     AttributeError,
     ArithmeticError,
+    AssertionError,
 )
 # A model may have so many more values than its file: small grids that take the stored shape.
 UNSTORED = 2**16
@@ -50,7 +54,7 @@ SIDE = 2**14
 # The most that one side of an image is longer than the other.
 ASPECT = 16
 # What training took: by name, numbers, and words that say how it ran.
-TrainingFigures = dict[str, float | str | None]
+TrainingFigures = dict[str, int | float | str | None]
 
 
 @dataclass(frozen=True)
@@ -74,21 +78,17 @@ class CheckpointMetadata:
             version.
     """
 
-    scene: str
+    scene: Line
     fingerprint: str
-    stage: str
+    stage: Line
     model: dict[str, Any]
-    protocol: str | None = None
+    protocol: Line | None = None
     records: dict[str, TrainingFigures] = field(default_factory=dict)
     training_config: dict[str, Any] = field(default_factory=dict)
     earlier_configs: dict[str, dict[str, Any]] = field(default_factory=dict)
     command: dict[str, Any] = field(default_factory=dict)
     complete: bool = True
     moves: bool | None = None
-
-
-_METADATA = TypeAdapter(CheckpointMetadata)
-_PROGRESS = TypeAdapter(dict[str, str | int])
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ class Viewpoints:
             sides = sorted((camera.width, camera.height))
             if not 0 < sides[0] <= sides[1] <= min(SIDE, ASPECT * sides[0]):
                 raise ValueError("an image of a size that cannot be")
-        return cls(**{**entry, **cameras, "clock": FrameClock(**entry["clock"])})
+        return cls(**{**entry, **cameras, "clock": built(FrameClock, entry["clock"])})
 
 
 @dataclass(frozen=True)
@@ -204,13 +204,30 @@ def load_checkpoint(
         model = _outlined(model_class, metadata.model, state).to(device)
         model.load_stored_state(state)
         viewpoints = Viewpoints.stored(data.get("viewpoints", {}))
-    except torch.OutOfMemoryError:
-        raise
+        if viewpoints is not None:
+            # One ray, which goes through all that was read: what does not fit is noticed here.
+            camera = viewpoints.held_out.resized(width=1, height=1)
+            Renderer(model).view(camera, index=0, time=1.0, background=1.0)
     except OutOfMemoryError as shortage:
         raise OutOfMemoryError(f"{path}: {shortage}") from None
-    except UNFIT:
-        raise DevrfError(f"{path}: its fields do not fit its description; train again") from None
+    except UNFIT as error:
+        if is_oom(error):
+            raise
+        raise unfit(path, error) from error
     return LoadedCheckpoint(metadata, model, viewpoints)
+
+
+def unfit(path: Path, error: Exception) -> DevrfError:
+    """The one line that says which parts of a file contradict each other, by what they raised."""
+    why = f"{type(error).__name__}: {error}"
+    if isinstance(error, ValidationError):
+        issue = error.errors()[0]
+        why = ": ".join([*map(str, issue["loc"]), issue["msg"]])
+    line = "".join(sign for sign in " ".join(why.split()) if sign.isprintable())
+    return DevrfError(
+        f"{path}: its parts do not fit together ({line[:120]}); take a copy that is whole, or "
+        "train again (resume=false)"
+    )
 
 
 def _outlined(model_class: Any, description: Mapping[str, Any], state: Mapping[str, Any]) -> Any:
@@ -289,27 +306,12 @@ def metadata_in(path: Path, data: dict[str, Any]) -> CheckpointMetadata:
     if not isinstance(data, dict) or not isinstance(data.get("devrf"), dict):
         raise DevrfError(f"{path}: not a devrf checkpoint; set ckpt to one that devrf wrote")
     try:
-        _METADATA.validate_python(data["devrf"])
-        metadata = CheckpointMetadata(**data["devrf"])
-        progress = data.get("progress")
-        if progress is not None:
-            _PROGRESS.validate_python(
-                {name: progress[name] for name in ("stage", "iteration", "total")}
-            )
-        texts = (
-            metadata.scene,
-            metadata.stage,
-            str(metadata.protocol),
-            str(progress and progress["stage"]),
-        )
-        if not all(text.isprintable() for text in texts):
-            raise TypeError("a name that cannot be printed")
-        return metadata
-    except (LookupError, TypeError, ValidationError) as error:
-        why = f"{error}".splitlines()[0]
-        raise DevrfError(
-            f"{path}: its description lacks an entry, or has a wrong one ({why}); train again"
-        ) from None
+        metadata = built(CheckpointMetadata, data["devrf"])
+        if data.get("progress") is not None:
+            built(Progress, data["progress"])
+    except UNFIT as error:
+        raise unfit(path, error) from error
+    return metadata
 
 
 def _model_class(path: Path, metadata: CheckpointMetadata) -> Any:
@@ -318,6 +320,6 @@ def _model_class(path: Path, metadata: CheckpointMetadata) -> Any:
         return stored_class(metadata.model.get("class"), StoredClass)
     except LookupError as error:
         raise DevrfError(
-            f"{path}: was learned by {error.args[0]}, which is not known here; install or import "
+            f"{path}: was learned by {error.args[0]!r}, which is not known here; install or import "
             "the method first"
         ) from None

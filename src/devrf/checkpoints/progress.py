@@ -13,6 +13,29 @@ from typing import Any
 
 import numpy as np
 import torch
+from typing_extensions import TypedDict
+
+from devrf.system.plain_data import Count, Line, Share
+
+
+class Progress(TypedDict):
+    """Where a stage was left: its name, its schedule's length, and attributes of it by name.
+
+    ``phase`` is the first iteration of the present phase; ``phase_state`` is what of it does not
+    follow from schedule and model, and ``random`` is what :func:`rng_state` gives.
+    """
+
+    stage: Line
+    total: Count
+    iteration: Count
+    iterations_done: Count
+    seed: Count
+    num_rollbacks: Count
+    lr_scale: Share
+    batch_share: Share
+    phase: Count | None
+    phase_state: dict[str, Any]
+    random: dict[str, Any]
 
 
 def progress_file(folder: Path, stage: str, iteration: int) -> Path:

@@ -8,7 +8,7 @@ precision: thinned out everywhere, and in detail near what is occupied.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -135,10 +135,19 @@ class StoredShape(nn.Module):
     """A module that may be loaded from a state of another resolution.
 
     Attributes:
-        resizable: names of the parameters and buffers that take the stored shape.
+        resizable: of the parameters and buffers that take the stored shape, by name, how many axes
+            may be longer or shorter, from the first on.
     """
 
-    resizable: ClassVar[tuple[str, ...]]
+    resizable: ClassVar[Mapping[str, int]]
+
+    def takes(self, name: str, shape: Sequence[int]) -> bool:
+        """Whether a tensor may have a stored ``shape``; kernels look up two points of an axis."""
+        present = getattr(self, name).shape
+        fixed = self.resizable[name]
+        if len(shape) != len(present) or shape[fixed:] != present[fixed:]:
+            return False
+        return all(points >= min(2, now) for points, now in zip(shape, present, strict=True))
 
     def _load_from_state_dict(
         self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
@@ -146,7 +155,9 @@ class StoredShape(nn.Module):
         for name in self.resizable:
             stored = state_dict.get(prefix + name)
             current = getattr(self, name)
-            if stored is not None and stored.shape != current.shape:
+            if stored is None or stored.shape == current.shape:
+                continue
+            if self.takes(name, stored.shape):
                 empty = current.new_empty(stored.shape)
                 setattr(self, name, nn.Parameter(empty) if name in self._parameters else empty)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)

@@ -119,12 +119,14 @@ def beginning(run: RunContext, stage: str) -> ResumePoint | None:
         try:
             content = read_checkpoint_file(progress)
             metadata = metadata_in(progress, content)
-            iteration = content["progress"]["iteration"]
+            if content.get("progress") is None:
+                raise DevrfError(f"{progress}: does not say where its stage was left")
         except DevrfError as error:
             log.warning("%s; the file before it is taken", error)
             progress.unlink()
             continue
         if _agrees(progress, metadata, training_config):
+            iteration = content["progress"]["iteration"]
             log.info("%s: goes on at iteration %d", stage, iteration)
             return ResumePoint(training_config, progress=progress, iteration=iteration)
         break

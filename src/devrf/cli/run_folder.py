@@ -27,7 +27,8 @@ log = logging.getLogger(__name__)
 # Made in the folder before the config is checked.
 AT_FIRST = {".hydra", PLACE}
 # What is written by names that are known, and might lead elsewhere; all that is in the first four.
-WRITTEN = (".hydra", PLACE, "logs", "export", "run.log", "checkpoints", "images", "videos", "paths")
+WRITTEN = [".hydra", PLACE, "logs", "export", "run.log", "checkpoints", "images", "videos", "paths"]
+WRITTEN += ["metrics.json", "frames.csv"]
 # Why a sweep's job failed.
 FAILURE = "failure.json"
 # Stages that leave .hydra alone: they look at other runs, or are none.

@@ -18,7 +18,7 @@ from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, save_checkpoin
 from devrf.checkpoints.progress import progress_files
 from devrf.cli.context import RunContext
 from devrf.cli.resume import ResumePoint, beginning, remove_progress
-from devrf.engine.stage import Stage
+from devrf.engine.stage import Stage, fit
 from devrf.errors import DevrfError
 from devrf.system.files import atomic_write
 from devrf.system.process import Interrupted
@@ -79,8 +79,7 @@ def _fit(run: RunContext, stage: Stage, begin: ResumePoint) -> None:
         trainer.strategy.checkpoint_io = ChecksummedCheckpointIO()
         if isinstance(run.logger, ResumableCSVLogger):
             run.logger.drop_rows_beyond(stage.capture, begin.iteration)
-        path = begin.progress and str(begin.progress)
-        trainer.fit(stage, datamodule=run.datamodule, ckpt_path=path)
+        fit(trainer, stage, run.datamodule, begin.progress)
         strategy = trainer.strategy
         stopping = strategy.reduce_boolean_decision(stop.number is not None, all=False)
         finished = stage.iteration >= stage.total_iterations

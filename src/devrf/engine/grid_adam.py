@@ -10,6 +10,7 @@ from torch import Tensor
 
 from devrf.kernels.adam import adam_step, add_total_variation_gradient
 from devrf.ops.adam import AdamRule
+from devrf.system.plain_data import Count, built
 
 
 class GridAdam(torch.optim.Optimizer):
@@ -132,12 +133,22 @@ class GridAdam(torch.optim.Optimizer):
                     parameter.grad = torch.zeros_like(parameter)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore a state, on the parameters' device."""
+        """Restore moments and steps; settings stay those that the stage has chosen.
+
+        So no index of a voxel comes from a file: kernels check none.
+
+        Raises:
+            ValueError: moments that do not fit the parameters.
+        """
+        settings = [dict(group) for group in self.param_groups]
         super().load_state_dict(state_dict)
-        for group in self.param_groups:
-            for name in ("per_voxel_lr", "rows"):
-                if group[name] is not None:
-                    group[name] = group[name].to(group["params"][0].device)
+        for group, own in zip(self.param_groups, settings, strict=True):
+            group |= own
+            for state, parameter in ((self.state.get(p), p) for p in group["params"]):
+                if state:
+                    state["steps"] = built(Count, state["steps"])
+                    if not parameter.shape == state["mean"].shape == state["square"].shape:
+                        raise ValueError("moments of another shape than what is learned")
 
     def replace(self, group: int, parameters: Sequence[Tensor], **settings: Any) -> None:
         """Give a group other parameters, such as a resized grid, with zero moments.

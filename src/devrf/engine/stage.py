@@ -13,18 +13,20 @@ from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
 import torch
-from lightning import LightningModule
+from lightning import LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
 
 from devrf.checkpoints.checkpoint import (
     MODEL,
+    UNFIT,
     CheckpointMetadata,
     LoadedCheckpoint,
     TrainingFigures,
     Viewpoints,
     check_scene,
     metadata_in,
+    unfit,
 )
 from devrf.checkpoints.progress import rng_state, set_rng_state
 from devrf.checkpoints.stored_class import class_path
@@ -46,12 +48,13 @@ from devrf.rendering.renderer import Renderer
 from devrf.rendering.view import Viewable
 from devrf.scenes.scene import CaptureName, ImagesName, Scene, Views
 from devrf.system.memory import free_cache, is_oom, numbers
+from devrf.system.plain_data import Count, built
 from devrf.system.profiling import span
 
 log = logging.getLogger(__name__)
 
-# Attributes of a stage that a progress file holds by name: where it is in its schedule, and how it
-# goes on.
+# Attributes of a stage that a progress file holds by name (:class:`Progress`): where it is in its
+# schedule, and how it goes on.
 POSITION = ("iteration", "iterations_done", "seed", "num_rollbacks", "lr_scale", "batch_share")
 
 
@@ -100,6 +103,7 @@ class Stage(LightningModule, ABC):
         abort_reason: why the stage ended before its schedule; None while it has not.
         time_share: the part of the whole method's seconds that is this stage's.
         began: when the stage was set up, by ``time.perf_counter``.
+        has_begun: whether it learns: a progress file has been restored, if there is one.
         record: what training took, once a ``TrainingRecord`` callback has measured it.
         earlier_records: the same for the stages that this one builds on, by name.
         training_config: the settings that decide what is learned, by config key; empty for a
@@ -135,6 +139,7 @@ class Stage(LightningModule, ABC):
         self.abort_reason: str | None = None
         self.time_share = 1.0
         self.began = 0.0
+        self.has_begun = False
         self.record: TrainingFigures = {}
         self.earlier_records: dict[str, TrainingFigures] = {}
         self.training_config: dict[str, Any] = {}
@@ -486,17 +491,13 @@ class Stage(LightningModule, ABC):
                 f"{progress['total']} iterations, this is the {self.name} stage on one of "
                 f"{self.total_iterations}; give it its own schedule"
             )
-        if not progress.keys() >= {*POSITION}:
-            raise DevrfError(
-                f"{path}: left by an earlier version, which this one cannot go on from; begin "
-                "afresh with resume=false"
-            )
         for name in POSITION:
             setattr(self, name, progress[name])
         self.previous_iteration = self.iteration - 1
         # A schedule is one epoch of a loader that never ends: what ended it there (max_time,
         # limit_train_batches, fast_dev_run) has not ended it here.
-        fit = checkpoint["loops"]["fit_loop"]
+        fit = _counts(checkpoint["loops"]["fit_loop"], like=self.trainer.fit_loop.state_dict())
+        checkpoint["loops"]["fit_loop"] = fit
         for epochs in ("total", "current"):
             fit["epoch_progress"][epochs].update(processed=0, completed=0)
         fit["epoch_loop.batch_progress"]["is_last_batch"] = False
@@ -519,6 +520,7 @@ class Stage(LightningModule, ABC):
             set_rng_state(self._progress["random"], self.device)
             self._progress = None
         self._reseed()
+        self.has_begun = True
 
     def on_train_end(self) -> None:
         """Pack what was learned while it is on its GPU: Lightning moves the stage to the host."""
@@ -574,6 +576,30 @@ class Stage(LightningModule, ABC):
         means = {f"test/{self.scored_capture}/{k}": v for k, v in scores.items()}
         self.log_dict(means, batch_size=1, sync_dist=True)
         return {"view": view}
+
+
+def fit(
+    trainer: Trainer, stage: Stage, datamodule: LightningDataModule, progress: Path | None = None
+) -> None:
+    """Learn a stage, from a ``progress`` file on if one is given.
+
+    Raises:
+        DevrfError: what that file holds contradicts itself.
+    """
+    try:
+        trainer.fit(stage, datamodule=datamodule, ckpt_path=progress and str(progress))
+    except UNFIT as error:
+        other = stage.has_begun or isinstance(error, DevrfError) or is_oom(error)
+        if progress is None or other:
+            raise
+        raise unfit(progress, error) from error
+
+
+def _counts(stored: Any, like: Any) -> Any:
+    """The counts that a loop stored, in those places where a new one has some."""
+    if isinstance(like, dict):
+        return {key: _counts(stored[key], value) for key, value in like.items()}
+    return built(Count if type(like) is int else type(like), stored)
 
 
 def mean_terms(iterations: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:

@@ -25,7 +25,8 @@ class Box:
     high: tuple[float, float, float]
 
     def __post_init__(self) -> None:
-        if not all(a < b for a, b in zip(self.low, self.high, strict=True)):
+        corners = zip(self.low, self.high, strict=True)
+        if not all(-math.inf < a < b < math.inf for a, b in corners):
             raise ValueError(f"a box needs low < high on every axis, not {self.low}, {self.high}")
 
     def __str__(self) -> str:

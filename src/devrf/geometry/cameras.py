@@ -47,7 +47,8 @@ class Cameras:
         shapes = [tuple(tensor.shape) for tensor in tensors]
         if shapes != [(count, 3, 4), (count, 2), (count, 2)]:
             raise ValueError(f"cameras of the shapes {shapes}")
-        finite = all(t.is_floating_point() and bool(t.isfinite().all()) for t in tensors)
+        single = all(tensor.dtype == torch.float32 for tensor in tensors)
+        finite = single and all(bool(tensor.isfinite().all()) for tensor in tensors)
         if not finite or not bool((self.focal > 0).all()):
             raise ValueError("a camera that is not finite, or sees nothing")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -42,7 +43,7 @@ class FrameClock:
     def __post_init__(self) -> None:
         if not self.times or self.times[0] != 0.0:
             raise ValueError("a frame clock begins at time 0")
-        if any(b - a <= self.TOLERANCE for a, b in zip(self.times, self.times[1:], strict=False)):
+        if not all(b - a > self.TOLERANCE for a, b in pairwise(self.times)):
             raise ValueError("a frame clock needs distinct ascending times")
 
     def __len__(self) -> int:

@@ -44,10 +44,7 @@ class ContractedSpace:
     is_linear: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        inner = Box.of(list(self.low), list(self.high))
-        # A checkpoint gives lists.
-        object.__setattr__(self, "low", inner.low)
-        object.__setattr__(self, "high", inner.high)
+        Box(self.low, self.high)  # which refuses what is no box
 
     @property
     def side_factor(self) -> float:

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from devrf.geometry.box import Box
 from devrf.ops.march import Surroundings
+from devrf.system.plain_data import built
 
 
 class Occupancy(nn.Module):
@@ -99,8 +100,8 @@ class Occupancy(nn.Module):
         self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
     ) -> None:
         stored = state_dict.get(prefix + "mask")
-        if stored is not None:
-            self.replace(stored.to(self.mask.device))
+        if stored is not None and stored.ndim == 3 and min(stored.shape) >= 2:
+            self.replace(self.mask.new_empty(stored.shape))
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     def get_extra_state(self) -> dict[str, Any]:
@@ -109,7 +110,7 @@ class Occupancy(nn.Module):
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_extra_state` gave."""
-        self.box = Box.of(state["low"], state["high"])
+        self.box = built(Box, state)
 
 
 def dilate(mask: Tensor, radius: int) -> Tensor:

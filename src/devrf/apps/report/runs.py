@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
@@ -100,7 +101,10 @@ def metric_over_time(path: Path, metric: str) -> pd.Series:
     Empty where the run has no such values.
     """
     try:
-        frames = pd.read_csv(path / "frames.csv")
+        file = path / "frames.csv"
+        frames = pd.read_csv(
+            file if file.is_file() else io.StringIO()
+        )  # a pipe would be waited for
         frames = frames[frames["capture"] == "dynamic"].dropna(subset=metric)
         return frames.astype({"time": float, metric: float}).groupby("time")[metric].mean()
     except (OSError, ValueError, KeyError):

@@ -3,19 +3,29 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Annotated, Any, ClassVar
 
 import torch
+from annotated_types import Ge, Gt, Lt
 from torch import Tensor, nn
+from typing_extensions import TypedDict
 
 from devrf.checkpoints.stored_grids import StoredShape
 from devrf.geometry.box import Box
 from devrf.kernels.look_up import look_up
 from devrf.ops.color_network import ColorNetwork, decode
 from devrf.ops.trilinear import resample
+from devrf.system.plain_data import built
 
-# What a checkpoint holds beside the tensors and the box.
-SIZES = ("voxels", "base_voxels", "alpha_init", "planes", "aspect")
+
+class Sizes(TypedDict):
+    """What a checkpoint holds of a field beside the tensors and the box: attributes by name."""
+
+    voxels: Annotated[int, Ge(1)]
+    base_voxels: Annotated[int, Ge(1)]
+    alpha_init: Annotated[float, Ge(1e-12), Lt(1)]
+    planes: Annotated[int, Ge(2)] | None
+    aspect: Annotated[float, Gt(0)]
 
 
 class VoxelGrid(StoredShape):
@@ -25,7 +35,7 @@ class VoxelGrid(StoredShape):
         values: (X, Y, Z, C), channels last so that a grid point is one row of memory.
     """
 
-    resizable = ("values",)  # a run may have ended at any resolution
+    resizable: ClassVar = {"values": 3}  # a run may have ended at any resolution
     values: nn.Parameter
 
     def __init__(self, shape: tuple[int, int, int], channels: int, fill: float = 0.0) -> None:
@@ -244,11 +254,11 @@ class CanonicalField(nn.Module):
 
     def get_extra_state(self) -> dict[str, Any]:
         """Box and sizes, as plain numbers."""
-        sizes = {name: getattr(self, name) for name in SIZES}
+        sizes = {name: getattr(self, name) for name in Sizes.__annotations__}
         return {"low": list(self.box.low), "high": list(self.box.high), **sizes}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_extra_state` gave."""
-        self.box = Box.of(state["low"], state["high"])
-        for name in SIZES:
-            setattr(self, name, state[name])
+        self.box = built(Box, state)
+        for name, size in built(Sizes, state).items():
+            setattr(self, name, size)

@@ -410,4 +410,4 @@ class DeformationStage(Stage):
     def restore(self, phase: DeformationPhase, state: dict[str, Any]) -> None:
         """Go on with the frame of ``phase``, the field being loaded."""
         self._activate(phase).load_state(state["frame"], self.views)
-        self._losses = [*state["losses"]]
+        self._losses = [float(loss) for loss in state["losses"]]

@@ -9,15 +9,17 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
 
+from devrf.checkpoints.stored_grids import StoredShape
 from devrf.engine.ddp import world_size
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.ops.trilinear import resample
+from devrf.system.plain_data import built
 
 log = logging.getLogger(__name__)
 
@@ -61,11 +63,11 @@ class FrameField(nn.Module):
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_extra_state` gave."""
-        self.box = Box.of(state["low"], state["high"])
-        self.clock = FrameClock(tuple(state["times"]))
+        self.box = built(Box, state)
+        self.clock = built(FrameClock, state)
 
 
-class FrameStore(nn.Module):
+class FrameStore(StoredShape):
     """Displacements of T frames in two directions.
 
     Attributes:
@@ -74,6 +76,7 @@ class FrameStore(nn.Module):
         on_host: whether they stay on the host when the module is moved.
     """
 
+    resizable: ClassVar = dict.fromkeys(NAMES, 4)
     to_canonical: Tensor
     to_time: Tensor
     here: Tensor
@@ -136,7 +139,14 @@ class FrameStore(nn.Module):
             setattr(self, name, moved.copy_(frames))
 
     def take(self, to_canonical: Tensor, to_time: Tensor) -> None:
-        """Hold these (T, X, Y, Z, 3) where they are; on the host they stay there."""
+        """Hold these (T, X, Y, Z, 3) where they are; on the host they stay there.
+
+        Raises:
+            ValueError: they are no displacements of the same frames.
+        """
+        alike = to_canonical.shape == to_time.shape and to_canonical.dtype == to_time.dtype
+        if not alike or not self.takes("to_time", to_time.shape):
+            raise ValueError(f"displacements of the shape {[*to_time.shape]}")
         self.to_canonical = to_canonical
         self.to_time = to_time
         self.on_host = to_time.device != self.here.device
@@ -180,16 +190,6 @@ class FrameStore(nn.Module):
         super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
         self._buffers.update(frames)
         return self
-
-    def _load_from_state_dict(
-        self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
-    ) -> None:
-        for name in NAMES:
-            stored = state_dict.get(prefix + name)
-            frames = getattr(self, name)
-            if stored is not None and stored.shape != frames.shape:
-                setattr(self, name, self._empty(stored.shape, frames.dtype))
-        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
 
 def fits_on_device(

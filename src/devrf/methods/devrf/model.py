@@ -30,6 +30,7 @@ from devrf.ops.trilinear import shape_of
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import ColorChange
 from devrf.rendering.sampling import RenderSettings
+from devrf.system.plain_data import built
 
 # Samples of a ray, at most, before empty space is skipped.
 SAMPLES = 2**14
@@ -103,17 +104,19 @@ class DeVRFModel(Renderable):
     def from_config(cls, config: Mapping[str, Any]) -> DeVRFModel:
         """Fields of a few voxels; the stored state gives them their shapes."""
         box = Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
-        build = Architecture(**config["architecture"])
+        build = built(Architecture, config["architecture"])
         # A stage that was stopped in its search has no colour network yet.
         radiance = config["radiance"]
         clock = FrameClock((0.0, 1.0))
         path = config["color_residual"]
-        residual: Callable[..., ColorField] | None = path and stored_class(path, ColorField)
+        residual: Callable[..., ColorField] | None = None
+        if path is not None:
+            residual = stored_class(path, ColorField)
         return cls(
             build,
             build.radiance_field(box, 8, 8) if radiance else build.search_field(box, 8),
             Occupancy.full((2, 2, 2), box),
-            RenderSettings(**config["settings"]),
+            built(RenderSettings, config["settings"]),
             DeformationField(box, clock, voxels=8) if config["deforms"] else None,
             space_from(config["space"]),
             residual and residual(box, clock, voxels=8),

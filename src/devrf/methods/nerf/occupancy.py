@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -36,7 +37,7 @@ class LearnedOccupancy(StoredShape):
         opacity: (X, Y, Z) of a step; 1 until it is evaluated. (0, 0, 0): nothing is left out.
     """
 
-    resizable = ("opacity",)
+    resizable: ClassVar = {"opacity": 3}
     opacity: Tensor
 
     def __init__(self, shape: tuple[int, int, int] = (0, 0, 0)) -> None:
@@ -114,7 +115,7 @@ class OccupancyFrames(StoredShape):
         learned: what the field leaves empty at all times, where alpha masks do not tell.
     """
 
-    resizable = ("mask",)
+    resizable: ClassVar = {"mask": 4}
     mask: Tensor
 
     def __init__(self, frames: int, shape: tuple[int, int, int]) -> None:

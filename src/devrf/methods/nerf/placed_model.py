@@ -21,6 +21,7 @@ from devrf.methods.nerf.placement import Placement
 from devrf.methods.nerf.samples import RaySamples
 from devrf.rendering.output import RenderedImage, RenderOutput
 from devrf.scenes.scene import Scene
+from devrf.system.plain_data import built
 
 # Rays of a view that are rendered at once, on a CPU and on a GPU.
 ON_CPU = 2048
@@ -83,11 +84,12 @@ class PlacedModel(RayTrainable):
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
         """Networks of the same sizes in the same place."""
-        model = cls(cls.settings_class(**config["settings"]))
+        model = cls(built(cls.settings_class, config["settings"]))
         low, high = config["box"]
-        near, far = config["limits"]
-        model.set_place(Box.of(low, high), space_from(config["space"]), (near, far))
-        model.set_times(tuple(config["times"]))
+        box = built(Box, {"low": low, "high": high})
+        depths = built(tuple[float, float], config["limits"])
+        model.set_place(box, space_from(config["space"]), depths)
+        model.set_times(built(FrameClock, config).times)
         for name in cls.remembered:
             setattr(model, name, config[name])
         return model

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection, Mapping
 from functools import partial
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -44,7 +44,7 @@ class ResidualField(ColorField, StoredShape):
         clock: the times of the T frames.
     """
 
-    resizable = ("values",)
+    resizable: ClassVar = {"values": 4}
     values: Tensor
 
     def __init__(self, box: Box, clock: FrameClock, *, voxels: int) -> None:

@@ -1,0 +1,148 @@
+"""Files with a right checksum whose parts contradict each other: taken, or refused in one line.
+
+Each has one changed value. DEVRF_FUZZ_INPUTS says how many are tried, of which a quarter are
+progress files.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import random
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lightning import Callback, Trainer
+from lightning.pytorch.callbacks import LambdaCallback
+from torch import Tensor
+
+from devrf.callbacks import DivergenceGuard, Previews, TrainingRecord
+from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, load_checkpoint, save_checkpoint
+from devrf.checkpoints.checkpoint_file import read_checkpoint_file, write_checkpoint_file
+from devrf.engine.stage import Stage, fit
+from devrf.errors import DevrfError
+from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
+from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
+from devrf.methods.devrf.deformation_stage import DeformationStage
+from devrf.rendering.renderer import Renderer
+from devrf.system.memory import own_memory
+
+INPUTS = int(os.environ.get("DEVRF_FUZZ_INPUTS", "100"))
+NUMBERS = [0, -1, 1, 0.5, 5e-324, 1e9, 1e300, 2**63, math.nan, math.inf, True]
+OTHERS = [None, "", "a", "../x", "\x1b[2J\n", [], [0], [[0] * 4] * 4, {}, {"": 1}]
+TENSORS = [torch.zeros(()), torch.zeros(0), torch.ones(3), torch.ones(1, 1, 1, 1)]
+LEFT_OUT = object()
+Place = tuple[Any, ...]
+
+
+def other_tensors(tensor: Tensor) -> Iterator[Tensor]:
+    """Other shapes, types and values."""
+    yield from (tensor[None], tensor.flatten(), tensor.double(), tensor.to(torch.uint8))
+    yield from (torch.full_like(tensor, value) for value in (0, 1))
+    if tensor.ndim:
+        yield from (tensor[:0], tensor[:1], tensor.repeat_interleave(3, dim=0))
+        yield tensor.transpose(0, -1)
+    if tensor.is_floating_point():
+        yield from (torch.full_like(tensor, value) for value in (math.nan, math.inf, -6e4))
+
+
+def changes(value: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:
+    """Each place in nested data, and what may stand there instead."""
+    if place:
+        yield from ((place, other) for other in (LEFT_OUT, *NUMBERS, *OTHERS, *TENSORS))
+    if isinstance(value, Tensor) and value.ndim:
+        yield from ((place, other) for other in other_tensors(value))
+    elif isinstance(value, dict):
+        for key, item in value.items():
+            yield from changes(item, (*place, key))
+    elif isinstance(value, list | tuple) and len(value) < 8:
+        for index, item in enumerate(value):
+            yield from changes(item, (*place, index))
+
+
+def changed(value: Any, place: Place, other: Any) -> Any:
+    """A copy of nested data with something else in a place."""
+    if not place:
+        return other
+    key, *rest = place
+    copy = {**value} if isinstance(value, dict) else [*value]
+    if other is LEFT_OUT and not rest:
+        del copy[key]
+    else:
+        copy[key] = changed(value[key], tuple(rest), other)
+    return tuple(copy) if isinstance(value, tuple) else copy
+
+
+def try_all(path: Path, keys: tuple[str, ...], use: Callable[[], object], count: int) -> int:
+    """Use so many changed copies of a file, of which ``keys`` change; how many are refused."""
+    content = read_checkpoint_file(path)
+    every = list(changes({key: content[key] for key in keys}))
+    refused = 0
+    for place, other in random.Random(0).sample(every, min(count, len(every))):
+        write_checkpoint_file(path, changed(content, place, other))
+        before = own_memory()
+        began = time.perf_counter()
+        where = f"{'/'.join(map(str, place))} = {other}"
+        try:
+            use()
+        except DevrfError as error:
+            message = str(error)
+            assert message.isprintable(), where
+            refused += 1
+        except Exception as error:
+            raise AssertionError(where) from error
+        assert time.perf_counter() - began < 10 and own_memory() - before < 300e6, where
+    return refused
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_checkpoint_is_shown_or_refused(rest, datamodule, trainer, tmp_path):
+    schedule, learner = DeformationSchedule(levels=(Level(4, 2),), rays=64), trainer(max_epochs=1)
+    learner.fit(DeformationStage(rest, schedule), datamodule=datamodule)
+    path = tmp_path / "deformation.ckpt"
+    save_checkpoint(learner, path)
+
+    def show() -> None:
+        stored = load_checkpoint(path)
+        if stored.viewpoints is not None:
+            camera = stored.viewpoints.held_out.of_height(12)
+            for moment in (0.0, 0.3, 1.0):
+                Renderer(stored.model).view(camera, index=0, time=moment, background=1.0)
+            stored.model.forward_map(0.7)(torch.zeros(2, 3))
+
+    count = INPUTS * 3 // 4
+    assert try_all(path, ("devrf", "state_dict", "viewpoints"), show, count) > count // 4
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", ["canonical", "deformation"])
+def test_a_progress_file_goes_on_or_is_refused(rest, datamodule, trainer, tmp_path, name):
+    def stage() -> Stage:
+        if name == "deformation":
+            levels = (Level(4, 4),)
+            schedule = DeformationSchedule(levels=levels, rays=64)
+            return DeformationStage(rest, schedule, iterations_per_step=1)
+        sizes = {"search_iterations": 0, "search_side": 8, "iterations": 3, "side": 10}
+        schedule = CanonicalSchedule(**sizes, upsample_at=(1,), rays=64)
+        return CanonicalStage(schedule, iterations_per_step=1)
+
+    def learn(progress: Path | None, *further: Callback) -> None:
+        watching = (TrainingRecord(), Previews(), DivergenceGuard(), *further)
+        learner = trainer(*watching, max_epochs=1)
+        learner.strategy.checkpoint_io = ChecksummedCheckpointIO()
+        fit(learner, stage(), datamodule, progress)
+
+    def leave(learner: Trainer, learns: Stage, *_: Any) -> None:
+        save_checkpoint(learner, path, weights_only=False)
+        learner.should_stop = True
+
+    path = tmp_path / "progress.ckpt"
+    learn(None, LambdaCallback(on_train_batch_end=leave))
+    parts = ("progress", "optimizer_states", "loops", "callbacks", "state_dict")
+    count = INPUTS // 8
+    assert try_all(path, parts, lambda: learn(path), count) > count // 4
