@@ -217,6 +217,21 @@ class RayTrainable(Renderable):
         """Called before iteration ``step`` of ``total``: for encoding windows and curricula."""
 
     @property
+    def resolution(self) -> tuple[int, ...]:
+        """Present shape of the grid that is learned; empty where there is none."""
+        return ()
+
+    def growths(self, total: int) -> Sequence[int]:
+        """Iterations, ascending, of a stage of ``total`` at which grids grow."""
+        return ()
+
+    def grow(self, count: int) -> None:
+        """Give grids the size that they have after ``count`` growths, unless they are as large.
+
+        A grid that grows becomes another parameter, whose optimiser begins without moments.
+        """
+
+    @property
     def sample_outputs(self) -> int:
         """How many numbers all layers give for one sample of a ray, to estimate memory by."""
         return sum(layer.out_features for layer in self.modules() if isinstance(layer, nn.Linear))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -116,6 +117,7 @@ class RayStage(Stage):
         self.weights = counted_weights(loss, self.scene_model.losses, "ray_stage.loss")
         self.pools: list[FramePool] = []
         self._centres: list[FramePool] = []
+        self._rays = schedule.rays
 
     @property
     def total_iterations(self) -> int:
@@ -124,12 +126,15 @@ class RayStage(Stage):
 
     @property
     def resolution(self) -> tuple[int, ...]:
-        """None: there is no grid that grows."""
-        return ()
+        """Present shape of the method's grid, if it has one."""
+        return self.scene_model.resolution
 
     def phase_at(self, iteration: int) -> Phase:
-        """The one phase there is."""
-        return Phase(kind="rays", start=0, stop=self.total_iterations)
+        """A phase lasts until the method's grids grow; all else stays as it is."""
+        last = self.total_iterations
+        edges = sorted({0, last, *(n for n in self.scene_model.growths(last) if 0 < n < last)})
+        place = min(bisect_right(edges, iteration), len(edges) - 1)
+        return Phase(kind="rays", start=edges[place - 1], stop=edges[place])
 
     def learning_rate_factor(self, iteration: int) -> float:
         """(final / initial)^(n / (N − 1)) at iteration n of N."""
@@ -160,8 +165,19 @@ class RayStage(Stage):
         self.optimizer = GridAdam(groups, betas=(first, second), eps=self.schedule.eps)
 
     def enter(self, phase: Phase) -> None:
-        """Gather the pixels to draw from."""
+        """Let grids grow; when the stage begins or goes on, gather the pixels to draw from."""
         self.phase = phase
+        growths = self.scene_model.growths(self.total_iterations)
+        self.scene_model.grow(sum(iteration <= phase.start for iteration in growths))
+        for index, group in enumerate(self.scene_model.param_groups()):
+            present = self.optimizer.param_groups[index]["params"]
+            if any(new is not old for new, old in zip(group["params"], present, strict=True)):
+                self.optimizer.replace(index, group["params"])
+        if self.pools:
+            return
+        fewer = self.schedule.rays_without_hull
+        if fewer is not None and not self.scene_model.has_hull:
+            self._rays = fewer
         views = [self.training_views(images) for images in self.images]
         self.pools = [FramePool.of(view_set) for view_set in views]
         if self.schedule.centre_crop:
@@ -178,10 +194,7 @@ class RayStage(Stage):
         Images are numbered through, the static ones first. Last are those the model asks for.
         """
         schedule = self.schedule
-        rays = schedule.rays
-        if schedule.rays_without_hull is not None and not self.scene_model.has_hull:
-            rays = schedule.rays_without_hull
-        rays = self.rays_to_draw(rays)
+        rays = self.rays_to_draw(self._rays)
         pools = self._centres if self.iteration < schedule.centre_crop else self.pools
         static = round(rays * self.static_share)
         counts = [static, rays - static] if len(pools) > 1 else [rays]

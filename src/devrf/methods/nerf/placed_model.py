@@ -112,9 +112,14 @@ class NeuralField(PlacedModel):
         share = self.settings.empty_from
         self.occupancy.learned.follow(step, total, share, self.box, self.opacity)
 
+    @property
+    def step_length(self) -> float:
+        """The distance between even samples, in the fields' space."""
+        return self.box.diagonal / float(self.settings.steps)
+
     def opacity(self, points: Tensor, time: Tensor) -> Tensor:
         """Opacity (S,) of a step at points (S, 3) of the fields' space and times (S,)."""
-        length = self.box.diagonal / self.settings.steps / self.placement.half_edge
+        length = self.step_length / self.placement.half_edge
         depth = self.optical_depth(self.placement.normalised(points), time, length)
         return -torch.expm1(-depth)
 
@@ -142,9 +147,9 @@ class NeuralField(PlacedModel):
     def march(self, rays: Rays, time: Tensor, *, jitter: bool) -> RaySamples:
         """Even steps where something may be at the frames around each ray's time."""
         before, after, _ = self.clock.between(time)
-        # A share of the box's diagonal, in units of the longest direction.
+        # In units of the longest direction.
         longest = float(rays.directions.norm(dim=1).amax()) if len(rays) else 1.0
-        step = self.box.diagonal / (self.settings.steps * longest)
+        step = self.step_length / longest
         return self.occupancy.march(
             rays, (before, after), self.box, self.depth_limits, step, jitter=jitter
         )
