@@ -1,0 +1,128 @@
+"""The parts of TiNeuVox: a grid that is looked up at several distances, and small networks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from devrf.checkpoints.stored_grids import StoredShape
+from devrf.geometry.box import Box
+from devrf.kernels.look_up import look_up
+from devrf.methods.nerf.networks import SinusoidalEncoding
+from devrf.methods.tineuvox.settings import TiNeuVoxSettings
+from devrf.ops.trilinear import Shape, resample, shape_of
+
+
+class MultiDistanceGrid(StoredShape):
+    """Features of space, at several spacings of one grid (docs/methods/tineuvox.md#grid).
+
+    Attributes:
+        values: (X, Y, Z, C). X − 1, Y − 1 and Z − 1 are multiples of the largest stride, so that the
+            outer points of all spacings are on the faces of one box.
+    """
+
+    resizable = ("values",)
+    values: nn.Parameter
+
+    def __init__(self, channels: int, strides: Sequence[int]) -> None:
+        """A grid of one cell of the largest stride, of zeros."""
+        super().__init__()
+        self.strides = tuple(strides)
+        side = max(strides) + 1
+        self.values = nn.Parameter(torch.zeros(side, side, side, channels))
+
+    @property
+    def shape(self) -> Shape:
+        """Grid points along x, y, z."""
+        return shape_of(self.values)
+
+    def forward(self, points: Tensor, box: Box) -> Tensor:
+        """Features (M, C · strides) at ``points`` (M, 3), one spacing after another.
+
+        The grid is over ``box``; outside they are those of its border.
+        """
+        grids = [self.values if n == 1 else self.values[::n, ::n, ::n] for n in self.strides]
+        return torch.cat([look_up(grid.contiguous(), points, box) for grid in grids], dim=1)
+
+    def fitting(self, box: Box, side: float) -> Shape:
+        """The least shape of about ``side``³ points over ``box`` that all strides fit into."""
+        widest = max(self.strides)
+        cells = [-(-(points - 1) // widest) for points in box.grid_shape(round(side**3))]
+        x, y, z = (count * widest + 1 for count in cells)
+        return x, y, z
+
+    @torch.no_grad()
+    def resize(self, shape: Shape) -> None:
+        """Resample to another shape over the same box, trilinearly; a new parameter results."""
+        values = resample(self.values, shape)
+        self.values = nn.Parameter(values, requires_grad=self.values.requires_grad)
+
+
+class TimeNetwork(nn.Module):
+    """γ(t) → the code of a time, of five numbers for each channel of the grid."""
+
+    def __init__(self, settings: TiNeuVoxSettings) -> None:
+        super().__init__()
+        self.encode = SinusoidalEncoding(1, settings.time_bands)
+        self.size = 5 * settings.channels
+        self.first = nn.Linear(self.encode.size, settings.width)
+        self.second = nn.Linear(settings.width, self.size)
+
+    def forward(self, time: Tensor) -> Tensor:
+        """Codes (R, size) of times (R,) in [0, 1]."""
+        code: Tensor = self.second(torch.relu(self.first(self.encode(time[:, None]))))
+        return code
+
+
+class DisplacementNetwork(nn.Module):
+    """(γ(x), code) → Δ(x, t): three linear layers."""
+
+    def __init__(self, position: int, code: int, width: int) -> None:
+        """For encoded positions and codes of these lengths, with layers of ``width``."""
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Linear(position + code, width),
+            nn.ReLU(),
+            nn.Linear(width, width),
+            nn.ReLU(),
+            nn.Linear(width, 3),
+        )
+
+    def forward(self, position: Tensor, code: Tensor) -> Tensor:
+        """Displacements (S, 3) in normalised space, of encoded positions and codes, a row each."""
+        displacement: Tensor = self.layers(torch.cat([position, code], dim=1))
+        return displacement
+
+
+class RadianceNetwork(nn.Module):
+    """(γ(features), γ(x), code) → density; with γ(d) → colour."""
+
+    def __init__(self, settings: TiNeuVoxSettings, position: int, code: int) -> None:
+        """For encoded positions and codes of these lengths."""
+        super().__init__()
+        s = settings
+        self.encode_feature = SinusoidalEncoding(s.channels * len(s.strides), s.feature_bands)
+        self.encode_direction = SinusoidalEncoding(3, s.direction_bands)
+        self.trunk = nn.Linear(self.encode_feature.size + position + code, s.width)
+        self.density = nn.Linear(s.width, 1)
+        self.feature = nn.Linear(s.width, s.width)
+        self.branch = nn.Linear(s.width + self.encode_direction.size, s.width // 2)
+        self.color = nn.Linear(s.width // 2, 3)
+
+    def hidden(self, features: Tensor, position: Tensor, code: Tensor) -> Tensor:
+        """What density and colour come from, (S, width), of S samples."""
+        encoded = self.encode_feature(features)
+        return torch.relu(self.trunk(torch.cat([encoded, position, code], dim=1)))
+
+    def raw_density(self, hidden: Tensor) -> Tensor:
+        """Densities (S,) before their activation."""
+        raw: Tensor = self.density(hidden)
+        return raw[:, 0]
+
+    def rgb(self, hidden: Tensor, viewdirs: Tensor, ray: Tensor) -> Tensor:
+        """RGB (S, 3) in [0, 1] of samples of the rays ``ray`` (S,), whose directions are (R, 3)."""
+        direction = self.encode_direction(viewdirs).index_select(0, ray)
+        branch = torch.relu(self.branch(torch.cat([self.feature(hidden), direction], dim=1)))
+        return torch.sigmoid(self.color(branch))
