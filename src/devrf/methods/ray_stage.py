@@ -171,8 +171,10 @@ class RayStage(Stage):
         self.scene_model.grow(sum(iteration <= phase.start for iteration in growths))
         for index, group in enumerate(self.scene_model.param_groups()):
             present = self.optimizer.param_groups[index]["params"]
-            if any(new is not old for new, old in zip(group["params"], present, strict=True)):
-                self.optimizer.replace(index, group["params"])
+            parameters = group.pop("params")
+            group.pop("rate", None)
+            if any(new is not old for new, old in zip(parameters, present, strict=True)):
+                self.optimizer.replace(index, parameters, **group)
         if self.pools:
             return
         fewer = self.schedule.rays_without_hull
