@@ -176,6 +176,6 @@ class TiNeuVox(NeuralField):
             others = [parameter for parameter in group["params"] if parameter is not values]
             groups.append({"name": name, "params": others, "rate": rates.get(name, 1.0)})
         if values.requires_grad:
-            grid = {"name": "grid", "params": [values], "rate": s.grid_rate}
-            groups.append({**grid, "skip_zero": True, "smoothing": s.tv})
+            grid = {"name": "grid", "params": [values], "rate": s.grid_rate, "skip_zero": True}
+            groups.append({**grid, "smoothing": s.tv * max(self.grid.shape) / 128 / 6})
         return groups

@@ -30,7 +30,7 @@ class TiNeuVoxSettings(OccupancySettings):
         weight_threshold: samples with a lower weight are not coloured.
         grid_rate: factor of the learning rate of the grid.
         motion_rate: the same of the networks of time and displacement.
-        tv: weight of the grid's total variation, for a batch of any size.
+        tv: weight of the grid's total variation over the rays of a batch.
     """
 
     sampling: ClassVar[str] = "occupancy"
