@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -36,7 +37,9 @@ class RaySchedule:
         rays_without_hull: of a batch where no masks tell which space is empty, so that a ray has
             more samples; None: as many.
         learning_rate: of Adam at the first iteration of a stage.
-        final_learning_rate: at its last; exponential in between.
+        final_learning_rate: at its last.
+        decay: of the rate in between: ``exponential``, or half a ``cosine``.
+        warmup: share of a stage during which the rate grows evenly from nothing, beside its decay.
         betas: of Adam.
         eps: of Adam.
         curriculum: share of a stage during which frames are added in the order of their times.
@@ -56,6 +59,8 @@ class RaySchedule:
     centre_crop: int = 0
     times_per_batch: int | None = None
     rays_without_hull: int | None = None
+    decay: Literal["exponential", "cosine"] = "exponential"
+    warmup: float = 0.0
     iterations_per_step: int = 10
 
     def __post_init__(self) -> None:
@@ -67,9 +72,12 @@ class RaySchedule:
             number = getattr(self, name)
             expect(number is None or number >= 1, f"{key}.{name}", "at least 1, or null", number)
         expect(self.centre_crop >= 0, f"{key}.centre_crop", "at least 0", self.centre_crop)
-        holds = 0 <= self.curriculum < 1
-        expected = "0 or more, below 1"
-        expect(holds, f"{key}.curriculum", expected, self.curriculum)
+        for name in ("curriculum", "warmup"):
+            share = getattr(self, name)
+            expect(0 <= share < 1, f"{key}.{name}", "0 or more, below 1", share)
+        positive = self.final_learning_rate > 0 or self.decay == "cosine"
+        expected = "more than 0, or decay=cosine"
+        expect(positive, f"{key}.final_learning_rate", expected, self.final_learning_rate)
 
 
 class RayStage(Stage):
@@ -137,10 +145,18 @@ class RayStage(Stage):
         return Phase(kind="rays", start=edges[place - 1], stop=edges[place])
 
     def learning_rate_factor(self, iteration: int) -> float:
-        """(final / initial)^(n / (N − 1)) at iteration n of N."""
+        """At iteration n of N, with ρ = final / initial and x = n / (N − 1), after a warm-up.
+
+        ρ^x, or ρ + (1 − ρ) (1 + cos πx) / 2.
+        """
+        schedule = self.schedule
         last = max(self.total_iterations - 1, 1)
-        ratio = self.schedule.final_learning_rate / self.schedule.learning_rate
-        return float(ratio ** (min(iteration, last) / last))
+        done = min(iteration, last) / last
+        ratio = schedule.final_learning_rate / schedule.learning_rate
+        warmth = min(1.0, (iteration + 1) / (schedule.warmup * self.total_iterations + 1))
+        if schedule.decay == "cosine":
+            return warmth * (ratio + (1 - ratio) * (1 + math.cos(math.pi * done)) / 2)
+        return float(warmth * ratio**done)
 
     def setup(self, stage: str) -> None:
         """Give the model what it needs of the scene, and make the optimiser."""
