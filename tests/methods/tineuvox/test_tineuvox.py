@@ -1,4 +1,4 @@
-"""TiNeuVox's facts: the grid at several distances, its growth, what is published, that it learns."""
+"""TiNeuVox: the grid at several distances, its growth, what is published, and that it learns."""
 
 from __future__ import annotations
 

@@ -19,8 +19,8 @@ class MultiDistanceGrid(StoredShape):
     """Features of space, at several spacings of one grid (docs/methods/tineuvox.md#grid).
 
     Attributes:
-        values: (X, Y, Z, C). X − 1, Y − 1 and Z − 1 are multiples of the largest stride, so that the
-            outer points of all spacings are on the faces of one box.
+        values: (X, Y, Z, C). X − 1, Y − 1, Z − 1 are multiples of the largest stride, so that
+            the outer points of all spacings are on the faces of one box.
     """
 
     resizable = ("values",)

@@ -35,6 +35,8 @@ class TiNeuVoxSettings(OccupancySettings):
 
     sampling: ClassVar[str] = "occupancy"
 
+    hull: bool = False
+    empty_from: float | None = None
     side: int = 160
     channels: int = 6
     strides: Sequence[int] = (1, 2, 4)
