@@ -56,6 +56,7 @@ RECORDED: dict[str, Callable[[Any], str]] = {
     "run.image_size": lambda size: f"{size[0]}×{size[1]}",
     "run.device": lambda name: f"on {name}",
     "run.test_frames": lambda n: f"{n} held-out images",
+    "run.lpips_network": lambda name: f"LPIPS of {name}",
     "run.fingerprint": lambda hashed: f"capture {hashed[:6]}",
     "run.git": lambda git: f"at {git[:9]}{'-dirty' * git.endswith('-dirty')}",
     "run.devrf": lambda version: f"devrf {version}",
