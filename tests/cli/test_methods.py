@@ -18,6 +18,8 @@ SMALL = {
     "nerfies": (*NARROW, f"{SETTINGS}.warp_width=8", "ray_stage.loss.elastic=1e-3"),
     "hypernerf": (*NARROW, f"{SETTINGS}.warp_width=8", "ray_stage.loss.elastic=1e-3"),
     "nsff": (*NARROW, f"{SETTINGS}.depth=2", f"{SETTINGS}.samples=8"),
+    "tineuvox": (f"{SETTINGS}.width=8", f"{SETTINGS}.side=8", f"{SETTINGS}.occupancy_side=8"),
+    "kplanes": (*NARROW, f"{SETTINGS}.resolution=4", f"{SETTINGS}.channels=2"),
     "neural_volumes": (
         f"{SETTINGS}.code=4",
         f"{SETTINGS}.encoder_views=2",
@@ -43,6 +45,8 @@ SHORT = ("ray_stage.schedule.iterations=4", "ray_stage.schedule.rays=64", *FILM)
         ("hypernerf", "two_stage", "tiny_facing"),
         ("nsff", "dynamic", "tiny_facing"),
         ("neural_volumes", "dynamic", "tiny_data"),
+        ("tineuvox", "two_stage", "tiny_facing"),
+        ("kplanes", "joint", "tiny_data"),
     ],
 )
 def test_a_protocol_trains_scores_and_films(devrf, tmp_path, request, method, protocol, scene):

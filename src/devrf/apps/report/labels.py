@@ -22,6 +22,8 @@ METHODS = {
     "hypernerf": "HyperNeRF",
     "nsff": "NSFF",
     "neural_volumes": "Neural Volumes",
+    "tineuvox": "TiNeuVox",
+    "kplanes": "K-Planes",
 }
 # As the paper's tables call them, in their order; then the rows of experiment=quality_table, for
 # inward- and for forward-facing scenes.

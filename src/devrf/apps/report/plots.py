@@ -51,9 +51,18 @@ STYLE: dict[Any, Any] = {
     "lines.linewidth": 1.6,
     "lines.markersize": 4,
 }
-# Markers of the paper's methods, and how the names of their variants end.
-NAMES = ("DeVRF", "D-NeRF", "Nerfies", "HyperNeRF", "NSFF", "Neural Volumes")
-MARKERS = dict(zip(NAMES, "s^vDPX", strict=True))
+# Markers of the methods, and how the names of their variants end.
+NAMES = (
+    "DeVRF",
+    "D-NeRF",
+    "Nerfies",
+    "HyperNeRF",
+    "NSFF",
+    "Neural Volumes",
+    "TiNeuVox",
+    "K-Planes",
+)
+MARKERS = dict(zip(NAMES, "s^vDPXo*", strict=True))
 VARIANT = r"-2 ?stage$|-dynamic$| \(base\)$| w/ .*$"
 # Seconds to label on an axis: the first of these multiples for which there is room.
 UNITS = (0.01, 0.1, 1, 10, 60, 600, 3600, 36000, 360000, math.inf)
