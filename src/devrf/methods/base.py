@@ -67,7 +67,15 @@ class Renderable(StoredClass, nn.Module, ABC):
     def surface(self) -> SurfaceField | None:
         """The scene at rest as a field of which a surface can be taken; None: there is none.
 
-        Of a method that has not this and :meth:`forward_map` exports take what :meth:`at` shows.
+        Of a method that has not this and :meth:`forward_map`, nor :meth:`surface_at`, exports take
+        what :meth:`at` shows.
+        """
+        return None
+
+    def surface_at(self, time: float) -> SurfaceField | None:
+        """The scene at ``time`` as a field of which a surface can be taken; None: there is none.
+
+        Of a method whose surface is not carried through time by :meth:`forward_map`.
         """
         return None
 

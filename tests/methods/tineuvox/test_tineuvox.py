@@ -169,6 +169,24 @@ def test_scenes_of_every_space_are_learned_and_come_back(
         torch.testing.assert_close(then.opacity, torch.ones_like(then.opacity))
 
 
+def test_a_surface_at_a_time_is_what_rays_meet_then(tiny_scene: Scene) -> None:
+    torch.manual_seed(0)
+    model = TiNeuVox(TINY)
+    model.setup(tiny_scene)
+    model.occupancy.mask[1, 0] = False
+    field = model.surface_at(model.clock.times[1])
+    low, high = model.box.corners(torch.zeros(()))
+    points = low + (high - low) * torch.tensor([[0.0, 0.5, 0.5], [0.6, 0.4, 0.5]])
+    depth = field.optical_depth(points)
+    # Nothing is where the masks of the frame leave nothing; elsewhere it is the field's.
+    assert depth[0] == 0
+    voxel = model.box.voxel_size(math.prod(field.shape)) / model.placement.half_edge
+    time = torch.full((1,), model.clock.times[1])
+    expected = model.optical_depth(model.placement.normalised(points[1:]), time, voxel)
+    torch.testing.assert_close(depth[1:], expected.detach())
+    assert field.color(points, torch.eye(3)[:2]).shape == (2, 3)
+
+
 def test_impossible_sizes_are_refused() -> None:
     with pytest.raises(DevrfError, match="strides: expected numbers above 0 that divide"):
         replace(TINY, strides=(1, 3, 4))

@@ -15,7 +15,7 @@ from devrf.methods.kplanes.decoders import ExplicitDecoder, HybridDecoder
 from devrf.methods.kplanes.planes import SixPlanes, sum_of
 from devrf.methods.kplanes.proposals import Proposal, drawn_edges, histogram_error, intervals
 from devrf.methods.kplanes.settings import KPlanesSettings
-from devrf.methods.nerf.placed_model import NeuralField
+from devrf.methods.nerf.placed_model import SurfacedField
 from devrf.methods.nerf.samples import RaySamples, limits, volume_render
 from devrf.ops.compositing import composite
 from devrf.ops.photometric import distortion
@@ -30,7 +30,7 @@ SLOPE = 10
 ANNEALED = 1 / 30
 
 
-class KPlanes(NeuralField):
+class KPlanes(SurfacedField):
     """(σ, c) = R(f(x, t), d): features f of six planes, decoded (docs/methods/kplanes.md).
 
     Attributes:
@@ -84,6 +84,12 @@ class KPlanes(NeuralField):
         """τ (S,) of ways of ``length`` at points (S, 3) in normalised space."""
         where = self.coordinates(self.placement.fields(points), time)
         return self.decoder.density(self.planes(where))[0] * length
+
+    def point_colors(self, points: Tensor, viewdirs: Tensor, time: Tensor) -> Tensor:
+        """RGB (S, 3) of points in normalised space."""
+        where = self.coordinates(self.placement.fields(points), time)
+        each = torch.arange(len(points), device=points.device)
+        return self.decoder.rgb(self.decoder.density(self.planes(where))[1], viewdirs, each)
 
     def render_rays(
         self, rays: Rays, time: Tensor, background: Tensor, *, jitter: bool = False

@@ -181,16 +181,28 @@ class OccupancyFrames(StoredShape):
         number = torch.arange(len(ray), device=ray.device) - (count.cumsum(0) - count)[ray]
         offset = torch.rand_like(entry) if jitter else torch.full_like(entry, 0.5)
         distance = entry[ray] + (number + offset[ray]) * step
-        _, x, y, z = self.mask.shape
-        nearest = box.to_grid(box.nearest(rays.at(ray, distance)), (x, y, z)).round().long()
-        cell = (nearest[:, 0] * y + nearest[:, 1]) * z + nearest[:, 2]
-        cells = self.mask[0].numel()
-        met = torch.zeros_like(ray, dtype=torch.bool)
-        for frame in frames:
-            met |= self.mask.view(-1)[frame[ray] * cells + cell]
-        occupied = self.learned.occupied(cell)
+        pair = (frames[0][ray], frames[1][ray])
+        masked, occupied = self._may_be(rays.at(ray, distance), pair, box)
         if occupied is not None:
             # The last sample of a ray stays: it may stand for all that is behind it.
-            met &= occupied | (number == count[ray] - 1)
-        index = met.nonzero()[:, 0]
+            masked &= occupied | (number == count[ray] - 1)
+        index = masked.nonzero()[:, 0]
         return RaySamples.at(rays, ray[index], distance[index], step)
+
+    def may_be_at(self, points: Tensor, frames: tuple[int, int], box: Box) -> Tensor:
+        """Whether something may be at ``points`` (S, 3) at one of two frames: (S,) bool."""
+        first = torch.zeros_like(points[:, 0], dtype=torch.int64)
+        masked, occupied = self._may_be(points, (first + frames[0], first + frames[1]), box)
+        return masked if occupied is None else masked & occupied
+
+    def _may_be(
+        self, points: Tensor, frames: tuple[Tensor, Tensor], box: Box
+    ) -> tuple[Tensor, Tensor | None]:
+        """Whether the masks of frames (S,), and what is learned, leave ``points`` (S, 3) in."""
+        _, x, y, z = self.mask.shape
+        nearest = box.to_grid(box.nearest(points), (x, y, z)).round().long()
+        cell = (nearest[:, 0] * y + nearest[:, 1]) * z + nearest[:, 2]
+        masks = self.mask.view(-1)
+        cells = self.mask[0].numel()
+        masked = masks[frames[0] * cells + cell] | masks[frames[1] * cells + cell]
+        return masked, self.learned.occupied(cell)

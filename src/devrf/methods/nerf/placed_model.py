@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
@@ -20,11 +21,14 @@ from devrf.methods.nerf.occupancy import OccupancyFrames
 from devrf.methods.nerf.placement import Placement
 from devrf.methods.nerf.samples import RaySamples
 from devrf.rendering.output import RenderedImage, RenderOutput
+from devrf.rendering.view import SurfaceField
 from devrf.scenes.scene import Scene
 
 # Rays of a view that are rendered at once, on a CPU and on a GPU.
 ON_CPU = 2048
 ON_GPU = 2**14
+# Points along an edge of a cube of the box's size, of which a surface is taken.
+SURFACE_SIDE = 128
 
 
 class PlacedModel(RayTrainable):
@@ -157,6 +161,52 @@ class NeuralField(PlacedModel):
     def at(self, time: float, *, half: bool = False) -> RayView:
         """The scene at ``time``."""
         return RayView(self, self.render_rays, time, half=half)
+
+
+class SurfacedField(NeuralField):
+    """Networks whose surface can be taken at any time."""
+
+    @abstractmethod
+    def point_colors(self, points: Tensor, viewdirs: Tensor, time: Tensor) -> Tensor:
+        """RGB (S, 3) at points (S, 3) in normalised space, seen along unit directions (S, 3)."""
+
+    def surface_at(self, time: float) -> SurfaceField:
+        """The scene at ``time``."""
+        return SurfaceAtTime(self, time)
+
+
+class SurfaceAtTime:
+    """A model's field at one time.
+
+    Attributes:
+        box: the fields' box.
+        shape: points of a grid over it, as fine as most such fields.
+    """
+
+    def __init__(self, model: SurfacedField, time: float) -> None:
+        self.box = model.box
+        self.shape = model.box.grid_shape(SURFACE_SIDE**3)
+        self._model = model
+        self._time = time
+
+    @torch.no_grad()
+    def optical_depth(self, points: Tensor) -> Tensor:
+        """τ (M,) of a way of one voxel at ``points`` (M, 3) of the fields' space."""
+        model = self._model
+        moment = model.clock.at(self._time)
+        frames = (moment.before, moment.after)
+        index = model.occupancy.may_be_at(points, frames, self.box).nonzero()[:, 0]
+        place = model.placement.normalised(points[index])
+        voxel = self.box.voxel_size(math.prod(self.shape)) / model.placement.half_edge
+        depth = model.optical_depth(place, torch.full_like(place[:, 0], self._time), voxel)
+        return torch.zeros_like(points[:, 0]).index_copy(0, index, depth)
+
+    @torch.no_grad()
+    def color(self, points: Tensor, viewdirs: Tensor) -> Tensor:
+        """RGB (M, 3) at ``points`` (M, 3) of the fields' space, along directions (M, 3)."""
+        place = self._model.placement.normalised(points)
+        time = torch.full_like(place[:, 0], self._time)
+        return self._model.point_colors(place, viewdirs, time)
 
 
 class RayView:

@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
 
+import torch
 from torch import Tensor, nn
 
 from devrf.data.batch import RayBatch
@@ -14,7 +15,7 @@ from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import Space
 from devrf.methods.nerf.networks import SinusoidalEncoding
-from devrf.methods.nerf.placed_model import NeuralField
+from devrf.methods.nerf.placed_model import SurfacedField
 from devrf.methods.nerf.samples import accumulated
 from devrf.methods.tineuvox.networks import (
     DisplacementNetwork,
@@ -30,7 +31,7 @@ from devrf.rendering.output import RenderOutput
 from devrf.scenes.scene import Scene
 
 
-class TiNeuVox(NeuralField):
+class TiNeuVox(SurfacedField):
     """(σ, c) = R(V(x + Δ(x, t)), x, t, d): voxels V at rest, and networks that know the time.
 
     See docs/methods/tineuvox.md. Networks live in normalised space.
@@ -118,6 +119,11 @@ class TiNeuVox(NeuralField):
         """τ (S,) of ways of ``length``."""
         way = length * self.placement.half_edge / self.base_voxel
         return self.density(self.hidden(points, self.time(time))) * way
+
+    def point_colors(self, points: Tensor, viewdirs: Tensor, time: Tensor) -> Tensor:
+        """RGB (S, 3) of points in normalised space."""
+        each = torch.arange(len(points), device=points.device)
+        return self.radiance.rgb(self.hidden(points, self.time(time)), viewdirs, each)
 
     def render_rays(
         self, rays: Rays, time: Tensor, background: Tensor, *, jitter: bool = False
