@@ -137,7 +137,8 @@ class OccupancyFrames(StoredShape):
 
         Args:
             scene: seen from all around, the training images' alpha masks carve them, grown by a
-                cell; static images show frame 0. Else the field itself has to tell what is empty.
+                cell; static images show frame 0, and what may be there stays in all frames. Else
+                the field itself has to tell what is empty.
             box: in the fields' space.
             side: cells along an edge of a cube of the box's size.
             hull: whether to carve at all.
@@ -150,7 +151,9 @@ class OccupancyFrames(StoredShape):
             assert views.frames is not None
             for frame in torch.unique(views.frames).tolist() if views.has_alpha else ():
                 shown = views[(views.frames == frame).nonzero()[:, 0]]
-                masks.mask[frame] &= dilate(visual_hull(shown, box, shape), 1).cpu()
+                hull = visual_hull(shown, box, shape, whole_in_view=frame > 0)
+                grown = dilate(hull, 1).cpu()
+                masks.mask[frame] &= grown if frame == 0 else grown | masks.mask[0]
         if empty_from is not None and not masks.has_hull:
             masks.learned = LearnedOccupancy(shape)
         return masks
