@@ -72,9 +72,9 @@ def test_a_plane_is_looked_up_along_its_own_two_axes() -> None:
 def test_scales_are_joined_and_time_has_the_same_points_in_each() -> None:
     planes = SixPlanes(4, [6, 12], 3)
     assert planes.size == 8 and planes(torch.rand(5, 4)).shape == (5, 8)
-    assert [tuple(p.shape[:2]) for p in planes.of_time()] == [(6, 3)] * 3 + [(12, 3)] * 3
-    assert all((plane == 1).all() for plane in planes.of_time())
-    still = torch.cat([plane.flatten() for plane in planes.of_space()])
+    assert [tuple(p.shape[:2]) for p in planes.along(time=True)] == [(6, 3)] * 3 + [(12, 3)] * 3
+    assert all((plane == 1).all() for plane in planes.along(time=True))
+    still = torch.cat([plane.flatten() for plane in planes.along(time=False)])
     assert 0.1 <= still.min() and still.max() <= 0.5
 
 
@@ -176,7 +176,7 @@ def test_proposals_learn_ever_less_often_and_sharpen() -> None:
 def test_time_has_half_as_many_points_as_frames() -> None:
     model = KPlanes(TINY)
     model.set_times(tuple(k / 49 for k in range(50)))
-    assert {plane.shape[1] for plane in model.planes.of_time()} == {25}
+    assert {plane.shape[1] for plane in model.planes.along(time=True)} == {25}
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -223,7 +223,7 @@ def test_two_stages_leave_what_space_says_as_it_was(
     before = {n: p.clone() for n, p in first.scene_model.named_parameters()}
     second = fit(ray_stage(KPlanes(TINY), step, loss=LOSS, rest=first.result()))
     model = second.scene_model
-    moving = {id(plane) for plane in model.planes.of_time()}  # type: ignore[union-attr]
+    moving = {id(plane) for plane in model.planes.along(time=True)}  # type: ignore[union-attr]
     for name, parameter in model.named_parameters():
         assert torch.equal(parameter, before[name]) == (id(parameter) not in moving), name
 

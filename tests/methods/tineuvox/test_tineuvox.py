@@ -44,8 +44,11 @@ def test_a_spacing_is_a_grid_of_every_so_many_points_over_the_same_box() -> None
     torch.testing.assert_close(grid(points, UNIT), expected)
 
 
-def test_a_spacing_teaches_the_points_that_it_has() -> None:
+@pytest.mark.parametrize("kept", [False, True])
+def test_a_spacing_teaches_the_points_that_it_has(kept: bool) -> None:
     grid = MultiDistanceGrid(1, (1, 4))
+    if kept:  # as the optimiser keeps it
+        grid.values.grad = torch.zeros_like(grid.values)
     grid(torch.full((1, 3), 0.5), UNIT).sum().backward()
     gradient = grid.values.grad
     assert gradient is not None

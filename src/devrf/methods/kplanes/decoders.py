@@ -53,11 +53,9 @@ class HybridDecoder(nn.Module):
     """Features → density and 15 numbers; these and the direction → colour."""
 
     def __init__(self, size: int, settings: KPlanesSettings) -> None:
-        """For features of length ``size``."""
         super().__init__()
-        width = settings.width
-        self.geometry = network(size, width, 1, FURTHER + 1)
-        self.color = network(FURTHER + len(FACTORS), width, 2, 3)
+        self.geometry = network(size, settings.width, 1, FURTHER + 1)
+        self.color = network(FURTHER + len(FACTORS), settings.width, 2, 3)
 
     def density(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """σ (S,), and what :meth:`rgb` takes, of features (S, size)."""
@@ -74,7 +72,6 @@ class ExplicitDecoder(nn.Module):
     """Density is linear in the features; so are colours, in a basis for each direction."""
 
     def __init__(self, size: int, settings: KPlanesSettings) -> None:
-        """For features of length ``size``."""
         super().__init__()
         self.geometry = nn.Linear(size, 1, bias=False)
         self.basis = network(3, settings.basis_width, settings.basis_depth, 3 * size)

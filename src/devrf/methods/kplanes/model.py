@@ -171,7 +171,7 @@ class KPlanes(SurfacedField):
     def parts(self) -> dict[str, Iterable[nn.Parameter]]:
         """What space alone says, with the decoder; what time says; the proposals."""
         return {
-            "canonical": [*self.planes.of_space(), *self.decoder.parameters()],
-            "motion": self.planes.of_time(),
+            "canonical": [*self.planes.along(time=False), *self.decoder.parameters()],
+            "motion": self.planes.along(time=True),
             "proposals": self.proposals.parameters(),
         }

@@ -67,13 +67,9 @@ class SixPlanes(nn.Module):
             joined += pairs if self._pairing == "hexplane" else [pairs[0] * pairs[1] * pairs[2]]
         return torch.cat(joined, dim=1)
 
-    def of_time(self) -> list[nn.Parameter]:
-        """The planes whose second axis is time."""
-        return [p for n, p in enumerate(self.planes) if TIME in AXES[n % len(AXES)]]
-
-    def of_space(self) -> list[nn.Parameter]:
-        """The planes without time."""
-        return [p for n, p in enumerate(self.planes) if TIME not in AXES[n % len(AXES)]]
+    def along(self, *, time: bool) -> list[nn.Parameter]:
+        """The planes whose second axis is ``time``, or is not."""
+        return [p for n, p in enumerate(self.planes) if (TIME in AXES[n % len(AXES)]) == time]
 
     def total_variation(self) -> Tensor:
         """Σ over planes of 2 · (mean squared differences along both axes)."""
@@ -81,11 +77,11 @@ class SixPlanes(nn.Module):
 
     def roughness(self) -> Tensor:
         """Σ over planes with time of the mean squared second difference along it."""
-        return sum_of([_square(plane.diff(n=2, dim=1)) for plane in self.of_time()])
+        return sum_of([_square(plane.diff(n=2, dim=1)) for plane in self.along(time=True)])
 
     def change(self) -> Tensor:
         """Σ over planes with time of the mean |1 − P|: 0 of what is at rest."""
-        return sum_of([(1 - plane).abs().mean() for plane in self.of_time()])
+        return sum_of([(1 - plane).abs().mean() for plane in self.along(time=True)])
 
 
 def sum_of(values: Sequence[Tensor]) -> Tensor:

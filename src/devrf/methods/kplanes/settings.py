@@ -23,14 +23,12 @@ class KPlanesSettings(OccupancySettings):
         pairing: how features of the six planes meet: ``product``, or as in ``hexplane``.
         decoder: ``hybrid`` (small networks) or ``explicit`` (linear, in a basis for a direction).
         width: units of the hybrid decoder's layers.
-        basis_width: units of the layers that give the basis (explicit).
-        basis_depth: how many of these (explicit).
+        basis_width, basis_depth: units and number of the layers that give the basis (explicit).
         sampling: ``occupancy`` (even steps where something may be) or ``proposals`` (as published).
         steps: samples along the box's diagonal (occupancy).
         samples: of a ray in the end (proposals).
-        proposal_samples: of a ray in the rounds before (proposals).
-        proposal_resolutions: points along x, y and z of each round's planes.
-        proposal_channels: numbers of a point of these.
+        proposal_samples, proposal_resolutions: of a ray and of the planes, of each round before.
+        proposal_channels: numbers of a point of these planes.
     """
 
     hull: bool = False

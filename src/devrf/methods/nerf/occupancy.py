@@ -151,8 +151,8 @@ class OccupancyFrames(StoredShape):
             assert views.frames is not None
             for frame in torch.unique(views.frames).tolist() if views.has_alpha else ():
                 shown = views[(views.frames == frame).nonzero()[:, 0]]
-                hull = visual_hull(shown, box, shape, whole_in_view=frame > 0)
-                grown = dilate(hull, 1).cpu()
+                held = visual_hull(shown, box, shape, whole_in_view=frame > 0)
+                grown = dilate(held, 1).cpu()
                 masks.mask[frame] &= grown if frame == 0 else grown | masks.mask[0]
         if empty_from is not None and not masks.has_hull:
             masks.learned = LearnedOccupancy(shape)

@@ -17,12 +17,7 @@ from devrf.geometry.space import Space
 from devrf.methods.nerf.networks import SinusoidalEncoding
 from devrf.methods.nerf.placed_model import SurfacedField
 from devrf.methods.nerf.samples import accumulated
-from devrf.methods.tineuvox.networks import (
-    DisplacementNetwork,
-    MultiDistanceGrid,
-    RadianceNetwork,
-    TimeNetwork,
-)
+from devrf.methods.tineuvox.networks import MultiDistanceGrid, RadianceNetwork
 from devrf.methods.tineuvox.settings import TiNeuVoxSettings
 from devrf.ops.compositing import composite
 from devrf.ops.photometric import background_entropy, per_sample_color
@@ -32,12 +27,15 @@ from devrf.scenes.scene import Scene
 
 
 class TiNeuVox(SurfacedField):
-    """(σ, c) = R(V(x + Δ(x, t)), x, t, d): voxels V at rest, and networks that know the time.
+    """(σ, c) = R(V(x + D(x, ω)), x, ω, d), ω = T(t): voxels at rest, networks that know the time.
 
     See docs/methods/tineuvox.md. Networks live in normalised space.
 
     Attributes:
         grid: V, over :attr:`grid_box`.
+        time: T, from times (R, 1) to codes ω (R, 5C).
+        deformation: D, from encoded positions and codes (S, ·) to displacements (S, 3).
+        radiance: R.
         grid_box: the fields' box in normalised space.
     """
 
@@ -52,9 +50,22 @@ class TiNeuVox(SurfacedField):
         super().__init__(s)
         self.encode = SinusoidalEncoding(3, s.bands)
         self.grid = MultiDistanceGrid(s.channels, s.strides)
-        self.time = TimeNetwork(s)
-        self.deformation = DisplacementNetwork(self.encode.size, self.time.size, s.width)
-        self.radiance = RadianceNetwork(s, self.encode.size, self.time.size)
+        encode_time = SinusoidalEncoding(1, s.time_bands)
+        code = 5 * s.channels
+        self.time = nn.Sequential(
+            encode_time,
+            nn.Linear(encode_time.size, s.width),
+            nn.ReLU(),
+            nn.Linear(s.width, code),
+        )
+        self.deformation = nn.Sequential(
+            nn.Linear(self.encode.size + code, s.width),
+            nn.ReLU(),
+            nn.Linear(s.width, s.width),
+            nn.ReLU(),
+            nn.Linear(s.width, 3),
+        )
+        self.radiance = RadianceNetwork(s, self.encode.size, code)
         self.density_shift = math.log(1 / (1 - s.alpha_init) - 1)
         self.place()
 
@@ -108,7 +119,8 @@ class TiNeuVox(SurfacedField):
             code: (S, size) of their times.
         """
         position = self.encode(points)
-        features = self.grid(points + self.deformation(position, code), self.grid_box)
+        displacement = self.deformation(torch.cat([position, code], dim=1))
+        features = self.grid(points + displacement, self.grid_box)
         return self.radiance.hidden(features, position, code)
 
     def density(self, hidden: Tensor) -> Tensor:
@@ -118,12 +130,12 @@ class TiNeuVox(SurfacedField):
     def optical_depth(self, points: Tensor, time: Tensor, length: float) -> Tensor:
         """τ (S,) of ways of ``length``."""
         way = length * self.placement.half_edge / self.base_voxel
-        return self.density(self.hidden(points, self.time(time))) * way
+        return self.density(self.hidden(points, self.time(time[:, None]))) * way
 
     def point_colors(self, points: Tensor, viewdirs: Tensor, time: Tensor) -> Tensor:
         """RGB (S, 3) of points in normalised space."""
         each = torch.arange(len(points), device=points.device)
-        return self.radiance.rgb(self.hidden(points, self.time(time)), viewdirs, each)
+        return self.radiance.rgb(self.hidden(points, self.time(time[:, None])), viewdirs, each)
 
     def render_rays(
         self, rays: Rays, time: Tensor, background: Tensor, *, jitter: bool = False
@@ -136,7 +148,7 @@ class TiNeuVox(SurfacedField):
         samples = self.march(rays, time, jitter=jitter)
         if not self.space.is_linear:
             samples = samples.unbounded()
-        code = self.time(time).index_select(0, samples.ray)
+        code = self.time(time[:, None]).index_select(0, samples.ray)
         hidden = self.hidden(self.placement.normalised(samples.points), code)
         depth = self.density(hidden).float() * samples.scaled(self.base_voxel).length
         weight, transmittance = composite(depth, samples.ray, samples.rays)

@@ -1,11 +1,13 @@
-"""The parts of TiNeuVox: a grid that is looked up at several distances, and small networks."""
+"""The grid of TiNeuVox, looked up at several distances, and the network behind it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from devrf.checkpoints.stored_grids import StoredShape
 from devrf.geometry.box import Box
@@ -13,6 +15,25 @@ from devrf.kernels.look_up import look_up
 from devrf.methods.nerf.networks import SinusoidalEncoding
 from devrf.methods.tineuvox.settings import TiNeuVoxSettings
 from devrf.ops.trilinear import Shape, resample, shape_of
+
+
+class _EveryNth(torch.autograd.Function):
+    """Every n-th point of a grid; what comes back is added to the gradient that is kept, if any."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, n: int, kept: Tensor | None) -> Tensor:
+        ctx.n = n
+        ctx.kept = kept
+        ctx.shape = values.shape
+        return values[::n, ::n, ::n].contiguous()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, None, None]:
+        n = ctx.n
+        whole = gradient.new_zeros(ctx.shape) if ctx.kept is None else ctx.kept
+        whole[::n, ::n, ::n] += gradient
+        return (whole if ctx.kept is None else None), None, None
 
 
 class MultiDistanceGrid(StoredShape):
@@ -43,8 +64,14 @@ class MultiDistanceGrid(StoredShape):
 
         The grid is over ``box``; outside they are those of its border.
         """
-        grids = [self.values if n == 1 else self.values[::n, ::n, ::n] for n in self.strides]
-        return torch.cat([look_up(grid.contiguous(), points, box) for grid in grids], dim=1)
+        return torch.cat([look_up(self._spaced(n), points, box) for n in self.strides], dim=1)
+
+    def _spaced(self, n: int) -> Tensor:
+        """Every ``n``-th point along each axis."""
+        if n == 1:
+            return self.values
+        spaced: Tensor = _EveryNth.apply(self.values, n, self.values.grad)  # type: ignore[no-untyped-call]
+        return spaced
 
     def fitting(self, box: Box, side: float) -> Shape:
         """The least shape of about ``side``³ points over ``box`` that all strides fit into."""
@@ -58,42 +85,6 @@ class MultiDistanceGrid(StoredShape):
         """Resample to another shape over the same box, trilinearly; a new parameter results."""
         values = resample(self.values, shape)
         self.values = nn.Parameter(values, requires_grad=self.values.requires_grad)
-
-
-class TimeNetwork(nn.Module):
-    """γ(t) → the code of a time, of five numbers for each channel of the grid."""
-
-    def __init__(self, settings: TiNeuVoxSettings) -> None:
-        super().__init__()
-        self.encode = SinusoidalEncoding(1, settings.time_bands)
-        self.size = 5 * settings.channels
-        self.first = nn.Linear(self.encode.size, settings.width)
-        self.second = nn.Linear(settings.width, self.size)
-
-    def forward(self, time: Tensor) -> Tensor:
-        """Codes (R, size) of times (R,) in [0, 1]."""
-        code: Tensor = self.second(torch.relu(self.first(self.encode(time[:, None]))))
-        return code
-
-
-class DisplacementNetwork(nn.Module):
-    """(γ(x), code) → Δ(x, t): three linear layers."""
-
-    def __init__(self, position: int, code: int, width: int) -> None:
-        """For encoded positions and codes of these lengths, with layers of ``width``."""
-        super().__init__()
-        self.layers = nn.Sequential(
-            nn.Linear(position + code, width),
-            nn.ReLU(),
-            nn.Linear(width, width),
-            nn.ReLU(),
-            nn.Linear(width, 3),
-        )
-
-    def forward(self, position: Tensor, code: Tensor) -> Tensor:
-        """Displacements (S, 3) in normalised space, of encoded positions and codes, a row each."""
-        displacement: Tensor = self.layers(torch.cat([position, code], dim=1))
-        return displacement
 
 
 class RadianceNetwork(nn.Module):
