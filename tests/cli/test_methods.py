@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 
 import pytest
+import trimesh
 
 from devrf import methods
 
@@ -18,6 +19,8 @@ SMALL = {
     "nerfies": (*NARROW, f"{SETTINGS}.warp_width=8", "ray_stage.loss.elastic=1e-3"),
     "hypernerf": (*NARROW, f"{SETTINGS}.warp_width=8", "ray_stage.loss.elastic=1e-3"),
     "nsff": (*NARROW, f"{SETTINGS}.depth=2", f"{SETTINGS}.samples=8"),
+    "tineuvox": (f"{SETTINGS}.width=8", f"{SETTINGS}.side=8", f"{SETTINGS}.occupancy_side=8"),
+    "kplanes": (*NARROW, f"{SETTINGS}.resolution=4", f"{SETTINGS}.channels=2"),
     "neural_volumes": (
         f"{SETTINGS}.code=4",
         f"{SETTINGS}.encoder_views=2",
@@ -43,6 +46,9 @@ SHORT = ("ray_stage.schedule.iterations=4", "ray_stage.schedule.rays=64", *FILM)
         ("hypernerf", "two_stage", "tiny_facing"),
         ("nsff", "dynamic", "tiny_facing"),
         ("neural_volumes", "dynamic", "tiny_data"),
+        ("tineuvox", "two_stage", "tiny_data"),
+        ("kplanes", "joint", "tiny_data"),
+        ("tineuvox", "dynamic", "tiny_facing"),
     ],
 )
 def test_a_protocol_trains_scores_and_films(devrf, tmp_path, request, method, protocol, scene):
@@ -59,14 +65,20 @@ def test_a_protocol_trains_scores_and_films(devrf, tmp_path, request, method, pr
     assert {path.stem for path in (run / "videos").iterdir()} == {"held_out", ring}
     names = {path.stem for path in (run / "checkpoints").glob("*.ckpt")}
     assert names == ({"canonical", "deformation"} if protocol == "two_stage" else {protocol})
+    export = ("stage=export", "hydra.run.dir=run", "trainer=cpu", "export.format=ply")
+    if method in ("tineuvox", "kplanes") and scene == "tiny_data":
+        done = devrf(*export, "export.threshold=1e-4", "export.side=12", "export.times=[0,1]")
+        assert (done.status, done.err) == (0, "")
+        meshes = [trimesh.load(path) for path in sorted((run / "export/ply").glob("*.ply"))]
+        assert len(meshes) == 2 and all(len(mesh.faces) for mesh in meshes)
     if method != "dnerf":
         return
     # Whatever was learned is not learned again.
     assert "learned already" in devrf(*asked).out
     refused = devrf("stage=export", "hydra.run.dir=run", "trainer=cpu")
-    assert refused.status == 2 and f"method={method} is exported as coloured points" in refused.err
-    points = ("export.format=ply", "export.points=20")
-    done = devrf("stage=export", "hydra.run.dir=run", "trainer=cpu", *points)
+    assert refused.status == 2
+    assert "has a mesh of its own at each time, and gltf moves one" in refused.err
+    done = devrf(*export, "export.content=points", "export.points=20")
     assert (done.status, done.err) == (0, "")
     assert len(list((run / "export" / "points").glob("frame_*.ply"))) == 3
 

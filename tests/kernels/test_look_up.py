@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 import torch
 from torch import Tensor
@@ -12,6 +14,7 @@ from devrf.ops import trilinear
 
 BOX = Box((-1.1, 0.3, -0.7), (0.9, 2.2, 1.3))
 SHAPE = (7, 4, 5)
+PLANE = (7, 4, 1)
 CHANNELS = [1, 3, 9, 12]
 
 
@@ -27,11 +30,12 @@ def points_around(count: int, rng: torch.Generator) -> Tensor:
     return chosen
 
 
+@pytest.mark.parametrize("shape", [SHAPE, PLANE])
 @pytest.mark.parametrize("channels", CHANNELS)
 def test_values_and_gradients_are_those_of_the_definition(
-    channels: int, rng: torch.Generator
+    channels: int, shape: tuple[int, int, int], rng: torch.Generator
 ) -> None:
-    grid = torch.randn(*SHAPE, channels, generator=rng).requires_grad_()
+    grid = torch.randn(*shape, channels, generator=rng).requires_grad_()
     points = points_around(1000, rng).requires_grad_()
     factor = torch.randn(1000, channels, generator=rng)
     exact_grid = grid.detach().double().requires_grad_()
@@ -46,6 +50,19 @@ def test_values_and_gradients_are_those_of_the_definition(
     torch.testing.assert_close(points.grad.double(), exact_points.grad, atol=1e-3, rtol=1e-4)
     outside = ~BOX.contains(points)
     assert outside.any() and points.grad[outside].eq(0).any(dim=1).all()
+
+
+@pytest.mark.parametrize("look", [look_up, trilinear.look_up])
+def test_a_plane_is_the_same_for_all_z(look: Callable[..., Tensor]) -> None:
+    plane = torch.tensor([[0.0, 2.0], [4.0, 6.0]])[:, :, None, None].requires_grad_()
+    box = Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    points = torch.tensor([[0.25, 0.5, 0.1], [0.25, 0.5, 0.9], [2.0, 0.5, 7.0]])
+    values = look(plane, points.requires_grad_(), box)
+    torch.testing.assert_close(values[:, 0], torch.tensor([2.0, 2.0, 5.0]))
+    values[:2].sum().backward()
+    expected = torch.tensor([[0.75, 0.75], [0.25, 0.25]])  # 2 · (1 − x) (1 − y) and so on
+    torch.testing.assert_close(plane.grad[:, :, 0, 0], expected)
+    torch.testing.assert_close(points.grad[0], torch.tensor([4.0, 2.0, 0.0]))
 
 
 @pytest.mark.parametrize("channels", [1, 3])

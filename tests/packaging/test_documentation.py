@@ -52,7 +52,7 @@ PACKAGE = REPOSITORY / "src" / "devrf"
 CHOICES = [f"data={name}" for name in ("procedural", "procedural_forward", "inward", "forward")]
 CHOICES += ["data=nerfstudio", "data=nerfies", "data=neural_3d_video"]
 CHOICES += ["logger=wandb", "method=nerfies", "method=nsff", "method=hypernerf"]
-CHOICES += ["method=dnerf", "method=neural_volumes"]
+CHOICES += ["method=dnerf", "method=neural_volumes", "method=tineuvox", "method=kplanes"]
 
 
 def shell(file: Path) -> str:

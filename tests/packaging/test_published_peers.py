@@ -67,6 +67,34 @@ PUBLISHED = {
             "blend_entropy": 1e-3,
         },
     },
+    "tineuvox": {
+        "settings": {
+            "side": 160, "channels": 6, "width": 256, "alpha_init": 1e-3, "strides": [1, 2, 4],
+            "upsample_at": [0.1, 0.2, 0.3], "step": 0.5, "weight_threshold": 1e-4, "tv": 0.0,
+            "bands": 10, "direction_bands": 4, "time_bands": 8, "feature_bands": 2,
+            "grid_rate": 0.08 / 8e-4, "motion_rate": pytest.approx(6e-4 / 8e-4),
+        },
+        "schedule": {
+            "iterations": 20_000, "rays": 4096, "learning_rate": 8e-4,
+            "final_learning_rate": 8e-5, "betas": [0.9, 0.99],
+        },
+        "loss": {"color": 1.0, "background_entropy": 0.001, "sample_color": 0.01},
+    },
+    "kplanes": {
+        "settings": {
+            "resolution": 64, "scales": [1, 2, 4, 8], "channels": 32, "width": 64,
+            "basis_width": 128, "basis_depth": 4, "samples": 48, "proposal_samples": [256, 128],
+            "proposal_resolutions": [64, 128], "proposal_channels": 8,
+        },
+        "schedule": {
+            "iterations": 30_001, "rays": 4096, "learning_rate": 0.01, "final_learning_rate": 0,
+            "decay": "cosine", "warmup": pytest.approx(512 / 30_001, rel=5e-3), "eps": 1e-15,
+        },
+        "loss": {
+            "color": 1, "tv": 1e-4, "smooth": 0.01, "smooth_proposals": 0.001, "change": 1e-4,
+            "histogram": 1, "distortion": 0,
+        },
+    },
     "neural_volumes": {
         # Images of 512 x 334 pixels in 512 x 384; seven convolutions.
         "settings": {
@@ -104,6 +132,50 @@ def test_the_published_numbers_are_the_config_and_the_defaults_of_the_code(compo
         given = getattr(built, name)
         assert (tuple(given) if isinstance(given, list) else given) == default, name
     assert set(config.loss) == set(get_class(config.model._target_).losses)
+
+
+# What a published form has that the method's file has not.
+FORMS = {
+    "tineuvox_light": {
+        "settings": {"side": 100, "channels": 4, "width": 64, "alpha_init": 1e-2},
+    },
+    "tineuvox_phone": {
+        "settings": {
+            "upsample_at": [0.1, 0.2, 0.3, 0.4], "grid_rate": 0.1 / 1e-3,
+            "motion_rate": pytest.approx(7e-4 / 1e-3), "tv": pytest.approx(1e-5 / 4096, rel=1e-2),
+        },
+        "schedule": {"learning_rate": 1e-3, "final_learning_rate": 1e-4},
+    },
+    "kplanes_paper": {"settings": {"sampling": "proposals", "decoder": "hybrid"}},
+    "kplanes_explicit": {"settings": {"sampling": "proposals", "decoder": "explicit"}},
+    "kplanes_video": {
+        "settings": {
+            "sampling": "proposals", "decoder": "hybrid", "time_resolution": 150, "channels": 16,
+            "proposal_resolutions": [128, 256],
+        },
+        "schedule": {"iterations": 90_001, "warmup": pytest.approx(512 / 90_001, rel=5e-3)},
+        "loss": {"tv": 2e-4, "smooth": 1e-3, "smooth_proposals": 1e-5, "distortion": 1e-3},
+    },
+    "kplanes_video_explicit": {
+        "settings": {
+            "sampling": "proposals", "decoder": "explicit", "time_resolution": 150,
+            "channels": 32, "basis_depth": 1, "proposal_resolutions": [128, 256],
+        },
+        "schedule": {"iterations": 120_001, "warmup": pytest.approx(512 / 120_001, rel=5e-3)},
+        "loss": {"tv": 1e-4, "smooth": 1e-3, "smooth_proposals": 1e-5, "distortion": 1e-3},
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("profile", FORMS)
+def test_a_profile_has_the_published_numbers_of_its_form(composed, profile):
+    method = profile.split("_")[0]
+    config = composed(f"method={method}", f"profile={profile}").ray_stage
+    stage = OmegaConf.to_container(config)
+    parts = {**stage, "settings": stage["model"]["settings"]}
+    for part, numbers in FORMS[profile].items():
+        assert {name: parts[part][name] for name in numbers} == numbers, part
+    instantiate(config.model.settings, _convert_="all")
 
 
 @pytest.mark.parametrize("method", ["nerfies", "hypernerf"])

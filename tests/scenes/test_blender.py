@@ -118,6 +118,18 @@ def test_single_folder_learns_the_static_scene_from_early_images(single_folder, 
     assert len(whole.static.train) == 8 and len(whole.static.test) == 3
 
 
+@pytest.mark.parametrize(("name", "images"), [("lego", 2), ("other", 3)])
+def test_lego_of_dnerf_is_scored_on_its_val_split(single_folder, caplog, name, images):
+    root = single_folder.rename(single_folder.with_name(name))
+    val = with_val(root)
+    content = json.loads(val.read_text())
+    val.write_text(json.dumps({**content, "frames": content["frames"][:2]}))
+    with caplog.at_level("INFO"):
+        scene = BlenderReader(root).read()
+    assert len(scene.dynamic.test) == images
+    assert ("test split shows another scene" in caplog.text) == (name == "lego")
+
+
 def shifted(content: dict[str, Any], meters: float) -> None:
     for frame in content["frames"]:
         frame["transform_matrix"][2][3] += meters

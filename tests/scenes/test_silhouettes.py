@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+import pytest
 import torch
 
+from devrf.geometry.box import Box
 from devrf.scenes.scene import Views
 from devrf.scenes.silhouettes import motion_box, visual_hull
 
@@ -81,3 +83,16 @@ def test_hull_holds_the_ball_and_little_more(ball_views, cube):
     assert hull[distance < BALL].all()
     # A cell is 0.06 wide; the cameras, all a little above, leave most below the ball.
     assert not hull[distance > BALL + 0.3].any()
+
+
+@pytest.mark.parametrize("cut", [False, True])
+def test_beyond_an_image_that_shows_all_of_it_there_may_be_nothing(ball_views, cut):
+    views = ball_views(CENTER[None], BALL, count=4)
+    if cut:
+        views.pixels[:, :, 0] = 255  # the silhouettes reach an edge of the images
+    wide = Box((-9.0, -9.0, -9.0), (9.0, 9.0, 9.0))
+    perhaps = visual_hull(views, wide, (19, 19, 19))
+    within = visual_hull(views, wide, (19, 19, 19), whole_in_view=True)
+    assert perhaps[0, 0, 0]  # no camera sees that corner
+    assert bool(within[0, 0, 0]) is cut
+    assert within[9, 9, 9] and not (within & ~perhaps).any()

@@ -71,6 +71,7 @@ def evaluate(run: RunContext) -> list[Path]:
         **{"choices": choices(), "overrides": as_typed(run.command), "seed": run.config.seed},
         **learning_record(metadata, run.stages_with_images),
         **data_record(scene),
+        "lpips_network": run.evaluation.lpips_network,
         "checkpoint": digest_of(run.checkpoint(metadata.stage)),
     }
     ran["wall_seconds"]["evaluate"] = run.step_seconds

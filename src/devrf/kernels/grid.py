@@ -16,6 +16,8 @@ Shape = tuple[int, int, int]
 class Grid:
     """A grid of x · y · z points, z first in memory, whose outer points lie on a box.
 
+    A plane has one point along z, and is the same for all z.
+
     Attributes:
         low: the box's corner with the smallest coordinates.
         high: the one with the largest.
@@ -58,7 +60,7 @@ def cell(grid: Grid, point: wp.vec3):
     z = wp.clamp(at[2], 0.0, float(grid.z - 1))
     i = wp.min(int(x), grid.x - 2)
     j = wp.min(int(y), grid.y - 2)
-    k = wp.min(int(z), grid.z - 2)
+    k = wp.max(wp.min(int(z), grid.z - 2), 0)
     return (i * grid.y + j) * grid.z + k, wp.vec3(x - float(i), y - float(j), z - float(k))
 
 
@@ -79,13 +81,15 @@ def interpolate(values: wp.array(dtype=Any), grid: Grid, row: int, f: wp.vec3):
     next_y = grid.z
     next_x = grid.y * grid.z
     total = values[row] * ((1.0 - f[0]) * (1.0 - f[1]) * (1.0 - f[2]))
-    total += values[row + 1] * ((1.0 - f[0]) * (1.0 - f[1]) * f[2])
     total += values[row + next_y] * ((1.0 - f[0]) * f[1] * (1.0 - f[2]))
-    total += values[row + next_y + 1] * ((1.0 - f[0]) * f[1] * f[2])
     total += values[row + next_x] * (f[0] * (1.0 - f[1]) * (1.0 - f[2]))
-    total += values[row + next_x + 1] * (f[0] * (1.0 - f[1]) * f[2])
     total += values[row + next_x + next_y] * (f[0] * f[1] * (1.0 - f[2]))
-    total += values[row + next_x + next_y + 1] * (f[0] * f[1] * f[2])
+    if grid.z > 1:
+        row += 1
+        total += values[row] * ((1.0 - f[0]) * (1.0 - f[1]) * f[2])
+        total += values[row + next_y] * ((1.0 - f[0]) * f[1] * f[2])
+        total += values[row + next_x] * (f[0] * (1.0 - f[1]) * f[2])
+        total += values[row + next_x + next_y] * (f[0] * f[1] * f[2])
     return total
 
 
@@ -106,16 +110,17 @@ def slope(values: wp.array(dtype=Any), factor: Any, grid: Grid, row: int, f: wp.
 
     Per unit of length, at the place ``f`` in the cell.
     """
+    next_z = wp.min(grid.z - 1, 1)
     next_y = grid.z
     next_x = grid.y * grid.z
     v000 = product(values[row], factor)
-    v001 = product(values[row + 1], factor)
+    v001 = product(values[row + next_z], factor)
     v010 = product(values[row + next_y], factor)
-    v011 = product(values[row + next_y + 1], factor)
+    v011 = product(values[row + next_y + next_z], factor)
     v100 = product(values[row + next_x], factor)
-    v101 = product(values[row + next_x + 1], factor)
+    v101 = product(values[row + next_x + next_z], factor)
     v110 = product(values[row + next_x + next_y], factor)
-    v111 = product(values[row + next_x + next_y + 1], factor)
+    v111 = product(values[row + next_x + next_y + next_z], factor)
     x_low = wp.lerp(v100 - v000, v101 - v001, f[2])
     x_high = wp.lerp(v110 - v010, v111 - v011, f[2])
     y_low = wp.lerp(v010 - v000, v011 - v001, f[2])

@@ -17,8 +17,9 @@ def look_up(grid: Tensor, points: Tensor, box: Box) -> Tensor:
     """Trilinear values of a grid over a box; outside they are those of the border.
 
     Args:
-        grid: (X, Y, Z, C), at least two points along each axis. A leaf that has a gradient is added
-            to there, without a temporary tensor of the grid's size.
+        grid: (X, Y, Z, C), at least two points along x and y; one along z is a plane, the same for
+            all z. A leaf that has a gradient is added to there, without a temporary tensor of the
+            grid's size.
         points: (M, 3) in the box's units.
         box: where the grid's outer points lie.
 
@@ -148,15 +149,17 @@ def add_kernel(channels: int) -> wp.Kernel:
         if plane % owners == owner:
             low = value * (1.0 - f[0])
             wp.atomic_add(result, row, low * ((1.0 - f[1]) * (1.0 - f[2])))
-            wp.atomic_add(result, row + 1, low * ((1.0 - f[1]) * f[2]))
             wp.atomic_add(result, row + next_y, low * (f[1] * (1.0 - f[2])))
-            wp.atomic_add(result, row + next_y + 1, low * (f[1] * f[2]))
+            if grid.z > 1:
+                wp.atomic_add(result, row + 1, low * ((1.0 - f[1]) * f[2]))
+                wp.atomic_add(result, row + next_y + 1, low * (f[1] * f[2]))
         if (plane + 1) % owners == owner:
             high = value * f[0]
             row += next_x
             wp.atomic_add(result, row, high * ((1.0 - f[1]) * (1.0 - f[2])))
-            wp.atomic_add(result, row + 1, high * ((1.0 - f[1]) * f[2]))
             wp.atomic_add(result, row + next_y, high * (f[1] * (1.0 - f[2])))
-            wp.atomic_add(result, row + next_y + 1, high * (f[1] * f[2]))
+            if grid.z > 1:
+                wp.atomic_add(result, row + 1, high * ((1.0 - f[1]) * f[2]))
+                wp.atomic_add(result, row + next_y + 1, high * (f[1] * f[2]))
 
     return add_to_grid

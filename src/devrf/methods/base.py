@@ -67,7 +67,15 @@ class Renderable(StoredClass, nn.Module, ABC):
     def surface(self) -> SurfaceField | None:
         """The scene at rest as a field of which a surface can be taken; None: there is none.
 
-        Of a method that has not this and :meth:`forward_map` exports take what :meth:`at` shows.
+        Of a method that has not this and :meth:`forward_map`, nor :meth:`surface_at`, exports take
+        what :meth:`at` shows.
+        """
+        return None
+
+    def surface_at(self, time: float) -> SurfaceField | None:
+        """The scene at ``time`` as a field of which a surface can be taken; None: there is none.
+
+        Of a method whose surface is not carried through time by :meth:`forward_map`.
         """
         return None
 
@@ -215,6 +223,21 @@ class RayTrainable(Renderable):
 
     def on_iteration(self, step: int, total: int) -> None:
         """Called before iteration ``step`` of ``total``: for encoding windows and curricula."""
+
+    @property
+    def resolution(self) -> tuple[int, ...]:
+        """Present shape of the grid that is learned; empty where there is none."""
+        return ()
+
+    def growths(self, total: int) -> Sequence[int]:
+        """Iterations, ascending, of a stage of ``total`` at which grids grow."""
+        return ()
+
+    def grow(self, count: int) -> None:
+        """Give grids the size that they have after ``count`` growths, unless they are as large.
+
+        A grid that grows becomes another parameter, whose optimiser begins without moments.
+        """
 
     @property
     def sample_outputs(self) -> int:

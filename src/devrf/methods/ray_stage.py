@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -35,7 +37,9 @@ class RaySchedule:
         rays_without_hull: of a batch where no masks tell which space is empty, so that a ray has
             more samples; None: as many.
         learning_rate: of Adam at the first iteration of a stage.
-        final_learning_rate: at its last; exponential in between.
+        final_learning_rate: at its last.
+        decay: of the rate in between: ``exponential``, or half a ``cosine``.
+        warmup: share of a stage during which the rate grows evenly from nothing, beside its decay.
         betas: of Adam.
         eps: of Adam.
         curriculum: share of a stage during which frames are added in the order of their times.
@@ -55,6 +59,8 @@ class RaySchedule:
     centre_crop: int = 0
     times_per_batch: int | None = None
     rays_without_hull: int | None = None
+    decay: Literal["exponential", "cosine"] = "exponential"
+    warmup: float = 0.0
     iterations_per_step: int = 10
 
     def __post_init__(self) -> None:
@@ -66,9 +72,12 @@ class RaySchedule:
             number = getattr(self, name)
             expect(number is None or number >= 1, f"{key}.{name}", "at least 1, or null", number)
         expect(self.centre_crop >= 0, f"{key}.centre_crop", "at least 0", self.centre_crop)
-        holds = 0 <= self.curriculum < 1
-        expected = "0 or more, below 1"
-        expect(holds, f"{key}.curriculum", expected, self.curriculum)
+        for name in ("curriculum", "warmup"):
+            share = getattr(self, name)
+            expect(0 <= share < 1, f"{key}.{name}", "0 or more, below 1", share)
+        positive = self.final_learning_rate > 0 or self.decay == "cosine"
+        expected = "more than 0, or decay=cosine"
+        expect(positive, f"{key}.final_learning_rate", expected, self.final_learning_rate)
 
 
 class RayStage(Stage):
@@ -116,6 +125,7 @@ class RayStage(Stage):
         self.weights = counted_weights(loss, self.scene_model.losses, "ray_stage.loss")
         self.pools: list[FramePool] = []
         self._centres: list[FramePool] = []
+        self._rays = schedule.rays
 
     @property
     def total_iterations(self) -> int:
@@ -124,18 +134,29 @@ class RayStage(Stage):
 
     @property
     def resolution(self) -> tuple[int, ...]:
-        """None: there is no grid that grows."""
-        return ()
+        """Present shape of the method's grid, if it has one."""
+        return self.scene_model.resolution
 
     def phase_at(self, iteration: int) -> Phase:
-        """The one phase there is."""
-        return Phase(kind="rays", start=0, stop=self.total_iterations)
+        """A phase lasts until the method's grids grow; all else stays as it is."""
+        last = self.total_iterations
+        edges = sorted({0, last, *(n for n in self.scene_model.growths(last) if 0 < n < last)})
+        place = min(bisect_right(edges, iteration), len(edges) - 1)
+        return Phase(kind="rays", start=edges[place - 1], stop=edges[place])
 
     def learning_rate_factor(self, iteration: int) -> float:
-        """(final / initial)^(n / (N − 1)) at iteration n of N."""
+        """At iteration n of N, with ρ = final / initial and x = n / (N − 1), after a warm-up.
+
+        ρ^x, or ρ + (1 − ρ) (1 + cos πx) / 2.
+        """
+        schedule = self.schedule
         last = max(self.total_iterations - 1, 1)
-        ratio = self.schedule.final_learning_rate / self.schedule.learning_rate
-        return float(ratio ** (min(iteration, last) / last))
+        done = min(iteration, last) / last
+        ratio = schedule.final_learning_rate / schedule.learning_rate
+        warmth = min(1.0, (iteration + 1) / (schedule.warmup * self.total_iterations + 1))
+        if schedule.decay == "cosine":
+            return warmth * (ratio + (1 - ratio) * (1 + math.cos(math.pi * done)) / 2)
+        return float(warmth * ratio**done)
 
     def setup(self, stage: str) -> None:
         """Give the model what it needs of the scene, and make the optimiser."""
@@ -160,8 +181,21 @@ class RayStage(Stage):
         self.optimizer = GridAdam(groups, betas=(first, second), eps=self.schedule.eps)
 
     def enter(self, phase: Phase) -> None:
-        """Gather the pixels to draw from."""
+        """Let grids grow; when the stage begins or goes on, gather the pixels to draw from."""
         self.phase = phase
+        growths = self.scene_model.growths(self.total_iterations)
+        self.scene_model.grow(sum(iteration <= phase.start for iteration in growths))
+        for index, group in enumerate(self.scene_model.param_groups()):
+            present = self.optimizer.param_groups[index]["params"]
+            parameters = group.pop("params")
+            group.pop("rate", None)
+            if any(new is not old for new, old in zip(parameters, present, strict=True)):
+                self.optimizer.replace(index, parameters, **group)
+        if self.pools:
+            return
+        fewer = self.schedule.rays_without_hull
+        if fewer is not None and not self.scene_model.has_hull:
+            self._rays = fewer
         views = [self.training_views(images) for images in self.images]
         self.pools = [FramePool.of(view_set) for view_set in views]
         if self.schedule.centre_crop:
@@ -178,10 +212,7 @@ class RayStage(Stage):
         Images are numbered through, the static ones first. Last are those the model asks for.
         """
         schedule = self.schedule
-        rays = schedule.rays
-        if schedule.rays_without_hull is not None and not self.scene_model.has_hull:
-            rays = schedule.rays_without_hull
-        rays = self.rays_to_draw(rays)
+        rays = self.rays_to_draw(self._rays)
         pools = self._centres if self.iteration < schedule.centre_crop else self.pools
         static = round(rays * self.static_share)
         counts = [static, rays - static] if len(pools) > 1 else [rays]

@@ -18,7 +18,8 @@ def look_up(grid: Tensor, points: Tensor, box: Box) -> Tensor:
     ``Σ_{i,j,k ∈ {0,1}} w_i(x) w_j(y) w_k(z) · grid[⌊(x, y, z)⌋ + (i, j, k)]`` with linear weights.
 
     Args:
-        grid: (X, Y, Z, C), at least two points along each axis.
+        grid: (X, Y, Z, C), at least two points along x and y; one along z is a plane, the same for
+            all z.
         points: (M, 3) in the box's units.
         box: where the grid's outer points lie.
 
@@ -29,13 +30,13 @@ def look_up(grid: Tensor, points: Tensor, box: Box) -> Tensor:
     last = torch.tensor(shape, device=points.device) - 1
     at = box.to_grid(points, shape)
     at = torch.minimum(at.clamp(min=0), last.to(at.dtype))
-    cell = at.detach().long().minimum(last - 1)
+    cell = at.detach().long().minimum(last - 1).clamp(min=0)
     fraction = at - cell
     values = grid.new_zeros(len(points), grid.shape[-1])
     for corner in product((0, 1), repeat=3):
         upper = torch.tensor(corner, device=points.device, dtype=torch.bool)
         weight = torch.where(upper, fraction, 1 - fraction).prod(dim=1)
-        x, y, z = (cell + upper).unbind(1)
+        x, y, z = (cell + upper).minimum(last).unbind(1)
         values = values + weight[:, None] * grid[x, y, z]
     return values
 

@@ -136,7 +136,12 @@ def _pixel_index(views: Views, image: int, points: Tensor) -> Array:
 
 
 def visual_hull(
-    views: Views, box: Box, shape: tuple[int, int, int], device: torch.device | None = None
+    views: Views,
+    box: Box,
+    shape: tuple[int, int, int],
+    device: torch.device | None = None,
+    *,
+    whole_in_view: bool = False,
 ) -> Tensor:
     """The visual hull (X, Y, Z) bool of one state of the scene, on a grid.
 
@@ -149,6 +154,8 @@ def visual_hull(
         box: where the grid is, world units; its corners sit on the box's corners.
         shape: grid points along x, y, z.
         device: where to work, one image after another; None: where the views are.
+        whole_in_view: whether nothing is beyond an image whose silhouette keeps clear of its
+            border, as for :func:`motion_box`; else everything may be.
     """
     cameras = views.cameras if device is None else views.cameras.to(device)
     points = box.grid_points(shape, cameras.focal).reshape(-1, 3)
@@ -168,5 +175,7 @@ def visual_hull(
         x, y = pixel.floor().long().unbind(-1)
         in_image = (depth > 0) & (x >= 0) & (x < views.width) & (y >= 0) & (y < views.height)
         row = torch.where(in_image, y * views.width + x, 0)
-        held[left[in_image & (grown.view(-1)[row] == 0)]] = False
+        border = torch.cat([solid[0, [0, -1]].flatten(), solid[0, :, [0, -1]].flatten()])
+        ends = whole_in_view and bool(solid.any()) and not bool(border.any())
+        held[left[torch.where(in_image, grown.view(-1)[row] == 0, ends)]] = False
     return held.view(shape)

@@ -16,7 +16,7 @@ from pxr import Gf, Usd, UsdGeom
 from devrf.apps.export.geometry import ExportSettings, MovingMesh, UpFrame, carried, seen_points
 from devrf.apps.export.gltf import write_gltf
 from devrf.apps.export.sequence import mesh_files, write_sequence
-from devrf.apps.export.surface import canonical_surface
+from devrf.apps.export.surface import surface_of
 from devrf.apps.export.usd import write_usd
 from devrf.rendering.renderer import Renderer
 
@@ -25,7 +25,7 @@ SECONDS = 2.0
 
 
 def moved_mesh(model, cameras, times, **settings):
-    surface = canonical_surface(model, cameras, ExportSettings(**settings))
+    surface = surface_of(model, model.surface(), cameras, ExportSettings(**settings))
     return carried(surface, model, times)
 
 

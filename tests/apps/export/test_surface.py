@@ -7,7 +7,7 @@ import torch
 import trimesh
 
 from devrf.apps.export.geometry import ExportSettings
-from devrf.apps.export.surface import canonical_surface
+from devrf.apps.export.surface import surface_of
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
@@ -15,8 +15,8 @@ from devrf.geometry.contraction import ContractedSpace
 from devrf.geometry.ndc import NormalizedDevice
 
 
-def surface_of(model, cameras, **settings):
-    return canonical_surface(model, cameras, ExportSettings(**settings))
+def exported(model, cameras, **settings):
+    return surface_of(model, model.surface(), cameras, ExportSettings(**settings))
 
 
 def mesh_of(surface):
@@ -24,7 +24,7 @@ def mesh_of(surface):
 
 
 def test_a_ball_is_where_it_is_closed_and_faces_outward(moving_ball, around):
-    surface = surface_of(moving_ball, around)
+    surface = exported(moving_ball, around)
     # Within a tenth of a voxel of 1/12: distances are not quite linear along an edge.
     assert (surface.points.norm(dim=1) - 0.5).abs().max() < 0.1 / 12
     mesh = mesh_of(surface)
@@ -34,7 +34,7 @@ def test_a_ball_is_where_it_is_closed_and_faces_outward(moving_ball, around):
 
 def test_what_no_camera_can_reach_is_solid(of_distance, cube, around):
     hollow = of_distance(lambda points: (points.norm(dim=1) - 0.4).abs() - 0.15, cube, 25)
-    mesh = mesh_of(surface_of(hollow, around))
+    mesh = mesh_of(exported(hollow, around))
     assert mesh.body_count == 1
     assert mesh.volume == pytest.approx(4 / 3 * torch.pi * 0.55**3, rel=0.03)
 
@@ -45,14 +45,14 @@ def test_small_pieces_are_left_out(of_distance, cube, around):
         return torch.minimum(points.norm(dim=1) - 0.5, small)
 
     model = of_distance(two, cube, 25)
-    assert mesh_of(surface_of(model, around, pieces=0.0)).body_count == 2
-    assert mesh_of(surface_of(model, around, pieces=0.2)).body_count == 1
+    assert mesh_of(exported(model, around, pieces=0.0)).body_count == 2
+    assert mesh_of(exported(model, around, pieces=0.2)).body_count == 1
 
 
 def test_it_has_the_colour_of_the_field(of_distance, cube, around):
     model = of_distance(lambda points: points.norm(dim=1) - 0.5, cube, 21, (0.2, 0.4, 0.9))
     for colors in ("mean", "normal"):
-        found = surface_of(model, around, colors=colors).colors
+        found = exported(model, around, colors=colors).colors
         expected = torch.tensor([0.2, 0.4, 0.9]).expand_as(found)
         torch.testing.assert_close(found, expected, atol=1e-3, rtol=0)
 
@@ -65,7 +65,7 @@ def test_a_forward_facing_surface_is_in_the_world_and_faces_the_camera(of_distan
     eye = Cameras(
         torch.eye(4)[None, :3], torch.full((1, 2), 40.0), torch.tensor([[20.0, 15.0]]), 40, 30
     )
-    surface = surface_of(wall, eye)
+    surface = exported(wall, eye)
     world = space.to_world(surface.points)
     torch.testing.assert_close(world[:, 2], torch.full_like(world[:, 2], -4.0))
     mesh = trimesh.Trimesh(world.numpy(), surface.faces.numpy(), process=False)
@@ -86,7 +86,7 @@ def test_of_an_unbounded_scene_what_is_far_is_left_out(of_distance):
         torch.zeros(1, 3), torch.tensor([[-1.0, 0, 0]]), focal=20.0, width=40, height=40
     )
     both, near = (
-        space.to_world(surface_of(model, middle, pieces=0.0, reach=reach).points)
+        space.to_world(exported(model, middle, pieces=0.0, reach=reach).points)
         for reach in (1e9, 2.0)
     )
     assert both[:, 0].max() > 20
@@ -113,4 +113,4 @@ def test_a_threshold_that_nothing_crosses_is_refused(of_distance, cube, around):
     flat = of_distance(lambda points: 0.01 * points[:, 0], cube, 9)
     for threshold in (0.999, 1e-9):
         with pytest.raises(DevrfError, match=r"^export\.threshold: "):
-            surface_of(flat, around, threshold=threshold)
+            exported(flat, around, threshold=threshold)

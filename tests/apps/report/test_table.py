@@ -107,6 +107,15 @@ def test_it_says_which_methods_took_their_samples_how(table, ran):
     ]
 
 
+def test_it_says_what_scores_are_measured_with(table, ran):
+    ran("0", scores={"psnr": 20.0})
+    (note,) = (note for note in table().notes if "made smaller" in note)
+    assert "INTER_AREA" in note and "colours in [0, 1]" in note and "LPIPS" not in note
+    ran("1", scores={"psnr": 20.0, "lpips": 0.1}, lpips_network="alex")
+    (note,) = (note for note in table().notes if "made smaller" in note)
+    assert note.endswith("LPIPS is that of alex, on images in [-1, 1].")
+
+
 def test_the_average_is_over_scenes_that_a_configuration_was_run_on(table, ran):
     for scene, psnr in (("robot", 30.0), ("flower", 33.0)):
         ran(f"{scene}_full", scene, scores={"psnr": psnr})

@@ -9,7 +9,7 @@ from pathlib import Path
 from devrf.apps.export.geometry import ExportSettings, MovingMesh, UpFrame, carried, seen_points
 from devrf.apps.export.gltf import write_gltf
 from devrf.apps.export.sequence import Drawn, mesh_files, point_file, write_sequence
-from devrf.apps.export.surface import canonical_surface
+from devrf.apps.export.surface import surface_of
 from devrf.apps.export.usd import write_usd
 from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError
@@ -37,16 +37,7 @@ def export_scene(
     """
     folder = folder if settings.into is None else Path(settings.into)
     times = settings.export_times(viewpoints.clock) if model.moves else (0.0,)
-    if _takes_surface(model, settings):
-        surface = canonical_surface(model, viewpoints.static, settings)
-        mesh = carried(surface, model, times)
-        path = _write_mesh(folder, mesh, viewpoints, settings)
-        faces = len(mesh.faces)
-        vertices = mesh.vertices.shape[1]
-        log.info(
-            "%d faces, %d vertices at %d times written to %s", faces, vertices, len(times), path
-        )
-    else:
+    if not _takes_surface(model, settings):
         path = folder / "points"
         max_points = _write_points(path, model, viewpoints, settings, times)
         log.info(
@@ -54,16 +45,38 @@ def export_scene(
         )
         if max_points == 0:
             log.warning("the files are empty: nothing that the cameras see hides what is behind it")
+    elif model.surface() is None:
+        path = folder / settings.format
+        meshes = followed(_meshes(model, viewpoints, settings, times), len(times), "meshes")
+        write_sequence(path, settings.format, times, meshes, "surface", settings.seconds)
+        log.info("a mesh of its own at %d times written to %s", len(times), path)
+    else:
+        field = model.surface()
+        assert field is not None
+        surface = surface_of(model, field, viewpoints.static, settings)
+        mesh = carried(surface, model, times)
+        path = _write_mesh(folder, mesh, viewpoints, settings)
+        faces = len(mesh.faces)
+        vertices = mesh.vertices.shape[1]
+        log.info(
+            "%d faces, %d vertices at %d times written to %s", faces, vertices, len(times), path
+        )
 
 
 def _takes_surface(model: Renderable, settings: ExportSettings) -> bool:
     """Whether a surface is exported, not points; refuses what cannot be had of the method."""
-    has = model.surface() is not None and model.forward_map(0.0) is not None
+    carries = model.surface() is not None and model.forward_map(0.0) is not None
+    has = carries or model.surface_at(0.0) is not None
     wanted = has if settings.content == "auto" else settings.content == "surface"
     if wanted and not has:
         raise DevrfError(
-            f"export.content: method={model.name} has no surface that a forward field carries "
-            "through time; give export.content=points export.format=ply"
+            f"export.content: method={model.name} has no surface; give export.content=points "
+            "export.format=ply"
+        )
+    if wanted and not carries and settings.format in SINGLE:
+        raise DevrfError(
+            f"export.format: method={model.name} has a mesh of its own at each time, and "
+            f"{settings.format} moves one; give export.format=ply or obj"
         )
     if not wanted and settings.format != "ply":
         why = "" if has else f"method={model.name} is exported as coloured points, and "
@@ -87,6 +100,21 @@ def _write_mesh(
     frame = UpFrame.of(viewpoints.static, settings.up, settings.metres)
     write(folder / name, mesh, _named_cameras(viewpoints), frame, settings.seconds)
     return folder / name
+
+
+def _meshes(
+    model: Renderable,
+    viewpoints: Viewpoints,
+    settings: ExportSettings,
+    times: tuple[float, ...],
+) -> Iterator[Drawn]:
+    """The surface at each time, of a method that carries none through time."""
+    for time in times:
+        field = model.surface_at(time)
+        assert field is not None
+        surface = surface_of(model, field, viewpoints.static, settings)
+        vertices = model.space.to_world(surface.points)[None]
+        yield from mesh_files(MovingMesh((time,), vertices, surface.faces, surface.colors))
 
 
 def _write_points(

@@ -28,7 +28,9 @@ ENTRIES = 16
 Mesh = tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]
 
 
-def isosurface(model: Renderable, outside: Tensor, threshold: float, side: int | None) -> Mesh:
+def isosurface(
+    field: SurfaceField, device: torch.device, outside: Tensor, threshold: float, side: int | None
+) -> Mesh:
     """Marching cubes on a field, as if solid wherever no empty way leads from ``outside``.
 
     Density is learned where images show it: behind a surface it often falls to nothing again. A
@@ -38,7 +40,8 @@ def isosurface(model: Renderable, outside: Tensor, threshold: float, side: int |
     softplus(v + b) that is v + b, which DeVRF interpolates, too (docs/method.md#density).
 
     Args:
-        model: that has a surface.
+        field: what is where.
+        device: where it is evaluated.
         outside: (K, 3) points of the fields' space that cameras see through.
         threshold: opacity of one voxel on the surface, in (0, 1).
         side: grid points along the box's longest edge; None: those of the field.
@@ -52,14 +55,13 @@ def isosurface(model: Renderable, outside: Tensor, threshold: float, side: int |
     """
     from skimage import measure  # an extra
 
-    field = _field(model)
     box = field.box
     shape = field.shape
     if side is not None:
         x, y, z = (max(2, round(edge / box.longest * (side - 1)) + 1) for edge in box.size)
         shape = (x, y, z)
     points = torch.split(box.grid_points(shape, torch.empty(0)).view(-1, 3), CHUNK)
-    depth = torch.cat([_optical_depth(model, part) for part in points]).view(shape)
+    depth = torch.cat([_optical_depth(field, device, part) for part in points]).view(shape)
     level = _logit(torch.tensor(-math.log1p(-threshold))).item()
     values = _logit(depth).numpy()
     empty = values < level
@@ -82,10 +84,9 @@ def isosurface(model: Renderable, outside: Tensor, threshold: float, side: int |
     return points.astype(np.float32), faces.astype(np.int64)
 
 
-def entries(model: Renderable, cameras: Cameras) -> Tensor:
-    """Points (K, 3) in the fields' space at which rays of the cameras begin to be sampled."""
+def entries(model: Renderable, box: Box, cameras: Cameras) -> Tensor:
+    """Points (K, 3) in the fields' space at which rays of the cameras enter ``box``."""
     space = model.space
-    box = _field(model).box
     cameras = cameras.resized(ENTRIES, ENTRIES)
     near, far = model.depth_limits
     points = []
@@ -97,15 +98,9 @@ def entries(model: Renderable, cameras: Cameras) -> Tensor:
     return torch.cat(points)
 
 
-def _field(model: Renderable) -> SurfaceField:
-    field = model.surface()
-    assert field is not None  # the export has checked
-    return field
-
-
-def _optical_depth(model: Renderable, points: Tensor) -> Tensor:
+def _optical_depth(field: SurfaceField, device: torch.device, points: Tensor) -> Tensor:
     """τ (M,) at ``points`` (M, 3), both on the host."""
-    return _field(model).optical_depth(points.to(model.device)).cpu()
+    return field.optical_depth(points.to(device)).cpu()
 
 
 def _logit(depth: Tensor) -> Tensor:
@@ -127,8 +122,10 @@ def _reached(empty: npt.NDArray[np.bool_], box: Box, outside: Tensor) -> npt.NDA
     return reached if reached.any() else empty
 
 
-def canonical_surface(model: Renderable, cameras: Cameras, settings: ExportSettings) -> Surface:
-    """The surface of a model at rest, as ``cameras`` on the host saw it, decimated and coloured.
+def surface_of(
+    model: Renderable, field: SurfaceField, cameras: Cameras, settings: ExportSettings
+) -> Surface:
+    """The surface of a model's field, as ``cameras`` on the host saw it, decimated and coloured.
 
     Raises:
         DevrfError: there is no surface at that threshold, or none within reach.
@@ -136,8 +133,9 @@ def canonical_surface(model: Renderable, cameras: Cameras, settings: ExportSetti
     import trimesh  # an extra
 
     space = model.space
-    outside = entries(model, cameras)
-    points, faces = isosurface(model, outside, settings.threshold, settings.side)
+    device = model.device
+    outside = entries(model, field.box, cameras)
+    points, faces = isosurface(field, device, outside, settings.threshold, settings.side)
     mesh = trimesh.Trimesh(points, faces, process=False)
     # Unbounded spaces reach to infinity: all vertices of a face have to be near enough.
     away = (space.to_world(torch.from_numpy(points)) - cameras.positions.mean(dim=0)).norm(dim=1)
@@ -155,9 +153,10 @@ def canonical_surface(model: Renderable, cameras: Cameras, settings: ExportSetti
         mesh = mesh.simplify_quadric_decimation(face_count=settings.faces)
     vertices = torch.from_numpy(np.array(mesh.vertices, np.float32))
     triangles = torch.from_numpy(np.array(mesh.faces, np.int64))
-    outward = triangles.flip(1) if _mirrors(space, _field(model).box) else triangles
+    outward = triangles.flip(1) if _mirrors(space, field.box) else triangles
     normals = vertex_normals(space.to_world(vertices), outward)
-    colors = vertex_colors(model, vertices, triangles, normals, averaged=settings.colors == "mean")
+    averaged = settings.colors == "mean"
+    colors = vertex_colors(field, device, vertices, triangles, normals, averaged=averaged)
     return Surface(vertices, outward, colors)
 
 
@@ -183,7 +182,13 @@ WIDEST = 60.0
 
 
 def vertex_colors(
-    model: Renderable, points: Tensor, faces: Tensor, normals: Tensor, *, averaged: bool
+    field: SurfaceField,
+    device: torch.device,
+    points: Tensor,
+    faces: Tensor,
+    normals: Tensor,
+    *,
+    averaged: bool,
 ) -> Tensor:
     """RGB (V, 3) in [0, 1] of vertices (V, 3) in the fields' space, seen from outside.
 
@@ -192,7 +197,6 @@ def vertex_colors(
     along its unit normal (V, 3) of the world, or ``averaged`` over directions up to 60 degrees off.
     Faces (F, 3) are counter-clockwise from outside in the fields' space.
     """
-    field = _field(model)
     low, _ = field.box.corners(points)
     voxel = points.new_tensor(field.box.size) / (points.new_tensor(field.shape) - 1)
     inward = -voxel * vertex_normals((points - low) / voxel, faces)
@@ -203,23 +207,26 @@ def vertex_colors(
         torch.split(normals, VERTICES),
         strict=True,
     )
-    return torch.cat([_seen(model, p, way, n, eyes) for p, way, n in blocks]).clamp(0, 1)
+    return torch.cat([_seen(field, device, p, way, n, eyes) for p, way, n in blocks]).clamp(0, 1)
 
 
 def _seen(
-    model: Renderable, points: Tensor, inward: Tensor, normals: Tensor, toward_eyes: Tensor
+    field: SurfaceField,
+    device: torch.device,
+    points: Tensor,
+    inward: Tensor,
+    normals: Tensor,
+    toward_eyes: Tensor,
 ) -> Tensor:
     """RGB (V, 3), the mean over the directions (K, 3), each weighted by its cosine."""
     way = torch.arange(BEFORE, BEHIND + STEP / 2, STEP)
     samples = points[:, None] + way[:, None] * inward[:, None]
-    depth = STEP * _optical_depth(model, samples.reshape(-1, 3)).view(samples.shape[:2])
+    depth = STEP * _optical_depth(field, device, samples.reshape(-1, 3)).view(samples.shape[:2])
     weight = torch.exp(depth - depth.cumsum(dim=1)) * -torch.expm1(-depth)
     weight = weight / weight.sum(dim=1, keepdim=True).clamp(min=1e-9)
     vertex, sample = (weight > SIGNIFICANT).nonzero(as_tuple=True)
     share = weight[vertex, sample, None]
     where = samples[vertex, sample]
-    field = _field(model)
-    device = model.device
     frames = _frames(normals)
     colors = torch.zeros_like(points)
     total = toward_eyes[:, 2].sum()

@@ -22,6 +22,8 @@ METHODS = {
     "hypernerf": "HyperNeRF",
     "nsff": "NSFF",
     "neural_volumes": "Neural Volumes",
+    "tineuvox": "TiNeuVox",
+    "kplanes": "K-Planes",
 }
 # As the paper's tables call them, in their order; then the rows of experiment=quality_table, for
 # inward- and for forward-facing scenes.
@@ -56,6 +58,7 @@ RECORDED: dict[str, Callable[[Any], str]] = {
     "run.image_size": lambda size: f"{size[0]}×{size[1]}",
     "run.device": lambda name: f"on {name}",
     "run.test_frames": lambda n: f"{n} held-out images",
+    "run.lpips_network": lambda name: f"LPIPS of {name}",
     "run.fingerprint": lambda hashed: f"capture {hashed[:6]}",
     "run.git": lambda git: f"at {git[:9]}{'-dirty' * git.endswith('-dirty')}",
     "run.devrf": lambda version: f"devrf {version}",

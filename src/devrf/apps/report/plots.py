@@ -16,6 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
 
+from devrf.apps.report.labels import METHODS
 from devrf.apps.report.runs import DEFAULT_METHOD, metric_over_time
 from devrf.apps.report.table import LPIPS, PSNR, SSIM, TIME, Block, Table
 from devrf.system.files import atomic_write
@@ -51,9 +52,9 @@ STYLE: dict[Any, Any] = {
     "lines.linewidth": 1.6,
     "lines.markersize": 4,
 }
-# Markers of the paper's methods, and how the names of their variants end.
-NAMES = ("DeVRF", "D-NeRF", "Nerfies", "HyperNeRF", "NSFF", "Neural Volumes")
-MARKERS = dict(zip(NAMES, "s^vDPX", strict=True))
+# Markers of the methods, and how the names of their variants end.
+NAMES = ("DeVRF", *list(METHODS.values())[1:])
+MARKERS = dict(zip(NAMES, "s^vDPXo*", strict=True))
 VARIANT = r"-2 ?stage$|-dynamic$| \(base\)$| w/ .*$"
 # Seconds to label on an axis: the first of these multiples for which there is room.
 UNITS = (0.01, 0.1, 1, 10, 60, 600, 3600, 36000, 360000, math.inf)

@@ -336,6 +336,17 @@ def _sampled(runs: pd.DataFrame) -> list[str]:
     return [f"Samples by {kind}: {', '.join(methods)}." for kind, methods in names.items()]
 
 
+def _scored(runs: pd.DataFrame) -> str:
+    """What numbers of other tables are compared with: filter, range, network."""
+    networks = runs.get("run.lpips_network", pd.Series(dtype=object)).dropna().unique()
+    perceptual = f" LPIPS is that of {' or '.join(sorted(networks))}, on images in [-1, 1]."
+    known = len(networks) and runs[LPIPS.title].notna().any()
+    return (
+        "Images are made smaller by the mean over areas (OpenCV's INTER_AREA); PSNR and SSIM are "
+        f"of colours in [0, 1].{perceptual if known else ''}"
+    )
+
+
 def _notes(runs: pd.DataFrame, at_rest: pd.Series, again: pd.Series) -> list[str]:
     notes = [
         f"No run has {column.title}: {column.why_missing}."
@@ -345,6 +356,7 @@ def _notes(runs: pd.DataFrame, at_rest: pd.Series, again: pd.Series) -> list[str
     if runs["run.device"].nunique(dropna=False) > 1:
         notes.append("Memory and time are marked only among rows of one device.")
     notes += _sampled(runs)
+    notes += [_scored(runs)] if len(runs) else []
     for why, folders in (
         ("Scored at rest only, and therefore not in the tables", at_rest),
         ("Counted once, as last scored elsewhere with the same checkpoint", again),

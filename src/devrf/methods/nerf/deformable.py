@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from devrf.data.batch import RayBatch
 from devrf.geometry.rays import Rays
 from devrf.methods.nerf.networks import RadianceField
-from devrf.methods.nerf.placed_model import NeuralField
+from devrf.methods.nerf.placed_model import SurfacedField
 from devrf.methods.nerf.samples import (
     RaySamples,
     flattened,
@@ -26,7 +26,7 @@ from devrf.ops.compositing import composite
 from devrf.rendering.output import RenderOutput
 
 
-class DeformableField(NeuralField):
+class DeformableField(SurfacedField):
     """(σ, c) = T(x′, w, d), where a deformation leads a point x at time t to x′ and w.
 
     A method defines the deformation (:meth:`deform`). T lives in normalised space.
@@ -145,6 +145,13 @@ class DeformableField(NeuralField):
         """τ (S,) of the canonical field, where the points lead."""
         canonical, ambient = self.deform(points, time)
         return self.canonical.sigma(canonical, ambient) * length
+
+    def point_colors(self, points: Tensor, viewdirs: Tensor, time: Tensor) -> Tensor:
+        """RGB (S, 3) of the canonical field, where the points lead."""
+        canonical, ambient = self.deform(points, time)
+        each = torch.arange(len(points), device=points.device)
+        color: Tensor = self.canonical(canonical, viewdirs, each, ambient)[1]
+        return color
 
     def loss_terms(
         self, output: RenderOutput, batch: RayBatch, names: Collection[str]

@@ -138,7 +138,8 @@ class OccupancyFrames(StoredShape):
 
         Args:
             scene: seen from all around, the training images' alpha masks carve them, grown by a
-                cell; static images show frame 0. Else the field itself has to tell what is empty.
+                cell; static images show frame 0, and what may be there stays in all frames. Else
+                the field itself has to tell what is empty.
             box: in the fields' space.
             side: cells along an edge of a cube of the box's size.
             hull: whether to carve at all.
@@ -151,7 +152,9 @@ class OccupancyFrames(StoredShape):
             assert views.frames is not None
             for frame in torch.unique(views.frames).tolist() if views.has_alpha else ():
                 shown = views[(views.frames == frame).nonzero()[:, 0]]
-                masks.mask[frame] &= dilate(visual_hull(shown, box, shape), 1).cpu()
+                held = visual_hull(shown, box, shape, whole_in_view=frame > 0)
+                grown = dilate(held, 1).cpu()
+                masks.mask[frame] &= grown if frame == 0 else grown | masks.mask[0]
         if empty_from is not None and not masks.has_hull:
             masks.learned = LearnedOccupancy(shape)
         return masks
@@ -182,16 +185,28 @@ class OccupancyFrames(StoredShape):
         number = torch.arange(len(ray), device=ray.device) - (count.cumsum(0) - count)[ray]
         offset = torch.rand_like(entry) if jitter else torch.full_like(entry, 0.5)
         distance = entry[ray] + (number + offset[ray]) * step
-        _, x, y, z = self.mask.shape
-        nearest = box.to_grid(box.nearest(rays.at(ray, distance)), (x, y, z)).round().long()
-        cell = (nearest[:, 0] * y + nearest[:, 1]) * z + nearest[:, 2]
-        cells = self.mask[0].numel()
-        met = torch.zeros_like(ray, dtype=torch.bool)
-        for frame in frames:
-            met |= self.mask.view(-1)[frame[ray] * cells + cell]
-        occupied = self.learned.occupied(cell)
+        pair = (frames[0][ray], frames[1][ray])
+        masked, occupied = self._may_be(rays.at(ray, distance), pair, box)
         if occupied is not None:
             # The last sample of a ray stays: it may stand for all that is behind it.
-            met &= occupied | (number == count[ray] - 1)
-        index = met.nonzero()[:, 0]
+            masked &= occupied | (number == count[ray] - 1)
+        index = masked.nonzero()[:, 0]
         return RaySamples.at(rays, ray[index], distance[index], step)
+
+    def may_be_at(self, points: Tensor, frames: tuple[int, int], box: Box) -> Tensor:
+        """Whether something may be at ``points`` (S, 3) at one of two frames: (S,) bool."""
+        first = torch.zeros_like(points[:, 0], dtype=torch.int64)
+        masked, occupied = self._may_be(points, (first + frames[0], first + frames[1]), box)
+        return masked if occupied is None else masked & occupied
+
+    def _may_be(
+        self, points: Tensor, frames: tuple[Tensor, Tensor], box: Box
+    ) -> tuple[Tensor, Tensor | None]:
+        """Whether the masks of frames (S,), and what is learned, leave ``points`` (S, 3) in."""
+        _, x, y, z = self.mask.shape
+        nearest = box.to_grid(box.nearest(points), (x, y, z)).round().long()
+        cell = (nearest[:, 0] * y + nearest[:, 1]) * z + nearest[:, 2]
+        masks = self.mask.view(-1)
+        cells = self.mask[0].numel()
+        masked = masks[frames[0] * cells + cell] | masks[frames[1] * cells + cell]
+        return masked, self.learned.occupied(cell)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
@@ -20,12 +21,15 @@ from devrf.methods.nerf.occupancy import OccupancyFrames
 from devrf.methods.nerf.placement import Placement
 from devrf.methods.nerf.samples import RaySamples
 from devrf.rendering.output import RenderedImage, RenderOutput
+from devrf.rendering.view import SurfaceField
 from devrf.scenes.scene import Scene
 from devrf.system.plain_data import built
 
 # Rays of a view that are rendered at once, on a CPU and on a GPU.
 ON_CPU = 2048
 ON_GPU = 2**14
+# Points along an edge of a cube of the box's size, of which a surface is taken.
+SURFACE_SIDE = 128
 
 
 class PlacedModel(RayTrainable):
@@ -114,9 +118,14 @@ class NeuralField(PlacedModel):
         share = self.settings.empty_from
         self.occupancy.learned.follow(step, total, share, self.box, self.opacity)
 
+    @property
+    def step_length(self) -> float:
+        """The distance between even samples, in the fields' space."""
+        return self.box.diagonal / float(self.settings.steps)
+
     def opacity(self, points: Tensor, time: Tensor) -> Tensor:
         """Opacity (S,) of a step at points (S, 3) of the fields' space and times (S,)."""
-        length = self.box.diagonal / self.settings.steps / self.placement.half_edge
+        length = self.step_length / self.placement.half_edge
         depth = self.optical_depth(self.placement.normalised(points), time, length)
         return -torch.expm1(-depth)
 
@@ -144,9 +153,9 @@ class NeuralField(PlacedModel):
     def march(self, rays: Rays, time: Tensor, *, jitter: bool) -> RaySamples:
         """Even steps where something may be at the frames around each ray's time."""
         before, after, _ = self.clock.between(time)
-        # A share of the box's diagonal, in units of the longest direction.
+        # In units of the longest direction.
         longest = float(rays.directions.norm(dim=1).amax()) if len(rays) else 1.0
-        step = self.box.diagonal / (self.settings.steps * longest)
+        step = self.step_length / longest
         return self.occupancy.march(
             rays, (before, after), self.box, self.depth_limits, step, jitter=jitter
         )
@@ -154,6 +163,52 @@ class NeuralField(PlacedModel):
     def at(self, time: float, *, half: bool = False) -> RayView:
         """The scene at ``time``."""
         return RayView(self, self.render_rays, time, half=half)
+
+
+class SurfacedField(NeuralField):
+    """Networks whose surface can be taken at any time."""
+
+    @abstractmethod
+    def point_colors(self, points: Tensor, viewdirs: Tensor, time: Tensor) -> Tensor:
+        """RGB (S, 3) at points (S, 3) in normalised space, seen along unit directions (S, 3)."""
+
+    def surface_at(self, time: float) -> SurfaceField:
+        """The scene at ``time``."""
+        return SurfaceAtTime(self, time)
+
+
+class SurfaceAtTime:
+    """A model's field at one time.
+
+    Attributes:
+        box: the fields' box.
+        shape: points of a grid over it, as fine as most such fields.
+    """
+
+    def __init__(self, model: SurfacedField, time: float) -> None:
+        self.box = model.box
+        self.shape = model.box.grid_shape(SURFACE_SIDE**3)
+        self._model = model
+        self._time = time
+
+    @torch.no_grad()
+    def optical_depth(self, points: Tensor) -> Tensor:
+        """τ (M,) of a way of one voxel at ``points`` (M, 3) of the fields' space."""
+        model = self._model
+        moment = model.clock.at(self._time)
+        frames = (moment.before, moment.after)
+        index = model.occupancy.may_be_at(points, frames, self.box).nonzero()[:, 0]
+        place = model.placement.normalised(points[index])
+        voxel = self.box.voxel_size(math.prod(self.shape)) / model.placement.half_edge
+        depth = model.optical_depth(place, torch.full_like(place[:, 0], self._time), voxel)
+        return torch.zeros_like(points[:, 0]).index_copy(0, index, depth)
+
+    @torch.no_grad()
+    def color(self, points: Tensor, viewdirs: Tensor) -> Tensor:
+        """RGB (M, 3) at ``points`` (M, 3) of the fields' space, along directions (M, 3)."""
+        place = self._model.placement.normalised(points)
+        time = torch.full_like(place[:, 0], self._time)
+        return self._model.point_colors(place, viewdirs, time)
 
 
 class RayView:

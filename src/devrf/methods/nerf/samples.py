@@ -43,6 +43,16 @@ class RaySamples:
         unit = rays.directions.norm(dim=1).index_select(0, ray)
         return RaySamples(ray, distance, unit * stretch, rays.at(ray, distance), len(rays))
 
+    def __getitem__(self, index: Tensor) -> RaySamples:
+        """Some of the samples, by their numbers (K,), ascending."""
+        return RaySamples(
+            ray=self.ray.index_select(0, index),
+            distance=self.distance.index_select(0, index),
+            length=self.length.index_select(0, index),
+            points=self.points.index_select(0, index),
+            rays=self.rays,
+        )
+
     def scaled(self, unit: float) -> RaySamples:
         """The same samples, their lengths in units of ``unit`` (of the fields' space)."""
         return replace(self, length=self.length / unit)

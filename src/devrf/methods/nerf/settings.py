@@ -41,7 +41,31 @@ class CheckedSettings:
 
 
 @dataclass(frozen=True)
-class PlacedSettings(CheckedSettings):
+class OccupancySettings(CheckedSettings):
+    """How empty space is skipped.
+
+    Attributes:
+        occupancy_side: the masks have about side³ cells.
+        hull: whether the masks are the visual hulls of each frame's alpha masks, if there are any;
+            the published methods never had these.
+        empty_from: without such hulls, space that the fields leave empty at all times is left out
+            after this share of a stage; None: never.
+    """
+
+    occupancy_side: int = 128
+    hull: bool = True
+    empty_from: float | None = 0.25
+
+    def __post_init__(self) -> None:
+        self.check_least(2, "occupancy_side")
+        for name in (field.name for field in fields(self) if field.name.endswith("bands")):
+            self.check(name, 0 <= getattr(self, name) <= BANDS, f"0 to {BANDS}")
+        share = self.empty_from
+        self.check("empty_from", share is None or 0 <= share <= 1, "0 to 1, or null")
+
+
+@dataclass(frozen=True)
+class PlacedSettings(OccupancySettings):
     """What D-NeRF, Nerfies, HyperNeRF and NSFF have in common.
 
     Attributes:
@@ -55,11 +79,6 @@ class PlacedSettings(CheckedSettings):
         precision: what a radiance field computes in while it learns: float32, bfloat16, or
             ``auto`` (bfloat16 on a GPU that multiplies it). All else is in float32.
         steps: samples along the box's diagonal (occupancy).
-        occupancy_side: the masks have about side³ cells (occupancy).
-        hull: whether the masks are the visual hulls of each frame's alpha masks, if there are any;
-            the published methods never had these (occupancy).
-        empty_from: without such hulls, space that the fields leave empty at all times is left out
-            after this share of a stage; None: never (occupancy).
     """
 
     width: int = 256
@@ -71,17 +90,11 @@ class PlacedSettings(CheckedSettings):
     initialisation: Initialisation = "uniform"
     precision: Precision = "float32"
     steps: int = 128
-    occupancy_side: int = 128
-    hull: bool = True
-    empty_from: float | None = 0.25
 
     def __post_init__(self) -> None:
-        self.check_least(2, "width", "depth", "occupancy_side")
+        super().__post_init__()
+        self.check_least(2, "width", "depth")
         self.check_samples("steps")
-        for name in (field.name for field in fields(self) if field.name.endswith("bands")):
-            self.check(name, 0 <= getattr(self, name) <= BANDS, f"0 to {BANDS}")
-        share = self.empty_from
-        self.check("empty_from", share is None or 0 <= share <= 1, "0 to 1, or null")
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,177 @@
+"""K-Planes (Fridovich-Keil et al., CVPR 2023): space and time on six planes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import replace
+from typing import ClassVar, cast
+
+import torch
+from torch import Tensor, nn
+
+from devrf.data.batch import RayBatch
+from devrf.geometry.rays import Rays
+from devrf.methods.kplanes.decoders import ExplicitDecoder, HybridDecoder
+from devrf.methods.kplanes.planes import SixPlanes, sum_of
+from devrf.methods.kplanes.proposals import Proposal, drawn_edges, histogram_error, intervals
+from devrf.methods.kplanes.settings import KPlanesSettings
+from devrf.methods.nerf.placed_model import SurfacedField
+from devrf.methods.nerf.samples import RaySamples, limits, volume_render
+from devrf.ops.compositing import composite
+from devrf.ops.photometric import distortion
+from devrf.rendering.output import RenderOutput
+
+# Proposals learn in the first iterations, then ever less often, up to a share of a stage.
+FIRST = 10
+RARELY = 5
+TAUGHT = 1 / 6
+# The exponent of weights is SLOPE f / ((SLOPE − 1) f + 1), f growing to 1 in a share of a stage.
+SLOPE = 10
+ANNEALED = 1 / 30
+
+
+class KPlanes(SurfacedField):
+    """(σ, c) = R(f(x, t), d): features f of six planes, decoded (docs/methods/kplanes.md).
+
+    Attributes:
+        planes: f.
+        proposals: the fields of the rounds, where these tell the samples.
+    """
+
+    name: ClassVar[str] = "kplanes"
+    losses: ClassVar[tuple[str, ...]] = (
+        "color", "tv", "smooth", "change", "smooth_proposals", "histogram", "distortion",
+    )  # fmt: skip
+    settings_class = KPlanesSettings
+    settings: KPlanesSettings
+
+    def __init__(self, settings: KPlanesSettings | None = None) -> None:
+        """Build planes and decoder, as published if no settings are given."""
+        s = settings or KPlanesSettings()
+        super().__init__(s)
+        self._sharpness = 1.0
+        self._teaches = True
+        self.place()
+        decoder = HybridDecoder if s.decoder == "hybrid" else ExplicitDecoder
+        self.decoder = decoder(self.planes.size, s)
+
+    def set_times(self, times: tuple[float, ...]) -> None:
+        """Take the frames' times, and draw planes for so many."""
+        super().set_times(times)
+        s = self.settings
+        points = s.time_resolution or max(2, len(times) // 2)
+        sides = [scale * s.resolution for scale in s.scales]
+        device = self.occupancy.mask.device
+        self.planes = SixPlanes(s.channels, sides, points, pairing=s.pairing).to(device)
+        rounds = s.proposal_resolutions if s.sampling == "proposals" else ()
+        self.proposals = nn.ModuleList(Proposal(side, points, s) for side in rounds).to(device)
+
+    def on_iteration(self, step: int, total: int) -> None:
+        """Sharpen the rounds' weights, let proposals learn ever less often, skip empty space."""
+        super().on_iteration(step, total)
+        done = min(1.0, step / (ANNEALED * total))
+        self._sharpness = SLOPE * done / ((SLOPE - 1) * done + 1)
+        every = round(1 + (RARELY - 1) * min(1.0, step / (TAUGHT * total)))
+        self._teaches = step < FIRST or step % every == 0
+
+    def coordinates(self, points: Tensor, time: Tensor) -> Tensor:
+        """[−1, 1]⁴ (S, 4) of points (S, 3) in the box, and of times (S,) in [0, 1]."""
+        low, high = self.box.corners(points)
+        place = (2 * points - low - high) / (high - low)
+        return torch.cat([place, 2 * time[:, None] - 1], dim=1)
+
+    def optical_depth(self, points: Tensor, time: Tensor, length: float) -> Tensor:
+        """τ (S,) of ways of ``length`` at points (S, 3) in normalised space."""
+        where = self.coordinates(self.placement.fields(points), time)
+        return self.decoder.density(self.planes(where))[0] * length
+
+    def point_colors(self, points: Tensor, viewdirs: Tensor, time: Tensor) -> Tensor:
+        """RGB (S, 3) of points in normalised space."""
+        where = self.coordinates(self.placement.fields(points), time)
+        each = torch.arange(len(points), device=points.device)
+        return self.decoder.rgb(self.decoder.density(self.planes(where))[1], viewdirs, each)
+
+    def render_rays(
+        self, rays: Rays, time: Tensor, background: Tensor, *, jitter: bool = False
+    ) -> RenderOutput:
+        """What rays see.
+
+        ``extras`` has ``weight``, ``ray`` and ``distance`` (S,) of samples in normalised space;
+        with proposals also ``edges`` (R, N + 1) and, of round k, ``edges_k`` and ``weight_k``.
+        """
+        extras: dict[str, Tensor] = {}
+        if self.settings.sampling == "occupancy":
+            samples = self.march(rays, time, jitter=jitter)
+        else:
+            samples, extras = self._proposed(rays, time, jitter=jitter)
+        if not self.space.is_linear:
+            samples = samples.unbounded()
+        where = self.coordinates(samples.points, time.index_select(0, samples.ray))
+        density, further = self.decoder.density(self.planes(where))
+        color = self.decoder.rgb(further, rays.viewdirs, samples.ray)
+        scaled = samples.scaled(self.placement.half_edge)
+        output = volume_render(scaled, density.float(), color.float(), background)
+        extras["distance"] = samples.distance / self.placement.half_edge
+        return replace(output, extras={**output.extras, **extras})
+
+    def _proposed(
+        self, rays: Rays, time: Tensor, *, jitter: bool
+    ) -> tuple[RaySamples, dict[str, Tensor]]:
+        """Samples by the rounds of proposals; the rounds' edges and weights."""
+        s = self.settings
+        near, far = limits(rays, self.box, self.depth_limits)
+        extras: dict[str, Tensor] = {}
+        edges = torch.stack([near, far], dim=1)
+        weight = torch.zeros_like(edges[:, :1])
+        rounds = zip(self.proposals, s.proposal_samples, strict=True)
+        for number, (proposal, count) in enumerate(rounds):
+            edges = drawn_edges(edges, weight, count, jitter=jitter)
+            samples = intervals(rays, edges)
+            where = self.coordinates(samples.points, time.index_select(0, samples.ray))
+            with torch.set_grad_enabled(torch.is_grad_enabled() and self._teaches):
+                depth = proposal(where).float() * samples.scaled(self.placement.half_edge).length
+                learned, _ = composite(depth, samples.ray, samples.rays)
+            learned = learned.view(len(rays), count)
+            extras |= {f"edges_{number}": edges, f"weight_{number}": learned}
+            weight = learned.detach() ** self._sharpness
+        edges = drawn_edges(edges, weight, s.samples, jitter=jitter)
+        return intervals(rays, edges), {**extras, "edges": edges}
+
+    def loss_terms(
+        self, output: RenderOutput, batch: RayBatch, names: Collection[str]
+    ) -> dict[str, Tensor]:
+        """``color``, and what keeps planes simple and proposals true.
+
+        See docs/methods/kplanes.md#losses. ``tv`` and ``change`` are of the field's planes and of
+        proposals'. Without proposals their terms are 0.
+        """
+        rounds = [proposal.planes for proposal in cast("list[Proposal]", [*self.proposals])]
+        extras = output.extras
+        known: dict[str, Callable[[], Tensor]] = {
+            "color": lambda: nn.functional.mse_loss(output.color, batch.color),
+            "tv": lambda: sum_of([each.total_variation() for each in (self.planes, *rounds)]),
+            "smooth": self.planes.roughness,
+            "change": lambda: sum_of([each.change() for each in (self.planes, *rounds)]),
+            "smooth_proposals": lambda: sum_of([nothing, *(each.roughness() for each in rounds)]),
+            "histogram": lambda: sum_of([nothing, *self._histogram_errors(extras)]),
+            "distortion": lambda: distortion(
+                extras["weight"], extras["distance"], extras["ray"], len(batch.time)
+            ),
+        }
+        nothing = output.color.new_zeros(())
+        return {name: known[name]() for name in self.losses if name in names}
+
+    def _histogram_errors(self, extras: Mapping[str, Tensor]) -> Iterator[Tensor]:
+        """The term of each round."""
+        for number in range(len(self.proposals)):
+            proposed = (extras[f"edges_{number}"], extras[f"weight_{number}"])
+            weight = extras["weight"].view(len(extras["edges"]), -1)
+            yield histogram_error(extras["edges"], weight, *proposed)
+
+    def parts(self) -> dict[str, Iterable[nn.Parameter]]:
+        """What space alone says, with the decoder; what time says; the proposals."""
+        return {
+            "canonical": [*self.planes.along(time=False), *self.decoder.parameters()],
+            "motion": self.planes.along(time=True),
+            "proposals": self.proposals.parameters(),
+        }

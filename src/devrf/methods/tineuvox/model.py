@@ -1,0 +1,198 @@
+"""TiNeuVox (Fang et al., SIGGRAPH Asia 2022): time-aware neural voxels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from devrf.data.batch import RayBatch
+from devrf.geometry.box import Box
+from devrf.geometry.rays import Rays
+from devrf.geometry.space import Space
+from devrf.methods.nerf.networks import SinusoidalEncoding
+from devrf.methods.nerf.placed_model import SurfacedField
+from devrf.methods.nerf.samples import accumulated
+from devrf.methods.tineuvox.networks import MultiDistanceGrid, RadianceNetwork
+from devrf.methods.tineuvox.settings import TiNeuVoxSettings
+from devrf.ops.compositing import composite
+from devrf.ops.photometric import background_entropy, per_sample_color
+from devrf.ops.trilinear import Shape
+from devrf.rendering.output import RenderOutput
+from devrf.scenes.scene import Scene
+
+
+class TiNeuVox(SurfacedField):
+    """(σ, c) = R(V(x + D(x, ω)), x, ω, d), ω = T(t): voxels at rest, networks that know the time.
+
+    See docs/methods/tineuvox.md. Networks live in normalised space.
+
+    Attributes:
+        grid: V, over :attr:`grid_box`.
+        time: T, from times (R, 1) to codes ω (R, 5C).
+        deformation: D, from encoded positions and codes (S, ·) to displacements (S, 3).
+        radiance: R.
+        grid_box: the fields' box in normalised space.
+    """
+
+    name: ClassVar[str] = "tineuvox"
+    losses: ClassVar[tuple[str, ...]] = ("color", "background_entropy", "sample_color")
+    settings_class = TiNeuVoxSettings
+    settings: TiNeuVoxSettings
+
+    def __init__(self, settings: TiNeuVoxSettings | None = None) -> None:
+        """Build grid and networks, of the published base's sizes if no settings are given."""
+        s = settings or TiNeuVoxSettings()
+        super().__init__(s)
+        self.encode = SinusoidalEncoding(3, s.bands)
+        self.grid = MultiDistanceGrid(s.channels, s.strides)
+        encode_time = SinusoidalEncoding(1, s.time_bands)
+        code = 5 * s.channels
+        self.time = nn.Sequential(
+            encode_time,
+            nn.Linear(encode_time.size, s.width),
+            nn.ReLU(),
+            nn.Linear(s.width, code),
+        )
+        self.deformation = nn.Sequential(
+            nn.Linear(self.encode.size + code, s.width),
+            nn.ReLU(),
+            nn.Linear(s.width, s.width),
+            nn.ReLU(),
+            nn.Linear(s.width, 3),
+        )
+        self.radiance = RadianceNetwork(s, self.encode.size, code)
+        self.density_shift = math.log(1 / (1 - s.alpha_init) - 1)
+        self.place()
+
+    def set_place(self, box: Box, space: Space, depths: tuple[float, float]) -> None:
+        """Take box, space and depths; the grid spans the box."""
+        super().set_place(box, space, depths)
+        x, y, z = (edge / box.longest for edge in box.size)
+        self.grid_box = Box((-x, -y, -z), (x, y, z))
+        self.grid.resize(self._shape_after(len(self.settings.upsample_at)))
+
+    def setup(self, scene: Scene) -> None:
+        """Take bounds, times and hulls; make the grid as small as it is before it grows."""
+        super().setup(scene)
+        self.grid.resize(self._shape_after(0))
+
+    @property
+    def resolution(self) -> tuple[int, ...]:
+        """Grid points along x, y, z."""
+        return self.grid.shape
+
+    def growths(self, total: int) -> Sequence[int]:
+        """As the settings say."""
+        return [round(share * total) for share in self.settings.upsample_at]
+
+    def grow(self, count: int) -> None:
+        """Resample the grid to N / 2^(growths left) points, if that is more than it has."""
+        shape = self._shape_after(count)
+        if math.prod(shape) > math.prod(self.grid.shape):
+            self.grid.resize(shape)
+
+    def _shape_after(self, count: int) -> Shape:
+        left = len(self.settings.upsample_at) - count
+        side = self.settings.side * self.space.side_factor / 2 ** (left / 3)
+        return self.grid.fitting(self.grid_box, side)
+
+    @property
+    def base_voxel(self) -> float:
+        """Edge of a voxel of the grown grid, in the fields' space: the unit of density."""
+        return self.box.voxel_size(round((self.settings.side * self.space.side_factor) ** 3))
+
+    @property
+    def step_length(self) -> float:
+        """So many voxels of the present grid, in the fields' space."""
+        return self.settings.step * self.box.voxel_size(math.prod(self.grid.shape))
+
+    def hidden(self, points: Tensor, code: Tensor) -> Tensor:
+        """What density and colour come from, (S, width).
+
+        Args:
+            points: (S, 3) x in normalised space.
+            code: (S, size) of their times.
+        """
+        position = self.encode(points)
+        displacement = self.deformation(torch.cat([position, code], dim=1))
+        features = self.grid(points + displacement, self.grid_box)
+        return self.radiance.hidden(features, position, code)
+
+    def density(self, hidden: Tensor) -> Tensor:
+        """σ (S,) = softplus(raw + log(1/(1 − α_init) − 1)), per :attr:`base_voxel`."""
+        return nn.functional.softplus(self.radiance.raw_density(hidden) + self.density_shift)
+
+    def optical_depth(self, points: Tensor, time: Tensor, length: float) -> Tensor:
+        """τ (S,) of ways of ``length``."""
+        way = length * self.placement.half_edge / self.base_voxel
+        return self.density(self.hidden(points, self.time(time[:, None]))) * way
+
+    def point_colors(self, points: Tensor, viewdirs: Tensor, time: Tensor) -> Tensor:
+        """RGB (S, 3) of points in normalised space."""
+        each = torch.arange(len(points), device=points.device)
+        return self.radiance.rgb(self.hidden(points, self.time(time[:, None])), viewdirs, each)
+
+    def render_rays(
+        self, rays: Rays, time: Tensor, background: Tensor, *, jitter: bool = False
+    ) -> RenderOutput:
+        """What rays see.
+
+        ``extras`` has ``weight`` (K,), ``ray`` (K,) and ``sample_color`` (K, 3) of the samples that
+        were coloured.
+        """
+        samples = self.march(rays, time, jitter=jitter)
+        if not self.space.is_linear:
+            samples = samples.unbounded()
+        code = self.time(time[:, None]).index_select(0, samples.ray)
+        hidden = self.hidden(self.placement.normalised(samples.points), code)
+        depth = self.density(hidden).float() * samples.scaled(self.base_voxel).length
+        weight, transmittance = composite(depth, samples.ray, samples.rays)
+        shown = (weight > self.settings.weight_threshold).nonzero()[:, 0]
+        samples = samples[shown]
+        weight = weight.index_select(0, shown)
+        color = self.radiance.rgb(hidden.index_select(0, shown), rays.viewdirs, samples.ray).float()
+        output = accumulated(samples, weight, weight[:, None] * color, transmittance, background)
+        extras = {"weight": weight, "ray": samples.ray, "sample_color": color}
+        return replace(output, extras=extras)
+
+    def loss_terms(
+        self, output: RenderOutput, batch: RayBatch, names: Collection[str]
+    ) -> dict[str, Tensor]:
+        """``color``; ``background_entropy`` of T_end; ``sample_color``, of each sample alone."""
+        terms = super().loss_terms(output, batch, names) if "color" in names else {}
+        if "background_entropy" in names:
+            terms["background_entropy"] = background_entropy(output.transmittance)
+        if "sample_color" in names:
+            extras = output.extras
+            terms["sample_color"] = per_sample_color(
+                extras["weight"], extras["sample_color"], extras["ray"], batch.color
+            )
+        return terms
+
+    def parts(self) -> dict[str, Iterable[nn.Parameter]]:
+        """Voxels with their networks; what displaces; and what both know of the time."""
+        return {
+            "canonical": [*self.grid.parameters(), *self.radiance.parameters()],
+            "deformation": self.deformation.parameters(),
+            "time": self.time.parameters(),
+        }
+
+    def param_groups(self) -> list[dict[str, Any]]:
+        """A group of the grid, whose untouched points keep their moments; the other parts."""
+        s = self.settings
+        values = self.grid.values
+        rates = {"deformation": s.motion_rate, "time": s.motion_rate}
+        groups: list[dict[str, Any]] = []
+        for group in super().param_groups():
+            name = group["name"]
+            others = [parameter for parameter in group["params"] if parameter is not values]
+            groups.append({"name": name, "params": others, "rate": rates.get(name, 1.0)})
+        if values.requires_grad:
+            grid = {"name": "grid", "params": [values], "rate": s.grid_rate, "skip_zero": True}
+            groups.append({**grid, "smoothing": s.tv * max(self.grid.shape) / 128 / 6})
+        return groups

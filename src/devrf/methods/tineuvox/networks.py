@@ -1,0 +1,119 @@
+"""The grid of TiNeuVox, looked up at several distances, and the network behind it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from devrf.checkpoints.stored_grids import StoredShape
+from devrf.geometry.box import Box
+from devrf.kernels.look_up import look_up
+from devrf.methods.nerf.networks import SinusoidalEncoding
+from devrf.methods.tineuvox.settings import TiNeuVoxSettings
+from devrf.ops.trilinear import Shape, resample, shape_of
+
+
+class _EveryNth(torch.autograd.Function):
+    """Every n-th point of a grid; what comes back is added to the gradient that is kept, if any."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, n: int, kept: Tensor | None) -> Tensor:
+        ctx.n = n
+        ctx.kept = kept
+        ctx.shape = values.shape
+        return values[::n, ::n, ::n].contiguous()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, None, None]:
+        n = ctx.n
+        whole = gradient.new_zeros(ctx.shape) if ctx.kept is None else ctx.kept
+        whole[::n, ::n, ::n] += gradient
+        return (whole if ctx.kept is None else None), None, None
+
+
+class MultiDistanceGrid(StoredShape):
+    """Features of space, at several spacings of one grid (docs/methods/tineuvox.md#grid).
+
+    Attributes:
+        values: (X, Y, Z, C). X − 1, Y − 1, Z − 1 are multiples of the largest stride, so that
+            the outer points of all spacings are on the faces of one box.
+    """
+
+    resizable = ("values",)
+    values: nn.Parameter
+
+    def __init__(self, channels: int, strides: Sequence[int]) -> None:
+        """A grid of one cell of the largest stride, of zeros."""
+        super().__init__()
+        self.strides = tuple(strides)
+        side = max(strides) + 1
+        self.values = nn.Parameter(torch.zeros(side, side, side, channels))
+
+    @property
+    def shape(self) -> Shape:
+        """Grid points along x, y, z."""
+        return shape_of(self.values)
+
+    def forward(self, points: Tensor, box: Box) -> Tensor:
+        """Features (M, C · strides) at ``points`` (M, 3), one spacing after another.
+
+        The grid is over ``box``; outside they are those of its border.
+        """
+        return torch.cat([look_up(self._spaced(n), points, box) for n in self.strides], dim=1)
+
+    def _spaced(self, n: int) -> Tensor:
+        """Every ``n``-th point along each axis."""
+        if n == 1:
+            return self.values
+        spaced: Tensor = _EveryNth.apply(self.values, n, self.values.grad)  # type: ignore[no-untyped-call]
+        return spaced
+
+    def fitting(self, box: Box, side: float) -> Shape:
+        """The least shape of about ``side``³ points over ``box`` that all strides fit into."""
+        widest = max(self.strides)
+        cells = [-(-(points - 1) // widest) for points in box.grid_shape(round(side**3))]
+        x, y, z = (count * widest + 1 for count in cells)
+        return x, y, z
+
+    @torch.no_grad()
+    def resize(self, shape: Shape) -> None:
+        """Resample to another shape over the same box, trilinearly; a new parameter results."""
+        values = resample(self.values, shape)
+        self.values = nn.Parameter(values, requires_grad=self.values.requires_grad)
+
+
+class RadianceNetwork(nn.Module):
+    """(γ(features), γ(x), code) → density; with γ(d) → colour."""
+
+    def __init__(self, settings: TiNeuVoxSettings, position: int, code: int) -> None:
+        """For encoded positions and codes of these lengths."""
+        super().__init__()
+        s = settings
+        self.encode_feature = SinusoidalEncoding(s.channels * len(s.strides), s.feature_bands)
+        self.encode_direction = SinusoidalEncoding(3, s.direction_bands)
+        self.trunk = nn.Linear(self.encode_feature.size + position + code, s.width)
+        self.density = nn.Linear(s.width, 1)
+        self.feature = nn.Linear(s.width, s.width)
+        self.branch = nn.Linear(s.width + self.encode_direction.size, s.width // 2)
+        self.color = nn.Linear(s.width // 2, 3)
+
+    def hidden(self, features: Tensor, position: Tensor, code: Tensor) -> Tensor:
+        """What density and colour come from, (S, width), of S samples."""
+        encoded = self.encode_feature(features)
+        return torch.relu(self.trunk(torch.cat([encoded, position, code], dim=1)))
+
+    def raw_density(self, hidden: Tensor) -> Tensor:
+        """Densities (S,) before their activation."""
+        raw: Tensor = self.density(hidden)
+        return raw[:, 0]
+
+    def rgb(self, hidden: Tensor, viewdirs: Tensor, ray: Tensor) -> Tensor:
+        """RGB (S, 3) in [0, 1] of samples of the rays ``ray`` (S,), whose directions are (R, 3)."""
+        direction = self.encode_direction(viewdirs).index_select(0, ray)
+        branch = torch.relu(self.branch(torch.cat([self.feature(hidden), direction], dim=1)))
+        return torch.sigmoid(self.color(branch))

@@ -1,0 +1,251 @@
+"""K-Planes' facts: planes and what keeps them simple, decoders, proposals, and that it learns."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lightning import Callback, Trainer
+from scipy.special import sph_harm_y
+
+from devrf.checkpoints.checkpoint import LoadedCheckpoint, save_checkpoint
+from devrf.data.datamodule import SceneDataModule
+from devrf.errors import DevrfError
+from devrf.geometry.rays import Rays
+from devrf.methods.kplanes.decoders import ExplicitDecoder, density_of, spherical_harmonics
+from devrf.methods.kplanes.model import KPlanes
+from devrf.methods.kplanes.planes import AXES, SixPlanes
+from devrf.methods.kplanes.proposals import drawn_edges, histogram_error, intervals
+from devrf.methods.kplanes.settings import KPlanesSettings
+from devrf.methods.protocol import ProtocolStage
+from devrf.methods.ray_stage import RayStage
+from devrf.rendering.renderer import Renderer
+from devrf.scenes.scene import Scene
+
+TINY = KPlanesSettings(
+    resolution=6, scales=(1, 2), channels=4, width=8, basis_width=8, steps=24, samples=6,
+    proposal_samples=(12, 8), proposal_resolutions=(4, 6), proposal_channels=2, occupancy_side=8,
+)  # fmt: skip
+LOSS = {"color": 1.0, "tv": 1e-4, "smooth": 1e-2, "change": 1e-4}
+LOSS |= {"smooth_proposals": 1e-3, "histogram": 1.0, "distortion": 1e-3}
+FORMS: list[Any] = [
+    {}, {"decoder": "explicit"}, {"pairing": "hexplane"}, {"sampling": "proposals"},
+    {"hull": False, "empty_from": 0.0},
+]  # fmt: skip
+
+
+def numbered(pairing: Any) -> SixPlanes:
+    """Planes of 2, 3, 5, 7, 11 and 13 everywhere."""
+    planes = SixPlanes(1, [2], 2, pairing=pairing)
+    with torch.no_grad():
+        for plane, value in zip(planes.planes, (2, 3, 5, 7, 11, 13), strict=True):
+            plane.fill_(value)
+    return planes
+
+
+def test_features_are_multiplied_over_planes_or_paired_as_hexplane_has_them() -> None:
+    somewhere = torch.zeros(1, 4)
+    assert numbered("product")(somewhere).tolist() == [[2 * 3 * 5 * 7 * 11 * 13]]
+    # xy · zt, xz · yt, yz · xt
+    assert numbered("hexplane")(somewhere).tolist() == [[2 * 13, 3 * 11, 7 * 5]]
+
+
+def test_a_plane_is_looked_up_along_its_own_two_axes() -> None:
+    planes = SixPlanes(1, [3], 5)
+    points = torch.tensor([[-1.0, -0.5, 0.25, 0.5]])
+    for number, (first, second) in enumerate(AXES):
+        with torch.no_grad():
+            for plane in planes.planes:
+                plane.fill_(1)
+            across = torch.linspace(-1, 1, planes.planes[number].shape[0])
+            along = torch.linspace(-1, 1, planes.planes[number].shape[1])
+            planes.planes[number][:, :, 0, 0] = across[:, None] + 10 * along
+        expected = points[:, first] + 10 * points[:, second]
+        torch.testing.assert_close(planes(points)[:, 0], expected)
+
+
+def test_scales_are_joined_and_time_has_the_same_points_in_each() -> None:
+    planes = SixPlanes(4, [6, 12], 3)
+    assert planes.size == 8 and planes(torch.rand(5, 4)).shape == (5, 8)
+    assert [tuple(p.shape[:2]) for p in planes.along(time=True)] == [(6, 3)] * 3 + [(12, 3)] * 3
+    assert all((plane == 1).all() for plane in planes.along(time=True))
+    still = torch.cat([plane.flatten() for plane in planes.along(time=False)])
+    assert 0.1 <= still.min() and still.max() <= 0.5
+
+
+def test_terms_of_planes_by_hand() -> None:
+    planes = SixPlanes(1, [2], 3)
+    with torch.no_grad():
+        for plane in planes.planes:
+            plane.fill_(1)
+    assert planes.total_variation() == planes.roughness() == planes.change() == 0
+    with torch.no_grad():
+        planes.planes[2][0, :, 0, 0] = torch.tensor([1.0, 2.0, 1.0])  # xt
+    # Along x: (0, 1, 0) squared, a third; along t: 1 and 1 of 4 differences, a half; twice both.
+    assert planes.total_variation().item() == pytest.approx(2 * (1 / 3 + 1 / 2))
+    assert planes.roughness().item() == pytest.approx((1 - 2 * 2 + 1) ** 2 / 2)
+    assert planes.change().item() == pytest.approx(1 / 6)
+
+
+def test_a_density_and_its_gradient() -> None:
+    raw = torch.tensor([1.0, 3.0, 31.0], requires_grad=True)
+    density = density_of(raw)
+    torch.testing.assert_close(density, (raw - 1).exp())
+    density.sum().backward()
+    torch.testing.assert_close(raw.grad, torch.tensor([1.0, math.exp(2), math.exp(15)]))
+
+
+def test_directions_are_spherical_harmonics() -> None:
+    torch.manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(20, 3), dim=1)
+    x, y, z = directions.double().unbind(1)
+    theta = z.acos().numpy()
+    phi = torch.atan2(y, x).numpy()
+    found = spherical_harmonics(directions)
+    column = 0
+    for degree in range(4):
+        for order in range(-degree, degree + 1):
+            value = sph_harm_y(degree, abs(order), theta, phi)
+            real = value.imag if order < 0 else value.real
+            scale = math.sqrt(2) if order else 1.0
+            expected = torch.from_numpy(scale * real).float()
+            torch.testing.assert_close(found[:, column], expected, atol=1e-5, rtol=0)
+            column += 1
+
+
+def test_explicit_colors_are_linear_in_the_features_before_the_sigmoid() -> None:
+    decoder = ExplicitDecoder(8, TINY)
+    features = torch.rand(2, 8)
+    viewdirs = torch.nn.functional.normalize(torch.randn(1, 3), dim=1)
+    ray = torch.zeros(2, dtype=torch.int64)
+    logits = torch.logit(decoder.rgb(features, viewdirs, ray))
+    double = torch.logit(decoder.rgb(2 * features, viewdirs, ray))
+    torch.testing.assert_close(double, 2 * logits, atol=1e-4, rtol=1e-4)
+
+
+def test_edges_are_drawn_where_the_weight_is() -> None:
+    edges = torch.tensor([[0.0, 1.0, 2.0, 4.0]])
+    even = drawn_edges(edges, torch.ones(1, 3), 3, jitter=False)
+    torch.testing.assert_close(even, edges)
+    drawn = drawn_edges(edges, torch.tensor([[0.0, 100.0, 0.0]]), 10, jitter=True)
+    assert (drawn.diff(dim=1) >= 0).all()
+    assert drawn[0, 0] == 0 and drawn[0, -1] == 4
+    assert (1 <= drawn[0, 1:-1]).all() and (drawn[0, 1:-1] <= 2).all()
+
+
+def test_intervals_fill_the_ray() -> None:
+    x = torch.tensor([[2.0, 0.0, 0.0]])
+    samples = intervals(Rays(torch.zeros(1, 3), x, x / 2), torch.tensor([[1.0, 2.0, 4.0]]))
+    assert samples.distance.tolist() == [1.5, 3.0]
+    assert samples.length.tolist() == [2.0, 4.0]  # of a direction of length 2
+    assert samples.points[:, 0].tolist() == [3.0, 6.0]
+
+
+def test_a_proposal_that_bounds_the_weights_has_no_error() -> None:
+    edges = torch.tensor([[0.0, 0.5, 1.0, 2.0]])
+    weight = torch.tensor([[0.2, 0.3, 0.1]])
+    proposed_edges = torch.tensor([[0.0, 1.0, 2.0]])
+    bounding = torch.tensor([[0.5, 0.1]])
+    assert histogram_error(edges, weight, proposed_edges, bounding) == 0
+    lower = torch.tensor([[0.25, 0.1]])
+    # Only the second interval has more than the 0.25 of the one that it lies in.
+    expected = (0.3 - 0.25) ** 2 / 0.3
+    assert histogram_error(edges, weight, proposed_edges, lower).item() == pytest.approx(
+        expected, rel=1e-4
+    )
+
+
+def test_proposals_learn_ever_less_often_and_sharpen() -> None:
+    model = KPlanes(replace(TINY, sampling="proposals"))
+    taught = []
+    for step in range(30000):
+        model.on_iteration(step, 30000)
+        taught.append(model._teaches)
+        if step in (0, 500, 1000):
+            f = step / 1000
+            assert model._sharpness == pytest.approx(10 * f / (9 * f + 1))
+    assert all(taught[:10])
+    assert sum(taught[:600]) > 500 and sum(taught[-100:]) == 20
+
+
+def test_time_has_half_as_many_points_as_frames() -> None:
+    model = KPlanes(TINY)
+    model.set_times(tuple(k / 49 for k in range(50)))
+    assert {plane.shape[1] for plane in model.planes.along(time=True)} == {25}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_it_learns(form: dict[str, Any], learned_losses: Callable[..., list[float]]) -> None:
+    torch.manual_seed(0)
+    model = KPlanes(replace(TINY, **form))
+    sizes = {"iterations": 120, "rays": 128, "iterations_per_step": 20}
+    rates = {"learning_rate": 3e-2, "final_learning_rate": 0.0, "decay": "cosine", "warmup": 0.1}
+    losses = learned_losses(model, term="color", loss=LOSS, **sizes, **rates)
+    assert losses[-1] < 0.7 * losses[0]
+
+
+@pytest.mark.parametrize("sampling", ["occupancy", "proposals"])
+def test_a_killed_run_goes_on_to_the_same_weights(
+    sampling: Any, ray_stage: Callable[..., RayStage], fit: Callable[..., RayStage], tmp_path: Path
+) -> None:
+    path = tmp_path / "progress.ckpt"
+
+    class StopHalfWay(Callback):
+        def on_train_batch_end(self, fitted: Trainer, *arguments: object) -> None:
+            save_checkpoint(fitted, path, weights_only=False)
+            fitted.should_stop = True
+
+    def stage() -> RayStage:
+        torch.manual_seed(0)
+        model = KPlanes(replace(TINY, sampling=sampling, hull=False, empty_from=0.0))
+        return ray_stage(model, loss=LOSS)
+
+    whole = fit(stage())
+    assert fit(stage(), StopHalfWay()).iteration == 2
+    resumed = stage()
+    torch.manual_seed(123)
+    fit(resumed, ckpt_path=path)
+    state = resumed.state_dict()
+    for name, value in whole.state_dict().items():
+        assert not isinstance(value, torch.Tensor) or torch.equal(value, state[name]), name
+
+
+def test_two_stages_leave_what_space_says_as_it_was(
+    ray_stage: Callable[..., RayStage], fit: Callable[..., RayStage]
+) -> None:
+    first = fit(ray_stage(KPlanes(TINY), "canonical", loss=LOSS))
+    step = ProtocolStage("deformation", "dynamic", frozen=("canonical",), builds_on="canonical")
+    before = {n: p.clone() for n, p in first.scene_model.named_parameters()}
+    second = fit(ray_stage(KPlanes(TINY), step, loss=LOSS, rest=first.result()))
+    model = second.scene_model
+    moving = {id(plane) for plane in model.planes.along(time=True)}  # type: ignore[union-attr]
+    for name, parameter in model.named_parameters():
+        assert torch.equal(parameter, before[name]) == (id(parameter) not in moving), name
+
+
+@pytest.mark.parametrize("form", FORMS[:4])
+@pytest.mark.parametrize("name", ["tiny_room", "facing"])
+def test_scenes_of_every_space_are_learned_and_come_back(
+    name: str, form: dict[str, Any], request: pytest.FixtureRequest,
+    serve: Callable[[Scene], SceneDataModule], ray_stage: Callable[..., RayStage],
+    fit: Callable[..., RayStage], stored: Callable[[RayStage], LoadedCheckpoint],
+) -> None:  # fmt: skip
+    scene = request.getfixturevalue(name)
+    stage = fit(ray_stage(KPlanes(replace(TINY, **form)), loss=LOSS), data=serve(scene))
+    model = stored(stage).model
+    assert model.space == scene.space
+    cameras = scene.static.test.cameras
+    now, then = (Renderer(m).view(cameras, 0, 0.5, 1.0) for m in (stage.scene_model, model))
+    assert torch.equal(now.color, then.color)
+
+
+def test_impossible_sizes_are_refused() -> None:
+    with pytest.raises(DevrfError, match="proposal_samples: expected numbers from 2, as many as"):
+        replace(TINY, proposal_samples=(8,))
+    with pytest.raises(DevrfError, match="scales: expected one or more numbers"):
+        replace(TINY, scales=())
