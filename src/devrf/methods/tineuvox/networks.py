@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -44,7 +44,7 @@ class MultiDistanceGrid(StoredShape):
             the outer points of all spacings are on the faces of one box.
     """
 
-    resizable = ("values",)
+    resizable: ClassVar = {"values": 3}
     values: nn.Parameter
 
     def __init__(self, channels: int, strides: Sequence[int]) -> None:
