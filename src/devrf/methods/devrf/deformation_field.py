@@ -147,27 +147,31 @@ class DeformationField(FrameField):
 
 
 @torch.no_grad()
-def deformed_occupancy(visible: Occupancy, warp: Callable[[Tensor], Tensor]) -> Occupancy:
-    """The occupancy at a time: the grid points whose canonical position is occupied.
+def deformed_occupancy(
+    field: CanonicalField,
+    occupancy: Occupancy,
+    settings: RenderSettings,
+    warp: Callable[[Tensor], Tensor],
+) -> Occupancy:
+    """The occupancy at a time: the points of the density's grid that move to what is opaque.
+
+    That is where samples count, there or at the nearest point at rest, since a thin thing may lie
+    between the places that grid points come from. Grown by one for what is between them now.
 
     Args:
-        visible: at rest, with a rim for what lies between the points (:func:`visible_occupancy`).
-        warp: x → x + Δ_b(x, t), the points (M, 3) of the occupancy's grid into canonical space.
+        field: the canonical field.
+        occupancy: where something is at rest.
+        settings: how rays are sampled.
+        warp: x → x + Δ_b(x, t), the points (M, 3) of the grid into canonical space.
     """
-    x, y, z = visible.mask.shape
-    points = visible.box.grid_points((x, y, z), torch.empty(0, device=visible.mask.device))
-    return Occupancy(visible.at(warp(points.view(-1, 3))).view(x, y, z), visible.box)
-
-
-@torch.no_grad()
-def visible_occupancy(
-    field: CanonicalField, occupancy: Occupancy, settings: RenderSettings
-) -> Occupancy:
-    """Where a sample at rest may be opaque enough to count, on the density's grid.
-
-    Those grid points that are, grown by one: a sample that moves with a grid point lies within half
-    a cell of it, and so does the grid point that the occupancy is looked up at.
-    """
-    opaque = field.voxel_alpha(settings.step) >= settings.alpha_threshold
-    mask = opaque & occupancy.on(field.density.shape, field.box)
-    return Occupancy(dilate(mask, 1), field.box)
+    x, y, z = field.density.shape
+    points = field.box.grid_points((x, y, z), field.density.values)
+    canonical = warp(points.view(-1, 3))
+    near = occupancy.at(canonical).nonzero()[:, 0]
+    canonical = canonical[near]
+    least = settings.alpha_threshold
+    at_rest = Occupancy(field.voxel_alpha(settings.step) >= least, field.box)
+    tau = field.optical_depth(canonical, field.step_in_base_voxels(settings.step))
+    mask = torch.zeros(x * y * z, dtype=torch.bool, device=near.device)
+    mask[near] = at_rest.at(canonical) | (-torch.expm1(-tau) >= least)
+    return Occupancy(dilate(mask.view(x, y, z), 1), field.box)

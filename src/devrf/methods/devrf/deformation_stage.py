@@ -282,8 +282,9 @@ class DeformationStage(Stage):
         further: dict[str, FrameField] = {}
         for extension in self.extensions:
             further |= extension.frame_fields(self, level)
-        visible = self.scene_model.visible_occupancy
-        frame = ActiveFrame.of(self.field.frames, visible, further)
+        canonical = self.scene_model.canonical
+        mask = torch.zeros(canonical.density.shape, dtype=torch.bool, device=self.device)
+        frame = ActiveFrame.of(self.field.frames, Occupancy(mask, canonical.box), further)
         self.active = frame
         self.weights = self.motion_loss.weights_at(level)
         smoothing = self.motion_loss.smoothing(level, self.field.shape)
@@ -319,7 +320,7 @@ class DeformationStage(Stage):
         frame = self.active
         assert frame is not None
         warp = self.field.warp_by(frame.backward)
-        found = deformed_occupancy(model.visible_occupancy, warp)
+        found = deformed_occupancy(model.canonical, model.occupancy, model.settings, warp)
         # Grown by one, since the displacements change until it is found anew.
         frame.occupancy.refill(Occupancy(dilate(found.mask, 1), found.box))
 

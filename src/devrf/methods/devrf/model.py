@@ -22,7 +22,6 @@ from devrf.methods.devrf.deformation_field import (
     DeformationField,
     GridWarp,
     deformed_occupancy,
-    visible_occupancy,
 )
 from devrf.methods.devrf.frame_store import NAMES, FrameField, fits_on_device
 from devrf.methods.devrf.view import CanonicalSurface, DeVRFView
@@ -136,12 +135,7 @@ class DeVRFModel(Renderable):
         warp = self.warp(time)
         if warp is None:
             return self.occupancy
-        return deformed_occupancy(self.visible_occupancy, warp)
-
-    @property
-    def visible_occupancy(self) -> Occupancy:
-        """Where something is opaque enough to be seen at rest."""
-        return visible_occupancy(self.canonical, self.occupancy, self.settings)
+        return deformed_occupancy(self.canonical, self.occupancy, self.settings, warp)
 
     def at(self, time: float, *, half: bool = False) -> DeVRFView:
         """The scene at ``time``: its occupancy and its displacements, ready."""

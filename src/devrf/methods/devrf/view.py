@@ -16,7 +16,6 @@ from devrf.methods.devrf.deformation_field import (
     DeformationField,
     GridWarp,
     deformed_occupancy,
-    visible_occupancy,
 )
 from devrf.methods.devrf.losses import induced_flow
 from devrf.methods.devrf.volume_rendering import render
@@ -70,15 +69,16 @@ class DeVRFView:
             return
         displacement = motion.blended(self.time)
         self._warp = warp = motion.warp_by(displacement)
-        visible = visible_occupancy(self.canonical, self.occupancy, self.picture_settings)
-        x, y, z = visible.mask.shape
+        x, y, z = self.canonical.density.shape
 
         def resampled(points: Tensor) -> Tensor:
             """Interpolation at the points of a grid over the same box, several times faster."""
             return points + resample(displacement, (x, y, z)).view(-1, 3)
 
         whole = resampled if not motion.still_outside else warp
-        self.occupancy = deformed_occupancy(visible, whole)
+        self.occupancy = deformed_occupancy(
+            self.canonical, self.occupancy, self.picture_settings, whole
+        )
 
     @property
     def chunk(self) -> int:
