@@ -24,7 +24,8 @@ import gzip
 import html
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from importlib.resources import files
 from itertools import pairwise
 from pathlib import Path
@@ -44,11 +45,7 @@ from devrf.geometry.contraction import ContractedSpace
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.methods.base import Renderable
 from devrf.methods.devrf.canonical_field import ColorDecoder
-from devrf.methods.devrf.deformation_field import (
-    DeformationField,
-    deformed_occupancy,
-    visible_occupancy,
-)
+from devrf.methods.devrf.deformation_field import DeformationField, GridWarp, deformed_occupancy
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.volume_rendering import medium
 from devrf.ops.trilinear import shape_of
@@ -116,7 +113,8 @@ def _element(part: str, values: Tensor) -> str:
 def _parts(model: DeVRFModel) -> Iterator[tuple[str, Tensor]]:
     """The contents of all textures by the elements' names: (depth, height, width, …)."""
     field, sampling = model.canonical, model.at(0.0).picture_settings
-    rest = visible_occupancy(field, model.occupancy, sampling)
+    occupied = partial(deformed_occupancy, field, model.occupancy, sampling)
+    rest = occupied(GridWarp((), model.box))
     shown = rest.points_near(field.density.shape, model.box)
     raw = field.density.values[..., 0]
     yield "density", torch.where(shown, raw, raw.min()).half()
@@ -130,7 +128,7 @@ def _parts(model: DeVRFModel) -> Iterator[tuple[str, Tensor]]:
     assert isinstance(field.decoder, ColorDecoder)
     yield "weights", _weights(field.decoder, low, high)
     motion, residual = model.deformation, model.color_residual
-    seen = _seen(motion, rest) if motion else []
+    seen = _seen(motion, rest.cell, occupied) if motion else []
     for part, mask in ({"rest": rest.mask} | dict(enumerate(seen))).items():
         yield f"distances-{part}", Occupancy(mask, model.box).surroundings.distances
     for k in range(len(motion.clock) if motion else 0):
@@ -147,20 +145,22 @@ def _parts(model: DeVRFModel) -> Iterator[tuple[str, Tensor]]:
             yield f"residual-{k}", (128 + codes).byte()
 
 
-def _seen(motion: DeformationField, rest: Occupancy) -> list[Tensor]:
+def _seen(
+    motion: DeformationField, cell: float, occupied: Callable[[GridWarp], Occupancy]
+) -> list[Tensor]:
     """Where something is at any time between two consecutive frames: masks (X, Y, Z).
 
-    From one time to the next nothing moves by more than a cell, the rim of the one at ``rest``.
+    From one time to the next nothing moves by more than a ``cell``, the rim of what is occupied.
     """
     masks = []
     for k, (start, end) in enumerate(pairwise(motion.clock.times)):
-        first, last = (deformed_occupancy(rest, motion.warp_at(t)).mask for t in (start, end))
-        mask = first | last
-        near = Occupancy(mask, rest.box).points_near(motion.shape, motion.box)
+        first = occupied(motion.warp_at(start))
+        mask = first.mask | occupied(motion.warp_at(end)).mask
+        near = Occupancy(mask, first.box).points_near(motion.shape, motion.box)
         before, after = (motion.to_canonical[n].to(near.device).float() for n in (k, k + 1))
         change = float(((after - before).norm(dim=-1) * near).amax())
-        for time in torch.linspace(start, end, math.ceil(change / rest.cell) + 1)[1:-1].tolist():
-            mask |= deformed_occupancy(rest, motion.warp_at(time)).mask
+        for time in torch.linspace(start, end, math.ceil(change / cell) + 1)[1:-1].tolist():
+            mask |= occupied(motion.warp_at(time)).mask
         masks.append(mask)
     return masks
 
