@@ -14,13 +14,15 @@ from devrf import methods
 PAGE = Path(__file__).parents[2] / "docs" / "extending.md"
 SETTINGS = "ray_stage.model.settings"
 NARROW = (f"{SETTINGS}.width=8", f"{SETTINGS}.steps=16", f"{SETTINGS}.occupancy_side=8")
+# Fine enough that a hull leaves some of the box empty.
+HULL = f"{SETTINGS}.occupancy_side=16"
 SMALL = {
     "dnerf": (*NARROW, f"{SETTINGS}.deformation_width=8"),
     "nerfies": (*NARROW, f"{SETTINGS}.warp_width=8", "ray_stage.loss.elastic=1e-3"),
     "hypernerf": (*NARROW, f"{SETTINGS}.warp_width=8", "ray_stage.loss.elastic=1e-3"),
     "nsff": (*NARROW, f"{SETTINGS}.depth=2", f"{SETTINGS}.samples=8"),
-    "tineuvox": (f"{SETTINGS}.width=8", f"{SETTINGS}.side=8", f"{SETTINGS}.occupancy_side=8"),
-    "kplanes": (*NARROW, f"{SETTINGS}.resolution=4", f"{SETTINGS}.channels=2"),
+    "tineuvox": (f"{SETTINGS}.width=8", f"{SETTINGS}.side=8", HULL),
+    "kplanes": (*NARROW, HULL, f"{SETTINGS}.resolution=4", f"{SETTINGS}.channels=2"),
     "neural_volumes": (
         f"{SETTINGS}.code=4",
         f"{SETTINGS}.encoder_views=2",
