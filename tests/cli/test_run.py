@@ -94,7 +94,7 @@ def test_everything_lies_in_the_run_folder(trained):
         *(".hydra/config.yaml", "run.log", "metrics.json", "frames.csv"),
         *("checkpoints/canonical.ckpt", "checkpoints/deformation.ckpt"),
         *(f"images/{name}.png" for name in pictures),
-        *("videos/held_out.mp4", "videos/orbit.mp4"),
+        *("videos/held_out.mp4", "videos/orbit.mp4", "export/scene.html"),
     } <= made
     assert not [name for name in made if "partial" in name]
     video = iio.imread(folder / "videos" / "held_out.mp4")
@@ -108,7 +108,8 @@ def test_the_last_lines_are_commands_that_work(devrf, tmp_path, trained):
     at = next(k for k, line in enumerate(lines) if line.startswith("results:"))
     results = "(metrics.json, images, videos, checkpoints)"
     assert lines[at] == f"results: outputs/robot/quickstart {results}"
-    commands = [shlex.split(line) for line in lines[at + 2 :]]
+    assert lines[at + 1] == "the scene, for any browser: outputs/robot/quickstart/export/scene.html"
+    commands = [shlex.split(line) for line in lines[at + 3 :]]
     assert [words[:3] for words in commands] == [["python", "-m", "devrf"]] * 3
     copy = tmp_path / "outputs" / "robot" / "quickstart"
     shutil.copytree(folder, copy)

@@ -112,6 +112,7 @@ class ViewerSettings:
     move_seconds: float = 0.2
     training: bool = False
     share: float = 0.03
+    renderer: Literal["auto", "browser", "server"] = "auto"
 
     def __post_init__(self) -> None:
         seconds = self.move_seconds

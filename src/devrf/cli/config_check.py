@@ -178,13 +178,16 @@ def unknown_key(where: str, known: Iterable[object]) -> DevrfError:
 
 def check_extras(config: DictConfig) -> None:
     """Refuse by a DevrfError settings for which an extra of devrf is not installed."""
+    # What DeVRF learns a browser draws by itself.
+    served = ("server",) if config.method == "devrf" else ("server", "auto")
+    serves = config.stage == "view" and config.viewer.renderer in served
     tensorboard = "TensorBoard" in config.logger.get("_target_", "")
-    exports = config.stage == "export"
+    exports = config.stage == "export" and config.export.format != "html"
     meshes = "skimage trimesh fast_simplification"
     usd = exports and config.export.format == "usd"
     for chosen, setting, packages, extra, instead in (
         (tensorboard, "logger=tensorboard", "tensorboard", "tensorboard", "logger=csv"),
-        (config.stage == "view", "stage=view", "viser", "viewer", "stage=render"),
+        (serves, "stage=view", "viser", "viewer", "stage=render"),
         (config.viewer.get("training"), "viewer=true", "viser", "viewer", "viewer=false"),
         (exports, "stage=export", meshes, "export", "stage=render"),
         (usd, "export.format=usd", "pxr", "export", "export.format=gltf"),

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import logging
 from contextlib import closing
+from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from hydra.utils import instantiate
 
 from devrf.apps.export.geometry import ExportSettings
-from devrf.apps.export.scene import export_scene
+from devrf.apps.export.scene import PAGE, export_scene
 from devrf.apps.images import to_bytes
 from devrf.apps.render import videos
 from devrf.apps.settings import ViewerSettings
@@ -17,6 +19,8 @@ from devrf.apps.still import StillSettings, write_still
 from devrf.apps.still import still as rendered
 from devrf.apps.video import VideoSettings
 from devrf.apps.video_file import write_pictures
+from devrf.apps.viewer.page import PageServer
+from devrf.apps.web.pack import drawable, page, write_page
 from devrf.checkpoints.checkpoint import Viewpoints, check_scene, metadata_of
 from devrf.cli.context import RunContext
 from devrf.cli.restore_config import root
@@ -28,6 +32,9 @@ from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
 from devrf.system.process import handle_signals
 from devrf.system.progress import followed
+
+if TYPE_CHECKING:
+    from devrf.apps.viewer.session import Session
 
 log = logging.getLogger(__name__)
 
@@ -69,26 +76,48 @@ def still(run: RunContext) -> None:
 
 def view(run: RunContext) -> None:
     """Show the run's checkpoint on a page until a signal arrives."""
+    settings: ViewerSettings = instantiate(run.config.viewer)
+    model, viewpoints = _learned(run)
+    without = "its cameras are shown without pictures"
+    by_browser = settings.renderer == "browser" or (settings.renderer == "auto" and drawable(model))
+    shown: PageServer | Session
+    if by_browser:
+        text = page(model, viewpoints, run.config.scene)
+        shown = PageServer(settings, text, cache(lambda: _with_images(run, without)))
+    else:
+        shown = _session(run, settings, model, viewpoints, _with_images(run, without))
+    with closing(shown), handle_signals(lambda _: shown.stop()):
+        shown.serve()
+
+
+def _session(
+    run: RunContext,
+    settings: ViewerSettings,
+    model: Renderable,
+    viewpoints: Viewpoints,
+    scene: Scene | None,
+) -> Session:
+    """The page whose pictures this machine renders."""
     from devrf.apps.viewer.drawing import Drawing
     from devrf.apps.viewer.session import Session  # an extra
 
-    settings: ViewerSettings = instantiate(run.config.viewer)
-    model, viewpoints = _learned(run)
-    scene = _with_images(run, "its cameras are shown without pictures")
-    with (
-        closing(Session(settings, viewpoints, scene, run.folder, run.config.ckpt)) as session,
-        handle_signals(lambda _: session.stop()),
-    ):
-        drawing = Drawing(Renderer(model, times=CACHED), background_value(viewpoints.background))
-        session.present(drawing)
-        session.serve()
+    session = Session(settings, viewpoints, scene, run.folder, run.config.ckpt)
+    session.present(Drawing(Renderer(model, times=CACHED), background_value(viewpoints.background)))
+    return session
 
 
 def export(run: RunContext) -> None:
-    """Write geometry that moves, for other programs."""
+    """Write geometry that moves, for other programs, or the page that browsers draw."""
     settings: ExportSettings = instantiate(run.config.export, _convert_="all")
     model, viewpoints = _learned(run)
-    export_scene(model, viewpoints, settings, run.folder / "export")
+    export_scene(model, viewpoints, settings, run.folder / "export", run.config.scene)
+
+
+def write_scene_page(run: RunContext) -> None:
+    """Write the page that browsers draw, if they can draw what was learned."""
+    model, viewpoints = _learned(run)
+    if drawable(model):
+        write_page(run.folder / "export" / PAGE, model, viewpoints, run.config.scene)
 
 
 def _learned(run: RunContext) -> tuple[Renderable, Viewpoints]:

@@ -174,7 +174,7 @@ def unfinished(run: RunContext) -> str | None:
 
 def done(run: RunContext, step: str) -> bool:
     """Whether a step has been done with the same checkpoint and settings; says so."""
-    files = _notes(run.folder).get(_made_with(run, step), [])
+    files = _notes(run.folder).get(_made_with(run, step), []) if step in DECIDES else []
     if not files or not all((run.folder / name).is_file() for name in files):
         return False
     log.info("%s: done already (%s); stage=%s does it again", step, ", ".join(files), step)

@@ -19,6 +19,7 @@ from hydra.utils import instantiate
 from lightning import seed_everything
 from omegaconf import DictConfig, OmegaConf
 
+from devrf.apps.export.scene import PAGE
 from devrf.apps.render import camera_path
 from devrf.apps.settings import ViewerSettings
 from devrf.cli.config import APART, OF_A_CHECKPOINT, PIPELINE, in_sweep
@@ -27,7 +28,7 @@ from devrf.cli.evaluate import evaluate
 from devrf.cli.memory import compare
 from devrf.cli.messages import as_own_errors
 from devrf.cli.preparation import capture, fetch, inspect, prepare, say_next, selfcheck
-from devrf.cli.render import export, render, still, view
+from devrf.cli.render import export, render, still, view, write_scene_page
 from devrf.cli.resume import done, note_done, unfinished
 from devrf.cli.run_folder import archive_previous
 from devrf.cli.sweep import report
@@ -55,7 +56,10 @@ STEPS: dict[str, Step] = {
         *(report, fetch, capture, selfcheck),
     )
 }
-AFTER_LEARNING = ("evaluate", "render")
+AFTER_LEARNING: dict[str, Step] = {
+    **{"evaluate": evaluate, "render": render},
+    "page": write_scene_page,
+}
 # What a run's folder may hold that a person looks at first, and what to try next.
 RESULTS = ("metrics.json", "images", "videos", "checkpoints")
 NEXT = ("stage=still still.time=0.35 still.height=400", "stage=view")
@@ -77,7 +81,7 @@ def plan(stage: str, protocol: Sequence[str]) -> tuple[Names, Names]:
         DevrfError: there is no such stage.
     """
     if stage == PIPELINE:
-        return tuple(protocol), AFTER_LEARNING
+        return tuple(protocol), tuple(AFTER_LEARNING)
     if stage in protocol:
         return (stage,), ()
     known = [PIPELINE, *protocol, *STEPS]
@@ -110,7 +114,7 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
             _learn(run, learning)
         for name in steps if run.leads or not learning else ():
             if not (learning and done(run, name)):
-                _take(run, name, STEPS[name])
+                _take(run, name, AFTER_LEARNING.get(name) or STEPS[name])
     scored = "evaluate" in steps and run.leads and unfinished(run) is None
     return _ended(run, steps) if scored else None
 
@@ -142,9 +146,11 @@ def _ended(run: RunContext, steps: Names) -> float | None:
         best = objective(run.config.objective, metrics)
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
         raise DevrfError(f"{scores}: damaged; remove it, and the run is scored again") from None
-    if steps == AFTER_LEARNING and not in_sweep():
+    if steps == tuple(AFTER_LEARNING) and not in_sweep():
         results = ", ".join(name for name in RESULTS if (run.folder / name).exists())
         log.info("results: %s (%s)", run.place, results)
+        if (run.folder / "export" / PAGE).exists():
+            log.info("the scene, for any browser: %s", run.place / "export" / PAGE)
         further = [[f"hydra.run.dir={run.place}", *words.split()] for words in NEXT]
         if metrics.get("at_rest"):
             further[0].remove("still.time=0.35")

@@ -1,4 +1,4 @@
-"""What ``stage=export`` writes: geometry that moves, for other programs."""
+"""What ``stage=export`` writes: geometry that moves, for other programs; a page, for browsers."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from devrf.apps.export.gltf import write_gltf
 from devrf.apps.export.sequence import Drawn, mesh_files, point_file, write_sequence
 from devrf.apps.export.surface import canonical_surface
 from devrf.apps.export.usd import write_usd
+from devrf.apps.web.pack import write_page
 from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
@@ -21,21 +22,28 @@ from devrf.system.progress import followed
 
 log = logging.getLogger(__name__)
 
+# The file of export.format=html.
+PAGE = "scene.html"
 # Formats that have one file for all times.
 SINGLE = {"gltf": ("scene.glb", write_gltf), "usd": ("scene.usdc", write_usd)}
 
 
 def export_scene(
-    model: Renderable, viewpoints: Viewpoints, settings: ExportSettings, folder: Path
+    model: Renderable, viewpoints: Viewpoints, settings: ExportSettings, folder: Path, name: str
 ) -> None:
     """Write the surface of what was learned, as it moves, or coloured points of each time.
 
-    ``folder`` is where, unless the settings say.
+    Or, as ``html``, the page of the scene ``name``. ``folder`` is where, unless the settings say.
 
     Raises:
         DevrfError: what is asked for cannot be had of the method, or is empty.
     """
     folder = folder if settings.into is None else Path(settings.into)
+    if settings.format == "html":
+        path = folder / PAGE
+        write_page(path, model, viewpoints, name)
+        log.info("the scene, for any browser, written to %s", path)
+        return
     times = settings.export_times(viewpoints.clock) if model.moves else (0.0,)
     if _takes_surface(model, settings):
         surface = canonical_surface(model, viewpoints.static, settings)

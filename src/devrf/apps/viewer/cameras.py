@@ -13,13 +13,12 @@ from kornia.geometry.conversions import (
 )
 from torch import Tensor
 
-from devrf.apps.images import evenly, scaled, to_bytes
+from devrf.apps.captured_cameras import MAX_FRUSTA, frustum_depth, thumbnail
+from devrf.apps.images import evenly
 from devrf.apps.keyframes import Keyframe, keyframes_of
 from devrf.errors import DevrfError
-from devrf.evaluation.held_out import truth_image
 from devrf.geometry.cameras import Cameras
-from devrf.scenes.bounds import nearest_point
-from devrf.scenes.scene import Scene, Views
+from devrf.scenes.scene import Scene
 from devrf.scenes.validation import in_reach
 
 if TYPE_CHECKING:
@@ -27,13 +26,6 @@ if TYPE_CHECKING:
 
 # From OpenGL's camera axes (y up, z backwards) to OpenCV's (y down, z forwards), and back.
 FLIP = (1.0, -1.0, -1.0)
-# Rows of an image in a frustum.
-ROWS = 96
-# The most frusta of a capture.
-MAX_FRUSTA = 60
-# A frustum is as deep as its neighbour is far, within these shares of the distance to the scene.
-MIN_DEPTH = 0.03
-MAX_DEPTH = 0.12
 COLOR = (40, 110, 170)
 THICKNESS = 1.5
 # The angles of view in degrees, and windows (width over height), that are rendered as they are.
@@ -80,19 +72,6 @@ def in_browser(keyframe: Keyframe) -> tuple[np.ndarray, np.ndarray, float]:
     return wxyz.numpy(), pose[:, 3].numpy(), math.radians(keyframe.fov)
 
 
-def distance_ahead(cameras: Cameras) -> float:
-    """How far before N cameras the point is that lies nearest to all their optical axes.
-
-    Axes that meet nowhere give the cameras' extent.
-    """
-    origins = cameras.positions
-    forwards = cameras.forwards
-    extent = float((origins - origins.mean(dim=0)).norm(dim=1).max()) or 1.0
-    point = nearest_point(origins, forwards, parallel=1e-3)
-    ahead = 0.0 if point is None else float(((point - origins) * forwards).sum(dim=1).mean())
-    return ahead if ahead > 0 else extent
-
-
 class Frustum(NamedTuple):
     """A captured camera; a fixed one has one name at every time, ``image`` is (H', W', 3) uint8."""
 
@@ -106,7 +85,7 @@ def dynamic_frusta(scene: Scene, time: float) -> list[Frustum]:
     views = scene.dynamic.train
     images = ((views.times - time).abs() < scene.clock.TOLERANCE).nonzero()[:, 0].tolist()
     return [
-        Frustum(f"moving/{views.view[k]}", views.cameras[[k]], _thumbnail(scene, views, k))
+        Frustum(f"moving/{views.view[k]}", views.cameras[[k]], thumbnail(scene, views, k))
         for k in (images[j] for j in evenly(len(images), MAX_FRUSTA))
     ]
 
@@ -115,14 +94,9 @@ def static_frusta(cameras: Cameras, scene: Scene | None) -> list[Frustum]:
     """The cameras that saw the scene at rest, with images if there is a scene."""
     frusta = []
     for k in evenly(len(cameras), MAX_FRUSTA):
-        image = None if scene is None else _thumbnail(scene, scene.static.train, k)
+        image = None if scene is None else thumbnail(scene, scene.static.train, k)
         frusta.append(Frustum(f"static/{k}", cameras[[k]], image))
     return frusta
-
-
-def _thumbnail(scene: Scene, views: Views, index: int) -> Tensor:
-    image = truth_image(views, index, scene.background)
-    return to_bytes(scaled(image, min(views.height, ROWS)))
 
 
 class FrustaLayer:
@@ -133,10 +107,7 @@ class FrustaLayer:
         self._server = server
         self._cameras = cameras
         self._scene = scene
-        shown = cameras.positions[evenly(len(cameras), MAX_FRUSTA)]
-        apart = torch.cdist(shown, shown).fill_diagonal_(math.inf).amin(dim=1).median()
-        away = distance_ahead(cameras)
-        self._depth = float(apart.clamp(MIN_DEPTH * away, MAX_DEPTH * away))
+        self._depth = frustum_depth(cameras)
         self._handles: dict[str, viser.CameraFrustumHandle] = {}
         self._shown: object = None
 

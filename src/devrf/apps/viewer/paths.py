@@ -14,6 +14,7 @@ import torch
 import viser
 
 from devrf.apps.camera_paths import WAYS, bullet_time, default_way, looked_at, time_freeze
+from devrf.apps.captured_cameras import distance_ahead
 from devrf.apps.keyframes import (
     CameraPath,
     Keyframe,
@@ -23,7 +24,7 @@ from devrf.apps.keyframes import (
     write_path,
 )
 from devrf.apps.video import VideoSettings
-from devrf.apps.viewer.cameras import distance_ahead, from_browser
+from devrf.apps.viewer.cameras import from_browser
 from devrf.apps.viewer.controls import choice_of, number_of, set_value
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras

@@ -5,12 +5,10 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
-import socket
 from functools import partial
 from http import HTTPStatus
 from typing import Any
 from unittest.mock import patch
-from urllib.parse import urlsplit
 
 import viser
 from websockets.asyncio import server as websockets_server
@@ -18,6 +16,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from devrf.apps.settings import ViewerSettings
+from devrf.apps.viewer.guard import own_names, refusal
 
 
 def open_server(settings: ViewerSettings) -> viser.ViserServer:
@@ -26,8 +25,7 @@ def open_server(settings: ViewerSettings) -> viser.ViserServer:
     logging.getLogger("websockets").setLevel(logging.WARNING)
     # A probe of the port asks for no page: its traceback would help nobody.
     logging.getLogger("websockets.server").addFilter(lambda r: r.msg != "opening handshake failed")
-    names = {"localhost", settings.host, socket.gethostname(), socket.getfqdn()}
-    serve = partial(_guarded, websockets_server.serve, {name.lower() for name in names})
+    serve = partial(_guarded, websockets_server.serve, own_names(settings.host))
     # viser has no setting for a check of requests.
     with quiet(), patch.object(websockets_server, "serve", serve):
         server = viser.ViserServer(settings.host, settings.port, label="devrf", verbose=False)
@@ -42,25 +40,16 @@ def quiet() -> contextlib.redirect_stdout[io.StringIO]:
     return contextlib.redirect_stdout(io.StringIO())
 
 
-def _guarded(serve: Any, names: set[str], *where: Any, process_request: Any, **more: Any) -> Any:
-    """``serve``, which refuses pages from elsewhere that the same browser shows.
-
-    Such a page gives its own address in ``Origin``. One whose name was made to lead to this machine
-    (DNS rebinding) gives that name in ``Host``: an IP address or one of the machine's own ``names``
-    cannot be made so.
-    """
+def _guarded(
+    serve: Any, names: frozenset[str], *where: Any, process_request: Any, **more: Any
+) -> Any:
+    """``serve``, which refuses what :func:`refusal` says."""
 
     def answer(connection: ServerConnection, request: Request) -> Response | None:
-        host = request.headers.get("Host", "").lower()
-        name = urlsplit(f"//{host}").hostname or ""
-        is_address = ":" in name or name.replace(".", "").isdigit()
-        if name not in names and not is_address:
-            why = f"this machine is not {name!r}; open the page by its IP address"
-        elif urlsplit(request.headers.get("Origin", f"//{host}")).netloc.lower() != host:
-            why = "another page's request"
-        else:
-            response: Response | None = process_request(connection, request)
-            return response
-        return connection.respond(HTTPStatus.FORBIDDEN, f"devrf: {why}\n")
+        why = refusal(request.headers, names)
+        if why is not None:
+            return connection.respond(HTTPStatus.FORBIDDEN, why)
+        response: Response | None = process_request(connection, request)
+        return response
 
     return serve(*where, process_request=answer, **more)

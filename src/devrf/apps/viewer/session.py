@@ -12,9 +12,10 @@ from pathlib import Path
 import torch
 import viser
 
+from devrf.apps.captured_cameras import distance_ahead
 from devrf.apps.keyframes import CameraPath, keyframes_of
 from devrf.apps.settings import ViewerSettings
-from devrf.apps.viewer.cameras import FrustaLayer, distance_ahead, in_browser
+from devrf.apps.viewer.cameras import FrustaLayer, in_browser
 from devrf.apps.viewer.controls import Controls
 from devrf.apps.viewer.drawing import Drawing, Frame, RenderScheduler
 from devrf.apps.viewer.paths import PathPanel, known_paths

@@ -1,0 +1,102 @@
+"""The captured cameras as frusta in a scene: how many and how deep, and what they show."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from devrf.apps.camera_paths import looked_at
+from devrf.apps.images import evenly, scaled, to_bytes
+from devrf.checkpoints.checkpoint import Viewpoints
+from devrf.evaluation.held_out import truth_image
+from devrf.geometry.cameras import Cameras
+from devrf.rendering.view import Viewable
+from devrf.scenes.bounds import nearest_point
+from devrf.scenes.scene import Scene, Views
+
+# The most frusta of a capture.
+MAX_FRUSTA = 60
+# A frustum is as deep as its neighbour is far, within these shares of the distance to the scene.
+MIN_DEPTH = 0.03
+MAX_DEPTH = 0.12
+# Rows of an image in a frustum.
+ROWS = 96
+
+
+def distance_ahead(cameras: Cameras) -> float:
+    """How far before N cameras the point is that lies nearest to all their optical axes.
+
+    Axes that meet nowhere give the cameras' extent.
+    """
+    origins = cameras.positions
+    forwards = cameras.forwards
+    extent = float((origins - origins.mean(dim=0)).norm(dim=1).max()) or 1.0
+    point = nearest_point(origins, forwards, parallel=1e-3)
+    ahead = 0.0 if point is None else float(((point - origins) * forwards).sum(dim=1).mean())
+    return ahead if ahead > 0 else extent
+
+
+def frustum_depth(cameras: Cameras) -> float:
+    """How deep the frusta of N cameras are drawn, in world units."""
+    shown = cameras.positions[evenly(len(cameras), MAX_FRUSTA)]
+    apart = torch.cdist(shown, shown).fill_diagonal_(math.inf).amin(dim=1).median()
+    away = distance_ahead(cameras)
+    return float(apart.clamp(MIN_DEPTH * away, MAX_DEPTH * away))
+
+
+def thumbnail(scene: Scene, views: Views, index: int) -> Tensor:
+    """The image ``index`` of views as a frustum shows it: (H', W', 3) uint8 on the host."""
+    image = truth_image(views, index, scene.background)
+    return to_bytes(scaled(image, min(views.height, ROWS)))
+
+
+def described(model: Viewable, viewpoints: Viewpoints) -> Iterator[dict[str, Any]]:
+    """The captured cameras in plain numbers, for a page: first those that saw the scene move.
+
+    Of each its ``name``, as :func:`picture_of` takes it; ``pose``, camera to world, 12 numbers, row
+    by row; ``fov``, its vertical angle of view in radians; ``aspect``, width over height;
+    ``distance`` of what it looks at, world units; ``times`` of the frames that it may have seen.
+    """
+    static = viewpoints.static
+    target = looked_at(model, static, lambda: distance_ahead(static))
+    for kind, captured in (("dynamic", viewpoints.dynamic), ("static", static)):
+        for k in evenly(len(captured), MAX_FRUSTA):
+            camera = captured[[k]]
+            fx, fy = camera.focal[0].tolist()
+            way = target - camera.positions[0]
+            yield {
+                "name": f"{kind}_{k}",
+                "pose": camera.camera_to_world.flatten().tolist(),
+                "fov": 2 * math.atan(camera.height / 2 / fy),
+                "aspect": (camera.width / fx) / (camera.height / fy),
+                "distance": max(float(way @ camera.forwards[0]), 0.1 * float(way.norm())),
+                "times": viewpoints.clock.times if kind == "dynamic" else [0.0],
+            }
+
+
+def picture_of(scene: Scene, camera: str, frame: int) -> Tensor | None:
+    """What a camera saw nearest to a frame's time, as :func:`thumbnail`; None: there is no such.
+
+    Args:
+        scene: the scene with its images.
+        camera: ``static_3``, or ``dynamic_1`` for the second of the places that saw it move.
+        frame: of the scene's clock.
+    """
+    kind, _, number = camera.partition("_")
+    if kind not in ("static", "dynamic") or not number.isdecimal() or frame >= len(scene.clock):
+        return None
+    place = int(number)
+    if kind == "static":
+        views = scene.static.train
+        return thumbnail(scene, views, place) if place < len(views) else None
+    views = scene.dynamic.train
+    seen = torch.unique(views.view)
+    if place >= len(seen):
+        return None
+    images = (views.view == seen[place]).nonzero()[:, 0]
+    nearest = (views.times[images] - scene.clock.times[frame]).abs().argmin()
+    return thumbnail(scene, views, int(images[nearest]))

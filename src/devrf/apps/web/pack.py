@@ -1,0 +1,250 @@
+"""Packs what DeVRF has learned into one HTML file, which a browser draws by itself.
+
+``scene.html`` gets ``scene.js``, ``scene.glsl`` and its textures' contents, gzip in base64:
+
+==================== ==============================================================================
+``density``          raw densities v at rest, half precision
+``features``         colour features f, a byte each: its share of its channel's range, which the
+                     network's first layer knows; blocks of four channels, one behind another
+``weights``          the colour network, single precision
+``distances-rest``   cells to the nearest occupied one at rest, a byte
+``distances-K``      the same at all times between the frames K and K + 1
+``displacement-K``   Δ_b of frame K, half precision
+``residual-K``       A_t of frame K, a byte each, if colours change
+==================== ==============================================================================
+
+Values are kept where samples read them, then or at any time; the others take no space, all the
+same. ``description``, JSON, holds boxes, sampling and cameras.
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import html
+import json
+import math
+from collections.abc import Iterator
+from importlib.resources import files
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import torch
+from kornia.color import ColorMap
+from torch import Tensor
+from torch.nn.functional import pad
+
+from devrf.apps.camera_paths import upward
+from devrf.apps.captured_cameras import described, frustum_depth
+from devrf.checkpoints.checkpoint import Viewpoints
+from devrf.errors import DevrfError
+from devrf.evaluation.held_out import background_value
+from devrf.geometry.contraction import ContractedSpace
+from devrf.geometry.ndc import NormalizedDevice
+from devrf.methods.base import Renderable
+from devrf.methods.devrf.canonical_field import ColorDecoder
+from devrf.methods.devrf.deformation_field import (
+    DeformationField,
+    deformed_occupancy,
+    visible_occupancy,
+)
+from devrf.methods.devrf.model import DeVRFModel
+from devrf.methods.devrf.volume_rendering import medium
+from devrf.ops.trilinear import shape_of
+from devrf.rendering.occupancy import Occupancy, dilate
+from devrf.system.files import atomic_write
+
+# Displacements are rounded to this share of a cell of the occupancy: noise takes space.
+ROUNDED = 1 / 64
+# What is farther counts as infinity, for which JSON has no number.
+FAR = 1e30
+# Of a texture's row of weights, four numbers each.
+ROW = 64
+# Colours of depth, from far to near.
+STOPS = 9
+
+
+def drawable(model: Renderable) -> bool:
+    """Whether a browser can draw a model: it has grids, and a colour network."""
+    return isinstance(model, DeVRFModel) and isinstance(model.canonical.decoder, ColorDecoder)
+
+
+def write_page(path: Path, model: Renderable, viewpoints: Viewpoints, name: str) -> None:
+    """Write :func:`page`, whole or not at all."""
+    text = page(model, viewpoints, name)
+    with atomic_write(path) as partial:
+        partial.write_text(text, encoding="utf-8")
+
+
+@torch.no_grad()
+def page(model: Renderable, viewpoints: Viewpoints, name: str) -> str:
+    """The page of the scene ``name``, with the cameras of ``viewpoints``.
+
+    Raises:
+        DevrfError: a browser cannot draw the model.
+    """
+    if not drawable(model):
+        raise DevrfError(
+            f"method={model.name}: it has no grids that a browser could draw; give "
+            "export.format=ply, or look at it with viewer.renderer=server"
+        )
+    assert isinstance(model, DeVRFModel)
+    parts = dict(_parts(model))
+    sizes = {part.partition("-")[0]: values.shape[2::-1] for part, values in parts.items()}
+    description = _description(model, viewpoints) | {"name": name, "shapes": sizes}
+    folder = files("devrf.apps.web")
+    texts = {
+        "title": html.escape(f"{name} · devrf"),
+        "shader": folder.joinpath("scene.glsl").read_text("utf-8"),
+        "script": folder.joinpath("scene.js").read_text("utf-8"),
+        # No name in it may end the element.
+        "description": json.dumps(description).replace("<", "\\u003c"),
+        "data": "\n".join(_element(part, values) for part, values in parts.items()),
+    }
+    text = folder.joinpath("scene.html").read_text("utf-8")
+    for word, filling in texts.items():
+        text = text.replace(f"{{{{{word}}}}}", filling)
+    return text
+
+
+def _element(part: str, values: Tensor) -> str:
+    packed = gzip.compress(values.contiguous().cpu().numpy().tobytes(), compresslevel=6, mtime=0)
+    return f'<script type="text/plain" id="{part}">{base64.b64encode(packed).decode()}</script>'
+
+
+def _parts(model: DeVRFModel) -> Iterator[tuple[str, Tensor]]:
+    """The contents of all textures by the elements' names: (depth, height, width, …)."""
+    field, sampling = model.canonical, model.at(0.0).picture_settings
+    rest = visible_occupancy(field, model.occupancy, sampling)
+    shown = rest.points_near(field.density.shape, model.box)
+    raw = field.density.values[..., 0]
+    yield "density", torch.where(shown, raw, raw.min()).half()
+    if not model.space.is_linear:  # rays end in the field's outer faces
+        shown[[0, -1]] = shown[:, [0, -1]] = shown[:, :, [0, -1]] = True
+    low, high = field.color.values[shown | ~shown.any()].aminmax(dim=0)
+    high = torch.maximum(high, low + 1e-6)
+    shares = ((field.color.values - low) / (high - low)).clamp(0, 1) * shown[..., None]
+    codes = pad((255 * shares).round().byte(), (0, -len(low) % 4))
+    yield "features", torch.cat(torch.split(codes, 4, dim=-1))
+    assert isinstance(field.decoder, ColorDecoder)
+    yield "weights", _weights(field.decoder, low, high)
+    motion, residual = model.deformation, model.color_residual
+    seen = _seen(motion, rest) if motion else []
+    for part, mask in ({"rest": rest.mask} | dict(enumerate(seen))).items():
+        yield f"distances-{part}", Occupancy(mask, model.box).surroundings.distances
+    for k in range(len(motion.clock) if motion else 0):
+        assert motion is not None
+        mask = torch.stack(seen[max(k - 1, 0) : k + 1]).any(dim=0)
+        near = Occupancy(mask, model.box).points_near(motion.shape, motion.box)
+        step = ROUNDED * rest.cell
+        rounded = (motion.to_canonical[k].to(near.device).float() / step).round() * step
+        yield f"displacement-{k}", (rounded * near[..., None]).half()
+        if residual is not None:
+            values = residual.values[k]
+            near = rest.points_near(shape_of(values), residual.box)
+            codes = (values / _residual_step(model) * near[..., None]).round()
+            yield f"residual-{k}", (128 + codes).byte()
+
+
+def _seen(motion: DeformationField, rest: Occupancy) -> list[Tensor]:
+    """Where something is at any time between two consecutive frames: masks (X, Y, Z).
+
+    From one time to the next nothing moves by more than a cell, by which the masks are grown.
+    """
+    masks = []
+    for k, (start, end) in enumerate(pairwise(motion.clock.times)):
+        first, last = (deformed_occupancy(rest, motion.warp_at(t)).mask for t in (start, end))
+        mask = first | last
+        near = Occupancy(mask, rest.box).points_near(motion.shape, motion.box)
+        before, after = (motion.to_canonical[n].to(near.device).float() for n in (k, k + 1))
+        change = float(((after - before).norm(dim=-1) * near).amax())
+        times = torch.linspace(start, end, math.ceil(change / rest.cell) + 1)[1:-1]
+        for time in times.tolist():
+            mask |= deformed_occupancy(rest, motion.warp_at(time)).mask
+        masks.append(dilate(mask, 1))
+    return masks
+
+
+def _residual_step(model: DeVRFModel) -> float:
+    residual = model.color_residual
+    return 1.0 if residual is None else max(float(residual.values.abs().amax()), 1e-6) / 127
+
+
+def _weights(decoder: ColorDecoder, low: Tensor, high: Tensor) -> Tensor:
+    """The colour network as scene.glsl reads it: vec4s, in rows of ``ROW``.
+
+    A layer lies in blocks of four outputs by four inputs, column by column. The first one takes
+    shares of the features' ranges from ``low`` to ``high`` (C,); of directions it takes d, sin d,
+    cos d, sin 2d, cos 2d and so on.
+    """
+    network = decoder.network
+    octaves = len(network.octaves)
+    order = [0, *(k for n in range(octaves) for k in (1 + n, 1 + octaves + n))]
+    groups = network.direction_weight.reshape(-1, 1 + 2 * octaves, 3)[:, order]
+    directions = _filled(groups.flatten(1)).reshape(-1, 4, 3 + 6 * octaves).transpose(1, 2)
+    parts = [
+        _filled(network.feature_bias + network.feature_weight @ low),
+        _blocks(network.feature_weight * (high - low)),
+        directions,
+        _filled(network.hidden_bias),
+        _blocks(network.hidden_weight).transpose(0, 1),  # all that an input adds, together
+        _filled(network.output_bias),
+        _blocks(network.output_weight),
+    ]
+    flat = torch.cat([part.flatten() for part in parts])
+    return pad(flat, (0, -len(flat) % (4 * ROW))).view(1, -1, ROW, 4)
+
+
+def _blocks(matrix: Tensor) -> Tensor:
+    """A matrix (O, I) as (⌈O/4⌉, ⌈I/4⌉, 4, 4) with the columns of each block in turn."""
+    whole = _filled(pad(matrix, (0, -matrix.shape[1] % 4)))
+    return whole.reshape(len(whole) // 4, 4, -1, 4).permute(0, 2, 3, 1)
+
+
+def _filled(values: Tensor) -> Tensor:
+    """Values (N, …) with zeros up to a multiple of four rows."""
+    return torch.cat([values, values.new_zeros(-len(values) % 4, *values.shape[1:])])
+
+
+def _description(model: DeVRFModel, viewpoints: Viewpoints) -> dict[str, Any]:
+    """What the page knows beside its textures."""
+    field, motion, space = model.canonical, model.deformation, model.space
+    sampling = model.at(0.0).picture_settings
+    path = medium(field, model.occupancy, sampling).path
+    inner, decoder = space.inner(model.box), field.decoder
+    assert isinstance(decoder, ColorDecoder)
+    defines = {
+        "SPACE": 0,
+        "FEATURES": math.ceil(decoder.from_feature.in_features / 4),
+        "WIDTH": math.ceil(decoder.hidden.in_features / 4),
+        "FREQUENCIES": len(decoder.octaves),
+        "MOVES": int(motion is not None),
+        "SHADES": int(model.color_residual is not None),
+    }
+    uniforms: dict[str, Any] = {
+        **{"low": model.box.low, "high": model.box.high},
+        **{"near": path.near, "far": min(path.far, FAR), "stepLength": path.step},
+        **{"shift": field.shift, "delta": field.step_in_base_voxels(sampling.step)},
+        "threshold": sampling.alpha_threshold,
+        "residualStep": _residual_step(model),
+        "background": [background_value(viewpoints.background)] * 3,
+        "palette": ColorMap("viridis", num_colors=STOPS).colors.T.tolist(),
+        **{"center": inner.middle, "reach": inner.diagonal / 3},
+    }
+    if isinstance(space, NormalizedDevice):
+        defines["SPACE"] = 1
+        uniforms["ndc"] = (*space.slopes, space.near)
+    if isinstance(space, ContractedSpace):
+        defines["SPACE"] = 2
+        uniforms |= {"innerHalf": [edge / 2 for edge in inner.size], "shell": space.shell}
+    if motion is not None:
+        uniforms |= {"motionLow": motion.box.low, "motionHigh": motion.box.high}
+        uniforms["stillOutside"] = motion.still_outside
+    static = viewpoints.static
+    return {
+        **{"defines": defines, "uniforms": uniforms},
+        "times": [0.0] if motion is None else motion.clock.times,
+        **{"up": upward(static).tolist(), "frustum": frustum_depth(static)},
+        "cameras": list(described(model, viewpoints)),
+    }

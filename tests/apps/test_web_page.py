@@ -1,0 +1,405 @@
+"""The page that browsers draw: pictures as the renderer's, controls that work, errors in words."""
+
+from __future__ import annotations
+
+import base64
+import copy
+import gzip
+import io
+import json
+import math
+import re
+import shutil
+import socket
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from devrf.apps.captured_cameras import picture_of
+from devrf.apps.settings import ViewerSettings
+from devrf.apps.viewer.page import PageServer
+from devrf.apps.web.pack import page
+from devrf.checkpoints.checkpoint import Viewpoints
+from devrf.errors import DevrfError
+from devrf.evaluation.held_out import background_value
+from devrf.geometry.cameras import Cameras
+from devrf.geometry.clock import FrameClock
+from devrf.methods.devrf.deformation_field import DeformationField
+from devrf.methods.devrf.model import DeVRFModel
+from devrf.rendering.renderer import Renderer
+from devrf.scenes.scene import Scene
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+DRIVER = shutil.which("chromedriver")
+# Without a GPU Chromium draws by SwiftShader.
+OPTIONS = ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader")
+OPTIONS += ("--enable-unsafe-swiftshader",)
+# A busy machine may take long to start a browser, and to draw without a GPU.
+PATIENCE = 120
+# The middle of a frustum that nothing covers.
+CLICKABLE = """
+for (const frustum of document.querySelectorAll("#frusta g:not([hidden]) polygon")) {
+  const { left, right, top, bottom } = frustum.getBoundingClientRect();
+  const middle = [Math.round((left + right) / 2), Math.round((top + bottom) / 2)];
+  if (document.elementFromPoint(...middle) === frustum) return middle;
+}
+"""
+LEAST_PSNR = 45.0
+ROWS = 54
+
+
+class Browser:
+    """A browser with one page, whose canvas is as large as is asked for."""
+
+    def __init__(self, driver: Any) -> None:
+        self.driver = driver
+
+    def open(self, address: str, width: int = 96, height: int = 72) -> None:
+        """Open a page in a window of that size."""
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        self.driver.get("about:blank")
+        self.driver.get_log("browser")  # forgets what was said before
+        self.driver.get(address)
+
+    def run(self, script: str) -> Any:
+        """What a function's body returns in the page."""
+        return self.driver.execute_script(script)
+
+    def wait(self, script: str) -> None:
+        """Wait until a condition holds in the page."""
+        until = time.monotonic() + PATIENCE
+        while not self.run(f"return {script}"):
+            assert time.monotonic() < until, (script, self.said(), self.message)
+            time.sleep(0.05)
+
+    def canvas(self) -> torch.Tensor:
+        """The finished picture (H, W, 3) in [0, 1]."""
+        self.wait("document.documentElement.dataset.quality === 'full'")
+        encoded = self.run("return document.getElementById('picture').toDataURL()")
+        picture = Image.open(io.BytesIO(base64.b64decode(encoded.partition(",")[2])))
+        return torch.from_numpy(np.asarray(picture.convert("RGB")) / 255.0)
+
+    @property
+    def message(self) -> str:
+        """What the page says in place of the picture."""
+        return str(self.run("return document.getElementById('message').textContent"))
+
+    def said(self) -> list[str]:
+        """Errors and warnings in the page's console."""
+        return [entry["message"] for entry in self.driver.get_log("browser")]
+
+    def element(self, name: str) -> Any:
+        """A control of the page."""
+        return self.driver.find_element("id", name)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    if CHROMIUM is None or DRIVER is None:
+        pytest.skip("no chromium and chromedriver on this machine")
+    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+    options = webdriver.ChromeOptions()
+    options.binary_location = CHROMIUM
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    for option in OPTIONS:
+        options.add_argument(option)
+    driver = webdriver.Chrome(options, webdriver.ChromeService(DRIVER))
+    yield Browser(driver)
+    driver.quit()
+
+
+def in_motion(rest: DeVRFModel, seed: int) -> DeVRFModel:
+    """A model at rest, of which at the times 0.4 and 1 points have moved by up to 5 %."""
+    model = copy.deepcopy(rest)
+    box = model.space.inner(model.box)
+    still_outside = not model.space.is_linear
+    clock = FrameClock((0.0, 0.4, 1.0))
+    motion = DeformationField(box, clock, voxels=5**3, still_outside=still_outside)
+    shape = motion.to_canonical[1:].shape
+    generator = torch.Generator().manual_seed(seed)
+    size = torch.tensor(box.size)
+    motion.to_canonical[1:] = 0.1 * size * (torch.rand(shape, generator=generator) - 0.5)
+    model.deformation = motion
+    return model
+
+
+@pytest.fixture
+def scenes(
+    moving: DeVRFModel,
+    canonical: Callable[..., Any],
+    fit: Callable[..., Any],
+    serve: Callable[[Scene], Any],
+    tiny_scene: Scene,
+    tiny_toy: Scene,
+    tiny_room: Scene,
+) -> Callable[[str], tuple[DeVRFModel, Viewpoints]]:
+    """``scenes(name)``: what was learned of a tiny scene, and its cameras."""
+
+    def learned(name: str) -> tuple[DeVRFModel, Viewpoints]:
+        scene = {"world": tiny_scene, "ndc": tiny_toy, "contracted": tiny_room}[name]
+        if name == "world":
+            return moving, Viewpoints.of(scene)
+        stage = fit(canonical(visual_hull_init=False, iterations=60), data=serve(scene))
+        model = in_motion(stage.scene_model, seed=1)
+        features = model.canonical.color.values.data
+        features += 3 * torch.randn(features.shape, generator=torch.Generator().manual_seed(2))
+        model.canonical.decoder.output.weight.data *= 10  # colours that differ after so few steps
+        return model, Viewpoints.of(scene)
+
+    return learned
+
+
+def link(camera: Cameras, time: float) -> str:
+    """The part of an address that says where the page's camera is."""
+    pose = ",".join(map(repr, camera.camera_to_world[0].flatten().tolist()))
+    fov = math.degrees(2 * math.atan(camera.height / 2 / float(camera.focal[0, 1])))
+    return f"#pose={pose}&distance=3&fov={fov!r}&time={time}"
+
+
+def psnr(picture: torch.Tensor, truth: torch.Tensor) -> float:
+    return -10 * math.log10(max(float((picture - truth).square().mean()), 1e-12))
+
+
+@pytest.mark.parametrize("space", ["world", "ndc", "contracted"])
+def test_a_browser_draws_what_the_renderer_does(browser, scenes, tmp_path, space):
+    model, viewpoints = scenes(space)
+    file = tmp_path / "a page.html"
+    file.write_text(page(model, viewpoints, "tiny <scene>"), encoding="utf-8")
+    renderer = Renderer(model)
+    behind = background_value(viewpoints.background)
+    at_rest = renderer.view(viewpoints.held_out.of_height(ROWS), 0, 0.0, behind).color
+    for camera, moment in (
+        (viewpoints.dynamic[[0]], 0.4),  # a captured time
+        (viewpoints.dynamic[[0]], 0.73),  # one between two
+        (viewpoints.held_out, 1.0),  # another view
+        (viewpoints.static[[1]], 0.0),
+    ):
+        camera = camera.of_height(ROWS)
+        browser.open(file.as_uri() + link(camera, moment), camera.width, camera.height)
+        picture = browser.canvas()
+        truth = renderer.view(camera, 0, moment, behind).color.clamp(0, 1).view(picture.shape)
+        assert truth.std() > 0.05
+        assert psnr(picture, truth) >= LEAST_PSNR, moment
+        assert browser.said() == []
+    moved = renderer.view(viewpoints.held_out.of_height(ROWS), 0, 1.0, behind).color
+    assert psnr(moved, at_rest) < LEAST_PSNR - 3  # the times do not all look the same
+
+
+@pytest.fixture
+def file(moving: DeVRFModel, tiny_scene: Scene, tmp_path: Path) -> Path:
+    """The page of the tiny scene in motion."""
+    path = tmp_path / "scene.html"
+    path.write_text(page(moving, Viewpoints.of(tiny_scene), "tiny"), encoding="utf-8")
+    return path
+
+
+def test_the_controls_do_what_they_say(browser, file, tmp_path):
+    actions = pytest.importorskip("selenium.webdriver.common.action_chains").ActionChains
+    keys = pytest.importorskip("selenium.webdriver.common.keys").Keys
+    browser.open(file.as_uri(), 480, 320)
+    browser.wait("document.body.className === 'ready'")
+    browser.wait("document.getElementById('clock').textContent > '0.05'")  # time runs
+    browser.element("play").click()
+    stands = browser.element("clock").text
+    time.sleep(0.3)
+    assert browser.element("clock").text == stands
+    browser.element("time").send_keys(keys.END)
+    assert browser.element("clock").text == "1.000"
+    whole = browser.canvas()
+    browser.element("rest").click()
+    browser.wait("document.documentElement.dataset.quality !== 'full'")
+    beside = browser.canvas()
+    assert psnr(whole, beside) < 30
+    browser.element("rest").click()
+    for word in ("depth", "motion"):
+        browser.element("channel").send_keys(word)
+        browser.wait("document.documentElement.dataset.quality !== 'full'")
+        assert psnr(whole, browser.canvas()) < 30
+    browser.element("channel").send_keys("colour")
+
+    def pose() -> str:
+        browser.element("link").click()
+        return str(browser.run("return location.hash"))
+
+    picture = browser.element("picture")
+    poses = [pose()]
+    hand = actions(browser.driver)
+    hand.move_to_element_with_offset(picture, 0, -60).click_and_hold()
+    hand.move_by_offset(40, 10).release().perform()
+    poses.append(pose())
+    actions(browser.driver).key_down("w").pause(0.3).key_up("w").perform()
+    poses.append(pose())
+    browser.element("cameras").click()
+    browser.wait("document.querySelectorAll('#frusta g:not([hidden])').length > 0")
+    wheel = actions(browser.driver)
+    for _ in range(3):  # from farther off more cameras are seen
+        wheel.scroll_by_amount(0, 300)
+    wheel.perform()
+    poses.append(pose())
+    time.sleep(0.5)
+    x, y = browser.run(CLICKABLE)
+    frustum = actions(browser.driver)
+    frustum.move_to_element_with_offset(picture, x - 240, y - 160).click().perform()
+    assert len(set(poses)) == 4 and pose() != poses[-1]
+    browser.element("home").click()
+    assert pose() == poses[0]
+    folder = {"behavior": "allow", "downloadPath": str(tmp_path)}
+    browser.driver.execute_cdp_cmd("Page.setDownloadBehavior", folder)
+    browser.element("save").click()
+    saved = tmp_path / "tiny_t1.000.png"
+    until = time.monotonic() + PATIENCE
+    while not saved.is_file():
+        assert time.monotonic() < until
+        time.sleep(0.1)
+    assert iio.imread(saved).shape[:2] == (320, 480)
+    assert browser.said() == []
+
+
+def test_fingers_turn_and_pinch(browser, file):
+    browser.open(file.as_uri() + "#time=0", 390, 500)
+    browser.wait("document.body.className === 'ready'")
+
+    def touch(kind: str, *points: tuple[int, int]) -> None:
+        fingers = [{"x": x, "y": y, "id": k} for k, (x, y) in enumerate(points)]
+        event = {"type": f"touch{kind}", "touchPoints": fingers}
+        browser.driver.execute_cdp_cmd("Input.dispatchTouchEvent", event)
+
+    def link_now() -> str:
+        browser.element("link").click()
+        return str(browser.run("return location.hash"))
+
+    before = link_now()
+    touch("Start", (100, 100))
+    touch("Move", (160, 110))
+    touch("End")
+    turned = link_now()
+    assert turned.partition("&")[0] != before.partition("&")[0]
+    touch("Start", (100, 100), (200, 100))
+    touch("Move", (100, 100), (300, 100))
+    touch("End")
+    distance = [float(re.search(r"distance=([^&]*)", text)[1]) for text in (turned, link_now())]
+    assert distance[1] == pytest.approx(distance[0] / 2, rel=0.05)
+
+
+def failing(file: Path, change: Callable[[str], str]) -> str:
+    broken = file.with_name("broken.html")
+    broken.write_text(change(file.read_text("utf-8")), encoding="utf-8")
+    return broken.as_uri()
+
+
+@pytest.mark.parametrize("share", [0.2, 0.9])
+def test_a_truncated_file_says_so(browser, file, share):
+    browser.open(failing(file, lambda text: text[: int(share * len(text))]))
+    browser.wait("document.getElementById('message').offsetHeight > 0")
+    assert "incomplete" in browser.message
+    assert browser.run("return document.getElementById('picture')?.offsetHeight ?? 0") == 0
+
+
+@pytest.mark.parametrize("part", ["features", "displacement-1"])
+def test_damaged_data_are_named(browser, file, part):
+    def damage(text: str) -> str:
+        at = text.index(f'id="{part}">') + len(part) + 60
+        return text[:at] + ("A" if text[at] != "A" else "B") * 8 + text[at + 8 :]
+
+    browser.open(failing(file, damage))
+    browser.wait("document.body.className === 'failed'")
+    assert "damaged or incomplete" in browser.message and part in browser.message
+    assert browser.run("return document.getElementById('picture').offsetHeight") == 0
+
+
+def test_without_webgl_and_after_a_lost_context_there_is_a_line(browser, file):
+    none = "HTMLCanvasElement.prototype.getContext = () => null;"
+    browser.open(
+        failing(file, lambda text: text.replace("<body>", f"<body><script>{none}</script>"))
+    )
+    browser.wait("document.body.className === 'failed'")
+    assert "no WebGL 2" in browser.message
+    browser.open(file.as_uri())
+    browser.wait("document.body.className === 'ready'")
+    browser.run(
+        "document.getElementById('picture').getContext('webgl2')"
+        ".getExtension('WEBGL_lose_context').loseContext()"
+    )
+    browser.wait("document.body.className === 'failed'")
+    assert "lost context" in browser.message
+
+
+# Without a browser
+
+
+def test_all_data_are_in_the_file_and_as_large_as_their_textures(moving, tiny_scene):
+    text = page(moving, Viewpoints.of(tiny_scene), "tiny")
+    described = json.loads(re.search(r'id="description">(.*)</script>', text)[1])
+    bytes_of = {"density": 2, "features": 4, "weights": 16, "distances": 1}
+    bytes_of |= {"displacement": 6, "residual": 3}
+    found = re.findall(r'<script type="text/plain" id="([a-z]+)(-\w+)?">(.+)</script>', text)
+    for kind, _, packed in found:
+        data = gzip.decompress(base64.b64decode(packed))
+        assert len(data) == math.prod(described["shapes"][kind]) * bytes_of[kind]
+    names = [kind + number for kind, number, _ in found]
+    changing = [f"{kind}-{k}" for k in range(3) for kind in ("displacement", "residual")]
+    assert sorted(names) == sorted(
+        [
+            "density",
+            "features",
+            "weights",
+            "distances-rest",
+            "distances-0",
+            "distances-1",
+            *changing,
+        ]
+    )
+    assert described["times"] == [0.0, 0.4, 1.0]
+    assert not re.search(r"""(src|href)=["'](?!data:)|https?://""", text)  # nothing is fetched
+
+
+def test_a_scene_at_rest_has_no_motion(learned, tiny_scene):
+    text = page(learned[0].scene_model, Viewpoints.of(tiny_scene), "tiny")
+    described = json.loads(re.search(r'id="description">(.*)</script>', text)[1])
+    assert described["times"] == [0.0] and described["defines"]["MOVES"] == 0
+
+
+def test_what_has_no_grids_is_refused_in_one_line(tiny_scene):
+    model: Any = SimpleNamespace(name="dnerf")
+    with pytest.raises(
+        DevrfError, match=r"^method=dnerf: it has no grids that a browser could draw"
+    ):
+        page(model, Viewpoints.of(tiny_scene), "tiny")
+
+
+def test_the_server_gives_page_and_pictures_to_its_own_page_alone(tiny_scene):
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    served = PageServer(ViewerSettings(port=port), "<p>a page</p>", lambda: tiny_scene)
+
+    def answer(path: str, **headers: str) -> tuple[int, bytes]:
+        request = urllib.request.Request(f"http://127.0.0.1:{port}{path}", headers=headers)
+        try:
+            with urllib.request.urlopen(request, timeout=20) as response:
+                return response.status, response.read()
+        except urllib.error.HTTPError as error:
+            return error.code, error.read()
+
+    try:
+        assert answer("/") == (200, b"<p>a page</p>")
+        status, picture = answer("/pictures/static_2/0.jpg")
+        truth = picture_of(tiny_scene, "static_2", 0).float()
+        assert status == 200
+        assert float((torch.from_numpy(iio.imread(picture)).float() - truth).abs().mean()) < 8
+        for path in ("/pictures/static_99/0.jpg", "/pictures/dynamic_0/9.jpg", "/etc/passwd", "/x"):
+            assert answer(path)[0] == 404
+        assert answer("/", Host="elsewhere.example")[0] == 403
+        assert answer("/", Origin="http://elsewhere.example")[0] == 403
+    finally:
+        served.close()
