@@ -49,7 +49,7 @@ from devrf.methods.devrf.deformation_field import DeformationField, GridWarp, de
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.volume_rendering import medium
 from devrf.ops.trilinear import shape_of
-from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.occupancy import Occupancy, dilate
 from devrf.system.files import atomic_write
 
 # Displacements are rounded to this share of a cell of the occupancy: noise takes space.
@@ -150,7 +150,7 @@ def _seen(
 ) -> list[Tensor]:
     """Where something is at any time between two consecutive frames: masks (X, Y, Z).
 
-    From one time to the next nothing moves by more than a ``cell``, the rim of what is occupied.
+    From one time to the next nothing moves by more than a ``cell``, by which they are grown.
     """
     masks = []
     for k, (start, end) in enumerate(pairwise(motion.clock.times)):
@@ -161,7 +161,7 @@ def _seen(
         change = float(((after - before).norm(dim=-1) * near).amax())
         for time in torch.linspace(start, end, math.ceil(change / cell) + 1)[1:-1].tolist():
             mask |= occupied(motion.warp_at(time)).mask
-        masks.append(mask)
+        masks.append(dilate(mask, 1))
     return masks
 
 

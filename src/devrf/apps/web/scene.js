@@ -3,8 +3,7 @@
 // Data are gzipped text in script elements (pack.py). They become textures, and scene.glsl follows
 // a ray through these for every pixel. Units are the world's, and radians.
 
-// Milliseconds that a picture may take while something moves, and its fewest rows then; how long
-// after the last change finer ones follow.
+// Milliseconds a picture while something moves, its fewest rows, and the wait for finer ones then.
 const BUDGET = 50;
 const MIN_ROWS = 72;
 const SETTLED = 120;
@@ -154,11 +153,6 @@ class Graphics {
       this.fill(kind, kind, await inflate(kind));
     }
     this.fill("rest", "distances", await inflate("distances-rest"));
-  }
-
-  resize(width, height) {
-    Object.assign(this.canvas, { width, height });
-    this.gl.renderbufferStorage(this.gl.RENDERBUFFER, this.gl.RGBA8, width, height);
   }
 
   /** Draws into a part of the target; "frame" is where the whole picture would lie. */
@@ -347,7 +341,10 @@ class Page {
 
   resize() {
     const ratio = Math.min(devicePixelRatio, 2);
-    this.graphics.resize(Math.round(innerWidth * ratio), Math.round(innerHeight * ratio));
+    const [width, height] = [innerWidth, innerHeight].map((edge) => Math.round(edge * ratio));
+    const { gl, canvas } = this.graphics;
+    Object.assign(canvas, { width, height });
+    gl.renderbufferStorage(gl.RENDERBUFFER, gl.RGBA8, width, height);
     this.state = null;
   }
 
@@ -528,9 +525,9 @@ class Page {
     const keys = { Space: "play", KeyR: "rest", KeyC: "cameras", KeyH: "home", KeyF: "full" };
     addEventListener("keydown", (event) => {
       // A control that has the focus takes keys for itself.
-      const space = event.code === "Space" && event.target.matches("button, input");
-      const other = event.ctrlKey || event.metaKey || event.altKey || event.repeat;
-      if (space || other || event.target.matches("select")) return;
+      const control = event.code === "Space" ? "button, input, select" : "select";
+      if (event.ctrlKey || event.metaKey || event.altKey || event.repeat) return;
+      if (event.target.matches(control)) return;
       if (keys[event.code]) byId(keys[event.code]).click();
       this.keys.add(event.code);
     });
