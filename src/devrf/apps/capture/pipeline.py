@@ -19,7 +19,7 @@ from devrf.apps.capture.images import (
     common_size,
     write_frames,
 )
-from devrf.apps.capture.structure import check_library, checked_model, reconstruct
+from devrf.apps.capture.structure import check_library, checked_model, models_folder, reconstruct
 from devrf.apps.capture.survey import Survey, check_sharp, sharpest, survey
 from devrf.apps.settings import CaptureSettings
 from devrf.errors import DevrfError
@@ -34,7 +34,7 @@ from devrf.system.progress import followed
 log = logging.getLogger(__name__)
 
 # Part of every key: a new version makes earlier results invalid.
-VERSION = 1
+VERSION = 2
 # Folders below the scene's: the results of the steps, and the images.
 WORK = "capture"
 IMAGES = "images"
@@ -210,10 +210,11 @@ def _model(
     images = [[video.label, _stamp(video.path), video.positions] for video in (moving, *fixed)]
 
     def make() -> dict[str, Any]:
-        return {"model": reconstruct(into / IMAGES, work, moving, list(first), settings).name}
+        model = reconstruct(into / IMAGES, work, moving, list(first), settings)
+        return {"model": model.relative_to(models_folder(work)).as_posix()}
 
     result = kept(work / "structure.json", [images, options, settings.size], make)
-    return checked_model(work / "models" / result["model"], moving, first)
+    return checked_model(models_folder(work) / result["model"], moving, first)
 
 
 def _around_motion(
