@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import warnings
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch import Tensor
 
 from devrf.apps.capture.images import Mask, shrunk
 from devrf.scenes.optical_flow import consistent, estimator
@@ -28,13 +30,21 @@ log = logging.getLogger(__name__)
 
 # Flow is estimated in images with so many pixels of the longer side.
 LONGER_SIDE = 320
-# Each frame is compared with those so many before and after it: the near ones give flow that can
-# be trusted, the far ones enough motion.
-STEPS = (1, 3)
+# Each frame is compared with those so many before and after it: in nearer ones little has moved,
+# and of farther ones there is no flow.
+STEPS = (2, 4)
 # Errors below this many pixels are those of the flow itself.
 NOISE = 0.15
 # What moves is off by more than so many times the frame's median error.
 TIMES_MEDIAN = 3.0
+# Root mean square of Sobel's slopes, 8 for a grey level a pixel, below which flow is a guess.
+TEXTURE = 16.0
+# Standard deviation, in pixels, of the neighbourhood in which pixels vote.
+AROUND = 6.0
+# What a frame's vote counts for in the next one.
+MEMORY = 0.9
+# What moves in the votes of so large a share of the frames moves.
+MOVES = 0.25
 # Features at the rim of what moves see both sides: masks are so much wider, as a share of the
 # image's longer side.
 RIM = 0.02
@@ -60,24 +70,16 @@ def masks_of_movers(images: Path, names: Sequence[str], model: SparseModel) -> d
     read = (cv2.imread(str(images / name), cv2.IMREAD_COLOR) for name in posed)
     pictures = [np.asarray(picture, np.uint8) for picture in read]
     height, width = pictures[0].shape[:2]
-    small = [torch.from_numpy(shrunk(picture, LONGER_SIDE)) for picture in pictures]
+    small = [shrunk(picture, LONGER_SIDE) for picture in pictures]
     cameras = [_Camera(model, place[name], small[0].shape[1]) for name in posed]
-    between = estimator("dis")
+    flow = _Flows(small)
+    numbered = enumerate(followed(small, len(small), "what moves"))
+    votes = [_votes(k, flow, cameras, _textured(picture)) for k, picture in numbered]
     masks = dict[str, Mask]()
-    for k, name in enumerate(followed(posed, len(posed), "what moves")):
-        errors = list[Numbers]()
-        for other in (k + step * way for step in STEPS for way in (-1, 1)):
-            if not 0 <= other < len(posed):
-                continue
-            there = between(small[k], small[other])
-            back = between(small[other], small[k])
-            error = cameras[k].error_of_flow(there.numpy(), cameras[other])
-            error[~consistent(there, back).numpy()] = np.nan
-            usual = max(float(np.nanmedian(error)), NOISE) if np.isfinite(error).any() else np.inf
-            errors.append(error / usual)
-        moves = _moves(np.stack(errors))
-        rim = 2 * round(RIM * max(moves.shape)) + 1
-        moves = cv2.dilate(moves, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (rim, rim)))
+    rim = 2 * round(RIM * LONGER_SIDE) + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (rim, rim))
+    for name, agreed in zip(posed, _agreed(votes, flow), strict=True):
+        moves = cv2.dilate(np.asarray(agreed > MOVES, np.uint8), disc)
         still = cv2.resize(1 - moves, (width, height), interpolation=cv2.INTER_NEAREST)
         masks[name] = np.asarray(255 * still, np.uint8)
     share = float(np.mean([(mask == 0).mean() for mask in masks.values()]))
@@ -85,22 +87,83 @@ def masks_of_movers(images: Path, names: Sequence[str], model: SparseModel) -> d
     return masks if share >= LEAST_SHARE else {}
 
 
-def _moves(errors: Numbers) -> Mask:
-    """0 or 1 (H, W): where the median of some frames' errors (K, H, W) is large.
+class _Flows:
+    """Optical flow between any two of some pictures (H, W, 3), estimated once."""
 
-    Pixels whose flow no frame knows are as those around them.
-    """
+    def __init__(self, pictures: Sequence[npt.NDArray[Any]]) -> None:
+        self._pictures = [torch.from_numpy(picture) for picture in pictures]
+        self._between = cache(self._estimated)
+        self._estimator = estimator("dis")
+
+    def __len__(self) -> int:
+        return len(self._pictures)
+
+    def between(self, one: int, other: int) -> tuple[Numbers, Mask]:
+        """Flow (H, W, 2) from one picture to another, and where (H, W) the way back agrees."""
+        there = self._between(one, other)
+        return there.numpy(), consistent(there, self._between(other, one)).numpy()
+
+    def _estimated(self, one: int, other: int) -> Tensor:
+        return self._estimator(self._pictures[one], self._pictures[other])
+
+
+def _votes(k: int, flow: _Flows, cameras: Sequence[_Camera], textured: Mask) -> Numbers:
+    """(H, W): the share of what is known around each pixel of picture ``k`` that moves."""
+    errors = list[Numbers]()
+    for other in (k + step * way for step in STEPS for way in (-1, 1)):
+        if not 0 <= other < len(flow):
+            continue
+        there, agrees = flow.between(k, other)
+        error = cameras[k].error_of_flow(there, cameras[other])
+        error[~(agrees & textured)] = np.nan
+        usual = max(float(np.nanmedian(error)), NOISE) if np.isfinite(error).any() else np.inf
+        errors.append(error / usual)
     with warnings.catch_warnings():  # of pixels that no frame knows
         warnings.simplefilter("ignore", RuntimeWarning)
-        median = np.nanmedian(errors, axis=0)
-    known = np.isfinite(median).astype(np.float32)
-    large = np.where(known > 0, median > TIMES_MEDIAN, 0).astype(np.float32)
-    # The majority of what is known around each pixel.
-    around = (0, 0)
-    deviation = 0.01 * max(errors.shape)
-    votes = cv2.GaussianBlur(large, around, deviation)
-    count = cv2.GaussianBlur(known, around, deviation)
-    return np.asarray(votes > 0.5 * np.maximum(count, 1e-6), np.uint8)
+        error = np.nanmedian(np.stack(errors), axis=0)
+    known = np.isfinite(error)
+    moves = known & (np.where(known, error, 0) > TIMES_MEDIAN)
+    count = cv2.GaussianBlur(known.astype(np.float64), (0, 0), AROUND)
+    return cv2.GaussianBlur(moves.astype(np.float64), (0, 0), AROUND) / np.maximum(count, 1e-3)
+
+
+def _textured(picture: npt.NDArray[Any]) -> Mask:
+    """Where (H, W) a picture has texture: elsewhere its flow is a guess."""
+    grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
+    across = cv2.Sobel(grey, cv2.CV_32F, 1, 0)
+    down = cv2.Sobel(grey, cv2.CV_32F, 0, 1)
+    return np.asarray(cv2.blur(across**2 + down**2, (7, 7)) > TEXTURE**2)
+
+
+def _agreed(votes: Sequence[Numbers], flow: _Flows) -> list[Numbers]:
+    """The mean of all pictures' votes (H, W) along the flow, those of near pictures before others.
+
+    What moves along its epipolar lines for a while moved across them before, or will; what was
+    wrong once is outvoted.
+    """
+    share = [vote.copy() for vote in votes]
+    count = [np.ones_like(vote) for vote in votes]
+    numbers = range(len(votes))
+    for order, way in ((numbers, -1), (numbers[::-1], 1)):
+        # Of the frame before in this order: the sum of votes, and of what each counts for.
+        total = weight = np.zeros_like(votes[0])
+        for k in order:
+            if k != order[0]:
+                there, agrees = flow.between(k, k + way)
+                total = MEMORY * agrees * _at(total, there)
+                weight = MEMORY * agrees * _at(weight, there)
+                share[k] += total
+                count[k] += weight
+            total = total + votes[k]
+            weight = weight + 1
+    return [a / b for a, b in zip(share, count, strict=True)]
+
+
+def _at(image: Numbers, flow: Numbers) -> Numbers:
+    """What an image (H, W) shows where flow (H, W, 2) leads."""
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]]
+    at = (np.stack([x, y], axis=-1) + flow).astype(np.float32)
+    return np.asarray(cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR), np.float64)
 
 
 class _Camera:

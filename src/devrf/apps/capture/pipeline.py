@@ -65,7 +65,11 @@ def scene_from_footage(settings: CaptureSettings) -> Path:
     if settings.alpha_masks is not None and not settings.subtracts:
         folder = Path(settings.alpha_masks).expanduser()
         masks = {path: alpha_masks_of(folder, path, len(s.times)) for path, s in surveys.items()}
-    moving = Chosen(static, "static", tuple(picked), masks.get(static))
+    still = None
+    if settings.masks is not None:
+        folder = Path(settings.masks).expanduser()
+        still = alpha_masks_of(folder, static, len(sharp), "capture.masks")
+    moving = Chosen(static, "static", tuple(picked), masks.get(static), still)
     clock = Timeline((), ())
     if views:
         in_view = [surveys[view] for view in views]
@@ -207,7 +211,10 @@ def _model(
 ) -> SparseModel:
     first = {video.names[0]: video.path for video in fixed}
     options = [settings.camera, settings.intrinsics, settings.matching]
-    images = [[video.label, _stamp(video.path), video.positions] for video in (moving, *fixed)]
+    images = [
+        [video.label, _stamp(video.path), video.positions, video.still and _stamp(video.still)]
+        for video in (moving, *fixed)
+    ]
 
     def make() -> dict[str, Any]:
         model = reconstruct(into / IMAGES, work, moving, list(first), settings)

@@ -8,14 +8,14 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
-from itertools import combinations
+from itertools import combinations, groupby
 from pathlib import Path
 from typing import Any
 
 import cv2
 import torch
 
-from devrf.apps.capture.images import Chosen, Mask
+from devrf.apps.capture.images import Chosen, Mask, still_masks
 from devrf.apps.capture.movers import masks_of_movers
 from devrf.apps.settings import CaptureSettings
 from devrf.errors import DevrfError
@@ -66,41 +66,26 @@ def pairs(moving: Sequence[str], fixed: Sequence[str], matching: str) -> list[tu
 
 
 def reconstruct(
-    images: Path,
-    work: Path,
-    moving: Chosen,
-    fixed: Sequence[str],
-    settings: CaptureSettings,
-    given: dict[str, Mask] | None = None,
+    images: Path, work: Path, moving: Chosen, fixed: Sequence[str], settings: CaptureSettings
 ) -> Path:
     """Run structure from motion, and write the data base and the models to ``work``.
 
     The moving camera's images and one of each ``fixed`` view are in the folder ``images``. Where
     they are all of the scene at rest, COLMAP's incremental mapper finds the cameras. Where one
-    camera films a scene that moves, its flow and these cameras tell what moves; that is masked,
-    cameras are found again, by both of COLMAP's mappers, and the better model is taken.
-
-    Args:
-        images: the folder of images.
-        work: the folder for everything else.
-        moving: the moving camera's frames.
-        fixed: one image of each fixed view.
-        settings: the lens model, and what is compared.
-        given: masks (H, W) of the moving camera's images, 0 where nothing is to be looked at;
-            None: found, where they are needed.
-
-    Returns:
-        The folder of the model, in :func:`models_folder`.
+    camera films a scene that moves, its flow and these cameras tell what moves, unless masks are
+    given; cameras are found again without it, by both of COLMAP's mappers, and the better model is
+    taken. Returns the folder of the model, in :func:`models_folder`.
 
     Raises:
-        DevrfError: nothing could be matched.
+        DevrfError: nothing could be matched, or a given mask does not fit.
     """
     library: Any = importlib.import_module("pycolmap")
     library.logging.minloglevel = 3
     library.set_random_seed(0)
     models = models_folder(work)
     shutil.rmtree(models, ignore_errors=True)
-    _match(images, work, moving, fixed, settings, given or {})
+    given = {} if moving.still is None else still_masks(images, moving)
+    _match(images, work, moving, fixed, settings, given)
     first = _mapped(images, work, "incremental", models / "first")
     if first is None:
         raise DevrfError(
@@ -109,7 +94,7 @@ def reconstruct(
     if not settings.monocular:
         return first.folder
     masked = {}
-    if given is None:
+    if not given:
         masked = masks_of_movers(images, moving.names, read_model(first.folder))
     if masked:
         log.info("structure from motion: again, without what moves")
@@ -232,9 +217,11 @@ def checked_model(folder: Path, moving: Chosen, fixed: dict[str, Path]) -> Spars
     placed = {image.name for image in model.images}
     posed = [name for name in moving.names if name in placed]
     if len(posed) < max(3, LEAST_SHARE * len(moving.names)):
+        first, last = _longest_gap(moving.names, placed)
         raise DevrfError(
             f"{moving.path}: cameras were found for {len(posed)} of {len(moving.names)} frames "
-            f"only, the others have too few matches with them; {_FILM}"
+            f"only, it broke from {Path(first).stem} to {Path(last).stem}, which have too few "
+            f"matches with the others; cut the film there, or {_FILM}"
         )
     if len(posed) < len(moving.names):
         log.warning(
@@ -253,6 +240,13 @@ def checked_model(folder: Path, moving: Chosen, fixed: dict[str, Path]) -> Spars
                 "out of capture.views"
             )
     return model
+
+
+def _longest_gap(names: Sequence[str], placed: set[str]) -> tuple[str, str]:
+    """The first and the last image of the longest stretch that was not placed."""
+    runs = [list(run) for is_placed, run in groupby(names, placed.__contains__) if not is_placed]
+    longest = max(runs, key=len)
+    return longest[0], longest[-1]
 
 
 def _check_turns(model: SparseModel, moving: Chosen, posed: Sequence[str]) -> None:

@@ -5,7 +5,6 @@ It fills a third of a picture. Structure from motion that takes it for the world
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
 

@@ -86,8 +86,9 @@ def exact_flow(shape: Shape, views: Views, *, forward: bool = False) -> OpticalF
     """Exact backward (or forward) flow of ``views`` with depth, the same cameras at each frame.
 
     They may have moved between frames. The point that the ray through a pixel's centre meets is
-    carried to the frame before (after) and projected into its camera there; it may be hidden there, or outside of the image. Where the ray meets nothing,
-    and in the first (last) frame, the flow is 0 and not valid.
+    carried to the frame before (after) and projected into its camera there; it may be hidden there,
+    or outside of the image. Where the ray meets nothing, and in the first (last) frame, the flow is
+    0 and not valid.
     """
     assert views.depth is not None
     times = torch.unique(views.times).tolist()

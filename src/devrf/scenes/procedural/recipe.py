@@ -203,6 +203,8 @@ NEAR = 1.0
 # neither wall nor floor.
 _HANGS = (0.0, 0.0, -2.6)
 _STAYS_WITHIN = 1.1
+# The contrast of the wall behind the cushion: features are found on the cushion, above all.
+_PALE = 0.3
 
 
 @dataclass(frozen=True)
@@ -267,8 +269,8 @@ class ProceduralForwardScene(Recipe):
         if self.shape == "plush":
             return Surrounded(Plush(self.speed), Backdrop(weave))
         if self.shape == "cushion":
-            cushion = Cushion(self.speed)
-            return Surrounded(cushion, Backdrop(weave), CUSHION_REACH, CUSHION_MIDDLE)
+            pale = Backdrop(weave, contrast=_PALE)
+            return Surrounded(Cushion(self.speed), pale, CUSHION_REACH, CUSHION_MIDDLE)
         body = random_body(self.scene_seed, self.speed, self.sliding)
         hung = placed(body, _HANGS, _STAYS_WITHIN)
         return Surrounded(hung, Backdrop(weave, pedestal=False), _STAYS_WITHIN, _HANGS)
