@@ -12,7 +12,7 @@ import torch
 
 from devrf.errors import DevrfError
 from devrf.scenes.files import read_json
-from devrf.scenes.sparse_model import faces_one_side, model_folder, read_model
+from devrf.scenes.sparse_model import ONE_SIDE, model_folder, read_model, widest_angle
 from devrf.scenes.splits import distinct_poses, distinct_times, stand_still
 from devrf.scenes.transforms import TransformsFile
 
@@ -34,7 +34,7 @@ def faces_forward(choice: str, root: str | Path, space: str | None) -> bool:
         return any(known is not None and known.space == "ndc" for known in bounds)
     with suppress(DevrfError):
         place = model_folder(folder)
-        return place is not None and faces_one_side(read_model(place))
+        return place is not None and widest_angle(read_model(place).poses) <= ONE_SIDE
     return False
 
 

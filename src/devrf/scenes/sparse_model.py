@@ -205,7 +205,7 @@ def normalised(model: SparseModel, facing: Facing = "auto") -> World:
     points = torch.from_numpy(model.points)
     near, far = _depth_range(model)
     if facing == "auto":
-        facing = "forward" if _ndc_holds(model, near) else "inward"
+        facing = "forward" if widest_angle(poses) <= ONE_SIDE else "inward"
     world = (_forward if facing == "forward" else _inward)(poses, points, near, far)
     here = bool(in_reach(world.poses[:, :, 3]).all())
     if not here or not 0 < world.near < world.far <= FARTHEST:  # NaN compares false
@@ -213,16 +213,6 @@ def normalised(model: SparseModel, facing: Facing = "auto") -> World:
             model.folder, f"its cameras do not look {facing} at a scene; run COLMAP's mapper again"
         )
     return world
-
-
-def faces_one_side(model: SparseModel) -> bool:
-    """Whether all cameras see the scene from one side, so that it is learned in NDC.
-
-    They look within :data:`ONE_SIDE` of one direction, stand behind one plane, before which all of
-    the scene is, and what they see from there on is no wider than :data:`WIDEST`. DevrfError if
-    the points do not tell.
-    """
-    return _ndc_holds(model, _depth_range(model)[0])
 
 
 def _depth_range(model: SparseModel) -> tuple[float, float]:
@@ -240,7 +230,14 @@ def _depth_range(model: SparseModel) -> tuple[float, float]:
     return near, far
 
 
-def _ndc_holds(model: SparseModel, nearest: float) -> bool:
+def ndc_holds(model: SparseModel) -> bool:
+    """Whether NDC is a good space for what one hand-held camera has filmed.
+
+    It has looked within :data:`ONE_SIDE` of one direction, from behind one plane, before which all
+    of the scene is, and what it has seen from there on is no wider than :data:`WIDEST`. DevrfError
+    if the points do not tell.
+    """
+    nearest, _ = _depth_range(model)
     if widest_angle(model.poses) > ONE_SIDE:
         return False
     poses = relative_to(average_pose(model.poses), model.poses)

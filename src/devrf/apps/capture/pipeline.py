@@ -26,7 +26,7 @@ from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.scenes.footage import frame_count, is_folder, pictures
 from devrf.scenes.formats.nerfstudio import FILE
-from devrf.scenes.sparse_model import AROUND, SparseModel, World, normalised
+from devrf.scenes.sparse_model import AROUND, SparseModel, World, ndc_holds, normalised
 from devrf.scenes.splits import every_nth
 from devrf.system.files import make_folder, write_json
 from devrf.system.progress import followed
@@ -81,7 +81,10 @@ def scene_from_footage(settings: CaptureSettings) -> Path:
     filmed = {path: survey.size for path, survey in surveys.items()}
     _write_images(into, work, [moving, *fixed], common_size(filmed, settings.size), filmed)
     model = _model(into, work, moving, fixed, settings)
-    world = normalised(model, settings.facing)
+    facing = settings.facing
+    if facing == "auto" and settings.monocular:
+        facing = "forward" if ndc_holds(model) else "inward"
+    world = normalised(model, facing)
     if settings.facing == "auto":
         facing = "forward" if world.space == "ndc" else "inward"
         log.info("cameras look %s-facing; capture.facing says otherwise", facing)
