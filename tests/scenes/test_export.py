@@ -13,6 +13,8 @@ from devrf.errors import DevrfError
 from devrf.scenes.export import export
 from devrf.scenes.formats.blender import BlenderReader
 from devrf.scenes.formats.llff import LlffReader
+from devrf.scenes.formats.nerfstudio import NerfstudioReader
+from devrf.scenes.procedural import ProceduralForwardScene
 from devrf.scenes.scene import Scene, Views
 
 
@@ -103,3 +105,21 @@ def test_frames_without_times_have_to_be_evenly_spread(facing: Scene, tmp_path: 
     with pytest.raises(DevrfError, match="data.novel_times_every"):
         export(replace(facing, dynamic=gap), tmp_path / "out")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_film_by_hand_reads_back_the_same(tmp_path: Path) -> None:
+    recipe = ProceduralForwardScene(camera="handheld", frames=4, width=24, height=18, supersample=1)
+    scene = recipe()
+    export(scene, tmp_path / "film")
+    assert len(list((tmp_path / "film" / "images").iterdir())) == 4  # what stage=capture takes
+    back = NerfstudioReader(tmp_path / "film", downscale=1).read()
+    assert back.kind == "forward" and back.static.train is back.dynamic.train
+    for there, here in (
+        (back.dynamic.train, scene.dynamic.train),
+        (back.dynamic.test, scene.dynamic.test),
+    ):
+        assert torch.equal(there.pixels, here.pixels)
+        torch.testing.assert_close(there.times, here.times)
+        off = there.cameras.camera_to_world - here.cameras.camera_to_world
+        # Readers take the average pose of the training views and the others as the identity.
+        assert float(off.abs().max()) < 1e-4

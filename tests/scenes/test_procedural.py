@@ -142,6 +142,38 @@ def test_flow_leads_to_the_same_color() -> None:
     assert torch.cat(errors).mean() < 0.5 * torch.cat(still).mean()
 
 
+def test_one_hand_held_camera_films_a_large_thing_and_others_see_it_at_the_same_times() -> None:
+    recipe = replace(FORWARD, shape="cushion", camera="handheld", frames=5, width=40, height=30)
+    scene = recipe()
+    train, test = scene.dynamic.train, scene.dynamic.test
+    assert scene.static.train is train and train.by_moving_camera
+    assert train.times.tolist() == test.times.tolist() == [0, 0.25, 0.5, 0.75, 1]
+    poses = torch.cat([v.cameras.camera_to_world for v in (train, test)])
+    torch.testing.assert_close(average_pose(poses), torch.eye(4)[:3], atol=1e-5, rtol=0)
+    apart = (train.cameras.positions - test.cameras.positions).norm(dim=1)
+    assert float(apart.min()) > 0.1
+    backdrop = Backdrop()
+    share = []
+    for k in range(len(train)):
+        points = seen_points(train.cameras[[k]], train.depth[[k]])
+        share.append(float((backdrop.distances(points).amin(dim=0) > 0.01).float().mean()))
+    assert 0.25 < sum(share) / len(share) < 0.45
+
+
+def test_flow_of_a_hand_held_camera_leads_to_the_same_point_of_the_wall() -> None:
+    recipe = replace(FORWARD, camera="handheld", frames=3, speed=0.0)
+    train = recipe().dynamic.train
+    flow = train.flow
+    assert flow is not None and not flow.valid[0].any() and flow.valid[1:].all()
+    points = seen_points(train.cameras[[1]], train.depth[[1]])
+    before, _ = train.cameras.project(torch.zeros(len(points), dtype=torch.long), points)
+    expected = before.view(*train.depth[1].shape, 2) - train.cameras.pixel_grid().view(
+        *train.depth[1].shape, 2
+    )
+    torch.testing.assert_close(flow.vectors[1], expected, atol=1e-3, rtol=1e-3)
+    assert float(flow.vectors[1].norm(dim=-1).mean()) > 1  # at rest, all that it sees flows
+
+
 def test_edges_are_antialiased() -> None:
     flat = replace(INWARD, light=0.0, supersample=2, frames=2, width=40, height=40)()
     pixels = flat.static.train.pixels.float()

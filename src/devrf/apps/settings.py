@@ -36,6 +36,7 @@ class CaptureSettings:
     test_view: int = -1
     holdout: int = 8
     alpha_masks: str | Path | None = None
+    masks: str | Path | None = None
 
     @property
     def subtracts(self) -> bool:

@@ -31,7 +31,7 @@ from devrf.errors import DevrfError
 # Keys whose values are files or folders.
 PATHS = {
     *("data.root", "data.export", "data.flow_cache", "ckpt", "fetch.into", "export.into"),
-    *("capture.static", "capture.into", "video.path"),
+    *("capture.static", "capture.into", "capture.masks", "video.path"),
     *("report.runs", "report.into", "evaluation.lpips_weights"),
     *("hydra.run.dir", "hydra.sweep.dir"),
 }

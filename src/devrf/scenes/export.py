@@ -1,4 +1,4 @@
-"""A scene written to disk in the published layout of its kind: Blender's, or LLFF's."""
+"""A scene written to disk in the published layout of its kind: Blender's, LLFF's; nerfstudio's."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from devrf.geometry.clock import FrameClock
+from devrf.geometry.ndc import NormalizedDevice
 from devrf.scenes.files import Numbers
 from devrf.scenes.flow_files import write_flow
 from devrf.scenes.formats.llff_poses import BOUND_FACTOR
@@ -61,12 +62,57 @@ def export(scene: Scene, folder: Path) -> None:
     """Write ``scene`` for ``data=inward`` or ``data=forward`` to read, as its kind says.
 
     It is an embedded one: all images of one focal length, their principal points in the middle;
-    fixed cameras stand still, and one of them is held out. ``folder`` is a new or an empty one.
+    fixed cameras stand still, and one of them is held out. What one camera has filmed by hand is
+    written for ``data=nerfstudio``. ``folder`` is a new or an empty one.
     DevrfError if it is in use or cannot be written, or a frame is left out by some views of a
     forward-facing scene.
     """
     write = _export_blender if scene.kind == "inward" else _export_llff
+    if scene.dynamic.train.by_moving_camera:
+        write = _export_film
     write(scene, folder)
+
+
+def _export_film(scene: Scene, folder: Path) -> None:
+    """Write ``folder/images``, the film, ``folder/others``, what is held out, and their true poses.
+
+    Poses, times and images read back exactly; ``stage=capture`` takes ``images`` alone.
+    """
+    assert isinstance(scene.space, NormalizedDevice)
+    bounds = {"space": "ndc", "near": scene.space.near}
+    with whole_folder(folder) as partial:
+        frames = list[dict[str, Any]]()
+        names: dict[str, list[str]] = {}
+        for place, views in (("images", scene.dynamic.train), ("others", scene.dynamic.test)):
+            _write_images(views, range(len(views)), partial / place)
+            names[place] = [f"{place}/{k:03d}.png" for k in range(len(views))]
+            posed = zip(
+                names[place],
+                views.cameras.camera_to_world.tolist(),
+                views.times.tolist(),
+                strict=True,
+            )
+            for name, pose, time in posed:
+                matrix = [*pose, [0.0, 0.0, 0.0, 1.0]]
+                frames.append({"file_path": name, "time": time, "transform_matrix": matrix})
+        cameras = scene.dynamic.train.cameras
+        fx, fy = cameras.focal[0].tolist()
+        cx, cy = cameras.center[0].tolist()
+        content = {
+            "camera_model": "PINHOLE",
+            "fl_x": fx,
+            "fl_y": fy,
+            "cx": cx,
+            "cy": cy,
+            "w": cameras.width,
+            "h": cameras.height,
+            "scene_bounds": bounds,
+            "frames": frames,
+            "train_filenames": names["images"],
+            "test_filenames": names["others"],
+        }
+        text = json.dumps(content, indent=1)
+        (partial / "transforms.json").write_text(text + "\n", encoding="utf-8")
 
 
 def _export_blender(scene: Scene, folder: Path) -> None:

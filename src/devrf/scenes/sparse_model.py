@@ -19,7 +19,7 @@ from torch.nn.functional import normalize
 
 from devrf.geometry.box import Box
 from devrf.geometry.poses import average_pose, relative_to
-from devrf.scenes.bounds import nearest_point
+from devrf.scenes.bounds import LEAST_COSINE, nearest_point
 from devrf.scenes.files import decoding
 from devrf.scenes.lens import CameraKeys, Intrinsics, intrinsics_of
 from devrf.scenes.validation import FARTHEST, in_reach, scene_error
@@ -159,6 +159,10 @@ Facing = Literal["auto", "forward", "inward"]
 
 # Cameras that all look within so many degrees of one direction face the scene from one side.
 ONE_SIDE = 45.0
+# The widest box that is worth normalised device coordinates, in pictures of their reference camera
+# side by side: DirectVoxGO's boxes of LLFF's scenes are 1.67 wide. Cameras that turn, or come near,
+# make a wider one, of which most is seen by none.
+WIDEST = 1.7
 # The least number of points, each counted in every image that shows it, from which near and far are
 # found.
 LEAST_POINTS = 50
@@ -199,6 +203,20 @@ def normalised(model: SparseModel, facing: Facing = "auto") -> World:
     """
     poses = model.poses
     points = torch.from_numpy(model.points)
+    near, far = _depth_range(model)
+    if facing == "auto":
+        facing = "forward" if widest_angle(poses) <= ONE_SIDE else "inward"
+    world = (_forward if facing == "forward" else _inward)(poses, points, near, far)
+    here = bool(in_reach(world.poses[:, :, 3]).all())
+    if not here or not 0 < world.near < world.far <= FARTHEST:  # NaN compares false
+        raise scene_error(
+            model.folder, f"its cameras do not look {facing} at a scene; run COLMAP's mapper again"
+        )
+    return world
+
+
+def _depth_range(model: SparseModel) -> tuple[float, float]:
+    """Least and largest depth of the points, each in every image that shows it; model's unit."""
     depths = torch.cat([model.depths(k) for k in range(len(model.images))])
     depths = depths[depths > 0]
     if len(depths) < LEAST_POINTS:
@@ -209,15 +227,40 @@ def normalised(model: SparseModel, facing: Facing = "auto") -> World:
         )
     near = float(np.percentile(depths.numpy(), OUTLIERS))
     far = float(np.percentile(depths.numpy(), 100 - OUTLIERS))
-    if facing == "auto":
-        facing = "forward" if widest_angle(poses) <= ONE_SIDE else "inward"
-    world = (_forward if facing == "forward" else _inward)(poses, points, near, far)
-    here = bool(in_reach(world.poses[:, :, 3]).all())
-    if not here or not 0 < world.near < world.far <= FARTHEST:  # NaN compares false
-        raise scene_error(
-            model.folder, f"its cameras do not look {facing} at a scene; run COLMAP's mapper again"
-        )
-    return world
+    return near, far
+
+
+def ndc_holds(model: SparseModel) -> bool:
+    """Whether NDC is a good space for what one hand-held camera has filmed.
+
+    It has looked within :data:`ONE_SIDE` of one direction, from behind one plane, before which all
+    of the scene is, and what it has seen from there on is no wider than :data:`WIDEST`. DevrfError
+    if the points do not tell.
+    """
+    nearest, _ = _depth_range(model)
+    if widest_angle(model.poses) > ONE_SIDE:
+        return False
+    poses = relative_to(average_pose(model.poses), model.poses)
+    plane = nearest / NEAREST
+    if float(poses[:, 2, 3].min()) <= -plane:
+        return False
+    lenses = [model.cameras[image.camera] for image in model.images]
+    focal = torch.tensor([[lens["fl_x"], lens["fl_y"]] for lens in lenses], dtype=poses.dtype)
+    size = torch.tensor([[lens["w"], lens["h"]] for lens in lenses], dtype=poses.dtype)
+    center = torch.tensor([[lens["cx"], lens["cy"]] for lens in lenses], dtype=poses.dtype)
+    corner = torch.cartesian_prod(*[torch.tensor([0.0, 1.0], dtype=poses.dtype)] * 2)
+    x, y = ((corner * size[:, None] - center[:, None]) / focal[:, None]).unbind(-1)
+    ahead = torch.stack([x, -y, -torch.ones_like(x)], dim=-1)
+    rays = normalize(ahead @ poses[:, :, :3].mT, dim=-1)
+    if float((-rays[..., 2]).min()) < LEAST_COSINE:
+        return False
+    # Where rays through the corners are on the plane, and at infinity; by depth.
+    endless = rays[..., :2] / -rays[..., 2:]
+    place = poses[:, None, :, 3]
+    on_plane = (place[..., :2] + endless * (plane + place[..., 2:])) / plane
+    slopes = torch.cat([endless, on_plane]).flatten(0, 1)
+    wide = (slopes.amax(dim=0) - slopes.amin(dim=0)) * (focal / size).mean(dim=0)
+    return float(wide.max()) <= WIDEST
 
 
 def widest_angle(poses: Tensor) -> float:
@@ -236,6 +279,9 @@ def _forward(poses: Tensor, points: Tensor, near: float, far: float) -> World:
 
 def _inward(poses: Tensor, points: Tensor, near: float, far: float) -> World:
     axes_meet = nearest_point(poses[:, :, 3], poses[:, :, 2], 1e-2)
+    # Of cameras that do not go round it, the axes meet anywhere, or behind them.
+    if axes_meet is not None and (widest_angle(poses) <= ONE_SIDE or _is_behind(axes_meet, poses)):
+        axes_meet = None
     middle = points.median(dim=0).values if axes_meet is None else axes_meet
     # z up, as far as the cameras were held upright.
     up = normalize(poses[:, :, 1].sum(dim=0), dim=0)
@@ -259,6 +305,11 @@ def _inward(poses: Tensor, points: Tensor, near: float, far: float) -> World:
     margin = 0.1 * np.maximum(high - low, 0.1 * AROUND)
     inner = Box.of((low - margin).tolist(), (high + margin).tolist())
     return World(poses, points, "contracted", near, far, (inner.low, inner.high))
+
+
+def _is_behind(point: Tensor, poses: Tensor) -> bool:
+    """Whether a point (3,) is behind most cameras (N, 3, 4)."""
+    return float(((point - poses[:, :, 3]) * -poses[:, :, 2]).sum(dim=1).median()) <= 0
 
 
 def _moved(poses: Tensor, points: Tensor, frame: Tensor, scale: float) -> tuple[Tensor, Tensor]:

@@ -16,6 +16,7 @@ from devrf.apps.capture.images import (
     box_of_motion,
     common_size,
     fitted,
+    still_masks,
     write_frames,
 )
 from devrf.apps.capture.pipeline import kept
@@ -187,6 +188,16 @@ def test_masks_that_do_not_fit_are_refused(walk, masks, tmp_path):
         written(Chosen(walk, "static", (2,), masks / "walk"), tmp_path / "images")
 
 
+def test_masks_of_what_moves_are_black_or_white_in_the_images_size(walk, masks, tmp_path):
+    half = np.full((48, 64), 255, np.uint8)
+    half[:, 32:] = 90
+    cv2.imwrite(str(masks / "walk" / "1.png"), half)
+    footage = Chosen(walk, "static", (1,), still=masks / "walk")
+    written(footage, tmp_path / "images", (32, 24))
+    (mask,) = still_masks(tmp_path / "images", footage).values()
+    assert mask.shape == (24, 32) and (mask[:, :16] == 255).all() and (mask[:, 16:] == 0).all()
+
+
 def test_frames_are_cropped_to_common_proportions_and_shrunk(textured):
     a, b = PATHS
     assert common_size({a: (1920, 1080), b: (1280, 720)}, 960) == (960, 540)
@@ -261,8 +272,11 @@ def test_a_model_that_does_not_hold_the_scene_is_refused(tmp_path):
     with pytest.raises(DevrfError, match=r"^right\.mp4: "):
         checked_model(folder, MOVING, {**fixed, "view2/00000.png": Path("right.mp4")})
     folder = model(tmp_path / "few", *MOVING.names[:2], *fixed)
-    with pytest.raises(DevrfError, match=r"^walk\.mp4: .* 2 of 4 frames"):
+    with pytest.raises(
+        DevrfError, match=r"^walk\.mp4: .* 2 of 4 frames only, it broke from"
+    ) as few:
         checked_model(folder, MOVING, {})
+    assert all(Path(name).stem in str(few.value) for name in MOVING.names[2:])
 
 
 def test_cameras_that_jump_within_a_video_are_refused(tmp_path):

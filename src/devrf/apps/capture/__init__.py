@@ -9,7 +9,8 @@
     frames      these frames as image files of one size
        │
     structure   structure from motion over the picked frames and the first frame of each fixed
-       │        video (the scene is at rest in all of them): cameras, lenses, sparse points
+       │        video (the scene is at rest in all of them): cameras, lenses, sparse points;
+       │        of one moving camera alone again, without what ``movers`` finds to move
     normalisation   origin, axes and unit; from which side the cameras look; near, far and box
        │
     writing     ``transforms.json`` with a ``time`` on each frame, and the lists of held-out images

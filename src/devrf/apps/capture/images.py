@@ -18,9 +18,9 @@ from torch import Tensor
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
-from devrf.scenes.footage import Picture, chosen, is_folder
+from devrf.scenes.footage import Picture, chosen, is_folder, pictures
 from devrf.scenes.image_folders import listed_images
-from devrf.scenes.masks import read_mask
+from devrf.scenes.masks import HALF, WHITE, read_mask
 from devrf.scenes.scene import Views
 from devrf.scenes.silhouettes import motion_box
 
@@ -35,12 +35,14 @@ class Chosen:
         label: the folder of its images: ``static``, ``view1`` …
         positions: positions of its frames, ascending; one may appear twice.
         masks: alpha masks of all its frames; None: the images have no alpha.
+        still: masks of all its frames, black where something moves; None: unknown.
     """
 
     path: Path
     label: str
     positions: tuple[int, ...]
     masks: Path | None = None
+    still: Path | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -110,20 +112,20 @@ Mask = npt.NDArray[np.uint8]
 VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm")
 
 
-def alpha_masks_of(folder: Path, footage: Path, count: int) -> Path:
+def alpha_masks_of(
+    folder: Path, footage: Path, count: int, key: str = "capture.alpha_masks"
+) -> Path:
     """The alpha masks of some footage: ``<folder>/<its name without suffix>``, a folder or a video.
 
     For photographs it is a folder with a file of each one's name. For a video of ``count`` frames
     it is a folder of as many images, in the order of their names, or a video of as many frames.
+    ``key`` is the setting that gives ``folder``: masks of what moves are laid out in the same way.
 
     Raises:
         DevrfError: there are none, or not of all frames.
     """
     if not folder.is_dir():
-        raise DevrfError(
-            f"{folder}: no such folder of alpha masks; correct "
-            "capture.alpha_masks, or give subtract"
-        )
+        raise DevrfError(f"{folder}: no such folder of masks; correct {key}, or leave it out")
     place = folder / footage.stem
     if not place.is_dir():
         videos = (folder / f"{footage.stem}{suffix}" for suffix in VIDEOS)
@@ -169,6 +171,22 @@ def chosen_masks(
             )
         # Grey as it is, whatever compression has made of its colours.
         yield picture.mean(axis=2).round().astype(np.uint8)
+
+
+def still_masks(images: Path, footage: Chosen) -> dict[str, Mask]:
+    """By the ``still`` masks of some footage, of each of its images: 0 where it moves, else 255.
+
+    Raises:
+        DevrfError: what :func:`chosen_masks` raises.
+    """
+    assert footage.still is not None
+    _, frame = next(pictures(footage.path))
+    height, width = np.asarray(cv2.imread(str(images / footage.names[0]))).shape[:2]
+    filmed = (frame.shape[1], frame.shape[0])
+    masks = chosen_masks(footage.still, footage.path, footage.positions, filmed)
+    fit = (fitted(mask, (width, height)) for mask in masks)
+    whole = (np.where(mask > HALF, WHITE, 0).astype(np.uint8) for mask in fit)
+    return dict(zip(footage.names, whole, strict=True))
 
 
 def _of_photograph(masks: Path, photograph: Path) -> Path:

@@ -19,14 +19,14 @@ from devrf.apps.capture.images import (
     common_size,
     write_frames,
 )
-from devrf.apps.capture.structure import check_library, checked_model, reconstruct
+from devrf.apps.capture.structure import check_library, checked_model, models_folder, reconstruct
 from devrf.apps.capture.survey import Survey, check_sharp, sharpest, survey
 from devrf.apps.settings import CaptureSettings
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.scenes.footage import frame_count, is_folder, pictures
 from devrf.scenes.formats.nerfstudio import FILE
-from devrf.scenes.sparse_model import AROUND, SparseModel, World, normalised
+from devrf.scenes.sparse_model import AROUND, SparseModel, World, ndc_holds, normalised
 from devrf.scenes.splits import every_nth
 from devrf.system.files import make_folder, write_json
 from devrf.system.progress import followed
@@ -34,7 +34,7 @@ from devrf.system.progress import followed
 log = logging.getLogger(__name__)
 
 # Part of every key: a new version makes earlier results invalid.
-VERSION = 1
+VERSION = 2
 # Folders below the scene's: the results of the steps, and the images.
 WORK = "capture"
 IMAGES = "images"
@@ -65,7 +65,11 @@ def scene_from_footage(settings: CaptureSettings) -> Path:
     if settings.alpha_masks is not None and not settings.subtracts:
         folder = Path(settings.alpha_masks).expanduser()
         masks = {path: alpha_masks_of(folder, path, len(s.times)) for path, s in surveys.items()}
-    moving = Chosen(static, "static", tuple(picked), masks.get(static))
+    still = None
+    if settings.masks is not None:
+        folder = Path(settings.masks).expanduser()
+        still = alpha_masks_of(folder, static, len(sharp), "capture.masks")
+    moving = Chosen(static, "static", tuple(picked), masks.get(static), still)
     clock = Timeline((), ())
     if views:
         in_view = [surveys[view] for view in views]
@@ -77,7 +81,10 @@ def scene_from_footage(settings: CaptureSettings) -> Path:
     filmed = {path: survey.size for path, survey in surveys.items()}
     _write_images(into, work, [moving, *fixed], common_size(filmed, settings.size), filmed)
     model = _model(into, work, moving, fixed, settings)
-    world = normalised(model, settings.facing)
+    facing = settings.facing
+    if facing == "auto" and settings.monocular:
+        facing = "forward" if ndc_holds(model) else "inward"
+    world = normalised(model, facing)
     if settings.facing == "auto":
         facing = "forward" if world.space == "ndc" else "inward"
         log.info("cameras look %s-facing; capture.facing says otherwise", facing)
@@ -207,13 +214,17 @@ def _model(
 ) -> SparseModel:
     first = {video.names[0]: video.path for video in fixed}
     options = [settings.camera, settings.intrinsics, settings.matching]
-    images = [[video.label, _stamp(video.path), video.positions] for video in (moving, *fixed)]
+    images = [
+        [video.label, _stamp(video.path), video.positions, video.still and _stamp(video.still)]
+        for video in (moving, *fixed)
+    ]
 
     def make() -> dict[str, Any]:
-        return {"model": reconstruct(into / IMAGES, work, moving, list(first), settings).name}
+        model = reconstruct(into / IMAGES, work, moving, list(first), settings)
+        return {"model": model.relative_to(models_folder(work)).as_posix()}
 
     result = kept(work / "structure.json", [images, options, settings.size], make)
-    return checked_model(work / "models" / result["model"], moving, first)
+    return checked_model(models_folder(work) / result["model"], moving, first)
 
 
 def _around_motion(

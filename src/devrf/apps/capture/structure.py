@@ -6,14 +6,17 @@ import importlib
 import logging
 import shutil
 from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib.util import find_spec
-from itertools import combinations
+from itertools import combinations, groupby
 from pathlib import Path
 from typing import Any
 
+import cv2
 import torch
 
-from devrf.apps.capture.images import Chosen
+from devrf.apps.capture.images import Chosen, Mask, still_masks
+from devrf.apps.capture.movers import masks_of_movers
 from devrf.apps.settings import CaptureSettings
 from devrf.errors import DevrfError
 from devrf.scenes.footage import is_folder
@@ -28,7 +31,11 @@ NEIGHBOURS = 10
 MOST_TURN = 45.0
 MOST_TURNS = 5.0
 # A model of a smaller share of a moving camera's images is not the scene.
-LEAST_SHARE = 0.5
+LEAST_SHARE = 2 / 3
+# A model without what moves is taken if it places so large a share of the images that the first
+# one places.
+FEWER = 0.9
+DATA_BASE = "matches.db"
 
 _FILM = (
     "film more slowly, with more overlap (neighbouring frames share more than half of what they "
@@ -63,21 +70,83 @@ def reconstruct(
 ) -> Path:
     """Run structure from motion, and write the data base and the models to ``work``.
 
-    The moving camera's images and one of each ``fixed`` view, all of the scene at rest, are in the
-    folder ``images``. Returns the folder of the largest model.
+    The moving camera's images and one of each ``fixed`` view are in the folder ``images``. Where
+    they are all of the scene at rest, COLMAP's incremental mapper finds the cameras. Where one
+    camera films a scene that moves, its flow and these cameras tell what moves, unless masks are
+    given; cameras are found again without it, by both of COLMAP's mappers, and the better model is
+    taken. Returns the folder of the model, in :func:`models_folder`.
 
     Raises:
-        DevrfError: nothing could be matched.
+        DevrfError: nothing could be matched, or a given mask does not fit.
     """
     library: Any = importlib.import_module("pycolmap")
     library.logging.minloglevel = 3
     library.set_random_seed(0)
-    base = work / "matches.db"
-    models = work / "models"
-    listed = work / "pairs.txt"
-    base.unlink(missing_ok=True)
+    models = models_folder(work)
     shutil.rmtree(models, ignore_errors=True)
-    models.mkdir(parents=True)
+    given = {} if moving.still is None else still_masks(images, moving)
+    _match(images, work, moving, fixed, settings, given)
+    first = _mapped(images, work, "incremental", models / "first")
+    if first is None:
+        raise DevrfError(
+            f"{moving.path}: too few matches between its frames to find any camera; {_FILM}"
+        )
+    if not settings.monocular:
+        return first.folder
+    masked = {}
+    if not given:
+        masked = masks_of_movers(images, moving.names, read_model(first.folder))
+    if masked:
+        log.info("structure from motion: again, without what moves")
+        _match(images, work, moving, fixed, settings, masked)
+        second = _mapped(images, work, "incremental", models / "masked")
+    else:
+        second = first
+    tried = [second, _mapped(images, work, "global", models / "global")]
+    # Where masks leave too little, cameras are those of whole images.
+    known = [model for model in tried if model and model.images >= FEWER * first.images]
+    best = max(known or [first], key=lambda model: (model.images, -model.error))
+    log.info("structure from motion: the %s mapper's cameras are taken", best.mapper)
+    return best.folder
+
+
+def models_folder(work: Path) -> Path:
+    """Where :func:`reconstruct` puts models."""
+    return work / "models"
+
+
+@dataclass(frozen=True)
+class _Mapped:
+    """The largest model that a mapper has found.
+
+    Attributes:
+        mapper: ``incremental`` or ``global``.
+        folder: where it is.
+        images: how many images it places.
+        error: mean reprojection error of its points, pixels.
+    """
+
+    mapper: str
+    folder: Path
+    images: int
+    error: float
+
+
+def _match(
+    images: Path,
+    work: Path,
+    moving: Chosen,
+    fixed: Sequence[str],
+    settings: CaptureSettings,
+    masks: dict[str, Mask],
+) -> None:
+    """Write a new data base of features, none of them where masks are 0, and their matches."""
+    library: Any = importlib.import_module("pycolmap")
+    base = work / DATA_BASE
+    base.unlink(missing_ok=True)
+    reading = library.ImageReaderOptions(camera_model=settings.camera)
+    if masks:
+        reading.mask_path = _written(masks, work / "masks")
     names = [*dict.fromkeys([*moving.names, *fixed])]
     log.info("structure from motion: features of %d images", len(names))
     modes = library.CameraMode
@@ -86,11 +155,12 @@ def reconstruct(
         images,
         names,
         camera_mode=modes.SINGLE if settings.intrinsics == "shared" else modes.PER_FOLDER,
-        reader_options=library.ImageReaderOptions(camera_model=settings.camera),
+        reader_options=reading,
         extraction_options=library.FeatureExtractionOptions(use_gpu=False),
         device=library.Device.cpu,
     )
     compared = pairs(moving.names, [n for n in fixed if n not in moving.names], settings.matching)
+    listed = work / "pairs.txt"
     listed.write_text("".join(f"{a} {b}\n" for a, b in compared))
     log.info("structure from motion: matches of %d pairs", len(compared))
     matching = library.FeatureMatchingOptions(use_gpu=False)
@@ -98,15 +168,42 @@ def reconstruct(
     verification = library.TwoViewGeometryOptions()
     verification.ransac.random_seed = 0
     library.match_image_pairs(base, matching, pairing, verification, device=library.Device.cpu)
-    log.info("structure from motion: cameras and points")
-    mapping = library.IncrementalPipelineOptions(random_seed=0, min_model_size=3)
-    reconstructions = library.incremental_mapping(base, images, models, mapping)
-    if not reconstructions:
-        raise DevrfError(
-            f"{moving.path}: too few matches between its frames to find any camera; {_FILM}"
-        )
-    best = max(reconstructions, key=lambda number: reconstructions[number].num_reg_images())
-    return models / str(best)
+
+
+def _written(masks: dict[str, Mask], folder: Path) -> Path:
+    """Masks as files where COLMAP looks for them: ``<folder>/<image>.png``."""
+    shutil.rmtree(folder, ignore_errors=True)
+    for name, mask in masks.items():
+        file = folder / f"{name}.png"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(file), mask)
+    return folder
+
+
+def _mapped(images: Path, work: Path, mapper: str, into: Path) -> _Mapped | None:
+    """The largest model that a mapper finds in the data base; None where it finds none."""
+    library: Any = importlib.import_module("pycolmap")
+    into.mkdir(parents=True)
+    base = work / DATA_BASE
+    if mapper == "incremental":
+        options = library.IncrementalPipelineOptions(random_seed=0, min_model_size=3)
+        found = library.incremental_mapping(base, images, into, options)
+    else:
+        options = library.GlobalPipelineOptions(random_seed=0, min_model_size=3)
+        found = library.global_mapping(base, images, into, options)
+    if not found:
+        log.info("structure from motion: the %s mapper finds no cameras", mapper)
+        return None
+    number, model = max(found.items(), key=lambda item: item[1].num_reg_images())
+    error = float(model.compute_mean_reprojection_error())
+    placed = int(model.num_reg_images())
+    log.info(
+        "structure from motion: the %s mapper places %d images, reprojection error %.2f px",
+        mapper,
+        placed,
+        error,
+    )
+    return _Mapped(mapper, into / str(number), placed, error)
 
 
 def checked_model(folder: Path, moving: Chosen, fixed: dict[str, Path]) -> SparseModel:
@@ -120,9 +217,11 @@ def checked_model(folder: Path, moving: Chosen, fixed: dict[str, Path]) -> Spars
     placed = {image.name for image in model.images}
     posed = [name for name in moving.names if name in placed]
     if len(posed) < max(3, LEAST_SHARE * len(moving.names)):
+        first, last = _longest_gap(moving.names, placed)
         raise DevrfError(
             f"{moving.path}: cameras were found for {len(posed)} of {len(moving.names)} frames "
-            f"only, the others have too few matches with them; {_FILM}"
+            f"only, it broke from {Path(first).stem} to {Path(last).stem}, which have too few "
+            f"matches with the others; cut the film there, or {_FILM}"
         )
     if len(posed) < len(moving.names):
         log.warning(
@@ -141,6 +240,13 @@ def checked_model(folder: Path, moving: Chosen, fixed: dict[str, Path]) -> Spars
                 "out of capture.views"
             )
     return model
+
+
+def _longest_gap(names: Sequence[str], placed: set[str]) -> tuple[str, str]:
+    """The first and the last image of the longest stretch that was not placed."""
+    runs = [list(run) for is_placed, run in groupby(names, placed.__contains__) if not is_placed]
+    longest = max(runs, key=len)
+    return longest[0], longest[-1]
 
 
 def _check_turns(model: SparseModel, moving: Chosen, posed: Sequence[str]) -> None:

@@ -121,7 +121,10 @@ def resolved_voxels(scene: Scene, schedule: CanonicalSchedule, box: Box) -> int:
     """
     whole: int = round(schedule.side**3)
     finer = schedule.voxels_per_pixel
-    if finer is None or not scene.space.is_linear or isinstance(scene.space, NormalizedDevice):
+    # Around a hand-held camera's sparse points space is contracted; the images resolve no more
+    # at their depth.
+    fits = scene.space.is_linear or scene.dynamic.train.by_moving_camera
+    if finer is None or not fits or isinstance(scene.space, NormalizedDevice):
         return whole
     edge = scene.static.train.cameras.pixel_size(torch.tensor(box.middle)) / finer
     least = 8 << len(schedule.upsample_at)  # as few as its first phase may have

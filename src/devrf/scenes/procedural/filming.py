@@ -83,11 +83,12 @@ def moved(shape: Shape, points: Tensor, time: float, to: float) -> Tensor:
 
 
 def exact_flow(shape: Shape, views: Views, *, forward: bool = False) -> OpticalFlow:
-    """Exact backward (or forward) flow of ``views`` with depth, all fixed cameras at each frame.
+    """Exact backward (or forward) flow of ``views`` with depth, the same cameras at each frame.
 
-    The point that the ray through a pixel's centre meets is carried to the frame before (after)
-    and projected; it may be hidden there, or outside of the image. Where the ray meets nothing,
-    and in the first (last) frame, the flow is 0 and not valid.
+    They may have moved between frames. The point that the ray through a pixel's centre meets is
+    carried to the frame before (after) and projected into its camera there; it may be hidden there,
+    or outside of the image. Where the ray meets nothing, and in the first (last) frame, the flow is
+    0 and not valid.
     """
     assert views.depth is not None
     times = torch.unique(views.times).tolist()
@@ -103,7 +104,8 @@ def exact_flow(shape: Shape, views: Views, *, forward: bool = False) -> OpticalF
         pixels = torch.stack([column, row], dim=-1).to(depth) + 0.5
         rays = cameras.rays(camera, pixels)
         points = rays.at(torch.arange(len(rays)), depth[met])
-        there, _ = cameras.project(camera, moved(shape, points, time, other))
+        seen_from = views.cameras[(views.times == other).nonzero()[:, 0]]
+        there, _ = seen_from.project(camera, moved(shape, points, time, other))
         flow = depth.new_zeros(*depth.shape, 2)
         flow[met] = there - pixels
         vectors[at] = flow
@@ -148,6 +150,26 @@ class Filming:
             train=self._moving(train, train_frames, frames, "train"),
             test=self._moving(test, range(frames), frames, "test"),
         )
+
+    def by_hand(self, camera: Cameras, others: Cameras) -> Capture:
+        """What one moving camera films, with the exact backward flow, and others to test on.
+
+        ``camera`` is where it is at each of T ≥ 2 frames, at times k / (T − 1); ``others`` has
+        another view at each of them.
+        """
+        train = self._followed(camera, "train")
+        return Capture(
+            train=replace(train, flow=exact_flow(self.shape, train)),
+            test=self._followed(others, "test"),
+        )
+
+    def _followed(self, cameras: Cameras, split: str) -> Views:
+        order = torch.arange(len(cameras))
+        times = order / (len(cameras) - 1)
+        shot = [self.pictures(cameras[[k]], time) for k, time in enumerate(times.tolist())]
+        pixels, depths = zip(*shot, strict=True)
+        names = tuple(f"hand-held {split} frame {k:03d}" for k in order.tolist())
+        return Views(torch.cat(pixels), cameras, times, order, names, depth=torch.cat(depths))
 
     def _still(self, cameras: Cameras, split: str) -> Views:
         pixels, depth = self.pictures(cameras, 0.0)

@@ -13,6 +13,9 @@ from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from devrf.scenes.bounds import forward_bounds, reference_space
+from devrf.scenes.procedural.cushion import MIDDLE as CUSHION_MIDDLE
+from devrf.scenes.procedural.cushion import REACH as CUSHION_REACH
+from devrf.scenes.procedural.cushion import Cushion
 from devrf.scenes.procedural.filming import Filming, extent
 from devrf.scenes.procedural.flower import Flower
 from devrf.scenes.procedural.plush import Plush
@@ -23,12 +26,13 @@ from devrf.scenes.procedural.rigs import (
     dynamic_rig,
     facing_dynamic_rig,
     facing_static_rig,
+    hand_held_rig,
     static_rig,
 )
 from devrf.scenes.procedural.robot import Robot
 from devrf.scenes.procedural.solids import Body, Shape
 from devrf.scenes.procedural.surroundings import REACH, STEPS, Backdrop, Room, Surrounded
-from devrf.scenes.scene import Bounds, Scene
+from devrf.scenes.scene import Bounds, Capture, Scene
 from devrf.scenes.space import inward_space
 from devrf.scenes.splits import every_nth
 from devrf.scenes.validation import MIN_SIDE, Options, scene_error
@@ -199,6 +203,8 @@ NEAR = 1.0
 # neither wall nor floor.
 _HANGS = (0.0, 0.0, -2.6)
 _STAYS_WITHIN = 1.1
+# The contrast of the wall behind the cushion: features are found on the cushion, above all.
+_PALE = 0.3
 
 
 @dataclass(frozen=True)
@@ -210,13 +216,18 @@ class ProceduralForwardScene(Recipe):
     ``static_views`` to learn from there are held-out ones, one in eight of all.
 
     Attributes:
-        shape: ``plush`` (the toy) or ``random``.
+        shape: ``plush`` (the toy), ``cushion`` (a large, finely painted thing that fills a third of
+            the picture), or ``random``.
+        camera: ``fixed``: a static set, and fixed cameras; ``handheld``: one camera that moves
+            while the scene does, and at each time another view, held out; then there is no static
+            set, and ``static_views`` and ``train_views`` are not used.
         texture: how wall and floor are painted: ``soft``, or ``fine`` for images of about 240
             pixels or more, in which it has waves of five to twelve pixels.
     """
 
-    shape: Literal["plush", "random"] = "plush"
+    shape: Literal["plush", "cushion", "random"] = "plush"
     _: KW_ONLY
+    camera: Literal["fixed", "handheld"] = "fixed"
     texture: Texture = "soft"
     height: Side = 72
     static_views: Count = 20
@@ -226,6 +237,11 @@ class ProceduralForwardScene(Recipe):
     def __call__(self) -> Scene:
         """Render everything."""
         film = Filming(self.filmed(), _REACH, self.supersample, self.light, STEPS, opaque=True)
+        name = {"random": "random_forward"}.get(self.shape, self.shape)
+        if self.camera == "handheld":
+            one, others = hand_held_rig(self.frames, width=self.width, height=self.height)
+            film_by_hand = film.by_hand(one, others)
+            return self._scene(f"{name}_by_hand", film_by_hand, film_by_hand)
         # Seven of each eight views are learned from.
         held_out = -(-self.static_views // (HOLDOUT - 1))
         static = facing_static_rig(
@@ -239,10 +255,12 @@ class ProceduralForwardScene(Recipe):
         )
         at_rest = film.at_rest(learned, tested)
         moving = film.moving(watching, unseen, self.frames, self.unseen_frames)
-        space = reference_space(static, NEAR)
+        return self._scene(name, at_rest, moving)
+
+    def _scene(self, name: str, at_rest: Capture, moving: Capture) -> Scene:
+        space = reference_space(at_rest.train.cameras, NEAR)
         source = "all that the cameras see (procedural scene)"
         bounds = forward_bounds([at_rest.train, moving.train], space, source)
-        name = "plush" if self.shape == "plush" else "random_forward"
         return Scene(name, "forward", at_rest, moving, bounds, "white", space)
 
     def filmed(self) -> Shape:
@@ -250,6 +268,9 @@ class ProceduralForwardScene(Recipe):
         weave = self.texture == "fine"
         if self.shape == "plush":
             return Surrounded(Plush(self.speed), Backdrop(weave))
+        if self.shape == "cushion":
+            pale = Backdrop(weave, contrast=_PALE)
+            return Surrounded(Cushion(self.speed), pale, CUSHION_REACH, CUSHION_MIDDLE)
         body = random_body(self.scene_seed, self.speed, self.sliding)
         hung = placed(body, _HANGS, _STAYS_WITHIN)
         return Surrounded(hung, Backdrop(weave, pedestal=False), _STAYS_WITHIN, _HANGS)

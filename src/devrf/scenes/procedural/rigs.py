@@ -118,11 +118,51 @@ def facing_dynamic_rig(train: int, *, width: int, height: int) -> tuple[Cameras,
     return _facing(around, width, height), _facing(middle, width, height)
 
 
-def _facing(positions: Tensor, width: int, height: int, *, centred: bool = False) -> Cameras:
-    """Float32 cameras at positions (N, 3) float64 that look at the rig's target, y up."""
+# Half widths (x, y, z) of a hand-held camera's path, and how often it goes to and fro in the film.
+_SWAY = (0.70, 0.22, 0.15)
+_TIMES_AROUND = (1.0, 1.7, 1.3)
+# The others are where it is so much of the film later, and aside.
+_LATER = 0.4
+_ASIDE = (-0.08, 0.06, 0.0)
+
+
+def hand_held_rig(frames: int, *, width: int, height: int) -> tuple[Cameras, Cameras]:
+    """A camera that one hand moves, at each of ``frames`` times, and another view at each of them.
+
+    It sways, trembles, and looks about the rig's target. The average pose of all is the identity.
+    """
+    time = torch.arange(frames, dtype=torch.float64) / (frames - 1)
+    aside = torch.tensor(_ASIDE, dtype=torch.float64)
+    positions = torch.cat([_swayed(time), _swayed(time + _LATER) + aside])
+    at = torch.cat([time, time + _LATER])
+    # Nobody holds the target in the middle of the picture.
+    wanders = torch.stack([0.15 * (9 * at).sin(), 0.10 * (7 * at + 1).cos(), 0 * at], dim=-1)
+    cameras = _facing(positions, width, height, centred=True, wanders=wanders)
+    return cameras[slice(frames)], cameras[slice(frames, None)]
+
+
+def _swayed(time: Tensor) -> Tensor:
+    """Where (N, 3) the hand is at times (N,), world units."""
+    turns = 2 * math.pi * time[:, None] * time.new_tensor(_TIMES_AROUND)
+    tremor = 0.006 * (time[:, None] * time.new_tensor([157.0, 181.0, 139.0])).sin()
+    return time.new_tensor(_SWAY) * (turns + time.new_tensor([0.0, 0.5, 1.0])).sin() + tremor
+
+
+def _facing(
+    positions: Tensor,
+    width: int,
+    height: int,
+    *,
+    centred: bool = False,
+    wanders: Tensor | float = 0.0,
+) -> Cameras:
+    """Float32 cameras at positions (N, 3) float64 that look at the rig's target, y up.
+
+    ``wanders`` (N, 3) is how far from it each looks.
+    """
     cameras = Cameras.looking_at(
         positions,
-        positions.new_tensor([0.0, 0.0, -_TARGET_DEPTH]).expand_as(positions),
+        positions.new_tensor([0.0, 0.0, -_TARGET_DEPTH]).expand_as(positions) + wanders,
         focal=max(width, height) / 2 / math.tan(FIELD_OF_VIEW / 2),
         width=width,
         height=height,

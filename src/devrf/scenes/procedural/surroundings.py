@@ -123,10 +123,13 @@ class Backdrop:
     Attributes:
         weave: whether the paint is fine, for images of about 240 pixels or more; else soft.
         pedestal: whether there is one.
+        contrast: of the paint, about its middle; what stands on the pedestal draws more attention
+            where it is low.
     """
 
     weave: bool = False
     pedestal: bool = True
+    contrast: float = 1.0
 
     @property
     def parts(self) -> int:
@@ -145,6 +148,8 @@ class Backdrop:
     def color(self, material: Material) -> Tensor:
         """The paint (M, 3): the pedestal stands out from the floor."""
         painted = mural(material.rest, (*WAVES, *WEAVE) if self.weave else WAVES)
+        middle = (painted.new_tensor(_DARKEST) + painted.new_tensor(_LIGHTEST)) / 2
+        painted = torch.lerp(middle, painted, self.contrast)
         return torch.where((material.part == _PEDESTAL)[:, None], 0.5 * painted, painted)
 
 

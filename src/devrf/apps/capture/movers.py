@@ -1,0 +1,212 @@
+"""What moves before a moving camera: optical flow that leaves the epipolar lines of its frames.
+
+A point that stands still is seen, in any other frame, on a line that the two cameras alone tell
+(Hartley and Zisserman, *Multiple View Geometry*, chapter 9). How far its optical flow ends from
+that line is an error in pixels, small wherever nothing moves and the cameras are right. Nothing is
+learned, and no weights are needed.
+"""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from devrf.apps.capture.images import Mask, shrunk
+from devrf.scenes.optical_flow import consistent, estimator
+from devrf.scenes.sparse_model import SparseModel
+from devrf.system.progress import followed
+
+log = logging.getLogger(__name__)
+
+# Flow is estimated in images with so many pixels of the longer side.
+LONGER_SIDE = 320
+# Each frame is compared with those so many before and after it: in nearer ones little has moved,
+# and of farther ones there is no flow.
+STEPS = (2, 4)
+# Errors below this many pixels are those of the flow itself.
+NOISE = 0.15
+# What moves is off by more than so many times the frame's median error.
+TIMES_MEDIAN = 3.0
+# Root mean square of Sobel's slopes, 8 for a grey level a pixel, below which flow is a guess.
+TEXTURE = 16.0
+# Standard deviation, in pixels, of the neighbourhood in which pixels vote.
+AROUND = 6.0
+# What a frame's vote counts for in the next one.
+MEMORY = 0.9
+# What moves in the votes of so large a share of the frames moves.
+MOVES = 0.25
+# Features at the rim of what moves see both sides: masks are so much wider, as a share of the
+# image's longer side.
+RIM = 0.02
+# Masks that cover less than this share of the frames change no camera.
+LEAST_SHARE = 0.02
+
+Numbers = npt.NDArray[np.float64]
+
+
+def masks_of_movers(images: Path, names: Sequence[str], model: SparseModel) -> dict[str, Mask]:
+    """Where nothing moves, by the cameras of a model: 255, what moves and its rim: 0.
+
+    Args:
+        images: the folder of images.
+        names: the moving camera's, in order of time, relative to the folder.
+        model: structure from motion of these images; those it has not placed get no mask.
+
+    Returns:
+        (H, W) of each image, of the images' size; none where less moves than is worth masking.
+    """
+    place = {image.name: k for k, image in enumerate(model.images)}
+    posed = [name for name in names if name in place]
+    read = (cv2.imread(str(images / name), cv2.IMREAD_COLOR) for name in posed)
+    pictures = [np.asarray(picture, np.uint8) for picture in read]
+    height, width = pictures[0].shape[:2]
+    small = [shrunk(picture, LONGER_SIDE) for picture in pictures]
+    cameras = [_Camera(model, place[name], small[0].shape[1]) for name in posed]
+    flow = _Flows(small)
+    numbered = enumerate(followed(small, len(small), "what moves"))
+    votes = [_votes(k, flow, cameras, _textured(picture)) for k, picture in numbered]
+    masks = dict[str, Mask]()
+    rim = 2 * round(RIM * LONGER_SIDE) + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (rim, rim))
+    for name, agreed in zip(posed, _agreed(votes, flow), strict=True):
+        moves = cv2.dilate(np.asarray(agreed > MOVES, np.uint8), disc)
+        still = cv2.resize(1 - moves, (width, height), interpolation=cv2.INTER_NEAREST)
+        masks[name] = np.asarray(255 * still, np.uint8)
+    share = float(np.mean([(mask == 0).mean() for mask in masks.values()]))
+    log.info("structure from motion: %.0f %% of the pixels are of what moves", 100 * share)
+    return masks if share >= LEAST_SHARE else {}
+
+
+class _Flows:
+    """Optical flow between any two of some pictures (H, W, 3), estimated once."""
+
+    def __init__(self, pictures: Sequence[npt.NDArray[Any]]) -> None:
+        self._pictures = [torch.from_numpy(picture) for picture in pictures]
+        self._between = cache(self._estimated)
+        self._estimator = estimator("dis")
+
+    def __len__(self) -> int:
+        return len(self._pictures)
+
+    def between(self, one: int, other: int) -> tuple[Numbers, Mask]:
+        """Flow (H, W, 2) from one picture to another, and where (H, W) the way back agrees."""
+        there = self._between(one, other)
+        return there.numpy(), consistent(there, self._between(other, one)).numpy()
+
+    def _estimated(self, one: int, other: int) -> Tensor:
+        return self._estimator(self._pictures[one], self._pictures[other])
+
+
+def _votes(k: int, flow: _Flows, cameras: Sequence[_Camera], textured: Mask) -> Numbers:
+    """(H, W): the share of what is known around each pixel of picture ``k`` that moves."""
+    errors = list[Numbers]()
+    for other in (k + step * way for step in STEPS for way in (-1, 1)):
+        if not 0 <= other < len(flow):
+            continue
+        there, agrees = flow.between(k, other)
+        error = cameras[k].error_of_flow(there, cameras[other])
+        error[~(agrees & textured)] = np.nan
+        usual = max(float(np.nanmedian(error)), NOISE) if np.isfinite(error).any() else np.inf
+        errors.append(error / usual)
+    with warnings.catch_warnings():  # of pixels that no frame knows
+        warnings.simplefilter("ignore", RuntimeWarning)
+        error = np.nanmedian(np.stack(errors), axis=0)
+    known = np.isfinite(error)
+    moves = known & (np.where(known, error, 0) > TIMES_MEDIAN)
+    count = cv2.GaussianBlur(known.astype(np.float64), (0, 0), AROUND)
+    return cv2.GaussianBlur(moves.astype(np.float64), (0, 0), AROUND) / np.maximum(count, 1e-3)
+
+
+def _textured(picture: npt.NDArray[Any]) -> Mask:
+    """Where (H, W) a picture has texture: elsewhere its flow is a guess."""
+    grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
+    across = cv2.Sobel(grey, cv2.CV_32F, 1, 0)
+    down = cv2.Sobel(grey, cv2.CV_32F, 0, 1)
+    return np.asarray(cv2.blur(across**2 + down**2, (7, 7)) > TEXTURE**2)
+
+
+def _agreed(votes: Sequence[Numbers], flow: _Flows) -> list[Numbers]:
+    """The mean of all pictures' votes (H, W) along the flow, those of near pictures before others.
+
+    What moves along its epipolar lines for a while moved across them before, or will; what was
+    wrong once is outvoted.
+    """
+    share = [vote.copy() for vote in votes]
+    count = [np.ones_like(vote) for vote in votes]
+    numbers = range(len(votes))
+    for order, way in ((numbers, -1), (numbers[::-1], 1)):
+        # Of the frame before in this order: the sum of votes, and of what each counts for.
+        total = weight = np.zeros_like(votes[0])
+        for k in order:
+            if k != order[0]:
+                there, agrees = flow.between(k, k + way)
+                total = MEMORY * agrees * _at(total, there)
+                weight = MEMORY * agrees * _at(weight, there)
+                share[k] += total
+                count[k] += weight
+            total = total + votes[k]
+            weight = weight + 1
+    return [a / b for a, b in zip(share, count, strict=True)]
+
+
+def _at(image: Numbers, flow: Numbers) -> Numbers:
+    """What an image (H, W) shows where flow (H, W, 2) leads."""
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]]
+    at = (np.stack([x, y], axis=-1) + flow).astype(np.float32)
+    return np.asarray(cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR), np.float64)
+
+
+class _Camera:
+    """A placed camera, for images of another size."""
+
+    def __init__(self, model: SparseModel, image: int, width: int) -> None:
+        lens = model.cameras[model.images[image].camera]
+        scale = width / lens["w"]
+        self.focal = lens["fl_x"] * scale
+        self.matrix = np.array(
+            [
+                [self.focal, 0, lens["cx"] * scale],
+                [0, lens["fl_y"] * scale, lens["cy"] * scale],
+                [0, 0, 1],
+            ]
+        )
+        self.distortion = np.array([lens.get(key, 0.0) for key in ("k1", "k2", "p1", "p2")])
+        pose = model.poses[image].numpy()
+        # OpenCV's axes: y points down, z ahead.
+        self.axes = pose[:, :3] * np.array([1, -1, -1])
+        self.position = pose[:, 3]
+
+    def error_of_flow(self, flow: npt.NDArray[Any], other: _Camera) -> Numbers:
+        """(H, W): pixels from where flow (H, W, 2) ends to the epipolar line in ``other``.
+
+        Sampson's distance, to first order in both images: Hartley and Zisserman, (11.9).
+        """
+        height, width = flow.shape[:2]
+        y, x = np.mgrid[:height, :width] + 0.5
+        here = self._rays(np.stack([x, y], axis=-1))
+        there = other._rays(np.stack([x, y], axis=-1) + flow)
+        turn = other.axes.T @ self.axes
+        a, b, c = other.axes.T @ (self.position - other.position)
+        essential = np.array([[0, -c, b], [c, 0, -a], [-b, a, 0]]) @ turn
+        lines = here @ essential.T
+        lines_back = there @ essential
+        product = (there * lines).sum(axis=1)
+        slope = np.hypot(np.hypot(lines[:, 0], lines[:, 1]), np.hypot(*lines_back.T[:2]))
+        error: Numbers = np.abs(product) / np.maximum(slope, 1e-12) * self.focal
+        return error.reshape(height, width)
+
+    def _rays(self, pixels: Numbers) -> Numbers:
+        """(M, 3): undistorted x, y and 1 of pixels (..., 2)."""
+        flat = pixels.reshape(-1, 1, 2).astype(np.float64)
+        plane = cv2.undistortPoints(flat, self.matrix, self.distortion).reshape(-1, 2)
+        return np.concatenate([plane, np.ones((len(plane), 1))], axis=1)

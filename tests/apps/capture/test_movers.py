@@ -1,0 +1,63 @@
+"""What moves before a moving camera, told from flow and the camera's true poses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from devrf.apps.capture.movers import masks_of_movers
+from devrf.scenes.sparse_model import ModelImage, SparseModel
+
+WIDTH = 160
+HEIGHT = 120
+FOCAL = 150.0
+COUNT = 9
+# By so many pixels a frame the wall goes left as the camera goes right, and the patch goes down.
+STEP = 3
+
+
+def pattern(seed, height, width):
+    """(height, width, 3) uint8, smooth enough for flow."""
+    noise = np.random.default_rng(seed).normal(size=(height, width, 3))
+    smooth = cv2.GaussianBlur(noise, (0, 0), 2.0)
+    return np.clip(128 + 50 * smooth / smooth.std(), 0, 255).astype(np.uint8)
+
+
+@pytest.fixture
+def filmed(tmp_path):
+    """Films a wall at distance 1, before it a patch that goes down; its names and its model."""
+
+    def film(patch):
+        wall = pattern(0, HEIGHT, WIDTH + STEP * COUNT)
+        thing = pattern(1, 50, 60)
+        images = []
+        for k in range(COUNT):
+            picture = wall[:, STEP * k : STEP * k + WIDTH].copy()
+            if patch:
+                picture[20 + STEP * k : 70 + STEP * k, 50:110] = thing
+            name = f"{k}.png"
+            cv2.imwrite(str(tmp_path / name), picture)
+            shift = (-STEP * k / FOCAL, 0.0, 0.0)
+            images.append(ModelImage(name, 1, (1.0, 0, 0, 0), shift, np.zeros(0, np.int64)))
+        lens = {"fl_x": FOCAL, "fl_y": FOCAL, "w": WIDTH, "h": HEIGHT, "cx": 80.0, "cy": 60.0}
+        points = np.zeros((0, 3))
+        model = SparseModel(Path(), {1: lens}, tuple(images), points, np.zeros(0, np.int64))
+        return masks_of_movers(tmp_path, [image.name for image in images], model)
+
+    return film
+
+
+def test_what_leaves_its_epipolar_lines_is_masked(filmed):
+    masks = filmed(patch=True)
+    middle = masks["4.png"]
+    assert middle.shape == (HEIGHT, WIDTH) and set(np.unique(middle)) == {0, 255}
+    inside = middle[20 + STEP * 4 : 70 + STEP * 4, 50:110]
+    assert (inside == 0).mean() > 0.9
+    assert (middle[:, 125:] == 255).mean() > 0.95
+
+
+def test_where_nothing_moves_there_are_no_masks(filmed):
+    assert filmed(patch=False) == {}

@@ -1,0 +1,62 @@
+"""The world of a sparse model: which space holds what its cameras see."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from devrf.scenes.sparse_model import (
+    AROUND,
+    ModelImage,
+    SparseModel,
+    ndc_holds,
+    normalised,
+)
+
+
+def model(places, turns=(0.0,)):
+    """Cameras that look along z, turned about y by degrees, 100 points at 4 to 5 before them."""
+    points = np.random.default_rng(0).uniform([-2, -2, 4], [2, 2, 5], (100, 3))
+    images = []
+    for k, place in enumerate(places):
+        half = math.radians(turns[k % len(turns)]) / 2
+        cosine = math.cos(2 * half)
+        sine = math.sin(2 * half)
+        turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
+        shift = tuple(float(value) for value in -turn @ np.array(place))
+        quaternion = (math.cos(half), 0.0, math.sin(half), 0.0)
+        images.append(ModelImage(f"{k}.png", 1, quaternion, shift, np.arange(100)))
+    lens = {"fl_x": 100.0, "fl_y": 100.0, "w": 100, "h": 100, "cx": 50.0, "cy": 50.0}
+    return SparseModel(Path("sparse"), {1: lens}, tuple(images), points, np.arange(100))
+
+
+NEAR_ONE_ANOTHER = [(-0.5, 0, 0), (0.5, 0, 0), (0, 0.5, 0), (0, -0.5, 0)]
+
+
+def test_cameras_near_one_another_that_look_one_way_share_ndc():
+    # The nearest point is at 4, the plane at 3, which cameras 1 apart see 1 / 3 wider than one.
+    assert ndc_holds(model(NEAR_ONE_ANOTHER))
+    assert normalised(model(NEAR_ONE_ANOTHER)).space == "ndc"
+
+
+@pytest.mark.parametrize(
+    "scattered",
+    [
+        model([(-3, 0, 0), (3, 0, 0), (0, 1, 0)]),  # their views are 3 wide on the plane
+        model(NEAR_ONE_ANOTHER, turns=(-30, 30)),  # within 45 degrees, but wider than a view
+        model([*NEAR_ONE_ANOTHER, (0, 0, 5)]),  # one is before the plane
+    ],
+)
+def test_hand_held_cameras_share_contraction_around_their_points(scattered):
+    assert not ndc_holds(scattered)
+    world = normalised(scattered, "inward")
+    assert world.space == "contracted" and world.box is not None
+    distances = world.poses[:, :, 3].norm(dim=1)
+    assert float(distances.median()) == pytest.approx(AROUND)
+    assert float(world.points.median(dim=0).values.norm()) < 0.1  # of other axes
+    low, high = (np.array(corner) for corner in world.box)
+    inside = ((world.points.numpy() > low) & (world.points.numpy() < high)).all(axis=1)
+    assert inside.mean() > 0.8
