@@ -24,7 +24,7 @@ const float MOTION_STEP = 0.05, MOTION_FULL = 0.02;
 uniform sampler3D density, features, weights;   // features: blocks of four channels
 uniform sampler3D displacement0, displacement1; // of the frames before and after the time
 uniform sampler3D residual0, residual1;
-uniform usampler3D distances, rest;             // at about the time, and at rest
+uniform usampler3D distances;
 uniform vec3 low, high, motionLow, motionHigh;  // the boxes of all fields, and of displacements
 uniform float shift, delta, threshold, stepLength, near, far, residualStep;
 uniform vec3 ndc;                    // 2f/W, 2f/H, near plane
@@ -113,12 +113,12 @@ vec3 residual(vec3 canonical) {
 }
 
 // Cells to the nearest occupied one, at least; 0 in an occupied cell.
-int clearance(usampler3D cells, vec3 point) {
-  ivec3 size = textureSize(cells, 0);
+int clearance(vec3 point) {
+  ivec3 size = textureSize(distances, 0);
   vec3 inside = ((point - low) / (high - low)).zyx;
   ivec3 cell = ivec3(floor(inside * vec3(size - 1) + 0.5));
   bool outside = any(lessThan(cell, ivec3(0))) || any(greaterThanEqual(cell, size));
-  return outside ? 1 : int(texelFetch(cells, cell, 0).r);
+  return outside ? 1 : int(texelFetch(distances, cell, 0).r);
 }
 
 // Colour network: docs/method.md#colour. Groups of three numbers of the direction; parts' places.
@@ -232,7 +232,7 @@ void main() {
     float s = 0.0;
     for (; k < count; k++) {
       s = entry + float(k) * stride;
-      int away = clearance(distances, at(ray, s));
+      int away = clearance(at(ray, s));
       if (away == 0) break;
       // In away - 1 cells' way the nearest cell changes by less than that and one.
       k += int(float(away - 1) * samplesPerCell);
@@ -246,9 +246,6 @@ void main() {
       p = place(canonical, low, high, textureSize(density, 0));
     } else {
       canonical = at(ray, s);
-      // Whether it is occupied at this very time is decided at the nearest grid point.
-      vec3 node = SAMPLEWISE == 1 ? low + round((canonical - low) * cells) / cells : canonical;
-      if (warps && clearance(rest, node + displacement(node, share)) > 0) continue;
       if (warps) canonical += displacement(canonical, share);
       p = place(canonical, low, high, textureSize(density, 0));
       float raw = textureLod(density, p, 0.0).r + shift;
