@@ -316,7 +316,7 @@ def test_the_pipeline_of_a_scene_at_rest_learns_no_motion(devrf, tmp_path, short
     where = ("data=inward", f"data.root={at_rest}", "hydra.run.dir=run")
     done = devrf(*where, *short, "objective=dynamic.psnr", "evaluation.metrics=[]")
     assert (done.status, done.err) == (0, "")
-    assert "statue is at rest: canonical, evaluate, render; no motion is learned" in done.out
+    assert "statue is at rest: canonical, evaluate, render, page; no motion is learned" in done.out
     run = tmp_path / "run"
     assert [path.name for path in (run / "checkpoints").glob("*.ckpt")] == ["canonical.ckpt"]
     found = metrics(run)

@@ -75,6 +75,7 @@ def test_the_wheel_has_code_configs_and_licence(wheel):
     assert {f"devrf/conf/{path.as_posix()}" for path in configs} <= names
     assert "devrf/__main__.py" in names and "devrf/py.typed" in names
     assert "devrf/apps/report/published.toml" in names
+    assert {f"devrf/apps/web/scene.{kind}" for kind in ("html", "js", "glsl")} <= names
     assert [name for name in names if name.endswith("licenses/LICENSE")]
     assert {name.split("/")[0].split("-")[0] for name in names} == {"devrf"}
 
