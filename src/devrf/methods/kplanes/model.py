@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
 from typing import ClassVar, cast
 
@@ -16,7 +16,7 @@ from devrf.methods.kplanes.planes import SixPlanes, sum_of
 from devrf.methods.kplanes.proposals import Proposal, drawn_edges, histogram_error, intervals
 from devrf.methods.kplanes.settings import KPlanesSettings
 from devrf.methods.nerf.placed_model import SurfacedField
-from devrf.methods.nerf.samples import RaySamples, limits, volume_render
+from devrf.methods.nerf.samples import limits, volume_render
 from devrf.ops.compositing import composite
 from devrf.ops.photometric import distortion
 from devrf.rendering.output import RenderOutput
@@ -96,46 +96,51 @@ class KPlanes(SurfacedField):
     ) -> RenderOutput:
         """What rays see.
 
-        ``extras`` has ``weight``, ``ray`` and ``distance`` (S,) of samples in normalised space;
-        with proposals also ``edges`` (R, N + 1) and, of round k, ``edges_k`` and ``weight_k``.
+        ``extras`` has ``weight``, ``ray`` and ``distance`` (S,) of samples in normalised space, and
+        ``histogram`` (), the error of the rounds.
         """
-        extras: dict[str, Tensor] = {}
+        rounds: list[tuple[Tensor, Tensor]] = []
+        edges = background
         if self.settings.sampling == "occupancy":
             samples = self.march(rays, time, jitter=jitter)
         else:
-            samples, extras = self._proposed(rays, time, jitter=jitter)
+            edges, rounds = self._proposed(rays, time, jitter=jitter)
+            samples = intervals(rays, edges)
         if not self.space.is_linear:
             samples = samples.unbounded()
         where = self.coordinates(samples.points, time.index_select(0, samples.ray))
         density, further = self.decoder.density(self.planes(where))
         color = self.decoder.rgb(further, rays.viewdirs, samples.ray)
-        scaled = samples.scaled(self.placement.half_edge)
-        output = volume_render(scaled, density.float(), color.float(), background)
-        extras["distance"] = samples.distance / self.placement.half_edge
+        unit = self.placement.half_edge
+        output = volume_render(samples.scaled(unit), density.float(), color.float(), background)
+        weight = output.extras["weight"]
+        errors = [
+            histogram_error(edges, weight.view(len(rays), -1), before, proposed)
+            for before, proposed in rounds
+        ]
+        nothing = weight.new_zeros(())
+        extras = {"distance": samples.distance / unit, "histogram": sum_of([nothing, *errors])}
         return replace(output, extras={**output.extras, **extras})
 
     def _proposed(
         self, rays: Rays, time: Tensor, *, jitter: bool
-    ) -> tuple[RaySamples, dict[str, Tensor]]:
-        """Samples by the rounds of proposals; the rounds' edges and weights."""
+    ) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
+        """Edges (R, N + 1) of the samples' intervals; edges and weights (R, M) of each round."""
         s = self.settings
         near, far = limits(rays, self.box, self.depth_limits)
-        extras: dict[str, Tensor] = {}
         edges = torch.stack([near, far], dim=1)
         weight = torch.zeros_like(edges[:, :1])
-        rounds = zip(self.proposals, s.proposal_samples, strict=True)
-        for number, (proposal, count) in enumerate(rounds):
+        rounds: list[tuple[Tensor, Tensor]] = []
+        for proposal, count in zip(self.proposals, s.proposal_samples, strict=True):
             edges = drawn_edges(edges, weight, count, jitter=jitter)
-            samples = intervals(rays, edges)
+            samples = intervals(rays, edges).scaled(self.placement.half_edge)
             where = self.coordinates(samples.points, time.index_select(0, samples.ray))
             with torch.set_grad_enabled(torch.is_grad_enabled() and self._teaches):
-                depth = proposal(where).float() * samples.scaled(self.placement.half_edge).length
-                learned, _ = composite(depth, samples.ray, samples.rays)
-            learned = learned.view(len(rays), count)
-            extras |= {f"edges_{number}": edges, f"weight_{number}": learned}
-            weight = learned.detach() ** self._sharpness
-        edges = drawn_edges(edges, weight, s.samples, jitter=jitter)
-        return intervals(rays, edges), {**extras, "edges": edges}
+                depth = proposal(where).float() * samples.length
+                proposed, _ = composite(depth, samples.ray, samples.rays)
+            rounds.append((edges, proposed.view(len(rays), count)))
+            weight = rounds[-1][1].detach() ** self._sharpness
+        return drawn_edges(edges, weight, s.samples, jitter=jitter), rounds
 
     def loss_terms(
         self, output: RenderOutput, batch: RayBatch, names: Collection[str]
@@ -153,20 +158,13 @@ class KPlanes(SurfacedField):
             "smooth": self.planes.roughness,
             "change": lambda: sum_of([each.change() for each in (self.planes, *rounds)]),
             "smooth_proposals": lambda: sum_of([nothing, *(each.roughness() for each in rounds)]),
-            "histogram": lambda: sum_of([nothing, *self._histogram_errors(extras)]),
+            "histogram": lambda: extras["histogram"],
             "distortion": lambda: distortion(
                 extras["weight"], extras["distance"], extras["ray"], len(batch.time)
             ),
         }
         nothing = output.color.new_zeros(())
         return {name: known[name]() for name in self.losses if name in names}
-
-    def _histogram_errors(self, extras: Mapping[str, Tensor]) -> Iterator[Tensor]:
-        """The term of each round."""
-        for number in range(len(self.proposals)):
-            proposed = (extras[f"edges_{number}"], extras[f"weight_{number}"])
-            weight = extras["weight"].view(len(extras["edges"]), -1)
-            yield histogram_error(extras["edges"], weight, *proposed)
 
     def parts(self) -> dict[str, Iterable[nn.Parameter]]:
         """What space alone says, with the decoder; what time says; the proposals."""
