@@ -138,8 +138,8 @@ class OccupancyFrames(StoredShape):
 
         Args:
             scene: seen from all around, the training images' alpha masks carve them, grown by a
-                cell; static images show frame 0, and what may be there stays in all frames. Else
-                the field itself has to tell what is empty.
+                cell; static images show frame 0. Where no camera of another frame looks, there is
+                what may be there at rest. Else the field itself has to tell what is empty.
             box: in the fields' space.
             side: cells along an edge of a cube of the box's size.
             hull: whether to carve at all.
@@ -152,9 +152,10 @@ class OccupancyFrames(StoredShape):
             assert views.frames is not None
             for frame in torch.unique(views.frames).tolist() if views.has_alpha else ():
                 shown = views[(views.frames == frame).nonzero()[:, 0]]
-                held = visual_hull(shown, box, shape, whole_in_view=frame > 0)
-                grown = dilate(held, 1).cpu()
-                masks.mask[frame] &= grown if frame == 0 else grown | masks.mask[0]
+                masks.mask[frame] &= dilate(visual_hull(shown, box, shape), 1).cpu()
+                if frame > 0:
+                    held = visual_hull(shown, box, shape, whole_in_view=True)
+                    masks.mask[frame] &= dilate(held, 1).cpu() | masks.mask[0]
         if empty_from is not None and not masks.has_hull:
             masks.learned = LearnedOccupancy(shape)
         return masks
