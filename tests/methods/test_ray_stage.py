@@ -130,6 +130,23 @@ def test_a_batch_may_have_fewer_rays_where_no_masks_tell_what_is_empty(
     assert sizes == [32, 7]
 
 
+def test_rates_decay_exponentially_or_as_half_a_cosine_after_a_warm_up(ray_stage: Make) -> None:
+    rates = {"iterations": 101, "learning_rate": 1e-2, "final_learning_rate": 1e-4}
+    plain = ray_stage(DNeRF(TINY), **rates)
+    factors = [plain.learning_rate_factor(n) for n in (0, 50, 100)]
+    assert factors == pytest.approx([1, 0.1, 0.01])
+    rates |= {"final_learning_rate": 0.0, "decay": "cosine"}
+    cosine = ray_stage(DNeRF(TINY), **rates)
+    factors = [cosine.learning_rate_factor(n) for n in (0, 50, 100)]
+    assert factors == pytest.approx([1, 0.5, 0])
+    warm = ray_stage(DNeRF(TINY), warmup=9 / 101, **rates)  # nine iterations below the decay's rate
+    for n in (0, 4, 9, 50):
+        expected = cosine.learning_rate_factor(n) * min(1, (n + 1) / 10)
+        assert warm.learning_rate_factor(n) == pytest.approx(expected)
+    with pytest.raises(DevrfError, match="final_learning_rate: expected more than 0, or decay"):
+        ray_stage(DNeRF(TINY), final_learning_rate=0.0)
+
+
 def test_a_checkpoint_shows_what_was_learned(
     ray_stage: Make, fit: Fit, stored: Callable[[RayStage], LoadedCheckpoint], tiny_scene: Scene
 ) -> None:
