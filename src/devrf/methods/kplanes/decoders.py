@@ -17,15 +17,15 @@ FACTORS = (
 )  # fmt: skip
 # What the first network gives beside the density.
 FURTHER = 15
-# The largest exponent in the gradient of a density.
+# The largest exponent of a density: more would be opaque likewise, and soon infinite.
 STEEPEST = 15.0
 
 
 def density_of(raw: Tensor) -> Tensor:
-    """σ = e^(raw − 1), whose gradient is that of an exponent of at most ±15."""
+    """σ = e^(raw − 1) with an exponent within ±15, whose gradient does not end there."""
     exponent = raw - 1
-    slope = exponent.detach().clamp(-STEEPEST, STEEPEST).exp()
-    return slope * exponent + (exponent.exp() - slope * exponent).detach()
+    density = exponent.detach().clamp(-STEEPEST, STEEPEST).exp()
+    return density * (1 + exponent - exponent.detach())
 
 
 def spherical_harmonics(directions: Tensor) -> Tensor:
