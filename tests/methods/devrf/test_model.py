@@ -13,7 +13,11 @@ from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import WORLD
 from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.deformation_field import DeformationField, deformed_occupancy
+from devrf.methods.devrf.deformation_field import (
+    DeformationField,
+    deformed_occupancy,
+    possible_occupancy,
+)
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.rendering.occupancy import Occupancy, dilate
 from devrf.rendering.output import RenderedImage
@@ -83,6 +87,12 @@ def test_deformed_occupancy_by_hand(model):
     moved = torch.roll(opaque & model.occupancy.mask, -2, dims=1)
     assert torch.equal(found.mask, dilate(moved, 1))
     assert found.box == model.canonical.box
+
+
+def test_while_a_frame_is_learned_all_that_may_be_is_occupied(model):
+    shift = torch.tensor([0.0, 0.4, 0.0])
+    found = possible_occupancy(model.occupancy, model.box, lambda points: points + shift)
+    assert torch.equal(found.mask, dilate(torch.roll(model.occupancy.mask, -2, dims=1), 1))
 
 
 def test_a_thin_thing_is_not_lost_between_the_places_that_points_come_from(model):

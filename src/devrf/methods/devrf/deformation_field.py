@@ -147,6 +147,26 @@ class DeformationField(FrameField):
 
 
 @torch.no_grad()
+def possible_occupancy(
+    occupancy: Occupancy, box: Box, warp: Callable[[Tensor], Tensor]
+) -> Occupancy:
+    """The occupancy while a frame is learned: grid points whose canonical position is occupied.
+
+    Wider than :func:`deformed_occupancy`, since the displacements go on changing: all that may be
+    occupied at rest, grown by one point.
+
+    Args:
+        occupancy: where something may be at rest.
+        box: the canonical field's.
+        warp: x → x + Δ_b(x, t), the points (M, 3) of the occupancy's grid into canonical space.
+    """
+    x, y, z = occupancy.mask.shape
+    points = box.grid_points((x, y, z), torch.empty(0, device=occupancy.mask.device))
+    occupied = occupancy.at(warp(points.view(-1, 3))).view(x, y, z)
+    return Occupancy(dilate(occupied, 1), box)
+
+
+@torch.no_grad()
 def deformed_occupancy(
     field: CanonicalField,
     occupancy: Occupancy,

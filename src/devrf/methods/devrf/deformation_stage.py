@@ -18,7 +18,7 @@ from devrf.engine.grid_adam import GridAdam
 from devrf.engine.stage import Stage
 from devrf.errors import DevrfError
 from devrf.methods.devrf.active_frame import ActiveFrame
-from devrf.methods.devrf.deformation_field import DeformationField, deformed_occupancy
+from devrf.methods.devrf.deformation_field import DeformationField, possible_occupancy
 from devrf.methods.devrf.deformation_schedule import (
     DeformationPhase,
     DeformationSchedule,
@@ -36,7 +36,7 @@ from devrf.methods.devrf.settings import (
     decoder_dtype,
 )
 from devrf.methods.devrf.volume_rendering import render
-from devrf.rendering.occupancy import Occupancy, dilate
+from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import ColorChange
 from devrf.scenes.scene import CaptureName, Views
 from devrf.system.profiling import span
@@ -282,9 +282,9 @@ class DeformationStage(Stage):
         further: dict[str, FrameField] = {}
         for extension in self.extensions:
             further |= extension.frame_fields(self, level)
-        canonical = self.scene_model.canonical
-        mask = torch.zeros(canonical.density.shape, dtype=torch.bool, device=self.device)
-        frame = ActiveFrame.of(self.field.frames, Occupancy(mask, canonical.box), further)
+        occupancy = self.scene_model.occupancy
+        nowhere = Occupancy(torch.zeros_like(occupancy.mask), occupancy.box)
+        frame = ActiveFrame.of(self.field.frames, nowhere, further)
         self.active = frame
         self.weights = self.motion_loss.weights_at(level)
         smoothing = self.motion_loss.smoothing(level, self.field.shape)
@@ -320,9 +320,7 @@ class DeformationStage(Stage):
         frame = self.active
         assert frame is not None
         warp = self.field.warp_by(frame.backward)
-        found = deformed_occupancy(model.canonical, model.occupancy, model.settings, warp)
-        # Grown by one, since the displacements change until it is found anew.
-        frame.occupancy.refill(Occupancy(dilate(found.mask, 1), found.box))
+        frame.occupancy.refill(possible_occupancy(model.occupancy, model.box, warp))
 
     def prepare(self) -> None:
         """Update the frame's occupancy every ``occupancy_every`` iterations."""
