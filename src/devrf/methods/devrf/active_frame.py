@@ -53,7 +53,7 @@ class ActiveFrame:
 
         Args:
             store: the displacements of all frames.
-            occupancy: memory for the frame's.
+            occupancy: at rest; the frame's is as large.
             fields: further fields whose frames are learned, by name.
         """
         zeros = store.here.new_zeros(*store.shape, 3)
@@ -62,7 +62,7 @@ class ActiveFrame:
             backward=zeros.clone().requires_grad_(),
             forward=zeros.clone().requires_grad_(),
             before=zeros,
-            occupancy=occupancy,
+            occupancy=Occupancy(torch.zeros_like(occupancy.mask), occupancy.box),
             fields=fields,
             further={
                 name: torch.zeros_like(field.values[0]).requires_grad_()

@@ -36,7 +36,6 @@ from devrf.methods.devrf.settings import (
     decoder_dtype,
 )
 from devrf.methods.devrf.volume_rendering import render
-from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import ColorChange
 from devrf.scenes.scene import CaptureName, Views
 from devrf.system.profiling import span
@@ -282,9 +281,7 @@ class DeformationStage(Stage):
         further: dict[str, FrameField] = {}
         for extension in self.extensions:
             further |= extension.frame_fields(self, level)
-        occupancy = self.scene_model.occupancy
-        nowhere = Occupancy(torch.zeros_like(occupancy.mask), occupancy.box)
-        frame = ActiveFrame.of(self.field.frames, nowhere, further)
+        frame = ActiveFrame.of(self.field.frames, self.scene_model.occupancy, further)
         self.active = frame
         self.weights = self.motion_loss.weights_at(level)
         smoothing = self.motion_loss.smoothing(level, self.field.shape)
