@@ -112,7 +112,8 @@ def _element(part: str, values: Tensor) -> str:
 
 def _parts(model: DeVRFModel) -> Iterator[tuple[str, Tensor]]:
     """The contents of all textures by the elements' names: (depth, height, width, …)."""
-    field, sampling = model.canonical, model.at(0.0).picture_settings
+    field = model.canonical
+    sampling = model.at(0.0).picture_settings
     occupied = partial(deformed_occupancy, field, model.occupancy, sampling)
     rest = occupied(GridWarp((), model.box))
     shown = rest.points_near(field.density.shape, model.box)
@@ -127,7 +128,8 @@ def _parts(model: DeVRFModel) -> Iterator[tuple[str, Tensor]]:
     yield "features", torch.cat(torch.split(codes, 4, dim=-1))
     assert isinstance(field.decoder, ColorDecoder)
     yield "weights", _weights(field.decoder, low, high)
-    motion, residual = model.deformation, model.color_residual
+    motion = model.deformation
+    residual = model.color_residual
     seen = _seen(motion, rest.cell, occupied) if motion else []
     for part, mask in ({"rest": rest.mask} | dict(enumerate(seen))).items():
         yield f"distances-{part}", Occupancy(mask, model.box).surroundings.distances
@@ -153,13 +155,15 @@ def _seen(
     From one time to the next nothing moves by more than a ``cell``, by which they are grown.
     """
     masks = []
-    for k, (start, end) in enumerate(pairwise(motion.clock.times)):
-        first = occupied(motion.warp_at(start))
-        mask = first.mask | occupied(motion.warp_at(end)).mask
+    times = motion.clock.times
+    at_frames = [occupied(motion.warp_at(time)) for time in times]
+    for k, (first, second) in enumerate(pairwise(at_frames)):
+        mask = first.mask | second.mask
         near = Occupancy(mask, first.box).points_near(motion.shape, motion.box)
         before, after = (motion.to_canonical[n].to(near.device).float() for n in (k, k + 1))
         change = float(((after - before).norm(dim=-1) * near).amax())
-        for time in torch.linspace(start, end, math.ceil(change / cell) + 1)[1:-1].tolist():
+        steps = math.ceil(change / cell)
+        for time in torch.linspace(times[k], times[k + 1], steps + 1)[1:-1].tolist():
             mask |= occupied(motion.warp_at(time)).mask
         masks.append(dilate(mask, 1))
     return masks
@@ -208,10 +212,13 @@ def _filled(values: Tensor) -> Tensor:
 
 def _description(model: DeVRFModel, viewpoints: Viewpoints) -> dict[str, Any]:
     """What the page knows beside its textures."""
-    field, motion, space = model.canonical, model.deformation, model.space
+    field = model.canonical
+    motion = model.deformation
+    space = model.space
     sampling = model.at(0.0).picture_settings
     path = medium(field, model.occupancy, sampling).path
-    inner, decoder = space.inner(model.box), field.decoder
+    inner = space.inner(model.box)
+    decoder = field.decoder
     assert isinstance(decoder, ColorDecoder)
     defines = {
         "SPACE": 0,
@@ -222,14 +229,19 @@ def _description(model: DeVRFModel, viewpoints: Viewpoints) -> dict[str, Any]:
         "SHADES": int(model.color_residual is not None),
     }
     uniforms: dict[str, Any] = {
-        **{"low": model.box.low, "high": model.box.high},
-        **{"near": path.near, "far": min(path.far, FAR), "stepLength": path.step},
-        **{"shift": field.shift, "delta": field.step_in_base_voxels(sampling.step)},
+        "low": model.box.low,
+        "high": model.box.high,
+        "near": path.near,
+        "far": min(path.far, FAR),
+        "stepLength": path.step,
+        "shift": field.shift,
+        "delta": field.step_in_base_voxels(sampling.step),
         "threshold": sampling.alpha_threshold,
         "residualStep": _residual_step(model),
         "background": [background_value(viewpoints.background)] * 3,
         "palette": ColorMap("viridis", num_colors=STOPS).colors.T.tolist(),
-        **{"center": inner.middle, "reach": inner.diagonal / 3},
+        "center": inner.middle,
+        "reach": inner.diagonal / 3,
     }
     if isinstance(space, NormalizedDevice):
         defines["SPACE"] = 1
@@ -242,8 +254,10 @@ def _description(model: DeVRFModel, viewpoints: Viewpoints) -> dict[str, Any]:
         uniforms["stillOutside"] = motion.still_outside
     static = viewpoints.static
     return {
-        **{"defines": defines, "uniforms": uniforms},
+        "defines": defines,
+        "uniforms": uniforms,
         "times": [0.0] if motion is None else motion.clock.times,
-        **{"up": upward(static).tolist(), "frustum": frustum_depth(static)},
+        "up": upward(static).tolist(),
+        "frustum": frustum_depth(static),
         "cameras": list(described(model, viewpoints)),
     }
