@@ -68,7 +68,9 @@ def evaluate(run: RunContext) -> list[Path]:
     at_rest = {} if scene.moves else {"at_rest": True}
     ran = {
         **provenance(model.size, run.device),
-        **{"choices": choices(), "overrides": as_typed(run.command), "seed": run.config.seed},
+        "choices": choices(),
+        "overrides": as_typed(run.command),
+        "seed": run.config.seed,
         **learning_record(metadata, run.stages_with_images),
         **data_record(scene),
         "lpips_network": run.evaluation.lpips_network,

@@ -57,7 +57,8 @@ STEPS: dict[str, Step] = {
     )
 }
 AFTER_LEARNING: dict[str, Step] = {
-    **{"evaluate": evaluate, "render": render},
+    "evaluate": evaluate,
+    "render": render,
     "page": write_scene_page,
 }
 # What a run's folder may hold that a person looks at first, and what to try next.
