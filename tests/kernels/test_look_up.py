@@ -164,7 +164,10 @@ def test_the_adjoint_adds_to_the_corners(channels: int, rng: torch.Generator) ->
     torch.testing.assert_close((grid - start).double(), exact.grad, atol=1e-5, rtol=0)
 
 
-def test_a_box_first_met_in_inference_mode_can_be_trained_in() -> None:
+@pytest.mark.parametrize("look_up", [look_up, trilinear.look_up])
+def test_a_box_first_met_in_inference_mode_can_be_trained_in(
+    look_up: Callable[..., torch.Tensor],
+) -> None:
     grid, box = torch.zeros(2, 3, 9, 1), Box((0.0, 0.0, 0.0), (1.0, 1.0, 8.0))
     grid[1] = 1.0
     grid[:, :, -1] += 5.0

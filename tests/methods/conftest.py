@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from lightning import Callback
+from lightning import Callback, Trainer
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint, load_checkpoint, save_checkpoint
 from devrf.data.batch import RayBatch
@@ -25,6 +25,18 @@ STEPS = {
     "dynamic": ProtocolStage("dynamic", "dynamic"),
     "canonical": ProtocolStage("canonical", "static"),
 }
+
+
+def assert_same_weights(one: RayStage, other: RayStage) -> None:
+    state = other.state_dict()
+    for name, value in one.state_dict().items():
+        assert not isinstance(value, torch.Tensor) or torch.equal(value, state[name]), name
+
+
+@pytest.fixture
+def same_weights() -> Callable[[RayStage, RayStage], None]:
+    """``same_weights(one, other)``: asserts that two stages have learned the same, bit by bit."""
+    return assert_same_weights
 
 
 @pytest.fixture
@@ -61,6 +73,39 @@ def learned_losses(ray_stage: Callable[..., RayStage], fit: Callable[..., RaySta
 
         fit(ray_stage(model, **changes), Note())
         return found
+
+    return learn
+
+
+@pytest.fixture
+def stopped_and_resumed(fit: Callable[..., RayStage], tmp_path: Path) -> Any:
+    """``stopped_and_resumed(make, at)``: a stage that ran whole, to iteration ``at``, and on.
+
+    ``make()`` gives the stage anew. The last one begins with other random numbers and goes on from
+    the second's progress file; asserts that it learns what the first has learned, bit by bit.
+    """
+
+    def learn(make: Callable[[], RayStage], at: int) -> tuple[RayStage, RayStage, RayStage]:
+        path = tmp_path / "progress.ckpt"
+
+        class Stop(Callback):
+            def on_train_batch_end(self, fitted: Trainer, *arguments: object) -> None:
+                if fitted.lightning_module.iteration == at:
+                    save_checkpoint(fitted, path, weights_only=False)
+                    fitted.should_stop = True
+
+        def begin(seed: int) -> RayStage:
+            torch.manual_seed(0)
+            stage = make()
+            torch.manual_seed(seed)
+            return stage
+
+        whole = fit(begin(0))
+        stopped = fit(begin(0), Stop())
+        assert stopped.iteration == at
+        resumed = fit(begin(123), ckpt_path=path)
+        assert_same_weights(whole, resumed)
+        return whole, stopped, resumed
 
     return learn
 

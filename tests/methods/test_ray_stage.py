@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
-from lightning import Callback, Trainer
 
-from devrf.checkpoints.checkpoint import LoadedCheckpoint, save_checkpoint
+from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
 from devrf.methods.dnerf.model import DNeRF, DNeRFSettings
@@ -31,38 +30,23 @@ Make = Callable[..., RayStage]
 Fit = Callable[..., RayStage]
 
 
-def assert_same_weights(one: RayStage, other: RayStage) -> None:
-    state = other.state_dict()
-    for name, value in one.state_dict().items():
-        assert not isinstance(value, torch.Tensor) or torch.equal(value, state[name]), name
-
-
 def test_a_killed_run_goes_on_to_the_same_weights(
-    ray_stage: Make, fit: Fit, tmp_path: Path
+    ray_stage: Make, stopped_and_resumed: Callable[..., Any]
 ) -> None:
-    path = tmp_path / "progress.ckpt"
-
-    class StopHalfWay(Callback):
-        def on_train_batch_end(self, fitted: Trainer, *arguments: object) -> None:
-            save_checkpoint(fitted, path, weights_only=False)
-            fitted.should_stop = True
-
     def stage() -> RayStage:
-        torch.manual_seed(0)
         return ray_stage(HyperNeRF(WHOLE), loss={"color": 1.0, "elastic": 0.01})
 
-    whole = fit(stage())
-    assert fit(stage(), StopHalfWay()).iteration == 2
-    resumed = stage()
-    torch.manual_seed(123)
-    fit(resumed, ckpt_path=path)
+    _, _, resumed = stopped_and_resumed(stage, at=2)
     assert resumed.iteration == 4
-    assert_same_weights(whole, resumed)
 
 
 def test_dynamic_never_reads_the_static_set(
-    ray_stage: Make, fit: Fit, serve: Callable[[Scene], SceneDataModule], tiny_scene: Scene
-) -> None:  # fmt: skip
+    ray_stage: Make,
+    fit: Fit,
+    serve: Callable[[Scene], SceneDataModule],
+    same_weights: Callable[[RayStage, RayStage], None],
+    tiny_scene: Scene,
+) -> None:
     """It learns the same, in the same box, where static images are black."""
     static, stages = tiny_scene.static, []
     black = replace(static.train, pixels=torch.zeros_like(static.train.pixels), depth=None)
@@ -70,7 +54,7 @@ def test_dynamic_never_reads_the_static_set(
     for scene in (tiny_scene, dark):
         torch.manual_seed(0)
         stages.append(fit(ray_stage(DNeRF(TINY), "dynamic"), data=serve(scene)))
-    assert_same_weights(*stages)
+    same_weights(*stages)
     assert stages[0].scene_model.box == stages[1].scene_model.box
 
 

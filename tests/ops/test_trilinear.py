@@ -82,14 +82,3 @@ def test_no_points_is_no_values_and_no_gradient(channels: int) -> None:
     out.sum().backward()
     assert grid.grad is not None and not grid.grad.any()
     assert points.grad is not None and points.grad.shape == (0, 3)
-
-
-def test_a_box_first_met_in_inference_mode_can_be_trained_in() -> None:
-    grid, box = torch.zeros(2, 3, 9, 1), Box((0.0, 0.0, 0.0), (1.0, 1.0, 8.0))
-    grid[1] = 1.0
-    grid[:, :, -1] += 5.0
-    with torch.inference_mode():
-        look_up(grid, torch.ones(1, 3), box)
-    points = torch.tensor([[0.5, 0.5, 7.5]], requires_grad=True)
-    look_up(grid, points, box).sum().backward()
-    assert points.grad is not None and points.grad.tolist() == [[1.0, 0.0, 5.0]]

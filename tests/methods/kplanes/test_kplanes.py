@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from lightning import Callback, Trainer
 from scipy.special import sph_harm_y
 
-from devrf.checkpoints.checkpoint import LoadedCheckpoint, save_checkpoint
+from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
 from devrf.geometry.rays import Rays
@@ -192,28 +190,13 @@ def test_it_learns(form: dict[str, Any], learned_losses: Callable[..., list[floa
 
 @pytest.mark.parametrize("sampling", ["occupancy", "proposals"])
 def test_a_killed_run_goes_on_to_the_same_weights(
-    sampling: Any, ray_stage: Callable[..., RayStage], fit: Callable[..., RayStage], tmp_path: Path
+    sampling: Any, ray_stage: Callable[..., RayStage], stopped_and_resumed: Callable[..., Any]
 ) -> None:
-    path = tmp_path / "progress.ckpt"
-
-    class StopHalfWay(Callback):
-        def on_train_batch_end(self, fitted: Trainer, *arguments: object) -> None:
-            save_checkpoint(fitted, path, weights_only=False)
-            fitted.should_stop = True
-
     def stage() -> RayStage:
-        torch.manual_seed(0)
         model = KPlanes(replace(TINY, sampling=sampling, hull=False, empty_from=0.0))
         return ray_stage(model, loss=LOSS)
 
-    whole = fit(stage())
-    assert fit(stage(), StopHalfWay()).iteration == 2
-    resumed = stage()
-    torch.manual_seed(123)
-    fit(resumed, ckpt_path=path)
-    state = resumed.state_dict()
-    for name, value in whole.state_dict().items():
-        assert not isinstance(value, torch.Tensor) or torch.equal(value, state[name]), name
+    stopped_and_resumed(stage, at=2)
 
 
 def test_two_stages_leave_what_space_says_as_it_was(

@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from lightning import Callback, Trainer
 
-from devrf.checkpoints.checkpoint import LoadedCheckpoint, save_checkpoint
+from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
@@ -116,31 +114,15 @@ def test_it_learns(hull: bool, learned_losses: Callable[..., list[float]]) -> No
 
 
 def test_a_run_that_was_stopped_between_two_growths_goes_on_to_the_same_weights(
-    ray_stage: Callable[..., RayStage], fit: Callable[..., RayStage], tmp_path: Path
+    ray_stage: Callable[..., RayStage], stopped_and_resumed: Callable[..., Any]
 ) -> None:
-    path = tmp_path / "progress.ckpt"
     small = replace(TINY, hull=False, empty_from=0.0, upsample_at=(0.25, 0.75), tv=1e-4)
 
-    class StopHalfWay(Callback):
-        def on_train_batch_end(self, fitted: Trainer, *arguments: object) -> None:
-            stage = fitted.lightning_module
-            if stage.iteration == 4:
-                save_checkpoint(fitted, path, weights_only=False)
-                fitted.should_stop = True
-
     def stage() -> RayStage:
-        torch.manual_seed(0)
         return ray_stage(TiNeuVox(small), loss=LOSS, iterations=8)
 
-    whole = fit(stage())
-    stopped = fit(stage(), StopHalfWay())
-    assert stopped.iteration == 4 and stopped.resolution < whole.resolution
-    resumed = stage()
-    torch.manual_seed(123)
-    fit(resumed, ckpt_path=path)
-    state = resumed.state_dict()
-    for name, value in whole.state_dict().items():
-        assert not isinstance(value, torch.Tensor) or torch.equal(value, state[name]), name
+    whole, stopped, _ = stopped_and_resumed(stage, at=4)
+    assert stopped.resolution < whole.resolution
 
 
 def test_two_stages_leave_the_canonical_part_as_it_was(
