@@ -159,7 +159,11 @@ def test_jobs_of_slurm_where_there_is_none(devrf, tmp_path, tiny, monkeypatch):
 
 
 @pytest.mark.parametrize("argument", ["--help", "--version"])
-def test_output_that_nobody_reads_ends_it_quietly(python, tmp_path, argument):
+@pytest.mark.parametrize("unbuffered", ["", "1"])  # empty is as not set
+def test_output_that_nobody_reads_ends_it_quietly(
+    python, tmp_path, monkeypatch, argument, unbuffered
+):
+    monkeypatch.setenv("PYTHONUNBUFFERED", unbuffered)
     script = (
         "import os, subprocess, sys\n"
         "read, write = os.pipe()\n"

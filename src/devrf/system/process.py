@@ -81,7 +81,11 @@ def quiet_if_unread() -> Iterator[None]:
     Python ignores that signal, for sockets that are closed send it, too.
     """
     try:
-        yield
+        try:
+            yield
+        except SystemExit as end:  # Hydra ends --help with one, of status 0
+            if end.code:
+                raise
         sys.stdout.flush()
     except BrokenPipeError:
         if _is_read():  # it was another pipe: a fault
