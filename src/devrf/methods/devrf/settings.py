@@ -8,6 +8,7 @@ from typing import Literal
 import torch
 
 from devrf.errors import expect
+from devrf.rendering.sampling import FINEST
 from devrf.system.device import multiplies_bfloat16
 
 # What the colour network computes in.
@@ -64,6 +65,12 @@ class Sampling:
     alpha_threshold: float = 1e-4
     search_alpha_threshold: float = 1e-7
     occupancy_threshold: float = 1e-3
+
+    def __post_init__(self) -> None:
+        expect(self.step >= FINEST, "sampling.step", f"at least {FINEST}", self.step)
+        for key in ("alpha_threshold", "search_alpha_threshold", "occupancy_threshold"):
+            value = getattr(self, key)
+            expect(0 <= value < 1, f"sampling.{key}", "at least 0 and below 1", value)
 
 
 @dataclass(frozen=True)
