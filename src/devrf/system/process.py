@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import logging
 import os
 import signal
 import sys
@@ -78,8 +79,10 @@ def use_utf8() -> None:
 def quiet_if_unread() -> Iterator[None]:
     """When nobody reads any more what is printed (``| head -1``), end as SIGPIPE ends a program.
 
-    Python ignores that signal, for sockets that are closed send it, too.
+    Python ignores that signal, for sockets that are closed send it, too. A stage whose log nobody
+    reads goes on.
     """
+    logging.raiseExceptions = False  # the log says nothing of that, either
     try:
         try:
             yield
