@@ -20,7 +20,7 @@ from rich.filesize import decimal
 from rich.progress import track
 
 from devrf.errors import DevrfError, did_you_mean
-from devrf.system.files import make_folder, write_json
+from devrf.system.files import make_folder, read_record, write_json
 
 log = logging.getLogger(__name__)
 
@@ -167,7 +167,7 @@ def fetched_before(scene: PublishedScene, into: Path) -> Fetched | None:
     if not path.exists():
         return None
     try:
-        record = json.loads((path / RECORD).read_text())
+        record = json.loads(read_record(path / RECORD))
         return Fetched(path, str(record["sha256"]), bool(record["compared"]), anew=False)
     except (OSError, ValueError, KeyError, TypeError):
         raise DevrfError(

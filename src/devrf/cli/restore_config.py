@@ -32,6 +32,7 @@ from devrf.cli.config import (
 from devrf.cli.config_check import RESERVED
 from devrf.cli.messages import in_quotes
 from devrf.errors import DevrfError
+from devrf.system.files import read_record
 
 log = logging.getLogger(__name__)
 
@@ -254,7 +255,7 @@ def _of_sweep(typed: Sequence[Override], folder: Path) -> list[str]:
 def _recorded(record: Path) -> list[Override]:
     """The overrides of a sweep, from its ``multirun.yaml``."""
     with suppress(*UNREADABLE):
-        text = record.read_text("utf-8")
+        text = read_record(record).decode()
         # Hydra writes no aliases, which may unfold without end.
         if not any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
             return parsed(yaml.safe_load(text)["hydra"]["overrides"]["task"])

@@ -40,7 +40,7 @@ from devrf.cli.config_check import REFERENCE
 from devrf.cli.context import RunContext
 from devrf.cli.restore_config import PLACES
 from devrf.errors import DevrfError
-from devrf.system.files import write_json
+from devrf.system.files import read_record, write_json
 from devrf.system.folder_lock import PLACE
 
 log = logging.getLogger(__name__)
@@ -207,6 +207,6 @@ def _made_with(run: RunContext, step: str) -> str:
 def _notes(folder: Path) -> dict[str, list[str]]:
     """The files that steps have written, by the digest of what decided them."""
     try:
-        return NOTES.validate_json((folder / PLACE / NOTE).read_bytes())
+        return NOTES.validate_json(read_record(folder / PLACE / NOTE))
     except (OSError, ValidationError):
         return {}

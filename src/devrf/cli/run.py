@@ -39,6 +39,7 @@ from devrf.errors import DevrfError, did_you_mean, expect
 from devrf.evaluation.objective import check_objective, objective
 from devrf.kernels import runtime
 from devrf.kernels.ahead import compile_ahead
+from devrf.system.files import read_record
 from devrf.system.folder_lock import PLACE
 from devrf.system.memory import shortage_in_words
 
@@ -143,7 +144,7 @@ def _ended(run: RunContext, steps: Names) -> float | None:
     """The objective; a pipeline ends with its results, and what to try next."""
     scores = run.folder / "metrics.json"
     try:
-        metrics = json.loads(scores.read_bytes())
+        metrics = json.loads(read_record(scores))
         best = objective(run.config.objective, metrics)
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
         raise DevrfError(f"{scores}: damaged; remove it, and the run is scored again") from None

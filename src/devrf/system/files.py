@@ -12,6 +12,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+# Bytes; the longest records, of footage of hours, have some ten million.
+LARGEST_RECORD = 64 * 2**20
 # Errors of a disk, its permissions, or a path that was given. A missing file may be a fault of the
 # program instead.
 REFUSED = {
@@ -76,6 +78,12 @@ def write_json(path: Path, values: dict[str, Any]) -> None:
     """Write ``values`` as an indented JSON object."""
     with atomic_write(path) as partial:
         partial.write_text(json.dumps(values, indent=2) + "\n")
+
+
+def read_record(path: Path) -> bytes:
+    """What devrf wrote; of a file that is larger the beginning, which is no whole JSON."""
+    with path.open("rb") as file:
+        return file.read(LARGEST_RECORD)
 
 
 def free_disk(folder: Path) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 
 import pytest
 
@@ -65,6 +66,19 @@ def test_damaged_records_are_skipped_with_a_line_that_says_where(runs, ran, cont
     assert len(found.skipped) == 2
     for line, name in zip(found.skipped, ("failure", "metrics"), strict=True):
         assert line.startswith(f"{runs / name / name}.json: skipped; it is damaged, or not as")
+
+
+def test_of_records_without_end_only_so_much_is_read_as_devrf_writes(runs, ran):
+    folder = ran("endless")
+    for name in ("failure.json", "metrics.json", "frames.csv"):
+        with (folder / name).open("wb") as file:
+            file.truncate(2**31)  # of zeros, which take no room on the disk
+    tracemalloc.start()
+    try:
+        assert len(collect(runs).skipped) == 2 and metric_over_time(folder, "psnr").empty
+        assert tracemalloc.get_traced_memory()[1] < 2**30
+    finally:
+        tracemalloc.stop()
 
 
 def test_curves_are_over_the_dynamic_images_views_of_a_time_averaged(ran):

@@ -28,7 +28,7 @@ from devrf.scenes.footage import frame_count, is_folder, pictures
 from devrf.scenes.formats.nerfstudio import FILE
 from devrf.scenes.sparse_model import AROUND, SparseModel, World, ndc_holds, normalised
 from devrf.scenes.splits import every_nth
-from devrf.system.files import make_folder, write_json
+from devrf.system.files import make_folder, read_record, write_json
 from devrf.system.progress import followed
 
 log = logging.getLogger(__name__)
@@ -120,7 +120,7 @@ def kept(file: Path, source: Any, make: Callable[[], dict[str, Any]]) -> dict[st
     key = _digest(source)
     if file.is_file():
         try:
-            stored = json.loads(file.read_bytes())
+            stored = json.loads(read_record(file))
             same, found = stored["key"] == key, dict(stored["result"])
         except (ValueError, LookupError, TypeError, RecursionError):
             raise DevrfError(f"{file}: damaged; remove it, and it is made again") from None

@@ -13,6 +13,7 @@ from typing import Any
 import pandas as pd
 
 from devrf.errors import DevrfError
+from devrf.system.files import read_record
 
 # What every run has; further columns are what its file holds, by dotted name.
 COLUMNS = (
@@ -79,7 +80,7 @@ def collect(folder: Path) -> Collection:
             if not file.is_file():
                 continue
             try:
-                record = read(json.loads(file.read_bytes()))
+                record = read(json.loads(read_record(file)))
             except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
                 skipped.append(f"{file}: skipped; it is damaged, or not as devrf writes it")
             else:
@@ -102,9 +103,8 @@ def metric_over_time(path: Path, metric: str) -> pd.Series:
     """
     try:
         file = path / "frames.csv"
-        frames = pd.read_csv(
-            file if file.is_file() else io.StringIO()
-        )  # a pipe would be waited for
+        text = read_record(file) if file.is_file() else b""  # a pipe would be waited for
+        frames = pd.read_csv(io.BytesIO(text))
         frames = frames[frames["capture"] == "dynamic"].dropna(subset=metric)
         return frames.astype({"time": float, metric: float}).groupby("time")[metric].mean()
     except (OSError, ValueError, KeyError):
