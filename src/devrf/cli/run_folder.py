@@ -9,6 +9,7 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from shutil import which
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
@@ -37,12 +38,17 @@ UNRECORDED = ("report", "fetch", "view")
 RANKS = ("RANK", "SLURM_PROCID")
 
 
-class RunFolderLock(Callback):
-    """Hydra callback that locks the folder of a run before anything is written there.
+class FolderLock(Callback):
+    """Hydra callback that locks the folder of a run or a sweep before anything is written there.
 
     Hydra writes before it calls the program, which then uses this lock. Hydra ignores what a
     callback raises, except an exit: errors are reported here.
+
+    Attributes:
+        sweep: the folder of the sweep that has begun, if one has.
     """
+
+    sweep: Path | None = None
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Lock the folder of a run; :func:`working_in` releases it."""
@@ -59,6 +65,21 @@ class RunFolderLock(Callback):
                     config.hydra.output_subdir = None
             elif not _is_worker(config):
                 lock_folder(folder, "hydra.run.dir")
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Lock the folder of a sweep; each job locks its own. Refuse SLURM where there is none."""
+        folder = Path(config.hydra.sweep.dir)
+        with report_user_errors():
+            missing = [name for name in ("srun", "sbatch") if which(name) is None]
+            if config.hydra.launcher._target_.endswith(".SlurmLauncher") and missing:
+                raise DevrfError(
+                    f"hydra/launcher: no {' and no '.join(missing)} here; type the command where "
+                    "SLURM takes jobs, or leave hydra/launcher out"
+                )
+            for place in (folder, *folder.glob("*/")):
+                refuse_links(place)
+            lock_folder(folder, "hydra.sweep.dir")
+        FolderLock.sweep = folder
 
 
 @contextmanager
