@@ -85,25 +85,15 @@ def view(run: RunContext) -> None:
         text = page(model, viewpoints, run.config.scene)
         shown = PageServer(settings, text, cache(lambda: _with_images(run, without)))
     else:
-        shown = _session(run, settings, model, viewpoints, _with_images(run, without))
+        from devrf.apps.viewer.drawing import Drawing
+        from devrf.apps.viewer.session import Session  # an extra
+
+        scene = _with_images(run, without)
+        shown = Session(settings, viewpoints, scene, run.folder, run.config.ckpt)
+        background = background_value(viewpoints.background)
+        shown.present(Drawing(Renderer(model, times=CACHED), background))
     with closing(shown), handle_signals(lambda _: shown.stop()):
         shown.serve()
-
-
-def _session(
-    run: RunContext,
-    settings: ViewerSettings,
-    model: Renderable,
-    viewpoints: Viewpoints,
-    scene: Scene | None,
-) -> Session:
-    """The page whose pictures this machine renders."""
-    from devrf.apps.viewer.drawing import Drawing
-    from devrf.apps.viewer.session import Session  # an extra
-
-    session = Session(settings, viewpoints, scene, run.folder, run.config.ckpt)
-    session.present(Drawing(Renderer(model, times=CACHED), background_value(viewpoints.background)))
-    return session
 
 
 def export(run: RunContext) -> None:
