@@ -38,7 +38,6 @@ from devrf.checkpoints.progress import progress_files
 from devrf.cli.config import command_line, leaves
 from devrf.cli.config_check import REFERENCE
 from devrf.cli.context import RunContext
-from devrf.cli.restore_config import PLACES
 from devrf.errors import DevrfError
 from devrf.system.files import read_record, write_json
 from devrf.system.folder_lock import PLACE
@@ -191,13 +190,12 @@ def note_done(run: RunContext, step: str, files: Sequence[Path] | None) -> None:
 
 def _made_with(run: RunContext, step: str) -> str:
     """A digest of what decides a step's results."""
-    data = {k: v for k, v in leaves(run.config.data, "data").items() if k not in PLACES}
-    root = data.pop("data.root", None)
+    root = run.config.data.get("root")
     keyframes = Path(str(run.config.video.path))
     made = (
         *(step, digest_of(run.checkpoint()), devrf.__version__, run.config.logger._target_),
-        *(data, root and Path(root).resolve()),
-        leaves(run.config[DECIDES[step]], step),
+        *(_values(run.config, "data"), root and Path(root).resolve()),
+        _values(run.config, DECIDES[step]),
         step == "evaluate" and run.datamodule.validation,
         step == "render" and keyframes.is_file() and keyframes.read_bytes(),
     )
