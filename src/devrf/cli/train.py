@@ -15,7 +15,6 @@ from devrf.apps.records import in_words
 from devrf.callbacks import PeriodicCheckpoint, StopOnSignal, TrainingRecord
 from devrf.callbacks.csv_logger import ResumableCSVLogger
 from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, save_checkpoint
-from devrf.checkpoints.progress import progress_files
 from devrf.cli.context import RunContext
 from devrf.cli.resume import ResumePoint, beginning, remove_progress
 from devrf.engine.stage import Stage, fit
@@ -113,9 +112,7 @@ def _keep(run: RunContext, trainer: Trainer, stage: Stage) -> None:
         with atomic_write(path.with_name("config.yaml")) as partial:
             OmegaConf.save(run.config, partial, resolve=True)
     except OSError as error:
-        left = progress_files(path.parent, stage.name)
-        stays = f"the last good progress file stays ({left[0].name}); " if left else ""
-        again = f"{stays}make it possible to write there, and run the same command again"
+        again = "make it possible to write there, and run the same command again"
         raise DevrfError(f"{error.filename or path}: {error.strerror}; {again}") from error
     remove_progress(path.parent, stage.name)
     log.info("%s: %s; written to %s", stage.name, in_words(stage.record), path)
