@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from devrf.cli.complete import PATHS, completed
+from devrf.cli.complete import completed
+from devrf.cli.config import PATHS
 from devrf.cli.messages import in_quotes
 from devrf.scenes.export import export
 from devrf.scenes.procedural import ProceduralForwardScene, ProceduralScene

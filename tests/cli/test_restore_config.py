@@ -260,7 +260,6 @@ RECORDS = {
     "an option elsewhere": ["data@callbacks.x=procedural"],
     "an interpolation among values": ["field.width=1,${seed}"],
     "no text": [5],
-    "a search": ["seed=interval(0,1)"],
 }
 
 

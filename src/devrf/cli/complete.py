@@ -23,18 +23,11 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from hydra.types import RunMode
 
-from devrf.cli.config import APART, config_folder, group_choices
+from devrf.cli.config import APART, PATHS, config_folder, group_choices
 from devrf.cli.messages import in_quotes
 from devrf.cli.restore_config import of_named_run, parsed, told, value, values
 from devrf.errors import DevrfError
 
-# Keys whose values are files or folders.
-PATHS = {
-    *("data.root", "data.export", "data.flow_cache", "ckpt", "fetch.into", "export.into"),
-    *("capture.static", "capture.into", "capture.masks", "video.path"),
-    *("report.runs", "report.into", "evaluation.lpips_weights"),
-    *("hydra.run.dir", "hydra.sweep.dir"),
-}
 # `viewer` is a group, whose choices Hydra wants to be text.
 SHORTHAND = {f"viewer={value}": f"viewer.training={value}" for value in ("true", "false")}
 KEY_VALUE = re.compile(r"(\+{0,2}([\w./@-]+)=)(.*)", re.DOTALL)

@@ -21,6 +21,13 @@ APART = ("report", "fetch", "capture", "selfcheck")
 STEPS = ("prepare", "inspect", "evaluate", "render", "still", "view", "export", *APART)
 # Of these, what uses a checkpoint.
 OF_A_CHECKPOINT = ("evaluate", "render", "still", "view", "export")
+# Keys whose values are files or folders.
+PATHS = {
+    *("data.root", "data.export", "data.flow_cache", "ckpt", "fetch.into", "export.into"),
+    *("capture.static", "capture.into", "capture.masks", "video.path"),
+    *("report.runs", "report.into", "evaluation.lpips_weights"),
+    *("hydra.run.dir", "hydra.sweep.dir"),
+}
 
 
 def config_folder() -> Path:

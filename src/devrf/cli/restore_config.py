@@ -23,6 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from devrf.cli.config import (
     OF_A_CHECKPOINT,
+    PATHS,
     choices,
     group_choices,
     leaves,
@@ -51,8 +52,6 @@ OPTION = re.compile(r"(?!null$)[\w-]+", re.ASCII | re.IGNORECASE)
 KEY = re.compile(r"/?[\w-]+([./][\w-]+){0,15}", re.ASCII)
 # Text that is more than text.
 CODE = re.compile(rf"\$\{{|^\?\?\?$|{'|'.join(RESERVED)}")
-# Values that are relative to the folder in which they were typed.
-RELATIVE = {"data.root", "evaluation.lpips_weights", "video.path"}
 # What reading a damaged record raises.
 UNREADABLE = (yaml.YAMLError, HydraException, LookupError, TypeError, ValueError, RecursionError)
 
@@ -75,7 +74,7 @@ def present_command(config: DictConfig) -> Command:
             said[f"/{key}"] = choices()[key]
         elif not override.is_delete():
             said |= leaves(OmegaConf.select(config, key), key)
-    for key in RELATIVE & {*said}:
+    for key in PATHS & {*said}:  # relative to the folder in which they were typed
         if isinstance(said[key], str) and (path := Path(said[key])).exists():
             said[key] = str(path.absolute())
     return {key: value for key, value in said.items() if _is_known(key, value)}
@@ -241,8 +240,6 @@ def _of_sweep(typed: Sequence[Override], folder: Path) -> list[str]:
         key = override.get_key_element().lstrip("+")
         if _of_a_command(key) or override.is_delete():
             continue
-        if override.is_sweep_override() and not override.is_discrete_sweep():
-            raise DevrfError(f"{record}: {key} is no list of values; type the sweep again")
         key = f"/{key}" if key in group_choices() else key
         for text in values([override], override.key_or_group):
             checked(record, {key: text})
