@@ -68,11 +68,8 @@ def test_a_fault_of_the_program_is_recorded_with_its_traceback_in_the_log(
     outcome = devrf("-m", *tiny, *LEARN, "seed=0,1,2")
     assert outcome.status == 3
     said, summary = outcome.err.splitlines()
-    assert said.startswith(
-        "devrf: job 1_robot_seed_1: ZeroDivisionError: division by zero; the traceback"
-    )
+    assert said == "devrf: job 1_robot_seed_1: ZeroDivisionError: division by zero"
     assert "jobs failed: 1_robot_seed_1" in summary
-    assert "Traceback" not in outcome.out
     found = failure(tmp_path / "sweep" / "1_robot_seed_1")
     assert found["mistake"] is False and found["error"] == "ZeroDivisionError: division by zero"
     assert "Traceback" in (tmp_path / "sweep" / "1_robot_seed_1" / "run.log").read_text()

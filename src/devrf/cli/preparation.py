@@ -67,12 +67,11 @@ def capture(run: RunContext) -> None:
 
 def prepare(run: RunContext) -> None:
     """Write the scene to ``data.export`` in the published layout."""
-    if "export" not in run.config.data:
-        embedded = "choose data=procedural or data=procedural_forward"
-        raise DevrfError(f"stage=prepare: writes an embedded scene; {embedded}")
-    folder = run.config.data.export
+    folder = run.config.data.get("export")
     if folder is None:
-        raise DevrfError("data.export: stage=prepare needs a folder; give data.export=PATH")
+        embedded = "for an embedded scene (data=procedural, flower, procedural_forward)"
+        given = "stage=prepare needs a folder; give data.export=PATH"
+        raise DevrfError(f"data.export: {given}, {embedded}")
     export(run.scene, Path(folder))
     log.info("scene written to %s", folder)
 

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from devrf.cli.context import RunContext
 
 log = logging.getLogger(__name__)
-# Its handler is the file of the log alone.
-faults = logging.getLogger("devrf.cli.failures")
 
 # The exit status of a sweep with failed jobs.
 JOBS_FAILED = 3
@@ -57,11 +55,9 @@ def record_failure(config: DictConfig, folder: Path) -> Iterator[None]:
         yield
     except Exception as error:
         message = one_line(error)
-        where = ""
         if not is_user_error(error):
             message = f"{type(error).__name__}: {message}"
-            where = f"; the traceback is in {folder / 'run.log'}"
-            faults.error("the job failed", exc_info=error)
+            log.error("the job failed", exc_info=error)
         failure = {
             "scene": scene_name(config),
             "choices": choices(),
@@ -72,7 +68,7 @@ def record_failure(config: DictConfig, folder: Path) -> Iterator[None]:
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
         }
         write_json(folder / FAILURE, failure)
-        print(f"devrf: job {folder.name}: {message}{where}", file=sys.stderr)
+        print(f"devrf: job {folder.name}: {message}", file=sys.stderr)
     finally:
         gc.collect()  # so that the next job does not start with the memory of this one
 
@@ -93,7 +89,7 @@ def naming_failures() -> Iterator[None]:
         problem = error
     if (sweep := FolderLock.sweep) is not None:
         release_folder(sweep)
-        if problem is not None and is_user_error(problem):
+        if problem is not None:
             remove_if_only(sweep, OF_SWEEP)
         records = [file for file in sweep.rglob(FAILURE) if file.stat().st_mtime >= began]
         if failed := sorted(str(file.parent.relative_to(sweep)) for file in records):
