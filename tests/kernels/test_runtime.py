@@ -13,10 +13,10 @@ from torch import Tensor
 
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
-from devrf.kernels.adam import adam_step, add_total_variation_gradient
+from devrf.kernels.adam import GRAIN_OF_VOXELS, adam_step, add_total_variation_gradient
 from devrf.kernels.look_up import add_to_grid, look_up
 from devrf.kernels.march import march, rays_that_hit
-from devrf.kernels.runtime import choose, take
+from devrf.kernels.runtime import GRAIN, GRAIN_OF_RAYS, choose, take
 from devrf.ops import adam, trilinear
 from devrf.ops import march as definition
 from devrf.ops.adam import AdamRule
@@ -97,19 +97,19 @@ def test_kernels_can_be_left_out(in_torch: None) -> None:
 def everything(given: tuple[Rays, Medium], points: Tensor, grid: Tensor) -> list[Any]:
     """What all functions of the kernels give."""
     rays, medium = given
+    samples = march(rays, medium)
+    looked_up = look_up(grid, points, BOX)
+    hits = rays_that_hit(rays, medium.path)
+    return [*vars(samples).values(), hits, looked_up, *optimised(grid)]
+
+
+def optimised(grid: Tensor) -> list[Tensor]:
+    """What the optimiser's kernels make of a grid."""
     stepped = [grid.clone(), grid.clone(), grid.clone(), grid.abs()]
     adam_step(*stepped, AdamRule(0.1, 2))
     smoothed = torch.zeros_like(grid)
     add_total_variation_gradient(grid, smoothed, 0.5)
-    samples = march(rays, medium)
-    looked_up = look_up(grid, points, BOX)
-    return [
-        *vars(samples).values(),
-        rays_that_hit(rays, medium.path),
-        looked_up,
-        smoothed,
-        *stepped,
-    ]
+    return [smoothed, *stepped]
 
 
 def by_definition(given: tuple[Rays, Medium], points: Tensor, grid: Tensor) -> list[Any]:
@@ -171,7 +171,7 @@ def with_gradients(given: tuple[Rays, Medium], points: Tensor, grid: Tensor) -> 
 
 
 @pytest.mark.parametrize("channels", [1, 3, 12])
-@pytest.mark.parametrize("count", [1, 500])
+@pytest.mark.parametrize("count", [1, 3 * GRAIN_OF_RAYS])
 def test_results_are_the_same_to_the_bit_with_any_number_of_threads(
     channels: int, count: int, rng: torch.Generator, threads: Callable[[int], None]
 ) -> None:
@@ -187,10 +187,21 @@ def test_results_are_the_same_to_the_bit_with_any_number_of_threads(
         assert all(torch.equal(one, other) for one, other in zip(alone, together, strict=True))
 
 
+def test_a_step_is_the_same_to_the_bit_with_any_number_of_threads(
+    rng: torch.Generator, threads: Callable[[int], None]
+) -> None:
+    grid = torch.randn(48, 47, 45, 2, generator=rng)
+    assert grid[..., 0].numel() >= 3 * GRAIN_OF_VOXELS
+    alone = optimised(grid)
+    for number in (2, 3):
+        threads(number)
+        assert all(map(torch.equal, alone, optimised(grid)))
+
+
 def test_every_plane_has_an_owner_with_more_threads_than_planes(
     rng: torch.Generator, threads: Callable[[int], None]
 ) -> None:
-    points, values = torch.randn(200, 3, generator=rng), torch.randn(200, 3, generator=rng)
+    points, values = torch.randn(2, 5 * GRAIN, 3, generator=rng)
     alone, together = torch.zeros(2, 3, 2, 3), torch.zeros(2, 3, 2, 3)
     add_to_grid(alone, points, values, BOX)
     threads(5)

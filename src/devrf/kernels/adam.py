@@ -14,6 +14,9 @@ from devrf.kernels.runtime import array, by_channels, launch, take
 from devrf.ops import adam as definition
 from devrf.ops.adam import AdamRule
 
+# As ``GRAIN``, of threads with so little to do.
+GRAIN_OF_VOXELS = 2**15
+
 
 def adam_step(
     values: Tensor,
@@ -55,7 +58,8 @@ def adam_step(
     if rule.per_voxel_lr is not None:
         step.has_rates = 1
         rates = array(rule.per_voxel_lr.reshape(-1))
-    launch(adam_kernel(channels), count, [step, *tables, indices, rates], values.device)
+    inputs = [step, *tables, indices, rates]
+    launch(adam_kernel(channels), count, inputs, values.device, grain=GRAIN_OF_VOXELS)
 
 
 def add_total_variation_gradient(
@@ -75,7 +79,7 @@ def add_total_variation_gradient(
     x, y, z, channels = grid.shape
     inputs = [x, y, z, channels, weight, along_z, int(touched_only)]
     inputs += [array(grid.view(-1)), array(gradient.view(-1))]
-    launch(add_total_variation, x * y * z, inputs, grid.device)
+    launch(add_total_variation, x * y * z, inputs, grid.device, grain=GRAIN_OF_VOXELS)
 
 
 @wp.struct

@@ -18,7 +18,7 @@ from devrf.geometry.contraction import INFINITY, ContractedRays
 from devrf.geometry.rays import Rays
 from devrf.kernels.grid import Grid, cell, coordinates, grid_over, inside, interpolate, slope
 from devrf.kernels.look_up import add_to_grid
-from devrf.kernels.runtime import array, launch, room, take
+from devrf.kernels.runtime import GRAIN_OF_RAYS, array, launch, room, take
 from devrf.ops import march as definition
 from devrf.ops.march import HIT_CELLS, STOP, Medium, Path, Samples, steps_through
 from devrf.ops.trilinear import shape_of
@@ -83,7 +83,7 @@ class _March(torch.autograd.Function):
         moves = lines.origins if displacement is None else array(displacement.contiguous())
         inputs = [geometry, lines, distances, array(density.contiguous()), moves, visible]
         inputs += [array(significant_count), array(transmittance)]
-        launch(march_kernel, len(rays), inputs, device)
+        launch(march_kernel, len(rays), inputs, device, grain=GRAIN_OF_RAYS)
 
         start, length = _starts(significant_count)
         ray = torch.empty(length, dtype=torch.int64, device=device)
@@ -131,7 +131,7 @@ class _March(torch.autograd.Function):
         result.points = array(points)
         result.canonical = array(canonical)
         inputs = [ctx.geometry, ctx.lines, array(density.contiguous()), ctx.visible, given, result]
-        launch(adjoint_kernel, len(visible_count), inputs, device)
+        launch(adjoint_kernel, len(visible_count), inputs, device, grain=GRAIN_OF_RAYS)
 
         of_density = of_displacement = None
         if ctx.needs_input_grad[0]:

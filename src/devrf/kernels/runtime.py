@@ -27,6 +27,10 @@ from devrf.errors import DevrfError
 # kernels where they run.
 Kernels = Literal["auto", "torch"]
 _chosen: Kernels = "auto"
+# Fewer threads of a kernel take less time than another core takes to begin with them, 0.1 ms: at
+# points of a grid or a ray, and where a thread follows a ray.
+GRAIN = 4096
+GRAIN_OF_RAYS = 256
 # Held by whoever makes, compiles or loads a kernel.
 compiling = RLock()
 _of_thread = local()
@@ -55,15 +59,22 @@ def take(tensor: Tensor) -> bool:
     return wanted
 
 
-def launch(kernel: wp.Kernel, count: int, inputs: Sequence[Any], device: torch.device) -> None:
+def launch(
+    kernel: wp.Kernel,
+    count: int,
+    inputs: Sequence[Any],
+    device: torch.device,
+    grain: int = GRAIN,
+) -> None:
     """Run ``kernel(first, *inputs)`` with ``count`` threads, of which thread k is ``first`` + k.
 
-    No two threads of such a kernel write to the same place.
+    No two threads of such a kernel write to the same place. On a CPU a part has ``grain`` threads
+    or more.
     """
-    parts = _parts(device)
+    parts = _parts(device, count, grain)
     edges = [count * part // parts for part in range(parts + 1)]
     counts = [stop - first for first, stop in pairwise(edges)]
-    _launch(kernel, counts, [[first, *inputs] for first in edges[:-1]], device)
+    _launch(kernel, counts, [[first] for first in edges[:-1]], inputs, device)
 
 
 def launch_by_owner(
@@ -75,9 +86,9 @@ def launch_by_owner(
     torch's threads add to one place, and sums are the same for any number of them. On a GPU there
     is one owner, and additions are atomic.
     """
-    owners = _parts(device)
-    inputs_of = [[owner, owners, *inputs] for owner in range(owners)]
-    _launch(kernel, [count] * owners, inputs_of, device)
+    owners = _parts(device, count, GRAIN)
+    places = [[owner, owners] for owner in range(owners)]
+    _launch(kernel, [count] * owners, places, inputs, device)
 
 
 def array(tensor: Tensor, kind: Any = None) -> wp.array:
@@ -128,48 +139,65 @@ def row_type(channels: int) -> Any:
 
 
 def _launch(
-    kernel: wp.Kernel, counts: Sequence[int], inputs: Sequence[list[Any]], device: torch.device
+    kernel: wp.Kernel,
+    counts: Sequence[int],
+    places: Sequence[Sequence[int]],
+    inputs: Sequence[Any],
+    device: torch.device,
 ) -> None:
-    """Launch a kernel for each part side by side, the first one in this thread."""
-    others = [
-        _pool(len(counts)).submit(_run, kernel, count, values, device)
-        for count, values in zip(counts[1:], inputs[1:], strict=True)
-    ]
-    _run(kernel, counts[0], inputs[0], device)
+    """Launch ``kernel(*place, *inputs)`` for each part side by side, the first in this thread.
+
+    The inputs are made ready once, in this thread, so that the others begin at once.
+    """
+    commands = _commands(kernel, len(counts), [*places[0], *inputs], device)
+    first, *others = commands
+    begin = len(places[0])
+    for index, value in enumerate(inputs, begin):
+        first.set_param_at_index(index, value)
     for other in others:
+        other.params[1 + begin :] = first.params[1 + begin :]
+    for command, count, place in zip(commands, counts, places, strict=True):
+        for index, value in enumerate(place):
+            command.set_param_at_index(index, value)
+        command.set_dim(count)
+    running = [_pool().submit(other.launch) for other in others]
+    if device.type == "cuda":
+        first.launch(wp.stream_from_torch(torch.cuda.current_stream(device)))
+    else:
+        first.launch()
+    for other in running:
         other.result()
 
 
-def _run(kernel: wp.Kernel, count: int, inputs: list[Any], device: torch.device) -> None:
-    """Launch a kernel in this thread, by a command of the thread's own that is made once.
+def _commands(
+    kernel: wp.Kernel, parts: int, inputs: list[Any], device: torch.device
+) -> list[wp.Launch]:
+    """This thread's launches of a kernel, one a part, made once.
 
     Warp finds, compiles and loads a kernel in one thread at a time.
     """
-    if count == 0:
-        return
-    commands = _of_thread.__dict__.setdefault("commands", {})
-    command = commands.get((kernel, device))
-    if command is None:
+    made = _of_thread.__dict__.setdefault("commands", {})
+    commands = made.get((kernel, parts, device))
+    if commands is None:
         with compiling:
-            command = wp.launch(kernel, 1, inputs=inputs, device=str(device), record_cmd=True)
-        commands[kernel, device] = command
-    for index, value in enumerate(inputs):
-        command.set_param_at_index(index, value)
-    command.set_dim(count)
-    if device.type == "cuda":
-        command.launch(wp.stream_from_torch(torch.cuda.current_stream(device)))
-    else:
-        command.launch()
+            commands = [
+                wp.launch(kernel, 1, inputs=inputs, device=str(device), record_cmd=True)
+                for _ in range(parts)
+            ]
+        made[kernel, parts, device] = commands
+    return commands
 
 
-def _parts(device: torch.device) -> int:
-    """Into how many parts a launch is divided."""
-    return torch.get_num_threads() if device.type == "cpu" else 1
+def _parts(device: torch.device, count: int, grain: int) -> int:
+    """Into how many parts a launch of ``count`` threads is divided."""
+    if device.type != "cpu":
+        return 1
+    return max(min(torch.get_num_threads(), count // grain), 1)
 
 
 @cache
-def _pool(parts: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(parts - 1, thread_name_prefix="devrf-kernels")
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="devrf-kernels")
 
 
 @cache
