@@ -15,6 +15,7 @@ from omegaconf import OmegaConf
 from devrf.cli.complete import completed
 from devrf.cli.config import PATHS
 from devrf.cli.messages import in_quotes
+from devrf.cli.restore_config import told
 from devrf.scenes.export import export
 from devrf.scenes.procedural import ProceduralForwardScene, ProceduralScene
 
@@ -88,11 +89,20 @@ def scenes(tmp_path_factory) -> Path:
     moved = [[1, 0, 0, 1], [0, 1, 0, 0], [0, 0, 1, 0]]
     frames = [frame | {"time": 0}, frame | {"time": 1, "transform_matrix": moved}]
     (folder / "hook/transforms_train.json").write_text(json.dumps({"frames": frames}))
+    # As stage=capture writes it of one video; ``stop`` is filmed at rest first.
+    for name, first in (("walk", frames[:1]), ("stop", 3 * frames[:1])):
+        (folder / name).mkdir()
+        file = folder / name / "transforms.json"
+        file.write_text(json.dumps({"frames": [*first, frames[1]]}))
+    for name, files in (("video", ["precomputed.json"]), ("vrig", ["dataset.json", "scene.json"])):
+        (folder / name).mkdir()
+        for file in files:
+            (folder / name / file).write_text("{}")
     return folder
 
 
 @pytest.mark.parametrize(
-    ("typed", "told"),
+    ("typed", "by_files"),
     [
         # The reader, and what its own config says of the scene.
         ("data.root=walker", "data=inward"),
@@ -100,7 +110,7 @@ def scenes(tmp_path_factory) -> Path:
         ("data.root=wall", "data=forward"),
         ("experiment=paper data.root=wall", "data=forward"),
         ("-m experiment=cpu_small,best_small data.root=walker", "data=inward"),
-        ("-m data.root=walker,hook", "data=inward"),
+        ("-m method=devrf data.root=walker,hook", "data=inward"),
         ("data.root=walker experiment=nonsense", "data=inward"),
         # What is typed, or an experiment chooses, is not told again.
         ("data.root=walker data=nerfstudio", ""),
@@ -117,7 +127,16 @@ def scenes(tmp_path_factory) -> Path:
         ("data.root=phone data.space=world", "data=nerfstudio"),
         ("data=colmap data.root=gone data.space=ndc", "facing=forward"),
         ("experiment=comparison_table data.root=phone", "data=nerfstudio facing=forward"),
-        # One camera that moves, and a method that can learn from it alone.
+        # One camera that moves: a method that can learn from it alone.
+        ("data.root=hook", "data=inward experiment=phone"),
+        ("stage=inspect data=inward data.root=hook schedule.seconds=60", "experiment=phone"),
+        ("data.root=walk", "data=nerfstudio experiment=phone"),
+        ("data.root=stop", "data=nerfstudio"),
+        ("data.root=video", "data=forward experiment=phone"),
+        ("data.root=vrig", "data=nerfies experiment=phone"),
+        ("data.root=hook experiment=phone profile=tineuvox_light", "data=inward"),
+        ("data.root=hook stage=canonical", "data=inward"),
+        ("data.root=hook profile=devrf_small", "data=inward"),
         ("data.root=hook method=dnerf", "data=inward protocol=dynamic"),
         ("data.root=hook method=dnerf protocol=joint", "data=inward"),
         ("data.root=hook comparison=dnerf", "data=inward"),
@@ -125,9 +144,11 @@ def scenes(tmp_path_factory) -> Path:
         ("data.root=walker method=dnerf", "data=inward"),
     ],
 )
-def test_what_the_files_of_a_scene_say_comes_after_what_was_typed(scenes, monkeypatch, typed, told):
+def test_what_the_files_of_a_scene_say_comes_after_what_was_typed(
+    scenes, monkeypatch, typed, by_files
+):
     monkeypatch.chdir(scenes)
-    assert completed(typed.split()) == [*typed.split(), *told.split()]
+    assert completed(typed.split()) == [*typed.split(), *by_files.split()]
 
 
 @pytest.mark.parametrize("place", ["--config-dir {}", "hydra.searchpath=[file://{}]"])
@@ -143,6 +164,11 @@ def test_what_the_files_say_is_said_in_one_line(devrf, scenes, short):
     done = devrf(f"data.root={scenes}/phone", *short, "stage=inspect")
     line = f"{scenes}/phone: the layout of nerfstudio, instant-ngp (data=nerfstudio facing=forward)"
     assert done.out.splitlines().count(line) == 1
+
+
+def test_devrf_on_one_moving_camera_is_told_what_learns_more(scenes):
+    completed([f"data.root={scenes}/hook", "stage=canonical"])
+    assert told[0].endswith("; experiment=phone learns more of it than method=devrf")
 
 
 @pytest.mark.parametrize(

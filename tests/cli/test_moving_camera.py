@@ -5,10 +5,14 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import pytest
+
 from devrf.scenes.procedural import ProceduralScene
 
 
-def test_a_capture_needs_no_flag_beside_its_folder(devrf, short, write_scene, tmp_path) -> None:
+@pytest.fixture
+def mill(write_scene, tmp_path) -> None:
+    """A folder ``mill`` in DyCheck's layout: one camera, elsewhere at each of three times."""
     sizes = {"width": 24, "height": 20, "static_views": 16, "static_test_views": 3}
     scene = ProceduralScene(shape="robot", train_views=2, frames=3, supersample=1, **sizes)()
     # The moving camera stands where one fixed view does, then where the next one does.
@@ -17,8 +21,28 @@ def test_a_capture_needs_no_flag_beside_its_folder(devrf, short, write_scene, tm
     write_scene(
         "dycheck", replace(scene, dynamic=replace(scene.dynamic, train=path)), tmp_path / "mill"
     )
+
+
+def test_a_capture_needs_no_flag_beside_its_folder(devrf, mill, tmp_path) -> None:
+    small = (
+        "ray_stage.model.settings.side=12",
+        "ray_stage.schedule.iterations=4",
+        "video.frames=1",
+    )
+    run = devrf("data.root=mill", "schedule.seconds=null", *small, "evaluation.metrics=[]")
+    assert (run.status, run.err) == (0, "")
+    why = (
+        "one moving camera, where method=devrf needs the scene at rest, too; the layout of DyCheck"
+    )
+    assert f"mill: {why} (data=dycheck experiment=phone)" in run.out
+    (folder,) = (tmp_path / "outputs/mill").iterdir()
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert metrics["method"] == "tineuvox" and metrics["protocol"] == "dynamic"
+
+
+def test_devrf_learns_such_a_capture_where_it_is_chosen(devrf, short, mill, tmp_path) -> None:
     quick = (*short, "schedule.canonical.visual_hull_init=false", "video.frames=1")
-    run = devrf("data.root=mill", *quick, "evaluation.metrics=[]")
+    run = devrf("data.root=mill", "method=devrf", *quick, "evaluation.metrics=[]")
     assert (run.status, run.err) == (0, "")
     assert "(data=dycheck)" in run.out
     metrics = json.loads((tmp_path / "outputs/mill/quickstart/metrics.json").read_text())

@@ -21,6 +21,7 @@ from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
+from devrf.methods.ray_stage import RaySchedule
 
 NAMES = group_choices()
 CHOICES = [f"{group}={name}" for group, names in NAMES.items() for name in names]
@@ -103,9 +104,12 @@ def test_it_composes_and_builds(composed, tmp_path, choice):
     check_config(config)
     if is_new(config.data):
         assert isinstance(instantiate(config.data), SceneDataModule)
-    if is_new(config.canonical):
+    if "ray_stage" in config:
+        stage = instantiate(config.ray_stage, _partial_=True, _convert_="all")
+        assert isinstance(stage.keywords["schedule"], RaySchedule)
+    elif is_new(config.canonical):
         assert isinstance(instantiate(config.canonical, _convert_="all"), CanonicalStage)
-    if is_new(config.deformation):
+    if "deformation" in config and is_new(config.deformation):
         build = instantiate(config.deformation, _partial_=True, _convert_="all")
         assert build.func is DeformationStage
         assert isinstance(build.keywords["schedule"], DeformationSchedule)

@@ -3,8 +3,8 @@
 * Paths get the quotes that Hydra's grammar needs, and ``~`` is filled in.
 * A run that is named (``ckpt=``, ``hydra.run.dir=``, ``hydra.sweep.dir=``) brings the overrides
   that it was learned with. What is typed comes after them: only that differs.
-* A scene's folder brings what its files say and nothing else has said: ``data=``, ``facing=``, and
-  for other methods than DeVRF ``protocol=dynamic`` if one camera filmed it.
+* A scene's folder brings what its files say and nothing else has said: ``data=``, ``facing=``; if
+  one camera filmed it ``experiment=phone``, or for a method that is typed ``protocol=dynamic``.
 """
 
 from __future__ import annotations
@@ -28,6 +28,10 @@ from devrf.cli.messages import in_quotes
 from devrf.cli.restore_config import of_named_run, parsed, told, value, values
 from devrf.errors import DevrfError
 
+# Stages that DeVRF's protocol alone has.
+OF_DEVRF = ("canonical", "deformation")
+# What says how a scene is learned.
+HOW = ("method", "profile", "protocol", "comparison", "experiment", "ablation")
 # `viewer` is a group, whose choices Hydra wants to be text.
 SHORTHAND = {f"viewer={value}": f"viewer.training={value}" for value in ("true", "false")}
 KEY_VALUE = re.compile(r"(\+{0,2}([\w./@-]+)=)(.*)", re.DOTALL)
@@ -94,6 +98,8 @@ def _told_by_scene(option: str | None, root: str, overrides: Sequence[Override])
         DevrfError: ``option`` is None, and no reader knows the layout.
     """
     # Imported here: they load torch.
+    import torch
+
     from devrf.data.kind import by_one_camera, faces_forward
     from devrf.scenes.formats import recognise
 
@@ -109,10 +115,16 @@ def _told_by_scene(option: str | None, root: str, overrides: Sequence[Override])
     space = value(overrides, "data.space")
     if not values(overrides, "facing") and faces_forward(option, root, space):
         words.append("facing=forward")
-    known = any(values(overrides, key) for key in ("protocol", "comparison"))
-    peer = value(overrides, "method") not in (None, "devrf")
-    if peer and not known and by_one_camera(option, root):
-        words.append("protocol=dynamic")
+    if by_one_camera(option, root):
+        method = value(overrides, "method")
+        if method == "devrf" or value(overrides, "stage") in OF_DEVRF:
+            lacks = "one camera filmed it moving, and nothing shows it at rest"
+            told.append(f"{root}: {lacks}; experiment=phone learns more of it than method=devrf")
+        elif not any(values(overrides, key) for key in HOW):
+            words.append(f"experiment={'phone_gpu' if torch.cuda.is_available() else 'phone'}")
+            why = f"one moving camera, where method=devrf needs the scene at rest, too; {why}"
+        elif method and not any(values(overrides, key) for key in ("protocol", "comparison")):
+            words.append("protocol=dynamic")
     scene = Path(root).expanduser().resolve().name
     if value(overrides, "experiment") == "paper" and option in ("inward", "forward"):
         if (config_folder() / f"for_scene/paper_{scene}.yaml").is_file():

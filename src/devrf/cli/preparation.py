@@ -56,12 +56,15 @@ def capture(run: RunContext) -> None:
     inspect(captured)
     _, _, change = compare(captured, captured.stages_with_images)
     config.merge_with_dotlist(change)
-    log.info("how long learning takes is tried out for some seconds")
-    moving = instantiate(config.deformation.schedule, _convert_="all")
-    stage = captured.stage_builder("canonical")()
-    trainer = partial(instantiate, config.trainer)
-    seconds = seconds_to_learn(stage, moving, captured.datamodule, trainer)
-    log.info("learning takes %s on this machine", duration(seconds))
+    seconds = config.schedule.seconds
+    if seconds is None and "canonical" in config:
+        log.info("how long learning takes is tried out for some seconds")
+        moving = instantiate(config.deformation.schedule, _convert_="all")
+        stage = captured.stage_builder("canonical")()
+        trainer = partial(instantiate, config.trainer)
+        seconds = seconds_to_learn(stage, moving, captured.datamodule, trainer)
+    if seconds is not None:
+        log.info("learning takes %s on this machine", duration(seconds))
     say_next([*words, *change])
 
 

@@ -12,9 +12,11 @@ import torch
 
 from devrf.errors import DevrfError
 from devrf.scenes.files import read_json
+from devrf.scenes.formats.llff_poses import PRECOMPUTED
+from devrf.scenes.formats.nerfstudio import STATIC_SET
 from devrf.scenes.sparse_model import ONE_SIDE, model_folder, read_model, widest_angle
 from devrf.scenes.splits import distinct_poses, distinct_times, stand_still
-from devrf.scenes.transforms import TransformsFile
+from devrf.scenes.transforms import TIME_TOLERANCE, TransformsFile
 
 
 def faces_forward(choice: str, root: str | Path, space: str | None) -> bool:
@@ -39,13 +41,20 @@ def faces_forward(choice: str, root: str | Path, space: str | None) -> bool:
 
 
 def by_one_camera(choice: str, root: str | Path) -> bool:
-    """Whether one camera takes all images, elsewhere in each as time passes, as D-NeRF's scenes."""
-    listing = _transforms(Path(root).expanduser() / "transforms_train.json")
-    if choice != "inward" or listing is None:
+    """Whether one camera takes all images, elsewhere in each as time passes, and no static set."""
+    folder = Path(root).expanduser()
+    if choice in ("nerfies", "dycheck"):
+        return True
+    if choice == "forward":
+        return (folder / PRECOMPUTED).is_file()
+    file = {"inward": "transforms_train.json", "nerfstudio": "transforms.json"}.get(choice)
+    listing = None if file is None else _transforms(folder / file)
+    if listing is None:
         return False
     times = torch.tensor([frame.time for frame in listing.frames if frame.time is not None])
     poses = torch.tensor([frame.transform_matrix[:3] for frame in listing.frames])
-    return len(distinct_times(times)) > 1 and not stand_still(distinct_poses(poses))
+    still = choice == "nerfstudio" and int((times <= TIME_TOLERANCE).sum()) >= STATIC_SET
+    return len(distinct_times(times)) > 1 and not still and not stand_still(distinct_poses(poses))
 
 
 def _transforms(file: Path) -> TransformsFile | None:

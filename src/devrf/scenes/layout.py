@@ -109,11 +109,6 @@ def without_static_set(train: Split, test: Split, static_until: float) -> Layout
         )
     if len(early_test.index) == 0:
         early_test = test
-    if not train.fixed:
-        log.warning(
-            "one camera, elsewhere in each image as in D-NeRF's scenes: DeVRF needs fixed views "
-            "and a static set, and learns little of such motion; method=dnerf does without"
-        )
     log.warning(
         "no static set: the canonical field is learned from %d of the %d training images "
         "(times up to %g), and tested on %d of %d",

@@ -87,13 +87,6 @@ def one_colour(scene):
     return changed(MOVING, painted(2, slice(3), [90, 90, 91]))(without_alpha(scene))
 
 
-def by_one_camera(scene):
-    walk = scene.static.train
-    seen = replace(walk, times=torch.linspace(0, 1, len(walk)))
-    static, dynamic = (replace(capture, train=seen) for capture in (scene.static, scene.dynamic))
-    return replace(scene, static=static, dynamic=dynamic)
-
-
 SETS = REST, REST_TEST, MOVING, _ = "static.train", "static.test", "dynamic.train", "dynamic.test"
 PROBLEMS = [
     (changed(REST_TEST, where(lambda v: v.times < 0)), "static test", "no view"),
@@ -105,7 +98,6 @@ PROBLEMS = [
     (changed(REST, ambiguous), "static train 007", "EXIF orientation"),
     (changed(REST_TEST, rgb), "static test", "without alpha masks"),
     (changed(REST_TEST, painted(slice(None), slice(3, 4), [255])), "static test", "opaque"),
-    (by_one_camera, "dynamic training", "one camera, elsewhere in each image"),
     (changed(MOVING, late), "dynamic training", "begins at time 0.1"),
     (
         changed(MOVING, where(lambda v: (v.times != 0.5) | (v.view != 1))),

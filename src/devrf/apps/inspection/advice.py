@@ -60,7 +60,6 @@ def advice_on(scene: Scene) -> list[Advice]:
         _alpha,
         _masks,
         _times,
-        _one_camera,
         _flow,
     )
     return [advice for check in checks for advice in check(scene)]
@@ -305,17 +304,6 @@ def _times(scene: Scene) -> Iterator[Advice]:
             "dynamic training set",
             f"not all views at every time: {listed(incomplete)}",
             "add the images, or leave these times or views out: motion is less certain there",
-        )
-
-
-def _one_camera(scene: Scene) -> Iterator[Advice]:
-    views = scene.dynamic.train
-    if scene.moves and views.by_moving_camera and {*scene.static.train.names} <= {*views.names}:
-        yield Advice(
-            "dynamic training set",
-            "one camera, elsewhere in each image as in D-NeRF's scenes, and no static set: DeVRF "
-            "learns little of such motion",
-            "film the scene at rest, then from fixed views, or learn it with method=dnerf",
         )
 
 
