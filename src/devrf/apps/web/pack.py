@@ -4,12 +4,13 @@
 
 ==================== ==============================================================================
 ``density``          raw densities v at rest, half precision
+``rough``            for pictures in haste: RGB as rays see it that go straight in, and v; bytes
 ``features``         colour features f, a byte each: its share of its channel's range, which the
                      network's first layer knows; blocks of four channels, one behind another
 ``weights``          the colour network, single precision
 ``distances-rest``   cells to the nearest occupied one at rest, a byte
 ``distances-K``      the same at all times between the frames K and K + 1
-``displacement-K``   Δ_b of frame K, half precision
+``displacement-K``   Δ_b of frame K, the higher bytes of 16 bits before the lower ones
 ``residual-K``       A_t of frame K, a byte each, if colours change
 ==================== ==============================================================================
 
@@ -34,10 +35,11 @@ from typing import Any
 import torch
 from kornia.color import ColorMap
 from torch import Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import normalize, pad
 
 from devrf.apps.camera_paths import upward
 from devrf.apps.captured_cameras import described, frustum_depth
+from devrf.apps.images import evenly
 from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
@@ -56,6 +58,9 @@ from devrf.system.files import atomic_write
 ROUNDED = 1 / 64
 # What is farther counts as infinity, for which JSON has no number.
 FAR = 1e30
+# Places of cameras, and grid points at once, for colours that are the same from all sides.
+EYES = 24
+CHUNK = 2**16
 # Of a texture's row of weights, four numbers each.
 ROW = 64
 # Colours of depth, from far to near.
@@ -87,7 +92,7 @@ def page(model: Renderable, viewpoints: Viewpoints, name: str) -> str:
             "export.format=ply, or look at it with viewer.renderer=server"
         )
     assert isinstance(model, DeVRFModel)
-    parts = dict(_parts(model))
+    parts = dict(_parts(model, viewpoints.static.positions))
     sizes = {part.partition("-")[0]: values.shape[2::-1] for part, values in parts.items()}
     description = _description(model, viewpoints) | {"name": name, "shapes": sizes}
     folder = files("devrf.apps.web")
@@ -110,7 +115,7 @@ def _element(part: str, values: Tensor) -> str:
     return f'<script type="text/plain" id="{part}">{base64.b64encode(packed).decode()}</script>'
 
 
-def _parts(model: DeVRFModel) -> Iterator[tuple[str, Tensor]]:
+def _parts(model: DeVRFModel, eyes: Tensor) -> Iterator[tuple[str, Tensor]]:
     """The contents of all textures by the elements' names: (depth, height, width, …)."""
     field = model.canonical
     sampling = model.at(0.0).picture_settings
@@ -121,6 +126,7 @@ def _parts(model: DeVRFModel) -> Iterator[tuple[str, Tensor]]:
     yield "density", torch.where(shown, raw, raw.min()).half()
     if not model.space.is_linear:  # rays end in the field's outer faces
         shown[[0, -1]] = shown[:, [0, -1]] = shown[:, :, [0, -1]] = True
+    yield "rough", _rough(model, shown, eyes[evenly(len(eyes), EYES)])
     low, high = field.color.values[shown | ~shown.any()].aminmax(dim=0)
     high = torch.maximum(high, low + 1e-6)
     shares = ((field.color.values - low) / (high - low)).clamp(0, 1) * shown[..., None]
@@ -137,14 +143,42 @@ def _parts(model: DeVRFModel) -> Iterator[tuple[str, Tensor]]:
         assert motion is not None
         mask = torch.stack(seen[max(k - 1, 0) : k + 1]).any(dim=0)
         near = Occupancy(mask, model.box).points_near(motion.shape, motion.box)
-        step = ROUNDED * rest.cell
-        rounded = (motion.to_canonical[k].to(near.device).float() / step).round() * step
-        yield f"displacement-{k}", (rounded * near[..., None]).half()
+        kept = near[..., None] * motion.to_canonical[k].to(near.device).float()
+        step = _displacement_step(motion)
+        fine = max(1, round(ROUNDED * rest.cell / step))
+        code = 2**15 + fine * (kept / step / fine).round().int()
+        yield f"displacement-{k}", torch.cat([code >> 8, code & 255]).byte()
         if residual is not None:
             values = residual.values[k]
             near = rest.points_near(shape_of(values), residual.box)
             codes = (values / _residual_step(model) * near[..., None]).round()
             yield f"residual-{k}", (128 + codes).byte()
+
+
+def _rough(model: DeVRFModel, shown: Tensor, eyes: Tensor) -> Tensor:
+    """Colours and v + b, (X, Y, Z, 4) bytes, of grid points where ``shown`` (X, Y, Z); else 0.
+
+    Colours are those for that of the ``eyes`` (K, 3) which looks most nearly straight at the
+    surface; bytes of densities are quarters above -20.
+    """
+    field, space = model.canonical, model.space
+    shape = field.density.shape
+    voxel = [edge / (n - 1) for edge, n in zip(model.box.size, shape, strict=True)]
+    slope = torch.stack(torch.gradient(field.voxel_alpha(1.0), spacing=voxel), dim=-1)
+    inward = 0.01 * min(voxel) * normalize(slope, dim=-1)
+    points = model.box.grid_points(shape, slope)
+    codes = torch.zeros(*shape, 4, dtype=torch.uint8, device=slope.device)
+    for where in torch.split(shown.nonzero(), CHUNK):
+        at = where.unbind(dim=1)
+        world = space.to_world(points[at])
+        views = normalize(world[:, None] - eyes.to(world), dim=-1)
+        straight = (views * (space.to_world(points[at] + inward[at]) - world)[:, None]).sum(dim=-1)
+        every = torch.arange(len(where), device=slope.device)
+        chosen = views[every, straight.argmax(dim=1)]
+        color = field.decoder(field.color.values[at], chosen, every)
+        density = 4 * (field.density.values[at] + field.shift + 20)
+        codes[at] = torch.cat([255 * color, density.clamp(0, 255)], dim=1).round().byte()
+    return codes
 
 
 def _seen(
@@ -167,6 +201,10 @@ def _seen(
             mask |= occupied(motion.warp_at(time)).mask
         masks.append(dilate(mask, 1))
     return masks
+
+
+def _displacement_step(motion: DeformationField) -> float:
+    return max(float(frame.abs().amax()) for frame in motion.to_canonical) / (2**14 - 1) or 1.0
 
 
 def _residual_step(model: DeVRFModel) -> float:
@@ -252,6 +290,7 @@ def _description(model: DeVRFModel, viewpoints: Viewpoints) -> dict[str, Any]:
     if motion is not None:
         uniforms |= {"motionLow": motion.box.low, "motionHigh": motion.box.high}
         uniforms["stillOutside"] = motion.still_outside
+        uniforms["motionStep"] = _displacement_step(motion)
     static = viewpoints.static
     return {
         "defines": defines,

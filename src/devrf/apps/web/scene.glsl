@@ -1,7 +1,7 @@
 // What a pixel sees of the scene at one time. Names after "docs/method.md" are anchors there.
 //
-// Defined before: SPACE (0 the world, 1 NDC, 2 contracted); SAMPLEWISE (1: the network at every
-// sample; 0, in haste: once a pixel, of mean features); FEATURES and WIDTH (vec4s of a sample's
+// Defined before: SPACE (0 the world, 1 NDC, 2 contracted); EXACT (1: all samples, their colours by
+// the network; 0, in haste: fewer, the same from all sides); FEATURES and WIDTH (vec4s of a sample's
 // features and of a hidden layer); FREQUENCIES (octaves of the direction); MOVES and SHADES
 // (whether there are displacements, and residual colours).
 
@@ -13,8 +13,8 @@ precision highp usampler3D;
 // Channels. A probe says in bytes how far a ray gets, for the page to read.
 const int COLOR = 0, DEPTH = 1, MOTION = 2, PROBE = 3;
 // A ray ends where its transmittance is less. In haste there are fewer samples.
-const float STOP = SAMPLEWISE == 1 ? 1e-4 : 1e-2;
-const float STRIDE = SAMPLEWISE == 1 ? 1.0 : 2.0;
+const float STOP = EXACT == 1 ? 1e-4 : 1e-2;
+const float STRIDE = EXACT == 1 ? 1.0 : 2.0;
 // Points nearer to infinity are taken to be at this distance from it.
 const float GAP = 1e-6;
 // Motion is shown over this share of all time, saturated at this share of the picture's height.
@@ -22,11 +22,12 @@ const float MOTION_STEP = 0.05, MOTION_FULL = 0.02;
 
 // Of all grids z is along the texture's width and x along its depth, as they lie in memory.
 uniform sampler3D density, features, weights;   // features: blocks of four channels
-uniform sampler3D displacement0, displacement1; // of the frames before and after the time
-uniform sampler3D residual0, residual1;
+uniform sampler3D rough;                        // in haste: colour and raw density
+uniform sampler3D displacement0, displacement1; // of the frames before and after the time: two
+uniform sampler3D residual0, residual1;         // blocks, of the higher and the lower bytes
 uniform usampler3D distances;
 uniform vec3 low, high, motionLow, motionHigh;  // the boxes of all fields, and of displacements
-uniform float shift, delta, threshold, stepLength, near, far, residualStep;
+uniform float shift, delta, threshold, stepLength, near, far, motionStep, residualStep;
 uniform vec3 ndc;                    // 2f/W, 2f/H, near plane
 uniform vec3 center, innerHalf;      // of the scene; in contracted space of the inner box
 uniform float reach, shell;          // of depths about the centre; of contracted space
@@ -101,8 +102,16 @@ vec3 place(vec3 point, vec3 boxLow, vec3 boxHigh, ivec3 size) {
 vec3 displacement(vec3 point, float after) {
   bool outside = any(lessThan(point, motionLow)) || any(greaterThan(point, motionHigh));
   if (MOVES == 0 || stillOutside && outside) return vec3(0.0);
-  vec3 p = place(point, motionLow, motionHigh, textureSize(displacement0, 0));
-  return mix(textureLod(displacement0, p, 0.0), textureLod(displacement1, p, 0.0), after).xyz;
+  ivec3 size = textureSize(displacement0, 0) / ivec3(1, 1, 2);
+  vec3 p = place(point, motionLow, motionHigh, size) * vec3(1.0, 1.0, 0.5);
+  vec3 code = mix(textureLod(displacement0, p, 0.0), textureLod(displacement1, p, 0.0), after).xyz;
+#if EXACT
+  p.z += 0.5;
+  vec3 low = mix(textureLod(displacement0, p, 0.0), textureLod(displacement1, p, 0.0), after).xyz;
+#else
+  const vec3 low = vec3(0.5);
+#endif
+  return (255.0 * (256.0 * code + low) - 32768.0) * motionStep; // of codes, 32768 is 0
 }
 
 vec3 residual(vec3 canonical) {
@@ -152,7 +161,11 @@ void encode(vec3 direction) {
   }
 }
 
-vec3 network(vec4 feature[FEATURES], vec3 added) {
+vec3 network(vec3 p, vec3 added) {
+  vec4 feature[FEATURES];
+  for (int c = 0; c < FEATURES; c++) {
+    feature[c] = textureLod(features, vec3(p.xy, (p.z + float(c)) / float(FEATURES)), 0.0);
+  }
   vec4 hidden[WIDTH];
   for (int i = 0; i < WIDTH; i++) hidden[i] = number(HIDDEN_BIAS + i);
   for (int j = 0; j < WIDTH; j++) {
@@ -224,10 +237,7 @@ void main() {
 
   vec3 color = vec3(0.0);
   float transmittance = 1.0, mass = 0.0, reached = 0.0;
-  vec4 mean[FEATURES];
-  for (int c = 0; c < FEATURES; c++) mean[c] = vec4(0.0);
-  vec3 meanResidual = vec3(0.0);
-  if (SAMPLEWISE == 1 && channel == COLOR && count > 0) encode(direction);
+  if (EXACT == 1 && channel == COLOR && count > 0) encode(direction);
   for (int k = 0; true; k++) {
     float s = 0.0;
     for (; k < count; k++) {
@@ -239,6 +249,7 @@ void main() {
     }
     bool ends = k >= count || transmittance < STOP;
     vec3 p, canonical, added = vec3(0.0);
+    vec4 look;
     float weight = transmittance;
     if (ends) {
       if (SPACE != 2 || channel != COLOR) break;
@@ -248,7 +259,12 @@ void main() {
       canonical = at(ray, s);
       if (warps) canonical += displacement(canonical, share);
       p = place(canonical, low, high, textureSize(density, 0));
+#if EXACT
       float raw = textureLod(density, p, 0.0).r + shift;
+#else
+      look = textureLod(rough, p, 0.0);
+      float raw = 63.75 * look.a - 20.0;
+#endif
       float alpha = 1.0 - exp(-STRIDE * delta * (raw > 15.0 ? raw : log(1.0 + exp(raw))));
       if (alpha < threshold) continue;
       weight *= alpha;
@@ -259,27 +275,15 @@ void main() {
       if (channel != COLOR) continue;
       added = residual(canonical);
     }
-    vec4 feature[FEATURES];
-    for (int c = 0; c < FEATURES; c++) {
-      feature[c] = textureLod(features, vec3(p.xy, (p.z + float(c)) / float(FEATURES)), 0.0);
-    }
-#if SAMPLEWISE
-    color += weight * network(feature, added);
+#if EXACT
+    color += weight * network(p, added);
 #else
-    for (int c = 0; c < FEATURES; c++) mean[c] += weight * feature[c];
-    meanResidual += weight * added;
+    if (ends) look = textureLod(rough, p, 0.0);
+    color += weight * look.rgb / (look.rgb + (1.0 - look.rgb) * exp(-added)); // added to the logit
 #endif
     if (ends) break;
   }
   if (SPACE != 2) color += transmittance * background;
-#if !SAMPLEWISE
-  float seen = SPACE == 2 ? mass + transmittance : mass;
-  if (channel == COLOR && seen > threshold) {
-    encode(direction);
-    for (int c = 0; c < FEATURES; c++) mean[c] /= seen;
-    color += seen * network(mean, meanResidual / seen);
-  }
-#endif
 
   float s = reached / max(mass, 1e-6);
   float opacity = 1.0 - transmittance;

@@ -4,7 +4,7 @@
 // a ray through these for every pixel. Units are the world's, and radians.
 
 // Milliseconds a picture while something moves, its fewest rows, and the wait for finer ones then.
-const BUDGET = 50;
+const BUDGET = 70;
 const MIN_ROWS = 72;
 const SETTLED = 120;
 // Seconds from time 0 to 1 at speed 1, and of a whole turn.
@@ -46,16 +46,17 @@ async function inflate(id) {
 // Of each kind of data: format in the texture and in memory, and what holds its numbers.
 const KINDS = {
   density: ["R16F", "RED", "HALF_FLOAT", Uint16Array],
+  rough: ["RGBA8", "RGBA", "UNSIGNED_BYTE", Uint8Array],
   features: ["RGBA8", "RGBA", "UNSIGNED_BYTE", Uint8Array],
   weights: ["RGBA32F", "RGBA", "FLOAT", Float32Array],
   distances: ["R8UI", "RED_INTEGER", "UNSIGNED_BYTE", Uint8Array],
-  displacement: ["RGB16F", "RGB", "HALF_FLOAT", Uint16Array],
+  displacement: ["RGB8", "RGB", "UNSIGNED_BYTE", Uint8Array],
   residual: ["RGB8", "RGB", "UNSIGNED_BYTE", Uint8Array],
 };
 // Textures by their units' numbers: of what changes one before the time, and one after it.
-const UNITS = ["density", "features", "weights", "distances", "rest"];
+const UNITS = ["density", "rough", "features", "weights", "distances", "rest"];
 UNITS.push("displacement0", "displacement1", "residual0", "residual1");
-const [DISTANCES, REST] = [3, 4];
+const [DISTANCES, REST] = [4, 5];
 
 class Graphics {
   constructor(canvas, scene) {
@@ -79,11 +80,11 @@ class Graphics {
     gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.RENDERBUFFER, buffer);
   }
 
-  /** The program that asks the network at every sample (1), or once a pixel (0). */
-  program(samplewise) {
+  /** The program for the exact picture (1), or for one in haste (0). */
+  program(exact) {
     const { gl, scene } = this;
-    if (this.programs[samplewise]) return this.programs[samplewise];
-    const values = Object.entries({ ...scene.defines, SAMPLEWISE: samplewise });
+    if (this.programs[exact]) return this.programs[exact];
+    const values = Object.entries({ ...scene.defines, EXACT: exact });
     const defines = values.map(([name, value]) => `#define ${name} ${value}\n`).join("");
     const triangle = "vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0";
     const vertices = `void main() { gl_Position = vec4(${triangle}, 0.0, 1.0); }`;
@@ -105,9 +106,9 @@ class Graphics {
       uniforms[name.replace("[0]", "")] = [gl.getUniformLocation(handle, name), type];
     }
     // Milliseconds a pixel; a guess, until it was measured.
-    const cost = samplewise ? 4 * this.programs[0].cost : 1e-3;
+    const cost = exact ? 20 * this.programs[0].cost : 1e-3;
     const program = { handle, uniforms, cost, warm: false };
-    this.programs[samplewise] = program;
+    this.programs[exact] = program;
     gl.useProgram(handle);
     UNITS.forEach((name, k) => this.set(program, { [name]: k }));
     this.set(program, scene.uniforms);
@@ -149,7 +150,7 @@ class Graphics {
 
   /** Brings onto the device what is the same at all times. */
   async load() {
-    for (const kind of ["density", "features", "weights"]) {
+    for (const kind of ["density", "rough", "features", "weights"]) {
       this.fill(kind, kind, await inflate(kind));
     }
     this.fill("rest", "distances", await inflate("distances-rest"));
@@ -362,14 +363,14 @@ class Page {
     return count > 1 ? [{ ...now, warps: false, distances: REST }, now] : [now];
   }
 
-  /** The better of the programs that draws a picture within the budget, and its rows. */
+  /** The exact program if it is twice as fast as need be, or the one in haste; and its rows. */
   plan() {
     const { width, height } = this.graphics.canvas;
     const fast = this.graphics.program(0);
-    const full = this.graphics.programs[1];
-    // Where the fast one takes no time, the full one may be tried.
-    const cost = full?.warm ? full.cost : 2 * fast.cost;
-    if (fast.warm && cost * width * height <= BUDGET) return [this.graphics.program(1), height];
+    const exact = this.graphics.programs[1];
+    // Where the fast one takes no time, the exact one may be tried.
+    const cost = exact?.warm ? exact.cost : 5 * fast.cost;
+    if (fast.warm && 2 * cost * width * height <= BUDGET) return [this.graphics.program(1), height];
     const rows = Math.sqrt((BUDGET * height) / (fast.cost * width));
     return [fast, Math.round(within(rows, Math.min(MIN_ROWS, height), height))];
   }
