@@ -15,6 +15,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -25,7 +26,7 @@ import pytest
 import torch
 from PIL import Image
 
-from devrf.apps.captured_cameras import picture_of
+from devrf.apps.captured_cameras import described, picture_of
 from devrf.apps.settings import ViewerSettings
 from devrf.apps.viewer.page import PageServer
 from devrf.apps.web.pack import page
@@ -170,7 +171,9 @@ def link(camera: Cameras, time: float) -> str:
     """The part of an address that says where the page's camera is."""
     pose = ",".join(map(repr, camera.camera_to_world[0].flatten().tolist()))
     fov = math.degrees(2 * math.atan(camera.height / 2 / float(camera.focal[0, 1])))
-    return f"#pose={pose}&distance=3&fov={fov!r}&time={time}"
+    away = torch.tensor([camera.width, camera.height]) / 2 - camera.center[0]
+    right, down = (away / camera.focal[0]).tolist()
+    return f"#pose={pose}&distance=3&fov={fov!r}&middle={right!r},{-down!r}&time={time}"
 
 
 def psnr(picture: torch.Tensor, truth: torch.Tensor) -> float:
@@ -189,7 +192,7 @@ def test_a_browser_draws_what_the_renderer_does(browser, scenes, tmp_path, space
         (viewpoints.dynamic[[0]], 0.4),  # a captured time
         (viewpoints.dynamic[[0]], 0.73),  # one between two
         (viewpoints.held_out, 1.0),  # another view
-        (viewpoints.static[[1]], 0.0),
+        (replace(viewpoints.static[[1]], center=torch.tensor([[8.0, 11.0]])), 0.0),  # off-centre
     ):
         camera = camera.of_height(ROWS)
         browser.open(file.as_uri() + link(camera, moment), camera.width, camera.height)
@@ -377,17 +380,27 @@ def test_all_data_are_in_the_file_and_as_large_as_their_textures(moving, tiny_sc
     assert not re.search(r"""(src|href)=["'](?!data:)|https?://""", text)  # nothing is fetched
 
 
+def test_an_off_centre_principal_point_moves_the_middle(moving, tiny_scene):
+    viewpoints = Viewpoints.of(tiny_scene)
+    off = replace(
+        viewpoints.static,
+        focal=torch.tensor([[20.0, 40.0]]).expand(len(viewpoints.static), 2),
+        center=torch.tensor([[8.0, 11.0]]).expand(len(viewpoints.static), 2),
+    )
+    *_, camera = described(moving, replace(viewpoints, static=off))
+    # 24×18 pixels, whose middle (12, 9) is 4 pixels to the right of the point, and 2 above.
+    assert camera["middle"] == pytest.approx([4 / 20, 2 / 40])
+
+
 def test_a_scene_at_rest_has_no_motion(learned, tiny_scene):
     text = page(learned[0].scene_model, Viewpoints.of(tiny_scene), "tiny")
     described = json.loads(re.search(r'id="description">(.*)</script>', text)[1])
     assert described["times"] == [0.0] and described["defines"]["MOVES"] == 0
 
 
-def test_what_has_no_grids_is_refused_in_one_line(tiny_scene):
-    model: Any = SimpleNamespace(name="dnerf")
-    with pytest.raises(
-        DevrfError, match=r"^method=dnerf: it has no grids that a browser could draw"
-    ):
+def test_other_methods_are_refused_in_one_line(tiny_scene):
+    model: Any = SimpleNamespace(name="tineuvox")
+    with pytest.raises(DevrfError, match=r"^method=tineuvox: the page draws DeVRF's fields"):
         page(model, Viewpoints.of(tiny_scene), "tiny")
 
 

@@ -58,7 +58,9 @@ def described(model: Viewable, viewpoints: Viewpoints) -> Iterator[dict[str, Any
     """The captured cameras in plain numbers, for a page: first those that saw the scene move.
 
     Of each its ``name``, as :func:`picture_of` takes it; ``pose``, camera to world, 12 numbers, row
-    by row; ``fov``, its vertical angle of view in radians; ``aspect``, width over height;
+    by row; ``fov``, its vertical angle of view in radians, were the principal point in the middle;
+    ``middle``, how far the image's middle is to the right of it and above, in tangents of angles;
+    ``aspect``, width over height;
     ``distance`` of what it looks at, world units; ``times`` of the frames that it may have seen.
     """
     static = viewpoints.static
@@ -67,11 +69,13 @@ def described(model: Viewable, viewpoints: Viewpoints) -> Iterator[dict[str, Any
         for k in evenly(len(captured), MAX_FRUSTA):
             camera = captured[[k]]
             fx, fy = camera.focal[0].tolist()
+            cx, cy = camera.center[0].tolist()
             way = target - camera.positions[0]
             yield {
                 "name": f"{kind}_{k}",
                 "pose": camera.camera_to_world.flatten().tolist(),
                 "fov": 2 * math.atan(camera.height / 2 / fy),
+                "middle": [(camera.width / 2 - cx) / fx, (cy - camera.height / 2) / fy],
                 "aspect": (camera.width / fx) / (camera.height / fy),
                 "distance": max(float(way @ camera.forwards[0]), 0.1 * float(way.norm())),
                 "times": viewpoints.clock.times if kind == "dynamic" else [0.0],

@@ -68,7 +68,7 @@ STOPS = 9
 
 
 def drawable(model: Renderable) -> bool:
-    """Whether a browser can draw a model: it has grids, and a colour network."""
+    """Whether the page can draw a model: DeVRF's fields with a colour network."""
     return isinstance(model, DeVRFModel) and isinstance(model.canonical.decoder, ColorDecoder)
 
 
@@ -84,12 +84,12 @@ def page(model: Renderable, viewpoints: Viewpoints, name: str) -> str:
     """The page of the scene ``name``, with the cameras of ``viewpoints``.
 
     Raises:
-        DevrfError: a browser cannot draw the model.
+        DevrfError: the page cannot draw the model.
     """
     if not drawable(model):
         raise DevrfError(
-            f"method={model.name}: it has no grids that a browser could draw; give "
-            "export.format=ply, or look at it with viewer.renderer=server"
+            f"method={model.name}: the page draws DeVRF's fields with their colour network only; "
+            "give export.format=ply, or look at it with viewer.renderer=server"
         )
     assert isinstance(model, DeVRFModel)
     parts = dict(_parts(model, viewpoints.static.positions))

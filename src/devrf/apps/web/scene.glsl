@@ -34,7 +34,7 @@ uniform float reach, shell;          // of depths about the centre; of contracte
 uniform bool warps, stillOutside;
 uniform float share, interval;       // of the frame after; from one to the other
 uniform vec3 eye, right, up, backward, background;
-uniform vec2 slope;                  // tangents of half the angles of view
+uniform vec2 slope, middle;          // tangents of half the angles of view, of its middle's angles
 uniform vec4 frame;                  // x, y, width and height of the picture, in pixels
 uniform int channel;
 uniform vec3 palette[9];
@@ -208,7 +208,7 @@ vec3 motionColor(vec3 x) {
 
 // Pixels: docs/method.md#compositing.
 void main() {
-  vec2 onScreen = slope * (2.0 * (gl_FragCoord.xy - frame.xy) / frame.zw - 1.0);
+  vec2 onScreen = middle + slope * (2.0 * (gl_FragCoord.xy - frame.xy) / frame.zw - 1.0);
   vec3 direction = normalize(right * onScreen.x + up * onScreen.y - backward);
   pixel = vec4(background, channel == PROBE ? 0.0 : 1.0);
   if (SPACE == 1 && direction.z > -1e-3) return; // it never crosses the near plane

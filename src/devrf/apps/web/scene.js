@@ -248,17 +248,20 @@ class Motion {
   }
 }
 
-/** A pinhole camera that looks at a target: { right, up, backward, target, distance, fov }. */
+/**
+ * A pinhole camera that looks at a target: { right, up, backward, target, distance, fov, middle }.
+ * The middle of its picture is off its axis by these tangents, to the right and upwards.
+ */
 class Camera {
   constructor(values) {
     Object.assign(this, values);
   }
 
   /** Of a camera-to-world pose of 12 numbers, OpenGL axes. */
-  static of({ pose, distance, fov }) {
+  static of({ pose, distance, fov, middle }) {
     const [right, up, backward, eye] = [0, 1, 2, 3].map((k) => [pose[k], pose[k + 4], pose[k + 8]]);
     const target = along(eye, -distance, backward);
-    return new Camera({ right, up, backward, target, distance, fov });
+    return new Camera({ right, up, backward, target, distance, fov, middle });
   }
 
   get eye() {
@@ -323,19 +326,22 @@ class Page {
 
   /** Camera and time in a link; the pose is what camera paths of stage=render have. */
   get link() {
-    const { right, up, backward, eye, distance, fov } = this.camera;
+    const { right, up, backward, eye, distance, fov, middle } = this.camera;
     const rows = [0, 1, 2].map((k) => [right[k], up[k], backward[k], eye[k]]);
     const pose = rows.flat().map((value) => value.toPrecision(7));
-    return `#pose=${pose}&distance=${distance}&fov=${(fov * 180) / Math.PI}&time=${this.time}`;
+    const lens = `&fov=${(fov * 180) / Math.PI}&middle=${middle}`;
+    return `#pose=${pose}&distance=${distance}${lens}&time=${this.time}`;
   }
 
   /** Takes what the page's link says, and tells whether it says anything. */
   follow() {
     const words = new URLSearchParams(location.hash.slice(1));
     const [distance, fov, time] = ["distance", "fov", "time"].map((k) => parseFloat(words.get(k)));
-    const pose = (words.get("pose") ?? "").split(",").map(parseFloat);
-    const poses = pose.length === 12 && pose.every(Number.isFinite) && distance > 0 && fov > 0;
-    if (poses) this.camera = Camera.of({ pose, distance, fov: (fov * Math.PI) / 180 });
+    const list = (name, otherwise) => (words.get(name) ?? otherwise).split(",").map(parseFloat);
+    const [pose, middle] = [list("pose", ""), list("middle", "0,0")];
+    const numbers = pose.length === 12 && [...pose, middle[0], middle[1]].every(Number.isFinite);
+    const poses = numbers && distance > 0 && fov > 0;
+    if (poses) this.camera = Camera.of({ pose, distance, fov: (fov * Math.PI) / 180, middle });
     if (time >= 0) this.setTime(time);
     return poses || time >= 0;
   }
@@ -351,14 +357,14 @@ class Page {
 
   /** Uniforms of each part of the picture: the rest state on the left, if it is wanted. */
   parts() {
-    const { right, up, backward, eye, fov } = this.camera;
+    const { right, up, backward, eye, fov, middle } = this.camera;
     const { width, height } = this.graphics.canvas;
     const count = byId("rest").checked ? 2 : 1;
     // From as much farther that each half shows the whole width.
     const tangent = count * Math.tan(fov / 2);
     const slope = [(tangent * width) / height / count, tangent];
     const channel = Number(byId("channel").value);
-    const view = { right, up, backward, eye, slope, channel };
+    const view = { right, up, backward, eye, slope, middle, channel };
     const now = { ...view, ...this.motion.uniforms(this.time) };
     return count > 1 ? [{ ...now, warps: false, distances: REST }, now] : [now];
   }
@@ -452,20 +458,22 @@ class Page {
 
   /** Draws the captured cameras as frusta, if they are wanted. */
   drawFrusta() {
-    const { right, up, backward, eye, fov } = this.camera;
+    const { right, up, backward, eye, fov, middle } = this.camera;
     const wanted = byId("cameras").checked && !byId("rest").checked;
     const scale = innerHeight / 2 / Math.tan(fov / 2);
     const place = (point) => {
       const away = along(point, -1, eye);
-      const zoom = scale / Math.max(-dot(away, backward), 1e-6);
-      return [innerWidth / 2 + zoom * dot(away, right), innerHeight / 2 - zoom * dot(away, up)];
+      const ahead = Math.max(-dot(away, backward), 1e-6);
+      const [x, y] = [right, up].map((axis, k) => scale * (dot(away, axis) / ahead - middle[k]));
+      return [innerWidth / 2 + x, innerHeight / 2 - y];
     };
     const distance = this.scene.frustum;
     this.scene.cameras.forEach((captured, k) => {
       const [image, lines] = this.frusta[k].children;
       const camera = Camera.of({ ...captured, distance });
       const tall = Math.tan(captured.fov / 2);
-      const corner = (x, y) => place(camera.moved(x * tall * captured.aspect, y * tall, 0).target);
+      const [wide, [left, low]] = [tall * captured.aspect, captured.middle];
+      const corner = (x, y) => place(camera.moved(left + x * wide, low + y * tall, 0).target);
       const behind = dot(along(camera.eye, -1, eye), backward) > -2 * distance;
       this.frusta[k].toggleAttribute("hidden", !wanted || behind);
       const [a, b, c, d] = [corner(-1, 1), corner(1, 1), corner(1, -1), corner(-1, -1)];
@@ -489,9 +497,10 @@ class Page {
     const away = this.graphics.reach(parts[0], x * ratio, canvas.height - 1 - y * ratio);
     this.state = null; // a pixel was drawn over
     if (away === null || parts.length > 1) return;
-    const { right, up, backward, eye, slope } = parts[0];
-    const [wide, high] = [(2 * x) / innerWidth - 1, 1 - (2 * y) / innerHeight];
-    const across = along(scaled(right, slope[0] * wide), slope[1] * high, up);
+    const { right, up, backward, eye, slope, middle } = parts[0];
+    const screen = [(2 * x) / innerWidth - 1, 1 - (2 * y) / innerHeight];
+    const [wide, high] = along(middle, 1, [0, 1].map((k) => slope[k] * screen[k]));
+    const across = along(scaled(right, wide), high, up);
     const ahead = unit(along(across, -1, backward));
     const distance = -away * dot(ahead, backward);
     this.look(new Camera({ ...this.camera, target: along(eye, away, ahead), distance }));
