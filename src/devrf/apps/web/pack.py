@@ -72,16 +72,26 @@ def drawable(model: Renderable) -> bool:
     return isinstance(model, DeVRFModel) and isinstance(model.canonical.decoder, ColorDecoder)
 
 
-def write_page(path: Path, model: Renderable, viewpoints: Viewpoints, name: str) -> None:
+def write_page(
+    path: Path, model: Renderable, viewpoints: Viewpoints, name: str, checkpoint: str = ""
+) -> None:
     """Write :func:`page`, whole or not at all."""
-    text = page(model, viewpoints, name)
+    text = page(model, viewpoints, name, checkpoint)
     with atomic_write(path) as partial:
         partial.write_text(text, encoding="utf-8")
 
 
+def written_page(path: Path, checkpoint: str) -> str | None:
+    """The page that was written to ``path`` of the checkpoint of this digest; None: of another."""
+    text = path.read_text("utf-8") if path.is_file() else ""
+    return text if f'"checkpoint": "{checkpoint}"' in text else None
+
+
 @torch.no_grad()
-def page(model: Renderable, viewpoints: Viewpoints, name: str) -> str:
+def page(model: Renderable, viewpoints: Viewpoints, name: str, checkpoint: str = "") -> str:
     """The page of the scene ``name``, with the cameras of ``viewpoints``.
+
+    ``checkpoint`` is the digest of the file that holds the model, for :func:`written_page`.
 
     Raises:
         DevrfError: the page cannot draw the model.
@@ -95,6 +105,7 @@ def page(model: Renderable, viewpoints: Viewpoints, name: str) -> str:
     parts = dict(_parts(model, viewpoints.static.positions))
     sizes = {part.partition("-")[0]: values.shape[2::-1] for part, values in parts.items()}
     description = _description(model, viewpoints) | {"name": name, "shapes": sizes}
+    description["checkpoint"] = checkpoint
     folder = files("devrf.apps.web")
     texts = {
         "title": html.escape(f"{name} · devrf"),
@@ -186,7 +197,7 @@ def _seen(
 ) -> list[Tensor]:
     """Where something is at any time between two consecutive frames: masks (X, Y, Z).
 
-    From one time to the next nothing moves by more than a ``cell``, by which they are grown.
+    From the nearest of some times nothing moves by more than a ``cell``, by which they are grown.
     """
     masks = []
     times = motion.clock.times
@@ -196,7 +207,7 @@ def _seen(
         near = Occupancy(mask, first.box).points_near(motion.shape, motion.box)
         before, after = (motion.to_canonical[n].to(near.device).float() for n in (k, k + 1))
         change = float(((after - before).norm(dim=-1) * near).amax())
-        steps = math.ceil(change / cell)
+        steps = math.ceil(change / (2 * cell))
         for time in torch.linspace(times[k], times[k + 1], steps + 1)[1:-1].tolist():
             mask |= occupied(motion.warp_at(time)).mask
         masks.append(dilate(mask, 1))
