@@ -19,7 +19,7 @@ from devrf.methods.base import Renderable
 from devrf.metrics.geometric import SOLID
 from devrf.rendering.renderer import Renderer, points_at_depth
 
-Format = Literal["gltf", "html", "ply", "obj", "usd"]
+Format = Literal["gltf", "html", "ply", "obj", "splats", "usd"]
 Up = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from devrf.apps.export.geometry import ExportSettings, MovingMesh, UpFrame, carried, seen_points
 from devrf.apps.export.gltf import write_gltf
 from devrf.apps.export.sequence import Drawn, mesh_files, point_file, write_sequence
+from devrf.apps.export.splats import write_splats
 from devrf.apps.export.surface import surface_of
 from devrf.apps.export.usd import write_usd
 from devrf.apps.web.pack import write_page
@@ -25,7 +26,11 @@ log = logging.getLogger(__name__)
 # The file of export.format=html.
 PAGE = "scene.html"
 # Formats that have one file for all times.
-SINGLE = {"gltf": ("scene.glb", write_gltf), "usd": ("scene.usdc", write_usd)}
+SINGLE = {
+    "gltf": ("scene.glb", write_gltf),
+    "usd": ("scene.usdc", write_usd),
+    "splats": ("splats.zip", write_splats),
+}
 
 
 def export_scene(

@@ -1,0 +1,74 @@
+"""Splats: Gaussians on the surface, as 3D Gaussian Splatting's viewers read them."""
+
+from __future__ import annotations
+
+import json
+import math
+from zipfile import ZipFile
+
+import numpy as np
+import pytest
+import torch
+
+from devrf.apps.export.geometry import ExportSettings, MovingMesh, UpFrame, carried
+from devrf.apps.export.splats import write_splats
+from devrf.apps.export.surface import surface_of
+
+HEADER = (
+    "ply\nformat binary_little_endian 1.0\nelement vertex {}\n"
+    "property float x\nproperty float y\nproperty float z\n"
+    "property float nx\nproperty float ny\nproperty float nz\n"
+    "property float f_dc_0\nproperty float f_dc_1\nproperty float f_dc_2\nproperty float opacity\n"
+    "property float scale_0\nproperty float scale_1\nproperty float scale_2\n"
+    "property float rot_0\nproperty float rot_1\nproperty float rot_2\nproperty float rot_3\n"
+    "end_header\n"
+)
+
+
+def read(path, number):
+    """The numbers (V, 17) of a frame."""
+    with ZipFile(path) as archive:
+        content = archive.read(f"frame_{number:04d}.ply")
+    header, end, values = content.partition(b"end_header\n")
+    rows = np.frombuffer(values, "<f4").reshape(-1, 17)
+    assert (header + end).decode() == HEADER.format(len(rows))
+    return rows
+
+
+def test_a_triangle_by_hand(tmp_path):
+    # Of area 2, in the plane of x and y, seen from +z; then it is lifted by 1.
+    corners = torch.tensor([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 2.0, 0.0]])
+    lifted = corners + torch.tensor([0.0, 0.0, 1.0])
+    colors = torch.tensor([[0.5, 1.0, 0.0]]).expand(3, 3)
+    vertices = torch.stack([corners, lifted])
+    mesh = MovingMesh((0.0, 1.0), vertices, torch.tensor([[0, 1, 2]]), colors)
+    path = tmp_path / "splats.zip"
+    write_splats(path, mesh, {}, UpFrame(torch.eye(3), 1.0, "y"), 3.0)
+    first = read(path, 0)
+    assert first[:, :3].tolist() == [[0, 0, 0], [2, 0, 0], [0, -2, 0]]  # y is down
+    np.testing.assert_array_equal(first[:, 3:6], [[0, 0, -1]] * 3)
+    # Y_0 = 0.28209479; a third of 2 is a square of the edge 0.8165, of which 0.65; logit(0.95).
+    np.testing.assert_allclose(first[:, 6:9], [[0, 1.7724539, -1.7724539]] * 3, rtol=1e-5)
+    np.testing.assert_allclose(first[:, 9], 2.944439, rtol=1e-5)
+    np.testing.assert_allclose(np.exp(first[:, 10:13]), [[0.530723, 0.530723, 0.0530723]] * 3, 1e-5)
+    np.testing.assert_array_equal(first[:, 13:], [[0, 1, 0, 0]] * 3)  # +z turned to -z
+    np.testing.assert_allclose(read(path, 1)[:, 2], -1)
+    with ZipFile(path) as archive:
+        index = json.loads(archive.read("index.json"))
+    assert index["frames"][1] == {"file": "frame_0001.ply", "time": 1.0, "seconds": 3.0}
+
+
+def test_gaussians_go_with_the_field_and_lie_in_the_surface(moving_ball, around, tmp_path):
+    surface = surface_of(moving_ball, moving_ball.surface(), around, ExportSettings(faces=800))
+    mesh = carried(surface, moving_ball, (0.0, 1.0))
+    path = tmp_path / "splats.zip"
+    write_splats(path, mesh, {}, UpFrame.of(around, "auto", 1.0), 3.0)
+    rest, moved = read(path, 0), read(path, 1)
+    assert np.linalg.norm(rest[:, :3], axis=1) == pytest.approx(0.5, abs=0.02)
+    # The ball grows by a fifth and moves by 0.4 along x.
+    np.testing.assert_allclose(moved[:, :3], 1.2 * rest[:, :3] + [0.4, 0, 0], atol=1e-4)
+    # +z turned by the quaternion is the normal, which leads away from the middle.
+    w, x, y, z = rest[:, 13:].T
+    turned = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
+    np.testing.assert_allclose(turned, rest[:, 3:6], atol=1e-5)
+    assert ((turned * rest[:, :3]).sum(axis=1) / 0.5).min() > math.cos(math.radians(25))
