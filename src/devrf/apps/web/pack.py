@@ -4,7 +4,7 @@
 
 ==================== ==============================================================================
 ``density``          raw densities v at rest, half precision
-``rough``            for pictures in haste: RGB as rays see it that go straight in, and v; bytes
+``rough``            for pictures in haste: RGB from the nearest camera, and v; bytes
 ``features``         colour features f, a byte each: its share of its channel's range, which the
                      network's first layer knows; blocks of four channels, one behind another
 ``weights``          the colour network, single precision
@@ -39,7 +39,6 @@ from torch.nn.functional import normalize, pad
 
 from devrf.apps.camera_paths import upward
 from devrf.apps.captured_cameras import described, frustum_depth
-from devrf.apps.images import evenly
 from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
@@ -58,8 +57,7 @@ from devrf.system.files import atomic_write
 ROUNDED = 1 / 64
 # What is farther counts as infinity, for which JSON has no number.
 FAR = 1e30
-# Places of cameras, and grid points at once, for colours that are the same from all sides.
-EYES = 24
+# Grid points whose colours are found at once.
 CHUNK = 2**16
 # Of a texture's row of weights, four numbers each.
 ROW = 64
@@ -137,7 +135,7 @@ def _parts(model: DeVRFModel, eyes: Tensor) -> Iterator[tuple[str, Tensor]]:
     yield "density", torch.where(shown, raw, raw.min()).half()
     if not model.space.is_linear:  # rays end in the field's outer faces
         shown[[0, -1]] = shown[:, [0, -1]] = shown[:, :, [0, -1]] = True
-    yield "rough", _rough(model, shown, eyes[evenly(len(eyes), EYES)])
+    yield "rough", _rough(model, shown, eyes.to(shown.device))
     low, high = field.color.values[shown | ~shown.any()].aminmax(dim=0)
     high = torch.maximum(high, low + 1e-6)
     shares = ((field.color.values - low) / (high - low)).clamp(0, 1) * shown[..., None]
@@ -148,6 +146,8 @@ def _parts(model: DeVRFModel, eyes: Tensor) -> Iterator[tuple[str, Tensor]]:
     motion = model.deformation
     residual = model.color_residual
     seen = _seen(motion, rest.cell, occupied) if motion else []
+    step = _displacement_step(motion) if motion else 1.0
+    fine = max(1, round(ROUNDED * rest.cell / step))
     for part, mask in ({"rest": rest.mask} | dict(enumerate(seen))).items():
         yield f"distances-{part}", Occupancy(mask, model.box).surroundings.distances
     for k in range(len(motion.clock) if motion else 0):
@@ -155,8 +155,6 @@ def _parts(model: DeVRFModel, eyes: Tensor) -> Iterator[tuple[str, Tensor]]:
         mask = torch.stack(seen[max(k - 1, 0) : k + 1]).any(dim=0)
         near = Occupancy(mask, model.box).points_near(motion.shape, motion.box)
         kept = near[..., None] * motion.to_canonical[k].to(near.device).float()
-        step = _displacement_step(motion)
-        fine = max(1, round(ROUNDED * rest.cell / step))
         code = 2**15 + fine * (kept / step / fine).round().int()
         yield f"displacement-{k}", torch.cat([code >> 8, code & 255]).byte()
         if residual is not None:
@@ -169,24 +167,18 @@ def _parts(model: DeVRFModel, eyes: Tensor) -> Iterator[tuple[str, Tensor]]:
 def _rough(model: DeVRFModel, shown: Tensor, eyes: Tensor) -> Tensor:
     """Colours and v + b, (X, Y, Z, 4) bytes, of grid points where ``shown`` (X, Y, Z); else 0.
 
-    Colours are those for that of the ``eyes`` (K, 3) which looks most nearly straight at the
-    surface; bytes of densities are quarters above -20.
+    Colours are as the nearest of the ``eyes`` (K, 3) sees them; bytes of densities are quarters
+    above -20.
     """
-    field, space = model.canonical, model.space
-    shape = field.density.shape
-    voxel = [edge / (n - 1) for edge, n in zip(model.box.size, shape, strict=True)]
-    slope = torch.stack(torch.gradient(field.voxel_alpha(1.0), spacing=voxel), dim=-1)
-    inward = 0.01 * min(voxel) * normalize(slope, dim=-1)
-    points = model.box.grid_points(shape, slope)
-    codes = torch.zeros(*shape, 4, dtype=torch.uint8, device=slope.device)
+    field = model.canonical
+    points = model.box.grid_points(field.density.shape, eyes)
+    codes = torch.zeros(*field.density.shape, 4, dtype=torch.uint8, device=shown.device)
     for where in torch.split(shown.nonzero(), CHUNK):
         at = where.unbind(dim=1)
-        world = space.to_world(points[at])
-        views = normalize(world[:, None] - eyes.to(world), dim=-1)
-        straight = (views * (space.to_world(points[at] + inward[at]) - world)[:, None]).sum(dim=-1)
-        every = torch.arange(len(where), device=slope.device)
-        chosen = views[every, straight.argmax(dim=1)]
-        color = field.decoder(field.color.values[at], chosen, every)
+        world = model.space.to_world(points[at])
+        views = normalize(world - eyes[torch.cdist(world, eyes).argmin(dim=1)], dim=1)
+        every = torch.arange(len(views), device=views.device)
+        color = field.decoder(field.color.values[at], views, every)
         density = 4 * (field.density.values[at] + field.shift + 20)
         codes[at] = torch.cat([255 * color, density.clamp(0, 255)], dim=1).round().byte()
     return codes
@@ -226,37 +218,22 @@ def _residual_step(model: DeVRFModel) -> float:
 def _weights(decoder: ColorDecoder, low: Tensor, high: Tensor) -> Tensor:
     """The colour network as scene.glsl reads it: vec4s, in rows of ``ROW``.
 
-    A layer lies in blocks of four outputs by four inputs, column by column. The first one takes
-    shares of the features' ranges from ``low`` to ``high`` (C,); of directions it takes d, sin d,
-    cos d, sin 2d, cos 2d and so on.
+    The first layer takes shares of the features' ranges from ``low`` to ``high`` (C,).
     """
     network = decoder.network
-    octaves = len(network.octaves)
-    order = [0, *(k for n in range(octaves) for k in (1 + n, 1 + octaves + n))]
-    groups = network.direction_weight.reshape(-1, 1 + 2 * octaves, 3)[:, order]
-    directions = _filled(groups.flatten(1)).reshape(-1, 4, 3 + 6 * octaves).transpose(1, 2)
-    parts = [
-        _filled(network.feature_bias + network.feature_weight @ low),
-        _blocks(network.feature_weight * (high - low)),
-        directions,
-        _filled(network.hidden_bias),
-        _blocks(network.hidden_weight).transpose(0, 1),  # all that an input adds, together
-        _filled(network.output_bias),
-        _blocks(network.output_weight),
-    ]
-    flat = torch.cat([part.flatten() for part in parts])
+    parts = (
+        (network.feature_bias + network.feature_weight @ low)[:, None],
+        network.feature_weight * (high - low),
+        network.direction_weight,
+        network.hidden_bias[:, None],
+        network.hidden_weight,
+        network.output_bias[:, None],
+        network.output_weight,
+    )
+    # What one input after the other adds to all outputs; of both a multiple of four.
+    whole = [pad(part, (0, -part.shape[1] % 4, 0, -part.shape[0] % 4)).T for part in parts]
+    flat = torch.cat([part.flatten() for part in whole])
     return pad(flat, (0, -len(flat) % (4 * ROW))).view(1, -1, ROW, 4)
-
-
-def _blocks(matrix: Tensor) -> Tensor:
-    """A matrix (O, I) as (⌈O/4⌉, ⌈I/4⌉, 4, 4) with the columns of each block in turn."""
-    whole = _filled(pad(matrix, (0, -matrix.shape[1] % 4)))
-    return whole.reshape(len(whole) // 4, 4, -1, 4).permute(0, 2, 3, 1)
-
-
-def _filled(values: Tensor) -> Tensor:
-    """Values (N, …) with zeros up to a multiple of four rows."""
-    return torch.cat([values, values.new_zeros(-len(values) % 4, *values.shape[1:])])
 
 
 def _description(model: DeVRFModel, viewpoints: Viewpoints) -> dict[str, Any]:

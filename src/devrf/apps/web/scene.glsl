@@ -131,16 +131,19 @@ int clearance(vec3 point) {
 }
 
 // Colour network: docs/method.md#colour. Groups of three numbers of the direction; parts' places.
+// Of each part come numbers for all outputs, input after input; biases take four inputs' place.
 const int GROUPS = 1 + 2 * FREQUENCIES;
-const int FROM_FEATURES = WIDTH;
+const int FROM_FEATURES = 4 * WIDTH;
 const int FROM_DIRECTION = FROM_FEATURES + 4 * WIDTH * FEATURES;
-const int HIDDEN_BIAS = FROM_DIRECTION + 3 * WIDTH * GROUPS;
-const int HIDDEN = HIDDEN_BIAS + WIDTH;
+const int HIDDEN_BIAS = FROM_DIRECTION + WIDTH * ((3 * GROUPS + 3) / 4 * 4);
+const int HIDDEN = HIDDEN_BIAS + 4 * WIDTH;
 const int OUTPUT_BIAS = HIDDEN + 4 * WIDTH * WIDTH;
-const int OUTPUT = OUTPUT_BIAS + 1;
+const int OUTPUT = OUTPUT_BIAS + 4;
 
 vec4 number(int k) { return texelFetch(weights, ivec3(k & 63, k >> 6, 0), 0); }
-mat4 block(int k) { return mat4(number(k), number(k + 1), number(k + 2), number(k + 3)); }
+mat4 block(int k, int outputs) {
+  return mat4(number(k), number(k + outputs), number(k + 2 * outputs), number(k + 3 * outputs));
+}
 
 // What the first layer gets from the direction: the same for all samples of a ray.
 vec4 fromRay[WIDTH];
@@ -149,14 +152,14 @@ void encode(vec3 direction) {
   vec3 code[GROUPS];
   code[0] = direction;
   for (int k = 0; k < FREQUENCIES; k++) {
-    code[1 + 2 * k] = sin(exp2(float(k)) * direction);
-    code[2 + 2 * k] = cos(exp2(float(k)) * direction);
+    code[1 + k] = sin(exp2(float(k)) * direction);
+    code[1 + FREQUENCIES + k] = cos(exp2(float(k)) * direction);
   }
   for (int j = 0; j < WIDTH; j++) {
     fromRay[j] = number(j);
     for (int group = 0; group < GROUPS; group++) {
-      int k = FROM_DIRECTION + 3 * (j * GROUPS + group);
-      fromRay[j] += mat3x4(number(k), number(k + 1), number(k + 2)) * code[group];
+      int k = FROM_DIRECTION + 3 * group * WIDTH + j;
+      fromRay[j] += mat3x4(number(k), number(k + WIDTH), number(k + 2 * WIDTH)) * code[group];
     }
   }
 }
@@ -170,13 +173,14 @@ vec3 network(vec3 p, vec3 added) {
   for (int i = 0; i < WIDTH; i++) hidden[i] = number(HIDDEN_BIAS + i);
   for (int j = 0; j < WIDTH; j++) {
     vec4 unit = fromRay[j];
-    int k = FROM_FEATURES + 4 * j * FEATURES;
-    for (int c = 0; c < FEATURES; c++) unit += block(k + 4 * c) * feature[c];
+    for (int c = 0; c < FEATURES; c++) {
+      unit += block(FROM_FEATURES + 4 * c * WIDTH + j, WIDTH) * feature[c];
+    }
     unit = max(unit, 0.0);
-    for (int i = 0; i < WIDTH; i++) hidden[i] += block(HIDDEN + 4 * (j * WIDTH + i)) * unit;
+    for (int i = 0; i < WIDTH; i++) hidden[i] += block(HIDDEN + 4 * j * WIDTH + i, WIDTH) * unit;
   }
   vec4 logits = number(OUTPUT_BIAS);
-  for (int i = 0; i < WIDTH; i++) logits += block(OUTPUT + 4 * i) * max(hidden[i], 0.0);
+  for (int i = 0; i < WIDTH; i++) logits += block(OUTPUT + 4 * i, 1) * max(hidden[i], 0.0);
   return 1.0 / (1.0 + exp(-(logits.xyz + added)));
 }
 
