@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import shlex
+from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -36,11 +38,13 @@ def config_folder() -> Path:
     return installed if installed.is_dir() else Path(__file__).resolve().parents[3] / "conf"
 
 
-def group_choices() -> dict[str, list[str]]:
+@cache
+def group_choices() -> Mapping[str, Sequence[str]]:
     """The names that each ``group=NAME`` takes."""
     names: dict[str, list[str]] = {}
-    for path in sorted(config_folder().glob("*/**/*.yaml")):
-        place = path.parent.relative_to(config_folder())
+    folder = config_folder()
+    for path in sorted(folder.glob("*/**/*.yaml")):
+        place = path.parent.relative_to(folder)
         names.setdefault(place.as_posix(), []).append(path.stem)
     return names
 
