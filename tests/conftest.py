@@ -16,6 +16,8 @@ from typing import Any
 
 import devrf  # noqa: F401 - before Lightning: an unusable torchvision ends no test
 
+gc.disable()  # what is imported until all tests are collected stays
+
 # A shell without job control starts what is in the background with SIGINT ignored, and so would
 # be every command that a test starts.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
@@ -114,6 +116,7 @@ def pytest_collection_finish() -> None:
     """Keep Python from looking for garbage, again and again, among all that was imported."""
     gc.collect()
     gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(autouse=True)

@@ -29,6 +29,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+gc.disable()  # what is imported stays
+
 import torch
 from hydra.core.plugins import Plugins
 
@@ -128,6 +130,7 @@ def main() -> None:
     assert take(torch.empty(0))  # loads Warp
     Plugins.instance()
     gc.freeze()  # what is there stays shared with the children
+    gc.enable()
     print("ready", flush=True)
     for line in sys.stdin:
         asked = json.loads(line)

@@ -27,6 +27,7 @@ from devrf.cli.config import APART, PATHS, config_folder, group_choices
 from devrf.cli.messages import in_quotes
 from devrf.cli.restore_config import of_named_run, parsed, told, value, values
 from devrf.errors import DevrfError
+from devrf.system.process import importing
 
 # Stages that DeVRF's protocol alone has.
 OF_DEVRF = ("canonical", "deformation")
@@ -97,11 +98,11 @@ def _told_by_scene(option: str | None, root: str, overrides: Sequence[Override])
     Raises:
         DevrfError: ``option`` is None, and no reader knows the layout.
     """
-    # Imported here: they load torch.
-    import torch
+    with importing():  # they load torch
+        import torch
 
-    from devrf.data.kind import by_one_camera, faces_forward
-    from devrf.scenes.formats import recognise
+        from devrf.data.kind import by_one_camera, faces_forward
+        from devrf.scenes.formats import recognise
 
     words = []
     why = "its cameras"

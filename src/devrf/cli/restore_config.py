@@ -34,6 +34,7 @@ from devrf.cli.config_check import RESERVED
 from devrf.cli.messages import in_quotes
 from devrf.errors import DevrfError
 from devrf.system.files import read_record
+from devrf.system.process import importing
 
 log = logging.getLogger(__name__)
 
@@ -182,7 +183,8 @@ def of_named_run(typed: Sequence[Override], multirun: bool) -> list[str]:
         return _of_sweep(typed, Path(sweep))
     if not checkpoints and (folder is None or multirun):
         return []
-    from devrf.checkpoints.checkpoint import latest_checkpoint, metadata_of  # loads torch
+    with importing():  # it loads torch
+        from devrf.checkpoints.checkpoint import latest_checkpoint, metadata_of
 
     if not checkpoints and (last := latest_checkpoint(Path(str(folder)))):
         checkpoints = [last]
