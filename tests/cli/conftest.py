@@ -10,7 +10,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -203,10 +203,24 @@ class Warm:
         status = self._answer(folder=str(folder), arguments=arguments, **how)
         return Outcome(status, said.read_text()[before:], "")
 
+    def together(self, folders: Sequence[Path], *arguments: str, **each: Any) -> list[Outcome]:
+        """``devrf ARGUMENTS`` in each of the folders at once; ``each`` has a value for each."""
+        begun = []
+        for k, folder in enumerate(folders):
+            how = {name: values[k] for name, values in each.items()}
+            how |= {"begins": True, "complaints": "complaints.txt"}
+            begun.append(self._answer(folder=str(folder), arguments=arguments, **how))
+        outcomes = []
+        for child, folder in zip(begun, folders, strict=True):
+            status = self._answer(wait=child)
+            said = (folder / "said.txt").read_text()
+            outcomes.append(Outcome(status, said, (folder / "complaints.txt").read_text()))
+        return outcomes
+
     def hanging(self, folder: Path, *arguments: str) -> int:
         """``devrf ARGUMENTS stage=prepare``, begun in a process that works on; its number."""
         arguments = (*arguments, "stage=prepare")
-        child = self._answer(folder=str(folder), arguments=arguments, hangs=True)
+        child = self._answer(folder=str(folder), arguments=arguments, hangs=True, begins=True)
         self._hanging.append(child)
         for _ in range(6000):
             if list(folder.rglob("begun")):
@@ -231,14 +245,16 @@ class Warm:
         return int(json.loads(self._process.stdout.readline()))
 
 
-@pytest.fixture(scope="session")
-def warm() -> Iterator[Warm]:
-    """Runs commands in processes of their own, at the cost of a fork each."""
+@contextlib.contextmanager
+def warmed(*path: Path) -> Iterator[Warm]:
+    """Runs commands in processes of their own, which find modules in the folders of ``path``."""
     if not hasattr(os, "fork"):
         pytest.skip("needs fork")
+    own = environment()
+    own["PYTHONPATH"] = os.pathsep.join([own["PYTHONPATH"], *map(str, path)])
     with subprocess.Popen(
         [sys.executable, str(Path(__file__).with_name("warm_process.py"))],
-        env=environment(),
+        env=own,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -247,3 +263,16 @@ def warm() -> Iterator[Warm]:
         assert process.stdout.readline() == "ready\n"
         yield Warm(process)
         process.stdin.close()
+
+
+@pytest.fixture(scope="session")
+def warm() -> Iterator[Warm]:
+    """Runs commands in processes of their own, at the cost of a fork each."""
+    with warmed() as commands:
+        yield commands
+
+
+@pytest.fixture(scope="session")
+def warm_with() -> Callable[..., contextlib.AbstractContextManager[Warm]]:
+    """The function :func:`warmed`."""
+    return warmed

@@ -74,20 +74,30 @@ def modules(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def pair(devrf_in, tiny, often, tmp_path_factory, modules):
+def learning(tiny, often):
+    """``learning(folder)``: how several processes learn, and record in the folder what."""
+
+    def words(folder):
+        return (
+            *(word for word in tiny if word not in ("trainer=cpu", "~callbacks.training_curve")),
+            *("trainer=ddp", "trainer.accelerator=cpu", *often),
+            "hydra.run.dir=run",
+            "evaluation.metrics=[]",
+            "video.frames=1",
+            "+callbacks.witness._target_=witnesses.Witness",
+            f"+callbacks.witness.folder={folder}",
+            "callbacks.training_curve._target_=witnesses.Curve",
+            f"callbacks.training_curve.folder={folder}/curves",
+        )
+
+    return words
+
+
+@pytest.fixture(scope="module")
+def pair(devrf_in, learning, tmp_path_factory, modules):
     """The folder of a run in two processes, left after 4 iterations, and how it went on."""
     folder = tmp_path_factory.mktemp("pair")
-    arguments = (
-        *(word for word in tiny if word not in ("trainer=cpu", "~callbacks.training_curve")),
-        *(*TWO, *often),
-        "hydra.run.dir=run",
-        "evaluation.metrics=[]",
-        "video.frames=1",
-        "+callbacks.witness._target_=witnesses.Witness",
-        f"+callbacks.witness.folder={folder}",
-        "callbacks.training_curve._target_=witnesses.Curve",
-        f"callbacks.training_curve.folder={folder}/curves",
-    )
+    arguments = (*learning(folder), "trainer.devices=2")
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(modules))
         first = devrf_in(folder, *arguments, "stage=canonical", "trainer.max_steps=4")
@@ -173,58 +183,44 @@ def test_a_fault_of_another_process_keeps_its_traceback():
     assert isinstance(kept, RuntimeError) and str(kept) == said
 
 
-def nodes(folders, commands, environments, modules):
-    """What two commands, begun together, came to: exit status, stdout, stderr of each."""
-    source = os.pathsep.join([str(Path(package.__file__).parents[1]), str(modules)])
-    common = {**os.environ, "PYTHONPATH": source, "OMP_NUM_THREADS": "1", "HYDRA_FULL_ERROR": "0"}
+def test_two_nodes_of_torchrun_learn_what_two_processes_of_one_command_learn(
+    pair, learning, modules, tmp_path
+):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    agent = ("torch.distributed.run", "--nnodes=2", "--nproc-per-node=1")
+    agent += ("--master-addr=127.0.0.1", f"--master-port={port}")
+    learn = ("-m", "devrf", *learning(tmp_path), "stage=canonical")
+    learn += ("trainer.devices=1", "trainer.num_nodes=2")
+    path = os.pathsep.join([str(Path(package.__file__).parents[1]), str(modules)])
+    own = {"PYTHONPATH": path, "OMP_NUM_THREADS": "1", "HYDRA_FULL_ERROR": "0"}
     begun = [
         subprocess.Popen(
-            [sys.executable, *command],
-            cwd=folder,
-            env={**common, **own},
+            [sys.executable, "-m", *agent, f"--node-rank={rank}", *learn],
+            cwd=tmp_path,
+            env={**os.environ, **own},
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
         )
-        for folder, command, own in zip(folders, commands, environments, strict=True)
+        for rank in (0, 1)
     ]
     said = [process.communicate(timeout=120) for process in begun]
-    return [(process.returncode, *words) for process, words in zip(begun, said, strict=True)]
+    assert [process.returncode for process in begun] == [0, 0], said
+    (first, _), (second, complaint) = said
+    assert first.count("canonical: seconds") == 1
+    # torchrun's agent warns there when the agent that keeps the store ends before it.
+    assert second == "" and "devrf:" not in complaint
+    fields = [
+        json.loads((folder / f"static-{rank}.json").read_text())["fields"]
+        for folder in (pair[0], tmp_path)
+        for rank in (0, 1)
+    ]
+    assert fields == fields[:1] * 4
 
 
-def test_two_nodes_of_torchrun_learn_what_two_processes_of_one_command_learn(
-    devrf, tiny, modules, monkeypatch, tmp_path
-):
-    monkeypatch.syspath_prepend(str(modules))
-    common = (*(word for word in tiny if word != "trainer=cpu"), "stage=canonical", "trainer=ddp")
-    common += ("trainer.accelerator=cpu", "+callbacks.witness._target_=witnesses.Witness")
-    fields = {}
-    for name in ("one", "two"):
-        (tmp_path / name).mkdir()
-        own = (f"hydra.run.dir={name}/run", f"+callbacks.witness.folder={tmp_path / name}")
-        if name == "one":
-            assert devrf(*common, *own, "trainer.devices=2").status == 0
-        else:
-            with socket.socket() as free:
-                free.bind(("127.0.0.1", 0))
-                port = free.getsockname()[1]
-            agent = ("torch.distributed.run", "--nnodes=2", "--nproc-per-node=1")
-            agent += ("--master-addr=127.0.0.1", f"--master-port={port}")
-            devices = ("trainer.devices=1", "trainer.num_nodes=2")
-            learn = ("-m", "devrf", *common, *own, *devices)
-            commands = [("-m", *agent, f"--node-rank={rank}", *learn) for rank in (0, 1)]
-            first, second = nodes([tmp_path] * 2, commands, [{}, {}], modules)
-            assert (first[0], second[:2]) == (0, (0, "")), (first, second)
-            assert first[1].count("canonical: seconds") == 1
-            # torchrun's agent warns there when the agent that keeps the store ends before it.
-            assert "devrf:" not in second[2]
-        written = [json.loads((tmp_path / name / f"static-{k}.json").read_text()) for k in (0, 1)]
-        fields[name] = written[0]["fields"]
-        assert written[1]["fields"] == fields[name]
-    assert fields["one"] == fields["two"]
-
-
-def test_tasks_of_slurm_without_a_common_folder_end_with_a_line_each(tiny, modules, tmp_path):
+def test_tasks_of_slurm_without_a_common_folder_end_with_a_line_each(warm, tiny, tmp_path):
     # What srun sets in the tasks of two nodes.
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -233,12 +229,10 @@ def test_tasks_of_slurm_without_a_common_folder_end_with_a_line_each(tiny, modul
     job |= {"SLURM_NNODES": "2", "SLURM_NTASKS_PER_NODE": "1", "SLURM_LOCALID": "0"}
     job |= {"SLURM_NODELIST": "127.0.0.1", "MASTER_PORT": str(port)}
     tasks = [{**job, "SLURM_PROCID": str(k), "SLURM_NODEID": str(k)} for k in (0, 1)]
-    command = ("-m", "devrf", *(word for word in tiny if word != "trainer=cpu"), "trainer=ddp")
+    command = (*(word for word in tiny if word != "trainer=cpu"), "trainer=ddp")
     command += ("trainer.accelerator=cpu", "trainer.devices=1", "trainer.num_nodes=2")
     folders = [tmp_path / "first", tmp_path / "second"]
-    for folder in folders:
-        folder.mkdir()
-    ended = nodes(folders, [(*command, "hydra.run.dir=run")] * 2, tasks, modules)
-    for folder, (status, _, complaint) in zip(folders, ended, strict=True):
-        assert status == 2 and complaint.count("\n") == 1
-        assert complaint.startswith(f"devrf: {folder / 'run'}: not there on every node; give")
+    ended = warm.together(folders, *command, "hydra.run.dir=run", environment=tasks)
+    for folder, outcome in zip(folders, ended, strict=True):
+        assert outcome.status == 2 and outcome.err.count("\n") == 1
+        assert outcome.err.startswith(f"devrf: {folder / 'run'}: not there on every node; give")

@@ -12,7 +12,11 @@ the signal that ended it. The keys, all but the first two optional:
 * ``most_bytes``: how large a file may become, as on a disk that is full.
 * ``most_memory``: bytes that the process may take beside what it has already.
 * ``hangs``: the stage ``prepare`` makes a file ``begun`` in the run's folder and goes on for longer
-  than any test. The answer is the number of the process, which ``{"end": NUMBER}`` kills.
+  than any test.
+* ``environment``: variables to set.
+* ``begins``: the answer, at once, is the number of the process, for which ``{"wait": NUMBER}``
+  waits, and which ``{"end": NUMBER}`` kills.
+* ``complaints``: the file for what is said on stderr, instead of ``said.txt``.
 """
 
 from __future__ import annotations
@@ -95,9 +99,10 @@ def run(asked: dict[str, Any]) -> int:
     folder = Path(asked["folder"])
     folder.mkdir(parents=True, exist_ok=True)
     os.chdir(folder)
-    with open("said.txt", "a") as said:
-        os.dup2(said.fileno(), 1)
-        os.dup2(said.fileno(), 2)
+    for file, descriptor in (("said.txt", 1), (asked.get("complaints", "said.txt"), 2)):
+        with open(file, "a") as said:
+            os.dup2(said.fileno(), descriptor)
+    os.environ.update(asked.get("environment", {}))
     if "most_bytes" in asked:
         resource.setrlimit(resource.RLIMIT_FSIZE, (asked["most_bytes"],) * 2)
     if "most_memory" in asked:
@@ -137,6 +142,8 @@ def main() -> None:
         if "end" in asked:
             child = asked["end"]
             os.kill(child, signal.SIGKILL)
+        elif "wait" in asked:
+            child = asked["wait"]
         else:
             child = os.fork()
         if child == 0:
@@ -145,7 +152,7 @@ def main() -> None:
                 status = run(asked)
             finally:
                 os._exit(status)
-        if asked.get("hangs"):
+        if asked.get("begins"):
             print(child, flush=True)
             continue
         _, how = os.waitpid(child, 0)
