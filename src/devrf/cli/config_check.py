@@ -67,7 +67,8 @@ def check_config(config: DictConfig) -> None:
         raise DevrfError(f"{key}: required; give {key}={value}")
     raw: Any = OmegaConf.to_container(config)
     resolved: Any = OmegaConf.to_container(config, resolve=True)
-    read = tuple(f"{key}." for key in REFERENCE.findall(OmegaConf.to_yaml(config)))
+    text = json.dumps(raw, default=str, ensure_ascii=False)
+    read = tuple(f"{key}." for key in REFERENCE.findall(text))
     # A key that is missing is wrong in its type, too.
     content = json.dumps(dict.fromkeys(ROOT) | resolved, default=str)
     try:

@@ -62,10 +62,11 @@ def run(config: DictConfig) -> float | None:
     guard = record_failure(config, folder) if in_sweep() else report_user_errors()
     with guard, working_in(folder, config):
         log_told()
-        check_config(config)
-        check_extras(config)
-        # Imported here: --help and a misspelt key are answered before torch has loaded.
+        # The check loads the parts that the config names, torch among them.
         with importing():
+            check_config(config)
+            check_extras(config)
+            # Imported here: --help and a misspelt key are answered before torch has loaded.
             from devrf.cli.run import run_stage
 
         return run_stage(config, folder)
