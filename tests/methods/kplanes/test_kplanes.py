@@ -182,7 +182,7 @@ def test_time_has_half_as_many_points_as_frames() -> None:
 def test_it_learns(form: dict[str, Any], learned_losses: Callable[..., list[float]]) -> None:
     torch.manual_seed(0)
     model = KPlanes(replace(TINY, **form))
-    sizes = {"iterations": 120, "rays": 128, "iterations_per_step": 20}
+    sizes = {"iterations": 60, "rays": 128, "iterations_per_step": 10}
     rates = {"learning_rate": 3e-2, "final_learning_rate": 0.0, "decay": "cosine", "warmup": 0.1}
     losses = learned_losses(model, term="color", loss=LOSS, **sizes, **rates)
     assert losses[-1] < 0.7 * losses[0]
