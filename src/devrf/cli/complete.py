@@ -137,13 +137,16 @@ def _told_by_scene(option: str | None, root: str, overrides: Sequence[Override])
 
 def _of_experiments(overrides: Sequence[Override], config_dir: str | None) -> list[str | None]:
     """The options of ``data`` that experiments choose, which may lie in other folders; or None."""
+    names = values(overrides, "experiment")
+    if not names:
+        return [None]
     texts = [str(o.input_line) for o in overrides if o.key_or_group == "hydra.searchpath"]
     if config_dir:
         texts.append(f"hydra.searchpath=[{in_quotes(f'file://{os.path.abspath(config_dir)}')}]")
     options: list[str | list[str] | None] = []
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         loader = GlobalHydra.instance().config_loader()
-        for name in values(overrides, "experiment"):
+        for name in names:
             with suppress(HydraException):  # reported when Hydra composes it
                 words = [f"experiment={name}", *texts]
                 found = loader.compute_defaults_list("config", words, RunMode.RUN)

@@ -22,6 +22,7 @@ from devrf.cli.complete import completed
 from devrf.cli.config import command_line
 from devrf.cli.context import RunContext
 from devrf.cli.memory import compare, needs
+from devrf.cli.restore_config import log_told
 from devrf.engine.ddp import ManualDDP
 from devrf.errors import DevrfError
 from devrf.scenes.export import export
@@ -52,6 +53,7 @@ def capture(run: RunContext) -> None:
     folder = scene_from_footage(settings)
     words = [f"data.root={folder}"]
     config = compose("config", completed(words))
+    log_told()
     captured = RunContext(config, run.folder)
     inspect(captured)
     _, _, change = compare(captured, captured.stages_with_images)
