@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from devrf.apps.capture.movers import masks_of_movers
+from devrf.apps.capture.movers import Film
 from devrf.scenes.sparse_model import ModelImage, SparseModel
 
 WIDTH = 160
@@ -45,13 +46,14 @@ def filmed(tmp_path):
         lens = {"fl_x": FOCAL, "fl_y": FOCAL, "w": WIDTH, "h": HEIGHT, "cx": 80.0, "cy": 60.0}
         points = np.zeros((0, 3))
         model = SparseModel(Path(), {1: lens}, tuple(images), points, np.zeros(0, np.int64))
-        return masks_of_movers(tmp_path, [image.name for image in images], model)
+        return Film(tmp_path, [image.name for image in images]), model
 
     return film
 
 
 def test_what_leaves_its_epipolar_lines_is_masked(filmed):
-    masks = filmed(patch=True)
+    film, model = filmed(patch=True)
+    masks = film.masks_of_movers(model)
     middle = masks["4.png"]
     assert middle.shape == (HEIGHT, WIDTH) and set(np.unique(middle)) == {0, 255}
     inside = middle[20 + STEP * 4 : 70 + STEP * 4, 50:110]
@@ -60,4 +62,20 @@ def test_what_leaves_its_epipolar_lines_is_masked(filmed):
 
 
 def test_where_nothing_moves_there_are_no_masks(filmed):
-    assert filmed(patch=False) == {}
+    film, model = filmed(patch=False)
+    assert film.masks_of_movers(model) == {}
+
+
+def test_what_stands_still_tells_which_cameras_are_right(filmed):
+    film, model = filmed(patch=True)
+    masks = film.masks_of_movers(model)
+    # Cameras that rise as the patch goes down explain it, and nothing else.
+    risen = replace(
+        model,
+        images=tuple(
+            replace(image, translation=(image.translation[0], STEP * k / FOCAL, 0.0))
+            for k, image in enumerate(model.images)
+        ),
+    )
+    assert film.error_of_still(model, masks) < 0.1
+    assert film.error_of_still(risen, masks) > 1.0

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -54,77 +55,152 @@ LEAST_SHARE = 0.02
 Numbers = npt.NDArray[np.float64]
 
 
-def masks_of_movers(images: Path, names: Sequence[str], model: SparseModel) -> dict[str, Mask]:
-    """Where nothing moves, by the cameras of a model: 255, what moves and its rim: 0.
+class Film:
+    """A moving camera's images, and the optical flow between any two, estimated once."""
 
-    Args:
-        images: the folder of images.
-        names: the moving camera's, in order of time, relative to the folder.
-        model: structure from motion of these images; those it has not placed get no mask.
+    def __init__(self, images: Path, names: Sequence[str]) -> None:
+        """Read images.
 
-    Returns:
-        (H, W) of each image, of the images' size; none where less moves than is worth masking.
-    """
-    place = {image.name: k for k, image in enumerate(model.images)}
-    posed = [name for name in names if name in place]
-    read = (cv2.imread(str(images / name), cv2.IMREAD_COLOR) for name in posed)
-    pictures = [np.asarray(picture, np.uint8) for picture in read]
-    height, width = pictures[0].shape[:2]
-    small = [shrunk(picture, LONGER_SIDE) for picture in pictures]
-    cameras = [_Camera(model, place[name], small[0].shape[1]) for name in posed]
-    flow = _Flows(small)
-    numbered = enumerate(followed(small, len(small), "what moves"))
-    votes = [_votes(k, flow, cameras, _textured(picture)) for k, picture in numbered]
-    masks = dict[str, Mask]()
-    rim = 2 * round(RIM * LONGER_SIDE) + 1
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (rim, rim))
-    for name, agreed in zip(posed, _agreed(votes, flow), strict=True):
-        moves = cv2.dilate(np.asarray(agreed > MOVES, np.uint8), disc)
-        still = cv2.resize(1 - moves, (width, height), interpolation=cv2.INTER_NEAREST)
-        masks[name] = np.asarray(255 * still, np.uint8)
-    share = float(np.mean([(mask == 0).mean() for mask in masks.values()]))
-    log.info("structure from motion: %.0f %% of the pixels are of what moves", 100 * share)
-    return masks if share >= LEAST_SHARE else {}
-
-
-class _Flows:
-    """Optical flow between any two of some pictures (H, W, 3), estimated once."""
-
-    def __init__(self, pictures: Sequence[npt.NDArray[Any]]) -> None:
-        self._pictures = [torch.from_numpy(picture) for picture in pictures]
-        self._between = cache(self._estimated)
+        Args:
+            images: the folder of images.
+            names: the moving camera's, in order of time, relative to the folder.
+        """
+        self._names = names
+        read = (cv2.imread(str(images / name), cv2.IMREAD_COLOR) for name in names)
+        pictures = [np.asarray(picture, np.uint8) for picture in read]
+        self._size = pictures[0].shape[1::-1]
+        self._small = [shrunk(picture, LONGER_SIDE) for picture in pictures]
         self._estimator = estimator("dis")
+        self._estimated = cache(self._estimate)
 
-    def __len__(self) -> int:
-        return len(self._pictures)
+    def masks_of_movers(self, model: SparseModel) -> dict[str, Mask]:
+        """Where nothing moves, by the cameras of a model: 255, what moves and its rim: 0.
+
+        Args:
+            model: structure from motion of these images; those it has not placed get no mask.
+
+        Returns:
+            (H, W) of each image, of the images' size; none where less moves than is worth masking.
+        """
+        shots = self._placed(model)
+        rim = 2 * round(RIM * LONGER_SIDE) + 1
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (rim, rim))
+        votes = [shots.votes(k) for k in followed(range(len(shots)), len(shots), "what moves")]
+        masks = dict[str, Mask]()
+        for number, agreed in zip(shots.numbers, shots.agreed(votes), strict=True):
+            moves = cv2.dilate(np.asarray(agreed > MOVES, np.uint8), disc)
+            still = cv2.resize(1 - moves, self._size, interpolation=cv2.INTER_NEAREST)
+            masks[self._names[number]] = np.asarray(255 * still, np.uint8)
+        share = float(np.mean([(mask == 0).mean() for mask in masks.values()]))
+        log.info("structure from motion: %.0f %% of the pixels are of what moves", 100 * share)
+        return masks if share >= LEAST_SHARE else {}
+
+    def error_of_still(self, model: SparseModel, masks: Mapping[str, Mask]) -> float:
+        """By how many pixels flow leaves its epipolar lines where ``masks`` say nothing moves.
+
+        The median over the images that a model has placed of each one's median.
+        """
+        shots = self._placed(model)
+        medians = list[float]()
+        for k, number in enumerate(shots.numbers):
+            mask = masks.get(self._names[number])
+            if mask is None:
+                continue
+            height, width = self._small[number].shape[:2]
+            still = cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST) > 0
+            of_pairs = [error[still & np.isfinite(error)] for error in shots.errors(k)]
+            known = np.concatenate([*of_pairs, np.empty(0)])
+            if len(known):
+                medians.append(float(np.median(known)))
+        return float(np.median(medians)) if medians else np.inf
 
     def between(self, one: int, other: int) -> tuple[Numbers, Mask]:
-        """Flow (H, W, 2) from one picture to another, and where (H, W) the way back agrees."""
-        there = self._between(one, other)
-        return there.numpy(), consistent(there, self._between(other, one)).numpy()
+        """Flow (H, W, 2) from one image to another, and where (H, W) the way back agrees."""
+        there = self._estimated(one, other)
+        return there.numpy(), consistent(there, self._estimated(other, one)).numpy()
 
-    def _estimated(self, one: int, other: int) -> Tensor:
-        return self._estimator(self._pictures[one], self._pictures[other])
+    def _estimate(self, one: int, other: int) -> Tensor:
+        pictures = (torch.from_numpy(self._small[number]) for number in (one, other))
+        return self._estimator(*pictures)
+
+    def _placed(self, model: SparseModel) -> _Shots:
+        place = {image.name: k for k, image in enumerate(model.images)}
+        numbers = [number for number, name in enumerate(self._names) if name in place]
+        width = self._small[0].shape[1]
+        cameras = [_Camera(model, place[self._names[number]], width) for number in numbers]
+        textured = [_textured(self._small[number]) for number in numbers]
+        return _Shots(self, numbers, cameras, textured)
 
 
-def _votes(k: int, flow: _Flows, cameras: Sequence[_Camera], textured: Mask) -> Numbers:
-    """(H, W): the share of what is known around each pixel of picture ``k`` that moves."""
-    errors = list[Numbers]()
-    for other in (k + step * way for step in STEPS for way in (-1, 1)):
-        if not 0 <= other < len(flow):
-            continue
-        there, agrees = flow.between(k, other)
-        error = cameras[k].error_of_flow(there, cameras[other])
-        error[~(agrees & textured)] = np.nan
-        usual = max(float(np.nanmedian(error)), NOISE) if np.isfinite(error).any() else np.inf
-        errors.append(error / usual)
-    with warnings.catch_warnings():  # of pixels that no frame knows
-        warnings.simplefilter("ignore", RuntimeWarning)
-        error = np.nanmedian(np.stack(errors), axis=0)
-    known = np.isfinite(error)
-    moves = known & (np.where(known, error, 0) > TIMES_MEDIAN)
-    count = cv2.GaussianBlur(known.astype(np.float64), (0, 0), AROUND)
-    return cv2.GaussianBlur(moves.astype(np.float64), (0, 0), AROUND) / np.maximum(count, 1e-3)
+@dataclass(frozen=True)
+class _Shots:
+    """The images of a film that a model has placed, by their order.
+
+    Attributes:
+        film: the film.
+        numbers: which of its images.
+        cameras: of each.
+        textured: where (H, W) each has texture.
+    """
+
+    film: Film
+    numbers: list[int]
+    cameras: list[_Camera]
+    textured: list[Mask]
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def between(self, one: int, other: int) -> tuple[Numbers, Mask]:
+        """As :meth:`Film.between`."""
+        return self.film.between(self.numbers[one], self.numbers[other])
+
+    def errors(self, k: int) -> Iterator[Numbers]:
+        """(H, W) of each near image: by how much flow there leaves its lines; NaN: unknown."""
+        for other in (k + step * way for step in STEPS for way in (-1, 1)):
+            if 0 <= other < len(self):
+                there, agrees = self.between(k, other)
+                error = self.cameras[k].error_of_flow(there, self.cameras[other])
+                error[~(agrees & self.textured[k])] = np.nan
+                yield error
+
+    def votes(self, k: int) -> Numbers:
+        """(H, W): the share of what is known around each pixel of image ``k`` that moves."""
+        shares = list[Numbers]()
+        for error in self.errors(k):
+            any_known = np.isfinite(error).any()
+            usual = max(float(np.nanmedian(error)), NOISE) if any_known else np.inf
+            shares.append(error / usual)
+        with warnings.catch_warnings():  # of pixels that no frame knows
+            warnings.simplefilter("ignore", RuntimeWarning)
+            error = np.nanmedian(np.stack(shares), axis=0)
+        known = np.isfinite(error)
+        moves = known & (np.where(known, error, 0) > TIMES_MEDIAN)
+        count = cv2.GaussianBlur(known.astype(np.float64), (0, 0), AROUND)
+        return cv2.GaussianBlur(moves.astype(np.float64), (0, 0), AROUND) / np.maximum(count, 1e-3)
+
+    def agreed(self, votes: Sequence[Numbers]) -> list[Numbers]:
+        """The mean of all images' votes (H, W) along the flow, of near ones before others.
+
+        What moves along its epipolar lines for a while moved across them before, or will; what was
+        wrong once is outvoted.
+        """
+        share = [vote.copy() for vote in votes]
+        count = [np.ones_like(vote) for vote in votes]
+        numbers = range(len(votes))
+        for order, way in ((numbers, -1), (numbers[::-1], 1)):
+            # Of the frame before in this order: the sum of votes, and of what each counts for.
+            total = weight = np.zeros_like(votes[0])
+            for k in order:
+                if k != order[0]:
+                    there, agrees = self.between(k, k + way)
+                    total = MEMORY * agrees * _at(total, there)
+                    weight = MEMORY * agrees * _at(weight, there)
+                    share[k] += total
+                    count[k] += weight
+                total = total + votes[k]
+                weight = weight + 1
+        return [a / b for a, b in zip(share, count, strict=True)]
 
 
 def _textured(picture: npt.NDArray[Any]) -> Mask:
@@ -133,30 +209,6 @@ def _textured(picture: npt.NDArray[Any]) -> Mask:
     across = cv2.Sobel(grey, cv2.CV_32F, 1, 0)
     down = cv2.Sobel(grey, cv2.CV_32F, 0, 1)
     return np.asarray(cv2.blur(across**2 + down**2, (7, 7)) > TEXTURE**2)
-
-
-def _agreed(votes: Sequence[Numbers], flow: _Flows) -> list[Numbers]:
-    """The mean of all pictures' votes (H, W) along the flow, those of near pictures before others.
-
-    What moves along its epipolar lines for a while moved across them before, or will; what was
-    wrong once is outvoted.
-    """
-    share = [vote.copy() for vote in votes]
-    count = [np.ones_like(vote) for vote in votes]
-    numbers = range(len(votes))
-    for order, way in ((numbers, -1), (numbers[::-1], 1)):
-        # Of the frame before in this order: the sum of votes, and of what each counts for.
-        total = weight = np.zeros_like(votes[0])
-        for k in order:
-            if k != order[0]:
-                there, agrees = flow.between(k, k + way)
-                total = MEMORY * agrees * _at(total, there)
-                weight = MEMORY * agrees * _at(weight, there)
-                share[k] += total
-                count[k] += weight
-            total = total + votes[k]
-            weight = weight + 1
-    return [a / b for a, b in zip(share, count, strict=True)]
 
 
 def _at(image: Numbers, flow: Numbers) -> Numbers:

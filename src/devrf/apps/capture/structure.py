@@ -16,7 +16,7 @@ import cv2
 import torch
 
 from devrf.apps.capture.images import Chosen, Mask, still_masks
-from devrf.apps.capture.movers import masks_of_movers
+from devrf.apps.capture.movers import Film
 from devrf.apps.settings import CaptureSettings
 from devrf.errors import DevrfError
 from devrf.scenes.footage import is_folder
@@ -74,7 +74,8 @@ def reconstruct(
     they are all of the scene at rest, COLMAP's incremental mapper finds the cameras. Where one
     camera films a scene that moves, its flow and these cameras tell what moves, unless masks are
     given; cameras are found again without it, by both of COLMAP's mappers, and the better model is
-    taken. Returns the folder of the model, in :func:`models_folder`.
+    taken; the first one, if what stands still agrees better with that. Returns the folder of the
+    model, in :func:`models_folder`.
 
     Raises:
         DevrfError: nothing could be matched, or a given mask does not fit.
@@ -93,9 +94,8 @@ def reconstruct(
         )
     if not settings.monocular:
         return first.folder
-    masked = {}
-    if not given:
-        masked = masks_of_movers(images, moving.names, read_model(first.folder))
+    film = Film(images, moving.names)
+    masked = {} if given else film.masks_of_movers(read_model(first.folder))
     if masked:
         log.info("structure from motion: again, without what moves")
         _match(images, work, moving, fixed, settings, masked)
@@ -106,6 +106,16 @@ def reconstruct(
     # Where masks leave too little, cameras are those of whole images.
     known = [model for model in tried if model and model.images >= FEWER * first.images]
     best = max(known or [first], key=lambda model: (model.images, -model.error))
+    if masked and best is not first:
+        error = film.error_of_still(read_model(best.folder), masked)
+        whole = film.error_of_still(read_model(first.folder), masked)
+        log.info(
+            "structure from motion: what stands still is off by %.2f px without what moves, by "
+            "%.2f px with it",
+            error,
+            whole,
+        )
+        best = first if whole < error else best
     log.info("structure from motion: the %s mapper's cameras are taken", best.mapper)
     return best.folder
 
