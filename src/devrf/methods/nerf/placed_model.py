@@ -25,8 +25,9 @@ from devrf.rendering.view import SurfaceField
 from devrf.scenes.scene import Scene
 from devrf.system.plain_data import built
 
-# Rays of a view that are rendered at once, on a CPU and on a GPU.
-ON_CPU = 2048
+# Rays of a view that are rendered at once: on a CPU what its caches hold, of a hundred samples a
+# ray; on a GPU what keeps it busy.
+ON_CPU = 256
 ON_GPU = 2**14
 # Points along an edge of a cube of the box's size, of which a surface is taken.
 SURFACE_SIDE = 128
