@@ -5,9 +5,19 @@ from __future__ import annotations
 import pytest
 import torch
 
-from devrf.apps.camera_paths import bullet_time, captured, orbit, spiral, time_freeze, tour, upward
+from devrf.apps.camera_paths import (
+    bullet_time,
+    captured,
+    orbit,
+    spiral,
+    swing,
+    time_freeze,
+    tour,
+    upward,
+)
 from devrf.apps.video import VideoSettings
 from devrf.geometry.cameras import Cameras
+from devrf.geometry.clock import FrameClock
 
 ORIGIN = torch.zeros(3)
 
@@ -101,3 +111,22 @@ def test_in_a_time_freeze_time_runs_then_the_camera_then_time():
     cameras, times = bullet_time(circle, 0.3, VideoSettings(frames=3))
     assert times == [0.3] * 3
     torch.testing.assert_close(cameras.positions, around)
+
+
+def test_a_swing_is_where_the_camera_was_then_to_and_fro_while_time_stands_still():
+    clock = FrameClock(tuple((torch.arange(33) / 32).tolist()))
+    settings = VideoSettings(frames=60, fps=10, time=0.25)
+    cameras, times = swing(WALK, clock, settings)
+    assert times[:20] == pytest.approx([0.0125 * k for k in range(20)])
+    assert times[20:40] == [0.25] * 20 and times[40] == 0.25 and times[-1] == 1.0
+    angles = azimuths(cameras)
+    # The walk goes from 40 to 120 degrees at an even pace; smoothing keeps off its ends alone.
+    torch.testing.assert_close(angles[10:20], 40 + 80 * torch.tensor(times[10:20]), atol=1, rtol=0)
+    to_and_fro = angles[20:40] - 60
+    assert float(to_and_fro.max()) == pytest.approx(80 * 0.06, abs=0.3)
+    torch.testing.assert_close(to_and_fro, -to_and_fro.flip(0), atol=0.2, rtol=0)
+    # Level and rigid: it shakes up and down by two degrees, the film hardly does.
+    heights = torch.rad2deg(torch.asin(cameras.positions[:, 2] / cameras.positions.norm(dim=1)))
+    assert float(heights.std()) < 0.5 * float((2 * torch.arange(33.0).sin()).std())
+    turns = cameras.camera_to_world[:, :, :3]
+    torch.testing.assert_close(turns @ turns.mT, torch.eye(3).expand(60, 3, 3), atol=1e-5, rtol=0)

@@ -14,6 +14,7 @@ from torch.nn.functional import normalize
 from devrf.apps.images import evenly
 from devrf.apps.video import VideoSettings
 from devrf.geometry.cameras import Cameras
+from devrf.geometry.clock import FrameClock
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.poses import average_pose
 from devrf.geometry.space import Space
@@ -42,6 +43,9 @@ MIN_STOPS = 6
 SMOOTH_SECONDS = 0.3
 SMOOTH_STOPS = 1.5
 SMOOTH_MOST = 1 / 12
+
+# A swing leads so far from where it stops, as a share of the time that one camera filmed.
+SWING = 0.06
 
 # The cameras of a video, from captured ones, what they look at (3,), and settings.
 Way = Callable[[Cameras, Tensor, VideoSettings], Cameras]
@@ -137,10 +141,7 @@ def captured(cameras: Cameras, target: Tensor, settings: VideoSettings) -> Camer
     # Smoothing has slowed the camera down where it turned.
     passed = torch.cat([poses[:, 3::4] / reach, -poses[:, 2::4]], dim=1)
     frames = torch.linspace(0, 1, settings.frames, dtype=torch.float64)
-    poses = _resampled(poses, passed, frames).view(-1, 3, 4)
-    left, _, right = torch.linalg.svd(poses[:, :, :3])
-    poses = torch.cat([left @ right, poses[:, :, 3:]], dim=2).float()
-    return _with_one_lens(cameras, poses)
+    return _with_one_lens(cameras, _rigid(_resampled(poses, passed, frames)))
 
 
 def in_order(apart: np.ndarray, longest: float) -> list[int]:
@@ -195,6 +196,13 @@ def _resampled(values: Tensor, places: Tensor, at: Tensor) -> Tensor:
     along = torch.cat([steps.new_zeros(1), steps.cumsum(dim=0)])
     columns = [np.interp(at * along[-1], along, column) for column in values.T]
     return torch.from_numpy(np.stack(columns, axis=1))
+
+
+def _rigid(poses: Tensor) -> Tensor:
+    """Camera-to-world transforms (N, 3, 4) near N means of several (N, 12)."""
+    means = poses.view(-1, 3, 4)
+    left, _, right = torch.linalg.svd(means[:, :, :3])
+    return torch.cat([left @ right, means[:, :, 3:]], dim=2).float()
 
 
 def _looking(cameras: Cameras, positions: Tensor, target: Tensor, up: Tensor) -> Cameras:
@@ -269,5 +277,33 @@ def time_freeze(ring: Ring, stop: float, settings: VideoSettings) -> Shots:
     return cameras[[0] * third + list(range(around)) + [0] * third], times
 
 
+def swing(cameras: Cameras, clock: FrameClock, settings: VideoSettings) -> Shots:
+    """As time runs, cameras are where one moving camera was, on a smooth way.
+
+    At ``video.time`` it stands still for a third of the frames, and the camera goes to and fro on
+    that way: nowhere else has the scene been seen.
+
+    Args:
+        cameras: where it was at the times of ``clock``.
+        clock: these times.
+        settings: frames a second, their number, and when time stands still.
+    """
+    third = settings.frames // 3
+    around = settings.frames - 2 * third
+    stop = settings.time
+    before = torch.linspace(0, stop, third + 1)[:-1]
+    after = torch.linspace(stop, 1, third)
+    times = torch.cat([before, torch.full((around,), stop), after])
+    turn = torch.linspace(0, 2 * math.pi, around)
+    there = torch.cat([before, stop + SWING * turn.sin(), after])
+    seconds = settings.frames / settings.fps
+    smooth = max(SMOOTH_SECONDS / seconds, SMOOTH_STOPS / len(cameras))
+    nearness = (there[:, None] - torch.tensor(clock.times)) / smooth
+    poses = torch.softmax(-0.5 * nearness**2, dim=1) @ cameras.camera_to_world.flatten(1)
+    return _with_one_lens(cameras, _rigid(poses.double())), times.tolist()
+
+
 # Beside them, videos in which the camera moves while time stands still.
 PRESETS = {"bullet_time": bullet_time, "time_freeze": time_freeze}
+# Of what one moving camera filmed, where it was: :func:`swing`.
+FOLLOWED = "swing"

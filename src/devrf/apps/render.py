@@ -11,7 +11,15 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from devrf.apps.camera_paths import PRESETS, WAYS, default_way, focus_distance, looked_at
+from devrf.apps.camera_paths import (
+    FOLLOWED,
+    PRESETS,
+    WAYS,
+    default_way,
+    focus_distance,
+    looked_at,
+    swing,
+)
 from devrf.apps.keyframes import CameraPath, cameras_of, read_path
 from devrf.apps.still import still
 from devrf.apps.video import (
@@ -22,6 +30,7 @@ from devrf.apps.video import (
     path_pictures,
 )
 from devrf.checkpoints.checkpoint import Viewpoints
+from devrf.errors import expect
 from devrf.evaluation.held_out import background_value
 from devrf.geometry.cameras import Cameras
 from devrf.rendering.renderer import Renderer
@@ -45,7 +54,7 @@ def camera_path(settings: VideoSettings) -> CameraPath | None:
     Raises:
         DevrfError: it holds no camera path, or one of too many frames.
     """
-    if settings.path is None or settings.path in (*WAYS, *PRESETS):
+    if settings.path is None or settings.path in (*WAYS, *PRESETS, FOLLOWED):
         return None
     path = read_path(Path(settings.path))
     _ = path.frames
@@ -92,6 +101,12 @@ def videos(
         shown = held_out_pictures(renderer, held_out, images, settings, background)
         yield video("held_out", shown)
     name = settings.path or default_way(space)
+    if name == FOLLOWED or (viewpoints.by_one_camera and not settings.path and name != "orbit"):
+        expected = "another way: more than one camera saw the scene"
+        expect(viewpoints.by_one_camera, "video.path", expected, FOLLOWED)
+        cameras, times = swing(settings.sized(viewpoints.dynamic), viewpoints.clock, settings)
+        yield video(FOLLOWED, path_pictures(renderer, cameras, behind, times))
+        return
     yield video(name, path_pictures(renderer, filmed(name)(settings), behind))
 
 

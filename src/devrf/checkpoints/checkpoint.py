@@ -109,6 +109,12 @@ class Viewpoints:
     dynamic: Cameras
     held_out: Cameras
 
+    @property
+    def by_one_camera(self) -> bool:
+        """Whether one moving camera took all images, and there is no static set."""
+        static, dynamic = self.static.camera_to_world, self.dynamic.camera_to_world
+        return len(dynamic) == len(self.clock) and torch.equal(static, dynamic)
+
     @classmethod
     def of(cls, scene: Scene) -> Viewpoints:
         """The viewpoints of a scene."""
