@@ -72,6 +72,19 @@ def test_batches_are_quartered_before_iterations_are_left_out(
     assert stage.rays_to_draw(SCHEDULE.rays) == rays
 
 
+def test_time_for_the_first_level_alone_leaves_the_finer_one_out(timed, caplog) -> None:
+    caplog.set_level("INFO")
+    # Two visits of each level: 0.2 s to enter, and 0.04 or 0.12 for an iteration each.
+    stage, seconds, visits = timed(0.4)
+    assert seconds == pytest.approx(0.4, abs=ITERATION[1])
+    assert list(visits) == [(0, 1), (0, 2)] and stage.resolution[0] <= 4
+    assert stage.iteration == SCHEDULE.total(3)  # it has ended, and can be kept
+    assert (
+        "schedule.seconds=0.4 is too little for its finest grids: it ends with level 1, after"
+        in (caplog.text)
+    )
+
+
 def test_too_little_time_is_refused_and_none_changes_nothing(timed) -> None:
     stage, seconds, visits = timed(None)
     assert (seconds, stage.iterations_done) == (pytest.approx(WHOLE), stage.iteration)

@@ -22,6 +22,8 @@ stage itself always goes one further; this callback adds the rest of the stride.
 * Where the stride would be more than 1, ``stage.batch_share`` is halved first, to a quarter: more
   iterations learn more than larger ones. What takes as long with fewer rays keeps its batches
   (:attr:`~devrf.engine.stage.Stage.cost_follows_rays`).
+* Where an iteration for each phase takes longer than there is time, the finest are left out: levels
+  of motion, growths of grids. Resolution follows the budget.
 * Of several processes rank 0's clock decides.
 * A progress file holds the seconds so far: a run that was interrupted goes on with those left. What
   it learns then is not bit for bit what it would have learned: a clock never gives the same twice.
@@ -31,6 +33,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Sequence
 from typing import Any
 
 from lightning import Callback, LightningModule, Trainer
@@ -46,7 +49,8 @@ log = logging.getLogger(__name__)
 
 # The most of the budget that a Lightning step may take, within which the stride is the same.
 STEP_SHARE = 0.01
-# The share of the budget after which it is checked that the rest suffices.
+# The share of the budget after which it is checked that the rest suffices. Where it does not even
+# for the coarsest grids, the stage is refused then; later what is finest is left out, no more.
 TRIAL_SHARE = 0.25
 # The least part of a batch that is drawn for want of time.
 LEAST_BATCH = 1 / 4
@@ -98,6 +102,7 @@ class TimeBudget(Callback):
         self._ahead = 0.0  # of ``stage.iteration``: where the strides have led
         self._phase: Phase | None = None
         self._phases: list[Phase] = []
+        self._end = 0  # the place in the schedule where the stage ends
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Look at the schedule and the clock."""
@@ -107,6 +112,7 @@ class TimeBudget(Callback):
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
         self._record = next(other for other in callbacks if isinstance(other, TrainingRecord))
         self._phases = phases_of(pl_module)
+        self._end = pl_module.total_iterations
         self._phase = pl_module.phase
         self._budget = self.seconds * pl_module.time_share
         self._most_iterations = pl_module.iterations_per_step
@@ -134,7 +140,7 @@ class TimeBudget(Callback):
             fitted = trainer.strategy.broadcast(self._fitted(pl_module))
             if isinstance(fitted, str):
                 raise DevrfError(fitted)
-            self.stride, pl_module.iterations_per_step, share = fitted
+            self.stride, pl_module.iterations_per_step, share, self._end = fitted
             # An iteration takes about as long as its rays; it is measured again.
             self._pace *= share / pl_module.batch_share
             pl_module.batch_share = share
@@ -152,23 +158,23 @@ class TimeBudget(Callback):
         place = pl_module.iteration + self._ahead + self.stride
         following = min(math.floor(place), pl_module.phase.stop)
         self._ahead = min(place - following, max(self.stride, 1.0))
-        pl_module.iteration = following - 1
+        ends = following >= self._end
+        pl_module.iteration = (pl_module.total_iterations if ends else following) - 1
 
-    def _fitted(self, stage: Stage) -> tuple[float, int, float] | str:
-        """Stride, iterations and share of batches from now on; or why the budget is too short."""
+    def _fitted(self, stage: Stage) -> tuple[float, int, float, int] | str:
+        """Stride, iterations, share of batches, and the end; or why the budget is too short."""
         assert self._pace is not None and stage.phase is not None
         pace = self._pace
         left = self._budget - self._step_began
         later = [phase for phase in self._phases if phase.start > stage.iteration]
-        # As long as an iteration, where no phase of the kind has been entered yet.
-        entering = sum(self._entering.get(phase.kind, pace * phase.cost) for phase in later)
         # The first iteration is slow, and says little unless it has taken all the time.
         tried = self._step_began >= TRIAL_SHARE * self._budget and (self._warm or left < 0)
-        if tried and not self._checked:
-            self._checked = True
-            least = entering + pace * sum(phase.cost for phase in later)
-            if least > left:
-                return self._too_short(stage, self._step_began + least)
+        if tried and self._least(later) > left:
+            if not self._leave_out(stage, left) and not self._checked:
+                return self._too_short(stage, self._step_began + self._least(later))
+            later = [phase for phase in later if phase in self._phases]
+        self._checked |= tried
+        entering = self._to_enter(later)
         place = stage.iteration + self._ahead
         whole = pace * sum(
             phase.cost * max(0.0, phase.stop - max(phase.start, place))
@@ -185,7 +191,41 @@ class TimeBudget(Callback):
             iterations = max(1, round(left / (pace * stage.phase.cost)))
             stride = (stage.phase.stop - place) / iterations + ROUNDING
         most = STEP_SHARE * self._budget / (pace * stage.phase.cost)
-        return stride, max(1, min(self._most_iterations, int(most))), share
+        iterations = max(1, min(self._most_iterations, int(most)))
+        return stride, iterations, share, self._phases[-1].stop
+
+    def _to_enter(self, phases: Sequence[Phase]) -> float:
+        """Seconds: as long as an iteration, where no phase of the kind has been entered yet."""
+        assert self._pace is not None
+        return sum(self._entering.get(one.kind, self._pace * one.cost) for one in phases)
+
+    def _least(self, phases: Sequence[Phase]) -> float:
+        """Seconds of one iteration each, with what it takes to enter them."""
+        assert self._pace is not None
+        return self._to_enter(phases) + self._pace * sum(phase.cost for phase in phases)
+
+    def _leave_out(self, stage: Stage, left: float) -> bool:
+        """Leave out the finest grids' phases, so that the others fit; whether any do."""
+        for count in range(len(self._phases) - 1, 0, -1):
+            last = self._phases[count - 1]
+            following = self._phases[count]
+            # A level of all frames, or none of it; and no field before its search has ended.
+            between = last.frame is None or last.kind != following.kind
+            ahead = following.start > stage.iteration and last.kind != "search"
+            later = [one for one in self._phases[:count] if one.start > stage.iteration]
+            if between and ahead and self._least(later) <= left:
+                log.info(
+                    "%s: schedule.seconds=%g is too little for its finest grids: it ends with %s, "
+                    "after %d of %d phases",
+                    stage.name,
+                    self.seconds,
+                    last.kind,
+                    count,
+                    len(self._phases),
+                )
+                self._phases = self._phases[:count]
+                return True
+        return False
 
     def _too_short(self, stage: Stage, least: float) -> str:
         assert self.seconds is not None
