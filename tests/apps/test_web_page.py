@@ -29,7 +29,7 @@ from PIL import Image
 from devrf.apps.captured_cameras import described, picture_of
 from devrf.apps.settings import ViewerSettings
 from devrf.apps.viewer.page import PageServer
-from devrf.apps.web.pack import page, write_page, written_page
+from devrf.apps.web.pack import page
 from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
@@ -390,14 +390,6 @@ def test_an_off_centre_principal_point_moves_the_middle(moving, tiny_scene):
     *_, camera = described(moving, replace(viewpoints, static=off))
     # 24×18 pixels, whose middle (12, 9) is 4 pixels to the right of the point, and 2 above.
     assert camera["middle"] == pytest.approx([4 / 20, 2 / 40])
-
-
-def test_a_page_is_found_again_by_the_checkpoint_that_it_shows(moving, tiny_scene, tmp_path):
-    path = tmp_path / "scene.html"
-    assert written_page(path, "ab12") is None
-    write_page(path, moving, Viewpoints.of(tiny_scene), "tiny", checkpoint="ab12")
-    assert written_page(path, "ab12") == path.read_text("utf-8")
-    assert written_page(path, "cd34") is None
 
 
 def test_a_scene_at_rest_has_no_motion(learned, tiny_scene):

@@ -94,10 +94,15 @@ def scenes(tmp_path_factory) -> Path:
         (folder / name).mkdir()
         file = folder / name / "transforms.json"
         file.write_text(json.dumps({"frames": [*first, frames[1]]}))
-    for name, files in (("video", ["precomputed.json"]), ("vrig", ["dataset.json", "scene.json"])):
+    (folder / "video").mkdir()
+    (folder / "video/precomputed.json").write_text("{}")
+    # As HyperNeRF's; ``pose`` shows one moment.
+    listing = {"ids": ["a", "b", "c"], "train_ids": ["a", "b"], "val_ids": ["c"]}
+    for name, later in (("vrig", 1), ("pose", 0)):
         (folder / name).mkdir()
-        for file in files:
-            (folder / name / file).write_text("{}")
+        moments = {"a": {"warp_id": 0}, "b": {"warp_id": later}, "c": {"warp_id": 0}}
+        for file, content in (("dataset", listing), ("metadata", moments), ("scene", {})):
+            (folder / name / f"{file}.json").write_text(json.dumps(content))
     return folder
 
 
@@ -134,6 +139,10 @@ def scenes(tmp_path_factory) -> Path:
         ("data.root=stop", "data=nerfstudio"),
         ("data.root=video", "data=forward experiment=phone"),
         ("data.root=vrig", "data=nerfies experiment=phone"),
+        ("data.root=pose", "data=nerfies"),
+        ("data.root=hook field.channels=3", "data=inward"),
+        ("data.root=hook loss.canonical.tv=1", "data=inward"),
+        ("data.root=hook data.static_until=0.3", "data=inward"),
         ("data.root=hook experiment=phone profile=tineuvox_light", "data=inward"),
         ("data.root=hook stage=canonical", "data=inward"),
         ("data.root=hook profile=devrf_small", "data=inward"),
@@ -148,6 +157,7 @@ def test_what_the_files_of_a_scene_say_comes_after_what_was_typed(
     scenes, monkeypatch, typed, by_files
 ):
     monkeypatch.chdir(scenes)
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     assert completed(typed.split()) == [*typed.split(), *by_files.split()]
 
 
@@ -164,6 +174,13 @@ def test_what_the_files_say_is_said_in_one_line(devrf, scenes, short):
     done = devrf(f"data.root={scenes}/phone", *short, "stage=inspect")
     line = f"{scenes}/phone: the layout of nerfstudio, instant-ngp (data=nerfstudio facing=forward)"
     assert done.out.splitlines().count(line) == 1
+
+
+def test_one_moving_camera_is_learned_as_published_where_there_is_a_gpu(scenes, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    root = f"data.root={scenes}/hook"
+    assert completed([root])[1:] == ["data=inward", "experiment=phone_gpu"]
+    assert completed([root, "trainer=cpu"])[2:] == ["data=inward", "experiment=phone"]
 
 
 def test_devrf_on_one_moving_camera_is_told_what_learns_more(scenes):

@@ -12,8 +12,9 @@ from devrf.scenes.procedural import ProceduralScene
 
 
 @pytest.fixture
-def mill(write_scene, tmp_path) -> None:
+def mill(write_scene, tmp_path, monkeypatch) -> None:
     """A folder ``mill`` in DyCheck's layout: one camera, elsewhere at each of three times."""
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     sizes = {"width": 24, "height": 20, "static_views": 16, "static_test_views": 3}
     scene = ProceduralScene(shape="robot", train_views=2, frames=3, supersample=1, **sizes)()
     # The moving camera stands where one fixed view does, then where the next one does.

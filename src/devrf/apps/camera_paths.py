@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +14,6 @@ from torch.nn.functional import normalize
 from devrf.apps.images import evenly
 from devrf.apps.video import VideoSettings
 from devrf.geometry.cameras import Cameras
-from devrf.geometry.clock import FrameClock
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.poses import average_pose
 from devrf.geometry.space import Space
@@ -277,15 +276,15 @@ def time_freeze(ring: Ring, stop: float, settings: VideoSettings) -> Shots:
     return cameras[[0] * third + list(range(around)) + [0] * third], times
 
 
-def swing(cameras: Cameras, clock: FrameClock, settings: VideoSettings) -> Shots:
+def swing(cameras: Cameras, seen_at: Sequence[float], settings: VideoSettings) -> Shots:
     """As time runs, cameras are where one moving camera was, on a smooth way.
 
     At ``video.time`` it stands still for a third of the frames, and the camera goes to and fro on
     that way: nowhere else has the scene been seen.
 
     Args:
-        cameras: where it was at the times of ``clock``.
-        clock: these times.
+        cameras: where it was.
+        seen_at: when, in any order.
         settings: frames a second, their number, and when time stands still.
     """
     third = settings.frames // 3
@@ -298,7 +297,7 @@ def swing(cameras: Cameras, clock: FrameClock, settings: VideoSettings) -> Shots
     there = torch.cat([before, stop + SWING * turn.sin(), after])
     seconds = settings.frames / settings.fps
     smooth = max(SMOOTH_SECONDS / seconds, SMOOTH_STOPS / len(cameras))
-    nearness = (there[:, None] - torch.tensor(clock.times)) / smooth
+    nearness = (there[:, None] - torch.tensor(seen_at)) / smooth
     poses = torch.softmax(-0.5 * nearness**2, dim=1) @ cameras.camera_to_world.flatten(1)
     return _with_one_lens(cameras, _rigid(poses.double())), times.tolist()
 

@@ -30,7 +30,7 @@ from devrf.apps.video import (
     path_pictures,
 )
 from devrf.checkpoints.checkpoint import Viewpoints
-from devrf.errors import expect
+from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
 from devrf.geometry.cameras import Cameras
 from devrf.rendering.renderer import Renderer
@@ -70,6 +70,9 @@ def videos(
     """
     behind = background_value(viewpoints.background)
     static = viewpoints.static
+    if settings.path == FOLLOWED and not viewpoints.followed:
+        expected = "another way, since it was not one moving camera that saw the scene move"
+        raise DevrfError(f"video.path: expected {expected}, not {FOLLOWED}")
     path = camera_path(settings)
     if path is not None:
         settings = replace(settings, frames=path.frames, fps=path.fps)
@@ -101,10 +104,9 @@ def videos(
         shown = held_out_pictures(renderer, held_out, images, settings, background)
         yield video("held_out", shown)
     name = settings.path or default_way(space)
-    if name == FOLLOWED or (viewpoints.by_one_camera and not settings.path and name != "orbit"):
-        expected = "another way: more than one camera saw the scene"
-        expect(viewpoints.by_one_camera, "video.path", expected, FOLLOWED)
-        cameras, times = swing(settings.sized(viewpoints.dynamic), viewpoints.clock, settings)
+    if name == FOLLOWED or (viewpoints.followed and not settings.path and name != "orbit"):
+        followed = settings.sized(viewpoints.dynamic)
+        cameras, times = swing(followed, viewpoints.followed, settings)
         yield video(FOLLOWED, path_pictures(renderer, cameras, behind, times))
         return
     yield video(name, path_pictures(renderer, filmed(name)(settings), behind))

@@ -101,6 +101,8 @@ class Viewpoints:
         static: cameras of the static training images.
         dynamic: cameras of the training images in motion, a fixed one once.
         held_out: the camera of the first held-out image of the moving scene: one camera.
+        followed: when each of the ``dynamic`` cameras was there, if they are those of one moving
+            camera; else empty.
     """
 
     background: Background
@@ -108,12 +110,7 @@ class Viewpoints:
     static: Cameras
     dynamic: Cameras
     held_out: Cameras
-
-    @property
-    def by_one_camera(self) -> bool:
-        """Whether one moving camera took all images, and there is no static set."""
-        static, dynamic = self.static.camera_to_world, self.dynamic.camera_to_world
-        return len(dynamic) == len(self.clock) and torch.equal(static, dynamic)
+    followed: tuple[float, ...] = ()
 
     @classmethod
     def of(cls, scene: Scene) -> Viewpoints:
@@ -123,7 +120,9 @@ class Viewpoints:
         first = [int((train.view == view).nonzero()[0]) for view in views]
         static = scene.static.train.cameras
         held_out = scene.dynamic.test.cameras[[0]]
-        return cls(scene.background, scene.clock, static, train.cameras[first], held_out)
+        moving = scene.moves and train.by_moving_camera and len(train) > 1
+        times = tuple(train.times[first].tolist()) if moving else ()
+        return cls(scene.background, scene.clock, static, train.cameras[first], held_out, times)
 
     @classmethod
     def stored(cls, entry: dict[str, Any]) -> Viewpoints | None:
@@ -138,7 +137,11 @@ class Viewpoints:
             sides = sorted((camera.width, camera.height))
             if not 0 < sides[0] <= sides[1] <= min(SIDE, ASPECT * sides[0]):
                 raise ValueError("an image of a size that cannot be")
-        return cls(**{**entry, **cameras, "clock": built(FrameClock, entry["clock"])})
+        followed = built(tuple[float, ...], entry.get("followed", ()))
+        if len(followed) not in (0, len(cameras["dynamic"])):
+            raise ValueError("times of other cameras")
+        clock = built(FrameClock, entry["clock"])
+        return cls(**{**entry, **cameras, "clock": clock, "followed": followed})
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,10 @@ from devrf.system.process import importing
 
 # Stages that DeVRF's protocol alone has.
 OF_DEVRF = ("canonical", "deformation")
-# What says how a scene is learned.
-HOW = ("method", "profile", "protocol", "comparison", "experiment", "ablation")
+# What says how a scene is learned: groups, and keys that DeVRF alone has.
+HOW: tuple[str, ...] = ("method", "profile", "protocol", "comparison", "experiment", "ablation")
+HOW += ("hparams_search", "data.static_until", "field", "sampling", "loss")
+HOW += ("canonical", "deformation", "schedule.canonical", "schedule.deformation", "schedule.motion")
 # `viewer` is a group, whose choices Hydra wants to be text.
 SHORTHAND = {f"viewer={value}": f"viewer.training={value}" for value in ("true", "false")}
 KEY_VALUE = re.compile(r"(\+{0,2}([\w./@-]+)=)(.*)", re.DOTALL)
@@ -65,7 +67,10 @@ def completed(arguments: Sequence[str]) -> list[str]:
         return [*flags, *before, *texts]
     readers: list[str | None] = [*values(overrides, "data")]
     readers = readers or _of_experiments(overrides, known.config_dir)
-    words = [_told_by_scene(reader, root, overrides) for reader, root in product(readers, roots)]
+    words = [
+        _told_by_scene(reader, root, overrides, continued=bool(before))
+        for reader, root in product(readers, roots)
+    ]
     if any(other != words[0] for other in words):
         needed = " and ".join(dict.fromkeys(" ".join(other) or "neither" for other in words))
         raise DevrfError(f"data.root: the scenes need {needed}; sweep over those of each apart")
@@ -92,8 +97,18 @@ def quoted_path(argument: str, multirun: bool) -> str:
     return start + ",".join(in_quotes(os.path.expanduser(path)) for path in paths)
 
 
-def _told_by_scene(option: str | None, root: str, overrides: Sequence[Override]) -> list[str]:
+def _says_how(override: Override) -> bool:
+    """Whether an override says how a scene is learned."""
+    key = f"{override.key_or_group}."
+    return any(key.startswith(f"{name}.") for name in HOW)
+
+
+def _told_by_scene(
+    option: str | None, root: str, overrides: Sequence[Override], *, continued: bool
+) -> list[str]:
     """What the files of a scene say, which ``data=option`` reads, and no override does.
+
+    How it is learned is not said where a run is ``continued``.
 
     Raises:
         DevrfError: ``option`` is None, and no reader knows the layout.
@@ -121,8 +136,10 @@ def _told_by_scene(option: str | None, root: str, overrides: Sequence[Override])
         if method == "devrf" or value(overrides, "stage") in OF_DEVRF:
             lacks = "one camera filmed it moving, and nothing shows it at rest"
             told.append(f"{root}: {lacks}; experiment=phone learns more of it than method=devrf")
-        elif not any(values(overrides, key) for key in HOW):
-            words.append(f"experiment={'phone_gpu' if torch.cuda.is_available() else 'phone'}")
+        elif not continued and not any(map(_says_how, overrides)):
+            on_cpu = "cpu" in (value(overrides, "trainer"), value(overrides, "trainer.accelerator"))
+            on_gpu = torch.cuda.is_available() and not on_cpu
+            words.append(f"experiment={'phone_gpu' if on_gpu else 'phone'}")
             why = f"one moving camera, where method=devrf needs the scene at rest, too; {why}"
         elif method and not any(values(overrides, key) for key in ("protocol", "comparison")):
             words.append("protocol=dynamic")

@@ -20,9 +20,8 @@ from devrf.apps.still import still as rendered
 from devrf.apps.video import VideoSettings
 from devrf.apps.video_file import write_pictures
 from devrf.apps.viewer.page import PageServer
-from devrf.apps.web.pack import drawable, page, write_page, written_page
+from devrf.apps.web.pack import drawable, page, write_page
 from devrf.checkpoints.checkpoint import Viewpoints, check_scene, metadata_of
-from devrf.checkpoints.checkpoint_file import digest_of
 from devrf.cli.context import RunContext
 from devrf.cli.restore_config import root
 from devrf.cli.resume import unfinished
@@ -83,9 +82,7 @@ def view(run: RunContext) -> None:
     by_browser = settings.renderer == "browser" or (settings.renderer == "auto" and drawable(model))
     shown: PageServer | Session
     if by_browser:
-        digest = digest_of(run.checkpoint())
-        text = written_page(run.folder / "export" / PAGE, digest)
-        text = text or page(model, viewpoints, run.config.scene)
+        text = page(model, viewpoints, run.config.scene)
         shown = PageServer(settings, text, cache(lambda: _with_images(run, without)))
     else:
         from devrf.apps.viewer.drawing import Drawing
@@ -111,7 +108,7 @@ def write_scene_page(run: RunContext) -> None:
     model, viewpoints = _learned(run)
     if drawable(model):
         path = run.folder / "export" / PAGE
-        write_page(path, model, viewpoints, run.config.scene, digest_of(run.checkpoint()))
+        write_page(path, model, viewpoints, run.config.scene)
 
 
 def _learned(run: RunContext) -> tuple[Renderable, Viewpoints]:

@@ -12,11 +12,13 @@ import torch
 
 from devrf.errors import DevrfError
 from devrf.scenes.files import read_json
+from devrf.scenes.formats.dycheck import DycheckReader
 from devrf.scenes.formats.llff_poses import PRECOMPUTED
-from devrf.scenes.formats.nerfstudio import STATIC_SET
+from devrf.scenes.formats.nerfies import NerfiesReader
 from devrf.scenes.sparse_model import ONE_SIDE, model_folder, read_model, widest_angle
 from devrf.scenes.splits import distinct_poses, distinct_times, stand_still
-from devrf.scenes.transforms import TIME_TOLERANCE, TransformsFile
+from devrf.scenes.transforms import TransformsFile
+from devrf.scenes.view_folders import dynamic_folders
 
 
 def faces_forward(choice: str, root: str | Path, space: str | None) -> bool:
@@ -44,17 +46,22 @@ def by_one_camera(choice: str, root: str | Path) -> bool:
     """Whether one camera takes all images, elsewhere in each as time passes, and no static set."""
     folder = Path(root).expanduser()
     if choice in ("nerfies", "dycheck"):
-        return True
+        with suppress(DevrfError):
+            reader = NerfiesReader(root) if choice == "nerfies" else DycheckReader(root)
+            listed, learned, _ = reader.listed(folder)
+            moments = reader.moments(folder, [listed[k] for k in learned])
+            return len(distinct_times(torch.tensor(moments))) > 1
+        return False
     if choice == "forward":
-        return (folder / PRECOMPUTED).is_file()
+        return (folder / PRECOMPUTED).is_file() and not dynamic_folders(folder)
     file = {"inward": "transforms_train.json", "nerfstudio": "transforms.json"}.get(choice)
     listing = None if file is None else _transforms(folder / file)
     if listing is None:
         return False
     times = torch.tensor([frame.time for frame in listing.frames if frame.time is not None])
     poses = torch.tensor([frame.transform_matrix[:3] for frame in listing.frames])
-    still = choice == "nerfstudio" and int((times <= TIME_TOLERANCE).sum()) >= STATIC_SET
-    return len(distinct_times(times)) > 1 and not still and not stand_still(distinct_poses(poses))
+    alone = 1 < len(times) == len(distinct_times(times))
+    return alone and not stand_still(distinct_poses(poses))
 
 
 def _transforms(file: Path) -> TransformsFile | None:

@@ -177,15 +177,13 @@ def _commands(
     Warp finds, compiles and loads a kernel in one thread at a time.
     """
     made = _of_thread.__dict__.setdefault("commands", {})
-    commands = made.get((kernel, parts, device))
-    if commands is None:
+    commands: list[wp.Launch] = made.setdefault((kernel, device), [])
+    while len(commands) < parts:
         with compiling:
-            commands = [
-                wp.launch(kernel, 1, inputs=inputs, device=str(device), record_cmd=True)
-                for _ in range(parts)
-            ]
-        made[kernel, parts, device] = commands
-    return commands
+            command = wp.launch(kernel, 1, inputs=inputs, device=str(device), record_cmd=True)
+        command.fwd_args = None  # these tensors are not to live as long
+        commands.append(command)
+    return commands[:parts]
 
 
 def _parts(device: torch.device, count: int, grain: int) -> int:

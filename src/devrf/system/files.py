@@ -81,9 +81,16 @@ def write_json(path: Path, values: dict[str, Any]) -> None:
 
 
 def read_record(path: Path) -> bytes:
-    """What devrf wrote; of a file that is larger the beginning, which is no whole JSON."""
+    """What devrf wrote.
+
+    Raises:
+        ValueError: the file is larger than that, and so damaged.
+    """
     with path.open("rb") as file:
-        return file.read(LARGEST_RECORD)
+        content = file.read(LARGEST_RECORD + 1)
+    if len(content) > LARGEST_RECORD:
+        raise ValueError(f"{path}: of more than {LARGEST_RECORD} bytes")
+    return content
 
 
 def free_disk(folder: Path) -> int:

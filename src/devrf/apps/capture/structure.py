@@ -94,8 +94,10 @@ def reconstruct(
         )
     if not settings.monocular:
         return first.folder
-    film = Film(images, moving.names)
-    masked = {} if given else film.masks_of_movers(read_model(first.folder))
+    masked = {}
+    if not given:
+        film = Film(images, moving.names)
+        masked = film.masks_of_movers(read_model(first.folder))
     if masked:
         log.info("structure from motion: again, without what moves")
         _match(images, work, moving, fixed, settings, masked)
@@ -106,7 +108,7 @@ def reconstruct(
     # Where masks leave too little, cameras are those of whole images.
     known = [model for model in tried if model and model.images >= FEWER * first.images]
     best = max(known or [first], key=lambda model: (model.images, -model.error))
-    if masked and best is not first:
+    if masked and best is not first and first.images >= FEWER * best.images:
         error = film.error_of_still(read_model(best.folder), masked)
         whole = film.error_of_still(read_model(first.folder), masked)
         log.info(

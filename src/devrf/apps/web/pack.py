@@ -70,26 +70,16 @@ def drawable(model: Renderable) -> bool:
     return isinstance(model, DeVRFModel) and isinstance(model.canonical.decoder, ColorDecoder)
 
 
-def write_page(
-    path: Path, model: Renderable, viewpoints: Viewpoints, name: str, checkpoint: str = ""
-) -> None:
+def write_page(path: Path, model: Renderable, viewpoints: Viewpoints, name: str) -> None:
     """Write :func:`page`, whole or not at all."""
-    text = page(model, viewpoints, name, checkpoint)
+    text = page(model, viewpoints, name)
     with atomic_write(path) as partial:
         partial.write_text(text, encoding="utf-8")
 
 
-def written_page(path: Path, checkpoint: str) -> str | None:
-    """The page that was written to ``path`` of the checkpoint of this digest; None: of another."""
-    text = path.read_text("utf-8") if path.is_file() else ""
-    return text if f'"checkpoint": "{checkpoint}"' in text else None
-
-
 @torch.no_grad()
-def page(model: Renderable, viewpoints: Viewpoints, name: str, checkpoint: str = "") -> str:
+def page(model: Renderable, viewpoints: Viewpoints, name: str) -> str:
     """The page of the scene ``name``, with the cameras of ``viewpoints``.
-
-    ``checkpoint`` is the digest of the file that holds the model, for :func:`written_page`.
 
     Raises:
         DevrfError: the page cannot draw the model.
@@ -103,7 +93,6 @@ def page(model: Renderable, viewpoints: Viewpoints, name: str, checkpoint: str =
     parts = dict(_parts(model, viewpoints.static.positions))
     sizes = {part.partition("-")[0]: values.shape[2::-1] for part, values in parts.items()}
     description = _description(model, viewpoints) | {"name": name, "shapes": sizes}
-    description["checkpoint"] = checkpoint
     folder = files("devrf.apps.web")
     texts = {
         "title": html.escape(f"{name} · devrf"),

@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 FILE = "transforms.json"
 # The least number of images at time 0 that make a static set: fewer teach no field.
-STATIC_SET = 3
+_SEVERAL = 3
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ def _one_file(train: Transforms, test: Transforms, static_until: float | None) -
     times = _times(train)
     at_zero = times <= TIME_TOLERANCE
     if static_until is None:
-        static_until = 0.0 if int(at_zero.sum()) >= STATIC_SET else 1.0
+        static_until = 0.0 if int(at_zero.sum()) >= _SEVERAL else 1.0
     if static_until > 0 or not bool(at_zero.any()):
         return one_capture(train, test, static_until)
     still = at_zero.nonzero()[:, 0].tolist()
