@@ -10,6 +10,8 @@ import pytest
 from devrf.cli import preparation
 from devrf.scenes.procedural import ProceduralScene
 
+FILM = ("video.frames=1", "video.height=24")
+
 
 @pytest.fixture
 def mill(write_scene, tmp_path, monkeypatch) -> None:
