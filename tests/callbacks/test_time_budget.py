@@ -16,11 +16,10 @@ from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 
 # Three frames: frames 1 and 2 are visited at each level, frame 1 for two shares.
-SCHEDULE = DeformationSchedule(levels=(Level(4, 30), Level(6, 10)), rays=16)
-# Seconds to enter a visit, and for an iteration of each level: 90 of the first, 30 of the second.
-ENTER, ITERATION = 0.1, {0: 0.02, 1: 0.06}
-WHOLE = 4 * ENTER + 90 * 0.02 + 30 * 0.06
-NEAR = 2 * ITERATION[1]  # two iterations
+SCHEDULE = DeformationSchedule(levels=(Level(4, 60), Level(6, 20)), rays=16)
+# Seconds to enter a visit, and for an iteration of each level: 180 of the first, 60 of the second.
+ENTER, ITERATION = 0.1, {0: 0.01, 1: 0.03}
+WHOLE = 4 * ENTER + 180 * 0.01 + 60 * 0.03
 
 
 @pytest.fixture
@@ -47,10 +46,10 @@ def timed(monkeypatch: pytest.MonkeyPatch, fit, rest: LoadedCheckpoint) -> Calla
     return learn
 
 
-@pytest.mark.parametrize("share", [0.4, 2.0])
+@pytest.mark.parametrize("share", [0.4, 3.0])
 def test_a_stage_ends_with_its_seconds_and_its_whole_schedule(timed, share: float) -> None:
     stage, seconds, visits = timed(2 * share * WHOLE, time_share=0.5)
-    assert seconds == pytest.approx(share * WHOLE, abs=NEAR)
+    assert seconds == pytest.approx(share * WHOLE, rel=0.05)
     assert stage.iteration == SCHEDULE.total(3) and stage.resolution[0] > 4
     assert stage.record["iterations"] == visits.total() == stage.iterations_done
     assert list(visits) == [(0, 1), (0, 2), (1, 1), (1, 2)]
@@ -68,27 +67,25 @@ def test_batches_are_quartered_before_iterations_are_left_out(
 ) -> None:
     monkeypatch.setattr(DeformationStage, "cost_follows_rays", by_rays)
     stage, seconds, _ = timed(share * WHOLE)
-    assert seconds == pytest.approx(share * WHOLE, abs=NEAR)
+    assert seconds == pytest.approx(share * WHOLE, rel=0.05)
     assert stage.rays_to_draw(SCHEDULE.rays) == rays
 
 
 def test_time_for_the_first_level_alone_leaves_the_finer_one_out(timed, caplog) -> None:
     caplog.set_level("INFO")
-    # Two visits of each level: 0.2 s to enter, and 0.04 or 0.12 for an iteration each.
+    # Two visits of each level: 0.2 s to enter, and 0.02 or 0.06 for an iteration each.
     stage, seconds, visits = timed(0.4)
     assert seconds == pytest.approx(0.4, abs=ITERATION[1])
     assert list(visits) == [(0, 1), (0, 2)] and stage.resolution[0] <= 4
     assert stage.iteration == SCHEDULE.total(3)  # it has ended, and can be kept
-    assert (
-        "schedule.seconds=0.4 is too little for its finest grids: it ends with level 1, after"
-        in (caplog.text)
-    )
+    said = "schedule.seconds=0.4 is too little for its finest grids: it ends with level 1, after"
+    assert said in caplog.text
 
 
 def test_too_little_time_is_refused_and_none_changes_nothing(timed) -> None:
     stage, seconds, visits = timed(None)
     assert (seconds, stage.iterations_done) == (pytest.approx(WHOLE), stage.iteration)
-    assert dict(visits) == {(0, 1): 60, (0, 2): 30, (1, 1): 20, (1, 2): 10}
+    assert dict(visits) == {(0, 1): 120, (0, 2): 60, (1, 1): 40, (1, 2): 20}
     for seconds in (0.2, 0.1):  # of which the first visit is entered in half, or in all
         with pytest.raises(DevrfError, match=rf"seconds: {seconds} is too little: .* 4 phases"):
             timed(seconds)

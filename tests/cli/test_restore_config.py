@@ -17,6 +17,7 @@ from devrf.cli.complete import completed
 from devrf.cli.config import config_folder
 from devrf.cli.run import STEPS
 from devrf.errors import DevrfError
+from devrf.system.files import LARGEST_RECORD
 
 
 @pytest.fixture
@@ -314,6 +315,7 @@ FOREIGN = {
     "deep scores": ("metrics.json", DEEP),
     "scores that are none": ("metrics.json", "[]"),
     "deep notes": (".devrf/done.json", DEEP),
+    "endless notes": (".devrf/done.json", " " * (LARGEST_RECORD + 1)),
     "notes of no files": (".devrf/done.json", '{"notes": [3, {"with": 1, "files": [5, [1]]}]}'),
 }
 

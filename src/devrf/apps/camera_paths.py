@@ -267,13 +267,18 @@ def time_freeze(ring: Ring, stop: float, settings: VideoSettings) -> Shots:
 
     Each takes a third of the frames.
     """
-    third = settings.frames // 3
-    around = settings.frames - 2 * third
+    before, around, after = _thirds(stop, settings.frames)
     cameras = ring(replace(settings, frames=around))
-    before = torch.linspace(0, stop, third + 1)[:-1]
-    after = torch.linspace(stop, 1, third)
+    third = len(after)
     times = [*before.tolist(), *[stop] * around, *after.tolist()]
     return cameras[[0] * third + list(range(around)) + [0] * third], times
+
+
+def _thirds(stop: float, frames: int) -> tuple[Tensor, int, Tensor]:
+    """Times up to ``stop``, for how many frames time stands still there, and times from there."""
+    third = frames // 3
+    before = torch.linspace(0, stop, third + 1)[:-1]
+    return before, frames - 2 * third, torch.linspace(stop, 1, third)
 
 
 def swing(cameras: Cameras, seen_at: Sequence[float], settings: VideoSettings) -> Shots:
@@ -287,11 +292,8 @@ def swing(cameras: Cameras, seen_at: Sequence[float], settings: VideoSettings) -
         seen_at: when, in any order.
         settings: frames a second, their number, and when time stands still.
     """
-    third = settings.frames // 3
-    around = settings.frames - 2 * third
     stop = settings.time
-    before = torch.linspace(0, stop, third + 1)[:-1]
-    after = torch.linspace(stop, 1, third)
+    before, around, after = _thirds(stop, settings.frames)
     times = torch.cat([before, torch.full((around,), stop), after])
     turn = torch.linspace(0, 2 * math.pi, around)
     there = torch.cat([before, stop + SWING * turn.sin(), after])
@@ -306,3 +308,5 @@ def swing(cameras: Cameras, seen_at: Sequence[float], settings: VideoSettings) -
 PRESETS = {"bullet_time": bullet_time, "time_freeze": time_freeze}
 # Of what one moving camera filmed, where it was: :func:`swing`.
 FOLLOWED = "swing"
+# What video.path may be beside a file.
+NAMES = (*WAYS, *PRESETS, FOLLOWED)

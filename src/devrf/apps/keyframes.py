@@ -18,7 +18,7 @@ from kornia.geometry.conversions import (
 from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, ValidationError
 from torch import Tensor
 
-from devrf.apps.camera_paths import FOLLOWED, PRESETS, WAYS
+from devrf.apps.camera_paths import NAMES
 from devrf.apps.video import MAX_FRAMES
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
@@ -215,8 +215,7 @@ def read_path(file: Path) -> CameraPath:
     Raises:
         DevrfError: there is no such file, or it is no camera path.
     """
-    choices = ", ".join([*WAYS, *PRESETS, FOLLOWED])
-    remedy = f"give video.path {choices}, or a file that the viewer saved"
+    remedy = f"give video.path {', '.join(NAMES)}, or a file that the viewer saved"
     return _path(read_json(file, _PathFile, remedy), file)
 
 

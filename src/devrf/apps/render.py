@@ -13,6 +13,7 @@ from torch import Tensor
 
 from devrf.apps.camera_paths import (
     FOLLOWED,
+    NAMES,
     PRESETS,
     WAYS,
     default_way,
@@ -54,7 +55,7 @@ def camera_path(settings: VideoSettings) -> CameraPath | None:
     Raises:
         DevrfError: it holds no camera path, or one of too many frames.
     """
-    if settings.path is None or settings.path in (*WAYS, *PRESETS, FOLLOWED):
+    if settings.path is None or settings.path in NAMES:
         return None
     path = read_path(Path(settings.path))
     _ = path.frames

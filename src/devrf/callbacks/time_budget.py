@@ -195,9 +195,14 @@ class TimeBudget(Callback):
         return stride, iterations, share, self._phases[-1].stop
 
     def _to_enter(self, phases: Sequence[Phase]) -> float:
-        """Seconds: as long as an iteration, where no phase of the kind has been entered yet."""
+        """Seconds: where no phase of the kind has been entered yet, as long as of another kind.
+
+        Where none has been at all, as long as an iteration.
+        """
         assert self._pace is not None
-        return sum(self._entering.get(one.kind, self._pace * one.cost) for one in phases)
+        longest = max(self._entering.values(), default=0.0)
+        usual = {one.kind: max(longest, self._pace * one.cost) for one in phases}
+        return sum((usual | self._entering)[one.kind] for one in phases)
 
     def _least(self, phases: Sequence[Phase]) -> float:
         """Seconds of one iteration each, with what it takes to enter them."""
@@ -212,8 +217,9 @@ class TimeBudget(Callback):
             # A level of all frames, or none of it; and no field before its search has ended.
             between = last.frame is None or last.kind != following.kind
             ahead = following.start > stage.iteration and last.kind != "search"
-            later = [one for one in self._phases[:count] if one.start > stage.iteration]
-            if between and ahead and self._least(later) <= left:
+            if not (between and ahead):
+                continue
+            if self._least([p for p in self._phases[:count] if p.start > stage.iteration]) <= left:
                 log.info(
                     "%s: schedule.seconds=%g is too little for its finest grids: it ends with %s, "
                     "after %d of %d phases",

@@ -107,8 +107,7 @@ def write_scene_page(run: RunContext) -> None:
     """Write the page that browsers draw, if they can draw what was learned."""
     model, viewpoints = _learned(run)
     if drawable(model):
-        path = run.folder / "export" / PAGE
-        write_page(path, model, viewpoints, run.config.scene)
+        write_page(run.folder / "export" / PAGE, model, viewpoints, run.config.scene)
 
 
 def _learned(run: RunContext) -> tuple[Renderable, Viewpoints]:

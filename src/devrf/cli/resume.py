@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
 import devrf
 from devrf.checkpoints.checkpoint import (
@@ -206,5 +206,5 @@ def _notes(folder: Path) -> dict[str, list[str]]:
     """The files that steps have written, by the digest of what decided them."""
     try:
         return NOTES.validate_json(read_record(folder / PLACE / NOTE))
-    except (OSError, ValidationError):
+    except (OSError, ValueError):
         return {}

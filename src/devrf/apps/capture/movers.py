@@ -56,7 +56,11 @@ Numbers = npt.NDArray[np.float64]
 
 
 class Film:
-    """A moving camera's images, and the optical flow between any two, estimated once."""
+    """A moving camera's images, and the optical flow between any two, estimated once.
+
+    Attributes:
+        textured: where (H, W) each image has texture, at the size that flow is estimated in.
+    """
 
     def __init__(self, images: Path, names: Sequence[str]) -> None:
         """Read images.
@@ -70,6 +74,7 @@ class Film:
         pictures = [np.asarray(picture, np.uint8) for picture in read]
         self._size = pictures[0].shape[1::-1]
         self._small = [shrunk(picture, LONGER_SIDE) for picture in pictures]
+        self.textured = [_textured(picture) for picture in self._small]
         self._estimator = estimator("dis")
         self._estimated = cache(self._estimate)
 
@@ -128,8 +133,7 @@ class Film:
         numbers = [number for number, name in enumerate(self._names) if name in place]
         width = self._small[0].shape[1]
         cameras = [_Camera(model, place[self._names[number]], width) for number in numbers]
-        textured = [_textured(self._small[number]) for number in numbers]
-        return _Shots(self, numbers, cameras, textured)
+        return _Shots(self, numbers, cameras)
 
 
 @dataclass(frozen=True)
@@ -140,13 +144,11 @@ class _Shots:
         film: the film.
         numbers: which of its images.
         cameras: of each.
-        textured: where (H, W) each has texture.
     """
 
     film: Film
     numbers: list[int]
     cameras: list[_Camera]
-    textured: list[Mask]
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -157,11 +159,12 @@ class _Shots:
 
     def errors(self, k: int) -> Iterator[Numbers]:
         """(H, W) of each near image: by how much flow there leaves its lines; NaN: unknown."""
+        textured = self.film.textured[self.numbers[k]]
         for other in (k + step * way for step in STEPS for way in (-1, 1)):
             if 0 <= other < len(self):
                 there, agrees = self.between(k, other)
                 error = self.cameras[k].error_of_flow(there, self.cameras[other])
-                error[~(agrees & self.textured[k])] = np.nan
+                error[~(agrees & textured)] = np.nan
                 yield error
 
     def votes(self, k: int) -> Numbers:
