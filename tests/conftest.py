@@ -6,13 +6,14 @@ import copy
 import gc
 import json
 import logging
+import pickle
 import re
 import signal
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import devrf  # noqa: F401 - before Lightning: an unusable torchvision ends no test
 
@@ -86,16 +87,17 @@ def quick_composition() -> Iterator[None]:
     """Configs composed in a fraction of Hydra's time.
 
     It reads and merges every file anew for each command, though files do not change while tests
-    run: what it makes of the same options of the same groups is kept. And it composes a first time
+    run: what it makes of the same options of the same groups is kept (pickled: that is read in a
+    third of the time of a deep copy). And it composes a first time
     only to see in which mode to run, which some files and overrides say.
     """
     Plugins.instance()  # registers the sources
     files = SourcesRegistry.instance().resolve("file")
     read, asked = files.load_config, Hydra.get_mode
     chosen, merged = create_defaults_list, ConfigLoaderImpl._compose_config_from_defaults_list
-    known: dict[tuple[str, str], ConfigResult] = {}
+    known: dict[tuple[str, str], bytes] = {}
     lists: dict[tuple[object, ...], DefaultsList] = {}
-    configs: dict[int, DictConfig] = {}
+    configs: dict[int, bytes] = {}
     files_of_sweeps = {
         file.stem
         for file in config_folder().rglob("*.y*ml")
@@ -110,8 +112,8 @@ def quick_composition() -> Iterator[None]:
             return read(self, config_path)
         place = self.path, config_path
         if place not in known:
-            known[place] = read(self, config_path)
-        return copy.deepcopy(known[place])
+            known[place] = pickle.dumps(read(self, config_path))
+        return cast(ConfigResult, pickle.loads(known[place]))
 
     def list_defaults(
         repo: IConfigRepository,
@@ -137,8 +139,8 @@ def quick_composition() -> Iterator[None]:
         if not any(defaults is one.defaults for one in lists.values()):
             return merged(self, defaults, repo)
         if id(defaults) not in configs:
-            configs[id(defaults)] = merged(self, defaults, repo)
-        return copy.deepcopy(configs[id(defaults)])
+            configs[id(defaults)] = pickle.dumps(merged(self, defaults, repo))
+        return cast(DictConfig, pickle.loads(configs[id(defaults)]))
 
     def get_mode(self: Hydra, config_name: str | None, overrides: list[str]) -> Any:
         others = (one for one in overrides if one != "hydra.mode=RUN")  # that is the usual

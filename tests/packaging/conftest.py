@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import copy
+import pickle
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import cast
 
 import pytest
 from hydra import compose, initialize_config_dir
@@ -15,15 +16,16 @@ from devrf.cli.config import config_folder, register_config
 
 Composed = Callable[..., DictConfig]
 
-known: dict[tuple[str, ...], DictConfig] = {}
+known: dict[tuple[str, ...], bytes] = {}
 
 
 def whole_config(*overrides: str) -> DictConfig:
     """The config with Hydra's own part; composed once, whoever asks for it."""
     if overrides not in known:
         with initialize_config_dir(str(config_folder()), version_base="1.3"):
-            known[overrides] = compose("config", list(overrides), return_hydra_config=True)
-    return copy.deepcopy(known[overrides])
+            whole = compose("config", list(overrides), return_hydra_config=True)
+        known[overrides] = pickle.dumps(whole)
+    return cast(DictConfig, pickle.loads(known[overrides]))
 
 
 @pytest.fixture
@@ -38,7 +40,7 @@ def composed(tmp_path: Path) -> Iterator[Composed]:
         with open_dict(whole):
             whole.hydra.runtime.output_dir = str(tmp_path)
         hydra.set_config(whole)
-        task = whole.copy()
+        task = whole_config(*overrides)
         with open_dict(task):
             del task["hydra"]
         return task
