@@ -114,6 +114,21 @@ def test_a_batch_may_have_fewer_rays_where_no_masks_tell_what_is_empty(
     assert sizes == [32, 7]
 
 
+def test_a_method_may_learn_before_random_colours_where_all_images_have_masks(
+    ray_stage: Make, fit: Fit, tiny_scene: Scene, serve: Callable[[Scene], SceneDataModule]
+) -> None:
+    class Varied(DNeRF):
+        random_background = True
+
+    bare = replace(tiny_scene.static.train, pixels=tiny_scene.static.train.pixels[..., :3])
+    half = replace(tiny_scene, static=replace(tiny_scene.static, train=bare))
+    shapes = []
+    for model, scene in ((DNeRF, tiny_scene), (Varied, tiny_scene), (Varied, half)):
+        stage = fit(ray_stage(model(TINY)), data=serve(scene))
+        shapes.append(tuple(stage.draw().background.shape))
+    assert shapes == [(3,), (32, 3), (3,)]
+
+
 def test_rates_decay_exponentially_or_as_half_a_cosine_after_a_warm_up(ray_stage: Make) -> None:
     rates = {"iterations": 101, "learning_rate": 1e-2, "final_learning_rate": 1e-4}
     plain = ray_stage(DNeRF(TINY), **rates)

@@ -123,12 +123,14 @@ class RayTrainable(Renderable):
         priors: what it wants of a scene beside images and backward flow, where it can be had:
             ``forward_flow``.
         cost_follows_rays: whether an iteration on fewer rays takes less time.
+        random_background: whether it learns before random colours where all images have masks.
     """
 
     losses: ClassVar[tuple[str, ...]] = ("color",)
     protocols: ClassVar[tuple[str, ...] | None] = None
     priors: ClassVar[tuple[str, ...]] = ()
     cost_follows_rays: ClassVar[bool] = True
+    random_background: ClassVar[bool] = False
 
     def check_protocol(self, protocol: str) -> None:
         """Refuse a protocol that the method cannot learn by.

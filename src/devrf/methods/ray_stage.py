@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
-from devrf.data.batch import Pixels, RayBatch, concatenated
+from devrf.data.batch import Pixels, RayBatch, background_color, concatenated
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.batches import FramePool, gather_batch
 from devrf.engine.grid_adam import GridAdam
@@ -126,6 +126,7 @@ class RayStage(Stage):
         self.pools: list[FramePool] = []
         self._centres: list[FramePool] = []
         self._rays = schedule.rays
+        self._random_background = False
 
     @property
     def total_iterations(self) -> int:
@@ -197,6 +198,8 @@ class RayStage(Stage):
         if fewer is not None and not self.scene_model.has_hull:
             self._rays = fewer
         views = [self.training_views(images) for images in self.images]
+        masked = all(view_set.has_alpha for view_set in views)
+        self._random_background = masked and self.scene_model.random_background
         self.pools = [FramePool.of(view_set) for view_set in views]
         if self.schedule.centre_crop:
             self._centres = [FramePool.of(view_set, centre=True) for view_set in views]
@@ -235,6 +238,12 @@ class RayStage(Stage):
                 flats.append(flat)
             image = torch.cat(images)
             return Pixels(image, flat=torch.cat(flats), background=self.background(image))
+
+    def background(self, image: Tensor) -> Tensor:
+        """Random (R, 3) where the method learns so and all images have masks; else the scene's."""
+        if self._random_background:
+            return background_color("random", len(image), self.generator)
+        return super().background(image)
 
     def _shown_frames(self, pool: FramePool) -> int:
         """How many frames the curriculum shows by now."""

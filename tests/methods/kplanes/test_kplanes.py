@@ -15,7 +15,12 @@ from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
 from devrf.geometry.rays import Rays
-from devrf.methods.kplanes.decoders import ExplicitDecoder, density_of, spherical_harmonics
+from devrf.methods.kplanes.decoders import (
+    ExplicitDecoder,
+    HybridDecoder,
+    density_of,
+    spherical_harmonics,
+)
 from devrf.methods.kplanes.model import KPlanes
 from devrf.methods.kplanes.planes import AXES, SixPlanes
 from devrf.methods.kplanes.proposals import drawn_edges, histogram_error, intervals
@@ -115,6 +120,20 @@ def test_directions_are_spherical_harmonics() -> None:
             expected = torch.from_numpy(scale * real).float()
             torch.testing.assert_close(found[:, column], expected, atol=1e-5, rtol=0)
             column += 1
+
+
+def test_without_harmonics_colors_are_the_same_from_all_sides() -> None:
+    torch.manual_seed(0)
+    further = torch.rand(2, 15)
+    viewdirs = torch.nn.functional.normalize(torch.randn(2, 3), dim=1)
+    ray = torch.arange(2)
+    for harmonics, same in ((0, True), (3, False)):
+        decoder = HybridDecoder(8, replace(TINY, harmonics=harmonics))
+        here = decoder.rgb(further, viewdirs, ray)
+        there = decoder.rgb(further, -viewdirs, ray)
+        assert torch.equal(here, there) == same
+    with pytest.raises(DevrfError, match="harmonics: expected 0 to 3"):
+        replace(TINY, harmonics=0, decoder="explicit")
 
 
 def test_explicit_colors_are_linear_in_the_features_before_the_sigmoid() -> None:

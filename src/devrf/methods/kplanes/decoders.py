@@ -55,7 +55,8 @@ class HybridDecoder(nn.Module):
     def __init__(self, size: int, settings: KPlanesSettings) -> None:
         super().__init__()
         self.geometry = network(size, settings.width, 1, FURTHER + 1)
-        self.color = network(FURTHER + len(FACTORS), settings.width, 2, 3)
+        self._directions = (settings.harmonics + 1) ** 2
+        self.color = network(FURTHER + self._directions, settings.width, 2, 3)
 
     def density(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """σ (S,), and what :meth:`rgb` takes, of features (S, size)."""
@@ -64,7 +65,8 @@ class HybridDecoder(nn.Module):
 
     def rgb(self, further: Tensor, viewdirs: Tensor, ray: Tensor) -> Tensor:
         """RGB (S, 3) in [0, 1] of samples of the rays ``ray`` (S,), whose directions are (R, 3)."""
-        direction = spherical_harmonics(viewdirs).index_select(0, ray)
+        harmonics = spherical_harmonics(viewdirs)[:, : self._directions]
+        direction = harmonics.index_select(0, ray)
         return torch.sigmoid(self.color(torch.cat([further, direction], dim=1)))
 
 

@@ -42,6 +42,7 @@ class KPlanes(SurfacedField):
     losses: ClassVar[tuple[str, ...]] = (
         "color", "tv", "smooth", "change", "smooth_proposals", "histogram", "distortion",
     )  # fmt: skip
+    random_background: ClassVar[bool] = True
     settings_class = KPlanesSettings
     settings: KPlanesSettings
 

@@ -9,6 +9,7 @@ from typing import Literal
 from devrf.methods.nerf.settings import OccupancySettings
 
 Pairing = Literal["product", "hexplane"]
+HIGHEST_DEGREE = 3  # of spherical harmonics
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,8 @@ class KPlanesSettings(OccupancySettings):
         pairing: how features of the six planes meet: ``product``, or as in ``hexplane``.
         decoder: ``hybrid`` (small networks) or ``explicit`` (linear, in a basis for a direction).
         width: units of the hybrid decoder's layers.
+        harmonics: highest degree of its spherical harmonics of the direction; 0: colours are the
+            same from all sides, since few fixed cameras cannot tell them from motion.
         basis_width, basis_depth: units and number of the layers that give the basis (explicit).
         sampling: ``occupancy`` (even steps where something may be) or ``proposals`` (as published).
         steps: samples along the box's diagonal (occupancy).
@@ -40,6 +43,7 @@ class KPlanesSettings(OccupancySettings):
     pairing: Pairing = "product"
     decoder: Literal["hybrid", "explicit"] = "hybrid"
     width: int = 64
+    harmonics: int = HIGHEST_DEGREE
     basis_width: int = 128
     basis_depth: int = 4
     sampling: Literal["occupancy", "proposals"] = "occupancy"
@@ -54,6 +58,9 @@ class KPlanesSettings(OccupancySettings):
         self.check_least(2, "resolution", "width", "basis_width")
         self.check_least(1, "channels", "basis_depth", "proposal_channels")
         self.check_samples("steps", "samples")
+        degree = self.harmonics
+        fit = degree == HIGHEST_DEGREE or (0 <= degree < 3 and self.decoder == "hybrid")
+        self.check("harmonics", fit, "0 to 3; 3 with decoder=explicit, which has none")
         fit = len(self.scales) > 0 and min(self.scales) >= 1
         self.check("scales", fit, "one or more numbers above 0")
         points = self.time_resolution
