@@ -19,9 +19,7 @@ BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --disable-pip-version-check \
 	$(if $(CONSTRAINTS),--constraint $(CONSTRAINTS)) --editable
 # A file's tests run in one process: what they share is made once. The last files are small ones.
-# Three suit two cores, since some tests wait. Tests start many commands, for which compiled
-# modules are kept, whatever the shell says.
-PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --numprocesses 3 --dist loadfile \
+PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile \
 	--no-loadscope-reorder --durations 15
 
 .PHONY: quickstart test docs house gpu-check fuzz format shell clean

@@ -256,10 +256,12 @@ def test_the_controls_do_what_they_say(browser, file, tmp_path):
     beside = browser.changed(whole)
     browser.element("rest").click()
     shown = browser.changed(beside)
+    assert psnr(whole, shown) > 60
     channel = choice(browser.element("channel"))
     for word in ("depth", "motion"):
         channel.select_by_visible_text(word)
         shown = browser.changed(shown)
+        assert psnr(whole, shown) < 30
     channel.select_by_visible_text("colour")
     assert psnr(whole, browser.changed(shown)) > 60
 

@@ -305,7 +305,7 @@ def test_motion_stays_within_the_extent(shape: Body) -> None:
         assert float(points.norm(dim=-1).max()) < where.reach
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(6))
 def test_a_random_body_has_the_size_and_the_motion_that_are_said(seed: int) -> None:
     body = random_body(seed)
     outline = body.outline()
@@ -319,7 +319,7 @@ def test_a_random_body_has_the_size_and_the_motion_that_are_said(seed: int) -> N
     assert len(other.parts) != len(body.parts) or other.parts[0].paint != body.parts[0].paint
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(6))
 def test_a_hung_body_touches_neither_wall_nor_floor(seed: int) -> None:
     hung = replace(HUNG, scene_seed=seed).filmed()
     assert isinstance(hung, Surrounded) and hung.surroundings.parts == 2

@@ -340,6 +340,11 @@ class Stage(LightningModule, ABC):
             whole = min(whole, most)
         return max(1, round(whole * self.batch_share))
 
+    @property
+    def background_name(self) -> str:
+        """What it learns before: ``white``, ``black`` or ``random``."""
+        return self.scene.background
+
     def background(self, image: Tensor) -> Tensor:
         """What is behind the pixels of ``image`` (R,): (3,), always the same tensor, if plain.
 
@@ -347,7 +352,7 @@ class Stage(LightningModule, ABC):
         """
         plain = self._plain_background
         if plain is None or plain.device != image.device:
-            name = self.scene.background
+            name = self.background_name
             if name == "random":
                 return background_color(name, len(image), self.generator)
             plain = background_color(name, 0, self.generator).to(image.device)

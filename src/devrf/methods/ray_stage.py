@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
-from devrf.data.batch import Pixels, RayBatch, background_color, concatenated
+from devrf.data.batch import Pixels, RayBatch, concatenated
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.batches import FramePool, gather_batch
 from devrf.engine.grid_adam import GridAdam
@@ -239,11 +239,10 @@ class RayStage(Stage):
             image = torch.cat(images)
             return Pixels(image, flat=torch.cat(flats), background=self.background(image))
 
-    def background(self, image: Tensor) -> Tensor:
-        """Random (R, 3) where the method learns so and all images have masks; else the scene's."""
-        if self._random_background:
-            return background_color("random", len(image), self.generator)
-        return super().background(image)
+    @property
+    def background_name(self) -> str:
+        """``random`` where the method learns so and all images have masks; else the scene's."""
+        return "random" if self._random_background else super().background_name
 
     def _shown_frames(self, pool: FramePool) -> int:
         """How many frames the curriculum shows by now."""

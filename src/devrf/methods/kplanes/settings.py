@@ -59,7 +59,9 @@ class KPlanesSettings(OccupancySettings):
         self.check_least(1, "channels", "basis_depth", "proposal_channels")
         self.check_samples("steps", "samples")
         degree = self.harmonics
-        fit = degree == HIGHEST_DEGREE or (0 <= degree < 3 and self.decoder == "hybrid")
+        fit = degree == HIGHEST_DEGREE or (
+            0 <= degree < HIGHEST_DEGREE and self.decoder == "hybrid"
+        )
         self.check("harmonics", fit, "0 to 3; 3 with decoder=explicit, which has none")
         fit = len(self.scales) > 0 and min(self.scales) >= 1
         self.check("scales", fit, "one or more numbers above 0")
