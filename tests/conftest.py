@@ -28,13 +28,14 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
-from hydra._internal import config_loader_impl
+from hydra._internal import config_loader_impl, defaults_list
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.config_repository import IConfigRepository
 from hydra._internal.defaults_list import DefaultsList, Overrides, create_defaults_list
 from hydra._internal.hydra import Hydra
 from hydra._internal.sources_registry import SourcesRegistry
-from hydra.core.default_element import ResultDefault
+from hydra.core.default_element import InputDefault, ResultDefault
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult, ConfigSource
@@ -89,13 +90,16 @@ def quick_composition() -> Iterator[None]:
     It reads and merges every file anew for each command, though files do not change while tests
     run: what it makes of the same options of the same groups is kept, pickled: that is read in
     2.3 ms, where a deep copy takes 9.5. And it composes a first time only to see in which mode to
-    run, which some files and overrides say.
+    run, which some files and overrides say. The same text is parsed once, and what names in a
+    defaults list refer to is listed only for lists with such names.
     """
     Plugins.instance()  # registers the sources
     files = SourcesRegistry.instance().resolve("file")
     read, asked = files.load_config, Hydra.get_mode
     chosen, merged = create_defaults_list, ConfigLoaderImpl._compose_config_from_defaults_list
+    listed, parse = defaults_list._create_interpolation_map, OverridesParser.parse_rule
     known: dict[tuple[str, str], bytes] = {}
+    rules: dict[tuple[str, str], Any] = {}
     lists: dict[tuple[object, ...], DefaultsList] = {}
     configs: dict[int, bytes] = {}
     files_of_sweeps = {
@@ -149,8 +153,22 @@ def quick_composition() -> Iterator[None]:
             return asked(self, config_name, overrides)
         return None
 
+    def list_names(
+        overrides: Overrides, defaults: list[InputDefault], self_added: bool
+    ) -> DictConfig | None:
+        if not any(default.is_interpolation() for default in defaults):
+            return None
+        return listed(overrides, defaults, self_added)
+
+    def parse_rule(self: OverridesParser, text: str, rule: str) -> Any:
+        if (text, rule) not in rules:
+            rules[text, rule] = parse(self, text, rule)
+        return copy.copy(rules[text, rule])  # it is told its loader later
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(files, "load_config", load_config)
+        patch.setattr(defaults_list, "_create_interpolation_map", list_names)
+        patch.setattr(OverridesParser, "parse_rule", parse_rule)
         patch.setattr(config_loader_impl, "create_defaults_list", list_defaults)
         patch.setattr(ConfigLoaderImpl, "_compose_config_from_defaults_list", merge)
         patch.setattr(Hydra, "get_mode", get_mode)

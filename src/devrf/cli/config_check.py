@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal, cast, get_type_hints
 
 from annotated_types import Ge, Lt
 from hydra.utils import get_object
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import MISSING, DictConfig, OmegaConf
 from typing_extensions import TypedDict
 
 from devrf.cli.config import config_folder
@@ -62,12 +62,12 @@ def check_config(config: DictConfig) -> None:
     # Imported here: --help is answered before it has loaded.
     from pydantic import TypeAdapter, ValidationError
 
-    for key in sorted(OmegaConf.missing_keys(config)):
+    raw: Any = OmegaConf.to_container(config)
+    text = json.dumps(raw, default=str, ensure_ascii=False)
+    for key in sorted(OmegaConf.missing_keys(config)) if MISSING in text else ():
         value = "PATH" if key.endswith("root") else "VALUE"
         raise DevrfError(f"{key}: required; give {key}={value}")
-    raw: Any = OmegaConf.to_container(config)
     resolved: Any = OmegaConf.to_container(config, resolve=True)
-    text = json.dumps(raw, default=str, ensure_ascii=False)
     read = tuple(f"{key}." for key in REFERENCE.findall(text))
     # A key that is missing is wrong in its type, too.
     content = json.dumps(dict.fromkeys(ROOT) | resolved, default=str)

@@ -69,10 +69,11 @@ def present_command(config: DictConfig) -> Command:
     Code that was typed (``_target_``), and what was removed, is not kept. Empty outside Hydra.
     """
     said: Command = {}
+    chosen = choices()
     for override in parsed(overrides()):
         key = override.key_or_group
-        if key in choices():
-            said[f"/{key}"] = choices()[key]
+        if key in chosen:
+            said[f"/{key}"] = chosen[key]
         elif not override.is_delete():
             said |= leaves(OmegaConf.select(config, key), key)
     for key in PATHS & {*said}:  # relative to the folder in which they were typed

@@ -68,6 +68,11 @@ class Part:
         """Radius of a ball about its base that holds it at rest."""
         return math.hypot(self.along, *self.half[:2])
 
+    @property
+    def rigid(self) -> bool:
+        """Whether it keeps its form: it neither bends, nor twists, nor is squashed."""
+        return {self.bend, self.twist, self.squash} == {STILL}
+
     def distance(self, local: Sequence[Tensor]) -> Tensor:
         """Lower bound (M,) at rest of points (M,), (M,), (M,) in its frame."""
         x, y, z = local
@@ -85,6 +90,8 @@ class Part:
         """Where points of its frame are in it at ``time``: spun, squashed, twisted, then bent."""
         x, y, z = local
         x, y = turn(x, y, self.spin(speed, time))
+        if self.rigid:
+            return x, y, z
         factor = math.exp(self.squash(speed, time))
         x = x / math.sqrt(factor)
         y = y / math.sqrt(factor)
@@ -96,18 +103,19 @@ class Part:
     def undeformed(self, local: Sequence[Tensor], speed: float, time: float) -> Sequence[Tensor]:
         """The exact inverse of :meth:`deformed`."""
         x, y, z = local
-        z, x = turn(z, x, -self.bend(speed, time) * self._ramp(x, y, z))
-        x, y = turn(x, y, -self.twist(speed, time) * (z / self.along).clamp(0, 1))
-        factor = math.exp(self.squash(speed, time))
-        x = x * math.sqrt(factor)
-        y = y * math.sqrt(factor)
-        z = z / factor
+        if not self.rigid:
+            z, x = turn(z, x, -self.bend(speed, time) * self._ramp(x, y, z))
+            x, y = turn(x, y, -self.twist(speed, time) * (z / self.along).clamp(0, 1))
+            factor = math.exp(self.squash(speed, time))
+            x = x * math.sqrt(factor)
+            y = y * math.sqrt(factor)
+            z = z / factor
         x, y = turn(x, y, -self.spin(speed, time))
         return x, y, z
 
     def distance_at(self, local: Sequence[Tensor], speed: float, time: float) -> Tensor:
         """Lower bound (M,) at ``time`` of points in its frame, which moves with it."""
-        if {self.bend, self.twist, self.squash} == {STILL}:
+        if self.rigid:
             return self.distance(local)
         factor = math.exp(self.squash(speed, time))
         longest = max(factor, 1 / math.sqrt(factor))

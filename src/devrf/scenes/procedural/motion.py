@@ -47,6 +47,8 @@ def rotation(axis: tuple[float, float, float], angle: float) -> Tensor:
 
 def turn(a: Tensor, b: Tensor, angle: Tensor | float) -> tuple[Tensor, Tensor]:
     """Coordinates (a, b) turned in their plane by ``angle`` (radians), from a towards b."""
+    if isinstance(angle, float) and angle == 0:
+        return a, b
     angle = torch.as_tensor(angle, dtype=a.dtype, device=a.device)
     cos = angle.cos()
     sin = angle.sin()
