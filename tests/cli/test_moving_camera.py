@@ -44,6 +44,23 @@ def test_a_capture_needs_no_flag_beside_its_folder(devrf, mill, tmp_path) -> Non
     assert metrics["method"] == "tineuvox" and metrics["protocol"] == "dynamic"
 
 
+@pytest.mark.parametrize(
+    ("typed", "said"),
+    [
+        ((), "where method=devrf needs the scene at rest, too (experiment=phone)"),
+        (("method=dnerf", "profile=dnerf_small"), "the scene at rest, too (protocol=dynamic)"),
+        (("method=devrf",), "experiment=phone learns more of it than method=devrf"),
+    ],
+)
+def test_an_embedded_film_by_hand_is_learned_as_others_are(
+    devrf, tiny_facing, monkeypatch, typed, said
+) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    outcome = devrf(*tiny_facing, "data.camera=handheld", *typed, "stage=inspect")
+    assert (outcome.status, outcome.err) == (0, "")
+    assert "data.camera=handheld: one" in outcome.out and said in outcome.out
+
+
 def test_devrf_learns_such_a_capture_where_it_is_chosen(devrf, short, mill, tmp_path) -> None:
     quick = (*short, "schedule.canonical.visual_hull_init=false", "video.frames=1")
     run = devrf("data.root=mill", "method=devrf", *quick, "evaluation.metrics=[]")

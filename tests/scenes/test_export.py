@@ -123,3 +123,6 @@ def test_a_film_by_hand_reads_back_the_same(tmp_path: Path) -> None:
         off = there.cameras.camera_to_world - here.cameras.camera_to_world
         # Readers take the average pose of the training views and the others as the identity.
         assert float(off.abs().max()) < 1e-4
+    masks = back.dynamic.test.valid_mask
+    assert masks is not None and torch.equal(masks, scene.dynamic.test.valid_mask)
+    assert back.dynamic.train.valid_mask is None

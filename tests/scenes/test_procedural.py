@@ -26,7 +26,7 @@ from devrf.scenes.procedural import (
     moved,
 )
 from devrf.scenes.procedural.assembled import Assembled
-from devrf.scenes.procedural.filming import Filming, extent
+from devrf.scenes.procedural.filming import Filming, covisible, extent
 from devrf.scenes.procedural.march import HIT
 from devrf.scenes.procedural.plush import BASE
 from devrf.scenes.procedural.random_bodies import random_body
@@ -151,6 +151,7 @@ def test_one_hand_held_camera_films_a_large_thing_and_others_see_it_at_the_same_
     assert train.times.tolist() == test.times.tolist() == [0, 0.25, 0.5, 0.75, 1]
     poses = torch.cat([v.cameras.camera_to_world for v in (train, test)])
     torch.testing.assert_close(average_pose(poses), torch.eye(4)[:3], atol=1e-5, rtol=0)
+    assert train.valid_mask is None and 0.6 < float(test.valid_mask.float().mean()) < 1
     apart = (train.cameras.positions - test.cameras.positions).norm(dim=1)
     assert float(apart.min()) > 0.1
     backdrop = Backdrop()
@@ -173,6 +174,48 @@ def test_flow_of_a_hand_held_camera_leads_to_the_same_point_of_the_wall() -> Non
     )
     torch.testing.assert_close(flow.vectors[1], expected, atol=1e-3, rtol=1e-3)
     assert float(flow.vectors[1].norm(dim=-1).mean()) > 1  # at rest, all that it sees flows
+
+
+def test_a_pixel_is_covisible_if_five_images_show_its_point_or_half_or_a_tenth() -> None:
+    recipe = replace(FORWARD, camera="handheld", frames=2, speed=0.0)
+    surface = recipe.filmed()
+    one = recipe().dynamic.train[torch.tensor([0])]
+
+    def learned(count: int, hidden: int) -> Views:
+        """The image ``count`` times; something is in front of all that ``hidden`` of them show."""
+        views = one[torch.zeros(count, dtype=torch.long)]
+        nearer = torch.tensor([0.5] * hidden + [1.0] * (count - hidden))
+        return replace(views, depth=views.depth * nearer[:, None, None])
+
+    cases = ((3, 1, 1), (3, 2, 0), (12, 7, 1), (12, 8, 0), (70, 63, 1), (70, 64, 0))
+    for count, hidden, seen in cases:
+        mask = covisible(surface, one, learned(count, hidden))
+        assert mask.float().unique().tolist() == [seen], (count, hidden)
+    aside = replace(one.cameras, center=one.cameras.center - torch.tensor([one.width / 2, 0.0]))
+    half = replace(one, cameras=aside, depth=torch.full_like(one.depth, torch.inf))
+    (mask,) = covisible(surface, one, half)
+    middle = one.width // 2
+    assert mask[:, middle:].all() and not mask[:, :middle].any()
+
+
+def test_a_moving_point_is_covisible_where_it_has_gone() -> None:
+    recipe = replace(FORWARD, shape="cushion", camera="handheld", frames=5, width=40, height=30)
+    surface = recipe.filmed()
+    train = recipe().dynamic.train
+    first = train[torch.tensor([0])]
+    last = train[torch.tensor([4])]
+    rays = first.cameras.image_rays(0)
+    points = rays.at(torch.arange(len(rays)), first.depth.flatten())
+    there = surface.forward(surface.material(points, 0.0), 1.0)
+    moved = (there - points).norm(dim=-1) > 0.02
+    pixels, _ = last.cameras.project_into(0, there)
+    x, y = pixels.long().unbind(-1)
+    inside = (pixels.amin(dim=-1) >= 0) & (x < 40) & (y < 30) & moved
+    # What is met in that pixel from there is the point itself, or something in front of it.
+    away = (there - last.cameras.positions[0]).norm(dim=-1)[inside]
+    shown = away <= 1.02 * last.depth[0][y[inside], x[inside]]
+    mask = covisible(surface, first, last).flatten()
+    assert moved.sum() > 100 and torch.equal(mask[inside], shown)
 
 
 def test_edges_are_antialiased() -> None:

@@ -4,7 +4,8 @@
 * A run that is named (``ckpt=``, ``hydra.run.dir=``, ``hydra.sweep.dir=``) brings the overrides
   that it was learned with. What is typed comes after them: only that differs.
 * A scene's folder brings what its files say and nothing else has said: ``data=``, ``facing=``; if
-  one camera filmed it ``experiment=phone``, or for a method that is typed ``protocol=dynamic``.
+  one camera filmed it ``experiment=phone``, or for a method that is typed ``protocol=dynamic``;
+  these, too, for ``data.camera=handheld``.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ OF_DEVRF = ("canonical", "deformation")
 HOW: tuple[str, ...] = ("method", "profile", "protocol", "comparison", "experiment", "ablation")
 HOW += ("hparams_search", "data.static_until", "field", "sampling", "loss")
 HOW += ("canonical", "deformation", "schedule.canonical", "schedule.deformation", "schedule.motion")
+ONE_CAMERA = "one moving camera, where method=devrf needs the scene at rest, too"
 # `viewer` is a group, whose choices Hydra wants to be text.
 SHORTHAND = {f"viewer={value}": f"viewer.training={value}" for value in ("true", "false")}
 KEY_VALUE = re.compile(r"(\+{0,2}([\w./@-]+)=)(.*)", re.DOTALL)
@@ -63,6 +65,11 @@ def completed(arguments: Sequence[str]) -> list[str]:
     before = of_named_run(typed, known.multirun)
     roots = values(typed, "data.root")
     overrides = parsed([*before, *texts])
+    if value(overrides, "data.camera") == "handheld" and value(overrides, "stage") not in APART:
+        chosen = _for_one_camera("data.camera=handheld", overrides, continued=bool(before))
+        if chosen:
+            told.append(f"data.camera=handheld: {ONE_CAMERA} ({' '.join(chosen)})")
+        return [*flags, *before, *texts, *chosen]
     if not roots or value(overrides, "stage") in APART or any("${" in root for root in roots):
         return [*flags, *before, *texts]
     readers: list[str | None] = [*values(overrides, "data")]
@@ -114,8 +121,6 @@ def _told_by_scene(
         DevrfError: ``option`` is None, and no reader knows the layout.
     """
     with importing():  # they load torch
-        import torch
-
         from devrf.data.kind import by_one_camera, faces_forward
         from devrf.scenes.formats import recognise
 
@@ -132,17 +137,9 @@ def _told_by_scene(
     if not values(overrides, "facing") and faces_forward(option, root, space):
         words.append("facing=forward")
     if by_one_camera(option, root):
-        method = value(overrides, "method")
-        if method == "devrf" or value(overrides, "stage") in OF_DEVRF:
-            lacks = "one camera filmed it moving, and nothing shows it at rest"
-            told.append(f"{root}: {lacks}; experiment=phone learns more of it than method=devrf")
-        elif not continued and not any(map(_says_how, overrides)):
-            on_cpu = "cpu" in (value(overrides, "trainer"), value(overrides, "trainer.accelerator"))
-            on_gpu = torch.cuda.is_available() and not on_cpu
-            words.append(f"experiment={'phone_gpu' if on_gpu else 'phone'}")
-            why = f"one moving camera, where method=devrf needs the scene at rest, too; {why}"
-        elif method and not any(values(overrides, key) for key in ("protocol", "comparison")):
-            words.append("protocol=dynamic")
+        chosen = _for_one_camera(root, overrides, continued=continued)
+        words += chosen
+        why = f"{ONE_CAMERA}; {why}" if chosen and chosen != ["protocol=dynamic"] else why
     scene = Path(root).expanduser().resolve().name
     if value(overrides, "experiment") == "paper" and option in ("inward", "forward"):
         if (config_folder() / f"for_scene/paper_{scene}.yaml").is_file():
@@ -150,6 +147,24 @@ def _told_by_scene(
     if words:
         told.append(f"{root}: {why} ({' '.join(words)}){remark}")
     return words
+
+
+def _for_one_camera(scene: str, overrides: Sequence[Override], *, continued: bool) -> list[str]:
+    """How what one moving camera filmed is learned, where nothing says it; see _told_by_scene."""
+    method = value(overrides, "method")
+    if method == "devrf" or value(overrides, "stage") in OF_DEVRF:
+        lacks = "one camera filmed it moving, and nothing shows it at rest"
+        told.append(f"{scene}: {lacks}; experiment=phone learns more of it than method=devrf")
+    elif not continued and not any(map(_says_how, overrides)):
+        with importing():
+            import torch
+
+        on_cpu = "cpu" in (value(overrides, "trainer"), value(overrides, "trainer.accelerator"))
+        on_gpu = torch.cuda.is_available() and not on_cpu
+        return [f"experiment={'phone_gpu' if on_gpu else 'phone'}"]
+    elif method and not any(values(overrides, key) for key in ("protocol", "comparison")):
+        return ["protocol=dynamic"]
+    return []
 
 
 def _of_experiments(overrides: Sequence[Override], config_dir: str | None) -> list[str | None]:

@@ -76,7 +76,8 @@ def export(scene: Scene, folder: Path) -> None:
 def _export_film(scene: Scene, folder: Path) -> None:
     """Write ``folder/images``, the film, ``folder/others``, what is held out, and their true poses.
 
-    Poses, times and images read back exactly; ``stage=capture`` takes ``images`` alone.
+    ``folder/masks`` says what of the others is scored. Poses, times and images read back exactly;
+    ``stage=capture`` takes ``images`` alone.
     """
     assert isinstance(scene.space, NormalizedDevice)
     bounds = {"space": "ndc", "near": scene.space.near}
@@ -92,9 +93,14 @@ def _export_film(scene: Scene, folder: Path) -> None:
                 views.times.tolist(),
                 strict=True,
             )
-            for name, pose, time in posed:
+            for k, (name, pose, time) in enumerate(posed):
                 matrix = [*pose, [0.0, 0.0, 0.0, 1.0]]
-                frames.append({"file_path": name, "time": time, "transform_matrix": matrix})
+                frame = {"file_path": name, "time": time, "transform_matrix": matrix}
+                if (mask := views.valid_mask_of(k)) is not None:
+                    frame["mask_path"] = f"masks/{k:03d}.png"
+                    (partial / "masks").mkdir(exist_ok=True)
+                    iio.imwrite(partial / frame["mask_path"], mask.numpy().astype(np.uint8) * 255)
+                frames.append(frame)
         cameras = scene.dynamic.train.cameras
         fx, fy = cameras.focal[0].tolist()
         cx, cy = cameras.center[0].tolist()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -113,6 +114,42 @@ def exact_flow(shape: Shape, views: Views, *, forward: bool = False) -> OpticalF
     return OpticalFlow(vectors, valid)
 
 
+# A point is seen well if so many images show it, or a tenth of all if these are more (DyCheck);
+# half of all suffice where there are few.
+_SEEN_BY = 5
+# It is the point that an image shows there if it is at most so much farther away, as a share.
+_SAME_DEPTH = 0.02
+
+
+def covisible(shape: Shape, views: Views, learned: Views) -> Tensor:
+    """Which pixels of ``views`` show what enough images of ``learned`` show, too: (N, H, W) bool.
+
+    The point that the ray through a pixel's centre meets is carried to the time of each image that
+    is learned from, and projected into it. What training has hardly seen is not to be scored (Gao
+    et al., *Monocular Dynamic View Synthesis: A Reality Check*, 2022).
+    """
+    assert views.depth is not None and learned.depth is not None
+    needed = min(max(_SEEN_BY, len(learned) // 10), math.ceil(len(learned) / 2))
+    size = torch.tensor([learned.width, learned.height])
+    masks = torch.zeros_like(views.depth, dtype=torch.bool)
+    for k, time in enumerate(views.times.tolist()):
+        met = views.depth[k].flatten().isfinite()
+        rays = views.cameras.image_rays(k)
+        points = rays.at(met.nonzero()[:, 0], views.depth[k].flatten()[met])
+        material = shape.material(points, time)
+        count = torch.zeros(len(points), dtype=torch.long)
+        for image, other in enumerate(learned.times.tolist()):
+            there = shape.forward(material, other)
+            pixels, ahead = learned.cameras.project_into(image, there)
+            inside = (ahead > 0) & ((pixels >= 0) & (pixels < size)).all(dim=-1)
+            column, row = pixels.clamp(min=torch.zeros(2), max=size - 1).long().unbind(-1)
+            shown = learned.depth[image][row, column]
+            away = (there - learned.cameras.positions[image]).norm(dim=-1)
+            count += inside & (away <= (1 + _SAME_DEPTH) * shown)
+        masks[k].view(-1)[met] = count >= needed
+    return masks
+
+
 @dataclass(frozen=True)
 class Filming:
     """What is filmed, and how.
@@ -155,12 +192,13 @@ class Filming:
         """What one moving camera films, with the exact backward flow, and others to test on.
 
         ``camera`` is where it is at each of T ≥ 2 frames, at times k / (T − 1); ``others`` has
-        another view at each of them.
+        another view at each of them, of which only what is :func:`covisible` is scored.
         """
         train = self._followed(camera, "train")
+        test = self._followed(others, "test")
         return Capture(
             train=replace(train, flow=exact_flow(self.shape, train)),
-            test=self._followed(others, "test"),
+            test=replace(test, valid_mask=covisible(self.shape, test, train)),
         )
 
     def _followed(self, cameras: Cameras, split: str) -> Views:
