@@ -80,3 +80,20 @@ def test_scoring_says_how_far_it_is(learned, tiny_scene, caplog, monkeypatch):
     assert [view.name for view in scored] == list(views.names) and len(views) > 2
     said = [line.split(", ")[0] for line in caplog.messages]
     assert said == [f"held-out images: {k} of {len(views)}" for k in range(1, len(views))]
+
+
+def test_half_an_image_tells_its_exposure(learned, tiny_scene):
+    renderer, views = Renderer(learned[0].scene_model), tiny_scene.dynamic.test
+    seen = score(renderer, views, 1, "white").prediction
+    gain = torch.tensor([0.5, 0.6, 0.7])
+    left = torch.zeros(len(views), 18, 24, dtype=torch.bool)
+    left[:, :, :12] = True
+    pixels = (seen * gain * 255).round().to(torch.uint8).expand(len(views), 18, 24, 3)
+    dark = replace(views, pixels=pixels, valid_mask=~left)
+    assert score(renderer, dark, 1, "white").psnr < 15
+    told = score(renderer, replace(dark, exposure_mask=left), 1, "white")
+    torch.testing.assert_close(told.prediction, seen * gain, atol=0.01, rtol=0)
+    assert told.psnr > 45
+    # Nothing tells it: as it is.
+    mute = score(renderer, replace(dark, exposure_mask=left & False), 1, "white")
+    assert torch.equal(mute.prediction, seen)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from devrf.data.datamodule import SceneDataModule
+from devrf.data.exposure import with_equal_exposure
 from devrf.data.flow import with_flow, with_forward_flow
 from devrf.errors import DevrfError
 from devrf.scenes.formats import check_choice
@@ -70,6 +71,7 @@ class RecordedDataModule(SceneDataModule):
             )
             if scene.moves:
                 log.info("%s: room for motion: %s", scene.name, bounds.source)
+        scene = with_equal_exposure(scene, self.reader.exposure)
         return with_flow(scene, self.reader.flow, self._cache)
 
     def provide(self, priors: Collection[str]) -> None:

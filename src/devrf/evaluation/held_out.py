@@ -62,7 +62,8 @@ def score(
     """Render image ``index`` of held-out ``views`` and compare it with the truth.
 
     Only valid pixels are compared, for SSIM in windows of valid pixels alone. For other metrics
-    over neighbourhoods the prediction at other pixels is the truth.
+    over neighbourhoods the prediction at other pixels is the truth. What is rendered has first been
+    given the image's own exposure, where a part of it is there to tell that.
 
     ``views`` are on the host. ``suite`` has metrics beside PSNR and SSIM. ``time`` in [0, 1] is
     rendered; None: the image's own.
@@ -72,10 +73,11 @@ def score(
     truth = truth_image(views, index, background)
     behind = background_value(background)
     rendered = renderer.view(views.cameras, index, time, behind)
-    prediction = _image(rendered, views)
+    prediction = _exposed(_image(rendered, views), truth, views, index)
     rest = prediction
     if not renderer.at(time).at_rest:
-        rest = _image(renderer.view(views.cameras, index, 0.0, behind), views)
+        at_rest = _image(renderer.view(views.cameras, index, 0.0, behind), views)
+        rest = _exposed(at_rest, truth, views, index)
     valid_mask = views.valid_mask_of(index)
     compared = compare(prediction, truth, valid_mask)
     rest = compare(rest, truth, valid_mask)
@@ -124,6 +126,16 @@ def compare(prediction: Tensor, truth: Tensor, valid_mask: Tensor | None) -> Ten
     if valid_mask is None:
         return prediction
     return torch.where(valid_mask[..., None], prediction, truth)
+
+
+def _exposed(prediction: Tensor, truth: Tensor, views: Views, index: int) -> Tensor:
+    """The prediction with each channel's gain that is nearest to the truth where that tells it."""
+    if views.exposure_mask is None:
+        return prediction
+    told = views.exposure_mask[index].cpu()
+    shown = prediction[told]
+    gain = (shown * truth[told]).sum(dim=0) / shown.square().sum(dim=0).clamp(min=1e-6)
+    return (prediction * gain).clamp(0, 1) if bool(told.any()) else prediction
 
 
 def _psnr(compared: Tensor, truth: Tensor, valid_mask: Tensor | None) -> float:

@@ -20,6 +20,7 @@ from devrf.scenes.transforms import SceneBounds
 from devrf.scenes.validation import LARGEST, Options, checked_box, scene_error
 
 FlowSource = Literal["auto", "files", "dis", "raft", "none"]
+Exposure = Literal["auto", "equal", "none"]
 # The flow sources of layouts that have no place for flow files.
 EstimatedFlow = Literal["auto", "dis", "raft", "none"]
 
@@ -61,6 +62,8 @@ class SceneReader(Options, ABC):
         flow: ``auto`` reads the scene's backward flow where it has files of it, ``files`` insists
             on them, ``dis`` and ``raft`` estimate it, ``none`` does without.
         flow_cache: an ``.npz`` that keeps estimated flow; None estimates it every time.
+        exposure: whether the images of one moving camera are given one exposure: ``auto`` where it
+            changes by more than a seventh, ``equal`` or ``none`` always or never.
         frames: keep so many times, evenly spread, first and last included; None: all.
         validation: whether the layout's validation split is read, too, where it has one beside the
             test split (Blender's, nerfstudio's).
@@ -76,6 +79,7 @@ class SceneReader(Options, ABC):
     background: Background = "white"
     flow: FlowSource = "auto"
     flow_cache: str | Path | None = None
+    exposure: Exposure = "auto"
     frames: SeveralFrames | None = None
     validation: bool = False
 

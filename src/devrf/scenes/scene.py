@@ -56,6 +56,8 @@ class Views:
             turned, which nothing confirms or refutes: they are as they are stored. None: none.
         valid_mask: (N, H, W) bool, the pixels that are learned from and scored; the others are
             ignored. None: all of them.
+        exposure_mask: (N, H, W) bool, of held-out images that each have an exposure of their own:
+            the pixels that tell it. None: they have that of the images learned from.
         frames: (N,) int64, the frame of the scene's clock that is nearest to each image's time;
             None until the images are those of a :class:`Scene`.
     """
@@ -70,6 +72,7 @@ class Views:
     depth: Tensor | None = None
     ambiguous_orientation: Tensor | None = None
     valid_mask: Tensor | None = None
+    exposure_mask: Tensor | None = None
     frames: Tensor | None = None
 
     def __len__(self) -> int:
