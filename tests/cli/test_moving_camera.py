@@ -8,7 +8,8 @@ from dataclasses import replace
 import pytest
 
 from devrf.cli import preparation
-from devrf.scenes.procedural import ProceduralScene
+from devrf.scenes.export import export
+from devrf.scenes.procedural import ProceduralForwardScene, ProceduralScene
 
 FILM = ("video.frames=1", "video.height=24")
 
@@ -59,6 +60,22 @@ def test_an_embedded_film_by_hand_is_learned_as_others_are(
     outcome = devrf(*tiny_facing, "data.camera=handheld", *typed, "stage=inspect")
     assert (outcome.status, outcome.err) == (0, "")
     assert "data.camera=handheld: one" in outcome.out and said in outcome.out
+
+
+def test_frames_in_the_order_of_their_names_are_a_film(devrf, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    small = {"frames": 9, "width": 24, "height": 18, "supersample": 1}
+    export(ProceduralForwardScene(camera="handheld", **small)(), tmp_path / "posed")
+    file = tmp_path / "posed" / "transforms.json"
+    content = json.loads(file.read_text())
+    frames = [frame for frame in content["frames"] if frame["file_path"].startswith("images")]
+    for frame in frames:
+        del frame["time"]
+    kept = {k: v for k, v in content.items() if k[:5] not in ("scene", "train", "test_")}
+    file.write_text(json.dumps(kept | {"frames": frames}))
+    outcome = devrf("data.root=posed", "data.times=order", "stage=inspect")
+    assert (outcome.status, outcome.err) == (0, "")
+    assert "(data=nerfstudio experiment=phone)" in outcome.out
 
 
 def test_devrf_learns_such_a_capture_where_it_is_chosen(devrf, short, mill, tmp_path) -> None:

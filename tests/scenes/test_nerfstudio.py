@@ -74,6 +74,23 @@ def test_a_moving_camera_without_a_static_set(moving, caplog):
     )
 
 
+def test_times_in_the_order_of_the_names(tmp_path, balls):
+    content = balls.write(tmp_path / "scene", [0.5] * 9)
+    names = [f"images/frame {number}.png" for number in (11, 2, 9, 1, 10, 3, 30, 4, 5)]
+    for frame, name in zip(content["frames"], names, strict=True):
+        (tmp_path / "scene" / frame["file_path"]).rename(tmp_path / "scene" / name)
+        frame["file_path"] = name
+        frame.pop("time")
+    (tmp_path / "scene/transforms.json").write_text(json.dumps(content))
+    assert not NerfstudioReader(tmp_path / "scene").read().moves
+    scene = NerfstudioReader(tmp_path / "scene", times="order").read()
+    views = scene.dynamic
+    found = dict(zip(views.train.names, views.train.times.tolist(), strict=True))
+    found |= dict(zip(views.test.names, views.test.times.tolist(), strict=True))
+    ordered = sorted(names, key=lambda name: int(name.split()[1][:-4]))
+    assert found == pytest.approx({name: k / 8 for k, name in enumerate(ordered)})
+
+
 @pytest.mark.parametrize(
     ("lists", "train", "test"),
     [

@@ -68,11 +68,11 @@ def image_folder(
     return ImageFolder(folders[best], downscale // best)
 
 
-def listed_images(folder: Path, *, by_number: bool = False) -> list[Path]:
+def listed_images(folder: Path, *, numbered: bool = False) -> list[Path]:
     """The image files in ``folder``, at least one, else DevrfError, in order of their names.
 
-    ``by_number`` counts runs of digits as numbers, so that 10.png comes after 9.png; else names are
-    compared by characters, which is the order of COLMAP's poses.
+    ``numbered``: in the order of :func:`by_number`; else names are compared by characters, which is
+    the order of COLMAP's poses.
     """
     images = [
         path
@@ -81,11 +81,14 @@ def listed_images(folder: Path, *, by_number: bool = False) -> list[Path]:
     ]
     if not images:
         raise scene_error(folder, f"no images (looked for {', '.join(SUFFIXES)}); add them")
-    return sorted(images, key=lambda path: _natural(path.name) if by_number else [path.name])
+    return sorted(images, key=lambda path: by_number(path.name) if numbered else [path.name])
 
 
-def _natural(name: str) -> list[object]:
-    """Text and numbers in turn, so that any two such lists can be compared."""
+def by_number(name: str) -> list[object]:
+    """A key to sort names by: runs of digits count as numbers, so that 10.png comes after 9.png.
+
+    Text and numbers in turn: any two such lists can be compared.
+    """
     pieces = _DIGITS.split(name)
     return [int(piece) if k % 2 else piece for k, piece in enumerate(pieces)]
 

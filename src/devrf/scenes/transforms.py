@@ -18,7 +18,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from torch import Tensor
 
 from devrf.scenes.files import Name, Number, Positive, Vector3, Vector4, inside, read_json
-from devrf.scenes.image_folders import Missing, present_images
+from devrf.scenes.image_folders import Missing, by_number, present_images
 from devrf.scenes.lens import CameraKeys, Intrinsics, frame_intrinsics, intrinsics_of
 from devrf.scenes.validation import check_poses, scene_error
 
@@ -124,12 +124,18 @@ class Transforms:
 
 
 def read_transforms(
-    file: Path, root: Path, *, masked: bool = False, missing: Missing = "error"
+    file: Path,
+    root: Path,
+    *,
+    masked: bool = False,
+    missing: Missing = "error",
+    in_order: bool = False,
 ) -> tuple[TransformsFile, Transforms]:
     """What a transforms file below ``root``, the scene's folder, says, and its posed images.
 
     ``masked``: whether ``mask_path`` is followed, too; ``missing``: as for
-    :func:`devrf.scenes.image_folders.present_images`.
+    :func:`devrf.scenes.image_folders.present_images`; ``in_order``: times are spread evenly over
+    the images in the order of their names, whatever the file says of times.
 
     Raises:
         DevrfError: the file or an image is missing, a value is wrong (NaN, a time outside [0, 1], a
@@ -140,6 +146,10 @@ def read_transforms(
     frames = [listing.frames[index] for index in images]
     where = [f"{file}: frames[{index}]" for index in images]
     times = [frame.time for frame in frames]
+    if in_order:
+        names = sorted((frame.file_path for frame in frames), key=by_number)
+        moments = {name: k / max(len(names) - 1, 1) for k, name in enumerate(names)}
+        times = [moments[frame.file_path] for frame in frames]
     known = [t for t in times if t is not None]
     if known and len(known) < len(times):
         raise scene_error(

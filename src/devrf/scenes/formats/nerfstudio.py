@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 import os
-from dataclasses import KW_ONLY
+from dataclasses import KW_ONLY, replace
 from pathlib import Path
+from typing import Literal
 
 import torch
 from pydantic.dataclasses import dataclass
@@ -45,6 +46,8 @@ class NerfstudioReader(PosedReader):
     Attributes:
         train_views: train on the first so many dynamic views; None: all.
         holdout: without lists in the file, one of so many images is held out.
+        times: ``file`` takes each frame's ``time``; ``order`` spreads times evenly over the images
+            in the order of their names: of a film that another program has posed.
         static_until: in one file, the latest time of an image that counts as static; None: 0 where
             several images are of time 0, else 1.
         masks: what the masks are taken for. ``ignore``, nerfstudio's meaning: their pixels (people
@@ -60,6 +63,7 @@ class NerfstudioReader(PosedReader):
     flow: EstimatedFlow = "auto"
     train_views: Count | None = None
     holdout: Holdout = 8
+    times: Literal["file", "order"] = "file"
     static_until: Time | None = None
     masks: Masks = "ignore"
 
@@ -83,7 +87,7 @@ def _layout(root: Path, options: NerfstudioReader) -> Layout:
         return layout.with_validation(validation)
     still = root / "static" / FILE
     moving = root / "dynamic" / FILE
-    train, test, validation = _splits(still, root, options)
+    train, test, validation = _splits(still, root, replace(options, times="file"))
     if not os.path.isfile(moving):
         layout = static_alone(train, test, f"there is no dynamic/{FILE}")
         return layout.with_validation(validation)
@@ -106,7 +110,11 @@ def _splits(
 ) -> tuple[Transforms, Transforms, Transforms]:
     """The images of a file to learn from, to test on, and in its validation list, if asked for."""
     listing, transforms = read_transforms(
-        file, root, masked=options.masks != "none", missing=options.missing
+        file,
+        root,
+        masked=options.masks != "none",
+        missing=options.missing,
+        in_order=options.times == "order",
     )
     count = len(transforms.images)
     listed = {
