@@ -80,6 +80,19 @@ def test_images_are_made_equal_where_they_drift(film, caplog):
     assert torch.equal(test.valid_mask | test.exposure_mask, film.dynamic.test.valid_mask)
 
 
+def test_what_is_too_bright_tells_no_colour(film):
+    scene = filmed(film)
+    train = scene.dynamic.train
+    burnt = train.pixels.clone()
+    burnt[:, 10:14, 20:24] = 255
+    capture = replace(scene.dynamic, train=replace(train, pixels=burnt))
+    made = with_equal_exposure(replace(scene, static=capture, dynamic=capture), "auto")
+    valid = made.dynamic.train.valid_mask
+    # At first images are brighter than their mean, at last darker: 255 is then what was there.
+    assert not valid[0, 10:14, 20:24].any() and valid[-1, 10:14, 20:24].all()
+    assert valid[:, 20:].all()
+
+
 def test_a_held_out_image_that_shows_nothing_on_its_right_is_scored_on_its_left(film):
     left = torch.zeros_like(film.dynamic.test.valid_mask)
     left[0, :, 10:20] = left[1:, :, 50:60] = True

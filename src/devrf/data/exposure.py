@@ -83,11 +83,18 @@ def with_equal_exposure(scene: Scene, choice: Exposure) -> Scene:
 
 
 def _exposed(views: Views, gains: Mapping[str, Tensor]) -> Views:
-    """The views with each image's red, green and blue times its gains (3,)."""
+    """The views with each image's red, green and blue times its gains (3,).
+
+    What an image shows at its brightest, and too bright, tells no colour: it is not valid.
+    """
     pixels = views.pixels.clone()
-    for image, name in zip(pixels, views.names, strict=True):
-        image[..., :3] = (image[..., :3] * gains[name]).round().clamp(0, 255).to(torch.uint8)
-    return replace(views, pixels=pixels)
+    told = torch.ones_like(pixels[..., 0], dtype=torch.bool)
+    for image, mask, name in zip(pixels, told, views.names, strict=True):
+        gain = gains[name]
+        mask &= ~((image[..., :3] > BRIGHTEST) & (gain < 1)).any(dim=-1)
+        image[..., :3] = (image[..., :3] * gain).round().clamp(0, 255).to(torch.uint8)
+    valid = told if views.valid_mask is None else views.valid_mask & told
+    return replace(views, pixels=pixels, valid_mask=valid)
 
 
 def exposures(views: Views) -> Tensor | None:

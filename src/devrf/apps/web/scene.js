@@ -236,6 +236,8 @@ class Motion {
     this.packed = Object.fromEntries(ids.map((id) => [id, this.packed[id] ?? inflate(id)]));
     const data = await Promise.all(now.map(([, , id]) => this.packed[id]));
     now.forEach(([name, kind], k) => this.graphics.fill(name, kind, data[k]));
+    // The device has the frame before: what comes next begins with the one after.
+    this.packed = Object.fromEntries(next.map(([, , id]) => [id, this.packed[id]]));
     Object.assign(this, { interval, loading: false });
   }
 
