@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -76,6 +77,11 @@ def test_frames_in_the_order_of_their_names_are_a_film(devrf, tmp_path, monkeypa
     outcome = devrf("data.root=posed", "data.times=order", "stage=inspect")
     assert (outcome.status, outcome.err) == (0, "")
     assert "(data=nerfstudio experiment=phone)" in outcome.out
+    (tmp_path / "two").mkdir()
+    file.parent.rename(tmp_path / "two" / "static")  # and a film: DeVRF has what it needs
+    shutil.copytree(tmp_path / "two" / "static", tmp_path / "two" / "dynamic")
+    outcome = devrf("data.root=two", "data.times=order", "stage=inspect")
+    assert outcome.status == 0 and "(data=nerfstudio)" in outcome.out
 
 
 def test_devrf_learns_such_a_capture_where_it_is_chosen(devrf, short, mill, tmp_path) -> None:

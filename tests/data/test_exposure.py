@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from devrf.data.exposure import exposures, with_equal_exposure
+from devrf.data.exposure import _equal, exposures, with_equal_exposure
 from devrf.data.recorded import RecordedDataModule
 from devrf.scenes.export import export
 from devrf.scenes.formats.nerfstudio import NerfstudioReader
@@ -62,11 +62,41 @@ def test_of_a_long_film_some_images_are_compared(film, monkeypatch):
     assert float((found[:, 0] - true + true.mean()).abs().max()) < 0.06
 
 
+def test_an_image_that_cannot_be_followed_has_an_exposure_in_between(film, monkeypatch):
+    monkeypatch.setattr("devrf.data.exposure.PAIRS", 0.8)  # two of 17 pairs are lost with it
+    train = film.dynamic.train
+    true = torch.linspace(0.2, -0.2, 18)[:, None].expand(18, 3)
+    dim = lit(train, true)
+    for lost, expected in ((9, true[9, 0]), (17, true[16, 0])):
+        pixels = dim.pixels.clone()
+        pixels[lost] = torch.randint(0, 256, pixels.shape[1:], dtype=torch.uint8)
+        found = exposures(replace(dim, pixels=pixels))
+        assert found is not None
+        assert float((found[lost] - found[0] - expected + true[0, 0]).abs().max()) < 0.06
+
+
+def test_images_at_one_time_have_exposures_of_their_own(film):
+    train = film.dynamic.train
+    true = 0.2 * (-1.0) ** torch.arange(18)[:, None].expand(18, 3)
+    found = exposures(replace(lit(train, true), times=(torch.arange(18) // 2) / 8))
+    assert found is not None and float((found - true).abs().max()) < 0.06
+
+
+def test_films_that_do_not_hang_together_are_left_alone(film, monkeypatch):
+    monkeypatch.setattr("devrf.data.exposure.APART", (1,))
+    train = film.dynamic.train
+    pixels = train.pixels.clone()
+    pixels[9:] = pixels[9:].flip(1).flip(3)  # another place
+    assert exposures(train) is not None
+    monkeypatch.setattr("devrf.data.exposure.PAIRS", 0.8)
+    assert exposures(replace(train, pixels=pixels)) is None
+
+
 def test_images_are_made_equal_where_they_drift(film, caplog):
     caplog.set_level("INFO")
     made = with_equal_exposure(filmed(film), "auto")
     assert "exposure changes by" in caplog.text and "made equal" in caplog.text
-    assert made.static.train is made.dynamic.train
+    assert made.static.train is made.dynamic.train and made.static.validation is None
     colors = made.dynamic.train.pixels.float()
     true = film.dynamic.train.pixels.float()
     off = (colors / true.clamp(min=1)).flatten(1, 2).median(dim=1).values
@@ -88,9 +118,16 @@ def test_what_is_too_bright_tells_no_colour(film):
     capture = replace(scene.dynamic, train=replace(train, pixels=burnt))
     made = with_equal_exposure(replace(scene, static=capture, dynamic=capture), "auto")
     valid = made.dynamic.train.valid_mask
-    # At first images are brighter than their mean, at last darker: 255 is then what was there.
-    assert not valid[0, 10:14, 20:24].any() and valid[-1, 10:14, 20:24].all()
+    # At first images are brighter than their mean: what was there was brighter than could be told;
+    # at last darker: it is brighter than can be told now.
+    assert not valid[0, 10:14, 20:24].any() and not valid[-1, 10:14, 20:24].any()
     assert valid[:, 20:].all()
+    colors = made.dynamic.train.pixels[valid]
+    assert float(colors.float().mean()) < 200
+    # Exposures that hardly differ leave it as it was.
+    for trifle in (0.005, -0.005):
+        same = _equal(replace(train, pixels=burnt), torch.full((18, 3), trifle))
+        assert same.valid_mask.all()
 
 
 def test_a_held_out_image_that_shows_nothing_on_its_right_is_scored_on_its_left(film):
@@ -127,5 +164,11 @@ def test_a_film_from_disk_is_made_equal_as_data_exposure_says(film, tmp_path: Pa
     assert module.scene.dynamic.test.exposure_mask is not None
     plain = RecordedDataModule(NerfstudioReader, tmp_path / "film", exposure="none")
     assert plain.scene.dynamic.test.exposure_mask is None
+    fewer = RecordedDataModule(NerfstudioReader, tmp_path / "film", frames=9)
+    train, rest = fewer.scene.dynamic.train, fewer.scene.static.train
+    assert (len(train), len(rest)) == (9, 18) and fewer.scene.dynamic.test.exposure_mask is not None
+    among = [rest.names.index(name) for name in train.names]
+    off = rest.pixels[among].float() - train.pixels.float()
+    assert float(off.abs().max()) <= 1
     changed = module.scene.dynamic.train.pixels != plain.scene.dynamic.train.pixels
     assert float(changed.float().mean()) > 0.5

@@ -5,11 +5,12 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import pytest
 import torch
 
-from devrf.evaluation.held_out import score, score_all, truth_image
+from devrf.evaluation.held_out import exposed, score, score_all, truth_image
 from devrf.evaluation.suite import MetricSuite
 from devrf.metrics.image import psnr, ssim
 from devrf.rendering.renderer import Renderer
@@ -97,3 +98,14 @@ def test_half_an_image_tells_its_exposure(learned, tiny_scene):
     # Nothing tells it: as it is.
     mute = score(renderer, replace(dark, exposure_mask=left & False), 1, "white")
     assert torch.equal(mute.prediction, seen)
+
+
+def test_what_is_too_bright_does_not_tell_the_exposure():
+    prediction = torch.rand(18, 24, 3, generator=torch.Generator().manual_seed(0))
+    truth = (1.5 * prediction).clamp(max=1)
+    assert float((truth == 1).float().mean()) > 0.2
+    told = torch.ones(1, 18, 24, dtype=torch.bool)
+    views = SimpleNamespace(exposure_mask=told)
+    torch.testing.assert_close(exposed(prediction, truth, views, 0), truth)
+    # An empty picture is not made as bright as the truth.
+    assert float(exposed(1e-4 + 0 * truth, truth, views, 0).max()) < 1e-3

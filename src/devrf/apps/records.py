@@ -129,8 +129,11 @@ def frame_rows(
 
 
 def data_record(scene: Scene) -> dict[str, Any]:
-    """How much data a scene has: kind, frames, views, and held-out images' size and number."""
-    height, width = scene.dynamic.test.pixels.shape[1:3]
+    """How much data a scene has: kind, frames, views; of held-out images size, number, exposure."""
+    test = scene.dynamic.test
+    height, width = test.pixels.shape[1:3]
+    # Half of each held-out image has told its exposure, and is not scored.
+    halved = {} if test.exposure_mask is None else {"exposure": "equal"}
     frames = scene.clock.frames_of(scene.dynamic.train.times)
     return {
         "kind": scene.kind,
@@ -138,7 +141,8 @@ def data_record(scene: Scene) -> dict[str, Any]:
         "frames": len(scene.clock) if scene.moves else None,
         # A camera that moves is one view, however many images it took.
         "train_views": int(frames.bincount().max()) if scene.moves else None,
-        "test_frames": len(scene.dynamic.test),
+        "test_frames": len(test),
+        **halved,
     }
 
 

@@ -25,7 +25,7 @@ from devrf.apps.images import (
 )
 from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError, expect
-from devrf.evaluation.held_out import HeldOutView, background_value, compare, truth_image
+from devrf.evaluation.held_out import HeldOutView, background_value, compare, exposed, truth_image
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.metrics.image import psnr
@@ -138,6 +138,7 @@ def preview(model: Viewable, views: Views, index: int, background: Background) -
     behind = background_value(background)
     prediction, depth = still(Renderer(model, times=1), views.cameras, time, behind, index)
     truth = truth_image(views, index, background).cpu()
+    prediction = exposed(prediction, truth, views, index)
     compared = compare(prediction, truth, views.valid_mask_of(index))
     shown = side_by_side([prediction, truth, error_colors(compared, truth)])
     return Preview({"view": shown, "depth": depth}, psnr(compared, truth))

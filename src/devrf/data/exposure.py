@@ -15,17 +15,16 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from devrf.scenes.optical_flow import LEAST_SIDE, Estimator, estimator, flow_between
+from devrf.scenes.optical_flow import LEAST_SIDE, Estimator, consistent, estimator
 from devrf.scenes.reader import Exposure
 from devrf.scenes.resampling import look_up_pixels, shrink_pixels
-from devrf.scenes.scene import Capture, Scene, Views
+from devrf.scenes.scene import Scene, Views
 
 log = logging.getLogger(__name__)
 
@@ -41,6 +40,13 @@ DARKEST, BRIGHTEST = 12, 248
 SAME = 0.15
 # Images so many places apart are compared: steps that add up to a long way are not exact.
 APART = (1, 4, 16)
+# Gains nearer to 1 change nothing that was too bright.
+TRIFLE = 0.01
+# The second eigenvalue of the comparisons is below this where some images are compared with none
+# of the others.
+CONNECTED = 1e-6
+# The share of followed pixels that have to agree: of noise a sixth does.
+AGREE = 0.25
 # The share of pixels that flow has to follow, and the share of the pairs of images in which it has.
 FOLLOWED = 0.15
 PAIRS = 0.9
@@ -57,13 +63,17 @@ def with_equal_exposure(scene: Scene, choice: Exposure) -> Scene:
             ``none`` changes nothing.
     """
     train = scene.dynamic.train
-    # Without a static set the images up to a time stand in for it.
-    alone = {*scene.static.train.names} <= {*train.names} and train.by_moving_camera
-    if choice == "none" or not alone or not scene.moves or train.cut_out:
+    # Without a static set images of the film stand in for it.
+    film = {*scene.static.train.names} & {*train.names}
+    possible = film and scene.moves and train.by_moving_camera and not train.cut_out
+    theta = exposures(train) if possible and choice != "none" else None
+    if theta is None:
+        if choice == "equal":
+            why = "no film by one camera, or too little to follow in it"
+            log.info("%s: data.exposure=equal: %s; images stay as they are", scene.name, why)
         return scene
-    theta = exposures(train)
-    drift = 0.0 if theta is None else float((theta.amax(dim=0) - theta.amin(dim=0)).max())
-    if theta is None or (choice == "auto" and drift < DRIFT):
+    drift = float((theta.amax(dim=0) - theta.amin(dim=0)).max())
+    if choice == "auto" and drift < DRIFT:
         return scene
     log.info(
         "%s: exposure changes by %.0f %% and is made equal; held-out images are scored on their "
@@ -71,30 +81,38 @@ def with_equal_exposure(scene: Scene, choice: Exposure) -> Scene:
         scene.name,
         100 * math.expm1(drift),
     )
-    gains = dict(zip(train.names, (-theta).exp(), strict=True))
+    moving = replace(scene.dynamic.mapped(_halved), train=_equal(train, theta))
+    if scene.static.train is train:
+        return replace(scene, static=replace(moving, validation=None), dynamic=moving)
+    known = dict(zip(train.names, theta, strict=True))
+    names = scene.static.train.names
+    places = torch.tensor([k for k, name in enumerate(names) if name in known])
+    found = torch.stack([known[names[k]] for k in places.tolist()])
+    rest = scene.static.mapped(_halved)
+    rest = replace(rest, train=_equal(scene.static.train, _between(places, found, len(names))))
+    return replace(scene, static=rest, dynamic=moving)
 
-    def changed(capture: Capture) -> Capture:
-        held_out = capture.mapped(_halved)
-        return replace(held_out, train=_exposed(capture.train, gains))
 
-    film = changed(scene.dynamic)
-    rest = film if scene.static.train is train else changed(scene.static)
-    return replace(scene, static=rest, dynamic=film)
+def _equal(views: Views, theta: Tensor) -> Views:
+    """The views without their exposures ``theta`` (N, 3).
 
-
-def _exposed(views: Views, gains: Mapping[str, Tensor]) -> Views:
-    """The views with each image's red, green and blue times its gains (3,).
-
-    What an image shows at its brightest, and too bright, tells no colour: it is not valid.
+    What was too bright to be told, or would be now, is not valid.
     """
-    pixels = views.pixels.clone()
-    told = torch.ones_like(pixels[..., 0], dtype=torch.bool)
-    for image, mask, name in zip(pixels, told, views.names, strict=True):
-        gain = gains[name]
-        mask &= ~((image[..., :3] > BRIGHTEST) & (gain < 1)).any(dim=-1)
-        image[..., :3] = (image[..., :3] * gain).round().clamp(0, 255).to(torch.uint8)
+    gain = (-theta).exp()[:, None, None]
+    colors = views.pixels[..., :3]
+    bright = (colors > BRIGHTEST) & (gain < 1 - TRIFLE)
+    equal = (colors * gain).round()
+    told = ~(bright | (equal > 255 * (1 + TRIFLE))).any(dim=-1)
+    pixels = torch.cat([equal.clamp(max=255).to(torch.uint8), views.pixels[..., 3:]], dim=-1)
     valid = told if views.valid_mask is None else views.valid_mask & told
     return replace(views, pixels=pixels, valid_mask=valid)
+
+
+def _between(places: Tensor, values: Tensor, count: int) -> Tensor:
+    """(``count``, 3) values at all places, from those (M, 3) at some of them, in between evenly."""
+    there = np.arange(count)
+    channels = [np.interp(there, places.numpy(), channel.numpy()) for channel in values.T]
+    return torch.from_numpy(np.stack(channels, axis=1)).float()
 
 
 def exposures(views: Views) -> Tensor | None:
@@ -106,31 +124,32 @@ def exposures(views: Views) -> Tensor | None:
         views: N images that one moving camera took one after another.
     """
     order = views.times.argsort(stable=True)
-    spread = order[:: math.ceil(len(views) / MOST)]
-    film = _small(views[spread])
+    spread = torch.arange(0, len(views), math.ceil(len(views) / MOST))
+    film = _small(views[order[spread]])
     between = estimator("dis")
     steps: dict[tuple[int, int], Tensor] = {}
     for apart in APART:
         for k in range(apart, len(film)):
-            there = _step(film, k, k - apart, between)
-            back = _step(film, k - apart, k, between)
-            if there is not None and back is not None:
-                # What one image is blurred by, looked up in between its pixels, cancels out.
-                steps[k, k - apart] = (there - back) / 2
+            if (step := _step(film, k, k - apart, between)) is not None:
+                steps[k, k - apart] = step
         if apart == 1 and len(steps) < max(PAIRS * (len(film) - 1), 1):
             return None
-    # One row for each step, weighed 1, and one for each exposure.
+    # One row for each step.
     rows = torch.zeros(len(steps), len(film), dtype=torch.float64)
     for row, (image, other) in zip(rows, steps, strict=True):
         row[image] = 1
         row[other] = -1
-    weights = WEIGHT * torch.eye(len(film), dtype=torch.float64)
+    known = rows.any(dim=0).nonzero()[:, 0]
+    rows = rows[:, known]
+    squares = rows.T @ rows
+    if float(torch.linalg.eigvalsh(squares)[1]) < CONNECTED:
+        return None
     seen = torch.stack(list(steps.values())).double()
-    theta = torch.linalg.solve(rows.T @ rows + weights, rows.T @ seen)
-    # Images in between have exposures in between.
-    all_of_them = [np.interp(views.times, film.times, channel) for channel in theta.T.numpy()]
-    found = torch.from_numpy(np.stack(all_of_them, axis=1)).float()
-    return found - found.mean(dim=0)
+    weights = WEIGHT * torch.eye(len(known), dtype=torch.float64)
+    theta = torch.linalg.solve(squares + weights, rows.T @ seen)
+    # Images that were not compared, or not followed, have exposures in between.
+    found = _between(spread[known], theta, len(views))
+    return (found - found.mean(dim=0))[order.argsort()]
 
 
 def _small(views: Views) -> Views:
@@ -146,19 +165,28 @@ def _small(views: Views) -> Views:
 
 def _step(film: Views, image: int, other: int, between: Estimator) -> Tensor | None:
     """(3,) the change of log(gain) from another image; None where flow follows too little."""
-    vectors, valid = flow_between(film, image, other, between)
+    there = between(film.pixels[image, ..., :3], film.pixels[other, ..., :3])
+    back = between(film.pixels[other, ..., :3], film.pixels[image, ..., :3])
+    forth = _ratio(film, image, other, there, consistent(there, back))
+    again = _ratio(film, other, image, back, consistent(back, there))
+    # What one image is blurred by, looked up in between its pixels, cancels out.
+    return None if forth is None or again is None else (forth - again) / 2
+
+
+def _ratio(film: Views, image: int, other: int, flow: Tensor, valid: Tensor) -> Tensor | None:
+    """(3,) log(Σ C / Σ C') of an image and another where ``flow`` (H, W, 2) is ``valid`` (H, W)."""
     if int(valid.sum()) < FOLLOWED * valid.numel():
         return None
     y, x = torch.meshgrid(torch.arange(film.height), torch.arange(film.width), indexing="ij")
-    place = torch.stack([x, y], dim=-1) + 0.5 + vectors
-    before = look_up_pixels(film.pixels[other].numpy(), place.numpy())
+    place = torch.stack([x, y], dim=-1) + 0.5 + flow
+    before = look_up_pixels(film.pixels[other, ..., :3].numpy(), place.numpy())
     now = film.pixels[image, ..., :3][valid].float()
-    then = torch.from_numpy(before)[..., :3][valid].float()
+    then = torch.from_numpy(before)[valid].float()
     told = (torch.minimum(now, then) > DARKEST) & (torch.maximum(now, then) < BRIGHTEST)
     ratio = (now / then.clamp(min=1)).log()
     away = ratio - ratio.where(told, torch.nan).nanmedian(dim=0).values
     same = told & (away.abs() < SAME)  # false where there is no median
-    if int(same.sum(dim=0).min()) < FOLLOWED * len(now):
+    if int(same.sum(dim=0).min()) < AGREE * len(now):
         return None
     # Sums, since grey levels are whole numbers: the median of their ratios is often just 1.
     return ((now * same).sum(dim=0) / (then * same).sum(dim=0)).log()

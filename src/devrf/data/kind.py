@@ -42,8 +42,11 @@ def faces_forward(choice: str, root: str | Path, space: str | None) -> bool:
     return False
 
 
-def by_one_camera(choice: str, root: str | Path) -> bool:
-    """Whether one camera takes all images, elsewhere in each as time passes, and no static set."""
+def by_one_camera(choice: str, root: str | Path, *, ordered: bool = False) -> bool:
+    """Whether one camera takes all images, elsewhere in each as time passes, and no static set.
+
+    ``ordered``: time passes in the order of their names (``data.times=order``).
+    """
     folder = Path(root).expanduser()
     if choice in ("nerfies", "dycheck"):
         with suppress(DevrfError):
@@ -58,7 +61,8 @@ def by_one_camera(choice: str, root: str | Path) -> bool:
     listing = None if file is None else _transforms(folder / file)
     if listing is None:
         return False
-    times = torch.tensor([frame.time for frame in listing.frames if frame.time is not None])
+    told = [frame.time for frame in listing.frames if frame.time is not None]
+    times = torch.arange(len(listing.frames)) if ordered else torch.tensor(told)
     poses = torch.tensor([frame.transform_matrix[:3] for frame in listing.frames])
     alone = 1 < len(times) == len(distinct_times(times))
     return alone and not stand_still(distinct_poses(poses))

@@ -73,11 +73,11 @@ def score(
     truth = truth_image(views, index, background)
     behind = background_value(background)
     rendered = renderer.view(views.cameras, index, time, behind)
-    prediction = _exposed(_image(rendered, views), truth, views, index)
+    prediction = exposed(_image(rendered, views), truth, views, index)
     rest = prediction
     if not renderer.at(time).at_rest:
         at_rest = _image(renderer.view(views.cameras, index, 0.0, behind), views)
-        rest = _exposed(at_rest, truth, views, index)
+        rest = exposed(at_rest, truth, views, index)
     valid_mask = views.valid_mask_of(index)
     compared = compare(prediction, truth, valid_mask)
     rest = compare(rest, truth, valid_mask)
@@ -128,14 +128,29 @@ def compare(prediction: Tensor, truth: Tensor, valid_mask: Tensor | None) -> Ten
     return torch.where(valid_mask[..., None], prediction, truth)
 
 
-def _exposed(prediction: Tensor, truth: Tensor, views: Views, index: int) -> Tensor:
-    """The prediction with each channel's gain that is nearest to the truth where that tells it."""
+# Brighter or darker values than these say little of a gain, and no gain is a larger factor.
+TELLING = (0.04, 0.97)
+LARGEST_GAIN = 4.0
+
+
+def exposed(prediction: Tensor, truth: Tensor, views: Views, index: int) -> Tensor:
+    """The prediction with each channel's gain that is nearest to the truth where that tells it.
+
+    Args:
+        prediction: (H, W, 3) RGB in [0, 1] of image ``index`` of held-out ``views``.
+        truth: the same.
+        views: those with an ``exposure_mask`` have exposures of their own; else nothing changes.
+        index: which image.
+    """
     if views.exposure_mask is None:
         return prediction
-    told = views.exposure_mask[index].cpu()
-    shown = prediction[told]
-    gain = (shown * truth[told]).sum(dim=0) / shown.square().sum(dim=0).clamp(min=1e-6)
-    return (prediction * gain).clamp(0, 1) if bool(told.any()) else prediction
+    low, high = TELLING
+    within = (torch.minimum(prediction, truth) > low) & (torch.maximum(prediction, truth) < high)
+    told = views.exposure_mask[index].cpu()[..., None] & within
+    squares = (prediction.square() * told).sum(dim=(0, 1))
+    gain = (prediction * truth * told).sum(dim=(0, 1)) / squares.clamp(min=1e-6)
+    gain = torch.where(squares > 0, gain, 1.0).clamp(1 / LARGEST_GAIN, LARGEST_GAIN)
+    return (prediction * gain).clamp(0, 1)
 
 
 def _psnr(compared: Tensor, truth: Tensor, valid_mask: Tensor | None) -> float:

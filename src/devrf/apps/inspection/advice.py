@@ -227,7 +227,9 @@ def _is_flat(views: Views) -> Iterator[bool]:
         if views.has_alpha:  # a subject of one colour still has an outline
             yield False
         else:
-            low, high = _valid_pixels(views, k).aminmax(dim=0)  # uint8: low is the less
+            pixels = _valid_pixels(views, k)
+            # uint8: low is the less.
+            low, high = pixels.aminmax(dim=0) if len(pixels) else pixels.new_zeros(2, 3)
             yield int((high - low).max()) <= FLAT
 
 
@@ -261,7 +263,12 @@ def _alpha(scene: Scene) -> Iterator[Advice]:
 
 def _masks(scene: Scene) -> Iterator[Advice]:
     sets = image_sets(scene).items()
-    masks = {name: views.valid_mask for name, views in sets if views.valid_mask is not None}
+    # Of images with exposures of their own a half is not scored, and no mask says so.
+    masks = {
+        name: views.valid_mask
+        for name, views in sets
+        if views.valid_mask is not None and views.exposure_mask is None
+    }
     shares = {name: mean_share(~mask for mask in of_set) for name, of_set in masks.items()}
     if much := {name: share for name, share in shares.items() if share > MUCH_MASKED}:
         yield Advice(
