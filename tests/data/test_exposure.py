@@ -20,7 +20,9 @@ from devrf.scenes.scene import Capture, Scene, Views
 @pytest.fixture(scope="module")
 def film() -> Scene:
     """What one hand films in 18 images, all of one exposure."""
-    return ProceduralForwardScene(camera="handheld", frames=18, supersample=1, texture="fine")()
+    return ProceduralForwardScene(
+        camera="handheld", frames=18, width=64, height=48, supersample=1, texture="fine"
+    )()
 
 
 def lit(views: Views, theta: Tensor) -> Views:
@@ -105,7 +107,7 @@ def test_images_are_made_equal_where_they_drift(film, caplog):
     assert torch.equal(test.pixels, filmed(film).dynamic.test.pixels)  # as they are
     assert test.valid_mask is not None and test.exposure_mask is not None
     assert not (test.valid_mask & test.exposure_mask).any()
-    assert not test.valid_mask[..., :48].any() and not test.exposure_mask[..., 48:].any()
+    assert not test.valid_mask[..., :32].any() and not test.exposure_mask[..., 32:].any()
     # What is left out stays so.
     assert torch.equal(test.valid_mask | test.exposure_mask, film.dynamic.test.valid_mask)
 
@@ -132,7 +134,7 @@ def test_what_is_too_bright_tells_no_colour(film):
 
 def test_a_held_out_image_that_shows_nothing_on_its_right_is_scored_on_its_left(film):
     left = torch.zeros_like(film.dynamic.test.valid_mask)
-    left[0, :, 10:20] = left[1:, :, 50:60] = True
+    left[0, :, 10:20] = left[1:, :, 40:50] = True
     test = replace(film.dynamic.test, valid_mask=left)
     scene = replace(film, dynamic=replace(film.dynamic, test=test))
     made = with_equal_exposure(scene, "equal").dynamic.test

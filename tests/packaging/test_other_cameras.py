@@ -23,7 +23,7 @@ OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 @pytest.fixture(scope="module")
 def film() -> Views:
     """What one hand films."""
-    small = {"frames": 10, "width": 64, "height": 48, "supersample": 1}
+    small = {"frames": 10, "width": 40, "height": 30, "supersample": 1}
     return ProceduralForwardScene(camera="handheld", **small)().dynamic.train
 
 
