@@ -11,6 +11,7 @@ import pytest
 from devrf.cli import preparation
 from devrf.scenes.export import export
 from devrf.scenes.procedural import ProceduralForwardScene, ProceduralScene
+from devrf.scenes.view_folders import dynamic_folders
 
 FILM = ("video.frames=1", "video.height=24")
 
@@ -61,6 +62,20 @@ def test_an_embedded_film_by_hand_is_learned_as_others_are(
     outcome = devrf(*tiny_facing, "data.camera=handheld", *typed, "stage=inspect")
     assert (outcome.status, outcome.err) == (0, "")
     assert "data.camera=handheld: one" in outcome.out and said in outcome.out
+
+
+def test_a_video_in_llffs_layout_is_learned_as_one(devrf, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    small = {"static_views": 8, "frames": 3, "width": 24, "height": 18, "supersample": 1}
+    export(ProceduralForwardScene(**small)(), tmp_path / "video")
+    for folder in dynamic_folders(tmp_path / "video"):
+        shutil.rmtree(folder)
+    still = devrf("data=forward", "data.root=video", "data.downscale=4", "stage=inspect")
+    assert still.status == 0 and "experiment=" not in still.out
+    words = ("data=forward", "data.root=video", "data.monocular=true", "data.downscale=4")
+    film = devrf(*words, "stage=inspect")
+    assert (film.status, film.err) == (0, "")
+    assert "scene at rest, too; its cameras (experiment=phone)" in film.out
 
 
 def test_frames_in_the_order_of_their_names_are_a_film(devrf, tmp_path, monkeypatch) -> None:

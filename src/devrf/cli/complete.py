@@ -136,7 +136,9 @@ def _told_by_scene(
     space = value(overrides, "data.space")
     if not values(overrides, "facing") and faces_forward(option, root, space):
         words.append("facing=forward")
-    if by_one_camera(option, root, ordered=value(overrides, "data.times") == "order"):
+    video = value(overrides, "data.monocular")
+    ordered = value(overrides, "data.times") == "order"
+    if video == "True" or (video is None and by_one_camera(option, root, ordered=ordered)):
         chosen = _for_one_camera(root, overrides, continued=continued)
         words += chosen
         why = f"{ONE_CAMERA}; {why}" if chosen and chosen != ["protocol=dynamic"] else why
