@@ -152,7 +152,10 @@ def _told_by_scene(
 
 
 def _for_one_camera(scene: str, overrides: Sequence[Override], *, continued: bool) -> list[str]:
-    """How what one moving camera filmed is learned, where nothing says it; see _told_by_scene."""
+    """The overrides by which what one moving camera filmed is learned, where nothing says how.
+
+    None where a run is ``continued``; where DeVRF is asked for, the log says what it lacks.
+    """
     method = value(overrides, "method")
     if method == "devrf" or value(overrides, "stage") in OF_DEVRF:
         lacks = "one camera filmed it moving, and nothing shows it at rest"
