@@ -117,12 +117,16 @@ def _silhouettes(views: Views, reach: int) -> Array:
     at_border = perhaps[:, [0, -1]].any(axis=(1, 2)) | perhaps[:, :, [0, -1]].any(axis=(1, 2))
     cut_off = at_border | ~solid.any(axis=(1, 2))
     codes = np.empty((count, height * width + 1), dtype=np.uint8)
-    square = np.ones((2 * reach + 1,) * 2, dtype=np.uint8)
-    grown = [cv2.dilate(mask, square) for mask in solid.astype(np.uint8)]
+    grown = [_dilated(mask, reach) for mask in solid.astype(np.uint8)]
     codes[:, :-1] = np.stack(grown).reshape(count, -1)
     codes[:, :-1][unknown.reshape(count, -1)] = UNSEEN
     codes[:, -1] = np.where(cut_off, UNSEEN, OUTSIDE)
     return codes
+
+
+def _dilated(mask: Array, reach: int) -> Array:
+    """The greatest value (H, W) uint8 within ``reach`` pixels along both axes."""
+    return cv2.dilate(mask, np.ones((2 * reach + 1,) * 2, dtype=np.uint8))
 
 
 def _pixel_index(views: Views, image: int, points: Tensor) -> Array:
@@ -167,15 +171,14 @@ def visual_hull(
         position = views.cameras.positions[k]
         nearest = float((position - box.nearest(position)).norm())
         reach = _reach(views, cell, nearest, float(views.cameras.focal[k].max()))
-        solid = views.pixels[k, :, :, 3][None].float()
+        solid = views.pixels[k, :, :, 3]
         if views.valid_mask is not None:
-            solid = solid.masked_fill(~views.valid_mask[k], 255.0)
-        solid = solid.to(points.device)
-        grown = torch.nn.functional.max_pool2d(solid, 2 * reach + 1, 1, reach)[0]
+            solid = solid.masked_fill(~views.valid_mask[k], 255)
+        grown = torch.from_numpy(_dilated(solid.cpu().numpy(), reach)).to(points.device)
         x, y = pixel.floor().long().unbind(-1)
         in_image = (depth > 0) & (x >= 0) & (x < views.width) & (y >= 0) & (y < views.height)
         row = torch.where(in_image, y * views.width + x, 0)
-        border = torch.cat([solid[0, [0, -1]].flatten(), solid[0, :, [0, -1]].flatten()])
+        border = torch.cat([solid[[0, -1]].flatten(), solid[:, [0, -1]].flatten()])
         ends = whole_in_view and bool(solid.any()) and not bool(border.any())
         held[left[torch.where(in_image, grown.view(-1)[row] == 0, ends)]] = False
     return held.view(shape)
