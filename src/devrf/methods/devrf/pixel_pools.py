@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -9,14 +11,16 @@ from devrf.data.batch import PixelPool, all_pixels, wanted_pixels
 from devrf.engine.ddp import world_size
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
+from devrf.geometry.space import WorldSpace
 from devrf.kernels.march import rays_that_hit
 from devrf.ops.march import Path
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.view import Viewable
 from devrf.scenes.scene import Views
 
-# One ray is followed for a block of so many pixels a side.
+# One ray is followed for a block of so many pixels a side: at least, and at most.
 BLOCK = 2
+MOST_BLOCK = 8
 # Images whose rays are made together: on a CPU what its caches hold, on a GPU what keeps it busy.
 IMAGES_ON_CPU = 1
 IMAGES_ON_GPU = 16
@@ -30,7 +34,7 @@ def rays_hit_occupied(
 ) -> Tensor:
     """Mask (K, H·W): the pixels of images whose rays pass near anything occupied.
 
-    One ray stands for a block of pixels: what is near it reaches far enough for its neighbours too.
+    One ray stands for a block of pixels (:func:`block_size`).
 
     Args:
         cameras: all cameras, on the model's device.
@@ -38,9 +42,12 @@ def rays_hit_occupied(
         model: gives box, space, near and far.
         occupancy: where something may be at the time of the images.
     """
-    width = -(-cameras.width // BLOCK)
-    height = -(-cameras.height // BLOCK)
-    coarse = cameras.resized(width, height)
+    block = block_size(cameras, model, occupancy)
+    width = -(-cameras.width // block)
+    height = -(-cameras.height // block)
+    coarse = Cameras(
+        cameras.camera_to_world, cameras.focal / block, cameras.center / block, width, height
+    )
     pixels = coarse.pixel_grid()
     near, far = model.depth_limits
     masks = []
@@ -57,9 +64,23 @@ def rays_hit_occupied(
             far=far,
         )
         hit = rays_that_hit(field_rays, path)
-        rows = hit.view(-1, height, width).repeat_interleave(BLOCK, dim=1)[:, : cameras.height]
-        masks.append(rows.repeat_interleave(BLOCK, dim=2)[:, :, : cameras.width].flatten(1))
+        rows = hit.view(-1, height, width).repeat_interleave(block, dim=1)[:, : cameras.height]
+        masks.append(rows.repeat_interleave(block, dim=2)[:, :, : cameras.width].flatten(1))
     return torch.cat(masks)
+
+
+def block_size(cameras: Cameras, model: Viewable, occupancy: Occupancy) -> int:
+    """Pixels a side of a block all of whose rays are within a cell of its middle one.
+
+    Anywhere in the box: a ray that hits is one that is nearer to something, so that what is near
+    it reaches far enough for its neighbours, too.
+    """
+    if not isinstance(model.space, WorldSpace):
+        return BLOCK
+    low, high = model.box.corners(cameras.positions)
+    away = torch.maximum((cameras.positions - low).abs(), (cameras.positions - high).abs())
+    pixel = float((away.norm(dim=1) / cameras.focal.amin(dim=1)).max())
+    return max(BLOCK, min(int(math.sqrt(2) * occupancy.cell / pixel), MOST_BLOCK))
 
 
 def static_pool(views: Views, model: Viewable, occupancy: Occupancy | None) -> PixelPool:
