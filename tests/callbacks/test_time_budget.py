@@ -26,7 +26,11 @@ WHOLE = 4 * ENTER + 180 * 0.01 + 60 * 0.03
 def timed(monkeypatch: pytest.MonkeyPatch, fit, rest: LoadedCheckpoint) -> Callable[..., Any]:
     """``timed(seconds)``: the fitted stage, its seconds, and the iterations of each visit."""
 
-    def learn(seconds: float | None, time_share: float = 1.0) -> tuple[Any, float, Counter]:
+    def learn(
+        seconds: float | None,
+        time_share: float = 1.0,
+        by_batch: Callable[[float], float] = lambda share: 1.0,
+    ) -> tuple[Any, float, Counter]:
         stage, now, visits = DeformationStage(rest, SCHEDULE), [0.0], Counter()
         stage.time_share, enter = time_share, stage.enter
 
@@ -35,7 +39,7 @@ def timed(monkeypatch: pytest.MonkeyPatch, fit, rest: LoadedCheckpoint) -> Calla
             now[0] += ENTER
 
         def tick(trainer: Any, stage: Any, optimizer: Any) -> None:
-            now[0] += ITERATION[stage.phase.level]
+            now[0] += ITERATION[stage.phase.level] * by_batch(stage.batch_share)
             visits[stage.phase.level, stage.phase.frame] += 1
 
         stage.enter = slowly
@@ -66,9 +70,24 @@ def test_batches_are_quartered_before_iterations_are_left_out(
     timed, monkeypatch: pytest.MonkeyPatch, share: float, by_rays: bool, rays: int
 ) -> None:
     monkeypatch.setattr(DeformationStage, "cost_follows_rays", by_rays)
-    stage, seconds, _ = timed(share * WHOLE)
+    stage, seconds, _ = timed(share * WHOLE, by_batch=lambda part: part if by_rays else 1.0)
     assert seconds == pytest.approx(share * WHOLE, rel=0.05)
     assert stage.rays_to_draw(SCHEDULE.rays) == rays
+
+
+def test_iterations_that_take_all_the_time_are_made_of_fewer_rays_still(timed) -> None:
+    # In a quarter of their rays six iterations would fit.
+    stage, seconds, visits = timed(0.7, by_batch=lambda part: 5 * part)
+    assert seconds == pytest.approx(0.7, rel=0.1)
+    assert stage.batch_share < 1 / 4 and visits.total() >= 20
+
+
+def test_batches_are_no_larger_than_there_is_memory_for(fit, rest: LoadedCheckpoint) -> None:
+    budget = TimeBudget(0.5, largest_batch=1 / 8)
+    stage = fit(DeformationStage(rest, SCHEDULE), budget, TrainingRecord())
+    assert stage.batch_share <= 1 / 8 and stage.iteration == SCHEDULE.total(3)
+    with pytest.raises(DevrfError, match=r"largest_batch: expected in \(0, 1\], not 2"):
+        TimeBudget(0.5, largest_batch=2)
 
 
 def test_time_for_the_first_level_alone_leaves_the_finer_one_out(timed, caplog) -> None:

@@ -90,6 +90,19 @@ def test_what_cannot_be_is_refused_with_a_change_that_fits(
     assert not (tmp_path / "run").exists()
 
 
+def test_a_budget_of_seconds_makes_do_with_the_batches_that_fit(
+    devrf, tiny_data, short, monkeypatch
+) -> None:
+    method = ("method=dnerf", "profile=dnerf_small", "protocol=joint", "stage=joint")
+    command = (*tiny_data, *method, "ray_stage.schedule.rays=64000", "trainer=cpu")
+    monkeypatch.setattr(fitting, "free_host_memory", lambda: 2 * 10**9 - fitting.own_memory())
+    outcome = devrf(*command)
+    assert outcome.status == 2 and "lack of host memory" in outcome.err
+    outcome = devrf(*command, "schedule.seconds=0.5")
+    assert outcome.status == 0
+    assert "batches have at most 0.016 of their rays" in outcome.out
+
+
 def test_a_full_disk_is_noticed_before_it_begins(devrf, tiny, monkeypatch) -> None:
     monkeypatch.setattr(fitting, "free_disk", lambda folder: 1000)
     outcome = devrf(*tiny)

@@ -45,10 +45,11 @@ def needed_bytes(
     *,
     on_gpu: bool,
 ) -> Bytes:
-    """What stages need; on a GPU with ``batch_share`` of each batch, else in each process."""
+    """What stages need with ``batch_share`` of each batch; without a GPU in each process."""
+    host = host_bytes(scene, stages, on_host=not on_gpu, batch_share=batch_share)
     return {
         "GPU memory": max(stage.peak(batch_share) for stage in stages),
-        "host memory": host_bytes(scene, stages, on_host=not on_gpu) * (1 if on_gpu else processes),
+        "host memory": host * (1 if on_gpu else processes),
         "disk": FILES * max(stage.learned for stage in stages),
     }
 

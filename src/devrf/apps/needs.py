@@ -67,9 +67,14 @@ def smaller(scene: Scene, by: float) -> Scene:
     return replace(scene, static=captures[0], dynamic=captures[1], space=space)
 
 
-def host_bytes(scene: Scene, stages: Iterable[StageNeeds], *, on_host: bool) -> float:
-    """Bytes that stages need of the host, which trains (``on_host``) or holds what a GPU learns."""
-    held = (FRAGMENTATION * s.peak() if on_host else 2 * s.learned for s in stages)
+def host_bytes(
+    scene: Scene, stages: Iterable[StageNeeds], *, on_host: bool, batch_share: float = 1.0
+) -> float:
+    """Bytes that stages need of the host.
+
+    It trains with ``batch_share`` of each batch (``on_host``), or holds what a GPU learns.
+    """
+    held = (FRAGMENTATION * s.peak(batch_share) if on_host else 2 * s.learned for s in stages)
     return PROGRAM + tensor_bytes(scene.captures.values()) + max(held)
 
 

@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 BACKGROUND = "is data.background that of the images, data.box around what they show?"
 # Iterations between snapshots in a long phase.
 SNAPSHOT_EVERY = 1000
-# The fewest iterations between checks that allow a judgement of opacity.
+# The fewest iterations, as carried out, between checks that allow a judgement of opacity.
 MIN_ITERATIONS = 20
 # An expected opacity (or transparency) below this is too small to judge by.
 FAINT = 0.02
@@ -89,6 +89,7 @@ class DivergenceGuard(Callback):
         self._steps: list[tuple[int, dict[str, Tensor]]] = []
         self._good: Snapshot | None = None
         self._checked = 0
+        self._done_by_then = 0
         # Of the opacity, since grids of this kind are learned.
         self._kind = ""
         self._range = [1.0, 0.0]
@@ -109,7 +110,7 @@ class DivergenceGuard(Callback):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Count from here."""
         assert isinstance(pl_module, Stage)
-        self._checked = pl_module.iteration
+        self._count_from(pl_module)
 
     def on_train_batch_start(
         self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int
@@ -134,7 +135,8 @@ class DivergenceGuard(Callback):
         if outputs:
             self._steps.append((done, outputs))
         ends = done >= min(pl_module.phase.stop, pl_module.total_iterations)
-        if ends or done - self._checked >= self.every_iterations:
+        due = done - self._checked >= self.every_iterations
+        if ends or (due and pl_module.iterations_done - self._done_by_then >= self._fewest):
             self.check(pl_module)
 
     def check(self, stage: Stage) -> None:
@@ -142,10 +144,10 @@ class DivergenceGuard(Callback):
         if not self._steps:
             return
         iterations = [done for done, _ in self._steps]
-        since = stage.iteration - self._checked
+        since = stage.iterations_done - self._done_by_then
         *steps, fields = _read(stage, [means for _, means in self._steps])
         self._steps = []
-        self._checked = stage.iteration
+        self._count_from(stage)
         wrong = _not_finite(stage, iterations, steps, fields)
         wrong = wrong or self._collapsed(stage, steps, since)
         assert self._good is not None and stage.phase is not None
@@ -153,6 +155,15 @@ class DivergenceGuard(Callback):
             self._rollback(stage, self._good, wrong)
         elif stage.phase.stop > stage.iteration >= self._good.iteration + SNAPSHOT_EVERY:
             self._snapshot(stage)
+
+    def _count_from(self, stage: Stage) -> None:
+        self._checked = stage.iteration
+        self._done_by_then = stage.iterations_done
+
+    @property
+    def _fewest(self) -> int:
+        """Iterations, as carried out, between checks: a budget of time strides over the others."""
+        return min(MIN_ITERATIONS, self.every_iterations)
 
     def _snapshot(self, stage: Stage) -> None:
         assert stage.phase is not None
@@ -188,7 +199,7 @@ class DivergenceGuard(Callback):
         for value, stored in zip(_trained(stage), good.values, strict=True):
             value.copy_(stored)
         stage.rollback(good.iteration, good.iterations_done, self.rate_factor)
-        self._checked = stage.iteration
+        self._count_from(stage)
         if again:
             stage.abort(
                 f"{wrong}, again after learning rates were cut to {scale:g}; what it was at "

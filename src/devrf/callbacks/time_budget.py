@@ -20,8 +20,10 @@ stage itself always goes one further; this callback adds the rest of the stride.
   of another is the stage's own estimate (:meth:`~devrf.engine.stage.Stage.cost`): where it is
   wrong, levels get other shares of the time, but the end is where it should be.
 * Where the stride would be more than 1, ``stage.batch_share`` is halved first, to a quarter: more
-  iterations learn more than larger ones. What takes as long with fewer rays keeps its batches
-  (:attr:`~devrf.engine.stage.Stage.cost_follows_rays`).
+  iterations learn more than larger ones. Where not even ``ENOUGH_ITERATIONS`` fit, nor a quarter
+  of the schedule's, it is halved further. It begins with ``FIRST_BATCH``, since nobody knows yet
+  what an iteration takes, and is doubled as long as the stride stays below 1. What takes as long
+  with fewer rays keeps its batches (:attr:`~devrf.engine.stage.Stage.cost_follows_rays`).
 * Where an iteration for each phase takes longer than there is time, the finest are left out: levels
   of motion, growths of grids. Resolution follows the budget.
 * Of several processes rank 0's clock decides.
@@ -52,8 +54,12 @@ STEP_SHARE = 0.01
 # The share of the budget after which it is checked that the rest suffices. Where it does not even
 # for the coarsest grids, the stage is refused then; later what is finest is left out, no more.
 TRIAL_SHARE = 0.25
-# The least part of a batch that is drawn for want of time.
+# The parts of a batch that are drawn: at first, for want of time, and where else too few iterations
+# would fit to teach anything.
+FIRST_BATCH = 1 / 64
 LEAST_BATCH = 1 / 4
+SMALLEST_BATCH = 1 / 256
+ENOUGH_ITERATIONS = 100
 # Added to the last strides, whose sum would else fall short of the end.
 ROUNDING = 1e-6
 # How much of an average the latest measurement is.
@@ -83,14 +89,23 @@ class TimeBudget(Callback):
 
     Attributes:
         seconds: for all stages of the method together; None: the schedule's iterations.
+        largest_batch: the most of the schedule's batches that is drawn.
         stride: how far an optimiser iteration goes in the schedule.
     """
 
-    def __init__(self, seconds: float | None = None) -> None:
-        """``seconds``: for all stages of the method together; None: the schedule's iterations."""
+    def __init__(self, seconds: float | None = None, largest_batch: float = 1.0) -> None:
+        """Prepare to count.
+
+        Args:
+            seconds: for all stages of the method together; None: the schedule's iterations.
+            largest_batch: the most of the schedule's batches that is drawn within them.
+        """
         expected = "more than 0, or null"
         expect(seconds is None or 0 < seconds < math.inf, "schedule.seconds", expected, seconds)
+        key = "callbacks.time_budget.largest_batch"
+        expect(0 < largest_batch <= 1, key, "in (0, 1]", largest_batch)
         self.seconds = seconds
+        self.largest_batch = largest_batch
         self._pace: float | None = None  # seconds for a unit of cost
         self._entering: dict[str, float] = {}  # seconds to enter a phase of a kind
         self._warm = self._checked = False
@@ -117,6 +132,8 @@ class TimeBudget(Callback):
         self._budget = self.seconds * pl_module.time_share
         self._most_iterations = pl_module.iterations_per_step
         pl_module.iterations_per_step = 1  # whose time is not known yet
+        if pl_module.cost_follows_rays and not pl_module.iterations_done:
+            pl_module.batch_share = min(FIRST_BATCH, self.largest_batch)
         self._step_ended = self._record.seconds
 
     def on_train_batch_start(
@@ -141,9 +158,10 @@ class TimeBudget(Callback):
             if isinstance(fitted, str):
                 raise DevrfError(fitted)
             self.stride, pl_module.iterations_per_step, share, self._end = fitted
-            # An iteration takes about as long as its rays; it is measured again.
-            self._pace *= share / pl_module.batch_share
-            pl_module.batch_share = share
+            if share != pl_module.batch_share:  # an iteration's time is measured anew
+                self._pace *= share / pl_module.batch_share
+                self._warm = False
+                pl_module.batch_share = share
 
     def on_before_optimizer_step(
         self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer
@@ -182,17 +200,38 @@ class TimeBudget(Callback):
         )
         # Out of time, what is left gets an iteration a phase.
         stride = whole / (left - entering) if left > entering else float(stage.total_iterations)
-        share = stage.batch_share
-        if stride > 1 and share > LEAST_BATCH and stage.cost_follows_rays:
-            stride /= 2
-            pace /= 2
-            share /= 2
+        change = self._change_of_batch(stage, stride)
+        share = stage.batch_share * change
+        stride *= change
+        pace *= change
         if not later:  # whole iterations are left: as many as end nearest to the budget
             iterations = max(1, round(left / (pace * stage.phase.cost)))
             stride = (stage.phase.stop - place) / iterations + ROUNDING
         most = STEP_SHARE * self._budget / (pace * stage.phase.cost)
         iterations = max(1, min(self._most_iterations, int(most)))
         return stride, iterations, share, self._phases[-1].stop
+
+    def _change_of_batch(self, stage: Stage, stride: float) -> float:
+        """By what the batches are made smaller or larger, a power of two.
+
+        An iteration is taken to last as long as its rays do.
+        """
+        if not stage.cost_follows_rays or stride <= 0:
+            return 1.0
+        share = stage.batch_share
+        iterations = (self._end - stage.iteration) / stride  # in the time that is left
+        enough = min(ENOUGH_ITERATIONS, self._end / 4) * (1 - stage.iteration / self._end)
+        change = 1.0
+        while change * stride > 1 and change * share > LEAST_BATCH:
+            change /= 2
+        while iterations < change * enough and change * share > SMALLEST_BATCH:
+            change /= 2
+        most = min(self.largest_batch, stage.largest_share) if self._warm else 0.0
+        while change >= 1 and 2 * change * share <= most and iterations >= 4 * change * enough:
+            if 2 * change * stride > 1 and 2 * change * share > LEAST_BATCH:
+                break
+            change *= 2
+        return change
 
     def _to_enter(self, phases: Sequence[Phase]) -> float:
         """Seconds: where no phase of the kind has been entered yet, as long as of another kind.
@@ -265,7 +304,7 @@ class TimeBudget(Callback):
             return
         assert isinstance(pl_module, Stage)
         log.info(
-            "%s: %d iterations for its %d, on %.0f%% of their rays, in %.1f s of %.1f",
+            "%s: %d iterations for its %d, on %.2g%% of their rays, in %.1f s of %.1f",
             pl_module.name,
             pl_module.iterations_done,
             pl_module.iteration,

@@ -33,6 +33,7 @@ class Progress(TypedDict):
     num_rollbacks: Count
     lr_scale: Share
     batch_share: Share
+    largest_share: Share
     phase: Count | None
     phase_state: dict[str, Any]
     random: dict[str, Any]

@@ -26,6 +26,10 @@ from devrf.scenes.scene import Scene
 
 log = logging.getLogger(__name__)
 
+# The parts of batches that a budget of seconds may do with, and the key of the most that it draws.
+BATCHES = [2**-k for k in range(1, 9)]
+LARGEST_BATCH = "callbacks.time_budget.largest_batch"
+
 
 def needs(run: RunContext, config: DictConfig, scene: Scene) -> dict[str, StageNeeds]:
     """What each stage of a configured run needs; several processes share a batch."""
@@ -54,14 +58,17 @@ def needs(run: RunContext, config: DictConfig, scene: Scene) -> dict[str, StageN
 def compare(run: RunContext, names: Sequence[str]) -> tuple[str, Advice | None, list[str]]:
     """What the stages ``names`` need of what there is; where that lacks, the override that helps.
 
-    Where the images' size was left to the run, it is changed at once.
+    Where the images' size was left to the run, it is changed at once; with ``schedule.seconds``
+    the largest batch is.
     """
     scene = run.scene
     by = run.datamodule.downscale
     processes = int(getattr(run.strategy, "num_processes", 1))
     free = free_bytes(run.device, run.folder, resume=run.config.resume)
+    on_gpu = run.device.type == "cuda"
+    least = 0.5 if on_gpu else 1.0  # a GPU says that it has no more memory, and half is drawn
 
-    def needed(key: str = "", value: int = 0, batch_share: float = 0.5) -> Bytes:
+    def needed(key: str = "", value: int = 0, batch_share: float = least) -> Bytes:
         config = run.config.copy()
         less = smaller(scene, value / by) if key == SIZE else scene
         if key:
@@ -69,13 +76,18 @@ def compare(run: RunContext, names: Sequence[str]) -> tuple[str, Advice | None, 
         with as_own_errors():
             every = needs(run, config, less)
         stages = [every[name] for name in names]
-        return needed_bytes(less, stages, processes, batch_share, on_gpu=run.device.type == "cuda")
+        return needed_bytes(less, stages, processes, batch_share, on_gpu=on_gpu)
 
     whole = needed(batch_share=1.0)
     line = f"needs about {in_words(whole, free)}"
     lacks = lacking(needed(), free)
     if not lacks:
         return line + "; batches will be halved" * bool(lacking(whole, free)), None, []
+    if run.config.schedule.seconds is not None:
+        fitting = (share for share in BATCHES if not lacking(needed(batch_share=share), free))
+        if share := next(fitting, None):
+            OmegaConf.update(run.config, LARGEST_BATCH, share)
+            return f"{line}: batches have at most {share:.2g} of their rays", None, []
     every = needs(run, run.config, scene)
     parts = max((every[name] for name in names), key=StageNeeds.peak).parts
     present = {key: OmegaConf.select(run.config, key) for key in parts} | {SIZE: by}

@@ -55,7 +55,8 @@ log = logging.getLogger(__name__)
 
 # Attributes of a stage that a progress file holds by name (:class:`Progress`): where it is in its
 # schedule, and how it goes on.
-POSITION = ("iteration", "iterations_done", "seed", "num_rollbacks", "lr_scale", "batch_share")
+POSITION = ("iteration", "iterations_done", "seed", "num_rollbacks", "lr_scale")
+POSITION += ("batch_share", "largest_share")
 
 
 class LearnedModel(Viewable, Protocol):
@@ -94,6 +95,7 @@ class Stage(LightningModule, ABC):
         iterations_done: optimiser iterations that were carried out.
         batch_share: the part of the schedule's batches that is drawn: less than 1 after memory
             has run out, or for want of time.
+        largest_share: the most of them for which there is memory: less than 1 after it has run out.
         generator: draws pixels, on the stage's device. Its state at the beginning of a Lightning
             step follows from the seed, the process, the iterations done and the rollbacks.
         seed: of the whole run.
@@ -131,6 +133,7 @@ class Stage(LightningModule, ABC):
         self.previous_iteration = -1
         self.iterations_done = 0
         self.batch_share = 1.0
+        self.largest_share = 1.0
         self.generator = torch.Generator()
         self.seed = 0
         self.num_rollbacks = 0
@@ -224,7 +227,7 @@ class Stage(LightningModule, ABC):
                 f"schedule: one of {world_size()} processes is {shortage}; fewer rays, smaller "
                 "grids or more processes"
             )
-        if self.batch_share < 1:
+        if self.largest_share < 1:
             lower = " or ".join(self.memory_keys)
             self.abort(
                 f"{shortage} at {self.describe(self.iteration)}; the same command goes on where "
@@ -232,7 +235,8 @@ class Stage(LightningModule, ABC):
                 f"{f'lower {lower}, or ' if lower else ''}higher data.downscale"
             )
             return False
-        self.batch_share = 0.5
+        self.batch_share /= 2
+        self.largest_share = self.batch_share
         log.warning("%s: batches have half of their rays from now on", shortage)
         return True
 

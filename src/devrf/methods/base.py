@@ -161,8 +161,14 @@ class RayTrainable(Renderable):
             terms: the loss terms that count.
         """
 
-    def further_pixels(self, generator: torch.Generator) -> tuple[Tensor, Tensor] | None:
+    def further_pixels(
+        self, generator: torch.Generator, batch_share: float
+    ) -> tuple[Tensor, Tensor] | None:
         """Pixels that the next batch has beside those drawn from all images; None: none.
+
+        Args:
+            generator: draws them.
+            batch_share: the part of the schedule's batches that is drawn.
 
         Returns:
             image (K,), numbered as for :meth:`learn_from`, and row-major number (K,), int64.

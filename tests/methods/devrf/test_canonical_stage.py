@@ -9,6 +9,7 @@ import pytest
 import torch
 from lightning import Callback, Trainer
 from lightning.pytorch.callbacks import LambdaCallback
+from torch.optim import Optimizer
 
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
@@ -120,6 +121,21 @@ def test_a_search_that_finds_nothing_says_what_to_check(datamodule, trainer):
     schedule = CanonicalSchedule(1, 8, False, 10, 8, (), rays=16)
     with pytest.raises(DevrfError, match="search_iterations"):
         trainer(max_epochs=1).fit(CanonicalStage(schedule, SMALL), datamodule=datamodule)
+
+
+def test_a_search_that_a_budget_has_cut_short_leaves_all_to_the_radiance_field(
+    datamodule, trainer, caplog
+):
+    def skip(trainer: Trainer, stage: CanonicalStage, optimizer: Optimizer) -> None:
+        stage.iteration = stage.phase.stop - 1  # as a TimeBudget's stride does
+
+    caplog.set_level("INFO")
+    stage = CanonicalStage(SEARCHED, SMALL)
+    watch = LambdaCallback(on_before_optimizer_step=skip)
+    trainer(watch, max_epochs=1).fit(stage, datamodule=datamodule)
+    assert stage.iterations_done == 2 and stage.iteration == stage.total_iterations
+    assert "nothing is opaque yet, for want of time" in caplog.text
+    assert stage.scene_model.occupancy.share > 0.9
 
 
 def test_afterwards_what_is_not_occupied_is_empty(learned):

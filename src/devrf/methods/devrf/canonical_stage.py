@@ -238,7 +238,9 @@ class CanonicalStage(Stage):
         search = self.scene_model.canonical
         occupancy = self.scene_model.occupancy
         opaque = search.voxel_alpha(self.sampling.step) > self.sampling.occupancy_threshold
-        occupancy.replace(dilate(opaque & occupancy.mask, 1))
+        if self._is_too_early(found := opaque & occupancy.mask):
+            found = occupancy.mask
+        occupancy.replace(dilate(found, 1))
         self.scene_model.canonical = self._radiance_field(occupancy, phase).to(self.device)
 
     def _radiance_field(self, occupancy: Occupancy, phase: CanonicalPhase) -> CanonicalField:
@@ -285,7 +287,15 @@ class CanonicalStage(Stage):
         occupancy = self.scene_model.occupancy
         field = self.scene_model.canonical
         before = occupancy.on(field.density.shape, field.box)
-        occupancy.replace(dilate(where, 1) & before, field.box)
+        kept = dilate(where, 1) & before
+        occupancy.replace(before if self._is_too_early(kept) else kept, field.box)
+
+    def _is_too_early(self, occupied: Tensor) -> bool:
+        """Whether nothing is ``occupied`` since a budget of time has left iterations out."""
+        early = self.iterations_done < self.iteration and not bool(occupied.any())
+        if early:
+            log.info("%s: nothing is opaque yet, for want of time", self.describe(self.iteration))
+        return early
 
     @torch.no_grad()
     def _forget_hidden(self) -> None:

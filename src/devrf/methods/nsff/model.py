@@ -115,12 +115,15 @@ class NSFF(NeuralField):
             listed = ", ".join(f"{name} ({why})" for name, why in missing.items())
             log.info("nsff: zero, for what this scene and blend do not have: %s", listed)
 
-    def further_pixels(self, generator: torch.Generator) -> tuple[Tensor, Tensor] | None:
+    def further_pixels(
+        self, generator: torch.Generator, batch_share: float
+    ) -> tuple[Tensor, Tensor] | None:
         """In the first N₀ iterations, pixels that move."""
         moving = None if self._images is None else self._images.moving
         if moving is None or not self.settings.hard_rays or self._step >= self._first:
             return None
-        return moving.draw(rays_per_rank(self.settings.hard_rays), generator)
+        rays = max(1, round(rays_per_rank(self.settings.hard_rays) * batch_share))
+        return moving.draw(rays, generator)
 
     def render_rays(
         self, rays: Rays, time: Tensor, background: Tensor, *, jitter: bool = False
