@@ -55,7 +55,7 @@ log = logging.getLogger(__name__)
 
 # Attributes of a stage that a progress file holds by name (:class:`Progress`): where it is in its
 # schedule, and how it goes on.
-POSITION = ("iteration", "iterations_done", "seed", "num_rollbacks", "lr_scale")
+POSITION: tuple[str, ...] = ("iteration", "iterations_done", "seed", "num_rollbacks", "lr_scale")
 POSITION += ("batch_share", "largest_share")
 
 
