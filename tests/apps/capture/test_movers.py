@@ -66,6 +66,13 @@ def test_where_nothing_moves_there_are_no_masks(filmed):
     assert film.masks_of_movers(model) == {}
 
 
+@pytest.mark.parametrize(("placed", "masked"), [(1, 0), (2, 0), (3, 3)])
+def test_images_too_few_to_compare_are_not_masked(filmed, placed, masked):
+    film, model = filmed(patch=True)
+    few = replace(model, images=model.images[:placed])
+    assert len(film.masks_of_movers(few)) == masked
+
+
 def test_what_stands_still_tells_which_cameras_are_right(filmed):
     film, model = filmed(patch=True)
     masks = film.masks_of_movers(model)
