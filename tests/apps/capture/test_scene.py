@@ -216,3 +216,12 @@ def test_footage_without_overlap(into, film):
     assert refused(into, static=static).startswith(f"{static}: too few matches")
     # What the steps before have found stays.
     assert (into / "capture" / "images.json").is_file()
+
+
+@pytest.mark.skipif(importlib.util.find_spec("pycolmap") is None, reason="needs devrf[capture]")
+def test_a_camera_that_stands_still_shows_no_depth(into, film):
+    place = np.random.default_rng(0).integers(0, 256, (160, 240, 3), dtype=np.uint8)
+    place = cv2.GaussianBlur(place, (0, 0), 1.5)
+    place = np.clip(128 + 3.0 * (place.astype(np.float32) - 128), 0, 255).astype(np.uint8)
+    static = film("static.mp4", [place] * 6)
+    assert refused(into, static=static).startswith(f"{static}: its frames show no depth: ")

@@ -35,6 +35,8 @@ LEAST_SHARE = 2 / 3
 # A model without what moves is taken if it places so large a share of the images that the first
 # one places.
 FEWER = 0.9
+# Where so large a share of the pairs of images shows no depth, that is why no cameras are found.
+DEPTHLESS = 0.9
 DATA_BASE = "matches.db"
 
 _FILM = (
@@ -78,7 +80,7 @@ def reconstruct(
     model, in :func:`models_folder`.
 
     Raises:
-        DevrfError: nothing could be matched, or a given mask does not fit.
+        DevrfError: nothing could be matched, nothing shows depth, or a given mask does not fit.
     """
     library: Any = importlib.import_module("pycolmap")
     library.logging.minloglevel = 3
@@ -88,6 +90,12 @@ def reconstruct(
     given = {} if moving.still is None else still_masks(images, moving)
     _match(images, work, moving, fixed, settings, given)
     first = _mapped(images, work, "incremental", models / "first")
+    placed = 0 if first is None else first.images
+    if placed < LEAST_SHARE * len(moving.names) and _shows_no_depth(work / DATA_BASE):
+        raise DevrfError(
+            f"{moving.path}: its frames show no depth: the camera stood still or only turned, or "
+            "saw one flat thing; walk past what you film, or half round it"
+        )
     if first is None:
         raise DevrfError(
             f"{moving.path}: too few matches between its frames to find any camera; {_FILM}"
@@ -180,6 +188,18 @@ def _match(
     verification = library.TwoViewGeometryOptions()
     verification.ransac.random_seed = 0
     library.match_image_pairs(base, matching, pairing, verification, device=library.Device.cpu)
+
+
+def _shows_no_depth(base: Path) -> bool:
+    """Whether a plane or a turning camera explains the matches of most pairs in a data base."""
+    library: Any = importlib.import_module("pycolmap")
+    database = library.Database.open(base)
+    _, geometries = database.read_two_view_geometries()
+    database.close()
+    kinds = library.TwoViewGeometryConfiguration
+    depthless = [kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC]
+    known = [geometry.config for geometry in geometries if len(geometry.inlier_matches)]
+    return sum(kind in depthless for kind in known) > DEPTHLESS * max(len(known), 1)
 
 
 def _written(masks: dict[str, Mask], folder: Path) -> Path:
