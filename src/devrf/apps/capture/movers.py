@@ -170,7 +170,7 @@ class _Shots:
     def votes(self, k: int) -> Numbers:
         """(H, W): the share of what is known around each pixel of image ``k`` that moves."""
         # A film may be too short to have an image near enough.
-        shares = [np.full(self.film.textured[self.numbers[k]].shape, np.nan)]
+        shares: list[Numbers] = [np.full(self.film.textured[self.numbers[k]].shape, np.nan)]
         for error in self.errors(k):
             any_known = np.isfinite(error).any()
             usual = max(float(np.nanmedian(error)), NOISE) if any_known else np.inf
