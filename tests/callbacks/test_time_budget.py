@@ -82,6 +82,12 @@ def test_iterations_that_take_all_the_time_are_made_of_fewer_rays_still(timed) -
     assert stage.batch_share < 1 / 4 and visits.total() >= 20
 
 
+def test_batches_are_not_made_smaller_where_that_saves_no_time(timed) -> None:
+    stage, seconds, _ = timed(0.7, by_batch=lambda part: 1 + part)
+    assert seconds == pytest.approx(0.7, rel=0.1)
+    assert stage.batch_share >= 1 / 16  # not the smallest: levels take other times than estimated
+
+
 def test_batches_are_no_larger_than_there_is_memory_for(fit, rest: LoadedCheckpoint) -> None:
     budget = TimeBudget(0.5, largest_batch=1 / 8)
     stage = fit(DeformationStage(rest, SCHEDULE), budget, TrainingRecord())

@@ -21,9 +21,10 @@ stage itself always goes one further; this callback adds the rest of the stride.
   wrong, levels get other shares of the time, but the end is where it should be.
 * Where the stride would be more than 1, ``stage.batch_share`` is halved first, to a quarter: more
   iterations learn more than larger ones. Where not even ``ENOUGH_ITERATIONS`` fit, nor a quarter
-  of the schedule's, it is halved further. It begins with ``FIRST_BATCH``, since nobody knows yet
-  what an iteration takes, and is doubled as long as the stride stays below 1. What takes as long
-  with fewer rays keeps its batches (:attr:`~devrf.engine.stage.Stage.cost_follows_rays`).
+  of the schedule's, it is halved further, as long as that saves time. It begins with
+  ``FIRST_BATCH``, since nobody knows yet what an iteration takes, and what its rays take of that
+  is learned from each change. What takes as long with fewer rays keeps its batches
+  (:attr:`~devrf.engine.stage.Stage.cost_follows_rays`).
 * Where an iteration for each phase takes longer than there is time, the finest are left out: levels
   of motion, growths of grids. Resolution follows the budget.
 * Of several processes rank 0's clock decides.
@@ -60,6 +61,8 @@ FIRST_BATCH = 1 / 64
 LEAST_BATCH = 1 / 4
 SMALLEST_BATCH = 1 / 256
 ENOUGH_ITERATIONS = 100
+# By how much what larger batches take may be misjudged.
+MARGIN = 1.25
 # Added to the last strides, whose sum would else fall short of the end.
 ROUNDING = 1e-6
 # How much of an average the latest measurement is.
@@ -107,6 +110,8 @@ class TimeBudget(Callback):
         self.seconds = seconds
         self.largest_batch = largest_batch
         self._pace: float | None = None  # seconds for a unit of cost
+        self._besides = 0.0  # of these, what is not for rays
+        self._before: tuple[float, float] | None = None  # share and pace, when the share changed
         self._entering: dict[str, float] = {}  # seconds to enter a phase of a kind
         self._warm = self._checked = False
         self._step_began = 0.0
@@ -159,7 +164,8 @@ class TimeBudget(Callback):
                 raise DevrfError(fitted)
             self.stride, pl_module.iterations_per_step, share, self._end = fitted
             if share != pl_module.batch_share:  # an iteration's time is measured anew
-                self._pace *= share / pl_module.batch_share
+                self._before = (pl_module.batch_share, self._pace)
+                self._pace = self._pace_with(pl_module, share)
                 self._warm = False
                 pl_module.batch_share = share
 
@@ -200,10 +206,9 @@ class TimeBudget(Callback):
         )
         # Out of time, what is left gets an iteration a phase.
         stride = whole / (left - entering) if left > entering else float(stage.total_iterations)
-        change = self._change_of_batch(stage, stride)
-        share = stage.batch_share * change
-        stride *= change
-        pace *= change
+        share = self._share_of_batches(stage, pace, stride)
+        stride *= self._pace_with(stage, share) / pace
+        pace = self._pace_with(stage, share)
         if not later:  # whole iterations are left: as many as end nearest to the budget
             iterations = max(1, round(left / (pace * stage.phase.cost)))
             stride = (stage.phase.stop - place) / iterations + ROUNDING
@@ -211,27 +216,44 @@ class TimeBudget(Callback):
         iterations = max(1, min(self._most_iterations, int(most)))
         return stride, iterations, share, self._phases[-1].stop
 
-    def _change_of_batch(self, stage: Stage, stride: float) -> float:
-        """By what the batches are made smaller or larger, a power of two.
+    def _share_of_batches(self, stage: Stage, pace: float, stride: float) -> float:
+        """The part of the schedule's batches to draw, of the powers of two.
 
-        An iteration is taken to last as long as its rays do.
+        The largest with which the stride is 1 at most, or else the least; with which enough
+        iterations fit, or its rays take no longer than what an iteration does besides.
         """
+        present = stage.batch_share
         if not stage.cost_follows_rays or stride <= 0:
-            return 1.0
-        share = stage.batch_share
-        iterations = (self._end - stage.iteration) / stride  # in the time that is left
+            return present
+        most = min(self.largest_batch, stage.largest_share) if self._warm else present
         enough = min(ENOUGH_ITERATIONS, self._end / 4) * (1 - stage.iteration / self._end)
-        change = 1.0
-        while change * stride > 1 and change * share > LEAST_BATCH:
-            change /= 2
-        while iterations < change * enough and change * share > SMALLEST_BATCH:
-            change /= 2
-        most = min(self.largest_batch, stage.largest_share) if self._warm else 0.0
-        while change >= 1 and 2 * change * share <= most and iterations >= 4 * change * enough:
-            if 2 * change * stride > 1 and 2 * change * share > LEAST_BATCH:
+        iterations = (self._end - stage.iteration) / stride  # in the time that is left
+        besides = min(self._besides / pace, 1.0)  # of the present iterations' time
+        share = 1.0
+        while share > SMALLEST_BATCH:
+            rays = (1 - besides) * share / present
+            longer = rays + besides
+            margin = 1.0 if share <= present else MARGIN
+            tight = margin * longer * stride > 1 and share > LEAST_BATCH
+            few = iterations < margin * longer * enough and rays > besides
+            if share <= most and not (tight or few):
                 break
-            change *= 2
-        return change
+            share /= 2
+        return share
+
+    def _pace_with(self, stage: Stage, share: float) -> float:
+        """Seconds for a unit of cost, with ``share`` of the batches."""
+        assert self._pace is not None
+        besides = min(self._besides, self._pace)
+        return besides + (self._pace - besides) * share / stage.batch_share
+
+    def _learn_what_rays_take(self, share: float, pace: float) -> None:
+        """From the paces of two shares: what of an iteration does not depend on its rays."""
+        if self._before is not None:
+            other, before = self._before
+            by_rays = max((pace - before) / (share - other), 0.0)
+            self._besides = max(min(pace, before) - by_rays * min(share, other), 0.0)
+        self._before = None
 
     def _to_enter(self, phases: Sequence[Phase]) -> float:
         """Seconds: where no phase of the kind has been entered yet, as long as of another kind.
@@ -294,6 +316,7 @@ class TimeBudget(Callback):
         done = pl_module.iterations_done - self._done
         if done > 0:  # none, if memory ran out
             pace = (self._step_ended - self._step_began) / (done * self._phase.cost)
+            self._learn_what_rays_take(pl_module.batch_share, pace)
             # The first step warms up.
             self._pace = running_mean(self._pace if self._warm else None, pace)
             self._warm = self._warm or pl_module.iterations_done > done
