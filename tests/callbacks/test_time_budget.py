@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+import torch
 from lightning.pytorch.callbacks import LambdaCallback
 
 from devrf.callbacks import TimeBudget, TrainingRecord
@@ -30,6 +31,7 @@ def timed(monkeypatch: pytest.MonkeyPatch, fit, rest: LoadedCheckpoint) -> Calla
         seconds: float | None,
         time_share: float = 1.0,
         by_batch: Callable[[float], float] = lambda share: 1.0,
+        largest_batch: float = 1.0,
     ) -> tuple[Any, float, Counter]:
         stage, now, visits = DeformationStage(rest, SCHEDULE), [0.0], Counter()
         stage.time_share, enter = time_share, stage.enter
@@ -45,7 +47,8 @@ def timed(monkeypatch: pytest.MonkeyPatch, fit, rest: LoadedCheckpoint) -> Calla
         stage.enter = slowly
         monkeypatch.setattr(TrainingRecord, "seconds", property(lambda self: now[0]))
         watch = LambdaCallback(on_before_optimizer_step=tick)
-        return fit(stage, TimeBudget(seconds), watch, TrainingRecord()), now[0], visits
+        budget = TimeBudget(seconds, largest_batch)
+        return fit(stage, budget, watch, TrainingRecord()), now[0], visits
 
     return learn
 
@@ -88,12 +91,30 @@ def test_batches_are_not_made_smaller_where_that_saves_no_time(timed) -> None:
     assert stage.batch_share >= 1 / 16  # not the smallest: levels take other times than estimated
 
 
-def test_batches_are_no_larger_than_there_is_memory_for(fit, rest: LoadedCheckpoint) -> None:
-    budget = TimeBudget(0.5, largest_batch=1 / 8)
-    stage = fit(DeformationStage(rest, SCHEDULE), budget, TrainingRecord())
-    assert stage.batch_share <= 1 / 8 and stage.iteration == SCHEDULE.total(3)
+def test_batches_are_no_larger_than_there_is_memory_for(timed, caplog) -> None:
+    caplog.set_level("INFO")
+    stage, _, _ = timed(3 * WHOLE, largest_batch=1 / 8)
+    assert stage.batch_share == 1 / 8 and "on 12.5% of their rays" in caplog.text
+    stage, _, _ = timed(3 * WHOLE, largest_batch=1 / 1000)
+    assert stage.batch_share == 1 / 1000
     with pytest.raises(DevrfError, match=r"largest_batch: expected in \(0, 1\], not 2"):
         TimeBudget(0.5, largest_batch=2)
+
+
+def test_memory_that_runs_out_as_batches_grow_ends_their_growth(timed, monkeypatch) -> None:
+    usual = DeformationStage.loss
+    drawn: list[int] = []
+
+    def loss(stage: DeformationStage, views: Any, pixels: Any) -> Any:
+        drawn.append(len(pixels))
+        if len(pixels) > SCHEDULE.rays / 4:
+            raise torch.OutOfMemoryError("CUDA out of memory.")
+        return usual(stage, views, pixels)
+
+    monkeypatch.setattr(DeformationStage, "loss", loss)
+    stage, _, _ = timed(3 * WHOLE, by_batch=lambda part: 0.5 + part)
+    assert stage.batch_share == 1 / 4 and [rays for rays in drawn if rays > 4] == [16, 8]
+    assert stage.iteration == SCHEDULE.total(3)
 
 
 def test_time_for_the_first_level_alone_leaves_the_finer_one_out(timed, caplog) -> None:

@@ -22,8 +22,9 @@ stage itself always goes one further; this callback adds the rest of the stride.
 * Where the stride would be more than 1, ``stage.batch_share`` is halved first, to a quarter: more
   iterations learn more than larger ones. Where not even ``ENOUGH_ITERATIONS`` fit, nor a quarter
   of the schedule's, it is halved further, as long as that saves time. It begins with
-  ``FIRST_BATCH``, since nobody knows yet what an iteration takes, and what its rays take of that
-  is learned from each change. What takes as long with fewer rays keeps its batches
+  ``FIRST_BATCH``, since nobody knows yet what an iteration takes; what its rays take of that is
+  learned from each change, and batches grow where twice the schedule's iterations still fit. What
+  takes as long with fewer rays keeps its batches
   (:attr:`~devrf.engine.stage.Stage.cost_follows_rays`).
 * Where an iteration for each phase takes longer than there is time, the finest are left out: levels
   of motion, growths of grids. Resolution follows the budget.
@@ -61,8 +62,8 @@ FIRST_BATCH = 1 / 64
 LEAST_BATCH = 1 / 4
 SMALLEST_BATCH = 1 / 256
 ENOUGH_ITERATIONS = 100
-# By how much what larger batches take may be misjudged.
-MARGIN = 1.25
+# Batches grow only where so many times the schedule's iterations, or enough of them, still fit.
+MARGIN = 2.0
 # Added to the last strides, whose sum would else fall short of the end.
 ROUNDING = 1e-6
 # How much of an average the latest measurement is.
@@ -112,6 +113,7 @@ class TimeBudget(Callback):
         self._pace: float | None = None  # seconds for a unit of cost
         self._besides = 0.0  # of these, what is not for rays
         self._before: tuple[float, float] | None = None  # share and pace, when the share changed
+        self._share = 1.0  # with which the present step began
         self._entering: dict[str, float] = {}  # seconds to enter a phase of a kind
         self._warm = self._checked = False
         self._step_began = 0.0
@@ -137,8 +139,8 @@ class TimeBudget(Callback):
         self._budget = self.seconds * pl_module.time_share
         self._most_iterations = pl_module.iterations_per_step
         pl_module.iterations_per_step = 1  # whose time is not known yet
-        if pl_module.cost_follows_rays and not pl_module.iterations_done:
-            pl_module.batch_share = min(FIRST_BATCH, self.largest_batch)
+        pl_module.smallest_share = SMALLEST_BATCH
+        pl_module.batch_share = min(pl_module.batch_share, self.largest_batch)
         self._step_ended = self._record.seconds
 
     def on_train_batch_start(
@@ -158,6 +160,9 @@ class TimeBudget(Callback):
             )
             self._phase = phase
             self._entering[phase.kind] = entering
+        if self._pace is None and pl_module.cost_follows_rays and not pl_module.iterations_done:
+            # Only now: what has been entered before is not made smaller for want of time.
+            pl_module.batch_share = min(pl_module.batch_share, FIRST_BATCH)
         if self._pace is not None:
             fitted = trainer.strategy.broadcast(self._fitted(pl_module))
             if isinstance(fitted, str):
@@ -168,6 +173,7 @@ class TimeBudget(Callback):
                 self._pace = self._pace_with(pl_module, share)
                 self._warm = False
                 pl_module.batch_share = share
+        self._share = pl_module.batch_share
 
     def on_before_optimizer_step(
         self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer
@@ -223,9 +229,10 @@ class TimeBudget(Callback):
         iterations fit, or its rays take no longer than what an iteration does besides.
         """
         present = stage.batch_share
+        allowed = min(self.largest_batch, stage.largest_share)
         if not stage.cost_follows_rays or stride <= 0:
-            return present
-        most = min(self.largest_batch, stage.largest_share) if self._warm else present
+            return min(present, allowed)
+        most = allowed if self._warm else present
         enough = min(ENOUGH_ITERATIONS, self._end / 4) * (1 - stage.iteration / self._end)
         iterations = (self._end - stage.iteration) / stride  # in the time that is left
         besides = min(self._besides / pace, 1.0)  # of the present iterations' time
@@ -239,7 +246,7 @@ class TimeBudget(Callback):
             if share <= most and not (tight or few):
                 break
             share /= 2
-        return share
+        return min(share, allowed)
 
     def _pace_with(self, stage: Stage, share: float) -> float:
         """Seconds for a unit of cost, with ``share`` of the batches."""
@@ -316,6 +323,9 @@ class TimeBudget(Callback):
         done = pl_module.iterations_done - self._done
         if done > 0:  # none, if memory ran out
             pace = (self._step_ended - self._step_began) / (done * self._phase.cost)
+            if pl_module.batch_share != self._share:  # memory ran out, and half of it was drawn
+                self._before = None
+                self._warm = False
             self._learn_what_rays_take(pl_module.batch_share, pace)
             # The first step warms up.
             self._pace = running_mean(self._pace if self._warm else None, pace)
@@ -327,7 +337,7 @@ class TimeBudget(Callback):
             return
         assert isinstance(pl_module, Stage)
         log.info(
-            "%s: %d iterations for its %d, on %.2g%% of their rays, in %.1f s of %.1f",
+            "%s: %d iterations for its %d, on %.3g%% of their rays, in %.1f s of %.1f",
             pl_module.name,
             pl_module.iterations_done,
             pl_module.iteration,

@@ -66,7 +66,9 @@ def compare(run: RunContext, names: Sequence[str]) -> tuple[str, Advice | None, 
     processes = int(getattr(run.strategy, "num_processes", 1))
     free = free_bytes(run.device, run.folder, resume=run.config.resume)
     on_gpu = run.device.type == "cuda"
-    least = 0.5 if on_gpu else 1.0  # a GPU says that it has no more memory, and half is drawn
+    budget = run.config.schedule.seconds is not None
+    most = OmegaConf.select(run.config, LARGEST_BATCH, default=1.0) if budget else 1.0
+    least = most / 2 if on_gpu else most  # a GPU says that it has no more memory, and half is drawn
 
     def needed(key: str = "", value: int = 0, batch_share: float = least) -> Bytes:
         config = run.config.copy()
@@ -78,16 +80,19 @@ def compare(run: RunContext, names: Sequence[str]) -> tuple[str, Advice | None, 
         stages = [every[name] for name in names]
         return needed_bytes(less, stages, processes, batch_share, on_gpu=on_gpu)
 
-    whole = needed(batch_share=1.0)
+    whole = needed(batch_share=most)
     line = f"needs about {in_words(whole, free)}"
+    if budget and lacking(whole, free):
+        # Images that may be made smaller are, before batches teach little.
+        smallest = BATCHES[1] if run.chooses_size else BATCHES[-1]
+        shares = (share for share in BATCHES if smallest <= share < most)
+        share = next((s for s in shares if not lacking(needed(batch_share=s), free)), None)
+        if share is not None:
+            OmegaConf.update(run.config, LARGEST_BATCH, share)
+            return f"{line}: batches have at most {share:.2g} of their rays", None, []
     lacks = lacking(needed(), free)
     if not lacks:
         return line + "; batches will be halved" * bool(lacking(whole, free)), None, []
-    if run.config.schedule.seconds is not None:
-        fitting = (share for share in BATCHES if not lacking(needed(batch_share=share), free))
-        if share := next(fitting, None):
-            OmegaConf.update(run.config, LARGEST_BATCH, share)
-            return f"{line}: batches have at most {share:.2g} of their rays", None, []
     every = needs(run, run.config, scene)
     parts = max((every[name] for name in names), key=StageNeeds.peak).parts
     present = {key: OmegaConf.select(run.config, key) for key in parts} | {SIZE: by}
@@ -102,5 +107,5 @@ def compare(run: RunContext, names: Sequence[str]) -> tuple[str, Advice | None, 
         run.config.data.downscale = value
         del run.datamodule  # the images are read again
         return compare(run, names)
-    then = in_words(needed(key, value, 1.0), {lacks[0]: free[lacks[0]]})
+    then = in_words(needed(key, value, most), {lacks[0]: free[lacks[0]]})
     return line, Advice(key, problem, f"give {key}={value} ({then})"), [f"{key}={value}"]

@@ -96,6 +96,7 @@ class Stage(LightningModule, ABC):
         batch_share: the part of the schedule's batches that is drawn: less than 1 after memory
             has run out, or for want of time.
         largest_share: the most of them for which there is memory: less than 1 after it has run out.
+        smallest_share: the least to which they are halved where memory runs out.
         generator: draws pixels, on the stage's device. Its state at the beginning of a Lightning
             step follows from the seed, the process, the iterations done and the rollbacks.
         seed: of the whole run.
@@ -134,6 +135,7 @@ class Stage(LightningModule, ABC):
         self.iterations_done = 0
         self.batch_share = 1.0
         self.largest_share = 1.0
+        self.smallest_share = 0.5
         self.generator = torch.Generator()
         self.seed = 0
         self.num_rollbacks = 0
@@ -196,7 +198,7 @@ class Stage(LightningModule, ABC):
 
         Returns:
             The loss () and its terms () by name, detached; None where memory has run out even for
-            half a batch, and the stage is to end. No parameter has changed.
+            the smallest batch, and the stage is to end. No parameter has changed.
         """
         try:
             self.optimizer.make_gradients()  # Lightning drops them where a run is resumed
@@ -217,7 +219,7 @@ class Stage(LightningModule, ABC):
         return self.find_gradients(views) if self._halve_batches(shortage) else None
 
     def _halve_batches(self, shortage: str) -> bool:
-        """Draw half of the rays from now on; end the stage if that was done before.
+        """Draw half of the rays from now on; end the stage if that is less than the smallest share.
 
         Raises:
             DevrfError: there are several processes: the others already wait for this one.
@@ -227,7 +229,7 @@ class Stage(LightningModule, ABC):
                 f"schedule: one of {world_size()} processes is {shortage}; fewer rays, smaller "
                 "grids or more processes"
             )
-        if self.largest_share < 1:
+        if self.batch_share / 2 < self.smallest_share:
             lower = " or ".join(self.memory_keys)
             self.abort(
                 f"{shortage} at {self.describe(self.iteration)}; the same command goes on where "

@@ -219,9 +219,12 @@ def test_footage_without_overlap(into, film):
 
 
 @pytest.mark.skipif(importlib.util.find_spec("pycolmap") is None, reason="needs devrf[capture]")
-def test_a_camera_that_stands_still_shows_no_depth(into, film):
+@pytest.mark.parametrize("plain_middle", [False, True])
+def test_a_camera_that_stands_still_shows_no_depth(into, film, plain_middle):
     place = np.random.default_rng(0).integers(0, 256, (160, 240, 3), dtype=np.uint8)
     place = cv2.GaussianBlur(place, (0, 0), 1.5)
     place = np.clip(128 + 3.0 * (place.astype(np.float32) - 128), 0, 255).astype(np.uint8)
+    if plain_middle:
+        place[24:136, 36:204] = 128
     static = film("static.mp4", [place] * 6)
     assert refused(into, static=static).startswith(f"{static}: its frames show no depth: ")

@@ -134,7 +134,7 @@ def test_a_search_that_a_budget_has_cut_short_leaves_all_to_the_radiance_field(
     watch = LambdaCallback(on_before_optimizer_step=skip)
     trainer(watch, max_epochs=1).fit(stage, datamodule=datamodule)
     assert stage.iterations_done == 2 and stage.iteration == stage.total_iterations
-    assert "nothing is opaque yet, for want of time" in caplog.text
+    assert "nothing is found yet, for want of time" in caplog.text
     assert stage.scene_model.occupancy.share > 0.9
 
 

@@ -43,6 +43,10 @@ _FILM = (
     "film more slowly, with more overlap (neighbouring frames share more than half of what they "
     "show), and with more texture in sight"
 )
+_FLAT = (
+    "its frames show no depth: the camera stood still or only turned, or saw one flat thing; walk "
+    "past what you film, or half round it"
+)
 
 
 def check_library() -> None:
@@ -90,16 +94,10 @@ def reconstruct(
     given = {} if moving.still is None else still_masks(images, moving)
     _match(images, work, moving, fixed, settings, given)
     first = _mapped(images, work, "incremental", models / "first")
-    placed = 0 if first is None else first.images
-    if placed < LEAST_SHARE * len(moving.names) and _shows_no_depth(work / DATA_BASE):
-        raise DevrfError(
-            f"{moving.path}: its frames show no depth: the camera stood still or only turned, or "
-            "saw one flat thing; walk past what you film, or half round it"
-        )
+    flat = _shows_no_depth(work / DATA_BASE)
     if first is None:
-        raise DevrfError(
-            f"{moving.path}: too few matches between its frames to find any camera; {_FILM}"
-        )
+        why = f"too few matches between its frames to find any camera; {_FILM}"
+        raise DevrfError(f"{moving.path}: {_FLAT if flat else why}")
     if not settings.monocular:
         return first.folder
     masked = {}
@@ -126,6 +124,8 @@ def reconstruct(
             whole,
         )
         best = first if whole < error else best
+    if flat and best.images < LEAST_SHARE * len(moving.names):
+        raise DevrfError(f"{moving.path}: {_FLAT}")
     log.info("structure from motion: the %s mapper's cameras are taken", best.mapper)
     return best.folder
 
@@ -197,7 +197,8 @@ def _shows_no_depth(base: Path) -> bool:
     _, geometries = database.read_two_view_geometries()
     database.close()
     kinds = library.TwoViewGeometryConfiguration
-    depthless = [kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC]
+    # Matches that do not move at all are taken for those of a watermark.
+    depthless = [kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC, kinds.WATERMARK]
     known = [geometry.config for geometry in geometries if len(geometry.inlier_matches)]
     return sum(kind in depthless for kind in known) > DEPTHLESS * max(len(known), 1)
 

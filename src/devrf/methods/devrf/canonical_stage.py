@@ -47,6 +47,10 @@ from devrf.system.profiling import span
 
 log = logging.getLogger(__name__)
 
+# Where fewer of the iterations were made, a field in which nothing is to be seen is not due to
+# wrong settings.
+LEAST_DONE = 1 / 4
+
 
 class CanonicalStage(Stage):
     """Learns the canonical field from the static views (docs/method.md#canonical-stage).
@@ -291,10 +295,12 @@ class CanonicalStage(Stage):
         occupancy.replace(before if self._is_too_early(kept) else kept, field.box)
 
     def _is_too_early(self, occupied: Tensor) -> bool:
-        """Whether nothing is ``occupied`` since a budget of time has left iterations out."""
-        early = self.iterations_done < self.iteration and not bool(occupied.any())
+        """Whether nothing is ``occupied`` as a budget of time has left most iterations out."""
+        few = self.iterations_done < LEAST_DONE * self.iteration
+        early = few and not bool(occupied.any())
         if early:
-            log.info("%s: nothing is opaque yet, for want of time", self.describe(self.iteration))
+            where = self.describe(self.iteration)
+            log.info("%s: nothing is found yet, for want of time; all is kept", where)
         return early
 
     @torch.no_grad()

@@ -72,8 +72,8 @@ def rays_hit_occupied(
 def block_size(cameras: Cameras, model: Viewable, occupancy: Occupancy) -> int:
     """Pixels a side of a block all of whose rays are within a cell of its middle one.
 
-    Anywhere in the box: a ray that hits is one that is nearer to something, so that what is near
-    it reaches far enough for its neighbours, too.
+    A ray that passes near anything stands for its neighbours. Only at the silhouette of the box, if
+    something reaches its faces, a block is lost whose middle ray passes beside it.
     """
     if not isinstance(model.space, WorldSpace):
         return BLOCK

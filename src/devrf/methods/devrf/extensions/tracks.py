@@ -78,8 +78,8 @@ class StartAlongFlow(Extension):
             self._tracks = FlowTracks(model, views, stage.previous_images, by_color=by_color)
         pool = all_pixels(views, images_of(views, frame))
         # As much less as batches are smaller for want of time or memory.
-        most = round(stage.batch_share * MOST_TRACKS)
-        steps = round(stage.batch_share * FIT_STEPS)
+        most = max(1, round(stage.batch_share * MOST_TRACKS))
+        steps = max(1, round(stage.batch_share * FIT_STEPS))
         tracks = self._tracks.follow(frame, pool, stage.generator, most=most)
         start_from_tracks(stage.field, frame, tracks, views.cameras, model.space, steps)
         # Each process has followed pixels of its own.
