@@ -56,11 +56,11 @@ STEP_SHARE = 0.01
 # The share of the budget after which it is checked that the rest suffices. Where it does not even
 # for the coarsest grids, the stage is refused then; later what is finest is left out, no more.
 TRIAL_SHARE = 0.25
-# The parts of a batch that are drawn: at first, for want of time, and where else too few iterations
-# would fit to teach anything.
+# The parts of the schedule's batches of which one is drawn; the first, before anything is measured;
+# the least for want of time; smaller ones where fewer iterations than enough would fit.
+BATCHES = tuple(2.0**-k for k in range(9))
 FIRST_BATCH = 1 / 64
 LEAST_BATCH = 1 / 4
-SMALLEST_BATCH = 1 / 256
 ENOUGH_ITERATIONS = 100
 # Batches grow only where so many times the schedule's iterations, or enough of them, still fit.
 MARGIN = 2.0
@@ -139,7 +139,7 @@ class TimeBudget(Callback):
         self._budget = self.seconds * pl_module.time_share
         self._most_iterations = pl_module.iterations_per_step
         pl_module.iterations_per_step = 1  # whose time is not known yet
-        pl_module.smallest_share = SMALLEST_BATCH
+        pl_module.smallest_share = BATCHES[-1]
         pl_module.batch_share = min(pl_module.batch_share, self.largest_batch)
         self._step_ended = self._record.seconds
 
@@ -212,9 +212,9 @@ class TimeBudget(Callback):
         )
         # Out of time, what is left gets an iteration a phase.
         stride = whole / (left - entering) if left > entering else float(stage.total_iterations)
-        share = self._share_of_batches(stage, pace, stride)
-        stride *= self._pace_with(stage, share) / pace
+        share = self._share_of_batches(stage, stride)
         pace = self._pace_with(stage, share)
+        stride *= pace / self._pace
         if not later:  # whole iterations are left: as many as end nearest to the budget
             iterations = max(1, round(left / (pace * stage.phase.cost)))
             stride = (stage.phase.stop - place) / iterations + ROUNDING
@@ -222,12 +222,13 @@ class TimeBudget(Callback):
         iterations = max(1, min(self._most_iterations, int(most)))
         return stride, iterations, share, self._phases[-1].stop
 
-    def _share_of_batches(self, stage: Stage, pace: float, stride: float) -> float:
-        """The part of the schedule's batches to draw, of the powers of two.
+    def _share_of_batches(self, stage: Stage, stride: float) -> float:
+        """The part of the schedule's batches to draw; ``stride`` is that with the present one.
 
         The largest with which the stride is 1 at most, or else the least; with which enough
         iterations fit, or its rays take no longer than what an iteration does besides.
         """
+        assert self._pace is not None
         present = stage.batch_share
         allowed = min(self.largest_batch, stage.largest_share)
         if not stage.cost_follows_rays or stride <= 0:
@@ -235,17 +236,13 @@ class TimeBudget(Callback):
         most = allowed if self._warm else present
         enough = min(ENOUGH_ITERATIONS, self._end / 4) * (1 - stage.iteration / self._end)
         iterations = (self._end - stage.iteration) / stride  # in the time that is left
-        besides = min(self._besides / pace, 1.0)  # of the present iterations' time
-        share = 1.0
-        while share > SMALLEST_BATCH:
-            rays = (1 - besides) * share / present
-            longer = rays + besides
-            margin = 1.0 if share <= present else MARGIN
-            tight = margin * longer * stride > 1 and share > LEAST_BATCH
-            few = iterations < margin * longer * enough and rays > besides
+        for share in BATCHES:
+            pace = self._pace_with(stage, share)
+            longer = pace / self._pace * (1.0 if share <= present else MARGIN)
+            tight = longer * stride > 1 and share > LEAST_BATCH
+            few = iterations < longer * enough and pace > 2 * self._besides
             if share <= most and not (tight or few):
                 break
-            share /= 2
         return min(share, allowed)
 
     def _pace_with(self, stage: Stage, share: float) -> float:
@@ -254,12 +251,12 @@ class TimeBudget(Callback):
         besides = min(self._besides, self._pace)
         return besides + (self._pace - besides) * share / stage.batch_share
 
-    def _learn_what_rays_take(self, share: float, pace: float) -> None:
+    def _learn_what_rays_take(self, pace: float) -> None:
         """From the paces of two shares: what of an iteration does not depend on its rays."""
         if self._before is not None:
             other, before = self._before
-            by_rays = max((pace - before) / (share - other), 0.0)
-            self._besides = max(min(pace, before) - by_rays * min(share, other), 0.0)
+            by_rays = max((pace - before) / (self._share - other), 0.0)
+            self._besides = max(min(pace, before) - by_rays * min(self._share, other), 0.0)
         self._before = None
 
     def _to_enter(self, phases: Sequence[Phase]) -> float:
@@ -323,10 +320,11 @@ class TimeBudget(Callback):
         done = pl_module.iterations_done - self._done
         if done > 0:  # none, if memory ran out
             pace = (self._step_ended - self._step_began) / (done * self._phase.cost)
-            if pl_module.batch_share != self._share:  # memory ran out, and half of it was drawn
+            if pl_module.batch_share == self._share:
+                self._learn_what_rays_take(pace)
+            else:  # memory ran out, and fewer rays were drawn
                 self._before = None
                 self._warm = False
-            self._learn_what_rays_take(pl_module.batch_share, pace)
             # The first step warms up.
             self._pace = running_mean(self._pace if self._warm else None, pace)
             self._warm = self._warm or pl_module.iterations_done > done

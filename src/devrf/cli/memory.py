@@ -20,14 +20,14 @@ from devrf.apps.fitting import (
 )
 from devrf.apps.inspection.advice import Advice
 from devrf.apps.needs import StageNeeds, needs_of_devrf, needs_of_networks, smaller
+from devrf.callbacks.time_budget import BATCHES, LEAST_BATCH
 from devrf.cli.context import RunContext
 from devrf.cli.messages import as_own_errors
 from devrf.scenes.scene import Scene
 
 log = logging.getLogger(__name__)
 
-# The parts of batches that a budget of seconds may do with, and the key of the most that it draws.
-BATCHES = [2**-k for k in range(1, 9)]
+# The key of the most of a batch that is drawn within a budget of seconds.
 LARGEST_BATCH = "callbacks.time_budget.largest_batch"
 
 
@@ -55,6 +55,15 @@ def needs(run: RunContext, config: DictConfig, scene: Scene) -> dict[str, StageN
     return {name: stages[name] for name in names}
 
 
+def _stages(
+    run: RunContext, config: DictConfig, scene: Scene, names: Sequence[str]
+) -> list[StageNeeds]:
+    """What the stages ``names`` of a configured run need."""
+    with as_own_errors():
+        every = needs(run, config, scene)
+    return [every[name] for name in names]
+
+
 def compare(run: RunContext, names: Sequence[str]) -> tuple[str, Advice | None, list[str]]:
     """What the stages ``names`` need of what there is; where that lacks, the override that helps.
 
@@ -66,37 +75,39 @@ def compare(run: RunContext, names: Sequence[str]) -> tuple[str, Advice | None, 
     processes = int(getattr(run.strategy, "num_processes", 1))
     free = free_bytes(run.device, run.folder, resume=run.config.resume)
     on_gpu = run.device.type == "cuda"
-    budget = run.config.schedule.seconds is not None
-    most = OmegaConf.select(run.config, LARGEST_BATCH, default=1.0) if budget else 1.0
+    budget = None
+    if run.config.schedule.seconds is not None:
+        budget = OmegaConf.select(run.config, LARGEST_BATCH)
+    most = 1.0 if budget is None else budget
     least = most / 2 if on_gpu else most  # a GPU says that it has no more memory, and half is drawn
+    stages = _stages(run, run.config, scene, names)
 
-    def needed(key: str = "", value: int = 0, batch_share: float = least) -> Bytes:
+    def with_share(batch_share: float) -> Bytes:
+        return needed_bytes(scene, stages, processes, batch_share, on_gpu=on_gpu)
+
+    def with_change(key: str, value: int, batch_share: float = least) -> Bytes:
         config = run.config.copy()
+        OmegaConf.update(config, key, value)
         less = smaller(scene, value / by) if key == SIZE else scene
-        if key:
-            OmegaConf.update(config, key, value)
-        with as_own_errors():
-            every = needs(run, config, less)
-        stages = [every[name] for name in names]
-        return needed_bytes(less, stages, processes, batch_share, on_gpu=on_gpu)
+        changed = _stages(run, config, less, names)
+        return needed_bytes(less, changed, processes, batch_share, on_gpu=on_gpu)
 
-    whole = needed(batch_share=most)
+    whole = with_share(most)
     line = f"needs about {in_words(whole, free)}"
-    if budget and lacking(whole, free):
+    if budget is not None and lacking(whole, free):
         # Images that may be made smaller are, before batches teach little.
-        smallest = BATCHES[1] if run.chooses_size else BATCHES[-1]
+        smallest = LEAST_BATCH if run.chooses_size else BATCHES[-1]
         shares = (share for share in BATCHES if smallest <= share < most)
-        share = next((s for s in shares if not lacking(needed(batch_share=s), free)), None)
+        share = next((s for s in shares if not lacking(with_share(s), free)), None)
         if share is not None:
             OmegaConf.update(run.config, LARGEST_BATCH, share)
             return f"{line}: batches have at most {share:.2g} of their rays", None, []
-    lacks = lacking(needed(), free)
+    lacks = lacking(with_share(least), free)
     if not lacks:
         return line + "; batches will be halved" * bool(lacking(whole, free)), None, []
-    every = needs(run, run.config, scene)
-    parts = max((every[name] for name in names), key=StageNeeds.peak).parts
+    parts = max(stages, key=StageNeeds.peak).parts
     present = {key: OmegaConf.select(run.config, key) for key in parts} | {SIZE: by}
-    change = least_change(parts, present, lambda *one: not lacking(needed(*one), free))
+    change = least_change(parts, present, lambda *one: not lacking(with_change(*one), free))
     problem = f"the run {line}; it would end for lack of {lacks[0]}"
     if change is None:
         remedy = "lower several keys, or free some of it"
@@ -107,5 +118,5 @@ def compare(run: RunContext, names: Sequence[str]) -> tuple[str, Advice | None, 
         run.config.data.downscale = value
         del run.datamodule  # the images are read again
         return compare(run, names)
-    then = in_words(needed(key, value, most), {lacks[0]: free[lacks[0]]})
+    then = in_words(with_change(key, value, most), {lacks[0]: free[lacks[0]]})
     return line, Advice(key, problem, f"give {key}={value} ({then})"), [f"{key}={value}"]

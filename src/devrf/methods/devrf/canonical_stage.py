@@ -242,9 +242,8 @@ class CanonicalStage(Stage):
         search = self.scene_model.canonical
         occupancy = self.scene_model.occupancy
         opaque = search.voxel_alpha(self.sampling.step) > self.sampling.occupancy_threshold
-        if self._is_too_early(found := opaque & occupancy.mask):
-            found = occupancy.mask
-        occupancy.replace(dilate(found, 1))
+        found = opaque & occupancy.mask
+        occupancy.replace(dilate(occupancy.mask if self._is_too_early(found) else found, 1))
         self.scene_model.canonical = self._radiance_field(occupancy, phase).to(self.device)
 
     def _radiance_field(self, occupancy: Occupancy, phase: CanonicalPhase) -> CanonicalField:
