@@ -70,6 +70,23 @@ def test_rendering_learns_first_what_no_checkpoint_has(benchmark, tmp_path, tiny
     assert (tmp_path / "run" / "checkpoints" / "deformation.ckpt").exists()
 
 
+def test_choosing_pixels_tells_seconds_of_both_blocks(monkeypatch, tmp_path, tiny_data, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(FOLDER)
+    monkeypatch.setattr(HydraConfig.instance(), "cfg", HydraConfig.instance().cfg)
+    monkeypatch.setattr(sys, "argv", ["choosing_pixels", *tiny_data])
+    runpy.run_path(str(FOLDER / "choosing_pixels.py"), run_name="__main__")
+    hull, *rows = [
+        line
+        for line in capsys.readouterr().out.splitlines()
+        if line.startswith(("6 images", "side"))
+    ]
+    assert hull.startswith("6 images of 24x20: hull ")
+    assert [row.split(",")[0] for row in rows] == ["side 50"] * 2 + ["side 80"] * 2 + [
+        "side 160"
+    ] * 2
+
+
 def test_the_report_of_a_gpu_records_what_fails_and_goes_on(monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(FOLDER)
     report = importlib.import_module("gpu_report")
