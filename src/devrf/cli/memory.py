@@ -75,10 +75,8 @@ def compare(run: RunContext, names: Sequence[str]) -> tuple[str, Advice | None, 
     processes = int(getattr(run.strategy, "num_processes", 1))
     free = free_bytes(run.device, run.folder, resume=run.config.resume)
     on_gpu = run.device.type == "cuda"
-    budget = None
-    if run.config.schedule.seconds is not None:
-        budget = OmegaConf.select(run.config, LARGEST_BATCH)
-    most = 1.0 if budget is None else budget
+    budget = run.config.schedule.seconds is not None
+    most = OmegaConf.select(run.config, LARGEST_BATCH) if budget else 1.0
     least = most / 2 if on_gpu else most  # a GPU says that it has no more memory, and half is drawn
     stages = _stages(run, run.config, scene, names)
 
@@ -94,7 +92,7 @@ def compare(run: RunContext, names: Sequence[str]) -> tuple[str, Advice | None, 
 
     whole = with_share(most)
     line = f"needs about {in_words(whole, free)}"
-    if budget is not None and lacking(whole, free):
+    if budget and lacking(whole, free):
         # Images that may be made smaller are, before batches teach little.
         smallest = LEAST_BATCH if run.chooses_size else BATCHES[-1]
         shares = (share for share in BATCHES if smallest <= share < most)
