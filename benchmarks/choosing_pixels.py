@@ -46,7 +46,7 @@ def main() -> None:
     largest = pixel_pools.MOST_BLOCK
     for side in SIDES:
         occupancy = Occupancy(carved.on(box.grid_shape(side**3), box), box)
-        for most in (largest, pixel_pools.BLOCK):
+        for most in (pixel_pools.BLOCK, largest):  # as it was in the end
             pixel_pools.MOST_BLOCK = most
             block = pixel_pools.block_size(views.cameras, model, occupancy)
             choose = partial(pixel_pools.rays_hit_occupied, views.cameras, images, model, occupancy)

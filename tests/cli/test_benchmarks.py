@@ -13,6 +13,8 @@ from pathlib import Path
 import pytest
 from hydra.core.hydra_config import HydraConfig
 
+from devrf.methods.devrf import pixel_pools
+
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 
 
@@ -74,6 +76,7 @@ def test_choosing_pixels_tells_seconds_of_both_blocks(monkeypatch, tmp_path, tin
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(FOLDER)
     monkeypatch.setattr(HydraConfig.instance(), "cfg", HydraConfig.instance().cfg)
+    monkeypatch.setattr(pixel_pools, "MOST_BLOCK", pixel_pools.MOST_BLOCK)
     monkeypatch.setattr(sys, "argv", ["choosing_pixels", *tiny_data])
     runpy.run_path(str(FOLDER / "choosing_pixels.py"), run_name="__main__")
     hull, *rows = [
