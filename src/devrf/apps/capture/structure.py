@@ -35,6 +35,10 @@ LEAST_SHARE = 2 / 3
 # A model without what moves is taken if it places so large a share of the images that the first
 # one places.
 FEWER = 0.9
+# Cameras are found so often without what moves, at most, and until masks of it change by less than
+# this share of the pixels: a first pass may follow a thing for a while, which hides that it moves.
+ROUNDS = 3
+STEADY = 0.05
 # Where so large a share of the pairs of images shows no depth, that is why no cameras are found.
 DEPTHLESS = 0.9
 DATA_BASE = "matches.db"
@@ -78,10 +82,9 @@ def reconstruct(
 
     The moving camera's images and one of each ``fixed`` view are in the folder ``images``. Where
     they are all of the scene at rest, COLMAP's incremental mapper finds the cameras. Where one
-    camera films a scene that moves, its flow and these cameras tell what moves, unless masks are
-    given; cameras are found again without it, by both of COLMAP's mappers, and the better model is
-    taken; the first one, if what stands still agrees better with that. Returns the folder of the
-    model, in :func:`models_folder`.
+    camera films a scene that moves, cameras are found again without what moves
+    (:func:`_without_movers`); where masks are given, and nothing is to be found out, by COLMAP's
+    global mapper, too. Returns the folder of the model, in :func:`models_folder`.
 
     Raises:
         DevrfError: nothing could be matched, nothing shows depth, or a given mask does not fit.
@@ -100,34 +103,66 @@ def reconstruct(
         raise DevrfError(f"{moving.path}: {_FLAT if flat else why}")
     if not settings.monocular:
         return first.folder
-    masked = {}
-    if not given:
-        film = Film(images, moving.names)
-        masked = film.masks_of_movers(read_model(first.folder))
-    if masked:
-        log.info("structure from motion: again, without what moves")
-        _match(images, work, moving, fixed, settings, masked)
-        second = _mapped(images, work, "incremental", models / "masked")
+    if given:
+        best = _more([first, _mapped(images, work, "global", models / "global")])
     else:
-        second = first
-    tried = [second, _mapped(images, work, "global", models / "global")]
-    # Where masks leave too little, cameras are those of whole images.
-    known = [model for model in tried if model and model.images >= FEWER * first.images]
-    best = max(known or [first], key=lambda model: (model.images, -model.error))
-    if masked and best is not first and first.images >= FEWER * best.images:
-        error = film.error_of_still(read_model(best.folder), masked)
-        whole = film.error_of_still(read_model(first.folder), masked)
-        log.info(
-            "structure from motion: what stands still is off by %.2f px without what moves, by "
-            "%.2f px with it",
-            error,
-            whole,
-        )
-        best = first if whole < error else best
+        best = _without_movers(images, work, moving, settings, first)
     if flat and best.images < LEAST_SHARE * len(moving.names):
         raise DevrfError(f"{moving.path}: {_FLAT}")
     log.info("structure from motion: the %s mapper's cameras are taken", best.mapper)
     return best.folder
+
+
+def _without_movers(
+    images: Path, work: Path, moving: Chosen, settings: CaptureSettings, first: _Mapped
+) -> _Mapped:
+    """The cameras that what stands still agrees best with, where one camera films what moves.
+
+    The ``first`` cameras and the film's flow tell what moves. Without it cameras are found again,
+    by both of COLMAP's mappers, and tell better what moves: until masks stay as they are.
+    """
+    film = Film(images, moving.names)
+    found = [first]
+    masks = dict[str, Mask]()
+    for number in range(1, ROUNDS + 1):
+        movers = film.masks_of_movers(read_model(found[-1].folder))
+        if _difference(movers, masks) < STEADY:
+            break
+        masks = movers
+        log.info("structure from motion: again, without what moves")
+        _match(images, work, moving, (), settings, masks)
+        tried = [
+            _mapped(images, work, mapper, models_folder(work) / f"{mapper}-{number}")
+            for mapper in ("incremental", "global")
+        ]
+        # Where masks leave too little, cameras are those of whole images.
+        placed = [model for model in tried if model and model.images >= FEWER * first.images]
+        if not placed:
+            break
+        found.append(_more(placed))
+    if not masks:
+        return _more([first, _mapped(images, work, "global", models_folder(work) / "global")])
+    most = max(model.images for model in found)
+    found = [model for model in found if model.images >= FEWER * most]
+    errors = [film.error_of_still(read_model(model.folder), masks) for model in found]
+    said = ", then ".join(f"{error:.2f}" for error in errors)
+    log.info("structure from motion: by these cameras what stands still is off by %s px", said)
+    return found[errors.index(min(errors))]
+
+
+def _more(models: Sequence[_Mapped | None]) -> _Mapped:
+    """Of the models that there are, the one of most images; of as many, that of least error."""
+    known = [model for model in models if model]
+    return max(known, key=lambda model: (model.images, -model.error))
+
+
+def _difference(masks: dict[str, Mask], before: dict[str, Mask]) -> float:
+    """The share of the pixels that masks cover now and did not before, or the other way round."""
+    changed = [
+        float((mask != before[name]).mean()) if name in before else 1.0
+        for name, mask in masks.items()
+    ]
+    return sum(changed) / max(len(changed), 1)
 
 
 def models_folder(work: Path) -> Path:
