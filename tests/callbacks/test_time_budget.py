@@ -67,13 +67,13 @@ def test_a_stage_ends_with_its_seconds_and_its_whole_schedule(timed, share: floa
 
 
 @pytest.mark.parametrize(
-    ("share", "by_rays", "rays"), [(0.4, True, 4), (0.4, False, 16), (2.5, True, 16)]
+    ("share", "keeps", "rays"), [(0.4, False, 4), (0.7, True, 16), (2.5, False, 16)]
 )
 def test_batches_are_quartered_before_iterations_are_left_out(
-    timed, monkeypatch: pytest.MonkeyPatch, share: float, by_rays: bool, rays: int
+    timed, monkeypatch: pytest.MonkeyPatch, share: float, keeps: bool, rays: int
 ) -> None:
-    monkeypatch.setattr(DeformationStage, "cost_follows_rays", by_rays)
-    stage, seconds, _ = timed(share * WHOLE, by_batch=lambda part: part if by_rays else 1.0)
+    monkeypatch.setattr(DeformationStage, "keeps_batches", keeps)
+    stage, seconds, _ = timed(share * WHOLE, by_batch=lambda part: part)
     assert seconds == pytest.approx(share * WHOLE, rel=0.05)
     assert stage.rays_to_draw(SCHEDULE.rays) == rays
 

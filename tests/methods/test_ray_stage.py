@@ -104,6 +104,18 @@ def test_a_batch_may_have_few_times(
     assert len(first.unique()) == len(second.unique()) == 1 and first[0] != second[0]
 
 
+def test_a_part_of_a_batch_has_fewer_times(
+    ray_stage: Make, fit: Fit, four_frames: SceneDataModule
+) -> None:
+    stage = fit(ray_stage(DNeRF(TINY), "dynamic", times_per_batch=2, rays=64), data=four_frames)
+    frames = stage.training_views("dynamic").frames
+    assert frames is not None
+    for share, times in ((1.0, 2), (1 / 2, 1), (1 / 8, 1)):
+        stage.batch_share = share
+        image = stage.draw().image
+        assert len(image) == 64 * share and len(frames[image].unique()) == times
+
+
 def test_a_batch_may_have_fewer_rays_where_no_masks_tell_what_is_empty(
     ray_stage: Make, fit: Fit
 ) -> None:

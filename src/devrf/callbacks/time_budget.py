@@ -20,12 +20,11 @@ stage itself always goes one further; this callback adds the rest of the stride.
   of another is the stage's own estimate (:meth:`~devrf.engine.stage.Stage.cost`): where it is
   wrong, levels get other shares of the time, but the end is where it should be.
 * Where the stride would be more than 1, ``stage.batch_share`` is halved first, to a quarter: more
-  iterations learn more than larger ones. Where not even ``ENOUGH_ITERATIONS`` fit, nor a quarter
-  of the schedule's, it is halved further, as long as that saves time. It begins with
-  ``FIRST_BATCH``, since nobody knows yet what an iteration takes; what its rays take of that is
-  learned from each change, and batches grow where twice the schedule's iterations still fit. What
-  takes as long with fewer rays keeps its batches
-  (:attr:`~devrf.engine.stage.Stage.cost_follows_rays`).
+  iterations learn more than larger ones, but of a stage that ``keeps_batches``. Where not even
+  ``ENOUGH_ITERATIONS`` fit, nor a quarter of the schedule's, it is halved further, as long as that
+  saves time. It begins with ``FIRST_BATCH``, since nobody knows yet what an iteration takes; what
+  its rays take of that is learned from each change, and batches grow where twice the schedule's
+  iterations still fit.
 * Where an iteration for each phase takes longer than there is time, the finest are left out: levels
   of motion, growths of grids. Resolution follows the budget.
 * Of several processes rank 0's clock decides.
@@ -160,7 +159,7 @@ class TimeBudget(Callback):
             )
             self._phase = phase
             self._entering[phase.kind] = entering
-        if self._pace is None and pl_module.cost_follows_rays and not pl_module.iterations_done:
+        if self._pace is None and not pl_module.iterations_done:
             # Only now: what has been entered before is not made smaller for want of time.
             pl_module.batch_share = min(pl_module.batch_share, FIRST_BATCH)
         if self._pace is not None:
@@ -231,15 +230,16 @@ class TimeBudget(Callback):
         assert self._pace is not None
         present = stage.batch_share
         allowed = min(self.largest_batch, stage.largest_share)
-        if not stage.cost_follows_rays or stride <= 0:
+        if stride <= 0:
             return min(present, allowed)
         most = allowed if self._warm else present
+        least = 1.0 if stage.keeps_batches else LEAST_BATCH
         enough = min(ENOUGH_ITERATIONS, self._end / 4) * (1 - stage.iteration / self._end)
         iterations = (self._end - stage.iteration) / stride  # in the time that is left
         for share in BATCHES:
             pace = self._pace_with(stage, share)
             longer = pace / self._pace * (1.0 if share <= present else MARGIN)
-            tight = longer * stride > 1 and share > LEAST_BATCH
+            tight = longer * stride > 1 and share > least
             few = iterations < longer * enough and pace > 2 * self._besides
             if share <= most and not (tight or few):
                 break

@@ -85,7 +85,7 @@ class Stage(LightningModule, ABC):
         capture: the part of the scene that is learned from.
         memory_keys: the config keys of what to lower when memory runs out.
         rate_keys: the config keys of what to lower when training diverges.
-        cost_follows_rays: whether an iteration on fewer rays takes less time.
+        keeps_batches: whether whole batches learn more in a time than more, smaller ones.
         scene_model: what is learned.
         optimizer: steps over everything that is learned; the same object throughout.
         phase: the phase that grids and optimiser are ready for; None before the first.
@@ -120,7 +120,7 @@ class Stage(LightningModule, ABC):
     capture: CaptureName | Literal["both"]
     memory_keys: tuple[str, ...] = ()
     rate_keys: ClassVar[str] = "the learning rates"
-    cost_follows_rays: bool = True
+    keeps_batches: bool = False
     scene_model: LearnedModel
     optimizer: GridAdam
     phase: Phase | None

@@ -122,14 +122,15 @@ class RayTrainable(Renderable):
         protocols: the names of the protocols that it learns by; None: every one.
         priors: what it wants of a scene beside images and backward flow, where it can be had:
             ``forward_flow``.
-        cost_follows_rays: whether an iteration on fewer rays takes less time.
+        keeps_batches: whether whole batches learn more in a time than more, smaller ones: a time
+            budget then cuts them only where next to no iterations would fit.
         random_background: whether it learns before random colours where all images have masks.
     """
 
     losses: ClassVar[tuple[str, ...]] = ("color",)
     protocols: ClassVar[tuple[str, ...] | None] = None
     priors: ClassVar[tuple[str, ...]] = ()
-    cost_follows_rays: ClassVar[bool] = True
+    keeps_batches: ClassVar[bool] = False
     random_background: ClassVar[bool] = False
 
     def check_protocol(self, protocol: str) -> None:

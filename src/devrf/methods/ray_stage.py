@@ -44,8 +44,8 @@ class RaySchedule:
         eps: of Adam.
         curriculum: share of a stage during which frames are added in the order of their times.
         centre_crop: so many first iterations of a stage draw from the images' centre half alone.
-        times_per_batch: for a method whose cost grows with them; of a batch of both captures the
-            static images' time is one of them. None: any number.
+        times_per_batch: for a method whose cost grows with them, of a whole batch; of one of both
+            captures the static images' time is one of them. None: any number.
         iterations_per_step: optimiser iterations in one Lightning step.
     """
 
@@ -121,7 +121,7 @@ class RayStage(Stage):
         if rest is not None:
             self.scene_model = rest.model
             self.earlier_records = rest.metadata.records
-        self.cost_follows_rays = self.scene_model.cost_follows_rays
+        self.keeps_batches = self.scene_model.keeps_batches
         self.weights = counted_weights(loss, self.scene_model.losses, "ray_stage.loss")
         self.pools: list[FramePool] = []
         self._centres: list[FramePool] = []
@@ -223,7 +223,7 @@ class RayStage(Stage):
             images: list[Tensor] = []
             flats: list[Tensor] = []
             offset = 0
-            times_left = schedule.times_per_batch
+            times_left = self._times_to_draw
             for pool, count in zip(pools, counts, strict=True):
                 frames = self._shown_frames(pool)
                 image, flat = pool.draw(count, frames, self.generator, times=times_left)
@@ -238,6 +238,12 @@ class RayStage(Stage):
                 flats.append(flat)
             image = torch.cat(images)
             return Pixels(image, flat=torch.cat(flats), background=self.background(image))
+
+    @property
+    def _times_to_draw(self) -> int | None:
+        """How many times a batch may have: fewer of them where it is a part of the schedule's."""
+        whole = self.schedule.times_per_batch
+        return None if whole is None else max(1, round(whole * self.batch_share))
 
     @property
     def background_name(self) -> str:

@@ -42,7 +42,7 @@ class NeuralVolumes(PlacedModel):
 
     name: ClassVar[str] = "neural_volumes"
     losses: ClassVar[tuple[str, ...]] = ("color", "kl", "opacity_prior", "tv")
-    cost_follows_rays: ClassVar[bool] = False  # a volume costs the same for any number of rays
+    keeps_batches: ClassVar[bool] = True  # a volume takes most of an iteration
     protocols: ClassVar[tuple[str, ...] | None] = ("joint", "dynamic")
     settings_class = NeuralVolumesSettings
     settings: NeuralVolumesSettings
