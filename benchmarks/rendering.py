@@ -1,7 +1,8 @@
-"""Frames a second of held-out views, at a new time and again at the same time.
+"""Frames a second of held-out views, at a new time and again at the same time; and of a viewer.
 
 A time's occupancy and displacements are computed once and cached, so that a camera path at one time
-renders faster than a film in which each frame has another time.
+renders faster than a film in which each frame has another time. The viewer's frames are what the
+server's draws of 240 rows, 4:3, and encodes, as the camera turns about the scene's upward axis.
 """
 
 from __future__ import annotations
@@ -9,17 +10,28 @@ from __future__ import annotations
 from harness import learned_scene, open_run, parser, report
 
 # isort: split
+import math
+import time
 from functools import partial
 from statistics import median
 from typing import Any
 
+import imageio.v3 as iio
 import torch
 from torch.utils.benchmark import Timer
 
+from devrf.apps.camera_paths import upward
+from devrf.apps.keyframes import Keyframe
+from devrf.apps.viewer.drawing import Drawing, Shot
 from devrf.cli.messages import report_user_errors
 from devrf.evaluation.held_out import background_value
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Views
+
+# Frames of a viewer: so many, of so many rows; the degrees that its camera turns between two.
+VIEWED = 20
+ROWS = 240
+TURN = 1.0
 
 
 def main() -> None:
@@ -33,6 +45,7 @@ def main() -> None:
         views = run.scene.dynamic.test
         background = background_value(run.scene.background)
         rows = [frames_a_second(Renderer(model), views, options.views, background)]
+        rows.append(of_a_viewer(Drawing(Renderer(model, times=VIEWED), background), views))
         into = options.json or run.folder / "benchmark_rendering.json"
         report(rows, into, run.device, scene=run.scene.name, overrides=options.overrides)
 
@@ -64,6 +77,26 @@ def frames_a_second(
         "new time": 1 / median(first),
         "same time": 1 / median(again),
     }
+
+
+def of_a_viewer(drawing: Drawing, views: Views) -> dict[str, Any]:
+    """Frames a second while the camera turns, at one time and while time runs."""
+    pose = views.cameras.camera_to_world[0]
+    axis = upward(views.cameras)
+    cross = torch.linalg.cross(axis.expand(3, 3), torch.eye(3), dim=1).T
+    rates: dict[str, Any] = {"width": ROWS * 4 // 3, "height": ROWS, "views": VIEWED}
+    for name, runs in (("camera turns", 0.0), ("time runs, too", 0.9 / VIEWED)):
+        taken = []
+        for k in range(VIEWED):
+            turn = torch.linalg.matrix_exp(math.radians(TURN * k) * cross) @ pose
+            shot = Shot(Keyframe(turn, fov=40.0, time=0.05 + runs * k, seconds=0.0), aspect=4 / 3)
+            began = time.perf_counter()
+            *_, frame = drawing.draw(shot, ROWS)
+            assert frame is not None
+            iio.imwrite("<bytes>", frame.pixels.numpy(), extension=".jpg")
+            taken.append(time.perf_counter() - began)
+        rates[name] = 1 / median(taken)
+    return rates
 
 
 if __name__ == "__main__":
