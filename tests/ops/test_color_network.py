@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from devrf.ops.color_network import ColorNetwork, decode
+from devrf.ops.color_network import TILE, ColorNetwork, decode
 
 
 def network(*, dtype: torch.dtype = torch.float64) -> ColorNetwork:
@@ -46,6 +46,22 @@ def test_rays_without_samples_do_not_matter_and_no_sample_is_no_color() -> None:
         0,
         3,
     )
+
+
+@pytest.mark.parametrize("shaded", [False, True])
+def test_colors_of_a_picture_are_found_tile_by_tile(shaded: bool) -> None:
+    generator = torch.Generator().manual_seed(0)
+    samples = 2 * TILE + 5
+    features = torch.randn(samples, 1, generator=generator)
+    viewdirs = torch.nn.functional.normalize(torch.randn(50, 3, generator=generator), dim=1)
+    ray = torch.arange(samples) * 50 // samples
+    residual = torch.randn(samples, 3, generator=generator) if shaded else None
+    single = network(dtype=torch.float32)
+    together = decode(features, viewdirs, ray, single, residual=residual)
+    with torch.no_grad():
+        tiles = decode(features, viewdirs, ray, single, residual=residual)
+    assert tiles.shape == (samples, 3)
+    torch.testing.assert_close(tiles, together, rtol=0, atol=1e-6)
 
 
 def test_gradients() -> None:

@@ -66,6 +66,16 @@ def test_rays_come_in_order(rays):
     assert [len(part) for part in in_chunks(lambda part: rays[part], 0, 300, CPU)] == [0]
 
 
+def test_a_small_picture_has_a_chunk_for_each_core(rays, monkeypatch):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
+    monkeypatch.setattr(torch, "set_num_threads", lambda threads: None)
+    assert [len(part) for part in in_chunks(lambda part: rays[part], 1000, 20_000, CPU)] == [
+        334,
+        334,
+        332,
+    ]
+
+
 @pytest.mark.parametrize(
     ("error", "sizes"),
     [

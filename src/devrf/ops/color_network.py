@@ -5,11 +5,16 @@ See docs/method.md#colour.
 
 from __future__ import annotations
 
+from itertools import repeat
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.functional import linear
+
+# Samples of a picture whose colours are found at once on a CPU: what a layer gives them fits its
+# caches (docs/notebook/costs.md).
+TILE = 4096
 
 
 class ColorNetwork(NamedTuple):
@@ -57,7 +62,27 @@ def decode(
     """
     # Most rays of a picture have no samples: their directions are not encoded.
     seen, place = torch.unique_consecutive(ray, return_inverse=True)
-    encoded = _encode(viewdirs.index_select(0, seen), network.octaves).index_select(0, place)
+    encoded = _encode(viewdirs.index_select(0, seen), network.octaves)
+    if torch.is_grad_enabled() or not features.is_cpu or len(ray) <= TILE:
+        return _color(features, encoded.index_select(0, place), network, precision, residual)
+    added = repeat(None) if residual is None else torch.split(residual, TILE)
+    tiles = zip(torch.split(features, TILE), torch.split(place, TILE), added, strict=False)
+    return torch.cat(
+        [
+            _color(tile, encoded.index_select(0, at), network, precision, further)
+            for tile, at, further in tiles
+        ]
+    )
+
+
+def _color(
+    features: Tensor,
+    encoded: Tensor,
+    network: ColorNetwork,
+    precision: torch.dtype,
+    residual: Tensor | None,
+) -> Tensor:
+    """RGB (S, 3) of features (S, C) and encoded directions (S, 3 + 6F)."""
     first = torch.cat([network.feature_weight, network.direction_weight], dim=1)
     # In place: no layer's gradient needs what it gave before its activation.
     x = torch.cat([features, encoded], dim=1)

@@ -151,9 +151,11 @@ def in_chunks(
             log.warning("out of memory: pictures are rendered %d rays at a time", most)
         return parts(first, first + size // 2) + parts(first + size // 2, last)
 
+    threads = torch.get_num_threads()
+    if device.type == "cpu":  # a small picture has one for each core
+        chunk = min(chunk, max(-(-rays // threads), MIN_CHUNK))
     firsts = range(0, max(rays, 1), chunk)
     lasts = [min(first + chunk, rays) for first in firsts]
-    threads = torch.get_num_threads()
     workers = min(threads, len(firsts), MOST_WORKERS) if device.type == "cpu" else 1
     if workers == 1:
         return list(chain.from_iterable(map(parts, firsts, lasts)))

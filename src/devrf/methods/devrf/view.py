@@ -27,7 +27,7 @@ from devrf.rendering.sampling import RenderSettings
 
 # Rays at once: on a CPU what its caches hold (in unbounded scenes a ray has tens of samples to
 # colour), on a GPU what keeps it busy and fits.
-ON_CPU = 8192
+ON_CPU = 20_000
 UNBOUNDED_ON_CPU = 4096
 ON_GPU = 2**15
 # Samples of unbounded scenes' pictures are so much further apart than while they are learned: what
