@@ -66,16 +66,32 @@ def test_a_stage_ends_with_its_seconds_and_its_whole_schedule(timed, share: floa
     )
 
 
-@pytest.mark.parametrize(
-    ("share", "keeps", "rays"), [(0.4, False, 4), (0.7, True, 16), (2.5, False, 16)]
-)
+@pytest.mark.parametrize(("share", "rays"), [(0.4, 4), (2.5, 16)])
 def test_batches_are_quartered_before_iterations_are_left_out(
-    timed, monkeypatch: pytest.MonkeyPatch, share: float, keeps: bool, rays: int
+    timed, share: float, rays: int
 ) -> None:
-    monkeypatch.setattr(DeformationStage, "keeps_batches", keeps)
     stage, seconds, _ = timed(share * WHOLE, by_batch=lambda part: part)
     assert seconds == pytest.approx(share * WHOLE, rel=0.05)
     assert stage.rays_to_draw(SCHEDULE.rays) == rays
+
+
+def test_batches_that_are_to_be_kept_are(timed, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(DeformationStage, "keeps_batches", True)
+    stage, seconds, _ = timed(0.7 * WHOLE, by_batch=lambda part: part)
+    assert seconds == pytest.approx(0.7 * WHOLE, rel=0.05)
+    assert stage.batch_share == 1
+
+
+def test_no_batch_is_smaller_than_saves_time(timed, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(DeformationStage, "useful_share", 1 / 4)
+    drawn: set[float] = set()
+
+    def by_batch(part: float) -> float:
+        drawn.add(part)
+        return 5 * max(part, 1 / 4)
+
+    timed(0.7, by_batch=by_batch)
+    assert min(drawn) == 1 / 4
 
 
 def test_iterations_that_take_all_the_time_are_made_of_fewer_rays_still(timed) -> None:

@@ -109,7 +109,7 @@ def test_a_part_of_a_batch_has_fewer_times(
 ) -> None:
     stage = fit(ray_stage(DNeRF(TINY), "dynamic", times_per_batch=2, rays=64), data=four_frames)
     frames = stage.training_views("dynamic").frames
-    assert frames is not None
+    assert frames is not None and stage.useful_share == 1 / 2
     for share, times in ((1.0, 2), (1 / 2, 1), (1 / 8, 1)):
         stage.batch_share = share
         image = stage.draw().image

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
 
+from devrf.ops import color_network
 from devrf.ops.color_network import TILE, ColorNetwork, decode
 
 
@@ -49,7 +51,17 @@ def test_rays_without_samples_do_not_matter_and_no_sample_is_no_color() -> None:
 
 
 @pytest.mark.parametrize("shaded", [False, True])
-def test_colors_of_a_picture_are_found_tile_by_tile(shaded: bool) -> None:
+def test_colors_of_a_picture_are_found_tile_by_tile(
+    shaded: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sizes: list[int] = []
+    usual = color_network._color
+
+    def color(features: torch.Tensor, *others: Any) -> torch.Tensor:
+        sizes.append(len(features))
+        return usual(features, *others)
+
+    monkeypatch.setattr(color_network, "_color", color)
     generator = torch.Generator().manual_seed(0)
     samples = 2 * TILE + 5
     features = torch.randn(samples, 1, generator=generator)
@@ -60,7 +72,7 @@ def test_colors_of_a_picture_are_found_tile_by_tile(shaded: bool) -> None:
     together = decode(features, viewdirs, ray, single, residual=residual)
     with torch.no_grad():
         tiles = decode(features, viewdirs, ray, single, residual=residual)
-    assert tiles.shape == (samples, 3)
+    assert sizes == [samples, TILE, TILE, 5]
     torch.testing.assert_close(tiles, together, rtol=0, atol=1e-6)
 
 

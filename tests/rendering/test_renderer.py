@@ -60,20 +60,25 @@ def rays(rng):
 def test_rays_come_in_order(rays):
     threads = torch.get_num_threads()
     parts = in_chunks(lambda part: rays.origins[part], len(rays), 300, CPU)
-    assert [len(part) for part in parts] == [300, 300, 300, 100]
     assert torch.equal(torch.cat(parts), rays.origins)
     assert torch.get_num_threads() == threads
     assert [len(part) for part in in_chunks(lambda part: rays[part], 0, 300, CPU)] == [0]
 
 
-def test_a_small_picture_has_a_chunk_for_each_core(rays, monkeypatch):
+@pytest.mark.parametrize(
+    ("count", "chunk", "sizes"),
+    [
+        (1000, 20_000, [334, 334, 332]),
+        (1000, 300, [256, 256, 256, 232]),
+        (300, 20_000, [256, 44]),
+        (2700, 500, [450] * 6),
+    ],
+)
+def test_all_cores_get_as_many_chunks(rays, monkeypatch, count, chunk, sizes):
     monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
     monkeypatch.setattr(torch, "set_num_threads", lambda threads: None)
-    assert [len(part) for part in in_chunks(lambda part: rays[part], 1000, 20_000, CPU)] == [
-        334,
-        334,
-        332,
-    ]
+    lengths = in_chunks(lambda part: [part.stop - part.start], count, chunk, CPU)
+    assert [length for (length,) in lengths] == sizes
 
 
 @pytest.mark.parametrize(

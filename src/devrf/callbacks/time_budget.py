@@ -20,11 +20,11 @@ stage itself always goes one further; this callback adds the rest of the stride.
   of another is the stage's own estimate (:meth:`~devrf.engine.stage.Stage.cost`): where it is
   wrong, levels get other shares of the time, but the end is where it should be.
 * Where the stride would be more than 1, ``stage.batch_share`` is halved first, to a quarter: more
-  iterations learn more than larger ones, but of a stage that ``keeps_batches``. Where not even
+  iterations learn more than larger ones; except for a stage that ``keeps_batches``. Where not even
   ``ENOUGH_ITERATIONS`` fit, nor a quarter of the schedule's, it is halved further, as long as that
   saves time. It begins with ``FIRST_BATCH``, since nobody knows yet what an iteration takes; what
   its rays take of that is learned from each change, and batches grow where twice the schedule's
-  iterations still fit.
+  iterations still fit, or, if they are to be kept, enough.
 * Where an iteration for each phase takes longer than there is time, the finest are left out: levels
   of motion, growths of grids. Resolution follows the budget.
 * Of several processes rank 0's clock decides.
@@ -161,7 +161,8 @@ class TimeBudget(Callback):
             self._entering[phase.kind] = entering
         if self._pace is None and not pl_module.iterations_done:
             # Only now: what has been entered before is not made smaller for want of time.
-            pl_module.batch_share = min(pl_module.batch_share, FIRST_BATCH)
+            first = max(FIRST_BATCH, pl_module.useful_share)
+            pl_module.batch_share = min(pl_module.batch_share, first)
         if self._pace is not None:
             fitted = trainer.strategy.broadcast(self._fitted(pl_module))
             if isinstance(fitted, str):
@@ -224,8 +225,9 @@ class TimeBudget(Callback):
     def _share_of_batches(self, stage: Stage, stride: float) -> float:
         """The part of the schedule's batches to draw; ``stride`` is that with the present one.
 
-        The largest with which the stride is 1 at most, or else the least; with which enough
-        iterations fit, or its rays take no longer than what an iteration does besides.
+        The largest with which the stride is 1 at most, or else ``LEAST_BATCH``, all of a stage that
+        keeps its batches; with which enough iterations fit, or its rays take no longer than what an
+        iteration does besides.
         """
         assert self._pace is not None
         present = stage.batch_share
@@ -234,11 +236,12 @@ class TimeBudget(Callback):
             return min(present, allowed)
         most = allowed if self._warm else present
         least = 1.0 if stage.keeps_batches else LEAST_BATCH
+        margin = 1.0 if stage.keeps_batches else MARGIN
         enough = min(ENOUGH_ITERATIONS, self._end / 4) * (1 - stage.iteration / self._end)
         iterations = (self._end - stage.iteration) / stride  # in the time that is left
-        for share in BATCHES:
+        for share in (part for part in BATCHES if part >= stage.useful_share):
             pace = self._pace_with(stage, share)
-            longer = pace / self._pace * (1.0 if share <= present else MARGIN)
+            longer = pace / self._pace * (1.0 if share <= present else margin)
             tight = longer * stride > 1 and share > least
             few = iterations < longer * enough and pace > 2 * self._besides
             if share <= most and not (tight or few):

@@ -86,6 +86,7 @@ class Stage(LightningModule, ABC):
         memory_keys: the config keys of what to lower when memory runs out.
         rate_keys: the config keys of what to lower when training diverges.
         keeps_batches: whether whole batches learn more in a time than more, smaller ones.
+        useful_share: the part of a batch than which a smaller one takes as long.
         scene_model: what is learned.
         optimizer: steps over everything that is learned; the same object throughout.
         phase: the phase that grids and optimiser are ready for; None before the first.
@@ -121,6 +122,7 @@ class Stage(LightningModule, ABC):
     memory_keys: tuple[str, ...] = ()
     rate_keys: ClassVar[str] = "the learning rates"
     keeps_batches: bool = False
+    useful_share: float = 0.0
     scene_model: LearnedModel
     optimizer: GridAdam
     phase: Phase | None

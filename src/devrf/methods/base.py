@@ -123,7 +123,7 @@ class RayTrainable(Renderable):
         priors: what it wants of a scene beside images and backward flow, where it can be had:
             ``forward_flow``.
         keeps_batches: whether whole batches learn more in a time than more, smaller ones: a time
-            budget then cuts them only where next to no iterations would fit.
+            budget then cuts them only where not even a hundred iterations would fit, nor a quarter.
         random_background: whether it learns before random colours where all images have masks.
     """
 

@@ -122,6 +122,8 @@ class RayStage(Stage):
             self.scene_model = rest.model
             self.earlier_records = rest.metadata.records
         self.keeps_batches = self.scene_model.keeps_batches
+        if schedule.times_per_batch is not None:
+            self.useful_share = 1 / schedule.times_per_batch
         self.weights = counted_weights(loss, self.scene_model.losses, "ray_stage.loss")
         self.pools: list[FramePool] = []
         self._centres: list[FramePool] = []

@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 Part = TypeVar("Part")
 
-# Smaller chunks would hardly need less memory.
+# Smaller chunks would hardly need less memory, and take as long.
 MIN_CHUNK = 256
 # Chunks that are rendered at once on a CPU: each takes memory.
 MOST_WORKERS = 8
@@ -132,7 +132,8 @@ def in_chunks(
     """``render(slice(k, l))`` for consecutive chunks of R ``rays``, in order; at least one.
 
     On a CPU several at once, each on its share of the cores: one chunk's operations are too small
-    for all of them. When memory runs out, this and later chunks are halved, down to ``MIN_CHUNK``.
+    for all of them. They are smaller there, so that all workers get as many, of one size. When
+    memory runs out, this and later chunks are halved, down to ``MIN_CHUNK``.
     """
     most = chunk
 
@@ -152,11 +153,13 @@ def in_chunks(
         return parts(first, first + size // 2) + parts(first + size // 2, last)
 
     threads = torch.get_num_threads()
-    if device.type == "cpu":  # a small picture has one for each core
-        chunk = min(chunk, max(-(-rays // threads), MIN_CHUNK))
+    workers = min(threads, MOST_WORKERS) if device.type == "cpu" else 1
+    rounds = math.ceil(rays / (chunk * workers))
+    if workers > 1 and rounds:
+        chunk = min(chunk, max(math.ceil(rays / (rounds * workers)), MIN_CHUNK))
     firsts = range(0, max(rays, 1), chunk)
     lasts = [min(first + chunk, rays) for first in firsts]
-    workers = min(threads, len(firsts), MOST_WORKERS) if device.type == "cpu" else 1
+    workers = min(workers, len(firsts))
     if workers == 1:
         return list(chain.from_iterable(map(parts, firsts, lasts)))
     share = partial(torch.set_num_threads, threads // workers)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 import torch
 
 from devrf.apps.capture.images import Chosen, Mask, still_masks
@@ -39,6 +40,8 @@ FEWER = 0.9
 # this share of the pixels: a first pass may follow a thing for a while, which hides that it moves.
 ROUNDS = 3
 STEADY = 0.05
+# Errors of what stands still up to so many times the least are as good.
+ABOUT = 1.05
 # Where so large a share of the pairs of images shows no depth, that is why no cameras are found.
 DEPTHLESS = 0.9
 DATA_BASE = "matches.db"
@@ -119,17 +122,19 @@ def _without_movers(
     """The cameras that what stands still agrees best with, where one camera films what moves.
 
     The ``first`` cameras and the film's flow tell what moves. Without it cameras are found again,
-    by both of COLMAP's mappers, and tell better what moves: until masks stay as they are.
+    by both of COLMAP's mappers, and tell better what moves: until masks stay as they are, at most
+    ``ROUNDS`` times. Where nothing moves both mappers see all.
     """
     film = Film(images, moving.names)
     found = [first]
+    used = list[dict[str, Mask]]()
     masks = dict[str, Mask]()
     for number in range(1, ROUNDS + 1):
         movers = film.masks_of_movers(read_model(found[-1].folder))
-        if _difference(movers, masks) < STEADY:
+        if not movers or _difference(movers, masks) < STEADY:
             break
-        masks = movers
-        log.info("structure from motion: again, without what moves")
+        masks = masks | movers  # an image that is not placed keeps the mask that it had
+        log.info("structure from motion: again, without what moves (%d)", number)
         _match(images, work, moving, (), settings, masks)
         tried = [
             _mapped(images, work, mapper, models_folder(work) / f"{mapper}-{number}")
@@ -140,14 +145,40 @@ def _without_movers(
         if not placed:
             break
         found.append(_more(placed))
+        used.append(masks)
     if not masks:
         return _more([first, _mapped(images, work, "global", models_folder(work) / "global")])
+    return _agreeing(film, found, used) if used else first
+
+
+def _agreeing(film: Film, found: Sequence[_Mapped], masks: Sequence[dict[str, Mask]]) -> _Mapped:
+    """Of models the one that flow agrees best with where nothing moves by any of the ``masks``.
+
+    They are compared in the images that all of them place; those that place far fewer than another
+    are out. Of models about as good the one of most images is taken; the first, where the masks
+    together leave nothing.
+    """
     most = max(model.images for model in found)
     found = [model for model in found if model.images >= FEWER * most]
-    errors = [film.error_of_still(read_model(model.folder), masks) for model in found]
+    if len(found) == 1:
+        return found[0]
+    models = [read_model(model.folder) for model in found]
+    names = set.intersection(*({image.name for image in model.images} for model in models))
+    still = {
+        name: np.minimum.reduce([each[name] for each in masks if name in each])
+        for name in sorted(names)
+        if any(name in each for each in masks)
+    }
+    errors = [film.error_of_still(model, still) for model in models]
     said = ", then ".join(f"{error:.2f}" for error in errors)
-    log.info("structure from motion: by these cameras what stands still is off by %s px", said)
-    return found[errors.index(min(errors))]
+    log.info(
+        "structure from motion: by each time's cameras what stands still is off by %s px", said
+    )
+    if min(errors) == float("inf"):
+        return found[0]
+    return _more(
+        [model for model, error in zip(found, errors, strict=True) if error <= ABOUT * min(errors)]
+    )
 
 
 def _more(models: Sequence[_Mapped | None]) -> _Mapped:
@@ -157,9 +188,12 @@ def _more(models: Sequence[_Mapped | None]) -> _Mapped:
 
 
 def _difference(masks: dict[str, Mask], before: dict[str, Mask]) -> float:
-    """The share of the pixels that masks cover now and did not before, or the other way round."""
+    """The share of the pixels that masks cover now and did not before, or the other way round.
+
+    An image that had no mask was covered nowhere.
+    """
     changed = [
-        float((mask != before[name]).mean()) if name in before else 1.0
+        float((mask != before[name] if name in before else mask == 0).mean())
         for name, mask in masks.items()
     ]
     return sum(changed) / max(len(changed), 1)
