@@ -66,9 +66,11 @@ def test_training_at_each_resolution_with_what_was_learned(
 
 def test_rendering_learns_first_what_no_checkpoint_has(benchmark, tmp_path, tiny):
     found = benchmark("rendering", *tiny, "hydra.run.dir=run", "--views=2")
-    (row,) = found["rows"]
+    row, viewer = found["rows"]
     assert (row["width"], row["height"], row["views"]) == (24, 20, 2)
     assert row["new time"] > 0 and row["same time"] > 0
+    assert (viewer["width"], viewer["height"]) == (320, 240)
+    assert viewer["camera turns"] > 0 and viewer["time runs, too"] > 0
     assert (tmp_path / "run" / "checkpoints" / "deformation.ckpt").exists()
 
 
