@@ -60,6 +60,7 @@ def rays(rng):
 def test_rays_come_in_order(rays):
     threads = torch.get_num_threads()
     parts = in_chunks(lambda part: rays.origins[part], len(rays), 300, CPU)
+    assert len(parts) >= 4 and max(map(len, parts)) <= 300
     assert torch.equal(torch.cat(parts), rays.origins)
     assert torch.get_num_threads() == threads
     assert [len(part) for part in in_chunks(lambda part: rays[part], 0, 300, CPU)] == [0]

@@ -154,8 +154,8 @@ def in_chunks(
 
     threads = torch.get_num_threads()
     workers = min(threads, MOST_WORKERS) if device.type == "cpu" else 1
-    rounds = math.ceil(rays / (chunk * workers))
-    if workers > 1 and rounds:
+    if workers > 1:
+        rounds = max(math.ceil(rays / (chunk * workers)), 1)
         chunk = min(chunk, max(math.ceil(rays / (rounds * workers)), MIN_CHUNK))
     firsts = range(0, max(rays, 1), chunk)
     lasts = [min(first + chunk, rays) for first in firsts]

@@ -15,23 +15,28 @@ NAMES = [f"{k}.png" for k in range(8)]
 
 
 def covering(first=0, last=0):
-    """Masks (10, 10) whose columns from ``first`` to ``last`` are 0: of what moves."""
-    mask = np.full((10, 10), 255, np.uint8)
-    mask[:, first:last] = 0
+    """Masks (10, 100) that are 0, of what moves, from a tenth of their width to another."""
+    mask = np.full((10, 100), 255, np.uint8)
+    mask[:, round(10 * first) : round(10 * last)] = 0
     return dict.fromkeys(NAMES, mask) if last > first else {}
+
+
+def still(mask):
+    """How many tenths of the width are not masked."""
+    return (mask[0] > 0).sum() / 10
 
 
 @pytest.fixture
 def reconstruct(monkeypatch, tmp_path):
     """Runs structure from motion whose passes find what they are told; returns what is taken.
 
-    ``movers``: masked columns, from and to, by the cameras of each pass; ``errors``: of what stands
+    ``movers``: masked tenths, from and to, by the cameras of each pass; ``errors``: of what stands
     still by each; ``placed``: how many images the two mappers place in each, None if none. Of as
-    many images the global mapper's have less error. With it come the columns that features were
-    looked for in, and those in which errors were.
+    many images the global mapper's have less error. With it come the tenths of the width in which
+    features were looked for, and those in which errors were.
     """
-    masked: list[int] = []
-    judged: list[int] = []
+    masked: list[float] = []
+    judged: list[float] = []
 
     def run(movers, errors, placed):
         def mapped(images, work, mapper, into):
@@ -47,13 +52,13 @@ def reconstruct(monkeypatch, tmp_path):
                 return covering(*movers[model.number])
 
             def error_of_still(self, model, masks):
-                seen = {int((mask[0] > 0).sum()) for mask in masks.values()}
+                seen = {still(mask) for mask in masks.values()}
                 judged.append(*seen)
                 return errors[model.number] if judged[-1] else float("inf")
 
         def match(images, work, moving, fixed, settings, masks):
             if masks:
-                masked.append(int((masks[NAMES[0]][0] > 0).sum()))
+                masked.append(still(masks[NAMES[0]]))
 
         def read(folder):
             number = int(folder.parts[0])
@@ -85,7 +90,7 @@ ALL = (8, 8)
 
 
 def test_cameras_are_found_again_until_masks_stay(reconstruct):
-    # By the first cameras three columns move, by those of the next pass five, and so on. All are
+    # By the first cameras three tenths move, by those of the next pass five, and so on. All are
     # compared where none of them sees anything move.
     taken = reconstruct([(0, 3), (0, 5), (0, 5), ()], [0.3, 0.2, 0.1, 0.0], [ALL] * 4)
     assert taken == ("2/global", [7, 5], [5])
@@ -126,3 +131,9 @@ def test_where_nothing_moves_both_mappers_see_all(reconstruct):
 def test_masks_stay_where_better_cameras_see_nothing_move(reconstruct):
     taken = reconstruct([(0, 3), ()], [0.3, 0.2], [ALL, ALL])
     assert taken == ("1/global", [7], [7])
+
+
+def test_little_that_moves_is_left_out_too(reconstruct):
+    # 3 % of the pixels: less than what counts as a change of masks.
+    taken = reconstruct([(0, 0.3), (0, 0.3)], [0.3, 0.2], [ALL, ALL])
+    assert taken == ("1/global", [9.7], [9.7])

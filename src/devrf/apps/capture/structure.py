@@ -86,8 +86,8 @@ def reconstruct(
     The moving camera's images and one of each ``fixed`` view are in the folder ``images``. Where
     they are all of the scene at rest, COLMAP's incremental mapper finds the cameras. Where one
     camera films a scene that moves, cameras are found again without what moves
-    (:func:`_without_movers`); where masks are given, and nothing is to be found out, by COLMAP's
-    global mapper, too. Returns the folder of the model, in :func:`models_folder`.
+    (:func:`_without_movers`); where masks are given, or nothing moves, the global mapper is tried,
+    too. Returns the folder of the model, in :func:`models_folder`.
 
     Raises:
         DevrfError: nothing could be matched, nothing shows depth, or a given mask does not fit.
@@ -106,10 +106,9 @@ def reconstruct(
         raise DevrfError(f"{moving.path}: {_FLAT if flat else why}")
     if not settings.monocular:
         return first.folder
-    if given:
+    best = None if given else _without_movers(images, work, moving, settings, first)
+    if best is None:
         best = _more([first, _mapped(images, work, "global", models / "global")])
-    else:
-        best = _without_movers(images, work, moving, settings, first)
     if flat and best.images < LEAST_SHARE * len(moving.names):
         raise DevrfError(f"{moving.path}: {_FLAT}")
     log.info("structure from motion: the %s mapper's cameras are taken", best.mapper)
@@ -118,26 +117,27 @@ def reconstruct(
 
 def _without_movers(
     images: Path, work: Path, moving: Chosen, settings: CaptureSettings, first: _Mapped
-) -> _Mapped:
-    """The cameras that what stands still agrees best with, where one camera films what moves.
+) -> _Mapped | None:
+    """The cameras that what stands still agrees best with; None where nothing moves.
 
     The ``first`` cameras and the film's flow tell what moves. Without it cameras are found again,
     by both of COLMAP's mappers, and tell better what moves: until masks stay as they are, at most
-    ``ROUNDS`` times. Where nothing moves both mappers see all.
+    ``ROUNDS`` times.
     """
+    models = models_folder(work)
     film = Film(images, moving.names)
     found = [first]
     used = list[dict[str, Mask]]()
     masks = dict[str, Mask]()
     for number in range(1, ROUNDS + 1):
         movers = film.masks_of_movers(read_model(found[-1].folder))
-        if not movers or _difference(movers, masks) < STEADY:
+        if not movers or (masks and _difference(movers, masks) < STEADY):
             break
         masks = masks | movers  # an image that is not placed keeps the mask that it had
         log.info("structure from motion: again, without what moves (%d)", number)
         _match(images, work, moving, (), settings, masks)
         tried = [
-            _mapped(images, work, mapper, models_folder(work) / f"{mapper}-{number}")
+            _mapped(images, work, mapper, models / f"{mapper}-{number}")
             for mapper in ("incremental", "global")
         ]
         # Where masks leave too little, cameras are those of whole images.
@@ -147,7 +147,7 @@ def _without_movers(
         found.append(_more(placed))
         used.append(masks)
     if not masks:
-        return _more([first, _mapped(images, work, "global", models_folder(work) / "global")])
+        return None
     return _agreeing(film, found, used) if used else first
 
 
@@ -166,8 +166,7 @@ def _agreeing(film: Film, found: Sequence[_Mapped], masks: Sequence[dict[str, Ma
     names = set.intersection(*({image.name for image in model.images} for model in models))
     still = {
         name: np.minimum.reduce([each[name] for each in masks if name in each])
-        for name in sorted(names)
-        if any(name in each for each in masks)
+        for name in sorted(names & {*masks[-1]})  # the last ones have all that were before
     }
     errors = [film.error_of_still(model, still) for model in models]
     said = ", then ".join(f"{error:.2f}" for error in errors)
