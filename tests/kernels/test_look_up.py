@@ -53,6 +53,31 @@ def test_values_and_gradients_are_those_of_the_definition(
 
 
 @pytest.mark.parametrize("look", [look_up, trilinear.look_up])
+def test_every_second_point_is_a_grid_of_its_own(
+    look: Callable[..., Tensor], rng: torch.Generator
+) -> None:
+    grid = torch.randn(7, 5, 9, 3, generator=rng).requires_grad_()
+    points = points_around(500, rng).requires_grad_()
+    factor = torch.randn(500, 3, generator=rng)
+    alone = grid.detach()[::2, ::2, ::2].contiguous().requires_grad_()
+    beside = points.detach().clone().requires_grad_()
+    (look(grid, points, BOX, every=2) * factor).sum().backward()
+    (look_up(alone, beside, BOX) * factor).sum().backward()
+    torch.testing.assert_close(grid.grad[::2, ::2, ::2], alone.grad)
+    torch.testing.assert_close(points.grad, beside.grad)
+    # The points between have no part in it; what a grid has from elsewhere stays.
+    between = torch.ones(7, 5, 9, dtype=torch.bool)
+    between[::2, ::2, ::2] = False
+    assert not grid.grad[between].any()
+    look(grid, points, BOX).sum().backward()
+    grid_alone = grid.detach().clone().requires_grad_()
+    look(grid_alone, points.detach(), BOX).sum().backward()
+    expected = grid_alone.grad.clone()
+    expected[::2, ::2, ::2] += alone.grad
+    torch.testing.assert_close(grid.grad, expected)
+
+
+@pytest.mark.parametrize("look", [look_up, trilinear.look_up])
 def test_a_plane_is_the_same_for_all_z(look: Callable[..., Tensor]) -> None:
     plane = torch.tensor([[0.0, 2.0], [4.0, 6.0]])[:, :, None, None].requires_grad_()
     box = Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))

@@ -22,6 +22,7 @@ class Grid:
         low: the box's corner with the smallest coordinates.
         high: the one with the largest.
         scale: grid points to a unit of length, along each axis.
+        next_x, next_y, next_z: rows of memory from a point to the next one along each axis.
     """
 
     low: wp.vec3
@@ -30,15 +31,22 @@ class Grid:
     x: int
     y: int
     z: int
+    next_x: int
+    next_y: int
+    next_z: int
 
 
 @lru_cache(maxsize=256)
-def grid_over(box: Box, shape: Shape) -> Grid:
-    """The grid of ``shape`` (X, Y, Z) over ``box``."""
+def grid_over(box: Box, shape: Shape, every: int = 1) -> Grid:
+    """The grid of ``shape`` (X, Y, Z) over ``box``, or every ``every``-th of its points."""
+    points = [(count - 1) // every + 1 for count in shape]
     grid = Grid()
     grid.low, grid.high = wp.vec3(*box.low), wp.vec3(*box.high)
-    grid.scale = wp.vec3(*((n - 1) / edge for n, edge in zip(shape, box.size, strict=True)))
-    grid.x, grid.y, grid.z = shape
+    grid.scale = wp.vec3(*((n - 1) / edge for n, edge in zip(points, box.size, strict=True)))
+    grid.x, grid.y, grid.z = points
+    grid.next_x = every * shape[1] * shape[2]
+    grid.next_y = every * shape[2]
+    grid.next_z = every if points[2] > 1 else 0
     return grid
 
 
@@ -61,7 +69,8 @@ def cell(grid: Grid, point: wp.vec3):
     i = wp.min(int(x), grid.x - 2)
     j = wp.min(int(y), grid.y - 2)
     k = wp.max(wp.min(int(z), grid.z - 2), 0)
-    return (i * grid.y + j) * grid.z + k, wp.vec3(x - float(i), y - float(j), z - float(k))
+    row = i * grid.next_x + j * grid.next_y + k * grid.next_z
+    return row, wp.vec3(x - float(i), y - float(j), z - float(k))
 
 
 @wp.func
@@ -78,18 +87,16 @@ def inside(grid: Grid, point: wp.vec3):
 @wp.func
 def interpolate(values: wp.array(dtype=Any), grid: Grid, row: int, f: wp.vec3):
     """Σ over a cell's corners of weight · value: trilinear, at the place ``f`` in the cell."""
-    next_y = grid.z
-    next_x = grid.y * grid.z
     total = values[row] * ((1.0 - f[0]) * (1.0 - f[1]) * (1.0 - f[2]))
-    total += values[row + next_y] * ((1.0 - f[0]) * f[1] * (1.0 - f[2]))
-    total += values[row + next_x] * (f[0] * (1.0 - f[1]) * (1.0 - f[2]))
-    total += values[row + next_x + next_y] * (f[0] * f[1] * (1.0 - f[2]))
+    total += values[row + grid.next_y] * ((1.0 - f[0]) * f[1] * (1.0 - f[2]))
+    total += values[row + grid.next_x] * (f[0] * (1.0 - f[1]) * (1.0 - f[2]))
+    total += values[row + grid.next_x + grid.next_y] * (f[0] * f[1] * (1.0 - f[2]))
     if grid.z > 1:
-        row += 1
+        row += grid.next_z
         total += values[row] * ((1.0 - f[0]) * (1.0 - f[1]) * f[2])
-        total += values[row + next_y] * ((1.0 - f[0]) * f[1] * f[2])
-        total += values[row + next_x] * (f[0] * (1.0 - f[1]) * f[2])
-        total += values[row + next_x + next_y] * (f[0] * f[1] * f[2])
+        total += values[row + grid.next_y] * ((1.0 - f[0]) * f[1] * f[2])
+        total += values[row + grid.next_x] * (f[0] * (1.0 - f[1]) * f[2])
+        total += values[row + grid.next_x + grid.next_y] * (f[0] * f[1] * f[2])
     return total
 
 
@@ -110,9 +117,9 @@ def slope(values: wp.array(dtype=Any), factor: Any, grid: Grid, row: int, f: wp.
 
     Per unit of length, at the place ``f`` in the cell.
     """
-    next_z = wp.min(grid.z - 1, 1)
-    next_y = grid.z
-    next_x = grid.y * grid.z
+    next_x = grid.next_x
+    next_y = grid.next_y
+    next_z = grid.next_z
     v000 = product(values[row], factor)
     v001 = product(values[row + next_z], factor)
     v010 = product(values[row + next_y], factor)

@@ -11,9 +11,10 @@ from devrf.geometry.box import Box
 from devrf.kernels.grid import Grid, cell, grid_over, inside, interpolate, slope
 from devrf.kernels.runtime import array, by_channels, launch, launch_by_owner, row_type, take
 from devrf.ops import trilinear
+from devrf.ops.trilinear import shape_of
 
 
-def look_up(grid: Tensor, points: Tensor, box: Box) -> Tensor:
+def look_up(grid: Tensor, points: Tensor, box: Box, every: int = 1) -> Tensor:
     """Trilinear values of a grid over a box; outside they are those of the border.
 
     Args:
@@ -22,47 +23,52 @@ def look_up(grid: Tensor, points: Tensor, box: Box) -> Tensor:
             grid's size.
         points: (M, 3) in the box's units.
         box: where the grid's outer points lie.
+        every: look at every so many-th of the grid's points alone, along each axis, of which
+            there are one more than a multiple.
 
     Returns:
         (M, C), differentiable once in ``grid`` and ``points``.
     """
     if not take(points):
-        return trilinear.look_up(grid, points, box)
+        return trilinear.look_up(grid, points, box, every)
     kept = grid.grad if grid.is_leaf else None
-    values: Tensor = _LookUp.apply(grid, points, box, kept)  # type: ignore[no-untyped-call]
+    values: Tensor = _LookUp.apply(grid, points, box, every, kept)  # type: ignore[no-untyped-call]
     return values
 
 
 class _LookUp(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, grid: Tensor, points: Tensor, box: Box, kept: Tensor | None) -> Tensor:
+    def forward(
+        ctx: Any, grid: Tensor, points: Tensor, box: Box, every: int, kept: Tensor | None
+    ) -> Tensor:
         grid = grid.contiguous()
         points = points.contiguous()
         ctx.save_for_backward(grid, points)
-        ctx.box, ctx.kept = box, kept
+        ctx.box, ctx.every, ctx.kept = box, every, kept
         values = grid.new_empty(len(points), grid.shape[-1])
-        inputs = [place(grid, box), array(points), array(grid), array(values)]
+        inputs = [grid_over(box, shape_of(grid), every), array(points), array(grid), array(values)]
         launch(look_up_kernel(grid.shape[-1]), len(points), inputs, points.device)
         return values
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         grid, points = ctx.saved_tensors
         gradient = gradient.contiguous()
         of_grid = of_points = None
         if ctx.needs_input_grad[0]:
             of_grid = torch.zeros_like(grid) if ctx.kept is None else None
-            add_to_grid(ctx.kept if of_grid is None else of_grid, points, gradient, ctx.box)
+            into = ctx.kept if of_grid is None else of_grid
+            add_to_grid(into, points, gradient, ctx.box, ctx.every)
         if ctx.needs_input_grad[1]:
             of_points = torch.empty_like(points)
-            inputs = [place(grid, ctx.box), array(points), array(grid), array(gradient)]
-            inputs.append(array(of_points))
+            place = grid_over(ctx.box, shape_of(grid), ctx.every)
+            inputs = [place, array(points), array(grid), array(gradient), array(of_points)]
             launch(slope_kernel(grid.shape[-1]), len(points), inputs, points.device)
-        return of_grid, of_points, None, None
+        return of_grid, of_points, None, None, None
 
 
-def add_to_grid(grid: Tensor, points: Tensor, values: Tensor, box: Box) -> None:
+def add_to_grid(grid: Tensor, points: Tensor, values: Tensor, box: Box, every: int = 1) -> None:
     """The adjoint of a look-up: add weight · ``values`` (M, C) to the corners around ``points``.
 
     Args:
@@ -70,15 +76,10 @@ def add_to_grid(grid: Tensor, points: Tensor, values: Tensor, box: Box) -> None:
         points: (M, 3) in the box's units.
         values: (M, C).
         box: where the grid's outer points lie.
+        every: as of a look-up.
     """
-    inputs = [place(grid, box), array(points), array(values), array(grid)]
+    inputs = [grid_over(box, shape_of(grid), every), array(points), array(values), array(grid)]
     launch_by_owner(add_kernel(grid.shape[-1]), len(points), inputs, points.device)
-
-
-def place(grid: Tensor, box: Box) -> Grid:
-    """Where the points of a grid (X, Y, Z, C) over ``box`` are."""
-    x, y, z = grid.shape[:3]
-    return grid_over(box, (x, y, z))
 
 
 @by_channels
@@ -142,24 +143,24 @@ def add_kernel(channels: int) -> wp.Kernel:
         """Planes of the grid across x belong to the owners in turn."""
         sample = wp.tid()
         row, f = cell(grid, points[sample])
-        next_y = grid.z
-        next_x = grid.y * grid.z
-        plane = row / next_x
+        next_y = grid.next_y
+        next_z = grid.next_z
+        plane = row / grid.next_x
         value = values[sample]
         if plane % owners == owner:
             low = value * (1.0 - f[0])
             wp.atomic_add(result, row, low * ((1.0 - f[1]) * (1.0 - f[2])))
             wp.atomic_add(result, row + next_y, low * (f[1] * (1.0 - f[2])))
             if grid.z > 1:
-                wp.atomic_add(result, row + 1, low * ((1.0 - f[1]) * f[2]))
-                wp.atomic_add(result, row + next_y + 1, low * (f[1] * f[2]))
+                wp.atomic_add(result, row + next_z, low * ((1.0 - f[1]) * f[2]))
+                wp.atomic_add(result, row + next_y + next_z, low * (f[1] * f[2]))
         if (plane + 1) % owners == owner:
             high = value * f[0]
-            row += next_x
+            row += grid.next_x
             wp.atomic_add(result, row, high * ((1.0 - f[1]) * (1.0 - f[2])))
             wp.atomic_add(result, row + next_y, high * (f[1] * (1.0 - f[2])))
             if grid.z > 1:
-                wp.atomic_add(result, row + 1, high * ((1.0 - f[1]) * f[2]))
-                wp.atomic_add(result, row + next_y + 1, high * (f[1] * f[2]))
+                wp.atomic_add(result, row + next_z, high * ((1.0 - f[1]) * f[2]))
+                wp.atomic_add(result, row + next_y + next_z, high * (f[1] * f[2]))
 
     return add_to_grid

@@ -371,7 +371,7 @@ def clearance(geometry: Geometry, distances: wp.array(dtype=wp.uint8), point: wp
     k = int(wp.rint(at[2]))
     if i < 0 or j < 0 or k < 0 or i >= grid.x or j >= grid.y or k >= grid.z:
         return 1
-    return int(distances[(i * grid.y + j) * grid.z + k])
+    return int(distances[i * grid.next_x + j * grid.next_y + k * grid.next_z])
 
 
 @wp.func

@@ -12,7 +12,7 @@ from devrf.geometry.box import Box
 Shape = tuple[int, int, int]
 
 
-def look_up(grid: Tensor, points: Tensor, box: Box) -> Tensor:
+def look_up(grid: Tensor, points: Tensor, box: Box, every: int = 1) -> Tensor:
     """Values of a grid between its points; outside the box they are those of the border.
 
     ``Σ_{i,j,k ∈ {0,1}} w_i(x) w_j(y) w_k(z) · grid[⌊(x, y, z)⌋ + (i, j, k)]`` with linear weights.
@@ -22,10 +22,13 @@ def look_up(grid: Tensor, points: Tensor, box: Box) -> Tensor:
             all z.
         points: (M, 3) in the box's units.
         box: where the grid's outer points lie.
+        every: look at every so many-th of the grid's points alone, along each axis, of which
+            there are one more than a multiple.
 
     Returns:
         (M, C), differentiable in ``grid`` and ``points``.
     """
+    grid = grid[::every, ::every, ::every]
     shape = shape_of(grid)
     last = torch.tensor(shape, device=points.device) - 1
     at = box.to_grid(points, shape)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 
 from devrf.checkpoints.stored_grids import StoredShape
 from devrf.geometry.box import Box
@@ -15,25 +14,6 @@ from devrf.kernels.look_up import look_up
 from devrf.methods.nerf.networks import SinusoidalEncoding
 from devrf.methods.tineuvox.settings import TiNeuVoxSettings
 from devrf.ops.trilinear import Shape, resample, shape_of
-
-
-class _EveryNth(torch.autograd.Function):
-    """Every n-th point of a grid; what comes back is added to the gradient that is kept, if any."""
-
-    @staticmethod
-    def forward(ctx: Any, values: Tensor, n: int, kept: Tensor | None) -> Tensor:
-        ctx.n = n
-        ctx.kept = kept
-        ctx.shape = values.shape
-        return values[::n, ::n, ::n].contiguous()
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, None, None]:
-        n = ctx.n
-        whole = gradient.new_zeros(ctx.shape) if ctx.kept is None else ctx.kept
-        whole[::n, ::n, ::n] += gradient
-        return (whole if ctx.kept is None else None), None, None
 
 
 class MultiDistanceGrid(StoredShape):
@@ -64,14 +44,7 @@ class MultiDistanceGrid(StoredShape):
 
         The grid is over ``box``; outside they are those of its border.
         """
-        return torch.cat([look_up(self._spaced(n), points, box) for n in self.strides], dim=1)
-
-    def _spaced(self, n: int) -> Tensor:
-        """Every ``n``-th point along each axis."""
-        if n == 1:
-            return self.values
-        spaced: Tensor = _EveryNth.apply(self.values, n, self.values.grad)  # type: ignore[no-untyped-call]
-        return spaced
+        return torch.cat([look_up(self.values, points, box, n) for n in self.strides], dim=1)
 
     def fitting(self, box: Box, side: float) -> Shape:
         """The least shape of about ``side``³ points over ``box`` that all strides fit into."""
