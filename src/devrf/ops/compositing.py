@@ -26,7 +26,9 @@ def composite(depth: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
     """
     edges = firsts(ray, rays)
     passed = running_sum(depth)
-    before = torch.exp(passed[edges[ray]] - passed[:-1]).to(depth.dtype)
+    # The gradient of index_select takes half the time of that of indexing.
+    first = passed.index_select(0, edges.index_select(0, ray))
+    before = torch.exp(first - passed[:-1]).to(depth.dtype)
     end = torch.exp(passed[edges[:-1]] - passed[edges[1:]]).to(depth.dtype)
     return before * -torch.expm1(-depth), end
 

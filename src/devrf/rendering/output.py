@@ -87,5 +87,8 @@ class VoxelOutput(RenderOutput):
     def on_rays(self, chosen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Ray (S,), position q (S, 3) and weight (S,) of the samples on ``chosen`` (R,) rays."""
         ray = self.samples.ray
-        index = chosen[ray].nonzero()[:, 0]
-        return ray[index], self.samples.canonical[index], self.samples.weight[index]
+        index = chosen.index_select(0, ray).nonzero()[:, 0]
+        # Its gradient takes half the time of that of indexing.
+        canonical = self.samples.canonical.index_select(0, index)
+        weight = self.samples.weight.index_select(0, index)
+        return ray.index_select(0, index), canonical, weight

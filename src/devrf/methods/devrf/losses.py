@@ -100,13 +100,13 @@ def flow(prediction: MotionPrediction) -> Tensor:
         canonical,
         prediction.unwarp_previous,
         prediction.cameras,
-        prediction.previous_image[batch.image[ray]],
-        batch.pixel[ray],
+        prediction.previous_image[batch.image].index_select(0, ray),
+        batch.pixel.index_select(0, ray),
         prediction.space,
     )
     valid = batch.flow_valid
     count = valid.sum() if prediction.flow_mean == "rays" else 2 * output.count_on(valid)
-    return flow_error(weight, induced, batch.flow[ray], count)
+    return flow_error(weight, induced, batch.flow.index_select(0, ray), count)
 
 
 def induced_flow(
