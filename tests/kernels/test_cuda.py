@@ -53,7 +53,8 @@ def together() -> wp.Module:
 def test_all_are_found() -> None:
     look_ups = ("look_up_kernel", "slope_kernel", "add_kernel")
     names = {f"look_up.{one}_{n}" for one in look_ups for n in CHANNELS}
-    names |= {f"adam.adam_kernel_{n}" for n in CHANNELS} | {"adam.add_total_variation"}
+    steps = ("adam_kernel", "total_variation_kernel")
+    names |= {f"adam.{one}_{n}" for one in steps for n in CHANNELS}
     names |= {"march.march_kernel", "march.adjoint_kernel", "march.rays_that_hit_kernel"}
     names |= {"march.keep_significant_kernel"}
     assert set(every_kernel()) == names

@@ -83,9 +83,10 @@ def add_total_variation_gradient(
         )
         return
     x, y, z, channels = grid.shape
-    inputs = [x, y, z, channels, weight, along_z, int(touched_only)]
-    inputs += [array(grid.view(-1)), array(gradient.view(-1))]
-    launch(add_total_variation, x * y * z, inputs, grid.device, grain=GRAIN_OF_VOXELS)
+    tables = [array(each.view(-1, channels), _numbers(channels)) for each in (grid, gradient)]
+    inputs = [x, y, z, weight, along_z, int(touched_only), *tables]
+    kernel = total_variation_kernel(channels)
+    launch(kernel, x * y * z, inputs, grid.device, grain=GRAIN_OF_VOXELS)
 
 
 @wp.struct
@@ -166,42 +167,49 @@ def adam_kernel(channels: int) -> wp.Kernel:
     return adam_step
 
 
-@wp.kernel(module="unique", enable_backward=False)
-def add_total_variation(
-    first: int,
-    x: int,
-    y: int,
-    z: int,
-    channels: int,
-    weight: float,
-    along_z: float,
-    touched_only: int,
-    grid: wp.array(dtype=float),
-    gradient: wp.array(dtype=float),
-):
-    """∂/∂v of Σ h(v − v') over the neighbours v' of the numbers v of one voxel."""
-    row = first + wp.tid()
-    k = row % z
-    j = (row / z) % y
-    i = row / (y * z)
-    next_z = channels
-    next_y = z * channels
-    next_x = y * next_y
-    for channel in range(channels):
-        place = row * channels + channel
-        if touched_only == 0 or gradient[place] != 0.0:
-            value = grid[place]
-            slope = float(0.0)
-            if i > 0:
-                slope += wp.clamp(value - grid[place - next_x], -1.0, 1.0)
-            if i < x - 1:
-                slope += wp.clamp(value - grid[place + next_x], -1.0, 1.0)
-            if j > 0:
-                slope += wp.clamp(value - grid[place - next_y], -1.0, 1.0)
-            if j < y - 1:
-                slope += wp.clamp(value - grid[place + next_y], -1.0, 1.0)
-            if k > 0:
-                slope += along_z * wp.clamp(value - grid[place - next_z], -1.0, 1.0)
-            if k < z - 1:
-                slope += along_z * wp.clamp(value - grid[place + next_z], -1.0, 1.0)
-            gradient[place] = gradient[place] + weight * slope
+@by_channels
+def total_variation_kernel(channels: int) -> wp.Kernel:
+    """The gradient of the total variation, in voxels of so many numbers."""
+    numbers = _numbers(channels)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def add_total_variation(
+        first: int,
+        x: int,
+        y: int,
+        z: int,
+        weight: float,
+        along_z: float,
+        touched_only: int,
+        grid: wp.array(dtype=numbers),
+        gradient: wp.array(dtype=numbers),
+    ):
+        """∂/∂v of Σ h(v − v') over the neighbours v' of the numbers v of one voxel."""
+        row = first + wp.tid()
+        k = row % z
+        j = (row / z) % y
+        i = row / (y * z)
+        next_x = y * z
+        low = numbers(-1.0)
+        high = numbers(1.0)
+        value = grid[row]
+        slope = numbers()
+        if i > 0:
+            slope += wp.min(wp.max(value - grid[row - next_x], low), high)
+        if i < x - 1:
+            slope += wp.min(wp.max(value - grid[row + next_x], low), high)
+        if j > 0:
+            slope += wp.min(wp.max(value - grid[row - z], low), high)
+        if j < y - 1:
+            slope += wp.min(wp.max(value - grid[row + z], low), high)
+        if k > 0:
+            slope += along_z * wp.min(wp.max(value - grid[row - 1], low), high)
+        if k < z - 1:
+            slope += along_z * wp.min(wp.max(value - grid[row + 1], low), high)
+        g = gradient[row]
+        if touched_only == 1:
+            for c in range(wp.static(channels)):
+                slope[c] = wp.where(g[c] == 0.0, 0.0, slope[c])
+        gradient[row] = g + weight * slope
+
+    return add_total_variation

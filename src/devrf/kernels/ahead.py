@@ -32,11 +32,12 @@ def compile_ahead(channels: Collection[int], device: torch.device) -> None:
     """
     if not take(torch.empty(0, device=device)):
         return
-    kernels = [*march.KERNELS, adam.add_total_variation]
-    kernels += [look_up.add_kernel(1), adam.adam_kernel(1)]
+    kernels = [*march.KERNELS]
+    kernels += [look_up.add_kernel(1), adam.adam_kernel(1), adam.total_variation_kernel(1)]
     for count in sorted({3, *channels}):
         kernels += [look_up.look_up_kernel(count), look_up.slope_kernel(count)]
         kernels += [look_up.add_kernel(count), adam.adam_kernel(count)]
+        kernels += [adam.total_variation_kernel(count)]
     Thread(target=_compile, args=(kernels, device), daemon=True).start()
 
 
