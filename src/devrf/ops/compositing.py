@@ -26,17 +26,15 @@ def composite(depth: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
     """
     edges = firsts(ray, rays)
     passed = running_sum(depth)
-    # The gradient of index_select takes half the time of that of indexing.
-    first = passed.index_select(0, edges.index_select(0, ray))
-    before = torch.exp(first - passed[:-1]).to(depth.dtype)
+    before = torch.exp(-sums_before(passed, edges, ray)).to(depth.dtype)
     end = torch.exp(passed[edges[:-1]] - passed[edges[1:]]).to(depth.dtype)
     return before * -torch.expm1(-depth), end
 
 
 def transmittances(depth: Tensor, ray: Tensor, rays: int) -> Tensor:
     """Transmittance T_i (S,) before each sample; arguments as for :func:`composite`."""
-    passed = running_sum(depth)
-    return torch.exp(passed[firsts(ray, rays)[ray]] - passed[:-1]).to(depth.dtype)
+    passed = sums_before(running_sum(depth), firsts(ray, rays), ray)
+    return torch.exp(-passed).to(depth.dtype)
 
 
 def sum_by_ray(values: Tensor, ray: Tensor, rays: int) -> Tensor:
@@ -78,6 +76,18 @@ def running_sum(values: Tensor) -> Tensor:
     else:
         sums = values.cumsum(dim=0)
     return torch.nn.functional.pad(sums, (1, 0))
+
+
+def sums_before(running: Tensor, edges: Tensor, ray: Tensor) -> Tensor:
+    """Sums (S,) of the values before each sample on its own ray.
+
+    Args:
+        running: (S + 1,) of :func:`running_sum`.
+        edges: (R + 1,) of :func:`firsts`.
+        ray: (S,) int64, ascending: the ray of each sample.
+    """
+    # The gradient of index_select takes half the time of that of indexing.
+    return running[:-1] - running.index_select(0, edges.index_select(0, ray))
 
 
 def sum_by_doubling(values: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from devrf.ops.compositing import firsts, running_sum
+from devrf.ops.compositing import firsts, running_sum, sums_before
 
 # A transmittance is at least so far from 0 and 1 in the entropy.
 NEAREST = 1e-6
@@ -46,9 +46,11 @@ def distortion(weight: Tensor, distance: Tensor, ray: Tensor, rays: int) -> Tens
         ray: (K,) int64, ascending.
         rays: R.
     """
-    first = firsts(ray, rays)[ray]
-    before = (running_sum(weight), running_sum(weight * distance))
-    mass, reached = ((sums[:-1] - sums[first]).to(weight.dtype) for sums in before)
+    edges = firsts(ray, rays)
+    mass, reached = (
+        sums_before(running_sum(values), edges, ray).to(weight.dtype)
+        for values in (weight, weight * distance)
+    )
     total: Tensor = (weight * (distance * mass - reached)).sum()
     return 2 * total / rays
 
