@@ -17,12 +17,14 @@ from devrf.kernels.runtime import take
 
 # Densities, displacements, features.
 CHANNELS = (1, 3, 12)
+# Whether it is contracted.
+SPACES = (False, True)
 # Of generations of GPUs from Ampere to Blackwell.
 ARCHITECTURES = (80, 90, 120)
 
 
 def every_kernel() -> dict[str, wp.Kernel]:
-    """All kernels by names of their own: those made for so many channels, for each number."""
+    """All kernels by names of their own; a factory's, for each number of channels or space."""
     found: dict[str, wp.Kernel] = {}
     for info in pkgutil.iter_modules(devrf.kernels.__path__):
         module = import_module(f"devrf.kernels.{info.name}")
@@ -33,8 +35,10 @@ def every_kernel() -> dict[str, wp.Kernel]:
                 if value.func.__module__ == module.__name__:
                     found[f"{info.name}.{name}"] = value
             elif hasattr(value, "__wrapped__"):
-                if inspect.signature(value).return_annotation in (wp.Kernel, "wp.Kernel"):
-                    found |= {f"{info.name}.{name}_{count}": value(count) for count in CHANNELS}
+                signature = inspect.signature(value)
+                if signature.return_annotation in (wp.Kernel, "wp.Kernel"):
+                    choices = CHANNELS if "channels" in signature.parameters else SPACES
+                    found |= {f"{info.name}.{name}_{one}": value(one) for one in choices}
     return found
 
 
@@ -55,8 +59,8 @@ def test_all_are_found() -> None:
     names = {f"look_up.{one}_{n}" for one in look_ups for n in CHANNELS}
     steps = ("adam_kernel", "total_variation_kernel")
     names |= {f"adam.{one}_{n}" for one in steps for n in CHANNELS}
-    names |= {"march.march_kernel", "march.adjoint_kernel", "march.rays_that_hit_kernel"}
-    names |= {"march.keep_significant_kernel"}
+    names |= {f"march.{one}_{n}" for one in ("march_kernel", "hit_kernel") for n in SPACES}
+    names |= {"march.adjoint_kernel", "march.keep_significant_kernel"}
     assert set(every_kernel()) == names
 
 

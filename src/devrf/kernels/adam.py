@@ -10,7 +10,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from devrf.kernels.runtime import array, by_channels, launch, take
+from devrf.kernels.runtime import array, made_once, launch, take
 from devrf.ops import adam as definition
 from devrf.ops.adam import AdamRule
 
@@ -120,7 +120,7 @@ def _numbers(channels: int) -> Any:
     return wp.types.vector(length=channels, dtype=wp.float32)
 
 
-@by_channels
+@made_once
 def adam_kernel(channels: int) -> wp.Kernel:
     """A step on voxels of so many numbers."""
     numbers = _numbers(channels)
@@ -167,7 +167,7 @@ def adam_kernel(channels: int) -> wp.Kernel:
     return adam_step
 
 
-@by_channels
+@made_once
 def total_variation_kernel(channels: int) -> wp.Kernel:
     """The gradient of the total variation, in voxels of so many numbers."""
     numbers = _numbers(channels)

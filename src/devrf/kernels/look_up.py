@@ -9,7 +9,7 @@ from torch.autograd.function import once_differentiable
 
 from devrf.geometry.box import Box
 from devrf.kernels.grid import Grid, cell, grid_over, inside, interpolate, slope
-from devrf.kernels.runtime import array, by_channels, launch, launch_by_owner, row_type, take
+from devrf.kernels.runtime import array, made_once, launch, launch_by_owner, row_type, take
 from devrf.ops import trilinear
 from devrf.ops.trilinear import shape_of
 
@@ -82,7 +82,7 @@ def add_to_grid(grid: Tensor, points: Tensor, values: Tensor, box: Box, every: i
     launch_by_owner(add_kernel(grid.shape[-1]), len(points), inputs, points.device)
 
 
-@by_channels
+@made_once
 def look_up_kernel(channels: int) -> wp.Kernel:
     """The look-up in grids of so many channels: Warp chooses slowly among kernels of one name."""
     row_of = row_type(channels)
@@ -102,7 +102,7 @@ def look_up_kernel(channels: int) -> wp.Kernel:
     return look_up
 
 
-@by_channels
+@made_once
 def slope_kernel(channels: int) -> wp.Kernel:
     """The look-up's adjoint in the points."""
     row_of = row_type(channels)
@@ -126,7 +126,7 @@ def slope_kernel(channels: int) -> wp.Kernel:
     return slopes
 
 
-@by_channels
+@made_once
 def add_kernel(channels: int) -> wp.Kernel:
     """The look-up's adjoint in the grid."""
     row_of = row_type(channels)

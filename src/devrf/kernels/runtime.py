@@ -115,17 +115,17 @@ def room(kind: Any, count: int, device: torch.device) -> wp.array:
     return array(torch.empty(count, floats, device=device), kind)
 
 
-def by_channels(factory: Callable[[int], wp.Kernel]) -> Callable[[int], wp.Kernel]:
-    """The kernels that a ``factory`` makes for so many channels, each made once."""
+def made_once(factory: Callable[[int], wp.Kernel]) -> Callable[[int], wp.Kernel]:
+    """The kernels of a ``factory``, each made when it is first asked for."""
     made: dict[int, wp.Kernel] = {}
 
     @wraps(factory)
-    def kernel(channels: int) -> wp.Kernel:
-        if channels not in made:
+    def kernel(choice: int) -> wp.Kernel:
+        if choice not in made:
             with compiling:
-                if channels not in made:
-                    made[channels] = factory(channels)
-        return made[channels]
+                if choice not in made:
+                    made[choice] = factory(choice)
+        return made[choice]
 
     return kernel
 
