@@ -61,6 +61,7 @@ def test_all_are_found() -> None:
     names |= {f"adam.{one}_{n}" for one in steps for n in CHANNELS}
     names |= {f"march.{one}_{n}" for one in ("march_kernel", "hit_kernel") for n in SPACES}
     names |= {"march.adjoint_kernel", "march.keep_significant_kernel"}
+    names |= {"march.occupied_points_kernel"}
     assert set(every_kernel()) == names
 
 

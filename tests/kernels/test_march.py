@@ -13,7 +13,7 @@ from devrf.geometry.box import Box
 from devrf.geometry.contraction import ContractedRays, ContractedSpace
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.rays import Rays
-from devrf.kernels.march import march, rays_that_hit
+from devrf.kernels.march import march, occupied_points, rays_that_hit
 from devrf.ops import march as definition
 from devrf.ops.march import STOP, Medium, Path, Samples, Surroundings
 from devrf.ops.trilinear import shape_of
@@ -452,3 +452,34 @@ def test_rays_and_gradients_may_lie_in_memory_anyhow(rng: torch.Generator) -> No
         moving.displacement,
     )
     torch.testing.assert_close(of_whole, of_again)
+
+
+@pytest.mark.parametrize("still_outside", [False, True])
+@pytest.mark.parametrize("moves", [False, True])
+def test_points_are_occupied_where_the_definition_says(
+    moves: bool, still_outside: bool, rng: torch.Generator
+) -> None:
+    given = setting("world", 1, rng)
+    moving = medium(given, rng, moves=moves, still_outside=still_outside)
+    shape = (19, 23, 21)
+    theirs = definition.occupied_points(exact(moving), shape)
+    points = given.path.box.grid_points(shape, torch.empty(0, dtype=torch.float64)).view(-1, 3)
+    canonical = definition.warped(points, exact(moving))
+    at = given.path.box.to_grid(canonical, shape_of(given.path.surroundings.distances))
+    unclear = ((at - at.floor() - 0.5).abs() < CLEAR).any(dim=1)
+    at = given.path.box.to_grid(canonical, shape_of(moving.density))
+    unclear |= ((at - at.floor() - 0.5).abs() < CLEAR).any(dim=1)
+    if moves:  # a point on the face of what moves jumps
+        at = given.motion_box.to_grid(points, shape_of(moving.displacement))
+        last = torch.tensor(shape_of(moving.displacement)) - 1
+        unclear |= torch.minimum(at.abs(), (at - last).abs()).amin(dim=1) < CLEAR
+    clear = ~unclear.view(shape)
+    assert clear.float().mean() > 0.5
+    assert torch.equal(occupied_points(moving, shape) & clear, theirs & clear)
+    assert 0.05 < theirs[clear].float().mean() < 0.95
+    everywhere = occupied_points(replace(moving, threshold=0.0), shape)
+    assert torch.equal(
+        (definition.occupied_points(replace(exact(moving), threshold=0.0), shape)) & clear,
+        everywhere & clear,
+    )
+    assert everywhere.sum() > theirs.sum()

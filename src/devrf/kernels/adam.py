@@ -10,7 +10,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from devrf.kernels.runtime import array, made_once, launch, take
+from devrf.kernels.runtime import array, launch, made_once, take
 from devrf.ops import adam as definition
 from devrf.ops.adam import AdamRule
 

@@ -9,7 +9,7 @@ from torch.autograd.function import once_differentiable
 
 from devrf.geometry.box import Box
 from devrf.kernels.grid import Grid, cell, grid_over, inside, interpolate, slope
-from devrf.kernels.runtime import array, made_once, launch, launch_by_owner, row_type, take
+from devrf.kernels.runtime import array, launch, launch_by_owner, made_once, row_type, take
 from devrf.ops import trilinear
 from devrf.ops.trilinear import shape_of
 

@@ -21,7 +21,7 @@ from devrf.kernels.look_up import add_to_grid
 from devrf.kernels.runtime import GRAIN_OF_RAYS, array, launch, made_once, room, take
 from devrf.ops import march as definition
 from devrf.ops.march import HIT_CELLS, STOP, Medium, Path, Samples, steps_through
-from devrf.ops.trilinear import shape_of
+from devrf.ops.trilinear import Shape, shape_of
 
 # Half edges of the inner box that a ray moves along any axis while its distance grows by what one
 # takes along the axis that it crosses fastest, at most; more in a thick shell, and where a ray
@@ -49,10 +49,28 @@ def rays_that_hit(rays: Rays, path: Path) -> Tensor:
     if not take(rays.origins):
         return definition.rays_that_hit(rays, path)
     hits = torch.empty(len(rays), dtype=torch.uint8, device=rays.origins.device)
-    inputs = [_geometry(rays, path), _arrays(rays, path)[0], _distances(path), array(hits)]
+    inputs = [_geometry(path, rays), _arrays(rays, path)[0], _distances(path), array(hits)]
     kernel = hit_kernel(isinstance(rays, ContractedRays))
     launch(kernel, len(rays), inputs, hits.device)
     return hits.bool()
+
+
+@torch.no_grad()
+def occupied_points(medium: Medium, shape: Shape) -> Tensor:
+    """As :func:`devrf.ops.march.occupied_points`."""
+    if not take(medium.density):
+        return definition.occupied_points(medium, shape)
+    device, path = medium.density.device, medium.path
+    geometry = _geometry(path)
+    _add_field(geometry, medium)
+    density = array(medium.density.contiguous())
+    still = torch.empty(0, 3, device=device)
+    moves = array(still if medium.displacement is None else medium.displacement.contiguous())
+    found = torch.empty(shape, dtype=torch.uint8, device=device)
+    points = grid_over(path.box, shape)
+    inputs = [points, geometry, _distances(path), density, moves, array(found.view(-1))]
+    launch(occupied_points_kernel, found.numel(), inputs, device)
+    return found.bool()
 
 
 class _March(torch.autograd.Function):
@@ -66,7 +84,7 @@ class _March(torch.autograd.Function):
         kept: Tensor | None,
     ) -> tuple[Tensor, ...]:
         device = density.device
-        geometry = _geometry(rays, medium.path)
+        geometry = _geometry(medium.path, rays)
         _add_field(geometry, medium)
         lines, counts = _arrays(rays, medium.path)
         distances = _distances(medium.path)
@@ -170,8 +188,8 @@ def _distances(path: Path) -> wp.array:
     return array(path.surroundings.distances.flatten())
 
 
-def _geometry(rays: Rays, path: Path) -> Geometry:
-    """Where ``rays`` are sampled."""
+def _geometry(path: Path, rays: Rays | None = None) -> Geometry:
+    """Where ``rays`` are sampled, if there are any."""
     geometry = Geometry()
     surroundings = path.surroundings
     geometry.occupancy = grid_over(surroundings.box, shape_of(surroundings.distances))
@@ -589,3 +607,33 @@ def hit_kernel(contracted: bool) -> wp.Kernel:
             k += int(float(wp.max(cells - wp.static(HIT_CELLS + 1), 0)) * ray.samples_per_cell) + 1
 
     return find_hits
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def occupied_points_kernel(
+    first: int,
+    points: Grid,
+    geometry: Geometry,
+    distances: wp.array(dtype=wp.uint8),
+    density: wp.array(dtype=float),
+    displacements: wp.array(dtype=wp.vec3),
+    occupied: wp.array(dtype=wp.uint8),
+):
+    """Whether a point of a grid moves to where something is at rest."""
+    number = first + wp.tid()
+    i = number / points.next_x
+    j = (number / points.next_y) % points.y
+    k = number % points.z
+    place = wp.vec3(float(i), float(j), float(k))
+    canonical = warped(geometry, displacements, points.low + wp.cw_div(place, points.scale))
+    at = coordinates(geometry.occupancy, canonical)
+    found = False
+    if clearance(geometry.occupancy, distances, at) == 0:
+        grid = geometry.density
+        row, fraction = cell(grid, canonical)
+        raw = interpolate(density, grid, row, fraction)
+        row += int(wp.rint(fraction[0])) * grid.next_x
+        row += int(wp.rint(fraction[1])) * grid.next_y
+        row += int(wp.rint(fraction[2])) * grid.next_z
+        found = wp.max(raw, density[row]) >= geometry.faintest
+    occupied[number] = wp.uint8(found)

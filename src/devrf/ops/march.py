@@ -14,7 +14,7 @@ from torch.nn.functional import softplus
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 from devrf.ops.compositing import composite, transmittances
-from devrf.ops.trilinear import look_up
+from devrf.ops.trilinear import Shape, look_up, shape_of
 
 # A ray ends where its transmittance is less: what is behind cannot be seen.
 STOP = 1e-4
@@ -153,6 +153,28 @@ def rays_that_hit(rays: Rays, path: Path) -> Tensor:
     hits = torch.zeros(len(rays), dtype=torch.bool, device=ray.device)
     hits[ray[path.surroundings.at(points) <= HIT_CELLS]] = True
     return hits
+
+
+@torch.no_grad()
+def occupied_points(medium: Medium, shape: Shape) -> Tensor:
+    """Which points of a grid move to where something is at rest: mask of ``shape`` (X, Y, Z).
+
+    That is to an occupied cell, of an opacity of at least the threshold there or at the nearest
+    point of the densities: a thin thing may lie between the places that points come from.
+
+    Args:
+        medium: where something is at rest, and what moves points there.
+        shape: of the grid, over the box of the densities.
+    """
+    box, density = medium.path.box, medium.density
+    canonical = warped(box.grid_points(shape, density).view(-1, 3), medium)
+    occupied = medium.path.surroundings.at(canonical) == 0
+    low, high = box.corners(canonical)
+    place = box.to_grid(canonical.clamp(low, high), shape_of(density))
+    x, y, z = (place - 0.5).ceil().long().unbind(1)
+    raw = torch.maximum(look_up(density, canonical, box), density[x, y, z])[:, 0]
+    opacity = -torch.expm1(-softplus(raw + medium.shift) * medium.delta)
+    return (occupied & (opacity >= medium.threshold)).view(shape)
 
 
 def samples_in_box(rays: Rays, path: Path) -> tuple[Tensor, Tensor, Tensor]:

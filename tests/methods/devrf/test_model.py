@@ -13,12 +13,9 @@ from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import WORLD
 from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.deformation_field import (
-    DeformationField,
-    deformed_occupancy,
-    possible_occupancy,
-)
+from devrf.methods.devrf.deformation_field import DeformationField, GridWarp
 from devrf.methods.devrf.model import DeVRFModel
+from devrf.methods.devrf.volume_rendering import deformed_occupancy, possible_occupancy
 from devrf.rendering.occupancy import Occupancy, dilate
 from devrf.rendering.output import RenderedImage
 from devrf.rendering.renderer import Renderer
@@ -78,11 +75,15 @@ def test_at_rest_nothing_is_warped(model):
     assert torch.equal(moving.color, still.color) and torch.equal(moving.depth, still.depth)
 
 
+def moved_by(model: DeVRFModel, shift: torch.Tensor) -> GridWarp:
+    """x → x + ``shift`` (3,)."""
+    return GridWarp((shift.expand(2, 2, 2, 3).contiguous(),), model.box)
+
+
 def test_deformed_occupancy_by_hand(model):
     shift = torch.tensor([0.0, 0.4, 0.0])
-    found = deformed_occupancy(
-        model.canonical, model.occupancy, model.settings, lambda points: points + shift
-    )
+    warp = moved_by(model, shift)
+    found = deformed_occupancy(model.canonical, model.occupancy, model.settings, warp)
     opaque = model.canonical.voxel_alpha(model.settings.step) >= model.settings.alpha_threshold
     moved = torch.roll(opaque & model.occupancy.mask, -2, dims=1)
     assert torch.equal(found.mask, dilate(moved, 1))
@@ -91,7 +92,8 @@ def test_deformed_occupancy_by_hand(model):
 
 def test_while_a_frame_is_learned_all_that_may_be_is_occupied(model):
     shift = torch.tensor([0.0, 0.4, 0.0])
-    found = possible_occupancy(model.occupancy, model.box, lambda points: points + shift)
+    warp = moved_by(model, shift)
+    found = possible_occupancy(model.canonical, model.occupancy, model.settings, warp)
     assert torch.equal(found.mask, dilate(torch.roll(model.occupancy.mask, -2, dims=1), 1))
 
 
@@ -103,7 +105,7 @@ def test_a_thin_thing_is_not_lost_between_the_places_that_points_come_from(model
     model.occupancy.mask.fill_(True)
     cell = [edge / (n - 1) for edge, n in zip(field.box.size, field.density.shape, strict=True)]
     half = 0.49 * torch.tensor(cell)  # none of the points comes from where it is opaque
-    found = deformed_occupancy(field, model.occupancy, model.settings, lambda q: q + half)
+    found = deformed_occupancy(field, model.occupancy, model.settings, moved_by(model, half))
     expected = torch.zeros_like(found.mask)
     expected[x - 1 : x + 2, y - 1 : y + 2, z - 1 : z + 2] = True
     assert torch.equal(found.mask, expected)

@@ -46,9 +46,9 @@ from devrf.geometry.contraction import ContractedSpace
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.methods.base import Renderable
 from devrf.methods.devrf.canonical_field import ColorDecoder
-from devrf.methods.devrf.deformation_field import DeformationField, GridWarp, deformed_occupancy
+from devrf.methods.devrf.deformation_field import DeformationField, GridWarp
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.volume_rendering import medium
+from devrf.methods.devrf.volume_rendering import deformed_occupancy, medium
 from devrf.ops.trilinear import shape_of
 from devrf.rendering.occupancy import Occupancy, dilate
 from devrf.system.files import atomic_write

@@ -12,10 +12,7 @@ from torch import Tensor
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.kernels.look_up import look_up
-from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.frame_store import FrameField, FrameStore
-from devrf.rendering.occupancy import Occupancy, dilate
-from devrf.rendering.sampling import RenderSettings
 
 # Points (M, 3) → where they move to, (M, 3).
 Warp = Callable[[Tensor], Tensor]
@@ -144,54 +141,3 @@ class DeformationField(FrameField):
         """Restore what :meth:`get_extra_state` gave."""
         super().set_extra_state(state)
         self.still_outside = bool(state.get("still_outside"))
-
-
-@torch.no_grad()
-def possible_occupancy(
-    occupancy: Occupancy, box: Box, warp: Callable[[Tensor], Tensor]
-) -> Occupancy:
-    """The occupancy while a frame is learned: grid points whose canonical position is occupied.
-
-    Wider than :func:`deformed_occupancy`, since the displacements go on changing: all that may be
-    occupied at rest, grown by one point.
-
-    Args:
-        occupancy: where something may be at rest.
-        box: the canonical field's.
-        warp: x → x + Δ_b(x, t), the points (M, 3) of the occupancy's grid into canonical space.
-    """
-    x, y, z = occupancy.mask.shape
-    points = box.grid_points((x, y, z), torch.empty(0, device=occupancy.mask.device))
-    occupied = occupancy.at(warp(points.view(-1, 3))).view(x, y, z)
-    return Occupancy(dilate(occupied, 1), box)
-
-
-@torch.no_grad()
-def deformed_occupancy(
-    field: CanonicalField,
-    occupancy: Occupancy,
-    settings: RenderSettings,
-    warp: Callable[[Tensor], Tensor],
-) -> Occupancy:
-    """The occupancy at a time: the points of the density's grid that move to what is opaque.
-
-    That is where samples count, there or at the nearest point at rest, since a thin thing may lie
-    between the places that grid points come from. Grown by one for what is between them now.
-
-    Args:
-        field: the canonical field.
-        occupancy: where something is at rest.
-        settings: how rays are sampled.
-        warp: x → x + Δ_b(x, t), the points (M, 3) of the grid into canonical space.
-    """
-    x, y, z = field.density.shape
-    points = field.box.grid_points((x, y, z), field.density.values)
-    canonical = warp(points.view(-1, 3))
-    near = occupancy.at(canonical).nonzero()[:, 0]
-    canonical = canonical[near]
-    least = settings.alpha_threshold
-    at_rest = Occupancy(field.voxel_alpha(settings.step) >= least, field.box)
-    tau = field.optical_depth(canonical, field.step_in_base_voxels(settings.step))
-    mask = torch.zeros(x * y * z, dtype=torch.bool, device=near.device)
-    mask[near] = at_rest.at(canonical) | (-torch.expm1(-tau) >= least)
-    return Occupancy(dilate(mask.view(x, y, z), 1), field.box)

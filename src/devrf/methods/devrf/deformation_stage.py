@@ -18,7 +18,7 @@ from devrf.engine.grid_adam import GridAdam
 from devrf.engine.stage import Stage
 from devrf.errors import DevrfError
 from devrf.methods.devrf.active_frame import ActiveFrame
-from devrf.methods.devrf.deformation_field import DeformationField, possible_occupancy
+from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformation_schedule import (
     DeformationPhase,
     DeformationSchedule,
@@ -35,7 +35,7 @@ from devrf.methods.devrf.settings import (
     Precision,
     decoder_dtype,
 )
-from devrf.methods.devrf.volume_rendering import render
+from devrf.methods.devrf.volume_rendering import possible_occupancy, render
 from devrf.rendering.output import ColorChange
 from devrf.scenes.scene import CaptureName, Views
 from devrf.system.profiling import span
@@ -317,7 +317,8 @@ class DeformationStage(Stage):
         frame = self.active
         assert frame is not None
         warp = self.field.warp_by(frame.backward)
-        frame.occupancy.refill(possible_occupancy(model.occupancy, model.box, warp))
+        possible = possible_occupancy(model.canonical, model.occupancy, model.settings, warp)
+        frame.occupancy.refill(possible)
 
     def prepare(self) -> None:
         """Update the frame's occupancy every ``occupancy_every`` iterations."""

@@ -18,13 +18,10 @@ from devrf.geometry.space import WORLD, Space, space_config, space_from
 from devrf.methods.base import Renderable
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField, ColorDecoder
-from devrf.methods.devrf.deformation_field import (
-    DeformationField,
-    GridWarp,
-    deformed_occupancy,
-)
+from devrf.methods.devrf.deformation_field import DeformationField, GridWarp
 from devrf.methods.devrf.frame_store import NAMES, FrameField, fits_on_device
 from devrf.methods.devrf.view import CanonicalSurface, DeVRFView
+from devrf.methods.devrf.volume_rendering import deformed_occupancy
 from devrf.ops.trilinear import shape_of
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import ColorChange

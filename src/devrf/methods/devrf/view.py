@@ -12,22 +12,17 @@ from devrf.geometry.cameras import Cameras
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import Space
 from devrf.methods.devrf.canonical_field import CanonicalField
-from devrf.methods.devrf.deformation_field import (
-    DeformationField,
-    GridWarp,
-    deformed_occupancy,
-)
+from devrf.methods.devrf.deformation_field import DeformationField, GridWarp
 from devrf.methods.devrf.losses import induced_flow
-from devrf.methods.devrf.volume_rendering import render
+from devrf.methods.devrf.volume_rendering import deformed_occupancy, render
 from devrf.ops.compositing import sum_by_ray
-from devrf.ops.trilinear import resample
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import ColorChange, RenderedImage
 from devrf.rendering.sampling import RenderSettings
 
 # Rays at once: on a CPU so many that what a chunk costs by itself, 0.8 ms, is little (in unbounded
 # scenes a ray has tens of samples to colour), on a GPU what keeps it busy and fits.
-ON_CPU = 20_000
+ON_CPU = 2**14
 UNBOUNDED_ON_CPU = 4096
 ON_GPU = 2**15
 # Samples of unbounded scenes' pictures are so much further apart than while they are learned: what
@@ -67,17 +62,9 @@ class DeVRFView:
         self.at_rest = motion is None or motion.clock.at(self.time).after == 0
         if motion is None or self.at_rest:
             return
-        displacement = motion.blended(self.time)
-        self._warp = warp = motion.warp_by(displacement)
-        x, y, z = self.canonical.density.shape
-
-        def resampled(points: Tensor) -> Tensor:
-            """Interpolation at the points of a grid over the same box, several times faster."""
-            return points + resample(displacement, (x, y, z)).view(-1, 3)
-
-        whole = resampled if not motion.still_outside else warp
+        self._warp = motion.warp_by(motion.blended(self.time))
         self.occupancy = deformed_occupancy(
-            self.canonical, self.occupancy, self.picture_settings, whole
+            self.canonical, self.occupancy, self.picture_settings, self._warp
         )
 
     @property

@@ -5,16 +5,18 @@ The samples of each ray, docs/method.md#rays, composited: docs/method.md#composi
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
 from devrf.geometry.rays import Rays
-from devrf.kernels.march import march
+from devrf.kernels.march import march, occupied_points
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.deformation_field import GridWarp
 from devrf.ops.compositing import color_and_depth, sum_by_ray
 from devrf.ops.march import Medium, Path
-from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.occupancy import Occupancy, dilate
 from devrf.rendering.output import ColorChange, VoxelOutput
 from devrf.rendering.sampling import RenderSettings
 from devrf.system.profiling import span
@@ -95,3 +97,33 @@ def medium(
         motion_box=None if warp is None or displacement is None else warp.box,
         still_outside=warp is not None and warp.still_outside,
     )
+
+
+def deformed_occupancy(
+    field: CanonicalField, occupancy: Occupancy, settings: RenderSettings, warp: GridWarp
+) -> Occupancy:
+    """The occupancy at a time: the points of the density's grid that move to what is opaque.
+
+    That is where samples count. Grown by one for what is between the points now.
+
+    Args:
+        field: the canonical field.
+        occupancy: where something is at rest.
+        settings: how rays are sampled.
+        warp: x → x + Δ_b(x, t).
+    """
+    mask = occupied_points(medium(field, occupancy, settings, warp), field.density.shape)
+    return Occupancy(dilate(mask, 1), field.box)
+
+
+def possible_occupancy(
+    field: CanonicalField, occupancy: Occupancy, settings: RenderSettings, warp: GridWarp
+) -> Occupancy:
+    """The occupancy while a frame is learned, of the grid of that at rest.
+
+    Wider than :func:`deformed_occupancy`, since the displacements go on changing: all that may be
+    occupied at rest, grown by one point.
+    """
+    anything = replace(medium(field, occupancy, settings, warp), threshold=0.0)
+    x, y, z = occupancy.mask.shape
+    return Occupancy(dilate(occupied_points(anything, (x, y, z)), 1), field.box)
