@@ -14,9 +14,9 @@ from torch import Tensor
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 from devrf.kernels.adam import GRAIN_OF_VOXELS, adam_step, add_total_variation_gradient
-from devrf.kernels.look_up import add_to_grid, look_up
+from devrf.kernels.look_up import look_up
 from devrf.kernels.march import march, rays_that_hit
-from devrf.kernels.runtime import GRAIN, GRAIN_OF_RAYS, choose, take
+from devrf.kernels.runtime import GRAIN_OF_RAYS, choose, take
 from devrf.ops import adam, trilinear
 from devrf.ops import march as definition
 from devrf.ops.adam import AdamRule
@@ -196,14 +196,3 @@ def test_a_step_is_the_same_to_the_bit_with_any_number_of_threads(
     for number in (2, 3):
         threads(number)
         assert all(map(torch.equal, alone, optimised(grid)))
-
-
-def test_every_plane_has_an_owner_with_more_threads_than_planes(
-    rng: torch.Generator, threads: Callable[[int], None]
-) -> None:
-    points, values = torch.randn(2, 5 * GRAIN, 3, generator=rng)
-    alone, together = torch.zeros(2, 3, 2, 3), torch.zeros(2, 3, 2, 3)
-    add_to_grid(alone, points, values, BOX)
-    threads(5)
-    add_to_grid(together, points, values, BOX)
-    assert alone.all() and torch.equal(alone, together)

@@ -77,20 +77,6 @@ def launch(
     _launch(kernel, counts, [[first] for first in edges[:-1]], inputs, device)
 
 
-def launch_by_owner(
-    kernel: wp.Kernel, count: int, inputs: Sequence[Any], device: torch.device
-) -> None:
-    """Run ``kernel(owner, owners, *inputs)`` with ``count`` threads for each owner.
-
-    Threads of such a kernel add to the same places, each to those of its owner alone. So no two of
-    torch's threads add to one place, and sums are the same for any number of them. On a GPU there
-    is one owner, and additions are atomic.
-    """
-    owners = _parts(device, count, GRAIN)
-    places = [[owner, owners] for owner in range(owners)]
-    _launch(kernel, [count] * owners, places, inputs, device)
-
-
 def array(tensor: Tensor, kind: Any = None) -> wp.array:
     """A contiguous tensor (N,) of numbers, or (…, C) of rows, as Warp's array of N; not a copy.
 

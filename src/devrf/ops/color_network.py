@@ -103,7 +103,7 @@ def _hidden(x: Tensor, network: ColorNetwork) -> Tensor:
     """
     weight, bias = network.hidden_weight, network.hidden_bias
     single = x.dtype == weight.dtype == torch.float32
-    if single and x.is_cpu and not torch.is_grad_enabled() and mkldnn.is_available():
+    if single and x.is_cpu and not torch.is_grad_enabled() and mkldnn.is_available():  # type: ignore[no-untyped-call]
         result = linear(x.to_mkldnn(), weight.to_mkldnn(), bias.to_mkldnn())
         return result.to_dense().relu_()
     return _linear(x, weight, bias, x.dtype).relu_()
