@@ -7,6 +7,7 @@ from itertools import combinations
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import mse_loss
 
 from devrf.geometry.box import Box
 from devrf.kernels.look_up import look_up
@@ -73,11 +74,11 @@ class SixPlanes(nn.Module):
 
     def total_variation(self) -> Tensor:
         """Σ over planes of 2 · (mean squared differences along both axes)."""
-        return sum_of([2 * (_square(p.diff(dim=0)) + _square(p.diff(dim=1))) for p in self.planes])
+        return sum_of([2 * _step(plane, axis) for plane in self.planes for axis in (0, 1)])
 
     def roughness(self) -> Tensor:
         """Σ over planes with time of the mean squared second difference along it."""
-        return sum_of([_square(plane.diff(n=2, dim=1)) for plane in self.along(time=True)])
+        return sum_of([_step(plane.diff(dim=1), axis=1) for plane in self.along(time=True)])
 
     def change(self) -> Tensor:
         """Σ over planes with time of the mean |1 − P|: 0 of what is at rest."""
@@ -89,6 +90,10 @@ def sum_of(values: Sequence[Tensor]) -> Tensor:
     return torch.stack(list(values)).sum()
 
 
-def _square(values: Tensor) -> Tensor:
-    """The mean square; 0 where there are no values, of an axis too short for differences."""
-    return values.square().mean() if values.numel() else values.sum()
+def _step(values: Tensor, axis: int) -> Tensor:
+    """The mean squared difference of neighbours along an axis; 0 where it has none."""
+    count = max(values.shape[axis] - 1, 0)
+    if count == 0:
+        return values.sum() * 0.0
+    # One operation and its gradient, in place of those of differences, squares and a mean.
+    return mse_loss(values.narrow(axis, 1, count), values.narrow(axis, 0, count))

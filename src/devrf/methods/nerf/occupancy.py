@@ -54,7 +54,7 @@ class LearnedOccupancy(StoredShape):
         """Whether something may be in cells of row-major numbers (S,): (S,) bool; None: in all."""
         if not self.opacity.numel():
             return None
-        return self.opacity.view(-1)[cell] > LEAST
+        return self.opacity.view(-1).index_select(0, cell) > LEAST
 
     @torch.no_grad()
     def follow(
@@ -183,16 +183,19 @@ class OccupancyFrames(StoredShape):
         near, far = depths
         entry, count = steps_through(rays, box, step=step, near=near, far=far)
         ray = torch.repeat_interleave(count)
-        number = torch.arange(len(ray), device=ray.device) - (count.cumsum(0) - count)[ray]
+        first = (count.cumsum(0) - count).index_select(0, ray)
+        number = torch.arange(len(ray), device=ray.device) - first
         offset = torch.rand_like(entry) if jitter else torch.full_like(entry, 0.5)
-        distance = entry[ray] + (number + offset[ray]) * step
-        pair = (frames[0][ray], frames[1][ray])
+        shifted = number + offset.index_select(0, ray)
+        distance = entry.index_select(0, ray) + shifted * step
+        pair = (frames[0].index_select(0, ray), frames[1].index_select(0, ray))
         masked, occupied = self._may_be(rays.at(ray, distance), pair, box)
         if occupied is not None:
             # The last sample of a ray stays: it may stand for all that is behind it.
-            masked &= occupied | (number == count[ray] - 1)
+            masked &= occupied | (number == (count - 1).index_select(0, ray))
         index = masked.nonzero()[:, 0]
-        return RaySamples.at(rays, ray[index], distance[index], step)
+        kept = ray.index_select(0, index)
+        return RaySamples.at(rays, kept, distance.index_select(0, index), step)
 
     def may_be_at(self, points: Tensor, frames: tuple[int, int], box: Box) -> Tensor:
         """Whether something may be at ``points`` (S, 3) at one of two frames: (S,) bool."""
@@ -209,5 +212,6 @@ class OccupancyFrames(StoredShape):
         cell = (nearest[:, 0] * y + nearest[:, 1]) * z + nearest[:, 2]
         masks = self.mask.view(-1)
         cells = self.mask[0].numel()
-        masked = masks[frames[0] * cells + cell] | masks[frames[1] * cells + cell]
+        before, after = (frame * cells + cell for frame in frames)
+        masked = masks.index_select(0, before) | masks.index_select(0, after)
         return masked, self.learned.occupied(cell)
