@@ -37,7 +37,8 @@ def every_kernel() -> dict[str, wp.Kernel]:
             elif hasattr(value, "__wrapped__"):
                 signature = inspect.signature(value)
                 if signature.return_annotation in (wp.Kernel, "wp.Kernel"):
-                    choices = CHANNELS if "channels" in signature.parameters else SPACES
+                    (what,) = signature.parameters
+                    choices = {"channels": CHANNELS, "contracted": SPACES}[what]
                     found |= {f"{info.name}.{name}_{one}": value(one) for one in choices}
     return found
 

@@ -454,13 +454,13 @@ def test_rays_and_gradients_may_lie_in_memory_anyhow(rng: torch.Generator) -> No
     torch.testing.assert_close(of_whole, of_again)
 
 
-@pytest.mark.parametrize("still_outside", [False, True])
-@pytest.mark.parametrize("moves", [False, True])
+@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("moves", ["not", "everywhere", "inside"])
 def test_points_are_occupied_where_the_definition_says(
-    moves: bool, still_outside: bool, rng: torch.Generator
+    space: str, moves: str, rng: torch.Generator
 ) -> None:
-    given = setting("world", 1, rng)
-    moving = medium(given, rng, moves=moves, still_outside=still_outside)
+    given = setting(space, 1, rng)
+    moving = medium(given, rng, moves=moves != "not", still_outside=moves == "inside")
     shape = (19, 23, 21)
     theirs = definition.occupied_points(exact(moving), shape)
     points = given.path.box.grid_points(shape, torch.empty(0, dtype=torch.float64)).view(-1, 3)
@@ -469,7 +469,7 @@ def test_points_are_occupied_where_the_definition_says(
     unclear = ((at - at.floor() - 0.5).abs() < CLEAR).any(dim=1)
     at = given.path.box.to_grid(canonical, shape_of(moving.density))
     unclear |= ((at - at.floor() - 0.5).abs() < CLEAR).any(dim=1)
-    if moves:  # a point on the face of what moves jumps
+    if moves == "inside":  # a point on the face of what moves jumps
         at = given.motion_box.to_grid(points, shape_of(moving.displacement))
         last = torch.tensor(shape_of(moving.displacement)) - 1
         unclear |= torch.minimum(at.abs(), (at - last).abs()).amin(dim=1) < CLEAR
@@ -483,3 +483,10 @@ def test_points_are_occupied_where_the_definition_says(
         everywhere & clear,
     )
     assert everywhere.sum() > theirs.sum()
+
+
+def test_points_that_move_nowhere_are_not_occupied(rng: torch.Generator) -> None:
+    moving = medium(setting("world", 1, rng), rng)
+    moving.displacement.fill_(math.nan)
+    for occupied in (occupied_points, definition.occupied_points):
+        assert not occupied(moving, (5, 6, 7)).any()

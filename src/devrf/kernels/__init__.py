@@ -1,12 +1,12 @@
 """The hot operations as kernels that Warp compiles for the CPU and for CUDA: one source for both.
 
-Each module defines kernels, and one or two functions that launch them. Where Warp does not run
+Each module defines kernels, and the functions that launch them. Where Warp does not run
 (:func:`devrf.kernels.runtime.take`) these functions call their definition in :mod:`devrf.ops`,
 against which every kernel is tested.
 
 | module | functions |
 |---|---|
-| ``march`` | ``march``: samples of rays, warped and composited; ``rays_that_hit`` |
+| ``march`` | ``march``: samples, warped and composited; ``rays_that_hit``; ``occupied_points`` |
 | ``look_up`` | ``look_up``: values of a grid between its points |
 | ``adam`` | ``adam_step``, ``add_total_variation_gradient``: a step of the optimiser |
 | ``grid`` | what the kernels share: where grids are, and which cell a point is in |

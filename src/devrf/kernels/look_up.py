@@ -71,8 +71,9 @@ class _LookUp(torch.autograd.Function):
 def add_to_grid(grid: Tensor, points: Tensor, values: Tensor, box: Box, every: int = 1) -> None:
     """The adjoint of a look-up: add weight · ``values`` (M, C) to the corners around ``points``.
 
-    On a CPU in one thread, in the order of the points. Two threads, each with planes of its own,
-    took twice as long: a processor that guesses wrongly which they are fetches the other's memory.
+    On a GPU by atomic additions, on a CPU in one thread, in the order of the points. Two threads,
+    each with planes of its own, took twice as long: one that guesses wrongly whose plane it is
+    fetches memory that the other writes.
 
     Args:
         grid: (X, Y, Z, C), changed in place.
@@ -147,15 +148,14 @@ def add_kernel(channels: int) -> wp.Kernel:
         row, f = cell(grid, points[sample])
         next_y = grid.next_y
         next_z = grid.next_z
-        low = values[sample] * (1.0 - f[0])
-        high = values[sample] * f[0]
-        for _ in range(2):
-            wp.atomic_add(result, row, low * ((1.0 - f[1]) * (1.0 - f[2])))
-            wp.atomic_add(result, row + next_y, low * (f[1] * (1.0 - f[2])))
+        part = values[sample] * (1.0 - f[0])
+        for _ in range(2):  # the corners with the lower x, then those with the higher
+            wp.atomic_add(result, row, part * ((1.0 - f[1]) * (1.0 - f[2])))
+            wp.atomic_add(result, row + next_y, part * (f[1] * (1.0 - f[2])))
             if grid.z > 1:
-                wp.atomic_add(result, row + next_z, low * ((1.0 - f[1]) * f[2]))
-                wp.atomic_add(result, row + next_y + next_z, low * (f[1] * f[2]))
+                wp.atomic_add(result, row + next_z, part * ((1.0 - f[1]) * f[2]))
+                wp.atomic_add(result, row + next_y + next_z, part * (f[1] * f[2]))
             row += grid.next_x
-            low = high
+            part = values[sample] * f[0]
 
     return add_to_grid

@@ -333,7 +333,8 @@ class SampleGradients:
 class Ray:
     """One of ``RayArrays``; in ``samples_per_cell`` or more it moves by a cell of the occupancy.
 
-    In straight space its k-th sample is at ``place`` + k · ``pace`` among the occupancy's points.
+    In straight space its k-th sample is at ``place`` + k · ``pace`` among the occupancy's points;
+    in contracted space these mean nothing.
     """
 
     origin: wp.vec3
@@ -376,15 +377,15 @@ def ray_of(geometry: Geometry, rays: RayArrays, number: int):
     ray.count = int(rays.counts[number])
     ray.place = coordinates(geometry.occupancy, ray.origin + ray.direction * ray.entry)
     ray.pace = wp.cw_mul(ray.direction, geometry.occupancy.scale) * geometry.step
-    pace = wp.max(wp.abs(ray.pace))
+    cells = wp.max(wp.abs(ray.pace))
     if geometry.contracted == 1:
         slopes = wp.abs(wp.cw_div(ray.direction, geometry.half))
         fastest = ray.course[1]
-        pace = 2.0 * (slopes[0] + slopes[1] + slopes[2]) - fastest
-        pace = wp.max(pace, wp.max(wp.static(CONTRACTED_PACE), geometry.shell) * fastest)
-        pace *= wp.max(wp.cw_mul(geometry.half, geometry.occupancy.scale)) * geometry.step
+        cells = 2.0 * (slopes[0] + slopes[1] + slopes[2]) - fastest
+        cells = wp.max(cells, wp.max(wp.static(CONTRACTED_PACE), geometry.shell) * fastest)
+        cells *= wp.max(wp.cw_mul(geometry.half, geometry.occupancy.scale)) * geometry.step
     # A little less: positions are rounded.
-    ray.samples_per_cell = 0.999 / wp.max(pace, 1.0e-9)
+    ray.samples_per_cell = 0.999 / wp.max(cells, 1.0e-9)
     return ray
 
 
@@ -445,7 +446,7 @@ def opacity(tau: float):
 
 @made_once
 def march_kernel(contracted: bool) -> wp.Kernel:
-    """The march in straight or in contracted space, which alone would take a third longer."""
+    """The march in straight or in contracted space; one for both takes a third longer."""
     place = contracted_place if contracted else straight_place
 
     @wp.kernel(module="unique", enable_backward=False)

@@ -2,7 +2,8 @@
 
 NVIDIA Warp compiles a kernel's Python source when it is first launched, and keeps the result on
 disk, in ``WARP_CACHE_PATH`` or the user's cache folder. A kernel has a thread for each ray, sample
-or voxel. On a CPU Warp runs these one after another; so each of torch's threads takes a part.
+or voxel. On a CPU Warp runs these one after another; so each of torch's threads takes a part,
+but of what is added to grids.
 """
 
 from __future__ import annotations
@@ -68,13 +69,28 @@ def launch(
 ) -> None:
     """Run ``kernel(first, *inputs)`` with ``count`` threads, of which thread k is ``first`` + k.
 
-    No two threads of such a kernel write to the same place. On a CPU a part has ``grain`` threads
-    or more.
+    On a CPU in parts of ``grain`` threads or more side by side, of which this thread runs the
+    first; no two threads of a kernel that has several parts may write to the same place. The inputs
+    are made ready once, in this thread, so that the others begin at once.
     """
     parts = _parts(device, count, grain)
     edges = [count * part // parts for part in range(parts + 1)]
-    counts = [stop - first for first, stop in pairwise(edges)]
-    _launch(kernel, counts, [[first] for first in edges[:-1]], inputs, device)
+    commands = _commands(kernel, parts, [0, *inputs], device)
+    begin, *others = commands
+    for index, value in enumerate(inputs, 1):
+        begin.set_param_at_index(index, value)
+    for other in others:
+        other.params[2:] = begin.params[2:]
+    for command, (first, stop) in zip(commands, pairwise(edges), strict=True):
+        command.set_param_at_index(0, first)
+        command.set_dim(stop - first)
+    running = [_pool().submit(other.launch) for other in others]
+    if device.type == "cuda":
+        begin.launch(wp.stream_from_torch(torch.cuda.current_stream(device)))
+    else:
+        begin.launch()
+    for other in running:
+        other.result()
 
 
 def array(tensor: Tensor, kind: Any = None) -> wp.array:
@@ -102,7 +118,7 @@ def room(kind: Any, count: int, device: torch.device) -> wp.array:
 
 
 def made_once(factory: Callable[[int], wp.Kernel]) -> Callable[[int], wp.Kernel]:
-    """The kernels of a ``factory``, each made when it is first asked for."""
+    """The kernels of a ``factory``, for a number of channels or a space, each made once."""
     made: dict[int, wp.Kernel] = {}
 
     @wraps(factory)
@@ -122,37 +138,6 @@ def row_type(channels: int) -> Any:
     if channels == 1:
         return wp.float32
     return wp.vec3 if channels == 3 else wp.types.vector(length=channels, dtype=wp.float32)
-
-
-def _launch(
-    kernel: wp.Kernel,
-    counts: Sequence[int],
-    places: Sequence[Sequence[int]],
-    inputs: Sequence[Any],
-    device: torch.device,
-) -> None:
-    """Launch ``kernel(*place, *inputs)`` for each part side by side, the first in this thread.
-
-    The inputs are made ready once, in this thread, so that the others begin at once.
-    """
-    commands = _commands(kernel, len(counts), [*places[0], *inputs], device)
-    first, *others = commands
-    begin = len(places[0])
-    for index, value in enumerate(inputs, begin):
-        first.set_param_at_index(index, value)
-    for other in others:
-        other.params[1 + begin :] = first.params[1 + begin :]
-    for command, count, place in zip(commands, counts, places, strict=True):
-        for index, value in enumerate(place):
-            command.set_param_at_index(index, value)
-        command.set_dim(count)
-    running = [_pool().submit(other.launch) for other in others]
-    if device.type == "cuda":
-        first.launch(wp.stream_from_torch(torch.cuda.current_stream(device)))
-    else:
-        first.launch()
-    for other in running:
-        other.result()
 
 
 def _commands(

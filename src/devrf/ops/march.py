@@ -164,17 +164,20 @@ def occupied_points(medium: Medium, shape: Shape) -> Tensor:
 
     Args:
         medium: where something is at rest, and what moves points there.
-        shape: of the grid, over the box of the densities.
+        shape: of the grid, over the box of the densities; two points or more along each axis.
     """
     box, density = medium.path.box, medium.density
     canonical = warped(box.grid_points(shape, density).view(-1, 3), medium)
     occupied = medium.path.surroundings.at(canonical) == 0
+    near = occupied.nonzero()[:, 0]
+    canonical = canonical[near]
     low, high = box.corners(canonical)
     place = box.to_grid(canonical.clamp(low, high), shape_of(density))
-    x, y, z = (place - 0.5).ceil().long().unbind(1)
+    x, y, z = (place - 0.5).ceil().long().unbind(1)  # half way the lower point
     raw = torch.maximum(look_up(density, canonical, box), density[x, y, z])[:, 0]
     opacity = -torch.expm1(-softplus(raw + medium.shift) * medium.delta)
-    return (occupied & (opacity >= medium.threshold)).view(shape)
+    occupied[near] = opacity >= medium.threshold
+    return occupied.view(shape)
 
 
 def samples_in_box(rays: Rays, path: Path) -> tuple[Tensor, Tensor, Tensor]:

@@ -21,7 +21,8 @@ from devrf.rendering.output import ColorChange, RenderedImage
 from devrf.rendering.sampling import RenderSettings
 
 # Rays at once: on a CPU so many that what a chunk costs by itself, 0.8 ms, is little (in unbounded
-# scenes a ray has tens of samples to colour), on a GPU what keeps it busy and fits.
+# scenes a ray has tens of samples to colour), and no more than whose samples fit 32 MB, beyond
+# which memory is mapped anew (docs/notebook/costs.md#tiles); on a GPU what keeps it busy and fits.
 ON_CPU = 2**14
 UNBOUNDED_ON_CPU = 4096
 ON_GPU = 2**15
