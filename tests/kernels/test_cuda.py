@@ -60,8 +60,9 @@ def test_all_are_found() -> None:
     names = {f"look_up.{one}_{n}" for one in look_ups for n in CHANNELS}
     steps = ("adam_kernel", "total_variation_kernel")
     names |= {f"adam.{one}_{n}" for one in steps for n in CHANNELS}
-    names |= {f"march.{one}_{n}" for one in ("march_kernel", "hit_kernel") for n in SPACES}
-    names |= {"march.adjoint_kernel", "march.keep_significant_kernel"}
+    names |= {f"march.march_kernel_{n}" for n in SPACES}
+    names |= {"march.adjoint_kernel", "march.rays_that_hit_kernel"}
+    names |= {"march.keep_significant_kernel"}
     names |= {"march.occupied_points_kernel"}
     assert set(every_kernel()) == names
 

@@ -103,8 +103,8 @@ def everything(given: tuple[Rays, Medium], points: Tensor, grid: Tensor) -> list
     samples = march(rays, medium)
     looked_up = look_up(grid, points, BOX)
     hits = rays_that_hit(rays, medium.path)
-    points = occupied_points(medium, POINTS)
-    return [*vars(samples).values(), hits, points, looked_up, *optimised(grid)]
+    occupied = occupied_points(medium, POINTS)
+    return [*vars(samples).values(), hits, occupied, looked_up, *optimised(grid)]
 
 
 def optimised(grid: Tensor) -> list[Tensor]:

@@ -83,8 +83,7 @@ def add_to_grid(grid: Tensor, points: Tensor, values: Tensor, box: Box, every: i
         every: as of a look-up.
     """
     inputs = [grid_over(box, shape_of(grid), every), array(points), array(values), array(grid)]
-    kernel = add_kernel(grid.shape[-1])
-    launch(kernel, len(points), inputs, points.device, grain=max(len(points), 1))
+    launch(add_kernel(grid.shape[-1]), len(points), inputs, points.device, grain=None)
 
 
 @made_once

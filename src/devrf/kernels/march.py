@@ -50,8 +50,7 @@ def rays_that_hit(rays: Rays, path: Path) -> Tensor:
         return definition.rays_that_hit(rays, path)
     hits = torch.empty(len(rays), dtype=torch.uint8, device=rays.origins.device)
     inputs = [_geometry(path, rays), _arrays(rays, path)[0], _distances(path), array(hits)]
-    kernel = hit_kernel(isinstance(rays, ContractedRays))
-    launch(kernel, len(rays), inputs, hits.device)
+    launch(rays_that_hit_kernel, len(rays), inputs, hits.device)
     return hits.bool()
 
 
@@ -63,12 +62,9 @@ def occupied_points(medium: Medium, shape: Shape) -> Tensor:
     device, path = medium.density.device, medium.path
     geometry = _geometry(path)
     _add_field(geometry, medium)
-    density = array(medium.density.contiguous())
-    still = torch.empty(0, 3, device=device)
-    moves = array(still if medium.displacement is None else medium.displacement.contiguous())
     found = torch.empty(shape, dtype=torch.uint8, device=device)
-    points = grid_over(path.box, shape)
-    inputs = [points, geometry, _distances(path), density, moves, array(found.view(-1))]
+    inputs = [grid_over(path.box, shape), geometry, _distances(path)]
+    inputs += [array(medium.density.contiguous()), _displacements(medium), array(found.view(-1))]
     launch(occupied_points_kernel, found.numel(), inputs, device)
     return found.bool()
 
@@ -98,10 +94,8 @@ class _March(torch.autograd.Function):
         visible.start = array(start)
         visible.count = array(visible_count)
         visible.samples = room(VisibleSample, length, device)
-        # Without displacements an array that is not read stands in for them.
-        moves = lines.origins if displacement is None else array(displacement.contiguous())
-        inputs = [geometry, lines, distances, array(density.contiguous()), moves, visible]
-        inputs += [array(significant_count), array(transmittance)]
+        inputs = [geometry, lines, distances, array(density.contiguous()), _displacements(medium)]
+        inputs += [visible, array(significant_count), array(transmittance)]
         kernel = march_kernel(isinstance(rays, ContractedRays))
         launch(kernel, len(rays), inputs, device, grain=GRAIN_OF_RAYS)
 
@@ -186,6 +180,12 @@ def _arrays(rays: Rays, path: Path) -> tuple[RayArrays, Tensor]:
 
 def _distances(path: Path) -> wp.array:
     return array(path.surroundings.distances.flatten())
+
+
+def _displacements(medium: Medium) -> wp.array:
+    """Where there are none, an array that is not read."""
+    moves = medium.displacement
+    return array(medium.density.new_empty(0, 3) if moves is None else moves.contiguous())
 
 
 def _geometry(path: Path, rays: Rays | None = None) -> Geometry:
@@ -390,16 +390,16 @@ def ray_of(geometry: Geometry, rays: RayArrays, number: int):
 
 
 @wp.func
-def straight_place(geometry: Geometry, ray: Ray, k: int):
+def place_of(geometry: Geometry, ray: Ray, k: int):
     """Where a ray's k-th sample is among the occupancy's grid points."""
-    return ray.place + ray.pace * float(k)
+    point = position(geometry, ray, ray.entry + float(k) * geometry.step)
+    return coordinates(geometry.occupancy, point)
 
 
 @wp.func
-def contracted_place(geometry: Geometry, ray: Ray, k: int):
-    """The same in contracted space."""
-    point = position(geometry, ray, ray.entry + float(k) * geometry.step)
-    return coordinates(geometry.occupancy, point)
+def straight_place(geometry: Geometry, ray: Ray, k: int):
+    """The same in straight space, by one multiplication."""
+    return ray.place + ray.pace * float(k)
 
 
 @wp.func
@@ -447,7 +447,7 @@ def opacity(tau: float):
 @made_once
 def march_kernel(contracted: bool) -> wp.Kernel:
     """The march in straight or in contracted space; one for both takes a third longer."""
-    place = contracted_place if contracted else straight_place
+    place = place_of if contracted else straight_place
 
     @wp.kernel(module="unique", enable_backward=False)
     def march(
@@ -582,32 +582,25 @@ def adjoint_kernel(
             result.moved[into] = of_canonical
 
 
-@made_once
-def hit_kernel(contracted: bool) -> wp.Kernel:
-    """Which rays hit, in straight or in contracted space."""
-    place = contracted_place if contracted else straight_place
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def find_hits(
-        first: int,
-        geometry: Geometry,
-        rays: RayArrays,
-        distances: wp.array(dtype=wp.uint8),
-        hits: wp.array(dtype=wp.uint8),
-    ):
-        """Whether each ray has a sample within so many cells of an occupied one."""
-        number = first + wp.tid()
-        ray = ray_of(geometry, rays, number)
-        hits[number] = wp.uint8(0)
-        k = int(0)
-        while k < ray.count:
-            cells = clearance(geometry.occupancy, distances, place(geometry, ray, k))
-            if cells <= wp.static(HIT_CELLS):
-                hits[number] = wp.uint8(1)
-                k = ray.count
-            k += int(float(wp.max(cells - wp.static(HIT_CELLS + 1), 0)) * ray.samples_per_cell) + 1
-
-    return find_hits
+@wp.kernel(module="unique", enable_backward=False)
+def rays_that_hit_kernel(
+    first: int,
+    geometry: Geometry,
+    rays: RayArrays,
+    distances: wp.array(dtype=wp.uint8),
+    hits: wp.array(dtype=wp.uint8),
+):
+    """Whether each ray has a sample within so many cells of an occupied one."""
+    number = first + wp.tid()
+    ray = ray_of(geometry, rays, number)
+    hits[number] = wp.uint8(0)
+    k = int(0)
+    while k < ray.count:
+        cells = clearance(geometry.occupancy, distances, place_of(geometry, ray, k))
+        if cells <= wp.static(HIT_CELLS):
+            hits[number] = wp.uint8(1)
+            k = ray.count
+        k += int(float(wp.max(cells - wp.static(HIT_CELLS + 1), 0)) * ray.samples_per_cell) + 1
 
 
 @wp.kernel(module="unique", enable_backward=False)

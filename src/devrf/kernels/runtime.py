@@ -65,13 +65,13 @@ def launch(
     count: int,
     inputs: Sequence[Any],
     device: torch.device,
-    grain: int = GRAIN,
+    grain: int | None = GRAIN,
 ) -> None:
     """Run ``kernel(first, *inputs)`` with ``count`` threads, of which thread k is ``first`` + k.
 
     On a CPU in parts of ``grain`` threads or more side by side, of which this thread runs the
-    first; no two threads of a kernel that has several parts may write to the same place. The inputs
-    are made ready once, in this thread, so that the others begin at once.
+    first; None: in one part, else no two threads may write to the same place. The inputs are made
+    ready once, in this thread, so that the others begin at once.
     """
     parts = _parts(device, count, grain)
     edges = [count * part // parts for part in range(parts + 1)]
@@ -157,9 +157,9 @@ def _commands(
     return commands[:parts]
 
 
-def _parts(device: torch.device, count: int, grain: int) -> int:
+def _parts(device: torch.device, count: int, grain: int | None) -> int:
     """Into how many parts a launch of ``count`` threads is divided."""
-    if device.type != "cpu":
+    if device.type != "cpu" or grain is None:
         return 1
     return max(min(torch.get_num_threads(), count // grain), 1)
 

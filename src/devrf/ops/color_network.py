@@ -110,17 +110,10 @@ def _logits(x: Tensor, network: ColorNetwork) -> Tensor:
             x.to_mkldnn(), network.hidden_weight.to_mkldnn(), network.hidden_bias.to_mkldnn()
         )
         return linear(hidden.relu_(), weight.to_mkldnn(), bias.to_mkldnn()).to_dense()
-    x = _linear(x, network.hidden_weight, network.hidden_bias, x.dtype).relu_()
+    x = linear(x, network.hidden_weight.to(x.dtype), network.hidden_bias.to(x.dtype)).relu_()
     return linear(x.to(weight.dtype), weight, bias)
 
 
 def _encode(viewdirs: Tensor, octaves: Tensor) -> Tensor:
     angles = (viewdirs[:, None, :] * octaves[:, None]).flatten(1)
     return torch.cat([viewdirs, angles.sin(), angles.cos()], dim=-1)
-
-
-def _linear(x: Tensor, weight: Tensor, bias: Tensor, precision: torch.dtype) -> Tensor:
-    """A layer of ``x`` (S, C), computed in ``precision``; float32 leaves it its own."""
-    if precision == torch.float32:
-        return linear(x, weight, bias)
-    return linear(x.to(precision), weight.to(precision), bias.to(precision))

@@ -92,8 +92,8 @@ def sum_of(values: Sequence[Tensor]) -> Tensor:
 
 def _step(values: Tensor, axis: int) -> Tensor:
     """The mean squared difference of neighbours along an axis; 0 where it has none."""
-    count = max(values.shape[axis] - 1, 0)
-    if count == 0:
-        return values.sum() * 0.0
+    count = values.shape[axis] - 1
+    if count < 1:
+        return values.new_zeros(())
     # One operation and its gradient, in place of those of differences, squares and a mean.
     return mse_loss(values.narrow(axis, 1, count), values.narrow(axis, 0, count))
