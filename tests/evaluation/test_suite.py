@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 import torch
 
 from devrf.errors import DevrfError
-from devrf.evaluation.held_out import score
+from devrf.evaluation.held_out import score, score_all
 from devrf.evaluation.suite import MEASURES, Evaluation, flow_error
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
@@ -118,6 +119,16 @@ def test_every_metric_of_a_learned_scene(learned, tiny_scene, alex):
     assert flow is not None and 0 < flow < 20
     # 24×18 pixels: too few for five scales, and for the network.
     assert view.further["ms_ssim"] is None and view.further["lpips"] is None
+
+
+def test_scores_at_rest_serve_the_same_views_in_motion(moving, tiny_scene) -> None:
+    held_out = tiny_scene.dynamic.test
+    scored = partial(score_all, moving, held_out, "white", None, "held-out images")
+    at_rest = scored(time=0.0)
+    known = [view.scores for view in scored(at_rest=at_rest)]
+    assert known == [view.scores for view in scored()]
+    assert [view["rest_pose_psnr"] for view in known] == [view.psnr for view in at_rest]
+    assert any(view["psnr"] != view["rest_pose_psnr"] for view in known)
 
 
 @pytest.mark.parametrize(

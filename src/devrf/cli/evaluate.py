@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 
 from devrf.apps.records import (
@@ -52,7 +53,10 @@ def evaluate(run: RunContext) -> list[Path]:
     rest = next((step.name for step in run.protocol.steps if step.capture == "static"), None)
     frames: dict[str, list[HeldOutView]] = {"static": _score(run, model, "static", suite)}
     if model.moves and metadata.stage != rest:
-        frames["dynamic"] = _score(run, model, "dynamic", suite)
+        # A film without a static set has the same images in both captures.
+        shared = scene.dynamic.test is scene.static.test
+        at_rest = frames["static"] if shared else ()
+        frames["dynamic"] = _score(run, model, "dynamic", suite, at_rest)
     size = round(run.checkpoint(metadata.stage).stat().st_size / 1e6, 3)
     sections = scores_by_section(frames, scene.clock, metadata, rest, size)
     if run.datamodule.validation and {*frames} == {*scene.captures}:
@@ -65,7 +69,7 @@ def evaluate(run: RunContext) -> list[Path]:
     write_frames(run.folder / "frames.csv", frames)
     protocol = metadata.protocol or run.protocol.name
     head = {"scene": scene.name, "method": model.name, "protocol": protocol}
-    at_rest = {} if scene.moves else {"at_rest": True}
+    without_motion = {} if scene.moves else {"at_rest": True}
     ran = {
         **provenance(model.size, run.device),
         "choices": choices(),
@@ -79,7 +83,7 @@ def evaluate(run: RunContext) -> list[Path]:
     ran["wall_seconds"]["evaluate"] = run.step_seconds
     # A report takes metrics.json for what a finished run has reached.
     metrics = "metrics.json" if standing is None else "metrics-unfinished.json"
-    write_json(run.folder / metrics, {**head, **at_rest, **sections, "run": ran})
+    write_json(run.folder / metrics, {**head, **without_motion, **sections, "run": ran})
     shown = shown_sections(sections)
     for name, values in shown.items():
         log.info("%s: %s", name.replace("_", " "), in_words(values))
@@ -92,14 +96,21 @@ def evaluate(run: RunContext) -> list[Path]:
 
 
 def _score(
-    run: RunContext, model: Renderable, capture: CaptureName, suite: MetricSuite
+    run: RunContext,
+    model: Renderable,
+    capture: CaptureName,
+    suite: MetricSuite,
+    at_rest: Sequence[HeldOutView] = (),
 ) -> list[HeldOutView]:
-    """Score a capture's held-out views; the static ones show the rest state at any time."""
+    """Score a capture's held-out views; the static ones show the rest state at any time.
+
+    ``at_rest``: scores of the same images at rest, where there are any.
+    """
     views = run.scene.capture(capture).test
     background = run.scene.background
     name = f"held-out images, {capture}"
     time = 0.0 if capture == "static" else None
-    scored = score_all(model, views, background, suite, name, time=time)
+    scored = score_all(model, views, background, suite, name, time=time, at_rest=at_rest)
     sheet = write_contact_sheet(run.folder / "images" / f"{capture}.png", scored)
     for tracker in run.trackers:
         tracker.show_image(f"held_out/{capture}", sheet)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -58,6 +59,7 @@ def score(
     suite: MetricSuite | None = None,
     *,
     time: float | None = None,
+    rest_pose_psnr: float | None = None,
 ) -> HeldOutView:
     """Render image ``index`` of held-out ``views`` and compare it with the truth.
 
@@ -66,7 +68,8 @@ def score(
     given the image's own exposure, where a part of it is there to tell that.
 
     ``views`` are on the host. ``suite`` has metrics beside PSNR and SSIM. ``time`` in [0, 1] is
-    rendered; None: the image's own.
+    rendered; None: the image's own. ``rest_pose_psnr`` is that of the image where it is known
+    already; None: the scene at rest is rendered, too.
     """
     own_time = float(views.times[index])
     time = own_time if time is None else time
@@ -74,13 +77,15 @@ def score(
     behind = background_value(background)
     rendered = renderer.view(views.cameras, index, time, behind)
     prediction = exposed(_image(rendered, views), truth, views, index)
-    rest = prediction
-    if not renderer.at(time).at_rest:
-        at_rest = _image(renderer.view(views.cameras, index, 0.0, behind), views)
-        rest = exposed(at_rest, truth, views, index)
     valid_mask = views.valid_mask_of(index)
     compared = compare(prediction, truth, valid_mask)
-    rest = compare(rest, truth, valid_mask)
+    psnr = _psnr(compared, truth, valid_mask)
+    if rest_pose_psnr is None:
+        rest_pose_psnr = psnr
+        if not renderer.at(time).at_rest:
+            rest = _image(renderer.view(views.cameras, index, 0.0, behind), views)
+            rest = compare(exposed(rest, truth, views, index), truth, valid_mask)
+            rest_pose_psnr = _psnr(rest, truth, valid_mask)
     further: dict[str, float | None] = {}
     opacity = rendered.opacity.cpu().view(truth.shape[:2])
     if suite is not None and suite.metrics:
@@ -95,9 +100,9 @@ def score(
         time=own_time,
         truth=truth,
         prediction=prediction,
-        psnr=_psnr(compared, truth, valid_mask),
+        psnr=psnr,
         ssim=_ssim(compared, truth, valid_mask),
-        rest_pose_psnr=_psnr(rest, truth, valid_mask),
+        rest_pose_psnr=rest_pose_psnr,
         further=further,
         compared=compared,
         depth=rendered.depth.cpu().view(truth.shape[:2]),
@@ -113,12 +118,20 @@ def score_all(
     name: str,
     *,
     time: float | None = None,
+    at_rest: Sequence[HeldOutView] = (),
 ) -> list[HeldOutView]:
-    """:func:`score` of each of the held-out ``views``; progress is shown under ``name``."""
+    """:func:`score` of each of the held-out ``views``; progress is shown under ``name``.
+
+    ``at_rest`` has the same views of the scene at rest where they were scored before.
+    """
     renderer = Renderer(model)
-    count = len(views)
-    scored = (score(renderer, views, k, background, suite, time=time) for k in range(count))
-    return list(followed(scored, count, name))
+
+    def scored() -> Iterator[HeldOutView]:
+        for index in range(len(views)):
+            known = at_rest[index].psnr if at_rest else None
+            yield score(renderer, views, index, background, suite, time=time, rest_pose_psnr=known)
+
+    return list(followed(scored(), len(views), name))
 
 
 def compare(prediction: Tensor, truth: Tensor, valid_mask: Tensor | None) -> Tensor:
