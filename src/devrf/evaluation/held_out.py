@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -125,13 +125,12 @@ def score_all(
     ``at_rest`` has the same views of the scene at rest where they were scored before.
     """
     renderer = Renderer(model)
-
-    def scored() -> Iterator[HeldOutView]:
-        for index in range(len(views)):
-            known = at_rest[index].psnr if at_rest else None
-            yield score(renderer, views, index, background, suite, time=time, rest_pose_psnr=known)
-
-    return list(followed(scored(), len(views), name))
+    known: Sequence[float | None] = [view.psnr for view in at_rest] or [None] * len(views)
+    scored = (
+        score(renderer, views, index, background, suite, time=time, rest_pose_psnr=rest_pose_psnr)
+        for index, rest_pose_psnr in enumerate(known)
+    )
+    return list(followed(scored, len(views), name))
 
 
 def compare(prediction: Tensor, truth: Tensor, valid_mask: Tensor | None) -> Tensor:
