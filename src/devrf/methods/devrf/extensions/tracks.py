@@ -33,7 +33,7 @@ LIKENESS = 0.15
 FARTHEST = 16
 # Tracks of a frame at most, chosen at random, and optimiser steps of a fit to them.
 MOST_TRACKS = 4096
-FIT_STEPS = 60
+FIT_STEPS = 40
 # Weight of differences between neighbouring voxels' changes in a fit.
 SMOOTHNESS = 0.01
 
@@ -259,36 +259,43 @@ def start_from_tracks(
         tracks = tracks[field.box.contains(tracks.canonical)]
     if len(tracks) == 0:
         return
-    scale = _pixels_per_unit(tracks, cameras, space, 1e-3 * field.box.longest)
     backward = field.frames.here.new_empty(*field.shape, 3)
-    forward = field.frames.here.new_empty(*field.shape, 3)
+    forward = torch.empty_like(backward)
     field.frames.read(frame, (backward, forward))
+    before = tracks.canonical + look_up(forward, tracks.canonical, field.box)
+    missed, slopes = _misses(tracks, before, cameras, space, 1e-3 * field.box.longest)
+    # Pixels to a unit of length, along the axis that moves pixels most.
+    scale = float(slopes.norm(dim=1).mean(dim=0).amax())
 
     def misses(change: Tensor) -> Tensor:
-        points = tracks.canonical + look_up(forward + change, tracks.canonical, field.box)
-        pixel, _ = cameras.project(tracks.camera, space.to_world(points))
-        return pixel - tracks.pixel
+        moved = look_up(change, tracks.canonical, field.box)
+        return missed + (slopes * moved[:, None]).sum(dim=-1)
 
     forward += _fit(misses, forward, scale, steps)
     arrived = tracks.canonical + look_up(forward, tracks.canonical, field.box)
+    lost = arrived + look_up(backward, arrived, field.box) - tracks.canonical
 
     def errs(change: Tensor) -> Tensor:
-        returned = arrived + look_up(backward + change, arrived, field.box)
-        return (returned - tracks.canonical) * scale
+        return (lost + look_up(change, arrived, field.box)) * scale
 
     backward += _fit(errs, backward, scale, steps)
     field.frames.write(frame, (backward, forward))
 
 
-def _pixels_per_unit(tracks: Tracks, cameras: Cameras, space: Space, small: float) -> float:
-    """By how many pixels the tracked points move in their images for a unit of ``space``."""
-    first, _ = cameras.project(tracks.camera, space.to_world(tracks.canonical))
-    moves = []
-    for axis in torch.eye(3).to(first):
-        there = space.to_world(tracks.canonical + small * axis)
+def _misses(
+    tracks: Tracks, points: Tensor, cameras: Cameras, space: Space, small: float
+) -> tuple[Tensor, Tensor]:
+    """By how many pixels (N, 2) ``points`` (N, 3) miss those of N tracks, and its slopes (N, 2, 3).
+
+    Slopes are for a unit of ``space`` along each axis, by differences over ``small``.
+    """
+    seen, _ = cameras.project(tracks.camera, space.to_world(points))
+    slopes = []
+    for axis in torch.eye(3).to(points):
+        there = space.to_world(points + small * axis)
         moved, _ = cameras.project(tracks.camera, there)
-        moves.append((moved - first).norm(dim=1).mean() / small)
-    return float(torch.stack(moves).amax())
+        slopes.append((moved - seen) / small)
+    return seen - tracks.pixel, torch.stack(slopes, dim=-1)
 
 
 @torch.enable_grad()
@@ -299,10 +306,10 @@ def _fit(residual: Callable[[Tensor], Tensor], like: Tensor, scale: float, steps
         residual: change → residuals (N, 2 or 3) in pixels.
         like: a grid of the shape and device wanted.
         scale: pixels per unit of the grid's values.
-        steps: Adam steps; the rate falls linearly from half a pixel a step.
+        steps: Adam steps; the rate falls linearly from three quarters of a pixel a step.
     """
     change = torch.zeros_like(like).requires_grad_()
-    fastest = 0.5 / scale
+    fastest = 0.75 / scale
     optimizer = GridAdam([change], lr=fastest, betas=(0.9, 0.999))
     for number in range(steps):
         optimizer.param_groups[0]["lr"] = fastest * (1 - number / steps)
