@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import combinations
 from typing import Any
 
 import pytest
 import torch
 from scipy.special import sph_harm_y
+from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
@@ -22,7 +24,7 @@ from devrf.methods.kplanes.decoders import (
     spherical_harmonics,
 )
 from devrf.methods.kplanes.model import KPlanes
-from devrf.methods.kplanes.planes import AXES, SixPlanes
+from devrf.methods.kplanes.planes import SPACE, TIME, SixPlanes
 from devrf.methods.kplanes.proposals import drawn_edges, histogram_error, intervals
 from devrf.methods.kplanes.settings import KPlanesSettings
 from devrf.methods.protocol import ProtocolStage
@@ -42,12 +44,17 @@ FORMS: list[Any] = [
 ]  # fmt: skip
 
 
+def plane_of(planes: SixPlanes, axes: tuple[int, int]) -> Tensor:
+    """The plane (A, B, 1, C) of two axes, at the first scale; a view."""
+    grids, order = (planes.space, SPACE) if axes in SPACE else (planes.time, TIME)
+    return grids[0].detach().unflatten(0, (3, -1))[order.index(axes)]
+
+
 def numbered(pairing: Any) -> SixPlanes:
     """Planes of 2, 3, 5, 7, 11 and 13 everywhere."""
     planes = SixPlanes(1, [2], 2, pairing=pairing)
-    with torch.no_grad():
-        for plane, value in zip(planes.planes, (2, 3, 5, 7, 11, 13), strict=True):
-            plane.fill_(value)
+    for axes, value in zip(combinations(range(4), 2), (2, 3, 5, 7, 11, 13), strict=True):
+        plane_of(planes, axes).fill_(value)
     return planes
 
 
@@ -58,37 +65,36 @@ def test_features_are_multiplied_over_planes_or_paired_as_hexplane_has_them() ->
     assert numbered("hexplane")(somewhere).tolist() == [[2 * 13, 3 * 11, 7 * 5]]
 
 
-def test_a_plane_is_looked_up_along_its_own_two_axes() -> None:
+@pytest.mark.parametrize("axes", [*combinations(range(4), 2)])
+def test_a_plane_is_looked_up_along_its_own_two_axes_up_to_its_border(
+    axes: tuple[int, int],
+) -> None:
     planes = SixPlanes(1, [3], 5)
-    points = torch.tensor([[-1.0, -0.5, 0.25, 0.5]])
-    for number, (first, second) in enumerate(AXES):
-        with torch.no_grad():
-            for plane in planes.planes:
-                plane.fill_(1)
-            across = torch.linspace(-1, 1, planes.planes[number].shape[0])
-            along = torch.linspace(-1, 1, planes.planes[number].shape[1])
-            planes.planes[number][:, :, 0, 0] = across[:, None] + 10 * along
-        expected = points[:, first] + 10 * points[:, second]
-        torch.testing.assert_close(planes(points)[:, 0], expected)
+    for every in combinations(range(4), 2):
+        plane_of(planes, every).fill_(1)
+    plane = plane_of(planes, axes)
+    across, along = (torch.linspace(-1, 1, points) for points in plane.shape[:2])
+    plane[:, :, 0, 0] = across[:, None] + 10 * along
+    points = torch.tensor([[-1.0, -0.5, 0.25, 0.5], [1.0] * 4, [-3.0, 3.0, 2.0, -2.0]])
+    places = points[:, axes].clamp(-1, 1)
+    torch.testing.assert_close(planes(points)[:, 0], places[:, 0] + 10 * places[:, 1])
 
 
 def test_scales_are_joined_and_time_has_the_same_points_in_each() -> None:
     planes = SixPlanes(4, [6, 12], 3)
     assert planes.size == 8 and planes(torch.rand(5, 4)).shape == (5, 8)
-    assert [tuple(p.shape[:2]) for p in planes.along(time=True)] == [(6, 3)] * 3 + [(12, 3)] * 3
-    assert all((plane == 1).all() for plane in planes.along(time=True))
-    still = torch.cat([plane.flatten() for plane in planes.along(time=False)])
+    assert [tuple(grid.shape[:2]) for grid in planes.time] == [(18, 3), (36, 3)]
+    assert all((grid == 1).all() for grid in planes.time)
+    still = torch.cat([grid.flatten() for grid in planes.space])
     assert 0.1 <= still.min() and still.max() <= 0.5
 
 
 def test_terms_of_planes_by_hand() -> None:
     planes = SixPlanes(1, [2], 3)
-    with torch.no_grad():
-        for plane in planes.planes:
-            plane.fill_(1)
+    for axes in combinations(range(4), 2):
+        plane_of(planes, axes).fill_(1)
     assert planes.total_variation() == planes.roughness() == planes.change() == 0
-    with torch.no_grad():
-        planes.planes[2][0, :, 0, 0] = torch.tensor([1.0, 2.0, 1.0])  # xt
+    plane_of(planes, (0, 3))[0, :, 0, 0] = torch.tensor([1.0, 2.0, 1.0])
     # Along x: (0, 1, 0) squared, a third; along t: 1 and 1 of 4 differences, a half; twice both.
     assert planes.total_variation().item() == pytest.approx(2 * (1 / 3 + 1 / 2))
     assert planes.roughness().item() == pytest.approx((1 - 2 * 2 + 1) ** 2 / 2)
@@ -194,7 +200,7 @@ def test_proposals_learn_ever_less_often_and_sharpen() -> None:
 def test_time_has_half_as_many_points_as_frames() -> None:
     model = KPlanes(TINY)
     model.set_times(tuple(k / 49 for k in range(50)))
-    assert {plane.shape[1] for plane in model.planes.along(time=True)} == {25}
+    assert {plane.shape[1] for plane in model.planes.time} == {25}
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -226,7 +232,7 @@ def test_two_stages_leave_what_space_says_as_it_was(
     before = {n: p.clone() for n, p in first.scene_model.named_parameters()}
     second = fit(ray_stage(KPlanes(TINY), step, loss=LOSS, rest=first.result()))
     model = second.scene_model
-    moving = {id(plane) for plane in model.planes.along(time=True)}  # type: ignore[union-attr]
+    moving = {id(grid) for grid in model.planes.time}  # type: ignore[union-attr]
     for name, parameter in model.named_parameters():
         assert torch.equal(parameter, before[name]) == (id(parameter) not in moving), name
 

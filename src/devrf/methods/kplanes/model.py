@@ -170,7 +170,7 @@ class KPlanes(SurfacedField):
     def parts(self) -> dict[str, Iterable[nn.Parameter]]:
         """What space alone says, with the decoder; what time says; the proposals."""
         return {
-            "canonical": [*self.planes.along(time=False), *self.decoder.parameters()],
-            "motion": self.planes.along(time=True),
+            "canonical": [*self.planes.space, *self.decoder.parameters()],
+            "motion": self.planes.time,
             "proposals": self.proposals.parameters(),
         }

@@ -3,33 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import combinations
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import mse_loss
 
-from devrf.geometry.box import Box
+from devrf.geometry.box import Box, constant
 from devrf.kernels.look_up import look_up
 from devrf.methods.kplanes.settings import Pairing
 
-# Axes of the planes: xy, xz, xt, yz, yt, zt.
-AXES = tuple(combinations(range(4), 2))
-TIME = 3
-# HexPlane's pairs: xy with zt, xz with yt, yz with xt.
-PAIRS = ((0, 5), (1, 4), (3, 2))
-# Space and time are [−1, 1]⁴.
-UNIT = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+# Axes of the planes of space: xy, xz, yz.
+SPACE = ((0, 1), (0, 2), (1, 2))
+# Of the planes with time: zt, yt, xt. Each is paired, as HexPlane has it, with the one of space
+# that does not have its axis.
+TIME = ((2, 3), (1, 3), (0, 3))
 
 
 class SixPlanes(nn.Module):
     """f(x, y, z, t): bilinear values of six planes, multiplied, and joined over scales.
 
-    See docs/methods/kplanes.md#planes.
+    See docs/methods/kplanes.md#planes. Planes of a scale lie one behind another along the first
+    axis of one grid, so that one look-up serves three.
 
     Attributes:
-        planes: for each scale six grids (A, B, 1, C), A and B being points along the axes of
-            :data:`AXES`; those of space begin uniform in a range, those with time at 1.
+        space: for each scale a grid (3N, N, 1, C) of the planes of :data:`SPACE`, at first uniform
+            in a range.
+        time: for each scale a grid (3N, T, 1, C) of those of :data:`TIME`, at first 1.
         size: length of f.
     """
 
@@ -48,46 +47,59 @@ class SixPlanes(nn.Module):
         """
         super().__init__()
         self._pairing = pairing
-        self.planes = nn.ParameterList()
+        self.space = nn.ParameterList()
+        self.time = nn.ParameterList()
         for points in resolutions:
-            sides = (points, points, points, time_resolution)
-            for first, second in AXES:
-                plane = torch.ones(sides[first], sides[second], 1, channels)
-                self.planes.append(plane if second == TIME else plane.uniform_(0.1, highest))
-        self.size = len(resolutions) * channels * (1 if pairing == "product" else len(PAIRS))
+            drawn = torch.empty(len(SPACE) * points, points, 1, channels).uniform_(0.1, highest)
+            self.space.append(drawn)
+            self.time.append(torch.ones(len(TIME) * points, time_resolution, 1, channels))
+        self.size = len(resolutions) * channels * (1 if pairing == "product" else len(SPACE))
 
     def forward(self, points: Tensor) -> Tensor:
         """f (S, size) at ``points`` (S, 4), x, y, z and t in [−1, 1]; outside as at the border."""
-        nothing = torch.zeros_like(points[:, 0])
-        places = [torch.stack([points[:, a], points[:, b], nothing], dim=1) for a, b in AXES]
+        share = (points.clamp(-1, 1) + 1) / 2
+        in_space, in_time = (share[:, axes].transpose(0, 1) for axes in (SPACE, TIME))
         joined: list[Tensor] = []
-        for start in range(0, len(self.planes), len(AXES)):
-            planes = self.planes[start : start + len(AXES)]
-            values = [look_up(p, at, UNIT) for p, at in zip(planes, places, strict=True)]
-            pairs = [values[first] * values[second] for first, second in PAIRS]
-            joined += pairs if self._pairing == "hexplane" else [pairs[0] * pairs[1] * pairs[2]]
+        for space, time in zip(self.space, self.time, strict=True):
+            first, second, third = (_values(space, in_space) * _values(time, in_time)).unbind()
+            product = self._pairing == "product"
+            joined += [first * second * third] if product else [first, second, third]
         return torch.cat(joined, dim=1)
-
-    def along(self, *, time: bool) -> list[nn.Parameter]:
-        """The planes whose second axis is ``time``, or is not."""
-        return [p for n, p in enumerate(self.planes) if (TIME in AXES[n % len(AXES)]) == time]
 
     def total_variation(self) -> Tensor:
         """Σ over planes of 2 · (mean squared differences along both axes)."""
-        return sum_of([2 * _step(plane, axis) for plane in self.planes for axis in (0, 1)])
+        planes = [_apart(grid) for grid in (*self.space, *self.time)]
+        return sum_of([2 * len(each) * _step(each, axis) for each in planes for axis in (1, 2)])
 
     def roughness(self) -> Tensor:
         """Σ over planes with time of the mean squared second difference along it."""
-        return sum_of([_step(plane.diff(dim=1), axis=1) for plane in self.along(time=True)])
+        steps = [grid.diff(dim=1) for grid in self.time]
+        return len(TIME) * sum_of([_step(each, axis=1) for each in steps])
 
     def change(self) -> Tensor:
         """Σ over planes with time of the mean |1 − P|: 0 of what is at rest."""
-        return sum_of([(1 - plane).abs().mean() for plane in self.along(time=True)])
+        return len(TIME) * sum_of([(1 - grid).abs().mean() for grid in self.time])
 
 
 def sum_of(values: Sequence[Tensor]) -> Tensor:
     """The sum () of one or more values ()."""
     return torch.stack(list(values)).sum()
+
+
+def _apart(grid: Tensor) -> Tensor:
+    """The three planes (3, A, B, 1, C) in a grid."""
+    return grid.view(len(SPACE), -1, *grid.shape[1:])
+
+
+def _values(grid: Tensor, share: Tensor) -> Tensor:
+    """(3, S, C) of a grid's three planes at ``share`` (3, S, 2) of the ways along their axes."""
+    _, rows, columns, _, channels = _apart(grid).shape
+    last = constant((rows - 1.0, columns - 1.0), share.dtype, share.device)
+    starts = constant((0.0, 1.0 * rows, 2.0 * rows), share.dtype, share.device)
+    row, column = (share * last).unbind(2)
+    at = torch.stack([row + starts[:, None], column, torch.zeros_like(row)], dim=2)
+    box = Box((0.0, 0.0, -1.0), (len(SPACE) * rows - 1.0, columns - 1.0, 1.0))
+    return look_up(grid, at.view(-1, 3), box).view(len(SPACE), -1, channels)
 
 
 def _step(values: Tensor, axis: int) -> Tensor:
