@@ -105,14 +105,8 @@ class _March(torch.autograd.Function):
         points = torch.empty(length, 3, device=device)
         canonical = torch.empty(length, 3, device=device)
         weight = torch.empty(length, device=device)
-        significant = SignificantSamples()
-        significant.start = array(start)
-        significant.ray = array(ray)
-        significant.distance = array(distance)
-        significant.points = array(points)
-        significant.canonical = array(canonical)
-        significant.weight = array(weight)
-        launch(keep_significant_kernel, len(rays), [geometry, lines, visible, significant], device)
+        results = [array(each) for each in (start, ray, distance, points, canonical, weight)]
+        launch(keep_significant_kernel, len(rays), [geometry, lines, visible, *results], device)
 
         ctx.mark_non_differentiable(ray, distance, points)
         if displacement is None or not displacement.requires_grad:
@@ -127,24 +121,14 @@ class _March(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         density, displacement, visible_count, start, transmittance = ctx.saved_tensors
         medium, device = ctx.medium, density.device
-        given = OutputGradients()
-        given.start = array(start)
-        given.canonical = array(gradients[3].contiguous())
-        given.weight = array(gradients[4].contiguous())
-        given.transmittance = array(gradients[5].contiguous())
-        given.reached = array(transmittance)
+        given = [start, *(each.contiguous() for each in gradients[3:]), transmittance]
         start, length = _starts(visible_count)
         raw = torch.empty(length, 1, device=device)
         moved = torch.empty(length, 3, device=device)
         points = torch.empty(length, 3, device=device)
         canonical = torch.empty(length, 3, device=device)
-        result = SampleGradients()
-        result.start = array(start)
-        result.raw = array(raw)
-        result.moved = array(moved)
-        result.points = array(points)
-        result.canonical = array(canonical)
-        inputs = [ctx.geometry, ctx.lines, array(density.contiguous()), ctx.visible, given, result]
+        inputs = [ctx.geometry, ctx.lines, array(density.contiguous()), ctx.visible]
+        inputs += [array(each) for each in (*given, start, raw, moved, points, canonical)]
         launch(adjoint_kernel, len(visible_count), inputs, device, grain=GRAIN_OF_RAYS)
 
         of_density = of_displacement = None
@@ -290,43 +274,6 @@ class VisibleSamples:
     start: wp.array(dtype=wp.int64)
     count: wp.array(dtype=int)
     samples: wp.array(dtype=VisibleSample)
-
-
-@wp.struct
-class SignificantSamples:
-    """The visible samples of enough weight, without gaps; a ray's begin at ``start``."""
-
-    start: wp.array(dtype=wp.int64)
-    ray: wp.array(dtype=wp.int64)
-    distance: wp.array(dtype=float)
-    points: wp.array(dtype=wp.vec3)
-    canonical: wp.array(dtype=wp.vec3)
-    weight: wp.array(dtype=float)
-
-
-@wp.struct
-class OutputGradients:
-    """∂L/∂q and ∂L/∂w of significant samples, which begin at ``start``; ∂L/∂T_end, and T_end."""
-
-    start: wp.array(dtype=wp.int64)
-    canonical: wp.array(dtype=wp.vec3)
-    weight: wp.array(dtype=float)
-    transmittance: wp.array(dtype=float)
-    reached: wp.array(dtype=float)
-
-
-@wp.struct
-class SampleGradients:
-    """∂L/∂v and ∂L/∂Δ that visible samples have seen, and where: at q, and at x.
-
-    They lie without gaps; a ray's begin at ``start``.
-    """
-
-    start: wp.array(dtype=wp.int64)
-    raw: wp.array(dtype=float)
-    moved: wp.array(dtype=wp.vec3)
-    points: wp.array(dtype=wp.vec3)
-    canonical: wp.array(dtype=wp.vec3)
 
 
 @wp.struct
@@ -507,21 +454,26 @@ def keep_significant_kernel(
     geometry: Geometry,
     rays: RayArrays,
     visible: VisibleSamples,
-    result: SignificantSamples,
+    starts: wp.array(dtype=wp.int64),
+    rays_of: wp.array(dtype=wp.int64),
+    distances: wp.array(dtype=float),
+    points: wp.array(dtype=wp.vec3),
+    canonical: wp.array(dtype=wp.vec3),
+    weights: wp.array(dtype=float),
 ):
-    """The visible samples of enough weight."""
+    """The visible samples of enough weight, without gaps; a ray's begin at its start."""
     number = first + wp.tid()
     ray = ray_of(geometry, rays, number)
     start = int(visible.start[number])
-    into = int(result.start[number])
+    into = int(starts[number])
     for k in range(visible.count[number]):
         sample = visible.samples[start + k]
         if sample.weight >= geometry.threshold:
-            result.ray[into] = wp.int64(number)
-            result.distance[into] = sample.distance
-            result.points[into] = position(geometry, ray, sample.distance)
-            result.canonical[into] = sample.canonical
-            result.weight[into] = sample.weight
+            rays_of[into] = wp.int64(number)
+            distances[into] = sample.distance
+            points[into] = position(geometry, ray, sample.distance)
+            canonical[into] = sample.canonical
+            weights[into] = sample.weight
             into += 1
 
 
@@ -532,10 +484,20 @@ def adjoint_kernel(
     rays: RayArrays,
     density: wp.array(dtype=float),
     visible: VisibleSamples,
-    given: OutputGradients,
-    result: SampleGradients,
+    significant_start: wp.array(dtype=wp.int64),
+    of_canonical: wp.array(dtype=wp.vec3),
+    of_weight: wp.array(dtype=float),
+    of_transmittance: wp.array(dtype=float),
+    transmittance: wp.array(dtype=float),
+    visible_start: wp.array(dtype=wp.int64),
+    of_raw: wp.array(dtype=float),
+    of_moved: wp.array(dtype=wp.vec3),
+    points: wp.array(dtype=wp.vec3),
+    canonical: wp.array(dtype=wp.vec3),
 ):
     """From gradients of what the march gives to those of raw densities and displacements.
+
+    ∂L/∂v and ∂L/∂Δ of visible samples, and where these have been looked up, lie without gaps.
 
     Back to front ∂L/∂τ_i = ∂L/∂w_i T_i exp(−τ_i) − Σ_{j>i} ∂L/∂w_j w_j − ∂L/∂T_end T_end.
     """
@@ -543,43 +505,42 @@ def adjoint_kernel(
     ray = ray_of(geometry, rays, number)
     start = int(visible.start[number])
     count = visible.count[number]
-    significant = int(given.start[number])
+    significant = int(significant_start[number])
     for k in range(count):
         if visible.samples[start + k].weight >= geometry.threshold:
             significant += 1
-    after = given.reached[number]
-    behind = given.transmittance[number] * after
+    after = transmittance[number]
+    behind = of_transmittance[number] * after
     for back in range(count):
         sample = visible.samples[start + count - 1 - back]
-        into = int(result.start[number]) + count - 1 - back
+        into = int(visible_start[number]) + count - 1 - back
         tau = sample.tau
         weight = sample.weight
-        of_tau = -behind
-        of_canonical = wp.vec3()
+        slope_of_tau = -behind
+        moved = wp.vec3()
         if weight >= geometry.threshold:
             significant -= 1
-            of_weight = given.weight[significant]
-            of_tau += of_weight * after
-            behind += of_weight * weight
-            of_canonical = given.canonical[significant]
+            slope_of_tau += of_weight[significant] * after
+            behind += of_weight[significant] * weight
+            moved = of_canonical[significant]
         # T_i, from T_i exp(−τ_i) or from w_i = T_i α_i, whichever is not a small number's ratio.
         if tau < 1.0:
             after *= wp.exp(tau)
         else:
             after = weight / opacity(tau)
         # ∂τ/∂v = δ · sigmoid(v + b), and sigmoid = 1 − exp(−softplus).
-        of_raw = of_tau * geometry.delta * opacity(tau / geometry.delta)
-        result.raw[into] = of_raw
-        result.canonical[into] = sample.canonical
+        slope_of_raw = slope_of_tau * geometry.delta * opacity(tau / geometry.delta)
+        of_raw[into] = slope_of_raw
+        canonical[into] = sample.canonical
         if geometry.moves == 1:
             point = position(geometry, ray, sample.distance)
             row, fraction = cell(geometry.density, sample.canonical)
-            change = slope(density, of_raw, geometry.density, row, fraction)
-            of_canonical += wp.cw_mul(change, inside(geometry.density, sample.canonical))
+            change = slope(density, slope_of_raw, geometry.density, row, fraction)
+            moved += wp.cw_mul(change, inside(geometry.density, sample.canonical))
             if geometry.still_outside == 1:
-                of_canonical *= wp.min(inside(geometry.motion, point))
-            result.points[into] = point
-            result.moved[into] = of_canonical
+                moved *= wp.min(inside(geometry.motion, point))
+            points[into] = point
+            of_moved[into] = moved
 
 
 @wp.kernel(module="unique", enable_backward=False)
