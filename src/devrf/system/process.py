@@ -16,7 +16,7 @@ from types import FrameType
 from typing import NoReturn
 
 # glibc's malloc.h
-M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD = -1, -2, -3
+M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -2, -3, -8
 # Ctrl-C, the system's request to end, and what SLURM sends some time before that.
 NAMES = ("SIGINT", "SIGTERM", "SIGUSR1", "SIGUSR2")
 STOP_SIGNALS = tuple(getattr(signal, name) for name in NAMES if hasattr(signal, name))
@@ -30,7 +30,8 @@ def tune_for_cpu() -> None:
     Threads that wait by spinning, the default, are a hundred times slower on a busy machine;
     threads that sleep at once gain nothing over one thread; a short spin suits both. A training
     step frees and takes the same dozens of megabytes again and again: mapping and zeroing those
-    pages anew would be a tenth of the run.
+    pages anew would be a tenth of the run. Threads share two heaps: what each of its own had kept
+    was up to 0.1 of a quickstart's 1.2 GB.
 
     Of no effect once torch is loaded, on a GPU, or where the C library is not glibc.
     """
@@ -45,6 +46,7 @@ def tune_for_cpu() -> None:
     mallopt(M_MMAP_THRESHOLD, 32 * 2**20)  # the most that glibc accepts
     mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
     mallopt(M_TOP_PAD, 64 * 2**20)
+    mallopt(M_ARENA_MAX, 2)
 
 
 @contextmanager
