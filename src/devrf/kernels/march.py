@@ -455,25 +455,28 @@ def keep_significant_kernel(
     rays: RayArrays,
     visible: VisibleSamples,
     starts: wp.array(dtype=wp.int64),
-    rays_of: wp.array(dtype=wp.int64),
-    distances: wp.array(dtype=float),
-    points: wp.array(dtype=wp.vec3),
-    canonical: wp.array(dtype=wp.vec3),
-    weights: wp.array(dtype=float),
+    result_ray: wp.array(dtype=wp.int64),
+    result_distance: wp.array(dtype=float),
+    result_points: wp.array(dtype=wp.vec3),
+    result_canonical: wp.array(dtype=wp.vec3),
+    result_weight: wp.array(dtype=float),
 ):
     """The visible samples of enough weight, without gaps; a ray's begin at its start."""
     number = first + wp.tid()
+    count = visible.count[number]
+    if count == 0:
+        return
     ray = ray_of(geometry, rays, number)
     start = int(visible.start[number])
     into = int(starts[number])
-    for k in range(visible.count[number]):
+    for k in range(count):
         sample = visible.samples[start + k]
         if sample.weight >= geometry.threshold:
-            rays_of[into] = wp.int64(number)
-            distances[into] = sample.distance
-            points[into] = position(geometry, ray, sample.distance)
-            canonical[into] = sample.canonical
-            weights[into] = sample.weight
+            result_ray[into] = wp.int64(number)
+            result_distance[into] = sample.distance
+            result_points[into] = position(geometry, ray, sample.distance)
+            result_canonical[into] = sample.canonical
+            result_weight[into] = sample.weight
             into += 1
 
 
@@ -485,15 +488,15 @@ def adjoint_kernel(
     density: wp.array(dtype=float),
     visible: VisibleSamples,
     significant_start: wp.array(dtype=wp.int64),
-    of_canonical: wp.array(dtype=wp.vec3),
-    of_weight: wp.array(dtype=float),
-    of_transmittance: wp.array(dtype=float),
+    given_canonical: wp.array(dtype=wp.vec3),
+    given_weight: wp.array(dtype=float),
+    given_transmittance: wp.array(dtype=float),
     transmittance: wp.array(dtype=float),
     visible_start: wp.array(dtype=wp.int64),
-    of_raw: wp.array(dtype=float),
-    of_moved: wp.array(dtype=wp.vec3),
-    points: wp.array(dtype=wp.vec3),
-    canonical: wp.array(dtype=wp.vec3),
+    result_raw: wp.array(dtype=float),
+    result_moved: wp.array(dtype=wp.vec3),
+    result_points: wp.array(dtype=wp.vec3),
+    result_canonical: wp.array(dtype=wp.vec3),
 ):
     """From gradients of what the march gives to those of raw densities and displacements.
 
@@ -510,19 +513,19 @@ def adjoint_kernel(
         if visible.samples[start + k].weight >= geometry.threshold:
             significant += 1
     after = transmittance[number]
-    behind = of_transmittance[number] * after
+    behind = given_transmittance[number] * after
     for back in range(count):
         sample = visible.samples[start + count - 1 - back]
         into = int(visible_start[number]) + count - 1 - back
         tau = sample.tau
         weight = sample.weight
         slope_of_tau = -behind
-        moved = wp.vec3()
+        slope_of_canonical = wp.vec3()
         if weight >= geometry.threshold:
             significant -= 1
-            slope_of_tau += of_weight[significant] * after
-            behind += of_weight[significant] * weight
-            moved = of_canonical[significant]
+            slope_of_tau += given_weight[significant] * after
+            behind += given_weight[significant] * weight
+            slope_of_canonical = given_canonical[significant]
         # T_i, from T_i exp(−τ_i) or from w_i = T_i α_i, whichever is not a small number's ratio.
         if tau < 1.0:
             after *= wp.exp(tau)
@@ -530,17 +533,17 @@ def adjoint_kernel(
             after = weight / opacity(tau)
         # ∂τ/∂v = δ · sigmoid(v + b), and sigmoid = 1 − exp(−softplus).
         slope_of_raw = slope_of_tau * geometry.delta * opacity(tau / geometry.delta)
-        of_raw[into] = slope_of_raw
-        canonical[into] = sample.canonical
+        result_raw[into] = slope_of_raw
+        result_canonical[into] = sample.canonical
         if geometry.moves == 1:
             point = position(geometry, ray, sample.distance)
             row, fraction = cell(geometry.density, sample.canonical)
             change = slope(density, slope_of_raw, geometry.density, row, fraction)
-            moved += wp.cw_mul(change, inside(geometry.density, sample.canonical))
+            slope_of_canonical += wp.cw_mul(change, inside(geometry.density, sample.canonical))
             if geometry.still_outside == 1:
-                moved *= wp.min(inside(geometry.motion, point))
-            points[into] = point
-            of_moved[into] = moved
+                slope_of_canonical *= wp.min(inside(geometry.motion, point))
+            result_points[into] = point
+            result_moved[into] = slope_of_canonical
 
 
 @wp.kernel(module="unique", enable_backward=False)

@@ -10,12 +10,13 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.backends import mkldnn
 from torch.nn.functional import linear
 
 # Samples of a picture whose colours are found at once on a CPU: what a layer gives them fits its
 # caches (docs/notebook/costs.md).
 TILE = 4096
+# A layer with its activation by oneDNN, as torch's compiler calls it; None: torch lacks it.
+LAYER = getattr(torch.ops.mkldnn, "_linear_pointwise", None)
 
 
 class ColorNetwork(NamedTuple):
@@ -100,15 +101,14 @@ def _color(
 def _logits(x: Tensor, network: ColorNetwork) -> Tensor:
     """What the second hidden and the last layer give to ``x`` (S, H).
 
-    Of a whole tile on a CPU by oneDNN, whose layers have their activation in them: two thirds to
-    half of MKL's time with AVX-512. Other numbers of samples it would compile for anew, in 0.2 ms.
+    Of a whole tile on a CPU by oneDNN, in two thirds of MKL's time (Intel, AVX-512). Other numbers
+    of samples it would compile for anew, in 0.2 ms.
     """
     weight, bias = network.output_weight, network.output_bias
     tile = len(x) == TILE and x.is_cpu and x.dtype == weight.dtype == torch.float32
-    if tile and not torch.is_grad_enabled() and mkldnn.is_available():  # type: ignore[no-untyped-call]
-        layer = torch.ops.mkldnn._linear_pointwise  # as torch's compiler calls it
-        hidden = layer(x, network.hidden_weight, network.hidden_bias, "relu", [], "")
-        logits: Tensor = layer(hidden, weight, bias, "none", [], "")
+    if tile and LAYER is not None and not torch.is_grad_enabled():
+        hidden = LAYER(x, network.hidden_weight, network.hidden_bias, "relu", [], "")
+        logits: Tensor = LAYER(hidden, weight, bias, "none", [], "")
         return logits
     x = linear(x, network.hidden_weight.to(x.dtype), network.hidden_bias.to(x.dtype)).relu_()
     return linear(x.to(weight.dtype), weight, bias)

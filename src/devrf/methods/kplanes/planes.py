@@ -22,13 +22,14 @@ TIME = ((2, 3), (1, 3), (0, 3))
 class SixPlanes(nn.Module):
     """f(x, y, z, t): bilinear values of six planes, multiplied, and joined over scales.
 
-    See docs/methods/kplanes.md#planes. Planes of a scale lie one behind another along the first
-    axis of one grid, so that one look-up serves three.
+    See docs/methods/kplanes.md#planes. Three planes of a scale lie one behind another along the
+    first axis of one grid, so that one look-up serves them.
 
     Attributes:
-        space: for each scale a grid (3N, N, 1, C) of the planes of :data:`SPACE`, at first uniform
-            in a range.
-        time: for each scale a grid (3N, T, 1, C) of those of :data:`TIME`, at first 1.
+        space: for each scale, of N points along x, y and z, a grid (3N, N, 1, C) of the planes of
+            :data:`SPACE`, at first uniform in a range.
+        time: for each scale a grid (3N, T, 1, C) of those of :data:`TIME`, of T points along time,
+            at first 1.
         size: length of f.
     """
 
@@ -58,7 +59,7 @@ class SixPlanes(nn.Module):
     def forward(self, points: Tensor) -> Tensor:
         """f (S, size) at ``points`` (S, 4), x, y, z and t in [−1, 1]; outside as at the border."""
         share = (points.clamp(-1, 1) + 1) / 2
-        in_space, in_time = (share[:, axes].transpose(0, 1) for axes in (SPACE, TIME))
+        in_space, in_time = (_places(share, axes) for axes in (SPACE, TIME))
         joined: list[Tensor] = []
         for space, time in zip(self.space, self.time, strict=True):
             first, second, third = (_values(space, in_space) * _values(time, in_time)).unbind()
@@ -91,6 +92,12 @@ def _apart(grid: Tensor) -> Tensor:
     return grid.view(len(SPACE), -1, *grid.shape[1:])
 
 
+def _places(share: Tensor, axes: Sequence[tuple[int, int]]) -> Tensor:
+    """(3, S, 2) of points ``share`` (S, 4): where they are on three planes with these axes."""
+    along = share.unbind(1)
+    return torch.stack([torch.stack([along[a], along[b]], dim=1) for a, b in axes])
+
+
 def _values(grid: Tensor, share: Tensor) -> Tensor:
     """(3, S, C) of a grid's three planes at ``share`` (3, S, 2) of the ways along their axes."""
     _, rows, columns, _, channels = _apart(grid).shape
@@ -98,6 +105,7 @@ def _values(grid: Tensor, share: Tensor) -> Tensor:
     starts = constant((0.0, 1.0 * rows, 2.0 * rows), share.dtype, share.device)
     row, column = (share * last).unbind(2)
     at = torch.stack([row + starts[:, None], column, torch.zeros_like(row)], dim=2)
+    # Lengths are points of the grid. Along z it has one, and the same values.
     box = Box((0.0, 0.0, -1.0), (len(SPACE) * rows - 1.0, columns - 1.0, 1.0))
     return look_up(grid, at.view(-1, 3), box).view(len(SPACE), -1, channels)
 

@@ -149,7 +149,7 @@ def test_three_views_of_a_shift_give_the_shift_and_the_way_back():
     cameras = three_cameras()
     tracks = shifted_ball(cameras)
     tracks.pixel[::50] += 40.0  # the wrong flow of a few pixels is outvoted
-    start_from_tracks(field, 2, tracks, cameras, steps=200)
+    start_from_tracks(field, 2, tracks, cameras)
     moved = field.unwarp(tracks.canonical, 1.0)
     # The shift is more than the ball's radius: no rendered overlap could have shown it.
     assert (moved - tracks.canonical - SHIFT).norm(dim=1).median() < 0.02

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import torch
@@ -14,6 +15,7 @@ from devrf.data.batch import PixelPool, all_pixels
 from devrf.engine.batches import gather_batch
 from devrf.engine.ddp import broadcast
 from devrf.engine.grid_adam import GridAdam
+from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import WORLD, Space
 from devrf.kernels.look_up import look_up
@@ -34,6 +36,8 @@ FARTHEST = 16
 # Tracks of a frame at most, chosen at random, and optimiser steps of a fit to them.
 MOST_TRACKS = 4096
 FIT_STEPS = 40
+# In so many rounds, at whose starts the projection is taken as linear.
+ROUNDS = 2
 # Weight of differences between neighbouring voxels' changes in a fit.
 SMOOTHNESS = 0.01
 
@@ -245,7 +249,8 @@ def start_from_tracks(
 
     First Δ_f, so that the tracked points project onto their pixels, then Δ_b, so that it leads
     from there back to them; both by the smoothest change that does. Errors are in pixels and
-    robust (Huber), since observed flow has outliers.
+    robust (Huber), since observed flow has outliers. Projections are taken as linear about where
+    the points are, half of the steps about where the first half has led.
 
     Args:
         field: the deformation field.
@@ -262,16 +267,13 @@ def start_from_tracks(
     backward = field.frames.here.new_empty(*field.shape, 3)
     forward = torch.empty_like(backward)
     field.frames.read(frame, (backward, forward))
-    before = tracks.canonical + look_up(forward, tracks.canonical, field.box)
-    missed, slopes = _misses(tracks, before, cameras, space, 1e-3 * field.box.longest)
-    # Pixels to a unit of length, along the axis that moves pixels most.
-    scale = float(slopes.norm(dim=1).mean(dim=0).amax())
-
-    def misses(change: Tensor) -> Tensor:
-        moved = look_up(change, tracks.canonical, field.box)
-        return missed + (slopes * moved[:, None]).sum(dim=-1)
-
-    forward += _fit(misses, forward, scale, steps)
+    for _ in range(ROUNDS):
+        there = tracks.canonical + look_up(forward, tracks.canonical, field.box)
+        missed, slopes = _projected(tracks, there, cameras, space, 1e-3 * field.box.longest)
+        # Pixels to a unit of length, along the axis that moves pixels most.
+        scale = float(slopes.norm(dim=1).mean(dim=0).amax())
+        misses = partial(_after, tracks.canonical, field.box, missed, slopes)
+        forward += _fit(misses, forward, scale, max(steps // ROUNDS, 1))
     arrived = tracks.canonical + look_up(forward, tracks.canonical, field.box)
     lost = arrived + look_up(backward, arrived, field.box) - tracks.canonical
 
@@ -282,7 +284,7 @@ def start_from_tracks(
     field.frames.write(frame, (backward, forward))
 
 
-def _misses(
+def _projected(
     tracks: Tracks, points: Tensor, cameras: Cameras, space: Space, small: float
 ) -> tuple[Tensor, Tensor]:
     """By how many pixels (N, 2) ``points`` (N, 3) miss those of N tracks, and its slopes (N, 2, 3).
@@ -296,6 +298,11 @@ def _misses(
         moved, _ = cameras.project(tracks.camera, there)
         slopes.append((moved - seen) / small)
     return seen - tracks.pixel, torch.stack(slopes, dim=-1)
+
+
+def _after(points: Tensor, box: Box, missed: Tensor, slopes: Tensor, change: Tensor) -> Tensor:
+    """By how much ``points`` miss their pixels (N, 2) once a grid over ``box`` has a ``change``."""
+    return missed + (slopes * look_up(change, points, box)[:, None]).sum(dim=-1)
 
 
 @torch.enable_grad()
