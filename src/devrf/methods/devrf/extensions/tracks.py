@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Literal
 
 import torch
@@ -15,7 +14,6 @@ from devrf.data.batch import PixelPool, all_pixels
 from devrf.engine.batches import gather_batch
 from devrf.engine.ddp import broadcast
 from devrf.engine.grid_adam import GridAdam
-from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import WORLD, Space
 from devrf.kernels.look_up import look_up
@@ -36,8 +34,8 @@ FARTHEST = 16
 # Tracks of a frame at most, chosen at random, and optimiser steps of a fit to them.
 MOST_TRACKS = 4096
 FIT_STEPS = 40
-# In so many rounds, at whose starts the projection is taken as linear.
-ROUNDS = 2
+# A change of a grid → residuals (N, 2 or 3) in pixels.
+Residual = Callable[[Tensor], Tensor]
 # Weight of differences between neighbouring voxels' changes in a fit.
 SMOOTHNESS = 0.01
 
@@ -267,18 +265,24 @@ def start_from_tracks(
     backward = field.frames.here.new_empty(*field.shape, 3)
     forward = torch.empty_like(backward)
     field.frames.read(frame, (backward, forward))
-    for _ in range(ROUNDS):
-        there = tracks.canonical + look_up(forward, tracks.canonical, field.box)
-        missed, slopes = _projected(tracks, there, cameras, space, 1e-3 * field.box.longest)
-        # Pixels to a unit of length, along the axis that moves pixels most.
-        scale = float(slopes.norm(dim=1).mean(dim=0).amax())
-        misses = partial(_after, tracks.canonical, field.box, missed, slopes)
-        forward += _fit(misses, forward, scale, max(steps // ROUNDS, 1))
-    arrived = tracks.canonical + look_up(forward, tracks.canonical, field.box)
-    lost = arrived + look_up(backward, arrived, field.box) - tracks.canonical
+    small = 1e-3 * field.box.longest
+    points = tracks.canonical
 
-    def errs(change: Tensor) -> Tensor:
-        return (lost + look_up(change, arrived, field.box)) * scale
+    def misses(start: Tensor) -> Residual:
+        there = points + look_up(forward + start, points, field.box)
+        missed, slopes = _projected(tracks, there, cameras, space, small)
+        missed -= _moved(slopes, look_up(start, points, field.box))
+        return lambda change: missed + _moved(slopes, look_up(change, points, field.box))
+
+    _, slopes = _projected(tracks, points, cameras, space, small)
+    # Pixels to a unit of length, along the axis that moves pixels most.
+    scale = float(slopes.norm(dim=1).mean(dim=0).amax())
+    forward += _fit(misses, forward, scale, steps)
+    arrived = points + look_up(forward, points, field.box)
+    lost = arrived + look_up(backward, arrived, field.box) - points
+
+    def errs(_: Tensor) -> Residual:
+        return lambda change: (lost + look_up(change, arrived, field.box)) * scale
 
     backward += _fit(errs, backward, scale, steps)
     field.frames.write(frame, (backward, forward))
@@ -300,17 +304,19 @@ def _projected(
     return seen - tracks.pixel, torch.stack(slopes, dim=-1)
 
 
-def _after(points: Tensor, box: Box, missed: Tensor, slopes: Tensor, change: Tensor) -> Tensor:
-    """By how much ``points`` miss their pixels (N, 2) once a grid over ``box`` has a ``change``."""
-    return missed + (slopes * look_up(change, points, box)[:, None]).sum(dim=-1)
+def _moved(slopes: Tensor, way: Tensor) -> Tensor:
+    """By how many pixels (N, 2) points go on ``way`` (N, 3)."""
+    return (slopes * way[:, None]).sum(dim=-1)
 
 
 @torch.enable_grad()
-def _fit(residual: Callable[[Tensor], Tensor], like: Tensor, scale: float, steps: int) -> Tensor:
-    """The smooth change of a grid (X, Y, Z, 3) that makes ``residual(change)`` small.
+def _fit(
+    residual_about: Callable[[Tensor], Residual], like: Tensor, scale: float, steps: int
+) -> Tensor:
+    """The smooth change of a grid (X, Y, Z, 3) that makes residuals of it small.
 
     Args:
-        residual: change → residuals (N, 2 or 3) in pixels.
+        residual_about: a change → residuals, linear about it.
         like: a grid of the shape and device wanted.
         scale: pixels per unit of the grid's values.
         steps: Adam steps; the rate falls linearly from three quarters of a pixel a step.
@@ -318,7 +324,10 @@ def _fit(residual: Callable[[Tensor], Tensor], like: Tensor, scale: float, steps
     change = torch.zeros_like(like).requires_grad_()
     fastest = 0.75 / scale
     optimizer = GridAdam([change], lr=fastest, betas=(0.9, 0.999))
+    residual = residual_about(change.detach())
     for number in range(steps):
+        if number == steps // 2:
+            residual = residual_about(change.detach())
         optimizer.param_groups[0]["lr"] = fastest * (1 - number / steps)
         optimizer.zero_grad()
         missed = residual(change)
