@@ -505,9 +505,11 @@ def adjoint_kernel(
     Back to front ∂L/∂τ_i = ∂L/∂w_i T_i exp(−τ_i) − Σ_{j>i} ∂L/∂w_j w_j − ∂L/∂T_end T_end.
     """
     number = first + wp.tid()
+    count = visible.count[number]
+    if count == 0:
+        return
     ray = ray_of(geometry, rays, number)
     start = int(visible.start[number])
-    count = visible.count[number]
     significant = int(significant_start[number])
     for k in range(count):
         if visible.samples[start + k].weight >= geometry.threshold:

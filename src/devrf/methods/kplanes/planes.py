@@ -102,7 +102,7 @@ def _values(grid: Tensor, share: Tensor) -> Tensor:
     """(3, S, C) of a grid's three planes at ``share`` (3, S, 2) of the ways along their axes."""
     _, rows, columns, _, channels = _apart(grid).shape
     last = constant((rows - 1.0, columns - 1.0), share.dtype, share.device)
-    starts = constant((0.0, 1.0 * rows, 2.0 * rows), share.dtype, share.device)
+    starts = constant(tuple(range(0, len(grid), rows)), share.dtype, share.device)
     row, column = (share * last).unbind(2)
     at = torch.stack([row + starts[:, None], column, torch.zeros_like(row)], dim=2)
     # Lengths are points of the grid. Along z it has one, and the same values.
