@@ -13,7 +13,7 @@ from devrf.geometry.box import Box
 from devrf.geometry.contraction import ContractedRays, ContractedSpace
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.rays import Rays
-from devrf.kernels.march import march, occupied_points, rays_that_hit
+from devrf.kernels.march import march
 from devrf.ops import march as definition
 from devrf.ops.march import STOP, Medium, Path, Samples, Surroundings
 from devrf.ops.trilinear import shape_of
@@ -277,8 +277,6 @@ def test_no_ray_and_one_ray(space: str, moves: bool, rng: torch.Generator) -> No
     assert none.canonical.shape == none.points.shape == (0, 3)
     random_loss(none).backward()
     assert all(not tensor.grad.any() for tensor in learned)
-    assert rays_that_hit(rays[:0], given.path).shape == (0,)
-    assert rays_that_hit(rays[number : number + 1], given.path).tolist() == [True]
 
 
 def test_rays_that_meet_nothing(rng: torch.Generator) -> None:
@@ -295,7 +293,6 @@ def test_rays_that_meet_nothing(rng: torch.Generator) -> None:
         assert torch.equal(samples.transmittance, torch.ones(200))
         (samples.canonical.sum() + samples.weight.sum() + samples.transmittance.sum()).backward()
         assert not moving.density.grad.any() and not moving.displacement.grad.any()
-        assert not rays_that_hit(rays, path).any()
 
 
 def test_the_last_plane_counts(rng: torch.Generator) -> None:
@@ -311,18 +308,6 @@ def test_the_last_plane_counts(rng: torch.Generator) -> None:
         )
         assert torch.equal(ours.ray, theirs.ray)
         assert planes in ours.ray.bincount()
-
-
-@pytest.mark.parametrize("space", SPACES)
-def test_rays_hit_what_the_definition_says(space: str, rng: torch.Generator) -> None:
-    given = setting(space, 2000, rng, share=0.003)
-    mask = torch.rand(31, 25, 28, generator=rng) < 1e-4
-    mask[11, 11, 14] = True
-    path = replace(given.path, surroundings=Occupancy(mask, given.path.box).surroundings)
-    rays = clear_rays(given.rays, path)
-    theirs = definition.rays_that_hit(doubled(rays), path)
-    assert torch.equal(rays_that_hit(rays, path), theirs)
-    assert 50 < theirs.sum() < len(rays) - 50
 
 
 def wide_rays(space: ContractedSpace, count: int, rng: torch.Generator) -> ContractedRays:
@@ -363,8 +348,6 @@ def test_curved_rays_never_skip_what_is_occupied(
     assert len(theirs.ray) > 500
     assert torch.equal(ours.ray, theirs.ray)
     torch.testing.assert_close(ours.distance.double(), theirs.distance, atol=1e-4, rtol=1e-5)
-    hits = rays_that_hit(rays, path)
-    assert torch.equal(hits, definition.rays_that_hit(doubled(rays), path)) and not hits.all()
 
 
 @pytest.mark.parametrize("shell", [0.5, 1.0])
@@ -452,41 +435,3 @@ def test_rays_and_gradients_may_lie_in_memory_anyhow(rng: torch.Generator) -> No
         moving.displacement,
     )
     torch.testing.assert_close(of_whole, of_again)
-
-
-@pytest.mark.parametrize("space", SPACES)
-@pytest.mark.parametrize("moves", ["not", "everywhere", "inside"])
-def test_points_are_occupied_where_the_definition_says(
-    space: str, moves: str, rng: torch.Generator
-) -> None:
-    given = setting(space, 1, rng)
-    moving = medium(given, rng, moves=moves != "not", still_outside=moves == "inside")
-    shape = (19, 23, 21)
-    theirs = definition.occupied_points(exact(moving), shape)
-    points = given.path.box.grid_points(shape, torch.empty(0, dtype=torch.float64)).view(-1, 3)
-    canonical = definition.warped(points, exact(moving))
-    at = given.path.box.to_grid(canonical, shape_of(given.path.surroundings.distances))
-    unclear = ((at - at.floor() - 0.5).abs() < CLEAR).any(dim=1)
-    at = given.path.box.to_grid(canonical, shape_of(moving.density))
-    unclear |= ((at - at.floor() - 0.5).abs() < CLEAR).any(dim=1)
-    if moves == "inside":  # a point on the face of what moves jumps
-        at = given.motion_box.to_grid(points, shape_of(moving.displacement))
-        last = torch.tensor(shape_of(moving.displacement)) - 1
-        unclear |= torch.minimum(at.abs(), (at - last).abs()).amin(dim=1) < CLEAR
-    clear = ~unclear.view(shape)
-    assert clear.float().mean() > 0.5
-    assert torch.equal(occupied_points(moving, shape) & clear, theirs & clear)
-    assert 0.05 < theirs[clear].float().mean() < 0.95
-    everywhere = occupied_points(replace(moving, threshold=0.0), shape)
-    assert torch.equal(
-        (definition.occupied_points(replace(exact(moving), threshold=0.0), shape)) & clear,
-        everywhere & clear,
-    )
-    assert everywhere.sum() > theirs.sum()
-
-
-def test_points_that_move_nowhere_are_not_occupied(rng: torch.Generator) -> None:
-    moving = medium(setting("world", 1, rng), rng)
-    moving.displacement.fill_(math.nan)
-    for occupied in (occupied_points, definition.occupied_points):
-        assert not occupied(moving, (5, 6, 7)).any()

@@ -15,8 +15,8 @@ from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 from devrf.kernels.adam import GRAIN_OF_VOXELS, adam_step, add_total_variation_gradient
 from devrf.kernels.look_up import look_up
-from devrf.kernels.march import march, occupied_points, rays_that_hit
-from devrf.kernels.runtime import GRAIN, GRAIN_OF_RAYS, choose, take
+from devrf.kernels.march import march
+from devrf.kernels.runtime import GRAIN_OF_RAYS, choose, take
 from devrf.ops import adam, trilinear
 from devrf.ops import march as definition
 from devrf.ops.adam import AdamRule
@@ -24,9 +24,6 @@ from devrf.ops.march import Medium, Path
 from devrf.rendering.occupancy import Occupancy
 
 BOX = Box((-1.0, -0.5, 0.0), (1.0, 1.5, 1.0))
-# Of a grid that three threads share.
-POINTS = (24, 23, 25)
-assert 24 * 23 * 25 >= 3 * GRAIN
 
 
 @pytest.fixture
@@ -102,9 +99,7 @@ def everything(given: tuple[Rays, Medium], points: Tensor, grid: Tensor) -> list
     rays, medium = given
     samples = march(rays, medium)
     looked_up = look_up(grid, points, BOX)
-    hits = rays_that_hit(rays, medium.path)
-    occupied = occupied_points(medium, POINTS)
-    return [*vars(samples).values(), hits, occupied, looked_up, *optimised(grid)]
+    return [*vars(samples).values(), looked_up, *optimised(grid)]
 
 
 def optimised(grid: Tensor) -> list[Tensor]:
@@ -124,10 +119,8 @@ def by_definition(given: tuple[Rays, Medium], points: Tensor, grid: Tensor) -> l
     smoothed = torch.zeros_like(grid)
     adam.add_total_variation_gradient(grid, smoothed, 0.5)
     samples = definition.march(rays, medium)
-    hits = definition.rays_that_hit(rays, medium.path)
     looked_up = trilinear.look_up(grid, points, BOX)
-    occupied = definition.occupied_points(medium, POINTS)
-    return [*vars(samples).values(), hits, occupied, looked_up, smoothed, *stepped]
+    return [*vars(samples).values(), looked_up, smoothed, *stepped]
 
 
 def test_without_kernels_everything_is_the_definition_to_the_bit(

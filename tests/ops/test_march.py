@@ -12,7 +12,7 @@ from torch.autograd import gradcheck
 from devrf.geometry.box import Box
 from devrf.geometry.contraction import ContractedSpace
 from devrf.geometry.rays import Rays
-from devrf.ops.march import HIT_CELLS, STOP, Medium, Path, march, rays_that_hit, steps_through
+from devrf.ops.march import STOP, Medium, Path, march, steps_through
 from devrf.rendering.occupancy import Occupancy
 
 BOX = Box((-1.0, -0.5, 0.0), (1.0, 1.5, 1.0))
@@ -79,17 +79,6 @@ def test_curved_rays_find_them_too(high, rng):
     torch.testing.assert_close(samples.distance, (entry[ray] + 0.05 * number)[kept])
 
 
-def test_a_curved_ray_that_march_samples_is_never_left_out(rng):
-    space = ContractedSpace((-1.0, -0.9, -1.1), (1.0, 0.9, 1.1))
-    inside = scattered_rays(2000, rng)
-    rays = space.rays(Rays(0.5 * inside.origins, inside.directions, inside.viewdirs))
-    occupancy = Occupancy(torch.rand(24, 20, 28, generator=rng) < 0.0005, space.box)
-    path = through(occupancy, 0.02, near=0.1, far=math.inf, box=space.box)
-    samples = march(rays, fog(path))
-    hits = rays_that_hit(rays, replace(path, step=occupancy.cell / rays.pace))
-    assert len(samples.ray) > 100 and hits[samples.ray].all() and not hits.all()
-
-
 def test_sample_places_by_hand(cube):
     d = torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64)
     rays = Rays(torch.tensor([[-3.0, 0.0, 0.0]], dtype=torch.float64), d, d)
@@ -130,40 +119,14 @@ def test_nothing_is_sampled_behind_what_nothing_is_seen_through(cube):
     assert samples.transmittance.item() == pytest.approx(9.9**-5)
 
 
-def test_a_ray_hits_what_is_two_cells_away_and_nothing_farther(cube):
-    mask = torch.zeros(21, 21, 21, dtype=torch.bool)
-    mask[10, 10, 10] = True
-    heights = torch.tensor([0.0, 0.1, 0.2, 0.24, 0.26, 0.3], dtype=torch.float64)
-    origins = torch.stack([torch.full_like(heights, -3.0), heights, 0 * heights], dim=1)
-    d = torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64).expand(6, 3)
-    path = through(Occupancy(mask, cube), 0.1, near=0.0, far=9.0, box=cube)
-    # Cells are 0.1 wide, and points belong to the nearest.
-    assert HIT_CELLS == 2
-    assert rays_that_hit(Rays(origins, d, d), path).tolist() == [True] * 4 + [False] * 2
-    before = replace(path, far=2.74)
-    assert not rays_that_hit(Rays(origins, d, d), before).any()
-
-
-def test_a_ray_that_march_samples_is_never_left_out(rng):
-    rays = scattered_rays(3000, rng)
-    for share in (0.002, 0.02):
-        occupancy = Occupancy(torch.rand(16, 17, 14, generator=rng) < share, BOX)
-        ray, _ = slowly(rays, occupancy, 0.007, 0.3, 3.0)
-        hit = rays_that_hit(rays, through(occupancy, occupancy.cell, near=0.3, far=3.0))
-        assert hit[ray].all()
-        assert not hit.all()
-
-
 def test_no_rays_and_missing_rays_give_no_samples(cube):
     path = through(Occupancy.full((3, 3, 3), cube), 0.1, near=0.0, far=9.0, box=cube)
     none = Rays(*[torch.zeros(0, 3, dtype=torch.float64)] * 3)
     assert len(march(none, fog(path)).ray) == 0
-    assert rays_that_hit(none, path).shape == (0,)
     d = torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]], dtype=torch.float64)
     past = Rays(torch.tensor([[-3.0, 2.0, 0.0], [-3.0, 0.0, 0.0]], dtype=torch.float64), d, d)
     samples = march(past, fog(path))
     assert len(samples.ray) == 0 and samples.transmittance.tolist() == [1.0, 1.0]
-    assert rays_that_hit(past, path).tolist() == [False, False]
 
 
 @pytest.mark.parametrize("still_outside", [False, True])

@@ -6,7 +6,7 @@ against which every kernel is tested.
 
 | module | functions |
 |---|---|
-| ``march`` | ``march``: samples, warped and composited; ``rays_that_hit``; ``occupied_points`` |
+| ``march`` | ``march``: samples, warped and composited |
 | ``look_up`` | ``look_up``: values of a grid between its points |
 | ``adam`` | ``adam_step``, ``add_total_variation_gradient``: a step of the optimiser |
 | ``grid`` | what the kernels share: where grids are, and which cell a point is in |

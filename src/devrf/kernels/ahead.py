@@ -33,7 +33,6 @@ def compile_ahead(channels: Collection[int], device: torch.device) -> None:
     if not take(torch.empty(0, device=device)):
         return
     kernels = [march.march_kernel(False), march.keep_significant_kernel, march.adjoint_kernel]
-    kernels += [march.rays_that_hit_kernel, march.occupied_points_kernel]
     kernels += [look_up.add_kernel(1), adam.adam_kernel(1), adam.total_variation_kernel(1)]
     for count in sorted({3, *channels}):
         kernels += [look_up.look_up_kernel(count), look_up.slope_kernel(count)]

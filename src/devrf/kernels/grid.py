@@ -101,17 +101,6 @@ def interpolate(values: wp.array(dtype=Any), grid: Grid, row: int, f: wp.vec3):
 
 
 @wp.func
-def product(a: float, b: float):
-    """a · b, of two numbers or rows."""
-    return a * b
-
-
-@wp.func
-def product(a: Any, b: Any):  # noqa: D103, F811
-    return wp.dot(a, b)
-
-
-@wp.func
 def slope(values: wp.array(dtype=Any), factor: Any, grid: Grid, row: int, f: wp.vec3):
     """∂/∂ position of the scalar product of :func:`interpolate`'s value and ``factor``.
 
@@ -120,14 +109,14 @@ def slope(values: wp.array(dtype=Any), factor: Any, grid: Grid, row: int, f: wp.
     next_x = grid.next_x
     next_y = grid.next_y
     next_z = grid.next_z
-    v000 = product(values[row], factor)
-    v001 = product(values[row + next_z], factor)
-    v010 = product(values[row + next_y], factor)
-    v011 = product(values[row + next_y + next_z], factor)
-    v100 = product(values[row + next_x], factor)
-    v101 = product(values[row + next_x + next_z], factor)
-    v110 = product(values[row + next_x + next_y], factor)
-    v111 = product(values[row + next_x + next_y + next_z], factor)
+    v000 = wp.dot(values[row], factor)
+    v001 = wp.dot(values[row + next_z], factor)
+    v010 = wp.dot(values[row + next_y], factor)
+    v011 = wp.dot(values[row + next_y + next_z], factor)
+    v100 = wp.dot(values[row + next_x], factor)
+    v101 = wp.dot(values[row + next_x + next_z], factor)
+    v110 = wp.dot(values[row + next_x + next_y], factor)
+    v111 = wp.dot(values[row + next_x + next_y + next_z], factor)
     x_low = wp.lerp(v100 - v000, v101 - v001, f[2])
     x_high = wp.lerp(v110 - v010, v111 - v011, f[2])
     y_low = wp.lerp(v010 - v000, v011 - v001, f[2])

@@ -18,15 +18,17 @@ from devrf.geometry.contraction import INFINITY, ContractedRays
 from devrf.geometry.rays import Rays
 from devrf.kernels.grid import Grid, cell, coordinates, grid_over, inside, interpolate, slope
 from devrf.kernels.look_up import add_to_grid
-from devrf.kernels.runtime import GRAIN_OF_RAYS, array, launch, made_once, room, take
+from devrf.kernels.runtime import GRAIN_OF_RAYS, array, launch, made_once, room, row_type, take
 from devrf.ops import march as definition
-from devrf.ops.march import HIT_CELLS, STOP, Medium, Path, Samples, steps_through
-from devrf.ops.trilinear import Shape, shape_of
+from devrf.ops.march import STOP, Medium, Path, Samples, steps_through
+from devrf.ops.trilinear import shape_of
 
 # Half edges of the inner box that a ray moves along any axis while its distance grows by what one
 # takes along the axis that it crosses fastest, at most; more in a thick shell, and where a ray
 # crosses several axes about as fast.
 CONTRACTED_PACE = 3.0
+# A row of the grid of raw densities.
+Density = row_type(1)
 
 
 def march(rays: Rays, medium: Medium) -> Samples:
@@ -43,32 +45,6 @@ def march(rays: Rays, medium: Medium) -> Samples:
     return Samples(*results)
 
 
-@torch.no_grad()
-def rays_that_hit(rays: Rays, path: Path) -> Tensor:
-    """As :func:`devrf.ops.march.rays_that_hit`."""
-    if not take(rays.origins):
-        return definition.rays_that_hit(rays, path)
-    hits = torch.empty(len(rays), dtype=torch.uint8, device=rays.origins.device)
-    inputs = [_geometry(path, rays), _arrays(rays, path)[0], _distances(path), array(hits)]
-    launch(rays_that_hit_kernel, len(rays), inputs, hits.device)
-    return hits.bool()
-
-
-@torch.no_grad()
-def occupied_points(medium: Medium, shape: Shape) -> Tensor:
-    """As :func:`devrf.ops.march.occupied_points`."""
-    if not take(medium.density):
-        return definition.occupied_points(medium, shape)
-    device, path = medium.density.device, medium.path
-    geometry = _geometry(path)
-    _add_field(geometry, medium)
-    found = torch.empty(shape, dtype=torch.uint8, device=device)
-    inputs = [grid_over(path.box, shape), geometry, _distances(path)]
-    inputs += [array(medium.density.contiguous()), _displacements(medium), array(found.view(-1))]
-    launch(occupied_points_kernel, found.numel(), inputs, device)
-    return found.bool()
-
-
 class _March(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -80,10 +56,8 @@ class _March(torch.autograd.Function):
         kept: Tensor | None,
     ) -> tuple[Tensor, ...]:
         device = density.device
-        geometry = _geometry(medium.path, rays)
-        _add_field(geometry, medium)
+        geometry = _geometry(rays, medium)
         lines, counts = _arrays(rays, medium.path)
-        distances = _distances(medium.path)
 
         # Room for all of a ray's samples; how many are visible is known afterwards.
         start, length = _starts(counts)
@@ -94,8 +68,11 @@ class _March(torch.autograd.Function):
         visible.start = array(start)
         visible.count = array(visible_count)
         visible.samples = room(VisibleSample, length, device)
-        inputs = [geometry, lines, distances, array(density.contiguous()), _displacements(medium)]
-        inputs += [visible, array(significant_count), array(transmittance)]
+        # Without displacements there is an array that is not read.
+        moves = density.new_empty(0, 3) if displacement is None else displacement.contiguous()
+        inputs = [geometry, lines, array(medium.path.surroundings.distances.flatten())]
+        inputs += [array(density.contiguous()), array(moves), visible]
+        inputs += [array(significant_count), array(transmittance)]
         kernel = march_kernel(isinstance(rays, ContractedRays))
         launch(kernel, len(rays), inputs, device, grain=GRAIN_OF_RAYS)
 
@@ -151,32 +128,26 @@ def _starts(counts: Tensor) -> tuple[Tensor, int]:
 def _arrays(rays: Rays, path: Path) -> tuple[RayArrays, Tensor]:
     """Rays as kernels take them, and how many samples (R,) each has, in empty space or not."""
     entry, count = steps_through(rays, path.box, step=path.step, near=path.near, far=path.far)
+    # Straight rays have no course; their origins stand in for it.
+    course = rays.course if isinstance(rays, ContractedRays) else rays.origins
     arrays = RayArrays()
     arrays.entries = array(entry)
     arrays.counts = array(count)
     arrays.origins = array(rays.origins.contiguous())
     arrays.directions = array(rays.directions.contiguous())
-    # Straight rays have no course; their origins stand in for it.
-    course = rays.course if isinstance(rays, ContractedRays) else rays.origins
     arrays.courses = array(course.contiguous())
     return arrays, count
 
 
-def _distances(path: Path) -> wp.array:
-    return array(path.surroundings.distances.flatten())
-
-
-def _displacements(medium: Medium) -> wp.array:
-    """Where there are none, an array that is not read."""
-    moves = medium.displacement
-    return array(medium.density.new_empty(0, 3) if moves is None else moves.contiguous())
-
-
-def _geometry(path: Path, rays: Rays | None = None) -> Geometry:
-    """Where ``rays`` are sampled, if there are any."""
+def _geometry(rays: Rays, medium: Medium) -> Geometry:
     geometry = Geometry()
-    surroundings = path.surroundings
+    path, surroundings = medium.path, medium.path.surroundings
+    geometry.density = grid_over(path.box, shape_of(medium.density))
     geometry.occupancy = grid_over(surroundings.box, shape_of(surroundings.distances))
+    if medium.displacement is not None and medium.motion_box is not None:
+        geometry.moves = 1
+        geometry.motion = grid_over(medium.motion_box, shape_of(medium.displacement))
+        geometry.still_outside = int(medium.still_outside)
     if isinstance(rays, ContractedRays):
         inner = rays.space.inner()
         geometry.contracted = 1
@@ -184,16 +155,6 @@ def _geometry(path: Path, rays: Rays | None = None) -> Geometry:
         geometry.half = wp.vec3(*(edge / 2 for edge in inner.size))
         geometry.shell = rays.space.shell
     geometry.step = path.step
-    return geometry
-
-
-def _add_field(geometry: Geometry, medium: Medium) -> None:
-    """Add the densities that rays are followed through, and how they move."""
-    geometry.density = grid_over(medium.path.box, shape_of(medium.density))
-    if medium.displacement is not None and medium.motion_box is not None:
-        geometry.moves = 1
-        geometry.motion = grid_over(medium.motion_box, shape_of(medium.displacement))
-        geometry.still_outside = int(medium.still_outside)
     geometry.shift = medium.shift
     geometry.delta = medium.delta
     geometry.threshold = medium.threshold
@@ -202,6 +163,7 @@ def _add_field(geometry: Geometry, medium: Medium) -> None:
     if medium.threshold > 0:
         tau = -math.log1p(-medium.threshold)
         geometry.faintest = math.log(math.expm1(tau / medium.delta)) - medium.shift
+    return geometry
 
 
 @wp.struct
@@ -402,7 +364,7 @@ def march_kernel(contracted: bool) -> wp.Kernel:
         geometry: Geometry,
         rays: RayArrays,
         distances: wp.array(dtype=wp.uint8),
-        density: wp.array(dtype=float),
+        density: wp.array(dtype=Density),
         displacements: wp.array(dtype=wp.vec3),
         visible: VisibleSamples,
         significant_count: wp.array(dtype=int),
@@ -426,7 +388,7 @@ def march_kernel(contracted: bool) -> wp.Kernel:
                 point = position(geometry, ray, distance)
                 canonical = warped(geometry, displacements, point)
                 row, fraction = cell(geometry.density, canonical)
-                raw = interpolate(density, geometry.density, row, fraction)
+                raw = interpolate(density, geometry.density, row, fraction)[0]
                 if raw >= geometry.faintest:
                     sample = VisibleSample()
                     sample.distance = distance
@@ -485,7 +447,7 @@ def adjoint_kernel(
     first: int,
     geometry: Geometry,
     rays: RayArrays,
-    density: wp.array(dtype=float),
+    density: wp.array(dtype=Density),
     visible: VisibleSamples,
     significant_start: wp.array(dtype=wp.int64),
     given_canonical: wp.array(dtype=wp.vec3),
@@ -493,7 +455,7 @@ def adjoint_kernel(
     given_transmittance: wp.array(dtype=float),
     transmittance: wp.array(dtype=float),
     visible_start: wp.array(dtype=wp.int64),
-    result_raw: wp.array(dtype=float),
+    result_raw: wp.array(dtype=Density),
     result_moved: wp.array(dtype=wp.vec3),
     result_points: wp.array(dtype=wp.vec3),
     result_canonical: wp.array(dtype=wp.vec3),
@@ -535,65 +497,14 @@ def adjoint_kernel(
             after = weight / opacity(tau)
         # ∂τ/∂v = δ · sigmoid(v + b), and sigmoid = 1 − exp(−softplus).
         slope_of_raw = slope_of_tau * geometry.delta * opacity(tau / geometry.delta)
-        result_raw[into] = slope_of_raw
+        result_raw[into] = Density(slope_of_raw)
         result_canonical[into] = sample.canonical
         if geometry.moves == 1:
             point = position(geometry, ray, sample.distance)
             row, fraction = cell(geometry.density, sample.canonical)
-            change = slope(density, slope_of_raw, geometry.density, row, fraction)
+            change = slope(density, Density(slope_of_raw), geometry.density, row, fraction)
             slope_of_canonical += wp.cw_mul(change, inside(geometry.density, sample.canonical))
             if geometry.still_outside == 1:
                 slope_of_canonical *= wp.min(inside(geometry.motion, point))
             result_points[into] = point
             result_moved[into] = slope_of_canonical
-
-
-@wp.kernel(module="unique", enable_backward=False)
-def rays_that_hit_kernel(
-    first: int,
-    geometry: Geometry,
-    rays: RayArrays,
-    distances: wp.array(dtype=wp.uint8),
-    hits: wp.array(dtype=wp.uint8),
-):
-    """Whether each ray has a sample within so many cells of an occupied one."""
-    number = first + wp.tid()
-    ray = ray_of(geometry, rays, number)
-    hits[number] = wp.uint8(0)
-    k = int(0)
-    while k < ray.count:
-        cells = clearance(geometry.occupancy, distances, place_of(geometry, ray, k))
-        if cells <= wp.static(HIT_CELLS):
-            hits[number] = wp.uint8(1)
-            k = ray.count
-        k += int(float(wp.max(cells - wp.static(HIT_CELLS + 1), 0)) * ray.samples_per_cell) + 1
-
-
-@wp.kernel(module="unique", enable_backward=False)
-def occupied_points_kernel(
-    first: int,
-    points: Grid,
-    geometry: Geometry,
-    distances: wp.array(dtype=wp.uint8),
-    density: wp.array(dtype=float),
-    displacements: wp.array(dtype=wp.vec3),
-    occupied: wp.array(dtype=wp.uint8),
-):
-    """Whether a point of a grid moves to where something is at rest."""
-    number = first + wp.tid()
-    i = number / points.next_x
-    j = (number / points.next_y) % points.y
-    k = number % points.z
-    place = wp.vec3(float(i), float(j), float(k))
-    canonical = warped(geometry, displacements, points.low + wp.cw_div(place, points.scale))
-    at = coordinates(geometry.occupancy, canonical)
-    found = False
-    if clearance(geometry.occupancy, distances, at) == 0:
-        grid = geometry.density
-        row, fraction = cell(grid, canonical)
-        raw = interpolate(density, grid, row, fraction)
-        row += int(wp.rint(fraction[0])) * grid.next_x
-        row += int(wp.rint(fraction[1])) * grid.next_y
-        row += int(wp.rint(fraction[2])) * grid.next_z
-        found = wp.max(raw, density[row]) >= geometry.faintest
-    occupied[number] = wp.uint8(found)

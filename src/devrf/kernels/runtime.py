@@ -135,8 +135,6 @@ def made_once(factory: Callable[[int], wp.Kernel]) -> Callable[[int], wp.Kernel]
 @cache
 def row_type(channels: int) -> Any:
     """Warp's type of a row of ``channels`` floats."""
-    if channels == 1:
-        return wp.float32
     return wp.vec3 if channels == 3 else wp.types.vector(length=channels, dtype=wp.float32)
 
 

@@ -5,7 +5,7 @@ compute where those do not run.
 
 | module | functions |
 |---|---|
-| ``march`` | ``march``: samples, warped and composited; ``rays_that_hit``; ``occupied_points`` |
+| ``march`` | ``march``: samples, warped and composited |
 | ``trilinear`` | ``look_up``: values of a grid between its points; ``resample`` |
 | ``compositing`` | ``composite``: weights; ``color_and_depth`` |
 | ``color_network`` | ``decode``: features and directions → RGB |

@@ -14,12 +14,10 @@ from torch.nn.functional import softplus
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 from devrf.ops.compositing import composite, transmittances
-from devrf.ops.trilinear import Shape, look_up, shape_of
+from devrf.ops.trilinear import look_up
 
 # A ray ends where its transmittance is less: what is behind cannot be seen.
 STOP = 1e-4
-# A ray hits what is so many cells away from it, or fewer.
-HIT_CELLS = 2
 
 
 @dataclass(frozen=True)
@@ -144,40 +142,6 @@ def march(rays: Rays, medium: Medium) -> Samples:
         weight=weight[significant],
         transmittance=transmittance,
     )
-
-
-@torch.no_grad()
-def rays_that_hit(rays: Rays, path: Path) -> Tensor:
-    """Mask (R,): which rays have a sample at most ``HIT_CELLS`` cells away from an occupied one."""
-    ray, _, points = samples_in_box(rays, path)
-    hits = torch.zeros(len(rays), dtype=torch.bool, device=ray.device)
-    hits[ray[path.surroundings.at(points) <= HIT_CELLS]] = True
-    return hits
-
-
-@torch.no_grad()
-def occupied_points(medium: Medium, shape: Shape) -> Tensor:
-    """Which points of a grid move to where something is at rest: mask of ``shape`` (X, Y, Z).
-
-    That is to an occupied cell, of an opacity of at least the threshold there or at the nearest
-    point of the densities: a thin thing may lie between the places that points come from.
-
-    Args:
-        medium: where something is at rest, and what moves points there.
-        shape: of the grid, over the box of the densities; two points or more along each axis.
-    """
-    box, density = medium.path.box, medium.density
-    canonical = warped(box.grid_points(shape, density).view(-1, 3), medium)
-    occupied = medium.path.surroundings.at(canonical) == 0
-    near = occupied.nonzero()[:, 0]
-    canonical = canonical[near]
-    low, high = box.corners(canonical)
-    place = box.to_grid(canonical.clamp(low, high), shape_of(density))
-    x, y, z = (place - 0.5).ceil().long().unbind(1)  # half way the lower point
-    raw = torch.maximum(look_up(density, canonical, box), density[x, y, z])[:, 0]
-    opacity = -torch.expm1(-softplus(raw + medium.shift) * medium.delta)
-    occupied[near] = opacity >= medium.threshold
-    return occupied.view(shape)
 
 
 def samples_in_box(rays: Rays, path: Path) -> tuple[Tensor, Tensor, Tensor]:

@@ -93,8 +93,14 @@ def test_deformed_occupancy_by_hand(model):
 def test_while_a_frame_is_learned_all_that_may_be_is_occupied(model):
     shift = torch.tensor([0.0, 0.4, 0.0])
     warp = moved_by(model, shift)
-    found = possible_occupancy(model.canonical, model.occupancy, model.settings, warp)
+    found = possible_occupancy(model.occupancy, warp)
     assert torch.equal(found.mask, dilate(torch.roll(model.occupancy.mask, -2, dims=1), 1))
+
+
+def test_points_that_move_nowhere_are_not_occupied(model):
+    lost = moved_by(model, torch.full((3,), math.nan))
+    found = deformed_occupancy(model.canonical, model.occupancy, model.settings, lost)
+    assert not found.mask.any() and not possible_occupancy(model.occupancy, lost).mask.any()
 
 
 def test_a_thin_thing_is_not_lost_between_the_places_that_points_come_from(model):

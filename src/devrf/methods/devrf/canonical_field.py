@@ -210,7 +210,11 @@ class CanonicalField(nn.Module):
     @torch.no_grad()
     def voxel_alpha(self, step: float) -> Tensor:
         """α (X, Y, Z) of a step of ``step`` voxels at each grid point."""
-        return -torch.expm1(-self._tau(self.density.values[..., 0], self.step_in_base_voxels(step)))
+        return self.alpha(self.density.values[..., 0], step)
+
+    def alpha(self, raw: Tensor, step: float) -> Tensor:
+        """α of a step of ``step`` voxels where raw densities are ``raw``, of any shape."""
+        return -torch.expm1(-self._tau(raw, self.step_in_base_voxels(step)))
 
     def rgb(
         self,

@@ -317,8 +317,7 @@ class DeformationStage(Stage):
         frame = self.active
         assert frame is not None
         warp = self.field.warp_by(frame.backward)
-        possible = possible_occupancy(model.canonical, model.occupancy, model.settings, warp)
-        frame.occupancy.refill(possible)
+        frame.occupancy.refill(possible_occupancy(model.occupancy, warp))
 
     def prepare(self) -> None:
         """Update the frame's occupancy every ``occupancy_every`` iterations."""

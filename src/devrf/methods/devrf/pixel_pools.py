@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -11,9 +12,10 @@ from devrf.data.batch import PixelPool, all_pixels, wanted_pixels
 from devrf.engine.ddp import world_size
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
+from devrf.geometry.rays import Rays
 from devrf.geometry.space import WorldSpace
-from devrf.kernels.march import rays_that_hit
-from devrf.ops.march import Path
+from devrf.kernels.march import march
+from devrf.ops.march import Medium, Path
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.view import Viewable
 from devrf.scenes.scene import Views
@@ -24,6 +26,8 @@ MOST_BLOCK = 8
 # Images whose rays are made together: on a CPU what its caches hold, on a GPU what keeps it busy.
 IMAGES_ON_CPU = 1
 IMAGES_ON_GPU = 16
+# A ray hits what is so many cells away from it, or fewer.
+HIT_CELLS = 2
 # The fewest rays of a batch, however few pixels there are.
 MIN_RAYS = 64
 
@@ -67,6 +71,17 @@ def rays_hit_occupied(
         rows = hit.view(-1, height, width).repeat_interleave(block, dim=1)[:, : cameras.height]
         masks.append(rows.repeat_interleave(block, dim=2)[:, :, : cameras.width].flatten(1))
     return torch.cat(masks)
+
+
+@torch.no_grad()
+def rays_that_hit(rays: Rays, path: Path) -> Tensor:
+    """Mask (R,): which rays have a sample at most ``HIT_CELLS`` cells away from an occupied one."""
+    distances = path.surroundings.distances.clamp(min=HIT_CELLS) - HIT_CELLS
+    near = replace(path, surroundings=replace(path.surroundings, distances=distances))
+    # Where all is opaque a ray ends at its first sample.
+    wall = distances.new_full((2, 2, 2, 1), 100, dtype=rays.origins.dtype)
+    samples = march(rays, Medium(near, density=wall, shift=0.0, delta=1.0, threshold=0.5))
+    return samples.transmittance < 0.5
 
 
 def block_size(cameras: Cameras, model: Viewable, occupancy: Occupancy) -> int:

@@ -5,17 +5,17 @@ The samples of each ray, docs/method.md#rays, composited: docs/method.md#composi
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
+from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
-from devrf.kernels.march import march, occupied_points
+from devrf.kernels.march import march
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.deformation_field import GridWarp
 from devrf.ops.compositing import color_and_depth, sum_by_ray
 from devrf.ops.march import Medium, Path
+from devrf.ops.trilinear import Shape
 from devrf.rendering.occupancy import Occupancy, dilate
 from devrf.rendering.output import ColorChange, VoxelOutput
 from devrf.rendering.sampling import RenderSettings
@@ -104,7 +104,9 @@ def deformed_occupancy(
 ) -> Occupancy:
     """The occupancy at a time: the points of the density's grid that move to what is opaque.
 
-    That is where samples count. Grown by one for what is between the points now.
+    That is where samples count: where the opacity is that of a visible sample, there or at the
+    nearest point of the densities; a thin thing may lie between the places that points come from.
+    Grown by one for what is between the points now.
 
     Args:
         field: the canonical field.
@@ -112,18 +114,48 @@ def deformed_occupancy(
         settings: how rays are sampled.
         warp: x → x + Δ_b(x, t).
     """
-    mask = occupied_points(medium(field, occupancy, settings, warp), field.density.shape)
-    return Occupancy(dilate(mask, 1), field.box)
+    box, shape, densities = field.box, field.density.shape, field.density.values
+    rows, canonical = points_that_arrive(occupancy, warp, box, shape)
+    x, y, z = box.to_grid(box.nearest(canonical), shape).round().long().unbind(1)
+    raw = torch.maximum(field.density(canonical, box), densities[x, y, z])
+    opaque = field.alpha(raw, settings.step)[:, 0] >= settings.alpha_threshold
+    return Occupancy(dilate(mask_of(rows[opaque], shape), 1), box)
 
 
-def possible_occupancy(
-    field: CanonicalField, occupancy: Occupancy, settings: RenderSettings, warp: GridWarp
-) -> Occupancy:
+def possible_occupancy(occupancy: Occupancy, warp: GridWarp) -> Occupancy:
     """The occupancy while a frame is learned, of the grid of that at rest.
 
     Wider than :func:`deformed_occupancy`, since the displacements go on changing: all that may be
     occupied at rest, grown by one point.
     """
-    anything = replace(medium(field, occupancy, settings, warp), threshold=0.0)
     x, y, z = occupancy.mask.shape
-    return Occupancy(dilate(occupied_points(anything, (x, y, z)), 1), field.box)
+    rows, _ = points_that_arrive(occupancy, warp, occupancy.box, (x, y, z))
+    return Occupancy(dilate(mask_of(rows, (x, y, z)), 1), occupancy.box)
+
+
+@torch.no_grad()
+def points_that_arrive(
+    occupancy: Occupancy, warp: GridWarp, box: Box, shape: Shape
+) -> tuple[Tensor, Tensor]:
+    """The points of a grid that move to an occupied cell.
+
+    Args:
+        occupancy: where something is at rest.
+        warp: how points move there.
+        box: of the grid.
+        shape: its points along x, y, z.
+
+    Returns:
+        Their rows (K,) in the grid, and where they move to, (K, 3).
+    """
+    points = box.grid_points(shape, torch.empty(0, device=occupancy.mask.device))
+    moved = warp(points.view(-1, 3))
+    rows = occupancy.at(moved).nonzero()[:, 0]
+    return rows, moved[rows]
+
+
+def mask_of(rows: Tensor, shape: Shape) -> Tensor:
+    """The mask of ``shape`` (X, Y, Z) that is True at ``rows`` (K,)."""
+    mask = torch.zeros(shape, dtype=torch.bool, device=rows.device)
+    mask.view(-1)[rows] = True
+    return mask
