@@ -61,7 +61,7 @@ def test_all_are_found() -> None:
     steps = ("adam_kernel", "total_variation_kernel")
     names |= {f"adam.{one}_{n}" for one in steps for n in CHANNELS}
     names |= {f"march.march_kernel_{n}" for n in SPACES}
-    names |= {"march.adjoint_kernel", "march.keep_significant_kernel"}
+    names |= {"march.enter_kernel", "march.adjoint_kernel", "march.keep_significant_kernel"}
     assert set(every_kernel()) == names
 
 

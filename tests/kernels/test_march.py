@@ -121,6 +121,8 @@ def assert_same(ours: Samples, theirs: Samples, weights: float = 1e-5) -> None:
     torch.testing.assert_close(ours.weight.double(), theirs.weight, atol=weights, rtol=2e-5)
     left = theirs.transmittance
     torch.testing.assert_close(ours.transmittance.double(), left, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(ours.depth.double(), theirs.depth, atol=2e-5, rtol=1e-4)
+    assert not ours.depth.requires_grad and not theirs.depth.requires_grad
 
 
 def assert_same_gradient(ours: Tensor, theirs: Tensor) -> None:

@@ -9,6 +9,9 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
+# A direction has at least so much along each axis where it is divided by.
+PARALLEL = 1e-9
+
 
 @dataclass(frozen=True)
 class Rays:
@@ -60,7 +63,7 @@ class Rays:
             far: the largest distance.
         """
         d = self.directions
-        d = torch.where(d.abs() < 1e-9, torch.full_like(d, 1e-9), d)
+        d = torch.where(d.abs() < PARALLEL, PARALLEL, d)
         to_low = (low - self.origins) / d
         to_high = (high - self.origins) / d
         entry = torch.minimum(to_low, to_high).amax(dim=-1)

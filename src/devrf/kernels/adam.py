@@ -7,7 +7,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from devrf.kernels.runtime import array, launch, made_once, row_type, take
+from devrf.kernels.runtime import launch, made_once, row_type, take
 from devrf.ops import adam as definition
 from devrf.ops.adam import AdamRule
 
@@ -35,7 +35,7 @@ def adam_step(
         return
     # A voxel of a grid, or one number of a network.
     channels = values.shape[-1] if values.ndim == 4 else 1
-    tables = [array(each.view(-1, channels)) for each in (values, gradient, mean, square)]
+    tables = [each.view(-1, channels) for each in (values, gradient, mean, square)]
     indices = torch.empty(0, dtype=torch.int32, device=values.device) if rows is None else rows
     rates = rule.per_voxel_lr
     factors = values.new_empty(0) if rates is None else rates.reshape(-1)
@@ -44,7 +44,7 @@ def adam_step(
     beta1, beta2 = rule.betas
     first, second = rule.corrections
     inputs = [count, run, rule.rate / first, 1 / second, beta1, beta2, rule.eps]
-    inputs += [int(rule.skip_zero), *tables, array(indices), array(factors)]
+    inputs += [int(rule.skip_zero), *tables, indices, factors]
     grain = GRAIN_OF_VOXELS // run
     launch(adam_kernel(channels), -(-count // run), inputs, values.device, grain=grain)
 
@@ -64,7 +64,7 @@ def add_total_variation_gradient(
         )
         return
     x, y, z, channels = grid.shape
-    tables = [array(each.view(-1, channels)) for each in (grid, gradient)]
+    tables = [each.view(-1, channels) for each in (grid, gradient)]
     inputs = [x, y, z, weight, along_z, int(touched_only), *tables]
     kernel = total_variation_kernel(channels)
     launch(kernel, x * y * z, inputs, grid.device, grain=GRAIN_OF_VOXELS)

@@ -9,7 +9,7 @@ from torch.autograd.function import once_differentiable
 
 from devrf.geometry.box import Box
 from devrf.kernels.grid import Grid, cell, grid_over, inside, interpolate, slope
-from devrf.kernels.runtime import array, launch, made_once, row_type, take
+from devrf.kernels.runtime import launch, made_once, row_type, take
 from devrf.ops import trilinear
 from devrf.ops.trilinear import shape_of
 
@@ -46,7 +46,7 @@ class _LookUp(torch.autograd.Function):
         ctx.save_for_backward(grid, points)
         ctx.box, ctx.every, ctx.kept = box, every, kept
         values = grid.new_empty(len(points), grid.shape[-1])
-        inputs = [grid_over(box, shape_of(grid), every), array(points), array(grid), array(values)]
+        inputs = [grid_over(box, shape_of(grid), every), points, grid, values]
         launch(look_up_kernel(grid.shape[-1]), len(points), inputs, points.device)
         return values
 
@@ -63,7 +63,7 @@ class _LookUp(torch.autograd.Function):
         if ctx.needs_input_grad[1]:
             of_points = torch.empty_like(points)
             place = grid_over(ctx.box, shape_of(grid), ctx.every)
-            inputs = [place, array(points), array(grid), array(gradient), array(of_points)]
+            inputs = [place, points, grid, gradient, of_points]
             launch(slope_kernel(grid.shape[-1]), len(points), inputs, points.device)
         return of_grid, of_points, None, None, None
 
@@ -82,7 +82,7 @@ def add_to_grid(grid: Tensor, points: Tensor, values: Tensor, box: Box, every: i
         box: where the grid's outer points lie.
         every: as of a look-up.
     """
-    inputs = [grid_over(box, shape_of(grid), every), array(points), array(values), array(grid)]
+    inputs = [grid_over(box, shape_of(grid), every), points, values, grid]
     launch(add_kernel(grid.shape[-1]), len(points), inputs, points.device, grain=None)
 
 

@@ -7,6 +7,7 @@ skipped by the distances to what is occupied.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -14,14 +15,16 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from devrf.geometry.contraction import INFINITY, ContractedRays
-from devrf.geometry.rays import Rays
+from devrf.geometry.box import Box
+from devrf.geometry.contraction import INFINITY, ContractedRays, ContractedSpace
+from devrf.geometry.rays import PARALLEL, Rays
 from devrf.kernels.grid import Grid, cell, coordinates, grid_over, inside, interpolate, slope
 from devrf.kernels.look_up import add_to_grid
-from devrf.kernels.runtime import GRAIN_OF_RAYS, array, launch, made_once, room, row_type, take
+from devrf.kernels.runtime import GRAIN_OF_RAYS, launch, made_once, room, row_type, take
 from devrf.ops import march as definition
-from devrf.ops.march import STOP, Medium, Path, Samples, steps_through
-from devrf.ops.trilinear import shape_of
+from devrf.ops.compositing import LEAST_MASS
+from devrf.ops.march import EXIT, STOP, Medium, Samples
+from devrf.ops.trilinear import Shape, shape_of
 
 # Half edges of the inner box that a ray moves along any axis while its distance grows by what one
 # takes along the axis that it crosses fastest, at most; more in a thick shell, and where a ray
@@ -57,22 +60,25 @@ class _March(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         device = density.device
         geometry = _geometry(rays, medium)
-        lines, counts = _arrays(rays, medium.path)
+        lines = room(Ray, len(rays), device)
+        counts = torch.empty(len(rays), dtype=torch.int32, device=device)
+        # Straight rays have no course; their origins stand in for it.
+        course = rays.course if isinstance(rays, ContractedRays) else rays.origins
+        inputs = [each.contiguous() for each in (rays.origins, rays.directions, course)]
+        inputs = [geometry, *inputs, medium.path.near, medium.path.far, lines, counts]
+        launch(enter_kernel, len(rays), inputs, device)
 
         # Room for all of a ray's samples; how many are visible is known afterwards.
-        start, length = _starts(counts)
-        visible_count = torch.empty(len(rays), dtype=torch.int32, device=device)
-        significant_count = torch.empty_like(visible_count)
+        visible_start, length = _starts(counts)
+        visible = room(VisibleSample, length, device)
+        visible_count = torch.empty_like(counts)
+        significant_count = torch.empty_like(counts)
         transmittance = torch.empty(len(rays), device=device)
-        visible = VisibleSamples()
-        visible.start = array(start)
-        visible.count = array(visible_count)
-        visible.samples = room(VisibleSample, length, device)
         # Without displacements there is an array that is not read.
         moves = density.new_empty(0, 3) if displacement is None else displacement.contiguous()
-        inputs = [geometry, lines, array(medium.path.surroundings.distances.flatten())]
-        inputs += [array(density.contiguous()), array(moves), visible]
-        inputs += [array(significant_count), array(transmittance)]
+        inputs = [geometry, lines, medium.path.surroundings.distances.flatten()]
+        inputs += [density.contiguous(), moves, visible_start, visible, visible_count]
+        inputs += [significant_count, transmittance]
         kernel = march_kernel(isinstance(rays, ContractedRays))
         launch(kernel, len(rays), inputs, device, grain=GRAIN_OF_RAYS)
 
@@ -82,30 +88,36 @@ class _March(torch.autograd.Function):
         points = torch.empty(length, 3, device=device)
         canonical = torch.empty(length, 3, device=device)
         weight = torch.empty(length, device=device)
-        results = [array(each) for each in (start, ray, distance, points, canonical, weight)]
-        launch(keep_significant_kernel, len(rays), [geometry, lines, visible, *results], device)
+        depth = torch.empty(len(rays), device=device)
+        inputs = [geometry, lines, visible_start, visible, visible_count, start]
+        inputs += [ray, distance, points, canonical, weight, depth]
+        launch(keep_significant_kernel, len(rays), inputs, device)
 
-        ctx.mark_non_differentiable(ray, distance, points)
-        if displacement is None or not displacement.requires_grad:
-            ctx.mark_non_differentiable(canonical)
-        ctx.save_for_backward(density, displacement, visible_count, start, transmittance)
+        fixed = displacement is None or not displacement.requires_grad
+        ctx.mark_non_differentiable(ray, distance, points, depth, *([canonical] if fixed else []))
+        ctx.save_for_backward(
+            density, displacement, visible_start, visible_count, start, transmittance
+        )
         ctx.geometry, ctx.lines, ctx.visible = geometry, lines, visible
         ctx.medium, ctx.kept = medium, kept
-        return ray, distance, points, canonical, weight, transmittance
+        return ray, distance, points, canonical, weight, transmittance, depth
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        density, displacement, visible_count, start, transmittance = ctx.saved_tensors
+        density, displacement, visible_start, visible_count, start, transmittance = (
+            ctx.saved_tensors
+        )
         medium, device = ctx.medium, density.device
-        given = [start, *(each.contiguous() for each in gradients[3:]), transmittance]
+        given = [start, *(each.contiguous() for each in gradients[3:6]), transmittance]
         start, length = _starts(visible_count)
         raw = torch.empty(length, 1, device=device)
         moved = torch.empty(length, 3, device=device)
         points = torch.empty(length, 3, device=device)
         canonical = torch.empty(length, 3, device=device)
-        inputs = [ctx.geometry, ctx.lines, array(density.contiguous()), ctx.visible]
-        inputs += [array(each) for each in (*given, start, raw, moved, points, canonical)]
+        inputs = [ctx.geometry, ctx.lines, density.contiguous()]
+        inputs += [visible_start, ctx.visible, visible_count]
+        inputs += [*given, start, raw, moved, points, canonical]
         launch(adjoint_kernel, len(visible_count), inputs, device, grain=GRAIN_OF_RAYS)
 
         of_density = of_displacement = None
@@ -125,44 +137,63 @@ def _starts(counts: Tensor) -> tuple[Tensor, int]:
     return stops - counts, int(stops[-1]) if len(stops) else 0
 
 
-def _arrays(rays: Rays, path: Path) -> tuple[RayArrays, Tensor]:
-    """Rays as kernels take them, and how many samples (R,) each has, in empty space or not."""
-    entry, count = steps_through(rays, path.box, step=path.step, near=path.near, far=path.far)
-    # Straight rays have no course; their origins stand in for it.
-    course = rays.course if isinstance(rays, ContractedRays) else rays.origins
-    arrays = RayArrays()
-    arrays.entries = array(entry)
-    arrays.counts = array(count)
-    arrays.origins = array(rays.origins.contiguous())
-    arrays.directions = array(rays.directions.contiguous())
-    arrays.courses = array(course.contiguous())
-    return arrays, count
-
-
 def _geometry(rays: Rays, medium: Medium) -> Geometry:
+    moves = medium.displacement is not None
+    return geometry_of(
+        medium.path.box,
+        shape_of(medium.density),
+        medium.path.surroundings.box,
+        shape_of(medium.path.surroundings.distances),
+        motion_box=medium.motion_box if moves else None,
+        motion_shape=shape_of(medium.displacement) if moves else None,
+        still_outside=medium.still_outside,
+        space=rays.space if isinstance(rays, ContractedRays) else None,
+        step=medium.path.step,
+        shift=medium.shift,
+        delta=medium.delta,
+        threshold=medium.threshold,
+    )
+
+
+@lru_cache(maxsize=64)
+def geometry_of(
+    box: Box,
+    shape: Shape,
+    occupancy_box: Box,
+    occupancy_shape: Shape,
+    *,
+    motion_box: Box | None,
+    motion_shape: Shape | None,
+    still_outside: bool,
+    space: ContractedSpace | None,
+    step: float,
+    shift: float,
+    delta: float,
+    threshold: float,
+) -> Geometry:
+    """What rays are followed through; with a ``space``, rays in contracted space."""
     geometry = Geometry()
-    path, surroundings = medium.path, medium.path.surroundings
-    geometry.density = grid_over(path.box, shape_of(medium.density))
-    geometry.occupancy = grid_over(surroundings.box, shape_of(surroundings.distances))
-    if medium.displacement is not None and medium.motion_box is not None:
+    geometry.density = grid_over(box, shape)
+    geometry.occupancy = grid_over(occupancy_box, occupancy_shape)
+    if motion_box is not None and motion_shape is not None:
         geometry.moves = 1
-        geometry.motion = grid_over(medium.motion_box, shape_of(medium.displacement))
-        geometry.still_outside = int(medium.still_outside)
-    if isinstance(rays, ContractedRays):
-        inner = rays.space.inner()
+        geometry.motion = grid_over(motion_box, motion_shape)
+        geometry.still_outside = int(still_outside)
+    if space is not None:
+        inner = space.inner()
         geometry.contracted = 1
         geometry.center = wp.vec3(*inner.middle)
         geometry.half = wp.vec3(*(edge / 2 for edge in inner.size))
-        geometry.shell = rays.space.shell
-    geometry.step = path.step
-    geometry.shift = medium.shift
-    geometry.delta = medium.delta
-    geometry.threshold = medium.threshold
+        geometry.shell = space.shell
+    geometry.step = step
+    geometry.shift = shift
+    geometry.delta = delta
+    geometry.threshold = threshold
     # α ≥ threshold where v + b ≥ softplus⁻¹(τ / δ).
     geometry.faintest = -math.inf
-    if medium.threshold > 0:
-        tau = -math.log1p(-medium.threshold)
-        geometry.faintest = math.log(math.expm1(tau / medium.delta)) - medium.shift
+    if threshold > 0:
+        tau = -math.log1p(-threshold)
+        geometry.faintest = math.log(math.expm1(tau / delta)) - shift
     return geometry
 
 
@@ -201,25 +232,6 @@ class Geometry:
 
 
 @wp.struct
-class RayArrays:
-    """R rays.
-
-    Attributes:
-        origins: in the fields' space; of contracted rays in the world.
-        directions: likewise.
-        courses: of ``ContractedRays``.
-        entries: the distance of each ray's first sample.
-        counts: the number of its samples up to its exit.
-    """
-
-    origins: wp.array(dtype=wp.vec3)
-    directions: wp.array(dtype=wp.vec3)
-    courses: wp.array(dtype=wp.vec3)
-    entries: wp.array(dtype=float)
-    counts: wp.array(dtype=wp.int64)
-
-
-@wp.struct
 class VisibleSample:
     """A sample at a distance along its ray, and at q in canonical space: τ, and w = T α."""
 
@@ -230,20 +242,12 @@ class VisibleSample:
 
 
 @wp.struct
-class VisibleSamples:
-    """Samples that are opaque enough and not hidden: ``count`` of each ray, from ``start`` on."""
-
-    start: wp.array(dtype=wp.int64)
-    count: wp.array(dtype=int)
-    samples: wp.array(dtype=VisibleSample)
-
-
-@wp.struct
 class Ray:
-    """One of ``RayArrays``; in ``samples_per_cell`` or more it moves by a cell of the occupancy.
+    """A ray: in the fields' space, or if it is contracted in the world, with its course.
 
-    In straight space its k-th sample is at ``place`` + k · ``pace`` among the occupancy's points;
-    in contracted space these mean nothing.
+    It has ``count`` samples from the distance ``entry`` on, and moves by a cell of the occupancy in
+    ``samples_per_cell`` or more. In straight space its k-th sample is at ``place`` + k · ``pace``
+    among the occupancy's points; in contracted space these mean nothing.
     """
 
     origin: wp.vec3
@@ -276,26 +280,13 @@ def position(geometry: Geometry, ray: Ray, distance: float):
 
 
 @wp.func
-def ray_of(geometry: Geometry, rays: RayArrays, number: int):
-    """One of the rays."""
-    ray = Ray()
-    ray.origin = rays.origins[number]
-    ray.direction = rays.directions[number]
-    ray.course = rays.courses[number]
-    ray.entry = rays.entries[number]
-    ray.count = int(rays.counts[number])
-    ray.place = coordinates(geometry.occupancy, ray.origin + ray.direction * ray.entry)
-    ray.pace = wp.cw_mul(ray.direction, geometry.occupancy.scale) * geometry.step
-    cells = wp.max(wp.abs(ray.pace))
-    if geometry.contracted == 1:
-        slopes = wp.abs(wp.cw_div(ray.direction, geometry.half))
-        fastest = ray.course[1]
-        cells = 2.0 * (slopes[0] + slopes[1] + slopes[2]) - fastest
-        cells = wp.max(cells, wp.max(wp.static(CONTRACTED_PACE), geometry.shell) * fastest)
-        cells *= wp.max(wp.cw_mul(geometry.half, geometry.occupancy.scale)) * geometry.step
-    # A little less: positions are rounded.
-    ray.samples_per_cell = 0.999 / wp.max(cells, 1.0e-9)
-    return ray
+def own_distance(course: wp.vec3, world: float):
+    """The distance along a contracted ray, of one in the world; as ``ContractedRays`` has it."""
+    x = course[0] + course[1] * world
+    if wp.abs(x) <= 1.0:
+        return world
+    y = wp.sign(x) * (1.0 + course[2] * (1.0 - 1.0 / wp.abs(x)))
+    return (y - course[0]) / course[1]
 
 
 @wp.func
@@ -353,6 +344,59 @@ def opacity(tau: float):
     return 1.0 - wp.exp(-tau)
 
 
+@wp.kernel(module="unique", enable_backward=False)
+def enter_kernel(
+    first: int,
+    geometry: Geometry,
+    origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    courses: wp.array(dtype=wp.vec3),
+    near: float,
+    far: float,
+    rays: wp.array(dtype=Ray),
+    counts: wp.array(dtype=int),
+):
+    """Rays, and how many samples each has to its exit, in empty space or not.
+
+    Where samples begin and how many there are as ``steps_through`` has it.
+    """
+    number = first + wp.tid()
+    ray = Ray()
+    ray.origin = origins[number]
+    ray.direction = directions[number]
+    ray.course = courses[number]
+    ray.entry = near
+    leave = far
+    cells = float(0.0)
+    if geometry.contracted == 1:
+        ray.entry = own_distance(ray.course, near)
+        leave = own_distance(ray.course, far)
+        slopes = wp.abs(wp.cw_div(ray.direction, geometry.half))
+        fastest = ray.course[1]
+        cells = 2.0 * (slopes[0] + slopes[1] + slopes[2]) - fastest
+        cells = wp.max(cells, wp.max(wp.static(CONTRACTED_PACE), geometry.shell) * fastest)
+        cells *= wp.max(wp.cw_mul(geometry.half, geometry.occupancy.scale)) * geometry.step
+    else:
+        for axis in range(3):
+            along = ray.direction[axis]
+            if wp.abs(along) < wp.static(PARALLEL):
+                along = wp.static(PARALLEL)
+            to_low = (geometry.density.low[axis] - ray.origin[axis]) / along
+            to_high = (geometry.density.high[axis] - ray.origin[axis]) / along
+            ray.entry = wp.max(ray.entry, wp.min(to_low, to_high))
+            leave = wp.min(leave, wp.max(to_low, to_high))
+        ray.place = coordinates(geometry.occupancy, ray.origin + ray.direction * ray.entry)
+        ray.pace = wp.cw_mul(ray.direction, geometry.occupancy.scale) * geometry.step
+        cells = wp.max(wp.abs(ray.pace))
+    # A little less: positions are rounded.
+    ray.samples_per_cell = 0.999 / wp.max(cells, 1.0e-9)
+    ray.count = 0
+    if leave >= ray.entry:
+        ray.count = 1 + int(wp.floor((leave - ray.entry) / geometry.step + wp.static(EXIT)))
+    rays[number] = ray
+    counts[number] = ray.count
+
+
 @made_once
 def march_kernel(contracted: bool) -> wp.Kernel:
     """The march in straight or in contracted space; one for both takes a third longer."""
@@ -362,18 +406,20 @@ def march_kernel(contracted: bool) -> wp.Kernel:
     def march(
         first: int,
         geometry: Geometry,
-        rays: RayArrays,
+        rays: wp.array(dtype=Ray),
         distances: wp.array(dtype=wp.uint8),
         density: wp.array(dtype=Density),
         displacements: wp.array(dtype=wp.vec3),
-        visible: VisibleSamples,
+        visible_start: wp.array(dtype=wp.int64),
+        visible: wp.array(dtype=VisibleSample),
+        visible_count: wp.array(dtype=int),
         significant_count: wp.array(dtype=int),
         transmittance: wp.array(dtype=float),
     ):
         """τ_i and w_i = T_i α_i of each ray's visible samples, and T_end."""
         number = first + wp.tid()
-        ray = ray_of(geometry, rays, number)
-        start = int(visible.start[number])
+        ray = rays[number]
+        start = int(visible_start[number])
         count = int(0)
         significant = int(0)
         left = float(1.0)
@@ -395,7 +441,7 @@ def march_kernel(contracted: bool) -> wp.Kernel:
                     sample.canonical = canonical
                     sample.tau = softplus(raw + geometry.shift) * geometry.delta
                     sample.weight = left * opacity(sample.tau)
-                    visible.samples[start + count] = sample
+                    visible[start + count] = sample
                     count += 1
                     if sample.weight >= geometry.threshold:
                         significant += 1
@@ -403,7 +449,7 @@ def march_kernel(contracted: bool) -> wp.Kernel:
                     if left < wp.static(STOP):
                         k = ray.count
             k += 1
-        visible.count[number] = count
+        visible_count[number] = count
         significant_count[number] = significant
         transmittance[number] = left
 
@@ -414,47 +460,58 @@ def march_kernel(contracted: bool) -> wp.Kernel:
 def keep_significant_kernel(
     first: int,
     geometry: Geometry,
-    rays: RayArrays,
-    visible: VisibleSamples,
+    rays: wp.array(dtype=Ray),
+    visible_start: wp.array(dtype=wp.int64),
+    visible: wp.array(dtype=VisibleSample),
+    visible_count: wp.array(dtype=int),
     starts: wp.array(dtype=wp.int64),
     result_ray: wp.array(dtype=wp.int64),
     result_distance: wp.array(dtype=float),
     result_points: wp.array(dtype=wp.vec3),
     result_canonical: wp.array(dtype=wp.vec3),
     result_weight: wp.array(dtype=float),
+    result_depth: wp.array(dtype=float),
 ):
     """The visible samples of enough weight, without gaps; a ray's begin at its start."""
     number = first + wp.tid()
-    count = visible.count[number]
+    count = visible_count[number]
+    result_depth[number] = 0.0
     if count == 0:
         return
-    ray = ray_of(geometry, rays, number)
-    start = int(visible.start[number])
+    ray = rays[number]
+    start = int(visible_start[number])
     into = int(starts[number])
+    mass = float(0.0)
+    reached = float(0.0)
     for k in range(count):
-        sample = visible.samples[start + k]
+        sample = visible[start + k]
         if sample.weight >= geometry.threshold:
+            mass += sample.weight
+            reached += sample.weight * sample.distance
             result_ray[into] = wp.int64(number)
             result_distance[into] = sample.distance
             result_points[into] = position(geometry, ray, sample.distance)
             result_canonical[into] = sample.canonical
             result_weight[into] = sample.weight
             into += 1
+    result_depth[number] = reached / wp.max(mass, wp.static(LEAST_MASS))
 
 
 @wp.kernel(module="unique", enable_backward=False)
 def adjoint_kernel(
     first: int,
     geometry: Geometry,
-    rays: RayArrays,
+    rays: wp.array(dtype=Ray),
     density: wp.array(dtype=Density),
-    visible: VisibleSamples,
+    visible_start: wp.array(dtype=wp.int64),
+    visible: wp.array(dtype=VisibleSample),
+    visible_count: wp.array(dtype=int),
     significant_start: wp.array(dtype=wp.int64),
     given_canonical: wp.array(dtype=wp.vec3),
     given_weight: wp.array(dtype=float),
     given_transmittance: wp.array(dtype=float),
     transmittance: wp.array(dtype=float),
-    visible_start: wp.array(dtype=wp.int64),
+    result_start: wp.array(dtype=wp.int64),
     result_raw: wp.array(dtype=Density),
     result_moved: wp.array(dtype=wp.vec3),
     result_points: wp.array(dtype=wp.vec3),
@@ -467,20 +524,20 @@ def adjoint_kernel(
     Back to front ∂L/∂τ_i = ∂L/∂w_i T_i exp(−τ_i) − Σ_{j>i} ∂L/∂w_j w_j − ∂L/∂T_end T_end.
     """
     number = first + wp.tid()
-    count = visible.count[number]
+    count = visible_count[number]
     if count == 0:
         return
-    ray = ray_of(geometry, rays, number)
-    start = int(visible.start[number])
+    ray = rays[number]
+    start = int(visible_start[number])
     significant = int(significant_start[number])
     for k in range(count):
-        if visible.samples[start + k].weight >= geometry.threshold:
+        if visible[start + k].weight >= geometry.threshold:
             significant += 1
     after = transmittance[number]
     behind = given_transmittance[number] * after
     for back in range(count):
-        sample = visible.samples[start + count - 1 - back]
-        into = int(visible_start[number]) + count - 1 - back
+        sample = visible[start + count - 1 - back]
+        into = int(result_start[number]) + count - 1 - back
         tau = sample.tau
         weight = sample.weight
         slope_of_tau = -behind

@@ -71,22 +71,36 @@ def launch(
 
     On a CPU in parts of ``grain`` threads or more side by side, of which this thread runs the
     first; None: in one part, else no two threads may write to the same place. The inputs are made
-    ready once, in this thread, so that the others begin at once.
+    ready once, in this thread, so that the others begin at once; tensors, which Warp sees as
+    :func:`array` has them, and numbers are written where the launch before had them, since Warp
+    takes longer to check each again than a small launch runs.
     """
     parts = _parts(device, count, grain)
     edges = [count * part // parts for part in range(parts + 1)]
-    commands = _commands(kernel, parts, [0, *inputs], device)
+    commands = _commands(kernel, parts, inputs, device)
     begin, *others = commands
     for index, value in enumerate(inputs, 1):
-        begin.set_param_at_index(index, value)
+        given = begin.params[index + 1]
+        if isinstance(value, Tensor):
+            assert value.is_contiguous()
+            given.data = value.data_ptr()
+            given.shape[0] = _rows(value)
+        elif isinstance(value, wp.array):
+            given.data = value.ptr
+            given.shape[0] = value.shape[0]
+        elif isinstance(value, int | float):
+            given.value = value
+        else:
+            begin.set_param_at_index(index, value)
     for other in others:
         other.params[2:] = begin.params[2:]
     for command, (first, stop) in zip(commands, pairwise(edges), strict=True):
-        command.set_param_at_index(0, first)
-        command.set_dim(stop - first)
+        command.params[1].value = first
+        if command.bounds.size != stop - first:
+            command.set_dim(stop - first)
     running = [_pool().submit(other.launch) for other in others]
     if device.type == "cuda":
-        begin.launch(wp.stream_from_torch(torch.cuda.current_stream(device)))
+        begin.launch(_stream(torch.cuda.current_stream(device)))
     else:
         begin.launch()
     for other in running:
@@ -103,9 +117,12 @@ def array(tensor: Tensor, kind: Any = None) -> wp.array:
     if kind is None:
         is_row = tensor.ndim > 1
         kind = row_type(tensor.shape[-1]) if is_row else wp.dtype_from_torch(tensor.dtype)
-    count = tensor.shape[:-1].numel() if tensor.ndim > 1 else len(tensor)
     made = wp.array(
-        ptr=tensor.data_ptr(), dtype=kind, shape=(count,), device=str(tensor.device), copy=False
+        ptr=tensor.data_ptr(),
+        dtype=kind,
+        shape=(_rows(tensor),),
+        device=str(tensor.device),
+        copy=False,
     )
     made.tensor = tensor  # the memory lives as long
     return made
@@ -138,21 +155,33 @@ def row_type(channels: int) -> Any:
     return wp.vec3 if channels == 3 else wp.types.vector(length=channels, dtype=wp.float32)
 
 
-def _commands(
-    kernel: wp.Kernel, parts: int, inputs: list[Any], device: torch.device
-) -> list[wp.Launch]:
-    """This thread's launches of a kernel, one a part, made once.
+def _rows(tensor: Tensor) -> int:
+    return tensor.shape[:-1].numel() if tensor.ndim > 1 else len(tensor)
 
-    Warp finds, compiles and loads a kernel in one thread at a time.
+
+def _commands(
+    kernel: wp.Kernel, parts: int, inputs: Sequence[Any], device: torch.device
+) -> list[wp.Launch]:
+    """This thread's launches of a kernel with tensors of these types, one a part, made once.
+
+    Warp finds, compiles and loads a kernel, and checks the types, in one thread at a time.
     """
     made = _of_thread.__dict__.setdefault("commands", {})
-    commands: list[wp.Launch] = made.setdefault((kernel, device), [])
+    types = tuple(value.dtype for value in inputs if isinstance(value, Tensor))
+    commands: list[wp.Launch] = made.setdefault((kernel, device, types), [])
     while len(commands) < parts:
+        values = [0, *(array(value) if isinstance(value, Tensor) else value for value in inputs)]
         with compiling:
-            command = wp.launch(kernel, 1, inputs=inputs, device=str(device), record_cmd=True)
+            command = wp.launch(kernel, 1, inputs=values, device=str(device), record_cmd=True)
         command.fwd_args = None  # these tensors are not to live as long
         commands.append(command)
     return commands[:parts]
+
+
+@cache
+def _stream(stream: torch.cuda.Stream) -> wp.Stream:
+    """One of torch's streams as Warp has it."""
+    return wp.stream_from_torch(stream)
 
 
 def _parts(device: torch.device, count: int, grain: int | None) -> int:

@@ -7,7 +7,7 @@ compute where those do not run.
 |---|---|
 | ``march`` | ``march``: samples, warped and composited |
 | ``trilinear`` | ``look_up``: values of a grid between its points; ``resample`` |
-| ``compositing`` | ``composite``: weights; ``color_and_depth`` |
+| ``compositing`` | ``composite``: weights; ``sum_by_ray``; ``mean_distance``: depths |
 | ``color_network`` | ``decode``: features and directions → RGB |
 | ``photometric`` | the terms that compare rays with images |
 | ``motion`` | ``cycle_error``, ``flow_error``: the cycle and the flow term |

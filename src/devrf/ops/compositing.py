@@ -9,6 +9,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+# Σ w of a ray is at least so much where something is divided by it.
+LEAST_MASS = 1e-6
+
 
 def composite(depth: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
     """Weights of samples, and each ray's transmittance behind them (Max 1995).
@@ -45,19 +48,18 @@ def sum_by_ray(values: Tensor, ray: Tensor, rays: int) -> Tensor:
     return values.new_zeros((rays, *values.shape[1:])).index_add(0, ray, values)
 
 
-def color_and_depth(
-    weighted_color: Tensor, reached: Tensor, mass: Tensor, transmittance: Tensor, background: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Colour Σ w_i c_i + T_end · background (R, 3) and depth Σ w_i z_i / Σ w_i (R,) of rays.
+@torch.no_grad()
+def mean_distance(weight: Tensor, distance: Tensor, ray: Tensor, rays: int) -> Tensor:
+    """Depths Σ w_i z_i / Σ w_i (R,) of rays, 0 where all weights are.
 
     Args:
-        weighted_color: (R, 3) Σ w_i c_i.
-        reached: (R,) Σ w_i z_i.
-        mass: (R,) Σ w_i; where it is 0, so is the depth.
-        transmittance: (R,) T_end.
-        background: (3,) or (R, 3) RGB.
+        weight: (S,) w of the samples.
+        distance: (S,) z of the samples, along their rays.
+        ray: (S,) int64, their rays.
+        rays: R.
     """
-    return weighted_color + transmittance[:, None] * background, reached / mass.clamp(min=1e-6)
+    mass = sum_by_ray(weight, ray, rays)
+    return sum_by_ray(weight * distance, ray, rays) / mass.clamp(min=LEAST_MASS)
 
 
 def firsts(ray: Tensor, rays: int) -> Tensor:

@@ -13,11 +13,13 @@ from torch.nn.functional import softplus
 
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
-from devrf.ops.compositing import composite, transmittances
+from devrf.ops.compositing import composite, mean_distance, transmittances
 from devrf.ops.trilinear import look_up
 
 # A ray ends where its transmittance is less: what is behind cannot be seen.
 STOP = 1e-4
+# A sample so close before a ray's exit counts, in steps: rounding does not decide on it.
+EXIT = 1e-3
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,8 @@ class Samples:
         canonical: (K, 3) positions q in canonical space.
         weight: (K,) w = T α.
         transmittance: (R,) T_end, behind the last sample of each ray.
+        depth: (R,) Σ w_i z_i / Σ w_i over a ray's samples at distances z, 0 without any; it has no
+            gradient.
     """
 
     ray: Tensor
@@ -107,6 +111,7 @@ class Samples:
     canonical: Tensor
     weight: Tensor
     transmittance: Tensor
+    depth: Tensor
 
 
 def march(rays: Rays, medium: Medium) -> Samples:
@@ -134,6 +139,7 @@ def march(rays: Rays, medium: Medium) -> Samples:
     weight, transmittance = composite(tau[visible], ray[visible], len(rays))
     significant = (weight >= medium.threshold).nonzero()[:, 0]
     kept = visible[significant]
+    depth = mean_distance(weight[significant], distance[kept], ray[kept], len(rays))
     return Samples(
         ray=ray[kept],
         distance=distance[kept],
@@ -141,6 +147,7 @@ def march(rays: Rays, medium: Medium) -> Samples:
         canonical=canonical[kept],
         weight=weight[significant],
         transmittance=transmittance,
+        depth=depth,
     )
 
 
@@ -171,5 +178,5 @@ def steps_through(
     A sample exactly at the exit counts: in NDC it is the last plane, behind the whole scene.
     """
     entry, leave = box.crossing(rays, near, far)
-    count = torch.where(leave >= entry, ((leave - entry) / step + 1e-3).floor() + 1, 0.0)
+    count = torch.where(leave >= entry, ((leave - entry) / step + EXIT).floor() + 1, 0.0)
     return entry, count.long()

@@ -13,7 +13,7 @@ from devrf.geometry.rays import Rays
 from devrf.kernels.march import march
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.deformation_field import GridWarp
-from devrf.ops.compositing import color_and_depth, sum_by_ray
+from devrf.ops.compositing import sum_by_ray
 from devrf.ops.march import Medium, Path
 from devrf.ops.trilinear import Shape
 from devrf.rendering.occupancy import Occupancy, dilate
@@ -57,14 +57,11 @@ def render(
             every = torch.arange(len(rays), device=ends.device)
             background = field.rgb(ends, rays.viewdirs, every, precision)
     with span("compositing"):
-        weighted = sum_by_ray(samples.weight[:, None] * color, samples.ray, len(rays))
-        with torch.no_grad():
-            mass = sum_by_ray(samples.weight, samples.ray, len(rays))
-            reached = sum_by_ray(samples.weight * samples.distance, samples.ray, len(rays))
-        image, depth = color_and_depth(weighted, reached, mass, samples.transmittance, background)
+        image = sum_by_ray(samples.weight[:, None] * color, samples.ray, len(rays))
+        image = image + samples.transmittance[:, None] * background
     return VoxelOutput(
         color=image,
-        depth=depth,
+        depth=samples.depth,
         transmittance=samples.transmittance,
         samples=samples,
         sample_color=color,

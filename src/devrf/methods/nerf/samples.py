@@ -9,7 +9,7 @@ from torch import Tensor
 
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
-from devrf.ops.compositing import color_and_depth, composite, sum_by_ray
+from devrf.ops.compositing import composite, mean_distance, sum_by_ray
 from devrf.rendering.output import RenderOutput
 
 # A length that is opaque at any density that a softplus gives.
@@ -101,12 +101,11 @@ def accumulated(
     """
     ray = samples.ray
     rays = samples.rays
-    weighted_color = sum_by_ray(color, ray, rays)
-    with torch.no_grad():
-        mass = sum_by_ray(weight, ray, rays)
-        reached = sum_by_ray(weight * samples.distance, ray, rays)
-    image, depth = color_and_depth(weighted_color, reached, mass, transmittance, background)
-    return RenderOutput(color=image, depth=depth, transmittance=transmittance)
+    return RenderOutput(
+        color=sum_by_ray(color, ray, rays) + transmittance[:, None] * background,
+        depth=mean_distance(weight, samples.distance, ray, rays),
+        transmittance=transmittance,
+    )
 
 
 def limits(rays: Rays, box: Box, depths: tuple[float, float]) -> tuple[Tensor, Tensor]:
