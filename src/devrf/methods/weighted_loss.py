@@ -39,10 +39,9 @@ def weighted_sum(
     values: Mapping[str, Tensor], weights: Mapping[str, float]
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Σ weight · value () over ``values`` () by name; and these, detached."""
-    total: Tensor | float = 0.0
+    total = next(iter(values.values())).new_zeros(())
     for name, value in values.items():
-        total = total + weights[name] * value
-    assert isinstance(total, Tensor)
+        total = torch.add(total, value, alpha=weights[name])
     return total, {name: value.detach() for name, value in values.items()}
 
 

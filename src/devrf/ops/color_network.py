@@ -62,10 +62,13 @@ def decode(
             sums, and the last layer stay in single precision, so that colours do.
         residual: (S, 3) what is added before the sigmoid; None: nothing.
     """
-    # Most rays of a picture have no samples: their directions are not encoded. The others' part of
-    # the first layer is the same for all samples of a ray.
-    seen, place = torch.unique_consecutive(ray, return_inverse=True)
-    encoded = _encode(viewdirs.index_select(0, seen), network.octaves)
+    # The directions' part of the first layer is the same for all samples of a ray.
+    place = ray
+    if not torch.is_grad_enabled():
+        # Most rays of a picture have no samples: their directions are not encoded.
+        seen, place = torch.unique_consecutive(ray, return_inverse=True)
+        viewdirs = viewdirs.index_select(0, seen)
+    encoded = _encode(viewdirs, network.octaves)
     along = linear(encoded, network.direction_weight, network.feature_bias)
     if torch.is_grad_enabled() or not features.is_cpu or len(ray) <= TILE:
         return _color(features, along.index_select(0, place), network, precision, residual)

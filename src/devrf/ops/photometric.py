@@ -30,9 +30,12 @@ def per_sample_color(weight: Tensor, color: Tensor, ray: Tensor, truth: Tensor) 
 
 
 def background_entropy(transmittance: Tensor) -> Tensor:
-    """Mean −(p log p + (1 − p) log(1 − p)), p = T_end (R,): a ray hits something or nothing."""
+    """Mean −(p log p + (1 − p) log(1 − p)), p = T_end (R,): a ray hits something or nothing.
+
+    That is the cross entropy of p with itself.
+    """
     p = transmittance.clamp(NEAREST, 1 - NEAREST)
-    return -(p * p.log() + (1 - p) * torch.log1p(-p)).mean()
+    return torch.nn.functional.binary_cross_entropy(p, p)
 
 
 def distortion(weight: Tensor, distance: Tensor, ray: Tensor, rays: int) -> Tensor:

@@ -65,7 +65,9 @@ def prediction() -> Prediction:
         color=torch.tensor([[0.5, 0.25, 0.0], [0.0, 0.0, 0.0], [0.4, 0.4, 0.4]]),
         depth=torch.zeros(3),
         transmittance=left,
-        samples=Samples(RAY, torch.ones(3), torch.zeros(3, 3), torch.zeros(3, 3), weight, left),
+        samples=Samples(
+            RAY, torch.ones(3), torch.zeros(3, 3), torch.zeros(3, 3), weight, left, torch.zeros(3)
+        ),
         sample_color=sample_color,
     )
     batch = batch_of(
@@ -146,7 +148,7 @@ def seen(
         color=torch.zeros(len(none), 3),
         depth=none,
         transmittance=none,
-        samples=Samples(ray, torch.zeros(len(ray)), points, canonical, weight, none),
+        samples=Samples(ray, torch.zeros(len(ray)), points, canonical, weight, none, none),
         sample_color=torch.zeros(len(ray), 3),
     )
 
