@@ -10,8 +10,11 @@ from __future__ import annotations
 import harness  # isort: skip: how threads wait is set before torch is loaded
 
 import argparse
+import cProfile
+import io
 import json
 import platform
+import pstats
 import subprocess
 import sys
 import time
@@ -22,6 +25,7 @@ from functools import partial
 from importlib.metadata import distributions
 from pathlib import Path
 
+import kernels
 import rendering
 import torch
 import training
@@ -118,6 +122,14 @@ def tests(into: Path) -> Iterator[Row]:
     yield {"tests": said([*command, str(HERE.parents[1] / "tests")]).splitlines()[-60:]}
 
 
+def kernel_rows(into: Path) -> Iterator[Row]:
+    """Each kernel at the paper's size beside its definition; first, seconds until one has run."""
+    began = time.perf_counter()
+    small = next(kernels.rows(DEVICE, side=8, rays=8, points=8))
+    yield {"seconds until the first two look-ups have run": time.perf_counter() - began, **small}
+    yield from kernels.rows(DEVICE) if GPU else kernels.rows(DEVICE, side=8, rays=8, points=8)
+
+
 def scene(into: Path) -> Iterator[Row]:
     """Write the embedded scene, so that each step reads it; or note where the given one is."""
     began = time.perf_counter()
@@ -144,13 +156,25 @@ def learned(
     yield json.loads((run.folder / "metrics.json").read_text())
 
 
+def learned_run(into: Path) -> RunContext:
+    """The run that learned with all iterations, or where there is none, with a tenth of them."""
+    whole = run_of(into, "paper")
+    return whole if whole.own_checkpoint("deformation").exists() else run_of(into, "as-it-is")
+
+
 def parts(into: Path) -> Iterator[Row]:
-    """Eager iterations at each resolution of the learned scene, by part, and their kernels."""
-    run = run_of(into, "paper")
+    """Iterations at each resolution of the learned scene, by part, on the host and by kernel."""
+    run = learned_run(into)
     tables = []
     usual = training.parts
 
     def noted(work: Callable[[], None], *, cuda: bool) -> dict[str, float]:
+        host = cProfile.Profile()
+        host.runcall(work)
+        wait(DEVICE)
+        text = io.StringIO()
+        pstats.Stats(host, stream=text).sort_stats("tottime").print_stats(40)
+        tables.append(text.getvalue())
         with profile(record_shapes=False) as profiled:
             work()
         order = "self_cuda_time_total" if cuda else "self_cpu_time_total"
@@ -167,7 +191,7 @@ def parts(into: Path) -> Iterator[Row]:
 
 def frames(into: Path) -> Iterator[Row]:
     """Frames a second at a new time and again at the same, and what a frame launches."""
-    run = run_of(into, "paper")
+    run = learned_run(into)
     began = time.perf_counter()
     stored = harness.learned_scene(run)
     yield {"seconds to load and unpack": time.perf_counter() - began}
@@ -186,6 +210,7 @@ TENTH = shortened(0, 2000, 20) if GPU else []
 # Each step with the minutes that it may take, the most telling first.
 STEPS: dict[str, tuple[float, Callable[[Path], Iterator[Row]]]] = {
     "machine": (1, machine),
+    "kernels": (3, kernel_rows),
     "checks": (6, checks),
     "scene": (8, scene),
     "paper": (15, partial(learned, name="paper")),
