@@ -11,7 +11,6 @@ from torch import Tensor
 
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
-from devrf.geometry.rays import Rays
 from devrf.scenes.procedural.march import CHUNK, MAX_STEPS, block_starts, trace
 from devrf.scenes.procedural.solids import Body, Shape
 from devrf.scenes.scene import Capture, OpticalFlow, Views
@@ -172,7 +171,12 @@ class Filming:
 
     def at_rest(self, train: Cameras, test: Cameras) -> Capture:
         """One image from each camera at time 0."""
-        return Capture(self._still(train, "train"), self._still(test, "test"))
+        pixels, depth = self.pictures(train.joined(test), 0.0)
+        learned, tested = slice(len(train)), slice(len(train), None)
+        return Capture(
+            train=_still(train, pixels[learned], depth[learned], "train"),
+            test=_still(test, pixels[tested], depth[tested], "test"),
+        )
 
     def moving(
         self, train: Cameras, test: Cameras, frames: int, unseen: Sequence[int] = ()
@@ -182,10 +186,16 @@ class Filming:
         There are ``frames`` ≥ 2 frames, at times k / (T − 1); the cameras to learn from leave out
         those in ``unseen``.
         """
-        train_frames = [frame for frame in range(frames) if frame not in unseen]
+        everyone = train.joined(test)
+        times = torch.arange(frames) / (frames - 1)
+        pixels, depth = self._shot([everyone] * frames, times)
+        seen = [frame for frame in range(frames) if frame not in unseen]
+        learned, tested = slice(len(train)), slice(len(train), None)
+        views = _moving(train, pixels[seen, learned], depth[seen, learned], times, seen, "train")
+        others = _moving(test, pixels[:, tested], depth[:, tested], times, range(frames), "test")
         return Capture(
-            train=self._moving(train, train_frames, frames, "train"),
-            test=self._moving(test, range(frames), frames, "test"),
+            train=replace(views, flow=exact_flow(self.shape, views)),
+            test=replace(others, flow=exact_flow(self.shape, others)),
         )
 
     def by_hand(self, camera: Cameras, others: Cameras) -> Capture:
@@ -194,44 +204,21 @@ class Filming:
         ``camera`` is where it is at each of T ≥ 2 frames, at times k / (T − 1); ``others`` has
         another view at each of them, of which only what is :func:`covisible` is scored.
         """
-        train = self._followed(camera, "train")
-        test = self._followed(others, "test")
+        times = torch.arange(len(camera)) / (len(camera) - 1)
+        pairs = [camera[[k]].joined(others[[k]]) for k in range(len(camera))]
+        pixels, depth = self._shot(pairs, times)
+        train = _followed(camera, pixels[:, 0], depth[:, 0], times, "train")
+        test = _followed(others, pixels[:, 1], depth[:, 1], times, "test")
         return Capture(
             train=replace(train, flow=exact_flow(self.shape, train)),
             test=replace(test, valid_mask=covisible(self.shape, test, train)),
         )
 
-    def _followed(self, cameras: Cameras, split: str) -> Views:
-        order = torch.arange(len(cameras))
-        times = order / (len(cameras) - 1)
-        shot = [self.pictures(cameras[[k]], time) for k, time in enumerate(times.tolist())]
-        pixels, depths = zip(*shot, strict=True)
-        names = tuple(f"hand-held {split} frame {k:03d}" for k in order.tolist())
-        return Views(torch.cat(pixels), cameras, times, order, names, depth=torch.cat(depths))
-
-    def _still(self, cameras: Cameras, split: str) -> Views:
-        pixels, depth = self.pictures(cameras, 0.0)
-        order = torch.arange(len(cameras))
-        names = tuple(f"static {split} {k:03d}" for k in order.tolist())
-        return Views(pixels, cameras, torch.zeros(len(cameras)), order, names, depth=depth)
-
-    def _moving(self, cameras: Cameras, shown: Sequence[int], frames: int, split: str) -> Views:
-        times = torch.tensor(shown) / (frames - 1)
-        pixels, depths = zip(*(self.pictures(cameras, t) for t in times.tolist()), strict=True)
-        view = torch.arange(len(cameras)).repeat(len(shown))
-        views = Views(
-            torch.cat(pixels),
-            cameras[view],
-            times.repeat_interleave(len(cameras)),
-            view,
-            tuple(
-                f"dynamic {split} frame {frame:03d} view {v}"
-                for frame in shown
-                for v in range(len(cameras))
-            ),
-            depth=torch.cat(depths),
-        )
-        return replace(views, flow=exact_flow(self.shape, views))
+    def _shot(self, cameras: Sequence[Cameras], times: Tensor) -> tuple[Tensor, Tensor]:
+        """The :meth:`pictures` (T, N, H, W, ·) and distances (T, N, H, W) by N cameras a time."""
+        moments = zip(cameras, times.tolist(), strict=True)
+        pixels, depths = zip(*(self.pictures(some, time) for some, time in moments), strict=True)
+        return torch.stack(pixels), torch.stack(depths)
 
     def pictures(self, cameras: Cameras, time: float) -> tuple[Tensor, Tensor]:
         """One image from each of N ``cameras`` at ``time``.
@@ -247,25 +234,25 @@ class Filming:
         depth = torch.full_like(start, torch.inf)
         image = start.new_zeros(len(start), 4)
         grid = cameras.pixel_grid()
-        # From a pixel's centre to the centres of its n × n parts.
+        # A pixel's centre, for its depth, and the centres of its n × n parts, for its colour.
         steps = (torch.arange(self.supersample) + 0.5) / self.supersample - 0.5
-        offsets = torch.cartesian_prod(steps, steps)
+        offsets = torch.cat([torch.zeros(1, 2), torch.cartesian_prod(steps, steps)])
         count = len(offsets)
         live = start.isfinite().nonzero().squeeze(-1)
         for pixel in torch.split(live, max(CHUNK // count, 1)):
-            camera = pixel // len(grid)
-            center = grid[pixel % len(grid)]
-            onset = start[pixel]
-            depth[pixel] = self._trace(cameras.rays(camera, center), time, onset)
-            parts = (center[:, None] + offsets).reshape(-1, 2)
-            rays = cameras.rays(camera.repeat_interleave(count), parts)
-            distance = self._trace(rays, time, onset.repeat_interleave(count))
-            hit = distance.isfinite().nonzero().squeeze(-1)
+            centers = grid[pixel % len(grid)]
+            rays = cameras.rays(
+                (pixel // len(grid)).repeat(count), (centers + offsets[:, None]).view(-1, 2)
+            )
+            onset = start[pixel].repeat(count)
+            distance = trace(self.shape, rays, time, onset, self.reach, self.steps)
+            depth[pixel] = distance[: len(pixel)]
+            hit = distance[len(pixel) :].isfinite().nonzero().squeeze(-1) + len(pixel)
             # Colour times alpha, and alpha: only these may be averaged.
             samples = start.new_zeros(len(rays), 4)
             samples[hit, 3] = 1
             samples[hit, :3] = shaded(self.shape, rays.at(hit, distance[hit]), time, self.light)
-            mean = samples.view(-1, count, 4).mean(dim=1)
+            mean = samples.view(count, -1, 4)[1:].mean(dim=0)
             color = mean[:, :3] / mean[:, 3:].clamp_min(1e-6)
             image[pixel] = torch.cat([color, mean[:, 3:]], dim=-1)
         pixels = (image * 255).round().clamp(0, 255).to(torch.uint8).view(*size, 4)
@@ -273,5 +260,38 @@ class Filming:
             pixels = pixels[..., :3].contiguous()
         return pixels, depth.view(size)
 
-    def _trace(self, rays: Rays, time: float, start: Tensor) -> Tensor:
-        return trace(self.shape, rays, time, start, self.reach, self.steps)
+
+def _still(cameras: Cameras, pixels: Tensor, depth: Tensor, split: str) -> Views:
+    order = torch.arange(len(cameras))
+    names = tuple(f"static {split} {k:03d}" for k in order.tolist())
+    return Views(pixels, cameras, torch.zeros(len(cameras)), order, names, depth=depth)
+
+
+def _moving(
+    cameras: Cameras,
+    pixels: Tensor,
+    depth: Tensor,
+    times: Tensor,
+    shown: Sequence[int],
+    split: str,
+) -> Views:
+    view = torch.arange(len(cameras)).repeat(len(shown))
+    names = (
+        f"dynamic {split} frame {frame:03d} view {v}"
+        for frame in shown
+        for v in range(len(cameras))
+    )
+    return Views(
+        pixels.flatten(0, 1),
+        cameras[view],
+        times[list(shown)].repeat_interleave(len(cameras)),
+        view,
+        tuple(names),
+        depth=depth.flatten(0, 1),
+    )
+
+
+def _followed(cameras: Cameras, pixels: Tensor, depth: Tensor, times: Tensor, split: str) -> Views:
+    order = torch.arange(len(cameras))
+    names = tuple(f"hand-held {split} frame {k:03d}" for k in order.tolist())
+    return Views(pixels, cameras, times, order, names, depth=depth)
