@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from devrf.geometry.box import Box
 from devrf.ops.march import Surroundings
@@ -40,13 +41,17 @@ class Occupancy(nn.Module):
     @property
     def surroundings(self) -> Surroundings:
         """How many cells away something may be, so that rays can skip what is empty."""
+        return Surroundings(self.find_distances(), self.box)
+
+    def find_distances(self) -> Tensor:
+        """Cells (X, Y, Z) to the nearest occupied one, uint8, found once for a mask."""
         if self._distances is None:
             grown, away = self.mask, (~self.mask).to(torch.uint8)
             for _ in range(self.FARTHEST - 1):
                 grown = dilate(grown, 1)
                 away += ~grown
             self._distances = away
-        return Surroundings(self._distances, self.box)
+        return self._distances
 
     @property
     def cell(self) -> float:
@@ -60,15 +65,15 @@ class Occupancy(nn.Module):
 
     def at(self, points: Tensor) -> Tensor:
         """Mask (M,): whether something may be at ``points`` (M, 3)."""
-        x, y, z = self.mask.shape
+        # A border of empty cells, to which all that is outside belongs.
+        bordered = pad(self.mask, (1, 1) * 3)
+        row = torch.zeros(len(points), dtype=torch.int32, device=points.device)
         # Axis by axis: several times faster than rows of three.
-        along = self.box.to_grid(points, (x, y, z)).round_().to(torch.int32).t().contiguous()
-        inside = torch.ones_like(along[0], dtype=torch.bool)
-        row = torch.zeros_like(along[0])
-        for cell, count in zip(along, self.mask.shape, strict=True):
-            inside &= (cell >= 0) & (cell < count)
-            row.mul_(count).add_(cell)
-        return self.mask.view(-1).index_select(0, row.mul_(inside)) & inside
+        for axis, count in enumerate(self.mask.shape):
+            scale = (count - 1) / self.box.size[axis]
+            place = points[:, axis].sub(self.box.low[axis]).mul_(scale).nan_to_num_(nan=-1.0)
+            row.mul_(count + 2).add_(place.round_().clamp_(-1, count).to(torch.int32).add_(1))
+        return bordered.view(-1).index_select(0, row)
 
     def points_near(self, shape: tuple[int, int, int], box: Box) -> Tensor:
         """The points of a grid over ``box`` that interpolation near anything occupied reads."""

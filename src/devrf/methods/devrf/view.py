@@ -19,6 +19,7 @@ from devrf.ops.compositing import sum_by_ray
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import ColorChange, RenderedImage
 from devrf.rendering.sampling import RenderSettings
+from devrf.system.threads import one_thread
 
 # Rays at once: on a CPU so many that what a chunk costs by itself, 0.8 ms, is little (in unbounded
 # scenes a ray has tens of samples to colour), and no more than whose samples fit 32 MB, beyond
@@ -57,8 +58,9 @@ class DeVRFView:
     _warp: GridWarp | None = field(init=False, default=None)
 
     @torch.no_grad()
+    @one_thread()
     def __post_init__(self) -> None:
-        """Blend the displacements of the time, and find its occupancy."""
+        """Blend the displacements of the time, and find its occupancy and the ways through it."""
         motion = self.motion
         self.at_rest = motion is None or motion.clock.at(self.time).after == 0
         if motion is None or self.at_rest:
@@ -67,6 +69,7 @@ class DeVRFView:
         self.occupancy = deformed_occupancy(
             self.canonical, self.occupancy, self.picture_settings, self._warp
         )
+        self.occupancy.find_distances()
 
     @property
     def chunk(self) -> int:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import KW_ONLY
 from typing import Annotated, Literal
 
@@ -36,6 +34,7 @@ from devrf.scenes.scene import Bounds, Capture, Scene
 from devrf.scenes.space import inward_space
 from devrf.scenes.splits import every_nth
 from devrf.scenes.validation import MIN_SIDE, Options, scene_error
+from devrf.system.threads import one_thread
 
 Side = Annotated[int, Field(strict=True, ge=MIN_SIDE, le=4096)]
 Count = Annotated[int, Field(strict=True, ge=1, le=10_000)]
@@ -44,21 +43,6 @@ Frames = Annotated[int, Field(strict=True, ge=2, le=10_000)]
 # squashed to pieces.
 Speed = Annotated[float, Field(strict=True, ge=0, le=2)]
 Texture = Literal["soft", "fine"]
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """PyTorch on one thread inside, on as many as before afterwards.
-
-    Rendering is thousands of small operations: a second thread gains little, and where the cores
-    are shared with others it waits at each of them, which makes a scene take minutes.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 @dataclass(frozen=True)
@@ -141,7 +125,7 @@ class ProceduralScene(Recipe):
     surroundings: Literal["none", "room"] = "none"
     texture: Texture = "soft"
 
-    @_one_thread()
+    @one_thread()
     def __call__(self) -> Scene:
         """Render everything."""
         where = extent(self.model())
@@ -233,7 +217,7 @@ class ProceduralForwardScene(Recipe):
     static_views: Count = 20
     frames: Frames = 12
 
-    @_one_thread()
+    @one_thread()
     def __call__(self) -> Scene:
         """Render everything."""
         film = Filming(self.filmed(), _REACH, self.supersample, self.light, STEPS, opaque=True)
