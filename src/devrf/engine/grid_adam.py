@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -13,7 +13,7 @@ from devrf.kernels.adam import adam_step, add_total_variation_gradient
 from devrf.ops.adam import AdamRule
 from devrf.system.plain_data import Count, built
 
-# Devices for which torch has Adam as one kernel.
+# Devices on which torch's fused Adam is used.
 FUSED = ("cpu", "cuda")
 
 
@@ -89,9 +89,10 @@ class GridAdam(torch.optim.Optimizer):
             parameter.grad = None
 
     def _step_by_voxel(self, learned: Sequence[Tensor], group: dict[str, Any]) -> None:
-        """A step that skips voxels, or has rates of theirs."""
+        """A step that skips voxels, or has a learning rate for each voxel."""
         for parameter in learned:
-            gradient, state = parameter.grad, self.state[parameter]
+            gradient = parameter.grad
+            state = self.state[parameter]
             assert gradient is not None
             rule = AdamRule(
                 rate=group["lr"],
@@ -113,17 +114,18 @@ class GridAdam(torch.optim.Optimizer):
     def _step_alike(self, learned: Sequence[Tensor], group: dict[str, Any]) -> None:
         """A step on all numbers alike, by torch: on a CPU in a seventh of the kernel's time."""
         states = [self.state[parameter] for parameter in learned]
-        device = learned[0].device
-        before = torch.tensor([state["steps"] - 1.0 for state in states], device=device)
+        fused = learned[0].device.type in FUSED
+        # Filled there: to copy a number to a GPU waits for it.
+        counts_on = learned[0].device if fused else "cpu"
         beta1, beta2 = group["betas"]
         adam(
             list(learned),
-            [parameter.grad for parameter in learned if parameter.grad is not None],
+            [cast(Tensor, parameter.grad) for parameter in learned],
             [state["mean"] for state in states],
             [state["square"] for state in states],
             max_exp_avg_sqs=[],
-            state_steps=list(before.unbind()),
-            fused=device.type in FUSED,
+            state_steps=[torch.full((), s["steps"] - 1.0, device=counts_on) for s in states],
+            fused=fused,
             amsgrad=False,
             beta1=beta1,
             beta2=beta2,

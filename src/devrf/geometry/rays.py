@@ -9,7 +9,7 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
-# A direction has at least so much along each axis where it is divided by.
+# A smaller component of a direction is replaced by this before a division.
 PARALLEL = 1e-9
 
 

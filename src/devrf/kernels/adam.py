@@ -33,7 +33,7 @@ def adam_step(
     if not take(values):
         definition.adam_step(values, gradient, mean, square, rule)
         return
-    # A voxel of a grid, or one number of a network.
+    # A voxel of a grid, or one number.
     channels = values.shape[-1] if values.ndim == 4 else 1
     tables = [each.view(-1, channels) for each in (values, gradient, mean, square)]
     indices = torch.empty(0, dtype=torch.int32, device=values.device) if rows is None else rows

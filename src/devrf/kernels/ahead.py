@@ -33,12 +33,11 @@ def compile_ahead(channels: Collection[int], device: torch.device) -> None:
     if not take(torch.empty(0, device=device)):
         return
     kernels = [march.enter_kernel, march.march_kernel(False), march.keep_significant_kernel]
-    kernels += [march.adjoint_kernel]
-    kernels += [look_up.add_kernel(1), adam.adam_kernel(1), adam.total_variation_kernel(1)]
+    kernels += [march.adjoint_kernel, look_up.add_kernel(1), adam.total_variation_kernel(1)]
     for count in sorted({3, *channels}):
         kernels += [look_up.look_up_kernel(count), look_up.slope_kernel(count)]
-        kernels += [look_up.add_kernel(count), adam.adam_kernel(count)]
-        kernels += [adam.total_variation_kernel(count)]
+        kernels += [look_up.add_kernel(count), adam.total_variation_kernel(count)]
+    kernels += [adam.adam_kernel(count) for count in sorted({1, *channels})]
     kernels.append(march.march_kernel(True))  # in contracted space
     Thread(target=_compile, args=(kernels, device), daemon=True).start()
 

@@ -358,7 +358,7 @@ def enter_kernel(
 ):
     """Rays, and how many samples each has to its exit, in empty space or not.
 
-    Where samples begin and how many there are as ``steps_through`` has it.
+    Their entries and counts are those of ``steps_through``.
     """
     number = first + wp.tid()
     ray = Ray()
@@ -472,7 +472,7 @@ def keep_significant_kernel(
     result_weight: wp.array(dtype=float),
     result_depth: wp.array(dtype=float),
 ):
-    """The visible samples of enough weight, without gaps; a ray's begin at its start."""
+    """The visible samples of enough weight, without gaps, each ray's from its start; its depth."""
     number = first + wp.tid()
     count = visible_count[number]
     result_depth[number] = 0.0

@@ -71,10 +71,16 @@ def launch(
 
     On a CPU in parts of ``grain`` threads or more side by side, of which this thread runs the
     first; None: in one part, else no two threads may write to the same place. The inputs are made
-    ready once, in this thread, so that the others begin at once; tensors, which Warp sees as
-    :func:`array` has them, and numbers are written where the launch before had them, since Warp
-    takes longer to check each again than a small launch runs.
+    ready once, in this thread, so that the others begin at once.
+
+    Warp sees tensors as :func:`array` has them, and checks them at the first launch alone: that
+    takes longer than a small launch runs. Later ones write addresses and numbers in their place.
     """
+    if device.type == "cuda" and wp.config.deterministic != wp.DeterministicMode.NOT_GUARANTEED:
+        # A recorded launch would order the additions to the arrays that it was recorded with.
+        stream = _stream(torch.cuda.current_stream(device))
+        wp.launch(kernel, count, inputs=[0, *_arrays(inputs)], device=str(device), stream=stream)
+        return
     parts = _parts(device, count, grain)
     edges = [count * part // parts for part in range(parts + 1)]
     commands = _commands(kernel, parts, inputs, device)
@@ -129,7 +135,7 @@ def array(tensor: Tensor, kind: Any = None) -> wp.array:
 
 
 def room(kind: Any, count: int, device: torch.device) -> wp.array:
-    """Memory for ``count`` of one of Warp's structs of floats, from torch's allocator."""
+    """Memory for ``count`` of a Warp struct of four-byte numbers, from torch's allocator."""
     floats = wp.types.type_size_in_bytes(kind) // 4
     return array(torch.empty(count, floats, device=device), kind)
 
@@ -167,15 +173,21 @@ def _commands(
     Warp finds, compiles and loads a kernel, and checks the types, in one thread at a time.
     """
     made = _of_thread.__dict__.setdefault("commands", {})
-    types = tuple(value.dtype for value in inputs if isinstance(value, Tensor))
+    types = tuple(
+        (v.dtype, v.shape[-1] if v.ndim > 1 else 1) for v in inputs if isinstance(v, Tensor)
+    )
     commands: list[wp.Launch] = made.setdefault((kernel, device, types), [])
     while len(commands) < parts:
-        values = [0, *(array(value) if isinstance(value, Tensor) else value for value in inputs)]
+        values = [0, *_arrays(inputs)]
         with compiling:
             command = wp.launch(kernel, 1, inputs=values, device=str(device), record_cmd=True)
         command.fwd_args = None  # these tensors are not to live as long
         commands.append(command)
     return commands[:parts]
+
+
+def _arrays(inputs: Sequence[Any]) -> list[Any]:
+    return [array(value) if isinstance(value, Tensor) else value for value in inputs]
 
 
 @cache

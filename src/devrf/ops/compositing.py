@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-# Σ w of a ray is at least so much where something is divided by it.
+# The least Σ w of a ray that something is divided by.
 LEAST_MASS = 1e-6
 
 

@@ -18,7 +18,7 @@ from devrf.ops.trilinear import look_up
 
 # A ray ends where its transmittance is less: what is behind cannot be seen.
 STOP = 1e-4
-# A sample so close before a ray's exit counts, in steps: rounding does not decide on it.
+# A sample so little behind a ray's exit still counts, in steps: rounding does not decide on it.
 EXIT = 1e-3
 
 

@@ -30,12 +30,9 @@ def per_sample_color(weight: Tensor, color: Tensor, ray: Tensor, truth: Tensor) 
 
 
 def background_entropy(transmittance: Tensor) -> Tensor:
-    """Mean −(p log p + (1 − p) log(1 − p)), p = T_end (R,): a ray hits something or nothing.
-
-    That is the cross entropy of p with itself.
-    """
+    """Mean −(p log p + (1 − p) log(1 − p)), p = T_end (R,): a ray hits something or nothing."""
     p = transmittance.clamp(NEAREST, 1 - NEAREST)
-    return torch.nn.functional.binary_cross_entropy(p, p)
+    return -(torch.xlogy(p, p) + torch.xlogy(1 - p, 1 - p)).mean()
 
 
 def distortion(weight: Tensor, distance: Tensor, ray: Tensor, rays: int) -> Tensor:

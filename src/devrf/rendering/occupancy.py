@@ -65,7 +65,7 @@ class Occupancy(nn.Module):
 
     def at(self, points: Tensor) -> Tensor:
         """Mask (M,): whether something may be at ``points`` (M, 3)."""
-        # A border of empty cells, to which all that is outside belongs.
+        # A border of empty cells, to which all that is outside belongs, and what is no number.
         bordered = pad(self.mask, (1, 1) * 3)
         row = torch.zeros(len(points), dtype=torch.int32, device=points.device)
         # Axis by axis: several times faster than rows of three.

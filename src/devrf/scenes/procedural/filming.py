@@ -172,10 +172,10 @@ class Filming:
     def at_rest(self, train: Cameras, test: Cameras) -> Capture:
         """One image from each camera at time 0."""
         pixels, depth = self.pictures(train.joined(test), 0.0)
-        learned, tested = slice(len(train)), slice(len(train), None)
+        count = len(train)
         return Capture(
-            train=_still(train, pixels[learned], depth[learned], "train"),
-            test=_still(test, pixels[tested], depth[tested], "test"),
+            train=_still(train, pixels[:count], depth[:count], "train"),
+            test=_still(test, pixels[count:], depth[count:], "test"),
         )
 
     def moving(
@@ -190,9 +190,9 @@ class Filming:
         times = torch.arange(frames) / (frames - 1)
         pixels, depth = self._shot([everyone] * frames, times)
         seen = [frame for frame in range(frames) if frame not in unseen]
-        learned, tested = slice(len(train)), slice(len(train), None)
-        views = _moving(train, pixels[seen, learned], depth[seen, learned], times, seen, "train")
-        others = _moving(test, pixels[:, tested], depth[:, tested], times, range(frames), "test")
+        count = len(train)
+        views = _moving(train, pixels[seen, :count], depth[seen, :count], times, seen, "train")
+        others = _moving(test, pixels[:, count:], depth[:, count:], times, range(frames), "test")
         return Capture(
             train=replace(views, flow=exact_flow(self.shape, views)),
             test=replace(others, flow=exact_flow(self.shape, others)),
@@ -215,7 +215,7 @@ class Filming:
         )
 
     def _shot(self, cameras: Sequence[Cameras], times: Tensor) -> tuple[Tensor, Tensor]:
-        """The :meth:`pictures` (T, N, H, W, ·) and distances (T, N, H, W) by N cameras a time."""
+        """Pictures (T, N, H, W, ·), distances (T, N, H, W) from N cameras at each of T times."""
         moments = zip(cameras, times.tolist(), strict=True)
         pixels, depths = zip(*(self.pictures(some, time) for some, time in moments), strict=True)
         return torch.stack(pixels), torch.stack(depths)
