@@ -159,7 +159,7 @@ def learned(
 
 
 def learned_run(into: Path) -> RunContext:
-    """The run that learned with all iterations, or where there is none, with a tenth of them."""
+    """The run that learned with all iterations, or where there is none, with fewer."""
     whole = run_of(into, "paper")
     return whole if whole.own_checkpoint("deformation").exists() else run_of(into, "as-it-is")
 
@@ -208,7 +208,7 @@ def frames(into: Path) -> Iterator[Row]:
     yield {**row, "launches": len(on_device)}
 
 
-TENTH = shortened(0, 2000, 20) if GPU else []
+FEWER = shortened(0, 2000, 20) if GPU else []
 # Each step with the minutes that it may take, the most telling first.
 STEPS: dict[str, tuple[float, Callable[[Path], Iterator[Row]]]] = {
     "machine": (1, machine),
@@ -219,7 +219,7 @@ STEPS: dict[str, tuple[float, Callable[[Path], Iterator[Row]]]] = {
     "frames": (5, frames),
     "parts": (5, parts),
     **{
-        name: (6, partial(learned, name=name, overrides=[*TENTH, *overrides]))
+        name: (6, partial(learned, name=name, overrides=[*FEWER, *overrides]))
         for name, overrides in {
             "as-it-is": [],
             "10-a-step": [f"{key}.iterations_per_step=10" for key in ("canonical", "deformation")],

@@ -16,7 +16,7 @@ from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.deformation_field import DeformationField, GridWarp
 from devrf.methods.devrf.losses import induced_flow
 from devrf.methods.devrf.volume_rendering import deformed_occupancy, render
-from devrf.ops.compositing import sum_by_ray
+from devrf.ops.compositing import LEAST_MASS, sum_by_ray
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import ColorChange, RenderedImage
 from devrf.rendering.sampling import RenderSettings
@@ -122,7 +122,7 @@ class DeVRFView:
         )
         mass = sum_by_ray(weight, ray, len(rays))
         total = sum_by_ray(weight[:, None] * moved, ray, len(rays))
-        return total / mass.clamp(min=1e-6)[:, None], mass
+        return total / mass.clamp(min=LEAST_MASS)[:, None], mass
 
 
 @dataclass(frozen=True)

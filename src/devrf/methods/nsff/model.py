@@ -25,7 +25,7 @@ from devrf.methods.nsff.losses import TERMS, missing_terms
 from devrf.methods.nsff.priors import ImagePriors
 from devrf.methods.nsff.renders import BlendedOutput, Renders
 from devrf.methods.nsff.settings import NSFFSettings
-from devrf.ops.compositing import sum_by_ray
+from devrf.ops.compositing import LEAST_MASS, sum_by_ray
 from devrf.rendering.output import RenderOutput
 from devrf.scenes.scene import Scene, Views
 
@@ -223,7 +223,7 @@ class FlowingView(RayView):
         still = cameras.project_into(0, placement.world(out.points))[0] - pixels[ray]
         total = blend.dynamic[:, None] * moving + blend.static[:, None] * still
         mass = sum_by_ray(blend.dynamic + blend.static, ray, len(rays))
-        return sum_by_ray(total, ray, len(rays)) / mass.clamp(min=1e-6)[:, None], mass
+        return sum_by_ray(total, ray, len(rays)) / mass.clamp(min=LEAST_MASS)[:, None], mass
 
     def _moved(self, points: Tensor, viewdirs: Tensor, ray: Tensor, time: float) -> Tensor:
         """Where dynamic points (S, 3), normalised, are at ``time``: led on from frame to frame.
