@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 
 import torch
+from torch import nn
 
 from devrf.methods.nerf.networks import (
     SinusoidalEncoding,
     TimeCodes,
     Trunk,
     initialise,
+    joined,
     octave_window,
 )
 
@@ -22,6 +24,25 @@ def test_two_octaves_of_a_number() -> None:
     assert encode.size == 5
     points = torch.tensor([[0.1, -0.2, 0.3]])
     assert torch.equal(SinusoidalEncoding(3, 0)(points), points)  # no octaves
+
+
+def test_joined_numbers_of_samples_and_rays_are_those_of_one_long_input() -> None:
+    layer, ray = nn.Linear(9, 4), torch.tensor([0, 0, 2, 2, 2])
+    inputs = [torch.randn(5, 2), torch.randn(5, 4), torch.randn(3, 3)]
+    first, second, of_rays = (each.requires_grad_() for each in inputs)
+    whole = layer(torch.cat([first, second, of_rays[ray]], dim=1))
+    parts = joined(layer, [first, second], of_rays, ray)
+    torch.testing.assert_close(parts, whole)
+    learned = [*inputs, *layer.parameters()]
+    expected = torch.autograd.grad(whole.square().sum(), learned)
+    torch.testing.assert_close(torch.autograd.grad(parts.square().sum(), learned), expected)
+
+
+def test_joined_numbers_in_half_precision_are_multiplied_there() -> None:
+    layer, ray = nn.Linear(5, 4), torch.tensor([0, 1, 1])
+    with torch.autocast("cpu", torch.bfloat16):
+        parts = joined(layer, [torch.randn(3, 3)], torch.randn(2, 2), ray)
+    assert parts.dtype == torch.bfloat16
 
 
 def test_a_window_opens_octaves_from_coarse_to_fine() -> None:

@@ -61,6 +61,29 @@ def octave_window(opened: Tensor, bands: int) -> Tensor:
     return (1 - torch.cos(math.pi * (opened - octave).clamp(0, 1))) / 2
 
 
+def joined(layer: nn.Linear, values: Sequence[Tensor], of_rays: Tensor, ray: Tensor) -> Tensor:
+    """What a layer gives to samples' numbers, one after another, and behind them their rays'.
+
+    Rays' numbers are multiplied once a ray, and what needs no gradient has none to be computed:
+    a joined input had both for each sample.
+
+    Args:
+        layer: of as many inputs as all of these have.
+        values: numbers (S, ·) of samples.
+        of_rays: (R, ·) numbers of rays.
+        ray: (S,) the ray of each sample.
+
+    Returns:
+        (S, units).
+    """
+    sizes = [part.shape[1] for part in (*values, of_rays)]
+    *weights, of_ray = torch.split(layer.weight, sizes, dim=1)
+    total = nn.functional.linear(of_rays, of_ray, layer.bias).index_select(0, ray)
+    for part, weight in zip(values, weights, strict=True):
+        total = torch.addmm(total, part, weight.t())
+    return total
+
+
 class Trunk(nn.Module):
     """Layers of equal width with ReLU; the input enters once more on the way.
 
@@ -228,8 +251,7 @@ class RadianceField(nn.Module):
         x = self.trunk(self.encode_position(points), ambient)
         density = self.density(x)[:, 0]
         further = x[:, :0] if self.further is None else self.further(x)
-        direction = self.encode_direction(viewdirs).index_select(0, ray)
-        x = torch.relu(self.branch(torch.cat([self.feature(x), direction], dim=-1)))
+        x = joined(self.branch, [self.feature(x)], self.encode_direction(viewdirs), ray).relu_()
         return density, self.color(x), further
 
     def raw_density(self, points: Tensor, ambient: Tensor | None = None) -> Tensor:

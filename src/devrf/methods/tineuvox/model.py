@@ -14,7 +14,7 @@ from devrf.data.batch import RayBatch
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import Space
-from devrf.methods.nerf.networks import SinusoidalEncoding
+from devrf.methods.nerf.networks import SinusoidalEncoding, joined
 from devrf.methods.nerf.placed_model import SurfacedField
 from devrf.methods.nerf.samples import accumulated
 from devrf.methods.tineuvox.networks import MultiDistanceGrid, RadianceNetwork
@@ -111,17 +111,27 @@ class TiNeuVox(SurfacedField):
         """So many voxels of the present grid, in the fields' space."""
         return self.settings.step * self.box.voxel_size(math.prod(self.grid.shape))
 
-    def hidden(self, points: Tensor, code: Tensor) -> Tensor:
+    def hidden(self, points: Tensor, code: Tensor, ray: Tensor) -> Tensor:
         """What density and colour come from, (S, width).
 
         Args:
             points: (S, 3) x in normalised space.
-            code: (S, size) of their times.
+            code: (R, size) of rays' times.
+            ray: (S,) the ray of each point.
         """
         position = self.encode(points)
-        displacement = self.deformation(torch.cat([position, code], dim=1))
+        first, *further = self.deformation
+        assert isinstance(first, nn.Linear)
+        displacement = joined(first, [position], code, ray)
+        for layer in further:
+            displacement = layer(displacement)
         features = self.grid(points + displacement, self.grid_box)
-        return self.radiance.hidden(features, position, code)
+        return self.radiance.hidden(features, position, code, ray)
+
+    def hidden_of_each(self, points: Tensor, time: Tensor) -> Tensor:
+        """The same of points (S, 3) that have times (S,) of their own."""
+        each = torch.arange(len(points), device=points.device)
+        return self.hidden(points, self.time(time[:, None]), each)
 
     def density(self, hidden: Tensor) -> Tensor:
         """σ (S,) = softplus(raw + log(1/(1 − α_init) − 1)), per :attr:`base_voxel`."""
@@ -130,12 +140,12 @@ class TiNeuVox(SurfacedField):
     def optical_depth(self, points: Tensor, time: Tensor, length: float) -> Tensor:
         """τ (S,) of ways of ``length``."""
         way = length * self.placement.half_edge / self.base_voxel
-        return self.density(self.hidden(points, self.time(time[:, None]))) * way
+        return self.density(self.hidden_of_each(points, time)) * way
 
     def point_colors(self, points: Tensor, viewdirs: Tensor, time: Tensor) -> Tensor:
         """RGB (S, 3) of points in normalised space."""
         each = torch.arange(len(points), device=points.device)
-        return self.radiance.rgb(self.hidden(points, self.time(time[:, None])), viewdirs, each)
+        return self.radiance.rgb(self.hidden_of_each(points, time), viewdirs, each)
 
     def render_rays(
         self, rays: Rays, time: Tensor, background: Tensor, *, jitter: bool = False
@@ -148,8 +158,8 @@ class TiNeuVox(SurfacedField):
         samples = self.march(rays, time, jitter=jitter)
         if not self.space.is_linear:
             samples = samples.unbounded()
-        code = self.time(time[:, None]).index_select(0, samples.ray)
-        hidden = self.hidden(self.placement.normalised(samples.points), code)
+        code = self.time(time[:, None])
+        hidden = self.hidden(self.placement.normalised(samples.points), code, samples.ray)
         depth = self.density(hidden).float() * samples.scaled(self.base_voxel).length
         weight, transmittance = composite(depth, samples.ray, samples.rays)
         shown = (weight > self.settings.weight_threshold).nonzero()[:, 0]

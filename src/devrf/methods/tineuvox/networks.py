@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from devrf.checkpoints.stored_grids import StoredShape
 from devrf.geometry.box import Box
 from devrf.kernels.look_up import look_up
-from devrf.methods.nerf.networks import SinusoidalEncoding
+from devrf.methods.nerf.networks import SinusoidalEncoding, joined
 from devrf.methods.tineuvox.settings import TiNeuVoxSettings
 from devrf.ops.trilinear import Shape, resample, shape_of
 
@@ -75,10 +75,14 @@ class RadianceNetwork(nn.Module):
         self.branch = nn.Linear(s.width + self.encode_direction.size, s.width // 2)
         self.color = nn.Linear(s.width // 2, 3)
 
-    def hidden(self, features: Tensor, position: Tensor, code: Tensor) -> Tensor:
-        """What density and colour come from, (S, width), of S samples."""
-        encoded = self.encode_feature(features)
-        return torch.relu(self.trunk(torch.cat([encoded, position, code], dim=1)))
+    def hidden(self, features: Tensor, position: Tensor, code: Tensor, ray: Tensor) -> Tensor:
+        """What density and colour come from, (S, width), of S samples of the rays ``ray`` (S,).
+
+        Looked up ``features`` (S, ·) and encoded ``position`` (S, ·) are the samples', ``code``
+        (R, ·) the rays'.
+        """
+        parts = [self.encode_feature(features), position]
+        return joined(self.trunk, parts, code, ray).relu_()
 
     def raw_density(self, hidden: Tensor) -> Tensor:
         """Densities (S,) before their activation."""
@@ -87,6 +91,6 @@ class RadianceNetwork(nn.Module):
 
     def rgb(self, hidden: Tensor, viewdirs: Tensor, ray: Tensor) -> Tensor:
         """RGB (S, 3) in [0, 1] of samples of the rays ``ray`` (S,), whose directions are (R, 3)."""
-        direction = self.encode_direction(viewdirs).index_select(0, ray)
-        branch = torch.relu(self.branch(torch.cat([self.feature(hidden), direction], dim=1)))
+        direction = self.encode_direction(viewdirs)
+        branch = joined(self.branch, [self.feature(hidden)], direction, ray).relu_()
         return torch.sigmoid(self.color(branch))
