@@ -89,6 +89,16 @@ def test_density_without_features_has_the_initial_opacity() -> None:
     assert -math.expm1(-depth.item()) == pytest.approx(0.25)
 
 
+@torch.no_grad()
+def test_a_model_that_starts_still_is_the_same_at_all_times() -> None:
+    points, times = torch.rand(5, 3).repeat(2, 1), torch.tensor([0.1] * 5 + [0.9] * 5)
+    for starts_still in (True, False):
+        model = TiNeuVox(replace(TINY, starts_still=starts_still))
+        torch.nn.init.uniform_(model.grid.values)
+        early, late = model.optical_depth(points, times, 1.0).split(5)
+        assert torch.allclose(early, late) == starts_still
+
+
 def test_terms_by_hand(tiny_scene: Scene, some_rays: Any) -> None:
     model = TiNeuVox(TINY)
     model.setup(tiny_scene)

@@ -58,14 +58,18 @@ class TiNeuVox(SurfacedField):
             nn.ReLU(),
             nn.Linear(s.width, code),
         )
+        last = nn.Linear(s.width, 3)
         self.deformation = nn.Sequential(
             nn.Linear(self.encode.size + code, s.width),
             nn.ReLU(),
             nn.Linear(s.width, s.width),
             nn.ReLU(),
-            nn.Linear(s.width, 3),
+            last,
         )
         self.radiance = RadianceNetwork(s, self.encode.size, code)
+        if s.starts_still:
+            for unmoved in (last.weight, last.bias, self.radiance.trunk.weight[:, -code:]):
+                nn.init.zeros_(unmoved)
         self.density_shift = math.log(1 / (1 - s.alpha_init) - 1)
         self.place()
 

@@ -30,6 +30,8 @@ class TiNeuVoxSettings(OccupancySettings):
         weight_threshold: samples with a lower weight are not coloured.
         grid_rate: factor of the learning rate of the grid.
         motion_rate: the same of the networks of time and displacement.
+        starts_still: displacements begin at 0, and so does what the time changes in density and
+            colour: what is learned first is at rest.
         tv: weight of the grid's total variation over the rays of a batch.
     """
 
@@ -51,6 +53,7 @@ class TiNeuVoxSettings(OccupancySettings):
     weight_threshold: float = 1e-4
     grid_rate: float = 100.0
     motion_rate: float = 0.75
+    starts_still: bool = False
     tv: float = 0.0
 
     def __post_init__(self) -> None:
