@@ -12,7 +12,7 @@ from devrf.methods.nerf.networks import (
     TimeCodes,
     Trunk,
     initialise,
-    joined,
+    linear_by_ray,
     octave_window,
 )
 
@@ -26,23 +26,27 @@ def test_two_octaves_of_a_number() -> None:
     assert torch.equal(SinusoidalEncoding(3, 0)(points), points)  # no octaves
 
 
-def test_joined_numbers_of_samples_and_rays_are_those_of_one_long_input() -> None:
+def test_a_layer_by_ray_is_that_of_one_long_input() -> None:
     layer, ray = nn.Linear(9, 4), torch.tensor([0, 0, 2, 2, 2])
     inputs = [torch.randn(5, 2), torch.randn(5, 4), torch.randn(3, 3)]
     first, second, of_rays = (each.requires_grad_() for each in inputs)
     whole = layer(torch.cat([first, second, of_rays[ray]], dim=1))
-    parts = joined(layer, [first, second], of_rays, ray)
+    parts = linear_by_ray(layer, [first, second], of_rays, ray)
     torch.testing.assert_close(parts, whole)
     learned = [*inputs, *layer.parameters()]
     expected = torch.autograd.grad(whole.square().sum(), learned)
     torch.testing.assert_close(torch.autograd.grad(parts.square().sum(), learned), expected)
 
 
-def test_joined_numbers_in_half_precision_are_multiplied_there() -> None:
-    layer, ray = nn.Linear(5, 4), torch.tensor([0, 1, 1])
+def test_a_ray_in_half_precision_learns_from_the_sum_of_many_samples() -> None:
+    layer, ray = nn.Linear(3, 1), torch.zeros(2048, dtype=torch.int64)
     with torch.autocast("cpu", torch.bfloat16):
-        parts = joined(layer, [torch.randn(3, 3)], torch.randn(2, 2), ray)
-    assert parts.dtype == torch.bfloat16
+        of_samples = linear_by_ray(layer, [torch.ones(2048, 2)], torch.ones(1, 1), ray)
+        of_none = linear_by_ray(layer, [torch.ones(0, 2)], torch.ones(1, 1), ray[:0])
+    assert of_samples.dtype == torch.bfloat16
+    assert of_none.shape == (0, 1)
+    of_samples.sum().backward()
+    assert layer.bias.grad == 2048  # a running sum in half precision stays at 256, as on a GPU
 
 
 def test_a_window_opens_octaves_from_coarse_to_fine() -> None:

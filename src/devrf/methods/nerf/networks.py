@@ -61,11 +61,12 @@ def octave_window(opened: Tensor, bands: int) -> Tensor:
     return (1 - torch.cos(math.pi * (opened - octave).clamp(0, 1))) / 2
 
 
-def joined(layer: nn.Linear, values: Sequence[Tensor], of_rays: Tensor, ray: Tensor) -> Tensor:
-    """What a layer gives to samples' numbers, one after another, and behind them their rays'.
+def linear_by_ray(
+    layer: nn.Linear, values: Sequence[Tensor], of_rays: Tensor, ray: Tensor
+) -> Tensor:
+    """``layer(cat([*values, of_rays[ray]], dim=1))``, whose last part is multiplied once a ray.
 
-    Rays' numbers are multiplied once a ray, and what needs no gradient has none to be computed:
-    a joined input had both for each sample.
+    What needs no gradient, as encoded positions, has none computed.
 
     Args:
         layer: of as many inputs as all of these have.
@@ -78,7 +79,8 @@ def joined(layer: nn.Linear, values: Sequence[Tensor], of_rays: Tensor, ray: Ten
     """
     sizes = [part.shape[1] for part in (*values, of_rays)]
     *weights, of_ray = torch.split(layer.weight, sizes, dim=1)
-    total = nn.functional.linear(of_rays, of_ray, layer.bias).index_select(0, ray)
+    # In single precision: the gradient of a ray is the sum of its samples'.
+    total = nn.functional.linear(of_rays, of_ray, layer.bias).float().index_select(0, ray)
     for part, weight in zip(values, weights, strict=True):
         total = torch.addmm(total, part, weight.t())
     return total
@@ -251,7 +253,9 @@ class RadianceField(nn.Module):
         x = self.trunk(self.encode_position(points), ambient)
         density = self.density(x)[:, 0]
         further = x[:, :0] if self.further is None else self.further(x)
-        x = joined(self.branch, [self.feature(x)], self.encode_direction(viewdirs), ray).relu_()
+        x = linear_by_ray(
+            self.branch, [self.feature(x)], self.encode_direction(viewdirs), ray
+        ).relu_()
         return density, self.color(x), further
 
     def raw_density(self, points: Tensor, ambient: Tensor | None = None) -> Tensor:

@@ -14,7 +14,7 @@ from devrf.data.batch import RayBatch
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import Space
-from devrf.methods.nerf.networks import SinusoidalEncoding, joined
+from devrf.methods.nerf.networks import SinusoidalEncoding, linear_by_ray
 from devrf.methods.nerf.placed_model import SurfacedField
 from devrf.methods.nerf.samples import accumulated
 from devrf.methods.tineuvox.networks import MultiDistanceGrid, RadianceNetwork
@@ -126,7 +126,7 @@ class TiNeuVox(SurfacedField):
         position = self.encode(points)
         first, *further = self.deformation
         assert isinstance(first, nn.Linear)
-        displacement = joined(first, [position], code, ray)
+        displacement = linear_by_ray(first, [position], code, ray)
         for layer in further:
             displacement = layer(displacement)
         features = self.grid(points + displacement, self.grid_box)

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from devrf.checkpoints.stored_grids import StoredShape
 from devrf.geometry.box import Box
 from devrf.kernels.look_up import look_up
-from devrf.methods.nerf.networks import SinusoidalEncoding, joined
+from devrf.methods.nerf.networks import SinusoidalEncoding, linear_by_ray
 from devrf.methods.tineuvox.settings import TiNeuVoxSettings
 from devrf.ops.trilinear import Shape, resample, shape_of
 
@@ -82,7 +82,7 @@ class RadianceNetwork(nn.Module):
         (R, ·) the rays'.
         """
         parts = [self.encode_feature(features), position]
-        return joined(self.trunk, parts, code, ray).relu_()
+        return linear_by_ray(self.trunk, parts, code, ray).relu_()
 
     def raw_density(self, hidden: Tensor) -> Tensor:
         """Densities (S,) before their activation."""
@@ -92,5 +92,5 @@ class RadianceNetwork(nn.Module):
     def rgb(self, hidden: Tensor, viewdirs: Tensor, ray: Tensor) -> Tensor:
         """RGB (S, 3) in [0, 1] of samples of the rays ``ray`` (S,), whose directions are (R, 3)."""
         direction = self.encode_direction(viewdirs)
-        branch = joined(self.branch, [self.feature(hidden)], direction, ray).relu_()
+        branch = linear_by_ray(self.branch, [self.feature(hidden)], direction, ray).relu_()
         return torch.sigmoid(self.color(branch))

@@ -25,7 +25,7 @@ class TiNeuVoxSettings(OccupancySettings):
         direction_bands: octaves of viewing directions.
         time_bands: octaves of times.
         feature_bands: octaves of what is looked up.
-        alpha_init: opacity of a step in an untrained field.
+        alpha_init: opacity of a voxel of the grown grid in an untrained field.
         step: distance between samples, in voxels of the present grid.
         weight_threshold: samples with a lower weight are not coloured.
         grid_rate: factor of the learning rate of the grid.
