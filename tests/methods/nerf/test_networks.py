@@ -46,7 +46,7 @@ def test_a_ray_in_half_precision_learns_from_the_sum_of_many_samples() -> None:
     assert of_samples.dtype == torch.bfloat16
     assert of_none.shape == (0, 1)
     of_samples.sum().backward()
-    assert layer.bias.grad == 2048  # a running sum in half precision stays at 256, as on a GPU
+    assert layer.bias.grad == 2048  # a running sum in half precision would stay at 256
 
 
 def test_a_window_opens_octaves_from_coarse_to_fine() -> None:
