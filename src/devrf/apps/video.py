@@ -17,8 +17,6 @@ from devrf.geometry.cameras import Cameras
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Background, Views
 
-# Upper bound of the bytes of a pixel in a video: measured on images of 400 pixels and less.
-PIXEL = 0.2
 # More frames than this are a mistake: an hour at 25 a second.
 MAX_FRAMES = 90_000
 # H.264 has blocks of so many pixels.

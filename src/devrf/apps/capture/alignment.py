@@ -89,7 +89,10 @@ def timeline(
             "at least 2; give longer videos"
         )
     instants = clock[usable]
-    positions = tuple(_nearest(other, instants) for other in clocks)
+    middles = ((other[1:] + other[:-1]) / 2 for other in clocks)
+    positions = tuple(
+        tuple(np.searchsorted(middle, instants, "right").tolist()) for middle in middles
+    )
     scaled = (instants - instants[0]) / (instants[-1] - instants[0])
     return Timeline(tuple(scaled.tolist()), positions)
 
@@ -157,10 +160,3 @@ def _correlation(a: Signal, b: Signal, lag: int) -> float:
     a = a[low:high]
     b = b[low - lag : high - lag]
     return float(np.corrcoef(a, b)[0, 1]) if a.std() * b.std() > 0 else -1.0
-
-
-def _nearest(clock: Signal, instants: Signal) -> tuple[int, ...]:
-    after = np.searchsorted(clock, instants).clip(1, len(clock) - 1)
-    before = after - 1
-    nearer = instants - clock[before] < clock[after] - instants
-    return tuple(np.where(nearer, before, after).tolist())

@@ -19,7 +19,7 @@ from devrf.apps.capture.images import (
     common_size,
     write_frames,
 )
-from devrf.apps.capture.structure import check_library, checked_model, models_folder, reconstruct
+from devrf.apps.capture.structure import MODELS, check_library, checked_model, reconstruct
 from devrf.apps.capture.survey import Survey, check_sharp, sharpest, survey
 from devrf.apps.settings import CaptureSettings
 from devrf.errors import DevrfError
@@ -29,6 +29,7 @@ from devrf.scenes.formats.nerfstudio import FILE
 from devrf.scenes.sparse_model import AROUND, SparseModel, World, ndc_holds, normalised
 from devrf.scenes.splits import every_nth
 from devrf.system.files import make_folder, read_record, write_json
+from devrf.system.plain_data import built
 from devrf.system.progress import followed
 
 log = logging.getLogger(__name__)
@@ -169,14 +170,7 @@ def _surveyed(path: Path, work: Path) -> Survey:
         return asdict(survey(path, frames))
 
     slug = f"{path.stem}-{_digest(str(path.resolve()))[:6]}"
-    values = kept(work / f"survey-{slug}.json", _stamp(path), make)
-    width, height = values["size"]
-    return Survey(
-        size=(width, height),
-        times=tuple(values["times"]),
-        sharpness=tuple(values["sharpness"]),
-        motion=tuple(values["motion"]),
-    )
+    return built(Survey, kept(work / f"survey-{slug}.json", _stamp(path), make))
 
 
 def _write_images(
@@ -221,10 +215,10 @@ def _model(
 
     def make() -> dict[str, Any]:
         model = reconstruct(into / IMAGES, work, moving, list(first), settings)
-        return {"model": model.relative_to(models_folder(work)).as_posix()}
+        return {"model": model.relative_to(work / MODELS).as_posix()}
 
     result = kept(work / "structure.json", [images, options, settings.size], make)
-    return checked_model(models_folder(work) / result["model"], moving, first)
+    return checked_model(work / MODELS / result["model"], moving, first)
 
 
 def _around_motion(

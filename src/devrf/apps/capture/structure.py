@@ -45,6 +45,8 @@ ABOUT = 1.05
 # Where so large a share of the pairs of images shows no depth, that is why no cameras are found.
 DEPTHLESS = 0.9
 DATA_BASE = "matches.db"
+# Where models are put, there too.
+MODELS = "models"
 
 _FILM = (
     "film more slowly, with more overlap (neighbouring frames share more than half of what they "
@@ -87,7 +89,7 @@ def reconstruct(
     they are all of the scene at rest, COLMAP's incremental mapper finds the cameras. Where one
     camera films a scene that moves, cameras are found again without what moves
     (:func:`_without_movers`); where masks are given, or nothing moves, the global mapper is tried,
-    too. Returns the folder of the model, in :func:`models_folder`.
+    too. Returns the folder of the model, in :data:`MODELS`.
 
     Raises:
         DevrfError: nothing could be matched, nothing shows depth, or a given mask does not fit.
@@ -95,7 +97,7 @@ def reconstruct(
     library: Any = importlib.import_module("pycolmap")
     library.logging.minloglevel = 3
     library.set_random_seed(0)
-    models = models_folder(work)
+    models = work / MODELS
     shutil.rmtree(models, ignore_errors=True)
     given = {} if moving.still is None else still_masks(images, moving)
     _match(images, work, moving, fixed, settings, given)
@@ -124,7 +126,7 @@ def _without_movers(
     by both of COLMAP's mappers, and tell better what moves: until masks stay as they are, at most
     ``ROUNDS`` times.
     """
-    models = models_folder(work)
+    models = work / MODELS
     film = Film(images, moving.names)
     found = [first]
     used = list[dict[str, Mask]]()
@@ -196,11 +198,6 @@ def _difference(masks: dict[str, Mask], before: dict[str, Mask]) -> float:
         for name, mask in masks.items()
     ]
     return sum(changed) / max(len(changed), 1)
-
-
-def models_folder(work: Path) -> Path:
-    """Where :func:`reconstruct` puts models."""
-    return work / "models"
 
 
 @dataclass(frozen=True)

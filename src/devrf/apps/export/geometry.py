@@ -12,6 +12,7 @@ from typing import Literal, cast
 import torch
 from torch import Tensor
 
+from devrf.apps.images import evenly
 from devrf.errors import DevrfError, expect
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
@@ -187,11 +188,11 @@ def seen_points(
     Each is at the mean depth of a ray. At most :data:`CAMERAS` cameras (world units) and ``count``
     points are taken, evenly chosen. ``background`` is a grey level.
     """
-    cameras = cameras[_evenly(len(cameras), CAMERAS)].to(renderer.device)
+    cameras = cameras[evenly(len(cameras), CAMERAS)].to(renderer.device)
     filled = len(_seen(renderer, cameras.of_height(FIRST), time, background)[0])
     rows = min(round(FIRST * (SPARE * count / max(filled, 1)) ** 0.5), LARGEST)
     points, colors = _seen(renderer, cameras.of_height(rows), time, background)
-    chosen = _evenly(len(points), count)
+    chosen = evenly(len(points), count)
     return points[chosen], colors[chosen]
 
 
@@ -209,10 +210,3 @@ def _seen(
         points.append(ends.float().cpu())
         colors.append(image.color[solid].clamp(0, 1).float().cpu())
     return torch.cat(points), torch.cat(colors)
-
-
-def _evenly(count: int, max_count: int) -> Tensor:
-    """Positions of at most ``max_count`` of ``count`` things, evenly spread."""
-    return (
-        torch.arange(count) if count <= max_count else torch.arange(max_count) * count // max_count
-    )

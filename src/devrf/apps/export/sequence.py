@@ -6,11 +6,10 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
 from torch import Tensor
 
 from devrf.apps.export.geometry import MovingMesh
+from devrf.apps.images import to_bytes
 from devrf.system.files import atomic_write, write_json
 
 FRAME = "world: the axes and the unit of the capture"
@@ -23,7 +22,7 @@ def mesh_files(mesh: MovingMesh) -> Iterable[Drawn]:
     """The mesh at each of its times."""
     import trimesh  # an extra
 
-    colors = _bytes(mesh.colors)
+    colors = to_bytes(mesh.colors).numpy()
     faces = mesh.faces.numpy()
     for vertices in mesh.vertices:
         yield trimesh.Trimesh(vertices.numpy(), faces, vertex_colors=colors, process=False)
@@ -33,7 +32,7 @@ def point_file(points: Tensor, colors: Tensor) -> Drawn:
     """The points (N, 3) of a time, with their colours (N, 3) in [0, 1]."""
     import trimesh
 
-    return trimesh.PointCloud(points.numpy(), colors=_bytes(colors))
+    return trimesh.PointCloud(points.numpy(), colors=to_bytes(colors).numpy())
 
 
 def write_sequence(
@@ -60,7 +59,3 @@ def write_sequence(
     for path in folder.glob(f"frame_[0-9]*.{format}"):
         if path.name not in {frame["file"] for frame in frames}:
             path.unlink()
-
-
-def _bytes(colors: Tensor) -> npt.NDArray[np.uint8]:
-    return (colors * 255).round().numpy().astype(np.uint8)

@@ -3,16 +3,8 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Collection
-from typing import Protocol
+from collections.abc import Callable, Collection
 from urllib.parse import urlsplit
-
-
-class Headers(Protocol):
-    """A request's headers, of whatever library."""
-
-    def get(self, key: str, default: str) -> str:
-        """The value of a header, else the default."""
 
 
 def own_names(host: str) -> frozenset[str]:
@@ -21,18 +13,18 @@ def own_names(host: str) -> frozenset[str]:
     return frozenset(name.lower() for name in names)
 
 
-def refusal(headers: Headers, names: Collection[str]) -> str | None:
-    """Why a request with these ``headers`` is not answered; None: it is.
+def refusal(header: Callable[[str, str], str], names: Collection[str]) -> str | None:
+    """Why a request is not answered, a ``header`` of which is looked up with a default; or None.
 
     A page from elsewhere that the same browser shows gives its own address in ``Origin``. One whose
     name was made to lead to this machine (DNS rebinding) gives that name in ``Host``: an IP address
     or one of the machine's own ``names`` cannot be made so.
     """
-    host = headers.get("Host", "").lower()
+    host = header("Host", "").lower()
     name = urlsplit(f"//{host}").hostname or ""
     is_address = ":" in name or name.replace(".", "").isdigit()
     if name not in names and not is_address:
         return f"devrf: this machine is not {name!r}; open the page by its IP address\n"
-    if urlsplit(headers.get("Origin", f"//{host}")).netloc.lower() != host:
+    if urlsplit(header("Origin", f"//{host}")).netloc.lower() != host:
         return "devrf: another page's request\n"
     return None

@@ -76,7 +76,7 @@ def _handler(
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:  # noqa: N802 - the name that http.server calls
-            why = refusal(self.headers, names)
+            why = refusal(self.headers.get, names)
             where = urlsplit(self.path)
             if why is not None:
                 self._send(HTTPStatus.FORBIDDEN, "text/plain", why.encode())

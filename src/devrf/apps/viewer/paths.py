@@ -62,18 +62,14 @@ def known_paths(cameras: Cameras, model: Callable[[], Viewable]) -> dict[str, Pr
     def ring(video: VideoSettings) -> Cameras:
         return filmed(default_way(model().space, closed=True), video)
 
-    def bullet(stop: float) -> tuple[Keyframe, ...]:
-        shots, shot_times = bullet_time(ring, stop, once)
-        return keyframes_of(shots, shot_times, SECONDS)
-
-    def freeze(stop: float) -> tuple[Keyframe, ...]:
-        shots, shot_times = time_freeze(ring, stop, longer)
-        return keyframes_of(shots, shot_times, 3 * SECONDS)
+    def stopped(shoot: Any, video: VideoSettings, stop: float) -> tuple[Keyframe, ...]:
+        shots, shot_times = shoot(ring, stop, video)
+        return keyframes_of(shots, shot_times, SECONDS * video.frames / KEYFRAMES)
 
     return {
         **{name: partial(running, name) for name in WAYS},
-        "bullet time": bullet,
-        "time freeze": freeze,
+        "bullet time": partial(stopped, bullet_time, once),
+        "time freeze": partial(stopped, time_freeze, longer),
     }
 
 

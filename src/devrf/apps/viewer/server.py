@@ -46,7 +46,7 @@ def _guarded(
     """``serve``, which refuses what :func:`refusal` says."""
 
     def answer(connection: ServerConnection, request: Request) -> Response | None:
-        why = refusal(request.headers, names)
+        why = refusal(request.headers.get, names)
         if why is not None:
             return connection.respond(HTTPStatus.FORBIDDEN, why)
         response: Response | None = process_request(connection, request)
