@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import json
 import logging
 import time
@@ -13,7 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from lightning import seed_everything
@@ -41,7 +39,7 @@ from devrf.kernels import runtime
 from devrf.kernels.ahead import compile_ahead
 from devrf.system.files import read_record
 from devrf.system.folder_lock import PLACE
-from devrf.system.memory import shortage_in_words
+from devrf.system.memory import free_cache, shortage_in_words
 
 log = logging.getLogger(__name__)
 
@@ -184,9 +182,7 @@ def _learn(run: RunContext, learning: Names) -> None:
         for name in run.learnable(learning):
             _take(run, name, partial(learn, name=name))
             # What a stage's trainer holds in circles would count as the next stage's memory.
-            gc.collect()
-            if run.device.type == "cuda":
-                torch.cuda.empty_cache()
+            free_cache(run.device)
 
 
 def _take(run: RunContext, name: str, step: Step) -> None:

@@ -9,7 +9,6 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from shutil import which
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
@@ -70,7 +69,7 @@ class FolderLock(Callback):
         """Lock the folder of a sweep; each job locks its own. Refuse SLURM where there is none."""
         folder = Path(config.hydra.sweep.dir)
         with report_user_errors():
-            missing = [name for name in ("srun", "sbatch") if which(name) is None]
+            missing = [name for name in ("srun", "sbatch") if shutil.which(name) is None]
             if config.hydra.launcher._target_.endswith(".SlurmLauncher") and missing:
                 raise DevrfError(
                     f"hydra/launcher: no {' and no '.join(missing)} here; type the command where "

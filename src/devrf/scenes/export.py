@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import shutil
@@ -23,6 +22,7 @@ from devrf.scenes.flow_files import write_flow
 from devrf.scenes.formats.llff_poses import BOUND_FACTOR
 from devrf.scenes.scene import Capture, Scene, Views
 from devrf.scenes.validation import scene_error
+from devrf.system.files import write_json
 
 _WRITE_HINT = "give data.export another folder"
 
@@ -117,8 +117,7 @@ def _export_film(scene: Scene, folder: Path) -> None:
             "train_filenames": names["images"],
             "test_filenames": names["others"],
         }
-        text = json.dumps(content, indent=1)
-        (partial / "transforms.json").write_text(text + "\n", encoding="utf-8")
+        write_json(partial / "transforms.json", content)
 
 
 def _export_blender(scene: Scene, folder: Path) -> None:
@@ -162,8 +161,7 @@ def _write_split(views: Views, split: str, folder: Path) -> None:
     focal = float(views.cameras.focal[0, 0])
     angle = 2 * math.atan(views.width / 2 / focal)
     content = {"camera_angle_x": angle, "frames": frames}
-    text = json.dumps(content, indent=1)
-    (folder / f"transforms_{split}.json").write_text(text + "\n", encoding="utf-8")
+    write_json(folder / f"transforms_{split}.json", content)
 
 
 # The published scenes are read at this factor, from folders images_4; larger images are not needed,

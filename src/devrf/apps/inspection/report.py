@@ -19,6 +19,7 @@ from devrf.data.color_change import CHANGING, color_change, color_drift
 from devrf.geometry.clock import FrameClock
 from devrf.scenes.optical_flow import frame_pairs
 from devrf.scenes.scene import Scene, Views
+from devrf.scenes.splits import distinct_times
 
 log = logging.getLogger(__name__)
 
@@ -113,17 +114,11 @@ def _why(reason: str) -> str:
 
 def _times(views: Views) -> str:
     """How many times, from when to when, and whether evenly spaced to a hundredth of a step."""
-    times = _distinct_times(views)
+    times = distinct_times(views.times)
     steps = times.diff()
     even = torch.allclose(steps, steps.mean(), rtol=0.01, atol=FrameClock.TOLERANCE)
     spacing = "" if even else "un"
     return f"{len(times)} from {float(times[0]):g} to {float(times[-1]):g}, {spacing}evenly spaced"
-
-
-def _distinct_times(views: Views) -> Tensor:
-    """The times of the views, each once, ascending; equal up to rounding is equal."""
-    times = views.times.sort().values
-    return times[times.diff(prepend=times.new_tensor([-1.0])) > FrameClock.TOLERANCE]
 
 
 def image_facts(scene: Scene) -> list[Row]:
@@ -146,7 +141,7 @@ def _set_facts(name: str, views: Views, middle: Tensor) -> Row:
     return (
         name,
         str(len(views)),
-        f"{len(set(views.view.tolist()))} x {len(_distinct_times(views))}",
+        f"{len(set(views.view.tolist()))} x {len(distinct_times(views.times))}",
         f"{views.width} x {views.height}",
         alpha,
         masked,

@@ -5,9 +5,6 @@ It fills a third of a picture. Structure from motion that takes it for the world
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
-
 import torch
 from torch import Tensor
 
@@ -31,18 +28,11 @@ _TWIST = Swing(0.35, 3.0, -0.5)
 _BEND = Swing(0.20, 4.0, 0.0)
 
 
-@dataclass(frozen=True)
-class Cushion:
-    """A :class:`~devrf.scenes.procedural.solids.Shape` of one part, painted as finely as the wall.
+class Cushion(Assembled):
+    """A body of one part, painted as finely as the wall."""
 
-    Attributes:
-        speed: scales turning, bending and twisting.
-    """
-
-    speed: float = 1.0
-
-    @cached_property
-    def _body(self) -> Assembled:
+    def __init__(self, speed: float = 1.0) -> None:
+        """``speed`` scales turning, bending and twisting."""
         # Columns: the part's x, y and z are the world's x, −z and y.
         axes = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
         part = Part(
@@ -57,19 +47,7 @@ class Cushion:
             bend=_BEND,
             twist=_TWIST,
         )
-        return Assembled((part,), self.speed)
-
-    def distance(self, points: Tensor, time: float) -> Tensor:
-        """The part's lower bound (M,)."""
-        return self._body.distance(points, time)
-
-    def material(self, points: Tensor, time: float) -> Material:
-        """The part's material."""
-        return self._body.material(points, time)
-
-    def forward(self, material: Material, time: float) -> Tensor:
-        """Bent and twisted, then turned."""
-        return self._body.forward(material, time)
+        super().__init__((part,), speed)
 
     def color(self, material: Material) -> Tensor:
         """The wall's paint, tinted; it depends on where the material is at rest."""

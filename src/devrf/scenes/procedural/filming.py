@@ -174,8 +174,8 @@ class Filming:
         pixels, depth = self.pictures(train.joined(test), 0.0)
         count = len(train)
         return Capture(
-            train=_still(train, pixels[:count], depth[:count], "train"),
-            test=_still(test, pixels[count:], depth[count:], "test"),
+            train=_each(train, pixels[:count], depth[:count], torch.zeros(count), "static train"),
+            test=_each(test, pixels[count:], depth[count:], torch.zeros(len(test)), "static test"),
         )
 
     def moving(
@@ -207,8 +207,8 @@ class Filming:
         times = torch.arange(len(camera)) / (len(camera) - 1)
         pairs = [camera[[k]].joined(others[[k]]) for k in range(len(camera))]
         pixels, depth = self._shot(pairs, times)
-        train = _followed(camera, pixels[:, 0], depth[:, 0], times, "train")
-        test = _followed(others, pixels[:, 1], depth[:, 1], times, "test")
+        train = _each(camera, pixels[:, 0], depth[:, 0], times, "hand-held train frame")
+        test = _each(others, pixels[:, 1], depth[:, 1], times, "hand-held test frame")
         return Capture(
             train=replace(train, flow=exact_flow(self.shape, train)),
             test=replace(test, valid_mask=covisible(self.shape, test, train)),
@@ -261,10 +261,11 @@ class Filming:
         return pixels, depth.view(size)
 
 
-def _still(cameras: Cameras, pixels: Tensor, depth: Tensor, split: str) -> Views:
+def _each(cameras: Cameras, pixels: Tensor, depth: Tensor, times: Tensor, label: str) -> Views:
+    """One image from each camera."""
     order = torch.arange(len(cameras))
-    names = tuple(f"static {split} {k:03d}" for k in order.tolist())
-    return Views(pixels, cameras, torch.zeros(len(cameras)), order, names, depth=depth)
+    names = tuple(f"{label} {k:03d}" for k in order.tolist())
+    return Views(pixels, cameras, times, order, names, depth=depth)
 
 
 def _moving(
@@ -289,9 +290,3 @@ def _moving(
         tuple(names),
         depth=depth.flatten(0, 1),
     )
-
-
-def _followed(cameras: Cameras, pixels: Tensor, depth: Tensor, times: Tensor, split: str) -> Views:
-    order = torch.arange(len(cameras))
-    names = tuple(f"hand-held {split} frame {k:03d}" for k in order.tolist())
-    return Views(pixels, cameras, times, order, names, depth=depth)
