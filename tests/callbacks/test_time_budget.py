@@ -122,8 +122,8 @@ def test_memory_that_runs_out_as_batches_grow_ends_their_growth(timed, monkeypat
     drawn: list[int] = []
 
     def loss(stage: DeformationStage, views: Any, pixels: Any) -> Any:
-        drawn.append(len(pixels))
-        if len(pixels) > SCHEDULE.rays / 4:
+        drawn.append(len(pixels.image))
+        if len(pixels.image) > SCHEDULE.rays / 4:
             raise torch.OutOfMemoryError("CUDA out of memory.")
         return usual(stage, views, pixels)
 

@@ -29,7 +29,8 @@ from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
-from devrf.methods.devrf.deformation_stage import DeformationStage, Extension
+from devrf.methods.devrf.deformation_stage import DeformationStage
+from devrf.methods.devrf.extension import Extension
 from devrf.methods.devrf.extensions.color_residual import ColorResidual
 from devrf.methods.devrf.extensions.priors import Elastic
 from devrf.methods.devrf.extensions.tracks import StartAlongFlow

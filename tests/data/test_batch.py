@@ -12,10 +12,10 @@ from devrf.data.batch import (
     all_pixels,
     background_color,
     concatenated,
+    gather_batch,
     pixel_positions,
     wanted_pixels,
 )
-from devrf.engine.batches import gather_batch
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.scene import OpticalFlow, Views
 

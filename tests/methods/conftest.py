@@ -11,8 +11,7 @@ import torch
 from lightning import Callback, Trainer
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint, load_checkpoint, save_checkpoint
-from devrf.data.batch import RayBatch
-from devrf.engine.batches import gather_batch
+from devrf.data.batch import RayBatch, gather_batch
 from devrf.engine.stage import Stage
 from devrf.methods.base import RayTrainable
 from devrf.methods.protocol import ProtocolStage

@@ -138,8 +138,6 @@ class ContractedRays(Rays):
         course: (M, 3) x_o, k and β of each ray.
     """
 
-    is_curved: ClassVar[bool] = True
-
     space: ContractedSpace
     course: Tensor
 

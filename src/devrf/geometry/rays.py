@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import ClassVar, Self
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -21,10 +21,7 @@ class Rays:
         origins: (M, 3) start points, in the fields' space (world units, or NDC).
         directions: (M, 3) unit vectors in world space; in NDC, from the near to the far plane.
         viewdirs: (M, 3) unit viewing directions in world space, what the colour decoder sees.
-        is_curved: whether points move at a pace that changes along a ray.
     """
-
-    is_curved: ClassVar[bool] = False
 
     origins: Tensor
     directions: Tensor

@@ -15,7 +15,6 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from devrf.geometry.box import Box
 from devrf.geometry.contraction import INFINITY, ContractedRays, ContractedSpace
 from devrf.geometry.rays import PARALLEL, Rays
 from devrf.kernels.grid import Grid, cell, coordinates, grid_over, inside, interpolate, slope
@@ -24,7 +23,7 @@ from devrf.kernels.runtime import GRAIN_OF_RAYS, launch, made_once, room, row_ty
 from devrf.ops import march as definition
 from devrf.ops.compositing import LEAST_MASS
 from devrf.ops.march import EXIT, STOP, Medium, Samples
-from devrf.ops.trilinear import Shape, shape_of
+from devrf.ops.trilinear import shape_of
 
 # Half edges of the inner box that a ray moves along any axis while its distance grows by what one
 # takes along the axis that it crosses fastest, at most; more in a thick shell, and where a ray
@@ -95,8 +94,9 @@ class _March(torch.autograd.Function):
 
         fixed = displacement is None or not displacement.requires_grad
         ctx.mark_non_differentiable(ray, distance, points, depth, *([canonical] if fixed else []))
+        stop = start + significant_count
         ctx.save_for_backward(
-            density, displacement, visible_start, visible_count, start, transmittance
+            density, displacement, visible_start, visible_count, stop, transmittance
         )
         ctx.geometry, ctx.lines, ctx.visible = geometry, lines, visible
         ctx.medium, ctx.kept = medium, kept
@@ -105,11 +105,9 @@ class _March(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        density, displacement, visible_start, visible_count, start, transmittance = (
-            ctx.saved_tensors
-        )
+        density, displacement, visible_start, visible_count, stop, transmittance = ctx.saved_tensors
         medium, device = ctx.medium, density.device
-        given = [start, *(each.contiguous() for each in gradients[3:6]), transmittance]
+        given = [stop, *(each.contiguous() for each in gradients[3:6]), transmittance]
         start, length = _starts(visible_count)
         raw = torch.empty(length, 1, device=device)
         moved = torch.empty(length, 3, device=device)
@@ -138,14 +136,14 @@ def _starts(counts: Tensor) -> tuple[Tensor, int]:
 
 
 def _geometry(rays: Rays, medium: Medium) -> Geometry:
-    moves = medium.displacement is not None
+    surroundings = medium.path.surroundings
+    motion = None
+    if medium.displacement is not None and medium.motion_box is not None:
+        motion = grid_over(medium.motion_box, shape_of(medium.displacement))
     return geometry_of(
-        medium.path.box,
-        shape_of(medium.density),
-        medium.path.surroundings.box,
-        shape_of(medium.path.surroundings.distances),
-        motion_box=medium.motion_box if moves else None,
-        motion_shape=shape_of(medium.displacement) if moves else None,
+        density=grid_over(medium.path.box, shape_of(medium.density)),
+        occupancy=grid_over(surroundings.box, shape_of(surroundings.distances)),
+        motion=motion,
         still_outside=medium.still_outside,
         space=rays.space if isinstance(rays, ContractedRays) else None,
         step=medium.path.step,
@@ -157,13 +155,10 @@ def _geometry(rays: Rays, medium: Medium) -> Geometry:
 
 @lru_cache(maxsize=64)
 def geometry_of(
-    box: Box,
-    shape: Shape,
-    occupancy_box: Box,
-    occupancy_shape: Shape,
     *,
-    motion_box: Box | None,
-    motion_shape: Shape | None,
+    density: Grid,
+    occupancy: Grid,
+    motion: Grid | None,
     still_outside: bool,
     space: ContractedSpace | None,
     step: float,
@@ -173,11 +168,11 @@ def geometry_of(
 ) -> Geometry:
     """What rays are followed through; with a ``space``, rays in contracted space."""
     geometry = Geometry()
-    geometry.density = grid_over(box, shape)
-    geometry.occupancy = grid_over(occupancy_box, occupancy_shape)
-    if motion_box is not None and motion_shape is not None:
+    geometry.density = density
+    geometry.occupancy = occupancy
+    if motion is not None:
         geometry.moves = 1
-        geometry.motion = grid_over(motion_box, motion_shape)
+        geometry.motion = motion
         geometry.still_outside = int(still_outside)
     if space is not None:
         inner = space.inner()
@@ -506,7 +501,7 @@ def adjoint_kernel(
     visible_start: wp.array(dtype=wp.int64),
     visible: wp.array(dtype=VisibleSample),
     visible_count: wp.array(dtype=int),
-    significant_start: wp.array(dtype=wp.int64),
+    significant_stop: wp.array(dtype=wp.int64),
     given_canonical: wp.array(dtype=wp.vec3),
     given_weight: wp.array(dtype=float),
     given_transmittance: wp.array(dtype=float),
@@ -529,10 +524,7 @@ def adjoint_kernel(
         return
     ray = rays[number]
     start = int(visible_start[number])
-    significant = int(significant_start[number])
-    for k in range(count):
-        if visible[start + k].weight >= geometry.threshold:
-            significant += 1
+    significant = int(significant_stop[number])
     after = transmittance[number]
     behind = given_transmittance[number] * after
     for back in range(count):

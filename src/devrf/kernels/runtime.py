@@ -142,15 +142,12 @@ def room(kind: Any, count: int, device: torch.device) -> wp.array:
 
 def made_once(factory: Callable[[int], wp.Kernel]) -> Callable[[int], wp.Kernel]:
     """The kernels of a ``factory``, for a number of channels or a space, each made once."""
-    made: dict[int, wp.Kernel] = {}
+    made = cache(factory)
 
     @wraps(factory)
     def kernel(choice: int) -> wp.Kernel:
-        if choice not in made:
-            with compiling:
-                if choice not in made:
-                    made[choice] = factory(choice)
-        return made[choice]
+        with compiling:
+            return made(choice)
 
     return kernel
 

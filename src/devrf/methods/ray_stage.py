@@ -12,9 +12,8 @@ import torch
 from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
-from devrf.data.batch import Pixels, RayBatch, concatenated
+from devrf.data.batch import FramePool, Pixels, RayBatch, concatenated, gather_batch
 from devrf.data.datamodule import SceneDataModule
-from devrf.engine.batches import FramePool, gather_batch
 from devrf.engine.grid_adam import GridAdam
 from devrf.engine.phase import Phase
 from devrf.engine.stage import Stage

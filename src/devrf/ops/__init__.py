@@ -10,6 +10,5 @@ compute where those do not run.
 | ``compositing`` | ``composite``: weights; ``sum_by_ray``; ``mean_distance``: depths |
 | ``color_network`` | ``decode``: features and directions → RGB |
 | ``photometric`` | the terms that compare rays with images |
-| ``motion`` | ``cycle_error``, ``flow_error``: the cycle and the flow term |
 | ``adam`` | ``adam_step``: one step on one tensor; ``add_total_variation_gradient`` |
 """

@@ -75,20 +75,3 @@ class VoxelOutput(RenderOutput):
     samples: Samples
     sample_color: Tensor
     residual: Tensor | None = None
-
-    def mean_over_samples(self, values: Tensor) -> Tensor:
-        """The mean () of values (K,) of samples, 0 without samples."""
-        return values.mean() if len(values) else values.sum()
-
-    def count_on(self, chosen: Tensor) -> Tensor:
-        """The number () of samples on the ``chosen`` (R,) rays."""
-        return chosen[self.samples.ray].sum()
-
-    def on_rays(self, chosen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Ray (S,), position q (S, 3) and weight (S,) of the samples on ``chosen`` (R,) rays."""
-        ray = self.samples.ray
-        index = chosen.index_select(0, ray).nonzero()[:, 0]
-        # Its gradient takes half the time of that of indexing.
-        canonical = self.samples.canonical.index_select(0, index)
-        weight = self.samples.weight.index_select(0, index)
-        return ray.index_select(0, index), canonical, weight

@@ -10,9 +10,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from devrf.data.batch import RayBatch
+from devrf.data.batch import RayBatch, gather_batch
 from devrf.data.flow import previous_images
-from devrf.engine.batches import gather_batch
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras

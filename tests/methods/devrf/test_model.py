@@ -136,7 +136,7 @@ def test_loaded_displacements_stay_in_half_precision_and_are_read_in_single(mode
         assert frames.dtype == torch.float16
     points = torch.full((1, 3), 0.1)
     for time in (0.25, 0.6):  # at a frame, and between two
-        assert other.deformation.blended(time).dtype == torch.float32
+        assert other.deformation.warp_at(time).displacement.dtype == torch.float32
         before, after = model.deformation.warp(points, time), other.deformation.warp(points, time)
         torch.testing.assert_close(after, before, atol=1e-3, rtol=0)
 

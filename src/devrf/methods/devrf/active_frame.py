@@ -75,11 +75,6 @@ class ActiveFrame:
         """Both directions of the frame."""
         return self.backward, self.forward
 
-    @property
-    def learned(self) -> list[Tensor]:
-        """Everything that is learned of the frame."""
-        return [*self.slices, *self.further.values()]
-
     @torch.no_grad()
     def check_out(self, number: int) -> None:
         """Copy a frame out of the fields."""

@@ -14,7 +14,7 @@ from devrf.checkpoints.stored_grids import StoredShape
 from devrf.geometry.box import Box
 from devrf.kernels.look_up import look_up
 from devrf.ops.color_network import ColorNetwork, decode
-from devrf.ops.trilinear import resample
+from devrf.ops.trilinear import resample, shape_of
 from devrf.system.plain_data import built
 
 
@@ -38,15 +38,14 @@ class VoxelGrid(StoredShape):
     resizable: ClassVar = {"values": 3}  # a run may have ended at any resolution
     values: nn.Parameter
 
-    def __init__(self, shape: tuple[int, int, int], channels: int, fill: float = 0.0) -> None:
+    def __init__(self, shape: tuple[int, int, int], channels: int) -> None:
         super().__init__()
-        self.values = nn.Parameter(torch.full((*shape, channels), fill))
+        self.values = nn.Parameter(torch.zeros(*shape, channels))
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """Grid points along x, y, z."""
-        x, y, z, _ = self.values.shape
-        return x, y, z
+        return shape_of(self.values)
 
     def forward(self, points: Tensor, box: Box) -> Tensor:
         """Values (M, C) at ``points`` (M, 3), trilinear; outside ``box`` they are the border's."""

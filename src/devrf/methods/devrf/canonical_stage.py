@@ -10,8 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from devrf.data.batch import PixelPool, Pixels
-from devrf.engine.batches import gather_batch
+from devrf.data.batch import PixelPool, Pixels, gather_batch
 from devrf.engine.grid_adam import GridAdam
 from devrf.engine.stage import Stage
 from devrf.errors import DevrfError
@@ -138,6 +137,8 @@ class CanonicalStage(Stage):
     def setup(self, stage: str) -> None:
         """Build the field of the first phase in the scene's box."""
         super().setup(stage)
+        device = self.trainer.strategy.root_device
+        self.decoder_dtype = decoder_dtype(self.decoder_precision, device)
         if hasattr(self, "scene_model"):
             return
         side = self.schedule.side
@@ -400,7 +401,7 @@ class CanonicalStage(Stage):
             model.occupancy,
             model.settings,
             batch.background,
-            precision=decoder_dtype(self.decoder_precision, self.device),
+            precision=self.decoder_dtype,
         )
         with span("losses"):
             prediction = Prediction(output=output, batch=batch)

@@ -90,8 +90,7 @@ class DeformationField(FrameField):
     @property
     def shape(self) -> tuple[int, int, int]:
         """Grid points along x, y, z."""
-        _, x, y, z, _ = self.to_canonical.shape
-        return x, y, z
+        return self.frames.shape
 
     def warp(self, points: Tensor, time: float) -> Tensor:
         """x + Δ_b(x, t) (M, 3) of ``points`` x (M, 3) at ``time`` t."""
@@ -114,18 +113,6 @@ class DeformationField(FrameField):
         chosen = [moment.before, moment.after] if moment.weight else [moment.before]
         slices = () if chosen == [0] else tuple(frames[k].to(here) for k in chosen)
         return GridWarp(slices, self.box, moment.weight, self.still_outside)
-
-    def blended(self, time: float) -> Tensor:
-        """Δ_b at ``time`` as one grid (X, Y, Z, 3): one look-up a point instead of two.
-
-        Rounded differently than :meth:`warp`. On a frame it shares the frame's memory, if the
-        frames are kept in single precision on the device.
-        """
-        moment, here = self.clock.at(time), self.frames.here
-        before = self.to_canonical[moment.before].to(here)
-        if not moment.weight:
-            return before
-        return before.lerp(self.to_canonical[moment.after].to(here), moment.weight)
 
     @torch.no_grad()
     def resize(self, voxels: int, planes: int | None = None) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
@@ -11,9 +11,8 @@ import torch
 from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
-from devrf.data.batch import Pixels
+from devrf.data.batch import Pixels, gather_batch
 from devrf.data.flow import previous_images
-from devrf.engine.batches import gather_batch
 from devrf.engine.grid_adam import GridAdam
 from devrf.engine.stage import Stage
 from devrf.errors import DevrfError
@@ -24,10 +23,11 @@ from devrf.methods.devrf.deformation_schedule import (
     DeformationSchedule,
     converged,
 )
+from devrf.methods.devrf.extension import Extension
 from devrf.methods.devrf.frame_store import FrameField
 from devrf.methods.devrf.losses import FlowMean, MotionPrediction, batch_loss
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.motion_loss import MotionLoss, MotionTerm
+from devrf.methods.devrf.motion_loss import MotionLoss
 from devrf.methods.devrf.pixel_pools import frame_pools, rays_for_epochs
 from devrf.methods.devrf.settings import (
     DEFORMATION_LOSS,
@@ -41,50 +41,6 @@ from devrf.scenes.scene import CaptureName, Views
 from devrf.system.profiling import span
 
 log = logging.getLogger(__name__)
-
-
-class Extension:
-    """Adds to the deformation stage; what is not overridden adds nothing.
-
-    An extension is one file of ``extensions/`` and one block of ``schedule.extensions``; without
-    both, all else runs as before. Hooks are called in the order in which they stand here.
-    """
-
-    @property
-    def terms(self) -> Mapping[str, MotionTerm]:
-        """Further loss terms, by name."""
-        return {}
-
-    @property
-    def weights(self) -> Mapping[str, float]:
-        """How much they count, where ``loss.deformation`` does not say."""
-        return {}
-
-    @property
-    def scaled_terms(self) -> Collection[str]:
-        """The loss terms that :meth:`weight_factor` may change."""
-        return ()
-
-    def setup(self, stage: DeformationStage) -> None:
-        """Add fields to the model and groups to the optimiser, before learning starts."""
-
-    def frame_fields(self, stage: DeformationStage, level: int) -> Mapping[str, FrameField]:
-        """Fields whose frames are learned at ``level`` as the displacements are, by name."""
-        return {}
-
-    def begin_level(self, stage: DeformationStage, level: int) -> None:
-        """Memory of the active frame is ready; give the optimiser what is learned of it."""
-
-    def weight_factor(self, term: str, level: int) -> float:
-        """Factor of the weight of any loss term at ``level``."""
-        return 1.0
-
-    def initialise(self, stage: DeformationStage, phase: DeformationPhase) -> None:
-        """Give the phase's frame its first values, in the fields, before a visit."""
-
-    def color_change(self, frame: ActiveFrame) -> ColorChange | None:
-        """What is added to the colours' logits of an active frame; None: nothing."""
-        return None
 
 
 class DeformationStage(Stage):
@@ -206,6 +162,8 @@ class DeformationStage(Stage):
     def setup(self, stage: str) -> None:
         """Build a field of no motion at the coarsest resolution; refuse a scene without motion."""
         super().setup(stage)
+        device = self.trainer.strategy.root_device
+        self.decoder_dtype = decoder_dtype(self.decoder_precision, device)
         if not self.scene.moves:
             raise DevrfError(f"{self.scene.name}: is at rest; the canonical stage is all it takes")
         if self.scene.dynamic.train.by_moving_camera and self.motion_loss.leave_out("flow"):
@@ -358,7 +316,7 @@ class DeformationStage(Stage):
             model.settings,
             batch.background,
             warp=field.warp_by(frame.backward),
-            precision=decoder_dtype(self.decoder_precision, self.device),
+            precision=self.decoder_dtype,
             color_change=self._color_change(frame),
         )
         # Before frame 1 nothing has moved.

@@ -18,7 +18,7 @@ from devrf.checkpoints.stored_grids import StoredShape
 from devrf.engine.ddp import world_size
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
-from devrf.ops.trilinear import resample
+from devrf.ops.trilinear import resample, shape_of
 from devrf.system.plain_data import built
 
 log = logging.getLogger(__name__)
@@ -93,8 +93,7 @@ class FrameStore(StoredShape):
     @property
     def shape(self) -> Shape:
         """Grid points along x, y, z."""
-        _, x, y, z, _ = self.to_canonical.shape
-        return x, y, z
+        return shape_of(self.to_canonical[0])
 
     @torch.no_grad()
     def read(self, frame: int, into: Directions) -> None:

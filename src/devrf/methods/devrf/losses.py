@@ -15,7 +15,6 @@ from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import WORLD, Space
 from devrf.methods.devrf.deformation_field import Warp
 from devrf.methods.weighted_loss import visibility, weighted_sum
-from devrf.ops.motion import cycle_error, flow_error
 from devrf.ops.photometric import (
     alpha_mask_error,
     background_entropy,
@@ -81,9 +80,10 @@ class MotionPrediction(Prediction):
 
 def cycle(prediction: MotionPrediction) -> Tensor:
     """L_cycle = mean_i ½ |x_i − (q_i + Δ_f(q_i, t))|² (docs/method.md#cycle)."""
-    output = prediction.output
-    returned = prediction.unwarp(output.samples.canonical)
-    return output.mean_over_samples(cycle_error(output.samples.points, returned))
+    samples = prediction.output.samples
+    missed = samples.points - prediction.unwarp(samples.canonical)
+    error = 0.5 * missed.square().sum(dim=1)
+    return error.mean() if len(error) else error.sum()
 
 
 def flow(prediction: MotionPrediction) -> Tensor:
@@ -92,21 +92,25 @@ def flow(prediction: MotionPrediction) -> Tensor:
     M is the number of ``rays`` whose flow is valid, or twice the number of their ``samples``.
     0 without observed flow.
     """
-    batch, output = prediction.batch, prediction.output
-    if batch.flow is None or batch.flow_valid is None:
-        return output.color.new_zeros(())
-    ray, canonical, weight = output.on_rays(batch.flow_valid)
+    batch, samples = prediction.batch, prediction.output.samples
+    valid = batch.flow_valid
+    if batch.flow is None or valid is None:
+        return samples.weight.new_zeros(())
+    known = valid.index_select(0, samples.ray).nonzero()[:, 0]
+    # Its gradient takes half the time of that of indexing.
+    ray = samples.ray.index_select(0, known)
+    weight = samples.weight.index_select(0, known)
     induced = induced_flow(
-        canonical,
+        samples.canonical.index_select(0, known),
         prediction.unwarp_previous,
         prediction.cameras,
         prediction.previous_image[batch.image].index_select(0, ray),
         batch.pixel.index_select(0, ray),
         prediction.space,
     )
-    valid = batch.flow_valid
-    count = valid.sum() if prediction.flow_mean == "rays" else 2 * output.count_on(valid)
-    return flow_error(weight, induced, batch.flow.index_select(0, ray), count)
+    error = (induced - batch.flow.index_select(0, ray)).abs().sum(dim=1)
+    count = valid.sum().clamp(min=1) if prediction.flow_mean == "rays" else max(2 * len(ray), 1)
+    return (weight * error).sum() / count
 
 
 def induced_flow(
@@ -154,8 +158,10 @@ def total_variation_weight(weight: float, side: int, rays: int) -> float:
     return weight * (side / 128) / rays / 6
 
 
+# An unweighted loss term: prediction → ().
+MotionTerm = Callable[[MotionPrediction], Tensor]
 # The terms of the paper that constrain the motion, and the photometric ones through the warp.
-MOTION_TERMS: dict[str, Callable[[MotionPrediction], Tensor]] = {
+MOTION_TERMS: dict[str, MotionTerm] = {
     **{("render" if name == "color" else name): term for name, term in PHOTOMETRIC_TERMS.items()},
     "cycle": cycle,
     "flow": flow,

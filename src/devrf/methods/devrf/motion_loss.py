@@ -3,46 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Protocol
-
-from torch import Tensor
+from collections.abc import Mapping, Sequence
 
 from devrf.errors import DevrfError
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
+from devrf.methods.devrf.extension import Extension
 from devrf.methods.devrf.losses import (
     MOTION_TERMS,
-    MotionPrediction,
+    MotionTerm,
     apart_from_total_variation,
     total_variation_weight,
 )
 from devrf.methods.weighted_loss import counted_weights
-
-# An unweighted loss term: prediction → ().
-MotionTerm = Callable[[MotionPrediction], Tensor]
-
-
-class LossExtension(Protocol):
-    """What an extension of the deformation stage adds to its loss."""
-
-    @property
-    def terms(self) -> Mapping[str, MotionTerm]:
-        """Further loss terms, by name."""
-        ...
-
-    @property
-    def weights(self) -> Mapping[str, float]:
-        """How much they count, where ``loss.deformation`` does not say."""
-        ...
-
-    @property
-    def scaled_terms(self) -> Collection[str]:
-        """The loss terms that :meth:`weight_factor` may change."""
-        ...
-
-    def weight_factor(self, term: str, level: int) -> float:
-        """Factor of the weight of any loss term at ``level``."""
-        ...
 
 
 class MotionLoss:
@@ -55,7 +27,7 @@ class MotionLoss:
     def __init__(
         self,
         loss: Mapping[str, float],
-        extensions: Sequence[LossExtension],
+        extensions: Sequence[Extension],
         schedule: DeformationSchedule,
     ) -> None:
         """Merge the weights, and check all names.

@@ -68,7 +68,10 @@ class DeVRFView:
         if motion is None or self.at_rest:
             return
         with one_thread() if self.canonical.density.values.numel() < MANY else nullcontext():
-            self._warp = motion.warp_by(motion.blended(self.time))
+            # As one grid: one look-up a point instead of two.
+            moves = motion.warp_at(self.time).displacement
+            assert moves is not None
+            self._warp = motion.warp_by(moves)
             self.occupancy = deformed_occupancy(
                 self.canonical, self.occupancy, self.picture_settings, self._warp
             )

@@ -18,11 +18,11 @@ from devrf.geometry.clock import FrameClock
 from devrf.kernels.look_up import look_up
 from devrf.methods.devrf.active_frame import ActiveFrame
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
-from devrf.methods.devrf.deformation_stage import DeformationStage, Extension
+from devrf.methods.devrf.deformation_stage import DeformationStage
+from devrf.methods.devrf.extension import Extension
 from devrf.methods.devrf.frame_store import FrameField
-from devrf.methods.devrf.losses import MotionPrediction, total_variation_weight
+from devrf.methods.devrf.losses import MotionPrediction, MotionTerm, total_variation_weight
 from devrf.methods.devrf.model import ColorField
-from devrf.methods.devrf.motion_loss import MotionTerm
 from devrf.rendering.output import ColorChange
 from devrf.scenes.scene import Views
 

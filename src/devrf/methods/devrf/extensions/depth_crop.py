@@ -7,8 +7,7 @@ import logging
 import torch
 from torch import Tensor, nn
 
-from devrf.data.batch import PixelPool
-from devrf.engine.batches import gather_batch
+from devrf.data.batch import PixelPool, gather_batch
 from devrf.geometry.box import Box
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.methods.devrf.canonical_field import CanonicalField

@@ -12,9 +12,9 @@ from torch import Tensor
 from torch.nn.functional import adaptive_max_pool3d, max_pool3d
 
 from devrf.geometry.box import Box
-from devrf.methods.devrf.deformation_stage import DeformationStage, Extension
-from devrf.methods.devrf.losses import MotionPrediction
-from devrf.methods.devrf.motion_loss import MotionTerm
+from devrf.methods.devrf.deformation_stage import DeformationStage
+from devrf.methods.devrf.extension import Extension
+from devrf.methods.devrf.losses import MotionPrediction, MotionTerm
 from devrf.rendering.occupancy import Occupancy
 
 # c of docs/method.md#elastic and #bending: beyond it a place counts as torn or jointed, not as

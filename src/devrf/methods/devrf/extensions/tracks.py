@@ -10,8 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from devrf.data.batch import PixelPool, all_pixels
-from devrf.engine.batches import gather_batch
+from devrf.data.batch import PixelPool, all_pixels, gather_batch
 from devrf.engine.ddp import broadcast
 from devrf.engine.grid_adam import GridAdam
 from devrf.geometry.cameras import Cameras
@@ -19,7 +18,8 @@ from devrf.geometry.space import WORLD, Space
 from devrf.kernels.look_up import look_up
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
-from devrf.methods.devrf.deformation_stage import DeformationStage, Extension
+from devrf.methods.devrf.deformation_stage import DeformationStage
+from devrf.methods.devrf.extension import Extension
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.pixel_pools import images_of
 from devrf.methods.devrf.volume_rendering import render
