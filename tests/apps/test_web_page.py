@@ -26,7 +26,7 @@ import pytest
 import torch
 from PIL import Image
 
-from devrf.apps.captured_cameras import described, picture_of
+from devrf.apps.captured_cameras import described, thumbnail, write_thumbnails
 from devrf.apps.settings import ViewerSettings
 from devrf.apps.viewer.page import PageServer
 from devrf.apps.web.pack import page
@@ -203,7 +203,7 @@ def psnr(picture: torch.Tensor, truth: torch.Tensor) -> float:
 def test_a_browser_draws_what_the_renderer_does(browser, scenes, tmp_path, space):
     model, viewpoints = scenes(space)
     file = tmp_path / "a page.html"
-    file.write_text(page(model, viewpoints, "tiny <scene>"), encoding="utf-8")
+    file.write_text(page(model, viewpoints, "tiny <scene>", "0123abcd"), encoding="utf-8")
     renderer = Renderer(model)
     behind = background_value(viewpoints.background)
     at_rest = renderer.view(viewpoints.held_out.of_height(ROWS), 0, 0.0, behind).color
@@ -234,7 +234,7 @@ def test_a_browser_draws_what_the_renderer_does(browser, scenes, tmp_path, space
 def file(moving: DeVRFModel, tiny_scene: Scene, tmp_path: Path) -> Path:
     """The page of the tiny scene in motion."""
     path = tmp_path / "scene.html"
-    path.write_text(page(moving, Viewpoints.of(tiny_scene), "tiny"), encoding="utf-8")
+    path.write_text(page(moving, Viewpoints.of(tiny_scene), "tiny", "0123abcd"), encoding="utf-8")
     return path
 
 
@@ -376,7 +376,7 @@ def test_without_webgl_and_after_a_lost_context_there_is_a_line(browser, file):
 
 
 def test_all_data_are_in_the_file_and_as_large_as_their_textures(moving, tiny_scene):
-    text = page(moving, Viewpoints.of(tiny_scene), "tiny")
+    text = page(moving, Viewpoints.of(tiny_scene), "tiny", "0123abcd")
     described = json.loads(re.search(r'id="description">(.*)</script>', text)[1])
     bytes_of = {"density": 2, "rough": 4, "features": 4, "weights": 16, "distances": 1}
     bytes_of |= {"displacement": 3, "residual": 3}
@@ -415,7 +415,7 @@ def test_an_off_centre_principal_point_moves_the_middle(moving, tiny_scene):
 
 
 def test_a_scene_at_rest_has_no_motion(learned, tiny_scene):
-    text = page(learned[0].scene_model, Viewpoints.of(tiny_scene), "tiny")
+    text = page(learned[0].scene_model, Viewpoints.of(tiny_scene), "tiny", "0123abcd")
     described = json.loads(re.search(r'id="description">(.*)</script>', text)[1])
     assert described["times"] == [0.0] and described["defines"]["MOVES"] == 0
 
@@ -423,13 +423,18 @@ def test_a_scene_at_rest_has_no_motion(learned, tiny_scene):
 def test_other_methods_are_refused_in_one_line(tiny_scene):
     model: Any = SimpleNamespace(name="tineuvox")
     with pytest.raises(DevrfError, match=r"^method=tineuvox: the page draws DeVRF's fields"):
-        page(model, Viewpoints.of(tiny_scene), "tiny")
+        page(model, Viewpoints.of(tiny_scene), "tiny", "0123abcd")
 
 
-def test_the_server_gives_page_and_pictures_to_its_own_page_alone(tiny_scene):
+def test_the_server_gives_page_and_pictures_to_its_own_page_alone(tiny_scene, moving, tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = probe.getsockname()[1]
-    served = PageServer(ViewerSettings(port=port), "<p>a page</p>", lambda: tiny_scene)
+    (tmp_path / "export").mkdir()
+    (tmp_path / "export" / "scene.html").write_text("<p>a page</p>")
+    (tmp_path / "run.log").write_text("a log")
+    viewpoints = Viewpoints.of(tiny_scene)
+    write_thumbnails(tmp_path / "export" / "pictures", tiny_scene, moving, viewpoints)
+    served = PageServer(ViewerSettings(port=port), tmp_path / "export")
 
     def answer(path: str, **headers: str) -> tuple[int, bytes]:
         request = urllib.request.Request(f"http://127.0.0.1:{port}{path}", headers=headers)
@@ -441,11 +446,20 @@ def test_the_server_gives_page_and_pictures_to_its_own_page_alone(tiny_scene):
 
     try:
         assert answer("/") == (200, b"<p>a page</p>")
-        status, picture = answer("/pictures/static_2/0.jpg")
-        truth = picture_of(tiny_scene, "static_2", 0).float()
-        assert status == 200
-        assert float((torch.from_numpy(iio.imread(picture)).float() - truth).abs().mean()) < 8
-        for path in ("/pictures/static_99/0.jpg", "/pictures/dynamic_0/9.jpg", "/etc/passwd", "/x"):
+        views = tiny_scene.dynamic.train
+        seen = ((views.view == views.view.unique()[1]) & (views.times == 0.5)).nonzero().item()
+        for path, truth in (
+            ("/pictures/static_2/0.jpg", thumbnail(tiny_scene, tiny_scene.static.train, 2)),
+            ("/pictures/dynamic_1/1.jpg", thumbnail(tiny_scene, views, seen)),
+        ):
+            status, picture = answer(path)
+            assert status == 200
+            away = torch.from_numpy(iio.imread(picture)).float() - truth.float()
+            assert float(away.abs().mean()) < 8
+        for path in (
+            *("/pictures/static_99/0.jpg", "/pictures/dynamic_0/9.jpg", "/pictures/"),
+            *("/x", "/etc/passwd", "/../run.log", "/%2e%2e/run.log", "//run.log"),
+        ):
             assert answer(path)[0] == 404
         assert answer("/", Host="elsewhere.example")[0] == 403
         assert answer("/", Origin="http://elsewhere.example")[0] == 403

@@ -16,11 +16,11 @@ from devrf.checkpoints.checkpoint_file import (
     DTYPES,
     _digest,
     _header,
-    digest_of,
     read_checkpoint_file,
     read_description,
     write_checkpoint_file,
 )
+from devrf.checkpoints.file_metadata import digest_of
 from devrf.errors import DevrfError
 from devrf.system.memory import own_memory
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import socket
 import threading
@@ -16,6 +17,8 @@ import trimesh
 
 from devrf.apps.keyframes import CameraPath, Keyframe, write_path
 from devrf.checkpoints.checkpoint import load_checkpoint
+from devrf.cli.restore_config import parsed
+from devrf.cli.view import serves_page
 
 
 @pytest.fixture
@@ -185,8 +188,43 @@ def test_it_serves_until_a_signal_and_ends_well(of_run, tmp_path, port):
     assert f"http://127.0.0.1:{port}" in outcome.out and "the viewer has ended" in outcome.out
     with socket.socket() as probe:
         assert probe.connect_ex(("127.0.0.1", port)) != 0
-    # It is no run: beside its log it leaves nothing, not even a config.
-    assert {path.name for path in (tmp_path / "run").iterdir()} <= {"run.log"}
+    # It is no run: beside its log it leaves what was served, not even a config.
+    assert {path.name for path in (tmp_path / "run").iterdir()} <= {"run.log", "export"}
+
+
+def test_the_page_of_a_run_is_served_before_anything_is_read(
+    devrf, trained, tmp_path, port, monkeypatch
+):
+    shutil.copytree(trained[0], tmp_path / "run")
+
+    def read(*arguments):
+        raise AssertionError("the page was there already")
+
+    monkeypatch.setattr("devrf.cli.run.run_stage", read)
+    monkeypatch.setattr("devrf.checkpoints.checkpoint.metadata_of", read)
+    sender = ended_by(signal.SIGINT, port)
+    outcome = devrf("stage=view", "hydra.run.dir=run", f"viewer.port={port}")
+    sender.join()
+    assert (outcome.status, outcome.err) == (0, "")
+    assert "the viewer has ended" in outcome.out
+    outcome = devrf("stage=view", "hydra.run.dir=run", "viewer.port=page")
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert outcome.err.startswith("devrf: viewer.port: expected a valid integer")
+
+
+def test_a_page_is_that_of_the_last_checkpoint(trained, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(trained[0], run)
+    typed = parsed(["stage=view", "hydra.run.dir=run", "viewer.port=8123"])
+    assert serves_page(typed, run)
+    assert not serves_page([*typed, *parsed(["viewer.renderer=server"])], run)
+    assert not serves_page([*typed, *parsed(["data=flower"])], run)
+    os.utime(run / "checkpoints" / "canonical.ckpt")  # learned since
+    assert not serves_page(typed, run)
+    os.utime(run / "checkpoints" / "deformation.ckpt")
+    assert serves_page(typed, run)
+    shutil.rmtree(run / "export" / "pictures")
+    assert not serves_page(typed, run)
 
 
 def test_a_port_in_use_is_said_in_one_line(of_run, tmp_path, port):

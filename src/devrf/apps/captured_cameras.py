@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
+import imageio.v3 as iio
 import torch
 from torch import Tensor
 
@@ -57,11 +59,11 @@ def thumbnail(scene: Scene, views: Views, index: int) -> Tensor:
 def described(model: Viewable, viewpoints: Viewpoints) -> Iterator[dict[str, Any]]:
     """The captured cameras in plain numbers, for a page: first those that saw the scene move.
 
-    Of each its ``name``, as :func:`picture_of` takes it; ``pose``, camera to world, 12 numbers, row
-    by row; ``fov``, its vertical angle of view in radians, were the principal point in the middle;
-    ``middle``, how far the image's middle is to the right of it and above, in tangents of angles;
-    ``aspect``, width over height;
-    ``distance`` of what it looks at, world units; ``times`` of the frames that it may have seen.
+    Of each its ``name``, as :func:`write_thumbnails` takes it; ``pose``, camera to world, 12
+    numbers, row by row; ``fov``, its vertical angle of view in radians, were the principal point in
+    the middle; ``middle``, how far the image's middle is to the right of it and above, in tangents
+    of angles; ``aspect``, width over height; ``distance`` of what it looks at, world units;
+    ``times`` of the frames that it may have seen.
     """
     static = viewpoints.static
     target = looked_at(model, static, lambda: distance_ahead(static))
@@ -71,6 +73,7 @@ def described(model: Viewable, viewpoints: Viewpoints) -> Iterator[dict[str, Any
             fx, fy = camera.focal[0].tolist()
             cx, cy = camera.center[0].tolist()
             way = target - camera.positions[0]
+            seen = viewpoints.followed[k : k + 1] or viewpoints.clock.times
             yield {
                 "name": f"{kind}_{k}",
                 "pose": camera.camera_to_world.flatten().tolist(),
@@ -78,29 +81,21 @@ def described(model: Viewable, viewpoints: Viewpoints) -> Iterator[dict[str, Any
                 "middle": [(camera.width / 2 - cx) / fx, (cy - camera.height / 2) / fy],
                 "aspect": (camera.width / fx) / (camera.height / fy),
                 "distance": max(float(way @ camera.forwards[0]), 0.1 * float(way.norm())),
-                "times": viewpoints.clock.times if kind == "dynamic" else [0.0],
+                "times": seen if kind == "dynamic" else [0.0],
             }
 
 
-def picture_of(scene: Scene, camera: str, frame: int) -> Tensor | None:
-    """What a camera saw nearest to a frame's time, as :func:`thumbnail`; None: there is no such.
-
-    Args:
-        scene: the scene with its images.
-        camera: ``static_3``, or ``dynamic_1`` for the second of the places that saw it move.
-        frame: of the scene's clock.
-    """
-    kind, _, number = camera.partition("_")
-    if kind not in ("static", "dynamic") or not number.isdecimal() or frame >= len(scene.clock):
-        return None
-    place = int(number)
-    if kind == "static":
+def write_thumbnails(folder: Path, scene: Scene, model: Viewable, viewpoints: Viewpoints) -> None:
+    """Write what the cameras of :func:`described` saw: ``<name>/<index of the time>.jpg``."""
+    for camera in described(model, viewpoints):
+        kind, _, number = camera["name"].partition("_")
         views = scene.static.train
-        return thumbnail(scene, views, place) if place < len(views) else None
-    views = scene.dynamic.train
-    seen = torch.unique(views.view)
-    if place >= len(seen):
-        return None
-    images = (views.view == seen[place]).nonzero()[:, 0]
-    nearest = (views.times[images] - scene.clock.times[frame]).abs().argmin()
-    return thumbnail(scene, views, int(images[nearest]))
+        images = torch.tensor([int(number)])
+        if kind == "dynamic":
+            views = scene.dynamic.train
+            images = (views.view == torch.unique(views.view)[int(number)]).nonzero()[:, 0]
+        (folder / camera["name"]).mkdir(parents=True, exist_ok=True)
+        for index, time in enumerate(camera["times"]):
+            nearest = images[(views.times[images] - time).abs().argmin()]
+            picture = thumbnail(scene, views, int(nearest)).numpy()
+            iio.imwrite(folder / camera["name"] / f"{index}.jpg", picture, quality=90)

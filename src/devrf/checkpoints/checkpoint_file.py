@@ -13,22 +13,19 @@ import hashlib
 import json
 from collections import defaultdict
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from torch import Tensor
 
+from devrf.checkpoints.file_metadata import FORMAT, file_metadata
 from devrf.errors import DevrfError
 from devrf.system.files import atomic_write
 from devrf.system.memory import need_memory
 
-FORMAT = "5"
 UNKNOWN = "0" * 64  # in the digest's place until it is known
-# Bytes of a header at most: usual are 20,000. In memory each may become 50.
-HEADER = 2**23
 # The names of safetensors.
 DTYPES = {getattr(torch, f"float{bits}"): f"F{bits}" for bits in (16, 32, 64)}
 DTYPES |= {getattr(torch, f"int{bits}"): f"I{bits}" for bits in (8, 16, 32, 64)}
@@ -67,7 +64,7 @@ def read_checkpoint_file(path: Path) -> dict[str, Any]:
     Raises:
         DevrfError: the file is damaged, of another format, or not devrf's.
     """
-    metadata = _metadata(path)
+    metadata = file_metadata(path)
     need_memory(path.stat().st_size, f"{path}: it")
     with safe_open(path, "pt") as file:
         # The library maps the file into memory: a copy does not change with it.
@@ -89,39 +86,7 @@ def read_description(path: Path) -> dict[str, Any]:
     Raises:
         DevrfError: the file does not begin as devrf's of this format.
     """
-    return _content(path, _metadata(path), defaultdict(lambda: None))
-
-
-def digest_of(path: Path) -> str:
-    """The SHA-256 of a file's content, in hexadecimal; "" if it is no checkpoint."""
-    try:
-        return _metadata(path)["sha256"]
-    except DevrfError:
-        return ""
-
-
-def _metadata(path: Path) -> dict[str, str]:
-    """The metadata of a file: ``devrf``, ``sha256`` and ``nested``."""
-    if not path.is_file():  # a pipe would be waited for
-        raise DevrfError(f"{path}: no file; set ckpt to one that devrf wrote")
-    metadata: dict[str, str] = {}
-    with path.open("rb") as start:
-        length = int.from_bytes(start.read(8), "little")
-    with suppress(SafetensorError):
-        if length <= HEADER:
-            with safe_open(path, "pt") as file:
-                metadata = file.metadata() or {}
-    if not {"devrf", "sha256", "nested"} <= set(metadata):
-        raise DevrfError(
-            f"{path}: not a devrf checkpoint, or a damaged one; set ckpt to a whole file that "
-            "devrf wrote"
-        )
-    if metadata["devrf"] != FORMAT:
-        raise DevrfError(
-            f"{path}: has format {metadata['devrf']}, this version of devrf reads {FORMAT}; use "
-            "the version that wrote it, or train again"
-        )
-    return metadata
+    return _content(path, file_metadata(path), defaultdict(lambda: None))
 
 
 def _content(path: Path, metadata: Mapping[str, str], tensors: Mapping[str, Any]) -> dict[str, Any]:

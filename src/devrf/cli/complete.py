@@ -27,6 +27,7 @@ from hydra.types import RunMode
 from devrf.cli.config import APART, PATHS, config_folder, group_choices
 from devrf.cli.messages import in_quotes
 from devrf.cli.restore_config import of_named_run, parsed, told, value, values
+from devrf.cli.view import serves_page
 from devrf.errors import DevrfError
 from devrf.system.process import importing
 
@@ -62,6 +63,9 @@ def completed(arguments: Sequence[str]) -> list[str]:
         if options and override.value() is None and not override.is_delete():
             line = override.input_line
             raise DevrfError(f"{line}: choose one of {', '.join(options)}, or leave it out")
+    run = value(typed, "hydra.run.dir")
+    if run is not None and serves_page(typed, Path(run)):
+        return [*flags, *texts]
     before = of_named_run(typed, known.multirun)
     roots = values(typed, "data.root")
     overrides = parsed([*before, *texts])

@@ -25,7 +25,7 @@ from devrf.checkpoints.checkpoint import (
     load_checkpoint,
     metadata_of,
 )
-from devrf.checkpoints.checkpoint_file import digest_of
+from devrf.checkpoints.file_metadata import digest_of
 from devrf.checkpoints.progress import progress_files
 from devrf.cli.config import PIPELINE, scene_name
 from devrf.cli.restore_config import present_command

@@ -19,7 +19,7 @@ from devrf.apps.records import (
     write_frames,
 )
 from devrf.apps.still import write_contact_sheet
-from devrf.checkpoints.checkpoint_file import digest_of
+from devrf.checkpoints.file_metadata import digest_of
 from devrf.cli.config import choices
 from devrf.cli.context import RunContext
 from devrf.cli.restore_config import as_typed

@@ -12,12 +12,13 @@ from omegaconf import DictConfig
 
 import devrf
 from devrf.cli.complete import completed
-from devrf.cli.config import config_folder, in_sweep, register_config
+from devrf.cli.config import config_folder, in_sweep, overrides, register_config
 from devrf.cli.config_check import check_config, check_extras
 from devrf.cli.messages import report_user_errors
-from devrf.cli.restore_config import log_told
+from devrf.cli.restore_config import log_told, parsed
 from devrf.cli.run_folder import working_in
 from devrf.cli.sweep import naming_failures, record_failure
+from devrf.cli.view import serve_page, serves_page
 from devrf.system.process import (
     Interrupted,
     end_at_once,
@@ -62,6 +63,9 @@ def run(config: DictConfig) -> float | None:
     guard = record_failure(config, folder) if in_sweep() else report_user_errors()
     with guard, working_in(folder, config):
         log_told()
+        if serves_page(parsed(overrides()), folder):
+            serve_page(config, folder)
+            return None
         # The check loads the parts that the config names, torch among them.
         with importing():
             check_config(config)

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import logging
-from contextlib import closing
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hydra.utils import instantiate
 
+from devrf.apps.captured_cameras import write_thumbnails
 from devrf.apps.export.geometry import ExportSettings
-from devrf.apps.export.scene import PAGE, export_scene
+from devrf.apps.export.scene import export_scene
 from devrf.apps.images import to_bytes
 from devrf.apps.render import videos
 from devrf.apps.settings import ViewerSettings
@@ -19,18 +18,19 @@ from devrf.apps.still import StillSettings, write_still
 from devrf.apps.still import still as rendered
 from devrf.apps.video import VideoSettings
 from devrf.apps.video_file import write_pictures
-from devrf.apps.viewer.page import PageServer
+from devrf.apps.viewer.page import PAGE, PICTURES, PageServer, is_current
 from devrf.apps.web.pack import drawable, page, write_page
 from devrf.checkpoints.checkpoint import Viewpoints, check_scene, metadata_of
+from devrf.checkpoints.file_metadata import digest_of
 from devrf.cli.context import RunContext
 from devrf.cli.restore_config import root
 from devrf.cli.resume import unfinished
+from devrf.cli.view import serve
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
 from devrf.methods.base import Renderable
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
-from devrf.system.process import handle_signals
 from devrf.system.progress import followed
 
 if TYPE_CHECKING:
@@ -78,36 +78,54 @@ def view(run: RunContext) -> None:
     """Show the run's checkpoint on a page until a signal arrives."""
     settings: ViewerSettings = instantiate(run.config.viewer)
     model, viewpoints = _learned(run)
-    without = "its cameras are shown without pictures"
-    by_browser = settings.renderer == "browser" or (settings.renderer == "auto" and drawable(model))
     shown: PageServer | Session
-    if by_browser:
-        text = page(model, viewpoints, run.config.scene)
-        shown = PageServer(settings, text, cache(lambda: _with_images(run, without)))
+    if settings.renderer == "browser" or (settings.renderer == "auto" and drawable(model)):
+        _write_with_pictures(run, model, viewpoints)
+        shown = PageServer(settings, run.folder / "export")
     else:
         from devrf.apps.viewer.drawing import Drawing
         from devrf.apps.viewer.session import Session  # an extra
 
-        scene = _with_images(run, without)
+        scene = _with_images(run, "its cameras are shown without pictures")
         shown = Session(settings, viewpoints, scene, run.folder, run.config.ckpt)
         background = background_value(viewpoints.background)
         shown.present(Drawing(Renderer(model, times=CACHED), background))
-    with closing(shown), handle_signals(lambda _: shown.stop()):
-        shown.serve()
+    serve(shown)
 
 
 def export(run: RunContext) -> None:
     """Write geometry that moves, for other programs, or the page that browsers draw."""
     settings: ExportSettings = instantiate(run.config.export, _convert_="all")
     model, viewpoints = _learned(run)
-    export_scene(model, viewpoints, settings, run.folder / "export", run.config.scene)
+    folder = run.folder / "export" if settings.into is None else Path(settings.into)
+    if settings.format == "html":
+        write_page(folder / PAGE, _page(run, model, viewpoints))
+        log.info("the scene, for any browser, written to %s", folder / PAGE)
+    else:
+        export_scene(model, viewpoints, settings, folder)
 
 
 def write_scene_page(run: RunContext) -> None:
-    """Write the page that browsers draw, if they can draw what was learned."""
+    """Write the page that browsers draw, unless it is there, or they cannot draw the model."""
+    if is_current(run.folder):
+        return
     model, viewpoints = _learned(run)
     if drawable(model):
-        write_page(run.folder / "export" / PAGE, model, viewpoints, run.config.scene)
+        _write_with_pictures(run, model, viewpoints)
+
+
+def _write_with_pictures(run: RunContext, model: Renderable, viewpoints: Viewpoints) -> None:
+    """Write what the page's cameras saw, if the run's images are there, and then the page."""
+    folder = run.folder / "export"
+    text = _page(run, model, viewpoints)
+    scene = _with_images(run, "the cameras on its page are shown without pictures")
+    if scene is not None:
+        write_thumbnails(folder / PICTURES, scene, model, viewpoints)
+    write_page(folder / PAGE, text)
+
+
+def _page(run: RunContext, model: Renderable, viewpoints: Viewpoints) -> str:
+    return page(model, viewpoints, run.config.scene, digest_of(run.checkpoint()))
 
 
 def _learned(run: RunContext) -> tuple[Renderable, Viewpoints]:

@@ -33,7 +33,8 @@ from devrf.checkpoints.checkpoint import (
     CheckpointMetadata,
     metadata_in,
 )
-from devrf.checkpoints.checkpoint_file import digest_of, read_checkpoint_file, read_description
+from devrf.checkpoints.checkpoint_file import read_checkpoint_file, read_description
+from devrf.checkpoints.file_metadata import digest_of
 from devrf.checkpoints.progress import progress_files
 from devrf.cli.config import command_line, leaves
 from devrf.cli.config_check import REFERENCE

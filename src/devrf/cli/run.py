@@ -17,9 +17,9 @@ from hydra.utils import instantiate
 from lightning import seed_everything
 from omegaconf import DictConfig, OmegaConf
 
-from devrf.apps.export.scene import PAGE
 from devrf.apps.render import camera_path
 from devrf.apps.settings import ViewerSettings
+from devrf.apps.viewer.page import PAGE
 from devrf.cli.config import APART, OF_A_CHECKPOINT, PIPELINE, in_sweep
 from devrf.cli.context import RunContext
 from devrf.cli.evaluate import evaluate

@@ -1,4 +1,4 @@
-"""What ``stage=export`` writes: geometry that moves, for other programs; a page, for browsers."""
+"""What ``stage=export`` writes for other programs: geometry that moves."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from devrf.apps.export.sequence import Drawn, mesh_files, point_file, write_sequ
 from devrf.apps.export.splats import write_splats
 from devrf.apps.export.surface import surface_of
 from devrf.apps.export.usd import write_usd
-from devrf.apps.web.pack import write_page
 from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
@@ -23,8 +22,6 @@ from devrf.system.progress import followed
 
 log = logging.getLogger(__name__)
 
-# The file of export.format=html.
-PAGE = "scene.html"
 # Formats that have one file for all times.
 SINGLE = {
     "gltf": ("scene.glb", write_gltf),
@@ -34,21 +31,13 @@ SINGLE = {
 
 
 def export_scene(
-    model: Renderable, viewpoints: Viewpoints, settings: ExportSettings, folder: Path, name: str
+    model: Renderable, viewpoints: Viewpoints, settings: ExportSettings, folder: Path
 ) -> None:
     """Write the surface of what was learned, as it moves, or coloured points of each time.
-
-    Or, as ``html``, the page of the scene ``name``. ``folder`` is where, unless the settings say.
 
     Raises:
         DevrfError: what is asked for cannot be had of the method, or is empty.
     """
-    folder = folder if settings.into is None else Path(settings.into)
-    if settings.format == "html":
-        path = folder / PAGE
-        write_page(path, model, viewpoints, name)
-        log.info("the scene, for any browser, written to %s", path)
-        return
     times = settings.export_times(viewpoints.clock) if model.moves else (0.0,)
     if not _takes_surface(model, settings):
         path = folder / "points"

@@ -1,35 +1,47 @@
-"""Serves the page of a scene, which a browser draws by itself, and its cameras' pictures."""
+"""Serves the page of a scene, which a browser draws by itself, and its cameras' pictures.
+
+A run's ``export/`` has both: ``scene.html``, which says which checkpoint it shows, and
+``pictures/``. So a page that shows the run's last checkpoint is served before torch has loaded.
+"""
 
 from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable
-from functools import cache
+from functools import partial
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import PurePosixPath
-from urllib.parse import urlsplit
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import BinaryIO
 
-import imageio.v3 as iio
-
-from devrf.apps.captured_cameras import picture_of
 from devrf.apps.settings import ViewerSettings
 from devrf.apps.viewer.guard import own_names, refusal
-from devrf.scenes.scene import Scene
+from devrf.checkpoints.file_metadata import digest_of
 
 log = logging.getLogger(__name__)
 
+PAGE = "scene.html"
+PICTURES = "pictures"
+# Bytes of a page in which it says what it shows.
+START = 2000
+
+
+def is_current(run: Path) -> bool:
+    """Whether a run's ``export/`` has the page of its newest checkpoint, and pictures for it."""
+    page = run / "export" / PAGE
+    checkpoints = sorted(run.glob("checkpoints/*.ckpt"), key=lambda path: path.stat().st_mtime_ns)
+    if not checkpoints or not page.is_file() or not (page.parent / PICTURES).is_dir():
+        return False
+    digest = digest_of(checkpoints[-1])
+    with page.open("rb") as file:
+        return digest != "" and digest.encode() in file.read(START)
+
 
 class PageServer:
-    """A server of one page, from its making on, until it is closed."""
+    """A server of a folder that has a page and its pictures, until it is closed."""
 
-    def __init__(
-        self, settings: ViewerSettings, page: str, scene: Callable[[], Scene | None]
-    ) -> None:
+    def __init__(self, settings: ViewerSettings, folder: Path) -> None:
         """Answer at the address of the settings.
-
-        ``scene`` is called when pictures are first asked for; None: there are none.
 
         Raises:
             DevrfError: the address is in use, or not this machine's.
@@ -37,7 +49,7 @@ class PageServer:
         settings.check_free()
         self.settings = settings
         self._stop = threading.Event()
-        handler = _handler(page.encode(), scene, own_names(settings.host))
+        handler = partial(_Handler, directory=str(folder), names=own_names(settings.host))
         self._server = ThreadingHTTPServer((settings.host, settings.port), handler)
         self._server.daemon_threads = True
         threading.Thread(target=self._server.serve_forever, daemon=True).start()
@@ -58,57 +70,28 @@ class PageServer:
         self._server.server_close()
 
 
-def _handler(
-    page: bytes, scene: Callable[[], Scene | None], names: frozenset[str]
-) -> type[BaseHTTPRequestHandler]:
-    """What answers the requests of one page."""
-    lock = threading.Lock()
+class _Handler(SimpleHTTPRequestHandler):
+    """Answers the page's own requests, by the files of the folder."""
 
-    @cache
-    def picture(camera: str, frame: int) -> bytes | None:
-        with lock:  # a scene is read once, and not by two threads
-            seen = scene()
-        pixels = None if seen is None else picture_of(seen, camera, frame)
-        if pixels is None:
-            return None
-        encoded: bytes = iio.imwrite("<bytes>", pixels.numpy(), extension=".jpg", quality=90)
-        return encoded
+    def __init__(self, *request: object, names: frozenset[str], directory: str) -> None:
+        self.names = names
+        super().__init__(*request, directory=directory)  # type: ignore[arg-type]
 
-    class Handler(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:  # noqa: N802 - the name that http.server calls
-            why = refusal(self.headers.get, names)
-            where = urlsplit(self.path)
-            if why is not None:
-                self._send(HTTPStatus.FORBIDDEN, "text/plain", why.encode())
-            elif self.path == "/":  # tells the page that pictures are to be had
-                self.send_response(HTTPStatus.FOUND)
-                self.send_header("Location", "/?pictures")
-                self.send_header("Content-Length", "0")
-                self.end_headers()
-            elif where.path == "/":
-                self._send(HTTPStatus.OK, "text/html; charset=utf-8", page)
-            else:
-                self._send_picture(PurePosixPath(where.path))
-
-        def _send_picture(self, path: PurePosixPath) -> None:
-            *folder, camera, file = ("", "", "", *path.parts)[-4:]
-            frame, _, suffix = file.partition(".")
-            data = None
-            if folder[-1:] == ["pictures"] and suffix == "jpg" and frame.isdecimal():
-                data = picture(camera, int(frame))
-            if data is None:
-                self._send(HTTPStatus.NOT_FOUND, "text/plain", b"devrf: no such picture\n")
-            else:
-                self._send(HTTPStatus.OK, "image/jpeg", data)
-
-        def _send(self, status: HTTPStatus, kind: str, data: bytes) -> None:
-            self.send_response(status)
-            self.send_header("Content-Type", kind)
-            self.send_header("Content-Length", str(len(data)))
+    def send_head(self) -> BinaryIO | None:
+        why = refusal(self.headers.get, self.names)
+        if why is not None:
+            self.send_error(HTTPStatus.FORBIDDEN, why)
+        elif self.path == "/":  # tells the page that pictures are to be had
+            self.send_response(HTTPStatus.FOUND)
+            self.send_header("Location", f"/{PAGE}?{PICTURES}")
+            self.send_header("Content-Length", "0")
             self.end_headers()
-            self.wfile.write(data)
+        else:
+            return super().send_head()
+        return None
 
-        def log_message(self, format: str, *arguments: object) -> None:
-            """Say nothing: requests are no news."""
+    def list_directory(self, path: object) -> None:
+        self.send_error(HTTPStatus.NOT_FOUND)
 
-    return Handler
+    def log_message(self, format: str, *arguments: object) -> None:
+        """Say nothing: requests are no news."""

@@ -70,16 +70,17 @@ def drawable(model: Renderable) -> bool:
     return isinstance(model, DeVRFModel) and isinstance(model.canonical.decoder, ColorDecoder)
 
 
-def write_page(path: Path, model: Renderable, viewpoints: Viewpoints, name: str) -> None:
-    """Write :func:`page`, whole or not at all."""
-    text = page(model, viewpoints, name)
+def write_page(path: Path, text: str) -> None:
+    """Write a :func:`page`, whole or not at all."""
     with atomic_write(path) as partial:
         partial.write_text(text, encoding="utf-8")
 
 
 @torch.no_grad()
-def page(model: Renderable, viewpoints: Viewpoints, name: str) -> str:
+def page(model: Renderable, viewpoints: Viewpoints, name: str, checkpoint: str) -> str:
     """The page of the scene ``name``, with the cameras of ``viewpoints``.
+
+    It says of which ``checkpoint`` it is, by its digest.
 
     Raises:
         DevrfError: the page cannot draw the model.
@@ -96,6 +97,7 @@ def page(model: Renderable, viewpoints: Viewpoints, name: str) -> str:
     folder = files("devrf.apps.web")
     texts = {
         "title": html.escape(f"{name} · devrf"),
+        "checkpoint": checkpoint,
         "shader": folder.joinpath("scene.glsl").read_text("utf-8"),
         "script": folder.joinpath("scene.js").read_text("utf-8"),
         # No name in it may end the element.
