@@ -44,8 +44,8 @@ STEADY = 0.05
 ABOUT = 1.05
 # Where so large a share of the pairs of images shows no depth, that is why no cameras are found.
 DEPTHLESS = 0.9
+# In the folder of the work: features with their matches, and the models.
 DATA_BASE = "matches.db"
-# Where models are put, there too.
 MODELS = "models"
 
 _FILM = (
@@ -89,7 +89,7 @@ def reconstruct(
     they are all of the scene at rest, COLMAP's incremental mapper finds the cameras. Where one
     camera films a scene that moves, cameras are found again without what moves
     (:func:`_without_movers`); where masks are given, or nothing moves, the global mapper is tried,
-    too. Returns the folder of the model, in :data:`MODELS`.
+    too. Returns the folder of the model, below ``work``.
 
     Raises:
         DevrfError: nothing could be matched, nothing shows depth, or a given mask does not fit.

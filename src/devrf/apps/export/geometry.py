@@ -12,7 +12,6 @@ from typing import Literal, cast
 import torch
 from torch import Tensor
 
-from devrf.apps.images import evenly
 from devrf.errors import DevrfError, expect
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
@@ -188,12 +187,18 @@ def seen_points(
     Each is at the mean depth of a ray. At most :data:`CAMERAS` cameras (world units) and ``count``
     points are taken, evenly chosen. ``background`` is a grey level.
     """
-    cameras = cameras[evenly(len(cameras), CAMERAS)].to(renderer.device)
+    cameras = cameras[_every(len(cameras), CAMERAS)].to(renderer.device)
     filled = len(_seen(renderer, cameras.of_height(FIRST), time, background)[0])
     rows = min(round(FIRST * (SPARE * count / max(filled, 1)) ** 0.5), LARGEST)
     points, colors = _seen(renderer, cameras.of_height(rows), time, background)
-    chosen = evenly(len(points), count)
+    chosen = _every(len(points), count)
     return points[chosen], colors[chosen]
+
+
+def _every(count: int, max_count: int) -> Tensor:
+    """At most ``max_count`` of ``count`` positions; on a ring the last is as far from the first."""
+    chosen = min(count, max_count)
+    return torch.arange(chosen) * count // max(chosen, 1)
 
 
 def _seen(

@@ -14,7 +14,9 @@ def own_names(host: str) -> frozenset[str]:
 
 
 def refusal(header: Callable[[str, str], str], names: Collection[str]) -> str | None:
-    """Why a request is not answered, a ``header`` of which is looked up with a default; or None.
+    """Why a request is not answered; None: it is.
+
+    ``header(name, default)`` gives a header of the request.
 
     A page from elsewhere that the same browser shows gives its own address in ``Origin``. One whose
     name was made to lead to this machine (DNS rebinding) gives that name in ``Host``: an IP address

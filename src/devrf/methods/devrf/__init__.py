@@ -4,8 +4,8 @@
 2. Rays, samples, compositing: ``volume_rendering``; then ``losses``.
 3. Canonical stage: ``canonical_schedule``, ``free_space``, ``canonical_stage``.
 4. Deformation field and warp: ``deformation_field``.
-5. Deformation stage: ``deformation_schedule``, ``extension`` (the loss, and what may be added),
-   ``deformation_stage``.
+5. Deformation stage: ``deformation_schedule``, ``motion_loss``, ``extension`` (what may be
+   added), ``deformation_stage``.
 
 ``settings`` has the defaults of the stages and ``voxel_stage`` what they share; ``model`` and
 ``view`` are the learned scene. ``extensions`` has what goes beyond the paper.

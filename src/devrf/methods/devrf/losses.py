@@ -96,8 +96,8 @@ def flow(prediction: MotionPrediction) -> Tensor:
     valid = batch.flow_valid
     if batch.flow is None or valid is None:
         return samples.weight.new_zeros(())
+    # The gradient of index_select takes half the time of that of indexing.
     known = valid.index_select(0, samples.ray).nonzero()[:, 0]
-    # Its gradient takes half the time of that of indexing.
     ray = samples.ray.index_select(0, known)
     weight = samples.weight.index_select(0, known)
     induced = induced_flow(
