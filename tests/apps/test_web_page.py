@@ -378,8 +378,8 @@ def test_without_webgl_and_after_a_lost_context_there_is_a_line(browser, file):
 def test_all_data_are_in_the_file_and_as_large_as_their_textures(moving, tiny_scene):
     text = page(moving, Viewpoints.of(tiny_scene), "tiny", "0123abcd")
     described = json.loads(re.search(r'id="description">(.*)</script>', text)[1])
-    bytes_of = {"density": 2, "rough": 4, "features": 4, "weights": 16, "distances": 1}
-    bytes_of |= {"displacement": 3, "residual": 3}
+    bytes_of = {"density": 2, "rough": 3, "features": 4, "weights": 16, "distances": 1}
+    bytes_of |= {"displacement": 6, "residual": 6}
     found = re.findall(r'<script type="text/plain" id="([a-z]+)(-\w+)?">(.+)</script>', text)
     for kind, _, packed in found:
         data = gzip.decompress(base64.b64decode(packed))

@@ -19,7 +19,7 @@ from devrf.apps.still import still as rendered
 from devrf.apps.video import VideoSettings
 from devrf.apps.video_file import write_pictures
 from devrf.apps.viewer.page import PAGE, PICTURES, PageServer, is_current
-from devrf.apps.web.pack import drawable, page, write_page
+from devrf.apps.web.pack import drawable, page
 from devrf.checkpoints.checkpoint import Viewpoints, check_scene, metadata_of
 from devrf.checkpoints.file_metadata import digest_of
 from devrf.cli.context import RunContext
@@ -31,6 +31,7 @@ from devrf.evaluation.held_out import background_value
 from devrf.methods.base import Renderable
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
+from devrf.system.files import write_text
 from devrf.system.progress import followed
 
 if TYPE_CHECKING:
@@ -99,7 +100,7 @@ def export(run: RunContext) -> None:
     model, viewpoints = _learned(run)
     folder = run.folder / "export" if settings.into is None else Path(settings.into)
     if settings.format == "html":
-        write_page(folder / PAGE, _page(run, model, viewpoints))
+        write_text(folder / PAGE, _page(run, model, viewpoints))
         log.info("the scene, for any browser, written to %s", folder / PAGE)
     else:
         export_scene(model, viewpoints, settings, folder)
@@ -121,7 +122,7 @@ def _write_with_pictures(run: RunContext, model: Renderable, viewpoints: Viewpoi
     scene = _with_images(run, "the cameras on its page are shown without pictures")
     if scene is not None:
         write_thumbnails(folder / PICTURES, scene, model, viewpoints)
-    write_page(folder / PAGE, text)
+    write_text(folder / PAGE, text)
 
 
 def _page(run: RunContext, model: Renderable, viewpoints: Viewpoints) -> str:

@@ -74,10 +74,15 @@ def _sync_folder(folder: Path) -> None:
             os.close(handle)
 
 
+def write_text(path: Path, text: str) -> None:
+    """Write ``text`` as UTF-8."""
+    with atomic_write(path) as partial:
+        partial.write_text(text, encoding="utf-8")
+
+
 def write_json(path: Path, values: dict[str, Any]) -> None:
     """Write ``values`` as an indented JSON object."""
-    with atomic_write(path) as partial:
-        partial.write_text(json.dumps(values, indent=2) + "\n")
+    write_text(path, json.dumps(values, indent=2) + "\n")
 
 
 def read_record(path: Path) -> bytes:

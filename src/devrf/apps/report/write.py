@@ -18,7 +18,7 @@ from devrf.apps.report.text import latex, markdown, plain
 from devrf.apps.settings import ReportSettings
 from devrf.apps.video_file import fitted_font, write_pictures
 from devrf.errors import DevrfError
-from devrf.system.files import atomic_write
+from devrf.system.files import atomic_write, write_text
 
 # Pictures a second of the videos that show rows side by side.
 FPS = 10
@@ -44,9 +44,9 @@ def write_report(settings: ReportSettings) -> str:
     table = tabulate(collection, settings.published)
     figures = _write_plots(table, folder)
     videos = _write_videos(table, folder)
-    _write(folder / "report.md", markdown(table, figures, videos))
-    _write(folder / "report.tex", latex(table))
-    _write(folder / "report.csv", csv(table))
+    write_text(folder / "report.md", markdown(table, figures, videos))
+    write_text(folder / "report.tex", latex(table))
+    write_text(folder / "report.csv", csv(table))
     return f"{plain(table)}\nreport written to {folder / 'report.md'}"
 
 
@@ -89,11 +89,6 @@ def _write_videos(table: Table, folder: Path) -> dict[str, str]:
             write_pictures(folder / "videos" / name, pictures, FPS)
             links[f"{scene}: truth and renderings side by side"] = f"videos/{name}"
     return links
-
-
-def _write(path: Path, text: str) -> None:
-    with atomic_write(path) as partial:
-        partial.write_text(text, encoding="utf-8")
 
 
 # What each run's video of the held-out views shows from left to right: truth, rendering, depth.

@@ -4,14 +4,15 @@
 
 ==================== ==============================================================================
 ``density``          raw densities v at rest, half precision
-``rough``            for pictures in haste: RGB from the nearest camera, and v; bytes
+``rough``            colours in haste: RGB as the nearest camera sees it; bytes
 ``features``         colour features f, a byte each: its share of its channel's range, which the
                      network's first layer knows; blocks of four channels, one behind another
 ``weights``          the colour network, single precision
 ``distances-rest``   cells to the nearest occupied one at rest, a byte
 ``distances-K``      the same at all times between the frames K and K + 1
-``displacement-K``   Δ_b of frame K, the higher bytes of 16 bits before the lower ones
-``residual-K``       A_t of frame K, a byte each, if colours change
+``displacement-K``   Δ_b of frame K in shares of a cell, half precision: devices may round what
+                     they read between bytes to a byte
+``residual-K``       A_t of frame K, half precision, if colours change
 ==================== ==============================================================================
 
 Values are kept where samples read them, then or at any time; the others take no space, all the
@@ -29,7 +30,6 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from importlib.resources import files
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -51,9 +51,8 @@ from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.volume_rendering import deformed_occupancy, medium
 from devrf.ops.trilinear import shape_of
 from devrf.rendering.occupancy import Occupancy, dilate
-from devrf.system.files import atomic_write
 
-# Displacements are rounded to this share of a cell of the occupancy: noise takes space.
+# The unit of displacements is this share of a cell, and values are rounded: noise takes space.
 ROUNDED = 1 / 64
 # What is farther counts as infinity, for which JSON has no number.
 FAR = 1e30
@@ -68,12 +67,6 @@ STOPS = 9
 def drawable(model: Renderable) -> bool:
     """Whether the page can draw a model: DeVRF's fields with a colour network."""
     return isinstance(model, DeVRFModel) and isinstance(model.canonical.decoder, ColorDecoder)
-
-
-def write_page(path: Path, text: str) -> None:
-    """Write a :func:`page`, whole or not at all."""
-    with atomic_write(path) as partial:
-        partial.write_text(text, encoding="utf-8")
 
 
 @torch.no_grad()
@@ -137,8 +130,6 @@ def _parts(model: DeVRFModel, eyes: Tensor) -> Iterator[tuple[str, Tensor]]:
     motion = model.deformation
     residual = model.color_residual
     seen = _seen(motion, rest.cell, occupied) if motion else []
-    step = _displacement_step(motion) if motion else 1.0
-    fine = max(1, round(ROUNDED * rest.cell / step))
     for part, mask in ({"rest": rest.mask} | dict(enumerate(seen))).items():
         yield f"distances-{part}", Occupancy(mask, model.box).surroundings.distances
     for k in range(len(motion.clock) if motion else 0):
@@ -146,32 +137,28 @@ def _parts(model: DeVRFModel, eyes: Tensor) -> Iterator[tuple[str, Tensor]]:
         mask = torch.stack(seen[max(k - 1, 0) : k + 1]).any(dim=0)
         near = Occupancy(mask, model.box).points_near(motion.shape, motion.box)
         kept = near[..., None] * motion.to_canonical[k].to(near.device).float()
-        code = 2**15 + fine * (kept / step / fine).round().int()
-        yield f"displacement-{k}", torch.cat([code >> 8, code & 255]).byte()
+        yield f"displacement-{k}", (kept / (ROUNDED * rest.cell)).round().half()
         if residual is not None:
             values = residual.values[k]
             near = rest.points_near(shape_of(values), residual.box)
-            codes = (values / _residual_step(model) * near[..., None]).round()
-            yield f"residual-{k}", (128 + codes).byte()
+            yield f"residual-{k}", ((values / ROUNDED).round() * ROUNDED * near[..., None]).half()
 
 
 def _rough(model: DeVRFModel, shown: Tensor, eyes: Tensor) -> Tensor:
-    """Colours and v + b, (X, Y, Z, 4) bytes, of grid points where ``shown`` (X, Y, Z); else 0.
+    """Colours (X, Y, Z, 3), bytes, as the nearest of the ``eyes`` (K, 3) sees them.
 
-    Colours are as the nearest of the ``eyes`` (K, 3) sees them; bytes of densities are quarters
-    above -20.
+    Of grid points where ``shown`` (X, Y, Z), else 0.
     """
     field = model.canonical
     points = model.box.grid_points(field.density.shape, eyes)
-    codes = torch.zeros(*field.density.shape, 4, dtype=torch.uint8, device=shown.device)
+    codes = torch.zeros(*field.density.shape, 3, dtype=torch.uint8, device=shown.device)
     for where in torch.split(shown.nonzero(), CHUNK):
         at = where.unbind(dim=1)
         world = model.space.to_world(points[at])
         views = normalize(world - eyes[torch.cdist(world, eyes).argmin(dim=1)], dim=1)
         every = torch.arange(len(views), device=views.device)
         color = field.decoder(field.color.values[at], views, every)
-        density = 4 * (field.density.values[at] + field.shift + 20)
-        codes[at] = torch.cat([255 * color, density.clamp(0, 255)], dim=1).round().byte()
+        codes[at] = (255 * color).round().byte()
     return codes
 
 
@@ -195,15 +182,6 @@ def _seen(
             mask |= occupied(motion.warp_at(time)).mask
         masks.append(dilate(mask, 1))
     return masks
-
-
-def _displacement_step(motion: DeformationField) -> float:
-    return max(float(frame.abs().amax()) for frame in motion.to_canonical) / (2**14 - 1) or 1.0
-
-
-def _residual_step(model: DeVRFModel) -> float:
-    residual = model.color_residual
-    return 1.0 if residual is None else max(float(residual.values.abs().amax()), 1e-6) / 127
 
 
 def _weights(decoder: ColorDecoder, low: Tensor, high: Tensor) -> Tensor:
@@ -254,7 +232,6 @@ def _description(model: DeVRFModel, viewpoints: Viewpoints) -> dict[str, Any]:
         "shift": field.shift,
         "delta": field.step_in_base_voxels(sampling.step),
         "threshold": sampling.alpha_threshold,
-        "residualStep": _residual_step(model),
         "background": [background_value(viewpoints.background)] * 3,
         "palette": ColorMap("viridis", num_colors=STOPS).colors.T.tolist(),
         "center": inner.middle,
@@ -269,7 +246,7 @@ def _description(model: DeVRFModel, viewpoints: Viewpoints) -> dict[str, Any]:
     if motion is not None:
         uniforms |= {"motionLow": motion.box.low, "motionHigh": motion.box.high}
         uniforms["stillOutside"] = motion.still_outside
-        uniforms["motionStep"] = _displacement_step(motion)
+        uniforms["motionStep"] = ROUNDED * model.occupancy.cell
     static = viewpoints.static
     return {
         "defines": defines,

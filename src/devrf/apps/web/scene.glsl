@@ -10,7 +10,7 @@ precision highp int;
 precision highp sampler3D;
 precision highp usampler3D;
 
-// Channels. A probe says in bytes how far a ray gets, for the page to read.
+// Channels. A probe is how far a ray gets, a float's four bytes, for the page to read.
 const int COLOR = 0, DEPTH = 1, MOTION = 2, PROBE = 3;
 // A ray ends where its transmittance is less. In haste there are fewer samples.
 const float STOP = EXACT == 1 ? 1e-4 : 1e-2;
@@ -22,12 +22,11 @@ const float MOTION_STEP = 0.05, MOTION_FULL = 0.02;
 
 // Of all grids z is along the texture's width and x along its depth, as they lie in memory.
 uniform sampler3D density, features, weights;   // features: blocks of four channels
-uniform sampler3D rough;                        // in haste: colour and raw density
-uniform sampler3D displacement0, displacement1; // of the frames before and after the time: two
-uniform sampler3D residual0, residual1;         // blocks, of the higher and the lower bytes
+uniform sampler3D rough;                        // colours in haste
+uniform sampler3D displacement0, displacement1, residual0, residual1; // before, after the time
 uniform usampler3D distances;
 uniform vec3 low, high, motionLow, motionHigh;  // the boxes of all fields, and of displacements
-uniform float shift, delta, threshold, stepLength, near, far, motionStep, residualStep;
+uniform float shift, delta, threshold, stepLength, near, far, motionStep;
 uniform vec3 ndc;                    // 2f/W, 2f/H, near plane
 uniform vec3 center, innerHalf;      // of the scene; in contracted space of the inner box
 uniform float reach, shell;          // of depths about the centre; of contracted space
@@ -102,23 +101,15 @@ vec3 place(vec3 point, vec3 boxLow, vec3 boxHigh, ivec3 size) {
 vec3 displacement(vec3 point, float after) {
   bool outside = any(lessThan(point, motionLow)) || any(greaterThan(point, motionHigh));
   if (MOVES == 0 || stillOutside && outside) return vec3(0.0);
-  ivec3 size = textureSize(displacement0, 0) / ivec3(1, 1, 2);
-  vec3 p = place(point, motionLow, motionHigh, size) * vec3(1.0, 1.0, 0.5);
-  vec3 code = mix(textureLod(displacement0, p, 0.0), textureLod(displacement1, p, 0.0), after).xyz;
-#if EXACT
-  p.z += 0.5;
-  vec3 low = mix(textureLod(displacement0, p, 0.0), textureLod(displacement1, p, 0.0), after).xyz;
-#else
-  const vec3 low = vec3(0.5);
-#endif
-  return (255.0 * (256.0 * code + low) - 32768.0) * motionStep; // of codes, 32768 is 0
+  vec3 p = place(point, motionLow, motionHigh, textureSize(displacement0, 0));
+  vec4 steps = mix(textureLod(displacement0, p, 0.0), textureLod(displacement1, p, 0.0), after);
+  return motionStep * steps.xyz;
 }
 
 vec3 residual(vec3 canonical) {
   if (SHADES == 0 || !warps) return vec3(0.0);
   vec3 p = place(canonical, low, high, textureSize(residual0, 0));
-  vec3 code = mix(textureLod(residual0, p, 0.0), textureLod(residual1, p, 0.0), share).xyz;
-  return (255.0 * code - 128.0) * residualStep; // of bytes, 128 is 0
+  return mix(textureLod(residual0, p, 0.0), textureLod(residual1, p, 0.0), share).xyz;
 }
 
 // Cells to the nearest occupied one, at least; 0 in an occupied cell.
@@ -214,7 +205,7 @@ vec3 motionColor(vec3 x) {
 void main() {
   vec2 onScreen = middle + slope * (2.0 * (gl_FragCoord.xy - frame.xy) / frame.zw - 1.0);
   vec3 direction = normalize(right * onScreen.x + up * onScreen.y - backward);
-  pixel = vec4(background, channel == PROBE ? 0.0 : 1.0);
+  pixel = channel == PROBE ? vec4(0.0) : vec4(background, 1.0);
   if (SPACE == 1 && direction.z > -1e-3) return; // it never crosses the near plane
   Ray ray = fieldRay(direction);
   vec3 cells = vec3(textureSize(distances, 0).zyx - 1) / (high - low);
@@ -253,7 +244,6 @@ void main() {
     }
     bool ends = k >= count || transmittance < STOP;
     vec3 p, canonical, added = vec3(0.0);
-    vec4 look;
     float weight = transmittance;
     if (ends) {
       if (SPACE != 2 || channel != COLOR) break;
@@ -263,12 +253,7 @@ void main() {
       canonical = at(ray, s);
       if (warps) canonical += displacement(canonical, share);
       p = place(canonical, low, high, textureSize(density, 0));
-#if EXACT
       float raw = textureLod(density, p, 0.0).r + shift;
-#else
-      look = textureLod(rough, p, 0.0);
-      float raw = 63.75 * look.a - 20.0;
-#endif
       float alpha = 1.0 - exp(-STRIDE * delta * (raw > 15.0 ? raw : log(1.0 + exp(raw))));
       if (alpha < threshold) continue;
       weight *= alpha;
@@ -282,8 +267,8 @@ void main() {
 #if EXACT
     color += weight * network(p, added);
 #else
-    if (ends) look = textureLod(rough, p, 0.0);
-    color += weight * look.rgb / (look.rgb + (1.0 - look.rgb) * exp(-added)); // added to the logit
+    vec3 look = textureLod(rough, p, 0.0).rgb;
+    color += weight * look / (look + (1.0 - look) * exp(-added)); // added to the logit
 #endif
     if (ends) break;
   }
@@ -293,7 +278,7 @@ void main() {
   float opacity = 1.0 - transmittance;
   if (channel == DEPTH) color = depthColor(s, opacity);
   if (channel == MOTION) color = opacity > 0.5 ? motionColor(at(ray, s)) : vec3(0.85);
-  vec3 digits = floor(vec3(256.0, 65536.0, 16777216.0) / (1.0 + length(toWorld(at(ray, s)) - eye)));
-  if (channel == PROBE) color = (digits - 256.0 * vec3(0.0, digits.xy)) / 255.0;
-  pixel = vec4(color, channel == PROBE ? opacity : 1.0);
+  uint bits = floatBitsToUint(opacity > 0.5 ? length(toWorld(at(ray, s)) - eye) : 0.0);
+  uvec4 bytes = uvec4(bits) >> uvec4(0, 8, 16, 24) & 255u;
+  pixel = channel == PROBE ? vec4(bytes) / 255.0 : vec4(color, 1.0);
 }

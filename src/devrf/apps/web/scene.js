@@ -48,12 +48,12 @@ async function inflate(id) {
 // Of each kind of data: format in the texture and in memory, and what holds its numbers.
 const KINDS = {
   density: ["R16F", "RED", "HALF_FLOAT", Uint16Array],
-  rough: ["RGBA8", "RGBA", "UNSIGNED_BYTE", Uint8Array],
+  rough: ["RGB8", "RGB", "UNSIGNED_BYTE", Uint8Array],
   features: ["RGBA8", "RGBA", "UNSIGNED_BYTE", Uint8Array],
   weights: ["RGBA32F", "RGBA", "FLOAT", Float32Array],
   distances: ["R8UI", "RED_INTEGER", "UNSIGNED_BYTE", Uint8Array],
-  displacement: ["RGB8", "RGB", "UNSIGNED_BYTE", Uint8Array],
-  residual: ["RGB8", "RGB", "UNSIGNED_BYTE", Uint8Array],
+  displacement: ["RGB16F", "RGB", "HALF_FLOAT", Uint16Array],
+  residual: ["RGB16F", "RGB", "HALF_FLOAT", Uint16Array],
 };
 // Textures by their units' numbers: of what changes one before the time, and one after it.
 const UNITS = ["density", "rough", "features", "weights", "distances", "rest"];
@@ -66,10 +66,7 @@ class Graphics {
     const options = { antialias: false, alpha: false, depth: false, preserveDrawingBuffer: true };
     const gl = canvas.getContext("webgl2", options);
     if (!gl) {
-      throw new Refusal(
-        "This browser has no WebGL 2, which draws the scene: switch on hardware acceleration, or " +
-          "open the file in a current Chromium, Firefox or Safari.",
-      );
+      throw new Refusal("There is no WebGL 2: allow hardware acceleration, or update the browser.");
     }
     canvas.addEventListener("webglcontextlost", () => {
       fail(new Refusal("The graphics driver has given up (lost context): reload the page."));
@@ -200,15 +197,14 @@ class Graphics {
     return true;
   }
 
-  /** How far a ray through a pixel gets, in world units; null if it meets nothing. */
+  /** How far a ray through a pixel gets, in world units; 0 if it meets nothing. */
   reach(uniforms, x, y) {
     const { gl, canvas } = this;
     const frame = [-x, -y, canvas.width, canvas.height];
     this.paint(this.program(0), { ...uniforms, channel: 3 }, frame, [0, 0, 1, 1]);
-    const pixel = new Uint8Array(4);
-    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
-    const near = pixel[0] / 2 ** 8 + pixel[1] / 2 ** 16 + pixel[2] / 2 ** 24;
-    return pixel[3] > 127 ? 1 / near - 1 : null;
+    const pixel = new Float32Array(1);
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(pixel.buffer));
+    return pixel[0];
   }
 }
 
@@ -500,7 +496,7 @@ class Page {
     const parts = this.parts();
     const away = this.graphics.reach(parts[0], x * ratio, canvas.height - 1 - y * ratio);
     this.state = null; // a pixel was drawn over
-    if (away === null || parts.length > 1) return;
+    if (away === 0 || parts.length > 1) return;
     const { right, up, backward, eye, slope, middle } = parts[0];
     const screen = [(2 * x) / innerWidth - 1, 1 - (2 * y) / innerHeight];
     const [wide, high] = along(middle, 1, [0, 1].map((k) => slope[k] * screen[k]));
