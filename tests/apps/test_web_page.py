@@ -384,6 +384,15 @@ def test_all_data_are_in_the_file_and_as_large_as_their_textures(moving, tiny_sc
     for kind, _, packed in found:
         data = gzip.decompress(base64.b64decode(packed))
         assert len(data) == math.prod(described["shapes"][kind]) * bytes_of[kind]
+    (packed,) = (
+        packed for kind, number, packed in found if (kind, number) == ("displacement", "-1")
+    )
+    numbers = np.frombuffer(gzip.decompress(base64.b64decode(packed)), np.float16).astype(float)
+    step = described["uniforms"]["motionStep"]
+    true = moving.deformation.to_canonical[1].numpy().flatten()
+    kept = numbers != 0
+    assert kept.mean() > 0.5
+    assert abs(step * numbers - true)[kept].max() <= step * (0.5 + 2**-11 * abs(numbers).max())
     names = [kind + number for kind, number, _ in found]
     changing = [f"{kind}-{k}" for k in range(3) for kind in ("displacement", "residual")]
     assert sorted(names) == sorted(
