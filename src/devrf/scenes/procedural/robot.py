@@ -131,6 +131,8 @@ SOLIDS = (
 
 
 _TABLE = SolidTable(SOLIDS)
+# Points whose distances to all solids are found at once: more leave the cache, and take memory.
+AT_ONCE = 8192
 
 
 @lru_cache(maxsize=256)
@@ -173,7 +175,8 @@ class Robot:
 
     def distance(self, points: Tensor, time: float) -> Tensor:
         """Exact distance (M,) outside of the nearest solid."""
-        return self._distances(points, time).amin(dim=0)
+        some = torch.split(points, AT_ONCE)
+        return torch.cat([self._distances(each, time).amin(dim=0) for each in some])
 
     def material(self, points: Tensor, time: float) -> Material:
         """The nearest solid's material: M_k(t)⁻¹ x."""
