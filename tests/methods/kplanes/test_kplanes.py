@@ -73,10 +73,10 @@ def test_a_plane_is_looked_up_along_its_own_two_axes_up_to_its_border(
     for every in combinations(range(4), 2):
         plane_of(planes, every).fill_(1)
     plane = plane_of(planes, axes)
-    across, along = (torch.linspace(-1, 1, points) for points in plane.shape[:2])
+    across, along = (torch.linspace(0, 1, points) for points in plane.shape[:2])
     plane[:, :, 0, 0] = across[:, None] + 10 * along
-    points = torch.tensor([[-1.0, -0.5, 0.25, 0.5], [1.0] * 4, [-3.0, 3.0, 2.0, -2.0]])
-    places = points[:, axes].clamp(-1, 1)
+    points = torch.tensor([[0.0, 0.25, 0.625, 0.75], [1.0] * 4, [-1.0, 2.0, 1.5, -0.5]])
+    places = points[:, axes].clamp(0, 1)
     torch.testing.assert_close(planes(points)[:, 0], places[:, 0] + 10 * places[:, 1])
 
 

@@ -76,10 +76,9 @@ class KPlanes(SurfacedField):
         self._teaches = step < FIRST or step % every == 0
 
     def coordinates(self, points: Tensor, time: Tensor) -> Tensor:
-        """[−1, 1]⁴ (S, 4) of points (S, 3) in the box, and of times (S,) in [0, 1]."""
+        """[0, 1]⁴ (S, 4) of points (S, 3) in the box, and of times (S,)."""
         low, high = self.box.corners(points)
-        place = (2 * points - low - high) / (high - low)
-        return torch.cat([place, 2 * time[:, None] - 1], dim=1)
+        return torch.cat([(points - low) / (high - low), time[:, None]], dim=1)
 
     def optical_depth(self, points: Tensor, time: Tensor, length: float) -> Tensor:
         """τ (S,) of ways of ``length`` at points (S, 3) in normalised space."""

@@ -57,8 +57,8 @@ class SixPlanes(nn.Module):
         self.size = len(resolutions) * channels * (1 if pairing == "product" else len(SPACE))
 
     def forward(self, points: Tensor) -> Tensor:
-        """f (S, size) at ``points`` (S, 4), x, y, z and t in [−1, 1]; outside as at the border."""
-        share = (points.clamp(-1, 1) + 1) / 2
+        """f (S, size) at ``points`` (S, 4), x, y, z and t in [0, 1]; outside as at the border."""
+        share = points.clamp(0, 1)
         in_space, in_time = (_places(share, axes) for axes in (SPACE, TIME))
         joined: list[Tensor] = []
         for space, time in zip(self.space, self.time, strict=True):

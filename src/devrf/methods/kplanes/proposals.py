@@ -9,7 +9,7 @@ from devrf.geometry.rays import Rays
 from devrf.methods.kplanes.decoders import density_of, network
 from devrf.methods.kplanes.planes import SixPlanes
 from devrf.methods.kplanes.settings import KPlanesSettings
-from devrf.methods.nerf.samples import RaySamples
+from devrf.methods.nerf.samples import RaySamples, drawn
 
 # Added to each weight before samples are drawn by it.
 PADDING = 0.01
@@ -32,7 +32,7 @@ class Proposal(nn.Module):
         )
 
     def forward(self, points: Tensor) -> Tensor:
-        """σ (S,) at points (S, 4) of space and time in [−1, 1]."""
+        """σ (S,) at points (S, 4) of space and time in [0, 1]."""
         return density_of(self.decoder(self.planes(points))[:, 0])
 
 
@@ -48,17 +48,10 @@ def drawn_edges(edges: Tensor, weight: Tensor, count: int, *, jitter: bool) -> T
 
     ``weight`` (R, N) is that of the intervals between ``edges`` (R, N + 1), without gradient.
     """
-    share = weight + PADDING
-    reached = torch.cumsum(share / share.sum(dim=1, keepdim=True), dim=1)
-    reached = torch.cat([torch.zeros_like(reached[:, :1]), reached], dim=1)
     place = torch.arange(count + 1, device=edges.device).repeat(len(edges), 1).to(edges.dtype)
     if jitter:
         place[:, 1:-1] += torch.rand_like(place[:, 1:-1]) - 0.5
-    wanted = place / count
-    above = torch.searchsorted(reached, wanted).clamp(1, edges.shape[1] - 1)
-    low = reached.gather(1, above - 1)
-    within = (wanted - low) / (reached.gather(1, above) - low).clamp(min=LEAST)
-    return torch.lerp(edges.gather(1, above - 1), edges.gather(1, above), within.clamp(0, 1))
+    return drawn(edges, weight + PADDING, place / count)
 
 
 def histogram_error(

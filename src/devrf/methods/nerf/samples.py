@@ -151,18 +151,23 @@ def importance(
     """
     middle = (distance[:, 1:] + distance[:, :-1]) / 2
     edge = torch.cat([near[:, None], middle, far[:, None]], dim=1)
-    share = weight + 1e-5
-    reached = torch.cumsum(share / share.sum(dim=1, keepdim=True), dim=1)
-    reached = torch.cat([torch.zeros_like(reached[:, :1]), reached], dim=1)
     wanted = stratified(torch.zeros_like(near), torch.ones_like(far), count, jitter=jitter)
+    return drawn(edge, weight + 1e-5, wanted)
+
+
+def drawn(edges: Tensor, weight: Tensor, wanted: Tensor) -> Tensor:
+    """Distances (R, M) at which shares ``wanted`` (R, M) of a ray's weight are reached.
+
+    ``weight`` (R, N) > 0 is that of the intervals between ``edges`` (R, N + 1), even within each.
+    """
+    reached = torch.cumsum(weight / weight.sum(dim=1, keepdim=True), dim=1)
+    reached = torch.cat([torch.zeros_like(reached[:, :1]), reached], dim=1)
     above = torch.searchsorted(reached, wanted.contiguous(), right=True)
-    above = above.clamp(min=1, max=edge.shape[1] - 1)
+    above = above.clamp(min=1, max=edges.shape[1] - 1)
     low = reached.gather(1, above - 1)
     high = reached.gather(1, above)
     within = ((wanted - low) / (high - low).clamp(min=1e-8)).clamp(0, 1)
-    start = edge.gather(1, above - 1)
-    stop = edge.gather(1, above)
-    return start + within * (stop - start)
+    return torch.lerp(edges.gather(1, above - 1), edges.gather(1, above), within)
 
 
 def flattened(rays: Rays, distance: Tensor, far: Tensor) -> RaySamples:
