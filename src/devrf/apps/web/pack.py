@@ -54,14 +54,10 @@ from devrf.rendering.occupancy import Occupancy, dilate
 
 # The unit of displacements is this share of a cell, and values are rounded: noise takes space.
 ROUNDED = 1 / 64
-# What is farther counts as infinity, for which JSON has no number.
-FAR = 1e30
 # Grid points whose colours are found at once.
 CHUNK = 2**16
 # Of a texture's row of weights, four numbers each.
 ROW = 64
-# Colours of depth, from far to near.
-STOPS = 9
 
 
 def drawable(model: Renderable) -> bool:
@@ -227,13 +223,13 @@ def _description(model: DeVRFModel, viewpoints: Viewpoints) -> dict[str, Any]:
         "low": model.box.low,
         "high": model.box.high,
         "near": path.near,
-        "far": min(path.far, FAR),
+        "far": min(path.far, 1e30),  # JSON has no infinity
         "stepLength": path.step,
         "shift": field.shift,
         "delta": field.step_in_base_voxels(sampling.step),
         "threshold": sampling.alpha_threshold,
         "background": [background_value(viewpoints.background)] * 3,
-        "palette": ColorMap("viridis", num_colors=STOPS).colors.T.tolist(),
+        "palette": ColorMap("viridis", num_colors=9).colors.T.tolist(),  # from far to near
         "center": inner.middle,
         "reach": inner.diagonal / 3,
     }

@@ -22,14 +22,11 @@ const cross = (a, b) =>
   [0, 1, 2].map((k) => a[(k + 1) % 3] * b[(k + 2) % 3] - a[(k + 2) % 3] * b[(k + 1) % 3]);
 const unit = (a) => scaled(a, 1 / Math.hypot(...a));
 
-class Refusal extends Error {} // in words for whoever opened the page
-
 /** Ends the page with one line in the picture's place. */
 function fail(error) {
   if (document.body.className === "failed") return;
   document.body.className = "failed";
-  const words = error instanceof Refusal ? error.message : `The page has failed: ${error?.message}`;
-  byId("message").textContent = words;
+  byId("message").textContent = `The scene cannot be shown. ${error?.message ?? error}`;
 }
 
 /** The bytes that an element of the page holds; gzip has a checksum of them. */
@@ -41,7 +38,7 @@ async function inflate(id) {
     const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
     return await new Response(stream).arrayBuffer();
   } catch {
-    throw new Refusal(`${DAMAGED} (${id}).`);
+    throw new Error(`${DAMAGED} (${id}).`);
   }
 }
 
@@ -55,7 +52,7 @@ const KINDS = {
   displacement: ["RGB16F", "RGB", "HALF_FLOAT", Uint16Array],
   residual: ["RGB16F", "RGB", "HALF_FLOAT", Uint16Array],
 };
-// Textures by their units' numbers: of what changes one before the time, and one after it.
+// Textures by their units' numbers: four that stay; of what changes one before the time, one after.
 const UNITS = ["density", "rough", "features", "weights", "distances", "rest"];
 UNITS.push("displacement0", "displacement1", "residual0", "residual1");
 const [DISTANCES, REST] = [4, 5];
@@ -66,10 +63,10 @@ class Graphics {
     const options = { antialias: false, alpha: false, depth: false, preserveDrawingBuffer: true };
     const gl = canvas.getContext("webgl2", options);
     if (!gl) {
-      throw new Refusal("There is no WebGL 2: allow hardware acceleration, or update the browser.");
+      throw new Error("There is no WebGL 2: allow hardware acceleration, or update the browser.");
     }
     canvas.addEventListener("webglcontextlost", () => {
-      fail(new Refusal("The graphics driver has given up (lost context): reload the page."));
+      fail(new Error("The graphics driver has given up (lost context): reload the page."));
     });
     Object.assign(this, { canvas, scene, gl, programs: [], target: gl.createFramebuffer() });
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
@@ -97,7 +94,7 @@ class Graphics {
     gl.linkProgram(handle);
     if (!gl.getProgramParameter(handle, gl.LINK_STATUS) && !gl.isContextLost()) {
       const why = gl.getShaderInfoLog(shaders[1]) || gl.getProgramInfoLog(handle);
-      throw new Refusal(`The graphics driver refuses the program: ${why.split("\n")[0]}`);
+      throw new Error(`The graphics driver refuses the program: ${why.split("\n")[0]}`);
     }
     const uniforms = {};
     for (let k = 0; k < gl.getProgramParameter(handle, gl.ACTIVE_UNIFORMS); k++) {
@@ -143,15 +140,13 @@ class Graphics {
     const numbers = new Numbers(data);
     gl.texSubImage3D(gl.TEXTURE_3D, 0, 0, 0, 0, ...size, gl[format], gl[type], numbers);
     if (gl.getError() && !gl.isContextLost()) {
-      throw new Refusal("The scene is too large for this graphics driver, or its memory is full.");
+      throw new Error("The scene is too large for this graphics driver, or its memory is full.");
     }
   }
 
   /** Brings onto the device what is the same at all times. */
   async load() {
-    for (const kind of ["density", "rough", "features", "weights"]) {
-      this.fill(kind, kind, await inflate(kind));
-    }
+    for (const kind of UNITS.slice(0, 4)) this.fill(kind, kind, await inflate(kind));
     this.fill("rest", "distances", await inflate("distances-rest"));
   }
 
@@ -588,7 +583,7 @@ class Page {
 
 addEventListener("unhandledrejection", (event) => fail(event.reason));
 addEventListener("error", (event) => fail(event.error ?? event));
-if (!byId("end")) throw new Refusal(`${DAMAGED}.`);
+if (!byId("end")) throw new Error(`${DAMAGED}.`);
 const scene = JSON.parse(byId("description").textContent);
 byId("message").textContent = "The scene is being unpacked …";
 const graphics = new Graphics(byId("picture"), scene);
