@@ -67,8 +67,10 @@ def flow_wheel(side: int) -> Tensor:
 
 
 def to_bytes(image: Tensor) -> Tensor:
-    """An image in [0, 1] as uint8, rounded."""
-    return (image.clamp(0, 1) * 255).round().to(torch.uint8)
+    """An image in [0, 1] as uint8, rounded; one of uint8 as it is."""
+    if image.dtype == torch.uint8:
+        return image
+    return image.clamp(0, 1).mul_(255).round_().to(torch.uint8)
 
 
 def _mapped(values: Tensor, name: str) -> Tensor:
@@ -77,7 +79,7 @@ def _mapped(values: Tensor, name: str) -> Tensor:
 
 
 def write_image(path: Path, image: Tensor) -> None:
-    """Write an image (H, W, 3) in [0, 1] as a PNG."""
+    """Write an image (H, W, 3), in [0, 1] or uint8, as a PNG."""
     with atomic_write(path) as partial:
         iio.imwrite(partial, to_bytes(image).numpy(), extension=".png")
 
@@ -105,7 +107,7 @@ def image_grid(
     labels: Sequence[Sequence[str]] = (),
     text: int | None = None,
 ) -> Tensor:
-    """A picture (H', W', 3) of images (H, W, 3) in [0, 1], all of one size, and fitted text.
+    """A picture (H', W', 3), uint8, of images (H, W, 3) in [0, 1] of one size, and fitted text.
 
     ``headings`` stand above each column, ``labels`` are lines left of each row. ``text`` is its
     height in pixels; None: a twentieth of that of the images, within limits.
@@ -137,7 +139,7 @@ def image_grid(
             lines = "\n".join(labels[number])
             middle = (left / 2, y + height / 2)
             pen.multiline_text(middle, lines, INK, font(size), "mm", spacing=gap, align="center")
-    return torch.from_numpy(np.array(page)).float() / 255
+    return torch.from_numpy(np.array(page))
 
 
 def scaled(image: Tensor, height: int, width: int | None = None) -> Tensor:

@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 
 
 class Video(NamedTuple):
-    """Pictures (H, W, 3) in [0, 1] that are rendered as they are asked for."""
+    """Pictures (H, W, 3), uint8, that are rendered as they are asked for."""
 
     name: str
     fps: float

@@ -145,7 +145,7 @@ def preview(model: Viewable, views: Views, index: int, background: Background) -
 
 
 def write_contact_sheet(path: Path, views: Sequence[HeldOutView], rows: int = 6) -> Tensor:
-    """Write a PNG of ``rows`` of the views with name, time and scores; the sheet (H, W, 3).
+    """Write a PNG of ``rows`` of the views with name, time and scores; the sheet (H, W, 3), uint8.
 
     Times are left out if all are 0.
     """

@@ -29,7 +29,7 @@ class Tracker(Protocol):
         """Keep the run's composed config."""
 
     def show_image(self, name: str, image: Tensor, step: int | None = None) -> None:
-        """Show an image (H, W, 3) in [0, 1], as of a stage's iteration ``step``."""
+        """Show an image (H, W, 3), in [0, 1] or uint8, as of a stage's iteration ``step``."""
 
     def show_video(self, name: str, path: Path) -> None:
         """Show a video file, where that is possible."""
@@ -63,7 +63,7 @@ class TensorBoardTracker(TensorBoardLogger):
             self.experiment.add_text("config", f"```json\n{json.dumps(params, indent=2)}\n```")
 
     def show_image(self, name: str, image: Tensor, step: int | None = None) -> None:
-        """Log an image (H, W, 3) in [0, 1]."""
+        """Log an image (H, W, 3), in [0, 1] or uint8."""
         pixels = to_bytes(image).cpu().numpy()
         self.experiment.add_image(name, pixels, step or 0, dataformats="HWC")
 
@@ -160,7 +160,7 @@ class WandbTracker(WandbLogger):
         return run
 
     def show_image(self, name: str, image: Tensor, step: int | None = None) -> None:
-        """Log an image (H, W, 3) in [0, 1]."""
+        """Log an image (H, W, 3), in [0, 1] or uint8."""
         self.log_image(name, [to_bytes(image).cpu().numpy()], step)
 
     def show_video(self, name: str, path: Path) -> None:

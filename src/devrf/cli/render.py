@@ -11,7 +11,6 @@ from hydra.utils import instantiate
 from devrf.apps.captured_cameras import write_thumbnails
 from devrf.apps.export.geometry import ExportSettings
 from devrf.apps.export.scene import export_scene
-from devrf.apps.images import to_bytes
 from devrf.apps.render import videos
 from devrf.apps.settings import ViewerSettings
 from devrf.apps.still import StillSettings, write_still
@@ -55,7 +54,7 @@ def render(run: RunContext) -> list[Path] | None:
     paths = []
     for video in videos(renderer, viewpoints, settings, held_out):
         path = run.folder / "videos" / f"{video.name}.mp4"
-        pictures = (to_bytes(picture).numpy() for picture in video.pictures)
+        pictures = (picture.numpy() for picture in video.pictures)
         write_pictures(path, followed(pictures, video.frames, path.name), video.fps)
         log.info("video written to %s", path)
         for tracker in run.trackers:
