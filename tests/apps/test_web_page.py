@@ -230,6 +230,28 @@ def test_a_browser_draws_what_the_renderer_does(browser, scenes, tmp_path, space
     assert psnr(browser.picture(), truth) >= LEAST_IN_HASTE
 
 
+def test_a_served_page_runs_its_own_program_alone(browser, file, moving, tiny_scene, tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    write_thumbnails(tmp_path / "pictures", tiny_scene, moving, Viewpoints.of(tiny_scene))
+    text = file.read_text("utf-8")
+    foreign = "<script>document.title = 'foreign'</script></body>"
+    file.write_text(text.replace("</body>", foreign), "utf-8")
+    served = PageServer(ViewerSettings(port=port), tmp_path)
+    try:
+        browser.open(f"http://127.0.0.1:{port}/", 360, 240)
+        browser.wait("document.body.className === 'ready'")
+        browser.element("cameras").click()
+        browser.wait("document.querySelector('#frusta image[href^=pictures]') !== null")
+        source = "document.querySelector('#frusta image[href^=pictures]').getAttribute('href')"
+        loads = "const image = new Image(); image.onload = () => arguments[0](image.width);"
+        loads += f"image.src = {source};"
+        assert browser.driver.execute_async_script(loads) == 24
+        assert browser.run("return document.title") == "tiny · devrf"
+    finally:
+        served.close()
+
+
 @pytest.fixture
 def file(moving: DeVRFModel, tiny_scene: Scene, tmp_path: Path) -> Path:
     """The page of the tiny scene in motion."""
@@ -440,9 +462,13 @@ def test_the_server_gives_page_and_pictures_to_its_own_page_alone(tiny_scene, mo
         port = probe.getsockname()[1]
     (tmp_path / "export").mkdir()
     (tmp_path / "export" / "scene.html").write_text("<p>a page</p>")
-    (tmp_path / "run.log").write_text("a log")
-    viewpoints = Viewpoints.of(tiny_scene)
-    write_thumbnails(tmp_path / "export" / "pictures", tiny_scene, moving, viewpoints)
+    log = tmp_path / "run.log"
+    log.write_text("a log")
+    pictures = tmp_path / "export" / "pictures"
+    (pictures / "static_0").mkdir(parents=True)
+    (pictures / "static_0" / "0.jpg").symlink_to(log)
+    write_thumbnails(pictures, tiny_scene, moving, Viewpoints.of(tiny_scene))
+    assert log.read_text() == "a log"
     served = PageServer(ViewerSettings(port=port), tmp_path / "export")
 
     def answer(path: str, **headers: str) -> tuple[int, bytes]:
@@ -470,7 +496,12 @@ def test_the_server_gives_page_and_pictures_to_its_own_page_alone(tiny_scene, mo
             *("/x", "/etc/passwd", "/../run.log", "/%2e%2e/run.log", "//run.log"),
         ):
             assert answer(path)[0] == 404
-        assert answer("/", Host="elsewhere.example")[0] == 403
+        status, text = answer("/", Host="elsewhere.example")
+        assert status == 403 and b"this machine is not 'elsewhere.example'" in text
+        assert answer("/", Host="[")[0] == 403
+        # Another run's page was there before, at the same address.
+        later = "Fri, 31 Dec 2100 00:00:00 GMT"
+        assert answer("/", **{"If-Modified-Since": later}) == (200, b"<p>a page</p>")
         assert answer("/", Origin="http://elsewhere.example")[0] == 403
     finally:
         served.close()

@@ -223,6 +223,14 @@ def test_a_page_is_that_of_the_last_checkpoint(trained, tmp_path):
     assert not serves_page(typed, run)
     os.utime(run / "checkpoints" / "deformation.ckpt")
     assert serves_page(typed, run)
+    progress = run / "checkpoints" / "deformation-progress-3.ckpt"
+    (run / "checkpoints" / "deformation.ckpt").rename(progress)  # it does not say how far it is
+    assert not serves_page(typed, run)
+    progress.rename(run / "checkpoints" / "deformation.ckpt")
+    assert serves_page(typed, run)
+    page = run / "export" / "scene.html"
+    page.write_text(page.read_text("utf-8").replace("const BUDGET", "const  BUDGET"), "utf-8")
+    assert not serves_page(typed, run)  # of another version
     shutil.rmtree(run / "export" / "pictures")
     assert not serves_page(typed, run)
 

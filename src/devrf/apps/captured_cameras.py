@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import imageio.v3 as iio
@@ -19,9 +21,12 @@ from devrf.geometry.cameras import Cameras
 from devrf.rendering.view import Viewable
 from devrf.scenes.bounds import nearest_point
 from devrf.scenes.scene import Scene, Views
+from devrf.system.progress import followed
 
 # The most frusta of a capture.
 MAX_FRUSTA = 60
+# The most times of which a camera's pictures are kept.
+MAX_TIMES = 60
 # A frustum is as deep as its neighbour is far, within these shares of the distance to the scene.
 MIN_DEPTH = 0.03
 MAX_DEPTH = 0.12
@@ -59,21 +64,23 @@ def thumbnail(scene: Scene, views: Views, index: int) -> Tensor:
 def described(model: Viewable, viewpoints: Viewpoints) -> Iterator[dict[str, Any]]:
     """The captured cameras in plain numbers, for a page: first those that saw the scene move.
 
-    Of each its ``name``, as :func:`write_thumbnails` takes it; ``pose``, camera to world, 12
-    numbers, row by row; ``fov``, its vertical angle of view in radians, were the principal point in
+    Of each its ``name``, that of its pictures' folder; ``pose``, camera to world, 12 numbers, row
+    by row; ``fov``, its vertical angle of view in radians, were the principal point in
     the middle; ``middle``, how far the image's middle is to the right of it and above, in tangents
     of angles; ``aspect``, width over height; ``distance`` of what it looks at, world units;
-    ``times`` of the frames that it may have seen.
+    ``times`` of frames that it may have seen, :data:`MAX_TIMES` at most.
     """
     static = viewpoints.static
     target = looked_at(model, static, lambda: distance_ahead(static))
+    times = viewpoints.clock.times
+    known = [times[k] for k in evenly(len(times), MAX_TIMES)]
     for kind, captured in (("dynamic", viewpoints.dynamic), ("static", static)):
         for k in evenly(len(captured), MAX_FRUSTA):
             camera = captured[[k]]
             fx, fy = camera.focal[0].tolist()
             cx, cy = camera.center[0].tolist()
             way = target - camera.positions[0]
-            seen = viewpoints.followed[k : k + 1] or viewpoints.clock.times
+            seen = viewpoints.followed[k : k + 1] or known
             yield {
                 "name": f"{kind}_{k}",
                 "pose": camera.camera_to_world.flatten().tolist(),
@@ -86,16 +93,30 @@ def described(model: Viewable, viewpoints: Viewpoints) -> Iterator[dict[str, Any
 
 
 def write_thumbnails(folder: Path, scene: Scene, model: Viewable, viewpoints: Viewpoints) -> None:
-    """Write what the cameras of :func:`described` saw: ``<name>/<index of the time>.jpg``."""
-    for camera in described(model, viewpoints):
-        kind, _, number = camera["name"].partition("_")
-        views = scene.static.train
-        images = torch.tensor([int(number)])
-        if kind == "dynamic":
-            views = scene.dynamic.train
-            images = (views.view == torch.unique(views.view)[int(number)]).nonzero()[:, 0]
-        (folder / camera["name"]).mkdir(parents=True, exist_ok=True)
-        for index, time in enumerate(camera["times"]):
-            nearest = images[(views.times[images] - time).abs().argmin()]
-            picture = thumbnail(scene, views, int(nearest)).numpy()
-            iio.imwrite(folder / camera["name"] / f"{index}.jpg", picture, quality=90)
+    """Write what the cameras of :func:`described` saw: ``<name>/<index of the time>.jpg``.
+
+    The whole folder, or nothing; one that was there is replaced.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix=".pictures-", dir=folder.parent) as partial:
+        whole = Path(partial) / folder.name
+        whole.mkdir()
+        cameras = list(described(model, viewpoints))
+        for camera in followed(cameras, len(cameras), "pictures of the cameras"):
+            _write_thumbnails(whole / camera["name"], scene, camera)
+        shutil.rmtree(folder, ignore_errors=True)
+        whole.rename(folder)
+
+
+def _write_thumbnails(folder: Path, scene: Scene, camera: dict[str, Any]) -> None:
+    kind, _, number = camera["name"].partition("_")
+    views = scene.static.train
+    images = torch.tensor([int(number)])
+    if kind == "dynamic":
+        views = scene.dynamic.train
+        images = (views.view == torch.unique(views.view)[int(number)]).nonzero()[:, 0]
+    folder.mkdir()
+    for index, time in enumerate(camera["times"]):
+        nearest = images[(views.times[images] - time).abs().argmin()]
+        picture = thumbnail(scene, views, int(nearest)).numpy()
+        iio.imwrite(folder / f"{index}.jpg", picture, quality=90)

@@ -120,7 +120,7 @@ def write_frames(path: Path, captures: Mapping[str, Sequence[HeldOutView]]) -> N
     """Write the :func:`frame_rows` of some captures as CSV."""
     rows = frame_rows(captures)
     columns = dict.fromkeys(column for row in rows for column in row)
-    with atomic_write(path) as partial, partial.open("w", newline="") as file:
+    with atomic_write(path) as partial, partial.open("w", encoding="utf-8", newline="") as file:
         # pandas would take 30 MB of every run.
         table = csv.DictWriter(file, [*columns], lineterminator="\n")
         table.writeheader()

@@ -87,8 +87,8 @@ def working_in(folder: Path, config: DictConfig) -> Iterator[None]:
 
     A folder that holds no results is removed if the block ends in a user error, but not by a
     worker: rank 0 works there, and locks for it. That of a sweep's job stays, for the record of
-    its failure, which a success removes. A report and the viewer only read, but for a camera path
-    that is written at once; stage=fetch locks where it writes.
+    its failure, which a success removes. A report only reads; what the viewer writes, a camera
+    path, the page and its pictures, becomes whole at once; stage=fetch locks where it writes.
 
     Raises:
         DevrfError: another process works there.

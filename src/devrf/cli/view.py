@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from devrf.apps.viewer.page import PageServer, is_current
 from devrf.cli.config_check import ROOT, check_config
-from devrf.cli.restore_config import root, value
+from devrf.cli.restore_config import value
 from devrf.system.process import handle_signals
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ def serves_page(typed: Sequence[Override], run: Path) -> bool:
     return (
         value(typed, "stage") == "view"
         and value(typed, "viewer.renderer") != "server"
-        and all(key in known or root(key) == "viewer" for key in keys)
+        and all(key in known or key.startswith("viewer.") for key in keys)
         and is_current(run)
     )
 

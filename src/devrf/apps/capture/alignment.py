@@ -89,7 +89,7 @@ def timeline(
             "at least 2; give longer videos"
         )
     instants = clock[usable]
-    # An instant's nearest frame is that of which it has passed the middle to the frame before.
+    # An instant's nearest frame is the last whose midpoint to the frame before it has passed.
     middles = [(other[1:] + other[:-1]) / 2 for other in clocks]
     positions = tuple(
         tuple(np.searchsorted(middle, instants, "right").tolist()) for middle in middles

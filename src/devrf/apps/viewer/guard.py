@@ -23,7 +23,10 @@ def refusal(header: Callable[[str, str], str], names: Collection[str]) -> str | 
     or one of the machine's own ``names`` cannot be made so.
     """
     host = header("Host", "").lower()
-    name = urlsplit(f"//{host}").hostname or ""
+    try:
+        name = urlsplit(f"//{host}").hostname or ""
+    except ValueError:
+        name = host
     is_address = ":" in name or name.replace(".", "").isdigit()
     if name not in names and not is_address:
         return f"devrf: this machine is not {name!r}; open the page by its IP address\n"

@@ -6,13 +6,17 @@ A run's ``export/`` has both: ``scene.html``, which says which checkpoint it sho
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import logging
 import threading
-from functools import partial
+from functools import cache, partial
 from http import HTTPStatus
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from importlib.resources import files
 from pathlib import Path
 from typing import BinaryIO
+from urllib.parse import urlsplit
 
 from devrf.apps.settings import ViewerSettings
 from devrf.apps.viewer.guard import own_names, refusal
@@ -27,14 +31,34 @@ START = 2000
 
 
 def is_current(run: Path) -> bool:
-    """Whether a run's ``export/`` has the page of its newest checkpoint, and pictures for it."""
-    page = run / "export" / PAGE
-    checkpoints = sorted(run.glob("checkpoints/*.ckpt"), key=lambda path: path.stat().st_mtime_ns)
-    if not checkpoints or not page.is_file() or not (page.parent / PICTURES).is_dir():
+    """Whether a run's ``export/`` has the page of its newest checkpoint, and pictures for it.
+
+    With the program of this version of devrf; and the checkpoint is that of a finished stage.
+    """
+    folder = run / "export"
+    try:
+        found = [(path.stat().st_mtime_ns, path) for path in run.glob("checkpoints/*.ckpt")]
+        newest = max(found)[1]
+        page = (folder / PAGE).read_bytes()
+        digest = digest_of(newest)
+    except (OSError, ValueError):  # none is there, or another process has just removed it
         return False
-    digest = digest_of(checkpoints[-1])
-    with page.open("rb") as file:
-        return digest != "" and digest.encode() in file.read(START)
+    whole = digest != "" and (folder / PICTURES).is_dir() and "-progress-" not in newest.name
+    programs = _source("scene.js").encode(), _source("scene.glsl").encode()
+    return whole and digest.encode() in page[:START] and all(text in page for text in programs)
+
+
+@cache
+def _source(name: str) -> str:
+    return files("devrf.apps.web").joinpath(name).read_text("utf-8")
+
+
+@cache
+def _policy() -> str:
+    """What a browser lets a page do: a file from somebody else runs no program but devrf's own."""
+    program = hashlib.sha256(f"\n{_source('scene.js')}\n".encode()).digest()
+    own = f"script-src 'sha256-{base64.b64encode(program).decode()}'"
+    return f"default-src 'none'; img-src 'self' data:; style-src 'unsafe-inline'; {own}"
 
 
 class PageServer:
@@ -71,7 +95,7 @@ class PageServer:
 
 
 class _Handler(SimpleHTTPRequestHandler):
-    """Answers the page's own requests, by the files of the folder."""
+    """Answers requests for the files of the folder, from this machine's own pages."""
 
     def __init__(self, *request: object, names: frozenset[str], directory: str) -> None:
         self.names = names
@@ -80,15 +104,21 @@ class _Handler(SimpleHTTPRequestHandler):
     def send_head(self) -> BinaryIO | None:
         why = refusal(self.headers.get, self.names)
         if why is not None:
-            self.send_error(HTTPStatus.FORBIDDEN, why)
-        elif self.path == "/":  # tells the page that pictures are to be had
+            self.send_error(HTTPStatus.FORBIDDEN, explain=why.strip())
+        elif urlsplit(self.path).path == "/":  # tells the page that pictures are to be had
             self.send_response(HTTPStatus.FOUND)
             self.send_header("Location", f"/{PAGE}?{PICTURES}")
             self.send_header("Content-Length", "0")
             self.end_headers()
         else:
+            del self.headers["If-Modified-Since"]  # by another run's page at the same address
             return super().send_head()
         return None
+
+    def end_headers(self) -> None:
+        self.send_header("Cache-Control", "no-store")
+        self.send_header("Content-Security-Policy", _policy())
+        super().end_headers()
 
     def list_directory(self, path: object) -> None:
         self.send_error(HTTPStatus.NOT_FOUND)

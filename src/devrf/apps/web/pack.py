@@ -52,7 +52,8 @@ from devrf.methods.devrf.volume_rendering import deformed_occupancy, medium
 from devrf.ops.trilinear import shape_of
 from devrf.rendering.occupancy import Occupancy, dilate
 
-# The unit of displacements is this share of a cell, and values are rounded: noise takes space.
+# Displacements are rounded to this share of a cell, residual colours to this share of a logit:
+# noise takes space.
 ROUNDED = 1 / 64
 # Grid points whose colours are found at once.
 CHUNK = 2**16
