@@ -230,10 +230,10 @@ def test_a_browser_draws_what_the_renderer_does(browser, scenes, tmp_path, space
     assert psnr(browser.picture(), truth) >= LEAST_IN_HASTE
 
 
-def test_a_served_page_runs_its_own_program_alone(browser, file, moving, tiny_scene, tmp_path):
+def test_a_served_page_runs_its_own_program_alone(browser, file, tiny_scene, tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = probe.getsockname()[1]
-    write_thumbnails(tmp_path / "pictures", tiny_scene, moving, Viewpoints.of(tiny_scene))
+    write_thumbnails(tmp_path / "pictures", tiny_scene, Viewpoints.of(tiny_scene))
     text = file.read_text("utf-8")
     foreign = "<script>document.title = 'foreign'</script></body>"
     file.write_text(text.replace("</body>", foreign), "utf-8")
@@ -457,7 +457,7 @@ def test_other_methods_are_refused_in_one_line(tiny_scene):
         page(model, Viewpoints.of(tiny_scene), "tiny", "0123abcd")
 
 
-def test_the_server_gives_page_and_pictures_to_its_own_page_alone(tiny_scene, moving, tmp_path):
+def test_the_server_gives_page_and_pictures_to_its_own_page_alone(tiny_scene, tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = probe.getsockname()[1]
     (tmp_path / "export").mkdir()
@@ -467,7 +467,7 @@ def test_the_server_gives_page_and_pictures_to_its_own_page_alone(tiny_scene, mo
     pictures = tmp_path / "export" / "pictures"
     (pictures / "static_0").mkdir(parents=True)
     (pictures / "static_0" / "0.jpg").symlink_to(log)
-    write_thumbnails(pictures, tiny_scene, moving, Viewpoints.of(tiny_scene))
+    write_thumbnails(pictures, tiny_scene, Viewpoints.of(tiny_scene))
     assert log.read_text() == "a log"
     served = PageServer(ViewerSettings(port=port), tmp_path / "export")
 

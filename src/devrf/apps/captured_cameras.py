@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -65,58 +65,58 @@ def described(model: Viewable, viewpoints: Viewpoints) -> Iterator[dict[str, Any
     """The captured cameras in plain numbers, for a page: first those that saw the scene move.
 
     Of each its ``name``, that of its pictures' folder; ``pose``, camera to world, 12 numbers, row
-    by row; ``fov``, its vertical angle of view in radians, were the principal point in
-    the middle; ``middle``, how far the image's middle is to the right of it and above, in tangents
-    of angles; ``aspect``, width over height; ``distance`` of what it looks at, world units;
-    ``times`` of frames that it may have seen, :data:`MAX_TIMES` at most.
+    by row; ``fov``, its vertical angle of view in radians, were the principal point in the middle;
+    ``middle``, how far the image's middle is to the right of it and above, in tangents of angles;
+    ``aspect``, width over height; ``distance`` of what it looks at, world units; ``times`` of
+    frames that it may have seen, :data:`MAX_TIMES` at most.
     """
-    static = viewpoints.static
-    target = looked_at(model, static, lambda: distance_ahead(static))
-    times = viewpoints.clock.times
-    known = [times[k] for k in evenly(len(times), MAX_TIMES)]
-    for kind, captured in (("dynamic", viewpoints.dynamic), ("static", static)):
-        for k in evenly(len(captured), MAX_FRUSTA):
-            camera = captured[[k]]
-            fx, fy = camera.focal[0].tolist()
-            cx, cy = camera.center[0].tolist()
-            way = target - camera.positions[0]
-            seen = viewpoints.followed[k : k + 1] or known
-            yield {
-                "name": f"{kind}_{k}",
-                "pose": camera.camera_to_world.flatten().tolist(),
-                "fov": 2 * math.atan(camera.height / 2 / fy),
-                "middle": [(camera.width / 2 - cx) / fx, (cy - camera.height / 2) / fy],
-                "aspect": (camera.width / fx) / (camera.height / fy),
-                "distance": max(float(way @ camera.forwards[0]), 0.1 * float(way.norm())),
-                "times": seen if kind == "dynamic" else [0.0],
-            }
+    target = looked_at(model, viewpoints.static, lambda: distance_ahead(viewpoints.static))
+    for kind, k, times in _shown(viewpoints):
+        camera = (viewpoints.dynamic if kind == "dynamic" else viewpoints.static)[[k]]
+        fx, fy = camera.focal[0].tolist()
+        cx, cy = camera.center[0].tolist()
+        way = target - camera.positions[0]
+        yield {
+            "name": f"{kind}_{k}",
+            "pose": camera.camera_to_world.flatten().tolist(),
+            "fov": 2 * math.atan(camera.height / 2 / fy),
+            "middle": [(camera.width / 2 - cx) / fx, (cy - camera.height / 2) / fy],
+            "aspect": (camera.width / fx) / (camera.height / fy),
+            "distance": max(float(way @ camera.forwards[0]), 0.1 * float(way.norm())),
+            "times": times,
+        }
 
 
-def write_thumbnails(folder: Path, scene: Scene, model: Viewable, viewpoints: Viewpoints) -> None:
+def write_thumbnails(folder: Path, scene: Scene, viewpoints: Viewpoints) -> None:
     """Write what the cameras of :func:`described` saw: ``<name>/<index of the time>.jpg``.
 
     The whole folder, or nothing; one that was there is replaced.
     """
+    cameras = list(_shown(viewpoints))
     folder.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(prefix=".pictures-", dir=folder.parent) as partial:
         whole = Path(partial) / folder.name
-        whole.mkdir()
-        cameras = list(described(model, viewpoints))
-        for camera in followed(cameras, len(cameras), "pictures of the cameras"):
-            _write_thumbnails(whole / camera["name"], scene, camera)
+        for kind, k, times in followed(cameras, len(cameras), "pictures of the cameras"):
+            own = whole / f"{kind}_{k}"
+            own.mkdir(parents=True)
+            views = scene.static.train
+            images = torch.tensor([k])
+            if kind == "dynamic":
+                views = scene.dynamic.train
+                images = (views.view == torch.unique(views.view)[k]).nonzero()[:, 0]
+            for index, time in enumerate(times):
+                nearest = images[(views.times[images] - time).abs().argmin()]
+                picture = thumbnail(scene, views, int(nearest)).numpy()
+                iio.imwrite(own / f"{index}.jpg", picture, quality=90)
         shutil.rmtree(folder, ignore_errors=True)
         whole.rename(folder)
 
 
-def _write_thumbnails(folder: Path, scene: Scene, camera: dict[str, Any]) -> None:
-    kind, _, number = camera["name"].partition("_")
-    views = scene.static.train
-    images = torch.tensor([int(number)])
-    if kind == "dynamic":
-        views = scene.dynamic.train
-        images = (views.view == torch.unique(views.view)[int(number)]).nonzero()[:, 0]
-    folder.mkdir()
-    for index, time in enumerate(camera["times"]):
-        nearest = images[(views.times[images] - time).abs().argmin()]
-        picture = thumbnail(scene, views, int(nearest)).numpy()
-        iio.imwrite(folder / f"{index}.jpg", picture, quality=90)
+def _shown(viewpoints: Viewpoints) -> Iterator[tuple[str, int, Sequence[float]]]:
+    """The cameras of a page: ``dynamic`` or ``static``, their numbers there, and their times."""
+    times = viewpoints.clock.times
+    known = [times[frame] for frame in evenly(len(times), MAX_TIMES)]
+    for k in evenly(len(viewpoints.dynamic), MAX_FRUSTA):
+        yield "dynamic", k, viewpoints.followed[k : k + 1] or known
+    for k in evenly(len(viewpoints.static), MAX_FRUSTA):
+        yield "static", k, [0.0]

@@ -120,7 +120,7 @@ def _write_with_pictures(run: RunContext, model: Renderable, viewpoints: Viewpoi
     text = _page(run, model, viewpoints)
     scene = _with_images(run, "the cameras on its page are shown without pictures")
     if scene is not None:
-        write_thumbnails(folder / PICTURES, scene, model, viewpoints)
+        write_thumbnails(folder / PICTURES, scene, viewpoints)
     write_text(folder / PAGE, text)
 
 

@@ -134,7 +134,7 @@ def _parts(model: DeVRFModel, eyes: Tensor) -> Iterator[tuple[str, Tensor]]:
         mask = torch.stack(seen[max(k - 1, 0) : k + 1]).any(dim=0)
         near = Occupancy(mask, model.box).points_near(motion.shape, motion.box)
         kept = near[..., None] * motion.to_canonical[k].to(near.device).float()
-        yield f"displacement-{k}", (kept / (ROUNDED * rest.cell)).round().half()
+        yield f"displacement-{k}", (kept / (ROUNDED * model.occupancy.cell)).round().half()
         if residual is not None:
             values = residual.values[k]
             near = rest.points_near(shape_of(values), residual.box)
