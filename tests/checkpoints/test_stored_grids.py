@@ -50,11 +50,16 @@ def test_the_size_is_two_bytes_a_kept_value():
     )
 
 
-def test_a_value_beyond_half_precision_is_refused():
-    with pytest.raises(ValueError, match="half precision"):
-        pack(
-            torch.full((1, 2, 2, 2, 1), 7e4), torch.ones(1, 2, 2, 2, dtype=torch.bool), smooth=False
-        )
+def test_one_grid_comes_back_as_one():
+    grid = torch.randn(9, 7, 6, 2).half().float()
+    keep = torch.ones(1, 9, 7, 6, dtype=torch.bool)
+    assert torch.equal(unpack(pack(grid, keep, smooth=False)), grid)
+
+
+def test_a_value_beyond_half_precision_is_kept_as_it_is():
+    grids = torch.full((1, 2, 2, 2, 1), 7e4)
+    stored = pack(grids, torch.ones(1, 2, 2, 2, dtype=torch.bool), smooth=False)
+    assert unpack(stored) is grids
 
 
 def test_masks_are_packed_to_bits() -> None:

@@ -24,53 +24,56 @@ THINNING = 4
 Packed = dict[str, Any]
 
 
-def pack(grids: Tensor, keep: Tensor, *, smooth: bool) -> Packed:
+def pack(grids: Tensor, keep: Tensor, *, smooth: bool) -> Packed | Tensor:
     """Store grids in about 2·C bytes a kept voxel, one after another, on the device of ``keep``.
 
     Args:
-        grids: (N, X, Y, Z, C) of finite values.
+        grids: one grid (X, Y, Z, C), or N of them (N, X, Y, Z, C).
         keep: (N, X, Y, Z) bool, where detail is kept; (1, X, Y, Z) serves all N.
         smooth: what values elsewhere are replaced by: True, the trilinear interpolation of every
             fourth grid point; False, each channel's mean over the voxels that are left out.
 
     Returns:
-        Tensors on the host and numbers, by name, for :func:`unpack`.
-
-    Raises:
-        ValueError: a value that half precision cannot hold.
+        Tensors on the host and numbers, by name, for :func:`unpack`; the grids themselves where
+        half precision cannot hold a value.
     """
-    thin = _thinned(grids.shape[1:4])
+    many = grids.ndim == 5
+    *_, x, y, z, channels = grids.shape
+    thin = _thinned((x, y, z))
     details = []
     elsewhere = []
-    for n, stored in enumerate(grids):
+    for n, stored in enumerate(grids.reshape(-1, x, y, z, channels)):
         grid = stored.to(keep.device, torch.float32)
         if float(grid.abs().amax()) > torch.finfo(torch.float16).max:
-            raise ValueError("a value of the grids is too large for half precision")
+            return grids
         kept_voxels = keep[min(n, len(keep) - 1)]
         details.append(grid[kept_voxels].half().cpu())
         if smooth:
             elsewhere.append(resample(grid, thin).half().cpu())
         else:
             left_out = grid[~kept_voxels]
-            mean = left_out.mean(dim=0) if len(left_out) else grid.new_zeros(grid.shape[-1])
+            mean = left_out.mean(dim=0) if len(left_out) else grid.new_zeros(channels)
             elsewhere.append(mean.half().cpu())
     return {
-        "shape": list(grids.shape[1:4]),
+        "shape": [x, y, z],
         "keep": torch.stack([pack_bits(mask) for mask in keep]),
         "kept": torch.cat(details),
         "elsewhere": torch.stack(elsewhere),
+        "many": many,
     }
 
 
 def unpack(
-    packed: Packed, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
-) -> Tensor:
-    """The grids (N, X, Y, Z, C) that :func:`pack` stored, one after another on ``device``.
+    packed: Any, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
+) -> Any:
+    """The grids that :func:`pack` stored, on ``device``; what is not packed as it is.
 
     Raises:
-        RuntimeError | ValueError: the parts do not fit together.
+        RuntimeError | KeyError | ValueError: the parts do not fit together.
         OutOfMemoryError: the grids take more than is free.
     """
+    if not isinstance(packed, dict) or "kept" not in packed:
+        return packed
     x, y, z = (int(points) for points in packed["shape"])
     shape = (x, y, z)
     voxels = x * y * z
@@ -91,28 +94,7 @@ def unpack(
     for grid, rest, mask, detail in zip(grids, elsewhere, keep, details, strict=True):
         grid.copy_(rest if rest.ndim == 1 else resample(rest, shape))
         grid[mask] = detail
-    return grids
-
-
-def packed(grids: Tensor, keep: Tensor, *, smooth: bool, many: bool = True) -> Packed | Tensor:
-    """What :func:`pack` gives; the grids themselves where half precision cannot hold a value.
-
-    Unless there are ``many``, what comes back is the one grid (X, Y, Z, C).
-    """
-    try:
-        return {**pack(grids, keep, smooth=smooth), "many": many}
-    except ValueError:
-        return grids if many else grids[0]
-
-
-def unpacked(
-    value: Any, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
-) -> Any:
-    """What :func:`packed` was given, on ``device``; anything else as it is."""
-    if not isinstance(value, dict) or "kept" not in value:
-        return value
-    grids = unpack(value, device, dtype)
-    return grids if value["many"] else grids[0]
+    return grids if packed["many"] else grids[0]
 
 
 def _thinned(shape: Sequence[int]) -> tuple[int, int, int]:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from devrf.checkpoints.stored_class import StoredClass, class_path, stored_class
-from devrf.checkpoints.stored_grids import packed, unpacked
+from devrf.checkpoints.stored_grids import pack, unpack
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.space import WORLD, Space, space_config, space_from
@@ -182,7 +182,7 @@ class DeVRFModel(Renderable):
             rim[:, 1:-1, 1:-1, 1:-1] = False
             shown |= rim
         for name in ("canonical.density.values", "canonical.color.values"):
-            state[name] = packed(state[name][None], shown, smooth=False, many=False)
+            state[name] = pack(state[name], shown, smooth=False)
         if motion is not None:
             place = motion.shape, motion.box
             at_rest = self.occupancy.points_near(*place)[None]
@@ -192,11 +192,11 @@ class DeVRFModel(Renderable):
             frames = {"to_canonical": torch.stack(moving), "to_time": at_rest}
             for name, keep in frames.items():
                 values = getattr(motion.frames, name)
-                state[f"deformation.frames.{name}"] = packed(values, keep, smooth=True)
+                state[f"deformation.frames.{name}"] = pack(values, keep, smooth=True)
         if residual is not None:
             values = residual.values
             at_rest = self.occupancy.points_near(shape_of(values[0]), residual.box)[None]
-            state["color_residual.values"] = packed(values, at_rest, smooth=False)
+            state["color_residual.values"] = pack(values, at_rest, smooth=False)
         return state
 
     def load_stored_state(self, state: Mapping[str, Any]) -> None:
@@ -213,10 +213,10 @@ class DeVRFModel(Renderable):
             names = [f"deformation.frames.{name}" for name in NAMES]
             frames = [full[name] for name in names]
             place = _place_of_frames(frames[0], self.device)
-            frames = [unpacked(value, place, torch.float16) for value in frames]
+            frames = [unpack(value, place, torch.float16) for value in frames]
             self.deformation.frames.take(*frames)
             full |= zip(names, frames, strict=True)
-        self.load_state_dict({name: unpacked(v, self.device) for name, v in full.items()})
+        self.load_state_dict({name: unpack(v, self.device) for name, v in full.items()})
         field = self.canonical
         if field.grid_shape(field.voxels) != shape_of(field.density.values):
             raise ValueError("a grid of another size than its description says")
