@@ -35,7 +35,7 @@ def test_stills_in_any_size_read_no_scene_and_stay(of_run, tmp_path, monkeypatch
     def unread(self):
         raise AssertionError("the scene was read")
 
-    monkeypatch.setattr("devrf.data.rendered.RenderedDataModule.load", unread)
+    monkeypatch.setattr("devrf.data.rendered.ProceduralDataModule.load", unread)
     small = "still.height=70"
     for typed in (("still.time=0.3", small), (small,), (small,), (small, "still.view=1")):
         outcome = of_run("stage=still", *typed)

@@ -173,7 +173,7 @@ def test_a_finished_run_says_so_and_reads_nothing(devrf, tiny, run, monkeypatch)
         raise AssertionError("the scene was read")
 
     before = stamps(run)
-    monkeypatch.setattr("devrf.data.rendered.RenderedDataModule.load", unread)
+    monkeypatch.setattr("devrf.data.rendered.ProceduralDataModule.load", unread)
     outcome = devrf(*tiny, "hydra.run.dir=run")
     assert (outcome.status, outcome.err) == (0, "")
     for stage in ("canonical", "deformation"):

@@ -17,7 +17,7 @@ from devrf.data.recorded import (
     InwardFacingDataModule,
     RecordedDataModule,
 )
-from devrf.data.rendered import ProceduralDataModule, RenderedDataModule
+from devrf.data.rendered import ProceduralDataModule
 from devrf.errors import DevrfError
 from devrf.scenes.export import export
 from devrf.scenes.procedural import ProceduralForwardScene
@@ -160,7 +160,7 @@ def test_a_scene_written_to_disk_is_read_with_its_flow(facing, tiny_scene, tmp_p
 
 
 def test_exact_forward_flow_undoes_backward_flow_once_it_is_asked_for(tiny_recipe):
-    module = RenderedDataModule(tiny_recipe, None)
+    module = ProceduralDataModule(recipe=lambda: tiny_recipe)
     before = module.training_views("dynamic", torch.device("cpu"))
     assert before.forward_flow is None
     module.provide(("forward_flow",))

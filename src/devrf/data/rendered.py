@@ -24,21 +24,28 @@ def rendered(recipe: Callable[[], Scene]) -> Scene:
     return recipe()
 
 
-class RenderedDataModule(SceneDataModule):
-    """A scene rendered when it is first needed."""
+class ProceduralDataModule(SceneDataModule):
+    """An embedded scene, rendered when it is first needed."""
 
     def __init__(
-        self, recipe: Callable[[], Scene], export: str | Path | None, flow: Flow = "exact"
+        self,
+        *shape: Any,
+        recipe: Callable[..., Callable[[], Scene]] = ProceduralScene,
+        export: str | Path | None = None,
+        flow: Flow = "exact",
+        **numbers: Any,
     ) -> None:
-        """Say how to render the scene.
+        """Say what to render.
 
         Args:
-            recipe: renders it when called.
+            shape: which shape, or the scene's name.
+            recipe: :class:`ProceduralScene` or :class:`ProceduralForwardScene`.
             export: the folder that ``stage=prepare`` writes the scene to.
             flow: the optical flow that is learned from.
+            numbers: of the recipe.
         """
         super().__init__()
-        self.recipe = recipe
+        self.recipe = recipe(*shape, **numbers)
         self.export = None if export is None else Path(export)
         if flow not in FLOWS:
             raise scene_error("data.flow", f"should be 'exact' or 'none', not {flow!r}")
@@ -61,26 +68,3 @@ class RenderedDataModule(SceneDataModule):
             flow = exact_flow(self.recipe.filmed(), train, forward=True)
             train = replace(train, forward_flow=flow)
             self.replace(replace(scene, dynamic=replace(scene.dynamic, train=train)))
-
-
-class ProceduralDataModule(RenderedDataModule):
-    """An embedded scene: ``robot`` or ``flower``, or another recipe's."""
-
-    def __init__(
-        self,
-        *shape: Any,
-        recipe: Callable[..., Recipe] = ProceduralScene,
-        export: str | Path | None = None,
-        flow: Flow = "exact",
-        **numbers: Any,
-    ) -> None:
-        """Say what to render.
-
-        Args:
-            shape: which shape, or the scene's name.
-            recipe: :class:`ProceduralScene` or :class:`ProceduralForwardScene`.
-            export: the folder that ``stage=prepare`` writes the scene to.
-            flow: the optical flow that is learned from.
-            numbers: of the recipe.
-        """
-        super().__init__(recipe(*shape, **numbers), export, flow)

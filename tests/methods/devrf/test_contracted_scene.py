@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from devrf.callbacks import Meter
-from devrf.data.rendered import RenderedDataModule
+from devrf.data.rendered import ProceduralDataModule
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.contraction import ContractedSpace
@@ -127,7 +127,7 @@ def test_the_fields_opacity_does_not_depend_on_its_resolution():
 
 
 def test_a_room_is_learned_and_moves_inside_the_inner_box(tiny_room, trainer):
-    room, data = tiny_room, RenderedDataModule(lambda: tiny_room, None)
+    room, data = tiny_room, ProceduralDataModule(recipe=lambda: lambda: tiny_room)
     schedule = CanonicalSchedule(
         search_iterations=0,
         search_side=16,

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from devrf.data.batch import gather_batch
-from devrf.data.rendered import RenderedDataModule
+from devrf.data.rendered import ProceduralDataModule
 from devrf.methods.nsff.fields import BACKWARD, FORWARD
 from devrf.methods.nsff.model import NSFF
 from devrf.methods.nsff.priors import ImagePriors
@@ -128,6 +128,6 @@ def test_flow_in_one_direction_counts_alone_and_added_densities_have_no_terms_of
 
 
 def test_an_embedded_scene_tells_flow_both_ways(tiny_recipe: ProceduralScene) -> None:
-    module = RenderedDataModule(tiny_recipe, None)
+    module = ProceduralDataModule(recipe=lambda: tiny_recipe)
     module.provide(NSFF.priors)
     assert ImagePriors([module.scene.dynamic.train], module.scene.space).has_flow == (True, True)
