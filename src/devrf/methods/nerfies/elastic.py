@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 from torch.func import jvp, vmap
 
+from devrf.ops.compositing import firsts, running_sum
+
 # The least squared singular value, so that log² stays finite.
 LEAST = 1e-12
 # c: strains above it count less and less.
@@ -63,15 +65,12 @@ def drawn(weight: Tensor, ray: Tensor, rays: Tensor, count: int) -> tuple[Tensor
     Returns:
         The samples (M,) int64 of those of the rays that have any weight, and the rays' Σ w_i (M,).
     """
-    reached = weight.double().cumsum(0)
-    total = torch.zeros(count, dtype=reached.dtype, device=weight.device).index_add(
-        0, ray, weight.double()
-    )
-    mass = total[rays]
-    start = (total.cumsum(0) - total)[rays]
+    reached = running_sum(weight)
+    edges = firsts(ray, count)
+    start = reached[edges[rays]]
+    mass = reached[edges[rays + 1]] - start
     visible = (mass > 0).nonzero()[:, 0]
     mass = mass[visible]
-    start = start[visible]
-    wanted = start + torch.rand_like(mass) * mass
-    picked = torch.searchsorted(reached, wanted, right=True).clamp(max=max(len(weight) - 1, 0))
-    return picked, mass.to(weight.dtype)
+    wanted = start[visible] + torch.rand_like(mass) * mass
+    picked = torch.searchsorted(reached, wanted, right=True) - 1
+    return picked.clamp(max=max(len(weight) - 1, 0)), mass.to(weight.dtype)

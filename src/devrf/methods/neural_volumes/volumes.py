@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from devrf.ops.compositing import sum_by_ray
+from devrf.ops.compositing import firsts, running_sum, sum_by_ray, sums_before
 
 
 @dataclass(frozen=True)
@@ -63,12 +63,8 @@ def added_opacity(amount: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tenso
     Returns:
         w (S,) and A (R,).
     """
-    # In double precision: a running sum over all rays loses the digits of the last ones.
-    reached = amount.double().cumsum(0)
-    count = torch.bincount(ray, minlength=rays)
-    before_ray = torch.cat([reached.new_zeros(1), reached])[count.cumsum(0) - count]
-    behind = reached - before_ray.index_select(0, ray)
-    weight = behind.clamp(max=1) - (behind - amount).clamp(max=1)
+    before = sums_before(running_sum(amount), firsts(ray, rays), ray)
+    weight = (before + amount).clamp(max=1) - before.clamp(max=1)
     return weight.to(amount.dtype), sum_by_ray(amount, ray, rays).clamp(max=1)
 
 
