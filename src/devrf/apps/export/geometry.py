@@ -11,6 +11,7 @@ from typing import Literal, cast
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from devrf.errors import DevrfError, expect
 from devrf.geometry.cameras import Cameras
@@ -167,6 +168,16 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
         normals.index_add_(0, faces[:, corner], across)
     lengths = normals.norm(dim=1, keepdim=True)
     return torch.where(lengths > 0, normals / lengths, torch.eye(3)[2])
+
+
+def halfway(normals: Tensor) -> Tensor:
+    """Unit vectors (V, 3) halfway from +z to unit ``normals``: half a turn about each leads there.
+
+    Of −z that is half a turn about x.
+    """
+    between = normals + torch.eye(3)[2]
+    between = torch.where(between.norm(dim=1, keepdim=True) > 1e-3, between, torch.eye(3)[0])
+    return normalize(between, dim=1)
 
 
 # Cameras that look at the scene, at most.

@@ -12,9 +12,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
-from devrf.apps.export.geometry import MovingMesh, UpFrame, vertex_normals
+from devrf.apps.export.geometry import MovingMesh, UpFrame, halfway, vertex_normals
 from devrf.geometry.cameras import Cameras
 from devrf.system.files import atomic_write
 
@@ -73,16 +72,9 @@ def gaussians(vertices: Tensor, faces: Tensor, colors: Tensor) -> Tensor:
     scales = torch.stack([across, across, THICKNESS * across], dim=1)
     opacity = torch.full_like(across, math.log(OPACITY / (1 - OPACITY)))[:, None]
     factors = (colors - 0.5) / HARMONIC
-    return torch.cat([vertices, normals, factors, opacity, scales.log(), _turned(normals)], dim=1)
-
-
-def _turned(normals: Tensor) -> Tensor:
-    """Unit quaternions (V, 4), w first, of the least rotations from +z to unit ``normals``."""
-    x, y, z = normals.unbind(dim=1)
-    halfway = torch.stack([1 + z, -y, x, torch.zeros_like(z)], dim=1)
-    # From +z to −z half a turn about x is as good as any.
-    over = halfway.new_tensor([0.0, 1.0, 0.0, 0.0])
-    return normalize(torch.where(z[:, None] > -1 + 1e-6, halfway, over), dim=1)
+    # As unit quaternions, w first: half turns.
+    turns = torch.nn.functional.pad(halfway(normals), (1, 0))
+    return torch.cat([vertices, normals, factors, opacity, scales.log(), turns], dim=1)
 
 
 def ply(rows: Tensor) -> bytes:

@@ -8,9 +8,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
-from devrf.apps.export.geometry import ExportSettings, Surface, vertex_normals
+from devrf.apps.export.geometry import ExportSettings, Surface, halfway, vertex_normals
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
@@ -227,12 +226,12 @@ def _seen(
     vertex, sample = (weight > SIGNIFICANT).nonzero(as_tuple=True)
     share = weight[vertex, sample, None]
     where = samples[vertex, sample]
-    frames = _frames(normals)
+    axes = halfway(normals)  # of half turns that lead +z to the normals
     colors = torch.zeros_like(points)
     total = toward_eyes[:, 2].sum()
     for direction in toward_eyes:
-        viewdirs = -(frames @ direction)
-        color = field.color(where.to(device), viewdirs[vertex].to(device)).cpu()
+        turned = 2 * (axes @ direction)[:, None] * axes - direction
+        color = field.color(where.to(device), -turned[vertex].to(device)).cpu()
         colors.index_add_(0, vertex, share * color * (direction[2] / total))
     weight_sum = torch.zeros(len(points)).index_add_(0, vertex, share[:, 0])
     return colors / weight_sum.clamp(min=1e-9)[:, None]
@@ -245,11 +244,3 @@ def _cap(count: int, widest: float) -> Tensor:
     around = math.pi * (1 + math.sqrt(5)) * k
     radius = (1 - z * z).sqrt()
     return torch.stack([radius * around.cos(), radius * around.sin(), z], dim=1)
-
-
-def _frames(normals: Tensor) -> Tensor:
-    """Rotations (V, 3, 3) that lead +z to the normals."""
-    x, _, z = torch.eye(3)
-    helper = torch.where(normals[:, 2:].abs() < 0.9, z, x)
-    right = normalize(torch.linalg.cross(helper, normals), dim=1)
-    return torch.stack([right, torch.linalg.cross(normals, right), normals], dim=2)
