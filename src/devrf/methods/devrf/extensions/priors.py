@@ -114,10 +114,8 @@ def occupied_cells(occupancy: Occupancy, box: Box, shape: tuple[int, int, int]) 
     The occupancy is looked up at as many points of the box as it has.
     """
     x, y, z = occupancy.mask.shape
-    points = box.grid_points((x, y, z), torch.zeros((), device=occupancy.mask.device))
-    occupied = occupancy.at(points.view(-1, 3)).view(1, x, y, z)
-    cells = [count - 1 for count in shape]
-    return adaptive_max_pool3d(occupied.float(), cells)[0]
+    occupied = occupancy.on((x, y, z), box)[None].float()
+    return adaptive_max_pool3d(occupied, [count - 1 for count in shape])[0]
 
 
 class MotionPrior(Extension):
