@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable
+from itertools import repeat
 from typing import Any
 
 import torch
 from lightning import LightningDataModule
-from torch.utils.data import DataLoader, Dataset, IterableDataset
 
 from devrf.data.priors import Priors, without_priors
 from devrf.scenes.scene import ImagesName, Scene, Views
@@ -67,14 +67,13 @@ class SceneDataModule(LightningDataModule, ABC):
         """Read the scene, if that was not done yet."""
         _ = self.scene
 
-    def train_dataloader(self) -> DataLoader[Any]:
-        """A loader that never ends of the same batch: the training views of the stage's capture."""
-        return DataLoader(_SameBatch(), batch_size=None)
+    def train_dataloader(self) -> Iterable[None]:
+        """Without end the same batch: the training views of the stage's capture."""
+        return repeat(None)
 
-    def test_dataloader(self) -> DataLoader[Any]:
-        """A loader of the positions of the held-out images, one at a time."""
-        held_out = self.scene.capture(self._stage.scored_capture).test
-        return DataLoader(_Positions(len(held_out)), batch_size=None)
+    def test_dataloader(self) -> Iterable[int]:
+        """The positions of the held-out images, one at a time."""
+        return range(len(self.scene.capture(self._stage.scored_capture).test))
 
     def transfer_batch_to_device(
         self, batch: Any, device: torch.device, dataloader_idx: int
@@ -103,20 +102,3 @@ class SceneDataModule(LightningDataModule, ABC):
         """The stage that the trainer carries out."""
         assert self.trainer is not None
         return self.trainer.lightning_module
-
-
-class _SameBatch(IterableDataset[None]):
-    def __iter__(self) -> Iterator[None]:
-        while True:
-            yield None
-
-
-class _Positions(Dataset[int]):
-    def __init__(self, count: int) -> None:
-        self.count = count
-
-    def __len__(self) -> int:
-        return self.count
-
-    def __getitem__(self, index: int) -> int:
-        return index
