@@ -71,4 +71,4 @@ def test_coarse_colors_count_where_coarse_samples_have_a_field_of_their_own(
     torch.testing.assert_close(loss, fine + coarse)
     assert len(output.extras["coarse_weight"]) == 6 * len(some_rays.time)
     loss.backward()
-    assert model.coarse is not None and model.coarse.color.weight.grad.abs().max() > 0
+    assert model.coarse is not None and model.coarse.color.output.weight.grad.abs().max() > 0

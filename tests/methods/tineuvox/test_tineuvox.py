@@ -110,7 +110,7 @@ def test_terms_by_hand(tiny_scene: Scene, some_rays: Any) -> None:
     torch.testing.assert_close(terms["sample_color"], expected)
     assert set(terms) == set(LOSS)
     terms["sample_color"].backward()
-    assert model.radiance.color.weight.grad is not None
+    assert model.radiance.color.output.weight.grad is not None
     assert model.radiance.density.weight.grad is None  # weights have no gradient
 
 

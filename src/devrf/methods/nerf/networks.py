@@ -178,6 +178,28 @@ class TimeCodes(nn.Module):
         return code
 
 
+class ColorBranch(nn.Module):
+    """What colours a trunk's result by the viewing direction: NeRF's last layers."""
+
+    def __init__(self, width: int, bands: int) -> None:
+        """For a trunk of ``width`` units; directions have so many ``bands``."""
+        super().__init__()
+        self.encode = SinusoidalEncoding(3, bands)
+        self.feature = nn.Linear(width, width)
+        self.hidden = nn.Linear(width + self.encode.size, width // 2)
+        self.output = nn.Linear(width // 2, 3)
+
+    def forward(self, trunk: Tensor, viewdirs: Tensor, ray: Tensor) -> Tensor:
+        """RGB (S, 3) before its activation.
+
+        Of samples (S, width) of the rays ``ray`` (S,), whose unit directions are (R, 3).
+        """
+        direction = self.encode(viewdirs)
+        hidden = linear_by_ray(self.hidden, [self.feature(trunk)], direction, ray).relu_()
+        logits: Tensor = self.output(hidden)
+        return logits
+
+
 class RadianceField(nn.Module):
     """(x, d) → (σ, c): a trunk over γ(x), a density head, and a colour branch over γ(d)."""
 
@@ -200,13 +222,10 @@ class RadianceField(nn.Module):
         super().__init__()
         s = self._settings = settings
         self.encode_position = SinusoidalEncoding(inputs, s.bands)
-        self.encode_direction = SinusoidalEncoding(3, s.direction_bands)
         self.trunk = Trunk(self.encode_position.size, s.width, s.depth, s.skip, beside=ambient)
         self.density = nn.Linear(s.width, 1)
         self.further = nn.Linear(s.width, further) if further else None
-        self.feature = nn.Linear(s.width, s.width)
-        self.branch = nn.Linear(s.width + self.encode_direction.size, s.width // 2)
-        self.color = nn.Linear(s.width // 2, 3)
+        self.color = ColorBranch(s.width, s.direction_bands)
         initialise(self, s.initialisation)
 
     def reduced(self) -> AbstractContextManager[None]:
@@ -253,10 +272,7 @@ class RadianceField(nn.Module):
         x = self.trunk(self.encode_position(points), ambient)
         density = self.density(x)[:, 0]
         further = x[:, :0] if self.further is None else self.further(x)
-        x = linear_by_ray(
-            self.branch, [self.feature(x)], self.encode_direction(viewdirs), ray
-        ).relu_()
-        return density, self.color(x), further
+        return density, self.color(x, viewdirs, ray), further
 
     def raw_density(self, points: Tensor, ambient: Tensor | None = None) -> Tensor:
         """Density (S,) alone before its activation; arguments as for :meth:`forward`."""

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from devrf.checkpoints.stored_grids import StoredShape
 from devrf.geometry.box import Box
 from devrf.kernels.look_up import look_up
-from devrf.methods.nerf.networks import SinusoidalEncoding, linear_by_ray
+from devrf.methods.nerf.networks import ColorBranch, SinusoidalEncoding, linear_by_ray
 from devrf.methods.tineuvox.settings import TiNeuVoxSettings
 from devrf.ops.trilinear import Shape, resample, shape_of
 
@@ -68,12 +68,9 @@ class RadianceNetwork(nn.Module):
         super().__init__()
         s = settings
         self.encode_feature = SinusoidalEncoding(s.channels * len(s.strides), s.feature_bands)
-        self.encode_direction = SinusoidalEncoding(3, s.direction_bands)
         self.trunk = nn.Linear(self.encode_feature.size + position + code, s.width)
         self.density = nn.Linear(s.width, 1)
-        self.feature = nn.Linear(s.width, s.width)
-        self.branch = nn.Linear(s.width + self.encode_direction.size, s.width // 2)
-        self.color = nn.Linear(s.width // 2, 3)
+        self.color = ColorBranch(s.width, s.direction_bands)
 
     def hidden(self, features: Tensor, position: Tensor, code: Tensor, ray: Tensor) -> Tensor:
         """What density and colour come from, (S, width), of S samples of the rays ``ray`` (S,).
@@ -91,6 +88,4 @@ class RadianceNetwork(nn.Module):
 
     def rgb(self, hidden: Tensor, viewdirs: Tensor, ray: Tensor) -> Tensor:
         """RGB (S, 3) in [0, 1] of samples of the rays ``ray`` (S,), whose directions are (R, 3)."""
-        direction = self.encode_direction(viewdirs)
-        branch = linear_by_ray(self.branch, [self.feature(hidden)], direction, ray).relu_()
-        return torch.sigmoid(self.color(branch))
+        return torch.sigmoid(self.color(hidden, viewdirs, ray))
