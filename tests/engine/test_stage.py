@@ -119,8 +119,8 @@ def test_a_resumed_stage_draws_half_batches_too(fit, memory_for, tmp_path):
 
 
 def test_one_of_several_processes_ends_with_an_error(fit, memory_for, monkeypatch):
-    memory_for(32)
-    monkeypatch.setattr("devrf.engine.stage.world_size", lambda: 2)
+    memory_for(0)
+    monkeypatch.setattr(CanonicalStage, "processes", 2)
     with pytest.raises(DevrfError, match="one of 2 processes is out of memory"):
         fit(canonical())
 

@@ -1,6 +1,6 @@
 """Data parallelism: several processes draw their shares of a batch and take the same step.
 
-With one process the functions of this module change nothing and return their arguments.
+With one process all but :func:`average_gradients` change nothing and return their arguments.
 """
 
 from __future__ import annotations
@@ -88,21 +88,14 @@ def _is_distributed() -> bool:
     return distributed.is_available() and distributed.is_initialized()
 
 
-def rays_per_rank(rays: int) -> int:
-    """Rays of a batch that each process draws: rounded up, so that all draw the same number."""
-    return -(-rays // world_size())
-
-
 def average_gradients(parameters: Iterable[Tensor]) -> None:
-    """Replace each gradient by its mean over the processes.
+    """Replace each gradient by its mean over the processes, of which there are several.
 
     A missing gradient counts as zero, so that all processes exchange the same tensors whichever
     parameters their rays have reached. Of a large grid (X, Y, Z, C) only the points are exchanged
     that a ray of any process has reached, unless these are most of them.
     """
     size = world_size()
-    if size == 1:
-        return
     dense: list[Tensor] = []
     grids: list[Tensor] = []
     for parameter in parameters:

@@ -37,8 +37,6 @@ from devrf.engine.ddp import (
     average_gradients,
     broadcast,
     check_strategy,
-    rays_per_rank,
-    world_size,
 )
 from devrf.engine.grid_adam import GridAdam
 from devrf.engine.phase import Phase
@@ -209,7 +207,9 @@ class Stage(LightningModule, ABC):
             if loss.requires_grad:  # it has no gradient where no ray meets anything
                 with span("backward"):
                     self.manual_backward(loss)
-            average_gradients(p for group in self.optimizer.param_groups for p in group["params"])
+            if self.processes > 1:
+                groups = self.optimizer.param_groups
+                average_gradients(p for group in groups for p in group["params"])
             return {"loss": loss.detach(), **terms}
         except (RuntimeError, MemoryError) as error:
             if not is_oom(error):
@@ -226,9 +226,9 @@ class Stage(LightningModule, ABC):
         Raises:
             DevrfError: there are several processes: the others already wait for this one.
         """
-        if world_size() > 1:
+        if self.processes > 1:
             raise DevrfError(
-                f"schedule: one of {world_size()} processes is {shortage}; fewer rays, smaller "
+                f"schedule: one of {self.processes} processes is {shortage}; fewer rays, smaller "
                 "grids or more processes"
             )
         if self.batch_share / 2 < self.smallest_share:
@@ -340,13 +340,21 @@ class Stage(LightningModule, ABC):
         """How many rays of a batch this process draws.
 
         Args:
-            rays: of the schedule's batches, over all processes.
-            most: of this process's batches, where these are smaller.
+            rays: of the schedule's batches.
+            most: rays of a batch at most, if there is a limit.
         """
-        whole = rays_per_rank(rays)
-        if most is not None:
-            whole = min(whole, most)
-        return max(1, round(whole * self.batch_share))
+        whole = rays if most is None else min(rays, most)
+        return max(1, round(whole * self.share))
+
+    @property
+    def share(self) -> float:
+        """The part of the schedule's batches that this process draws."""
+        return self.batch_share / self.processes
+
+    @property
+    def processes(self) -> int:
+        """How many processes learn together."""
+        return self.trainer.world_size
 
     @property
     def background_name(self) -> str:

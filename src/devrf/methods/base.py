@@ -163,13 +163,13 @@ class RayTrainable(Renderable):
         """
 
     def further_pixels(
-        self, generator: torch.Generator, batch_share: float
+        self, generator: torch.Generator, share: float
     ) -> tuple[Tensor, Tensor] | None:
         """Pixels that the next batch has beside those drawn from all images; None: none.
 
         Args:
             generator: draws them.
-            batch_share: the part of the schedule's batches that is drawn.
+            share: the part of the schedule's batches that this process draws.
 
         Returns:
             image (K,), numbered as for :meth:`learn_from`, and row-major number (K,), int64.

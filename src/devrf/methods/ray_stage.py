@@ -232,7 +232,7 @@ class RayStage(Stage):
                 flats.append(flat)
                 offset += pool.images
                 times_left = None if times_left is None else max(1, times_left - pool.frames)
-            further = self.scene_model.further_pixels(self.generator, self.batch_share)
+            further = self.scene_model.further_pixels(self.generator, self.share)
             if further is not None:
                 image, flat = further
                 images.append(image)

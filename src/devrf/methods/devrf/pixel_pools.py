@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from devrf.data.batch import PixelPool, all_pixels, wanted_pixels
-from devrf.engine.ddp import world_size
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.rays import Rays
@@ -155,5 +154,5 @@ def images_of(views: Views, frame: int) -> Tensor:
 
 
 def rays_for_epochs(epochs: float, pixels: int, iterations: int) -> int:
-    """Rays of a batch of this process, of which ``iterations`` show each pixel ``epochs`` times."""
-    return max(round(epochs * pixels / iterations / world_size()), MIN_RAYS)
+    """Rays of a batch, of which ``iterations`` show each pixel ``epochs`` times."""
+    return max(round(epochs * pixels / iterations), MIN_RAYS)

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor, nn
 
 from devrf.data.batch import RayBatch
-from devrf.engine.ddp import rays_per_rank
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
@@ -116,13 +115,13 @@ class NSFF(NeuralField):
             log.info("nsff: zero, for what this scene and blend do not have: %s", listed)
 
     def further_pixels(
-        self, generator: torch.Generator, batch_share: float
+        self, generator: torch.Generator, share: float
     ) -> tuple[Tensor, Tensor] | None:
         """In the first N₀ iterations, pixels that move."""
         moving = None if self._images is None else self._images.moving
         if moving is None or not self.settings.hard_rays or self._step >= self._first:
             return None
-        rays = max(1, round(rays_per_rank(self.settings.hard_rays) * batch_share))
+        rays = max(1, round(self.settings.hard_rays * share))
         return moving.draw(rays, generator)
 
     def render_rays(
