@@ -18,7 +18,7 @@ from devrf.apps.images import (
     short_name,
     to_bytes,
 )
-from devrf.apps.still import StillSettings, write_contact_sheet
+from devrf.apps.still import StillSettings, still, write_contact_sheet
 from devrf.apps.video import VideoSettings, held_out_images, held_out_pictures, path_pictures
 from devrf.apps.video_file import write_pictures
 from devrf.checkpoints.checkpoint import Viewpoints
@@ -128,6 +128,20 @@ def test_held_out_pictures_are_rendered_in_the_films_size_beside_the_truth(
         seen = reference(moving, large.image_rays(index), time, torch.ones(3))
         shades = rendered.reshape(-1, 3) / 255
         torch.testing.assert_close(shades, seen.color, atol=0.51 / 255, rtol=0)
+
+
+def test_held_out_images_of_a_moving_camera_are_shown_at_their_own_times(moving, tiny_scene):
+    views = tiny_scene.dynamic.test
+    walked = replace(views, view=torch.arange(len(views)))
+    renderer = Renderer(moving)
+    images = held_out_images(walked, 2 * len(walked))
+    film = VideoSettings(height=18)
+    shown = list(held_out_pictures(renderer, walked, images, film, "white"))
+    for image, picture in zip(images, shown, strict=True):
+        color, _ = still(renderer, walked.cameras, float(walked.times[image]), 1.0, image)
+        assert torch.equal(picture[18:, 28:52], to_bytes(color))
+    # Each is rendered once.
+    assert len({id(picture) for picture in shown}) == len(set(images))
 
 
 def test_films_of_a_scene_at_rest_speak_of_no_time(learned, tiny_scene, monkeypatch):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 
 import torch
 from torch import Tensor
@@ -99,15 +100,20 @@ def held_out_pictures(
     settings: VideoSettings,
     background: Background,
 ) -> Iterator[Tensor]:
-    """Truth, rendering and depth (H', W', 3) side by side, while time runs from 0 to 1.
+    """Truth, rendering and depth (H', W', 3) side by side.
 
-    ``images`` are those of the ``views`` to show, one a frame (:func:`held_out_images`).
+    ``images`` are those of the ``views`` to show, one a frame (:func:`held_out_images`). Where a
+    camera stood still, time runs from 0 to 1. Where it moved, each image is shown at its own time:
+    from there nothing was taken at another.
     """
     cameras = settings.sized(views.cameras)
     behind = background_value(background)
     larger = ", enlarged" if cameras.height > views.height else ""
-    for frame, image in enumerate(images):
-        time = frame / max(len(images) - 1, 1)
+    times = torch.linspace(0, 1, len(images)).tolist()
+    if views.by_moving_camera and len(views) > 1:
+        times = views.times[images].tolist()
+    shots = zip(images, times, strict=True)
+    for (image, time), frames in groupby(shots):
         color, depth = still(renderer, cameras, time, behind, image)
         # Resized from its own size, not rendered: it shows what there is to compare with.
         truth = scaled(truth_image(views, image, background), cameras.height, cameras.width)
@@ -118,7 +124,8 @@ def held_out_pictures(
             at_time = f" at time {time:.2f}"
         size = f"({views.width}x{views.height}{larger})"
         headings = [f"truth{at} {size}", f"rendered{at_time}", DEPTH]
-        yield image_grid([[truth, color, depth]], headings)
+        picture = image_grid([[truth, color, depth]], headings)
+        yield from (picture for _ in frames)
 
 
 def held_out_images(views: Views, frames: int) -> list[int]:
