@@ -25,7 +25,7 @@ HERE = Path(__file__).resolve().parent.parent
 # What a worker prints its result behind.
 MARK = "result: "
 PICTURE = 400
-ROUNDS = 5
+ROUNDS = 15
 
 
 def main() -> None:

@@ -134,11 +134,14 @@ class Box:
 
     def grid_points(self, shape: tuple[int, int, int], like: Tensor) -> Tensor:
         """(X, Y, Z, 3) positions of a grid whose corners sit on the box's corners."""
-        axes = [
+        return torch.stack(torch.meshgrid(*self.grid_lines(shape, like), indexing="ij"), dim=-1)
+
+    def grid_lines(self, shape: tuple[int, int, int], like: Tensor) -> list[Tensor]:
+        """Its coordinates along each axis: (X,), (Y,) and (Z,)."""
+        return [
             torch.linspace(a, b, n, dtype=like.dtype, device=like.device)
             for a, b, n in zip(self.low, self.high, shape, strict=True)
         ]
-        return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
 
     def crossing(
         self, rays: Rays, near: float = -math.inf, far: float = math.inf

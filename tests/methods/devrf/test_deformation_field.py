@@ -48,6 +48,20 @@ def test_between_frames_by_hand(cube):
     torch.testing.assert_close(field.unwarp(x, 0.3), x)
 
 
+@pytest.mark.parametrize("still_outside", [False, True])
+@pytest.mark.parametrize("time", [0.0, 0.2, 0.3])
+def test_the_points_of_any_grid_are_moved_as_points_are(cube, time, still_outside):
+    field = DeformationField(cube, CLOCK, voxels=125, still_outside=still_outside)
+    field.to_canonical[1:].normal_()
+    # A grid that reaches out of the field on some sides, one that shares its faces, one within.
+    larger = Box((-1.5, -1.0, -0.5), (1.0, 2.0, 0.5))
+    for box, shape in ((larger, (6, 7, 3)), (cube, (8, 5, 6)), (cube, field.shape)):
+        warp = field.warp_at(time)
+        moved = warp.of_grid(box, shape, torch.device("cpu"))
+        grid = box.grid_points(shape, torch.empty(0)).view(-1, 3)
+        torch.testing.assert_close(moved, warp(grid), atol=1e-5, rtol=0)
+
+
 def test_resizing_keeps_a_linear_motion_exactly_and_frames_never_trained_zero(cube, rng):
     field = DeformationField(cube, CLOCK, voxels=27)
     turn = torch.tensor([[0.1, -0.3, 0.0], [0.2, 0.0, 0.1], [0.0, 0.5, -0.2]])

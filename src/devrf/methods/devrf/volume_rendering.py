@@ -145,8 +145,7 @@ def points_that_arrive(
     Returns:
         Their rows (K,) in the grid, and where they move to, (K, 3).
     """
-    points = box.grid_points(shape, torch.empty(0, device=occupancy.mask.device))
-    moved = warp(points.view(-1, 3))
+    moved = warp.of_grid(box, shape, occupancy.mask.device)
     rows = occupancy.at(moved).nonzero()[:, 0]
     return rows, moved[rows]
 
