@@ -64,10 +64,10 @@ def test_means_over_iterations() -> None:
     terms = [
         {"render": torch.tensor(factor), "loss": torch.tensor(2 * factor)} for factor in (1.0, 3.0)
     ]
-    means = mean_terms(terms)
+    means = mean_terms(terms, processes=1)
     assert {name: float(mean) for name, mean in means.items()} == {"render": 2.0, "loss": 4.0}
     assert float(terms[0]["loss"]) == 2.0
-    assert mean_terms([]) == {}
+    assert mean_terms([], processes=1) == {}
 
 
 def test_when_memory_runs_out_batches_are_halved(fit, memory_for, caplog):

@@ -1,6 +1,6 @@
 """Data parallelism: several processes draw their shares of a batch and take the same step.
 
-With one process all but :func:`average_gradients` change nothing and return their arguments.
+Means are of several processes; with one, the other functions change nothing.
 """
 
 from __future__ import annotations
@@ -144,11 +144,8 @@ def largest(values: Sequence[int], device: torch.device) -> list[int]:
 
 
 def average(values: Tensor) -> Tensor:
-    """Means of ``values`` over the processes; all processes pass the same shape."""
-    size = world_size()
-    if size == 1:
-        return values
-    means = values / size
+    """Means of ``values`` over several processes, all of which pass the same shape."""
+    means = values / world_size()
     distributed.all_reduce(means)
     return means
 

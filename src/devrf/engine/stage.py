@@ -185,7 +185,7 @@ class Stage(LightningModule, ABC):
             self.previous_iteration = present
             self.iteration += 1
             self.iterations_done += 1
-        means = mean_terms(losses)
+        means = mean_terms(losses, self.processes)
         if losses and self.iteration < stop and self.converged(means["loss"]):
             self.iteration = stop
         self._reseed()
@@ -623,9 +623,11 @@ def _counts(stored: Any, like: Any) -> Any:
     return built(Count if type(like) is int else type(like), stored)
 
 
-def mean_terms(iterations: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
-    """The means () of terms () by name, over iterations that have the same, and all processes."""
+def mean_terms(iterations: Sequence[Mapping[str, Tensor]], processes: int) -> dict[str, Tensor]:
+    """The means () of terms () by name, over iterations that have the same, and ``processes``."""
     if not iterations:
         return {}
     total = reduce(torch.add, (torch.stack(list(terms.values())) for terms in iterations))
-    return dict(zip(iterations[0], (average(total) / len(iterations)).unbind(), strict=True))
+    if processes > 1:
+        total = average(total)
+    return dict(zip(iterations[0], (total / len(iterations)).unbind(), strict=True))
