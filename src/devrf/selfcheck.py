@@ -126,7 +126,6 @@ class SmallScene:
             devices=[self.device.index or 0] if gpu else 1,
             deterministic=variant.deterministic,
             max_epochs=1,
-            use_distributed_sampler=False,
             callbacks=[GridUpscaling(), LearningRateDecay(), *callbacks],
             logger=False,
             enable_checkpointing=False,

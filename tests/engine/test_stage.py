@@ -70,6 +70,14 @@ def test_means_over_iterations() -> None:
     assert mean_terms([], processes=1) == {}
 
 
+def test_each_of_several_processes_draws_its_share(monkeypatch):
+    monkeypatch.setattr(CanonicalStage, "processes", 4)
+    stage = canonical()
+    assert [stage.rays_to_draw(64), stage.rays_to_draw(64, most=40)] == [16, 10]
+    stage.batch_share = 0.5
+    assert [stage.rays_to_draw(64), stage.rays_to_draw(1)] == [8, 1]
+
+
 def test_when_memory_runs_out_batches_are_halved(fit, memory_for, caplog):
     calls = memory_for(32)
     with caplog.at_level(logging.WARNING, logger="devrf"):

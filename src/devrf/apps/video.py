@@ -103,8 +103,8 @@ def held_out_pictures(
     """Truth, rendering and depth (H', W', 3) side by side.
 
     ``images`` are those of the ``views`` to show, one a frame (:func:`held_out_images`). Where a
-    camera stood still, time runs from 0 to 1. Where it moved, each image is shown at its own time:
-    from there nothing was taken at another.
+    camera took several, time runs from 0 to 1. Where each is of a place of its own, it is shown at
+    its own time: from there nothing was taken at another.
     """
     cameras = settings.sized(views.cameras)
     behind = background_value(background)

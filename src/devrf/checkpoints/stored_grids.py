@@ -64,7 +64,7 @@ def pack(grids: Tensor, keep: Tensor, *, smooth: bool) -> Packed | Tensor:
 
 
 def unpack(
-    packed: Any, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
+    stored: Any, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
 ) -> Any:
     """The grids that :func:`pack` stored, on ``device``; what is not packed as it is.
 
@@ -72,14 +72,13 @@ def unpack(
         RuntimeError | KeyError | ValueError: the parts do not fit together.
         OutOfMemoryError: the grids take more than is free.
     """
-    if not isinstance(packed, dict) or "kept" not in packed:
-        return packed
-    x, y, z = (int(points) for points in packed["shape"])
+    if not isinstance(stored, dict) or "kept" not in stored:
+        return stored
+    x, y, z = (int(points) for points in stored["shape"])
     shape = (x, y, z)
     voxels = x * y * z
-    elsewhere = packed["elsewhere"].to(device, torch.float32)
-    stored = packed["keep"]
-    masks, bits = stored.shape
+    elsewhere = stored["elsewhere"].to(device, torch.float32)
+    masks, bits = stored["keep"].shape
     if min(shape) < 1 or bits != math.ceil(voxels / 8) or masks not in (1, len(elsewhere)):
         raise ValueError("masks of other voxels than the grids have")
     if not elsewhere.numel() or elsewhere.ndim not in (2, 5):
@@ -87,14 +86,14 @@ def unpack(
     values = len(elsewhere) * voxels * elsewhere.shape[-1]
     # A module copies them.
     need_memory(2 * values * dtype.itemsize + masks * voxels, "its fields", device)
-    keep = [unpack_bits(mask, shape, device) for mask in stored]
+    keep = [unpack_bits(mask, shape, device) for mask in stored["keep"]]
     keep = keep * len(elsewhere) if masks == 1 else keep
-    details = packed["kept"].to(device, dtype).split([int(mask.sum()) for mask in keep])
+    details = stored["kept"].to(device, dtype).split([int(mask.sum()) for mask in keep])
     grids: Tensor = elsewhere.new_empty(len(elsewhere), *shape, elsewhere.shape[-1], dtype=dtype)
     for grid, rest, mask, detail in zip(grids, elsewhere, keep, details, strict=True):
         grid.copy_(rest if rest.ndim == 1 else resample(rest, shape))
         grid[mask] = detail
-    return grids if packed["many"] else grids[0]
+    return grids if stored["many"] else grids[0]
 
 
 def _thinned(shape: Sequence[int]) -> tuple[int, int, int]:

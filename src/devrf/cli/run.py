@@ -64,10 +64,10 @@ AFTER_LEARNING: dict[str, Step] = {
 RESULTS = ("metrics.json", "images", "videos", "checkpoints")
 NEXT = ("stage=still still.time=0.35 still.height=400", "stage=view")
 
-# Lightning's messages on accelerators, tips and data loaders say nothing about this run.
+# Lightning's messages on accelerators and tips say nothing about this run.
 for _name in ("lightning.pytorch", "lightning.fabric"):
     logging.getLogger(_name).setLevel(logging.WARNING)
-_IGNORED = "many workers|LeafSpec|GPU available but not used|Experiment logs directory"
+_IGNORED = "LeafSpec|GPU available but not used|Experiment logs directory"
 _IGNORED += "|callbacks used to create the checkpoint"  # a resumed run may be watched otherwise
 warnings.filterwarnings("ignore", message=f".*({_IGNORED})")
 

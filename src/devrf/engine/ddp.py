@@ -1,6 +1,6 @@
 """Data parallelism: several processes draw their shares of a batch and take the same step.
 
-Means are of several processes; with one, the other functions change nothing.
+The functions that average are for several processes; with one, the others change nothing.
 """
 
 from __future__ import annotations

@@ -137,7 +137,7 @@ class Box:
         return torch.stack(torch.meshgrid(*self.grid_lines(shape, like), indexing="ij"), dim=-1)
 
     def grid_lines(self, shape: tuple[int, int, int], like: Tensor) -> list[Tensor]:
-        """Its coordinates along each axis: (X,), (Y,) and (Z,)."""
+        """Coordinates of :meth:`grid_points` along each axis: (X,), (Y,) and (Z,)."""
         return [
             torch.linspace(a, b, n, dtype=like.dtype, device=like.device)
             for a, b, n in zip(self.low, self.high, shape, strict=True)
