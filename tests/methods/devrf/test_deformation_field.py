@@ -62,6 +62,18 @@ def test_the_points_of_any_grid_are_moved_as_points_are(cube, time, still_outsid
         torch.testing.assert_close(moved, warp(grid), atol=1e-5, rtol=0)
 
 
+@pytest.mark.parametrize("lost", [float("nan"), float("inf")])
+def test_a_displacement_that_is_no_number_moves_only_what_is_around_it_out_of_the_box(cube, lost):
+    field = DeformationField(cube, CLOCK, voxels=80, planes=3)
+    field.to_canonical[1, 0, 0, 0, 1] = lost
+    shape = tuple(2 * n - 1 for n in field.shape)
+    moved = field.warp_at(0.2).of_grid(cube, shape, torch.device("cpu")).view(*shape, 3)
+    kept = moved == cube.grid_points(shape, moved)
+    assert not cube.contains(moved[:2, :2, :2]).any()
+    kept[:2, :2, :2] = True
+    assert kept.all()
+
+
 def test_resizing_keeps_a_linear_motion_exactly_and_frames_never_trained_zero(cube, rng):
     field = DeformationField(cube, CLOCK, voxels=27)
     turn = torch.tensor([[0.1, -0.3, 0.0], [0.2, 0.0, 0.1], [0.0, 0.5, -0.2]])

@@ -15,6 +15,8 @@ from devrf.kernels.look_up import look_up
 from devrf.methods.devrf.frame_store import FrameField, FrameStore
 from devrf.ops.trilinear import Shape
 
+# Far away, in longest edges of a box.
+FAR = 1000.0
 # Points (M, 3) → where they move to, (M, 3).
 Warp = Callable[[Tensor], Tensor]
 
@@ -58,14 +60,15 @@ class GridWarp:
         """The points of a grid of ``shape`` over ``box``, moved: (M, 3), as columns in memory.
 
         As the warp of these points, faster: between two grids along the same axes interpolation is
-        a matrix for each axis. A displacement that is no number moves nothing.
+        a matrix for each axis. Displacements that are no numbers lead far away.
         """
         lines = box.grid_lines(shape, torch.empty(0, device=device))
         points = torch.stack(torch.meshgrid(*lines, indexing="ij"))
         moves = self.displacement
         if moves is not None:
-            # In a product it would leave no number anywhere.
-            moves = moves.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0).permute(3, 0, 1, 2)
+            # Products of matrices would spread what is no number to all points.
+            far = FAR * self.box.longest
+            moves = moves.nan_to_num(nan=far, posinf=far, neginf=far).permute(3, 0, 1, 2)
             for axis, line in enumerate(lines):
                 # An axis of the displacements goes, one of the points comes last.
                 weights = self._weights(axis, line, moves.shape[1])
