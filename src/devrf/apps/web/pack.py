@@ -81,8 +81,11 @@ def page(model: Renderable, viewpoints: Viewpoints, name: str, checkpoint: str) 
             "give export.format=ply, or look at it with viewer.renderer=server"
         )
     assert isinstance(model, DeVRFModel)
-    parts = dict(_parts(model, viewpoints.static.positions))
-    sizes = {part.partition("-")[0]: values.shape[2::-1] for part, values in parts.items()}
+    sizes: dict[str, tuple[int, ...]] = {}
+    elements = []
+    for part, values in _parts(model, viewpoints.static.positions):
+        sizes[part.partition("-")[0]] = values.shape[2::-1]
+        elements.append(_element(part, values))
     description = _description(model, viewpoints) | {"name": name, "shapes": sizes}
     folder = files("devrf.apps.web")
     texts = {
@@ -92,7 +95,7 @@ def page(model: Renderable, viewpoints: Viewpoints, name: str, checkpoint: str) 
         "script": folder.joinpath("scene.js").read_text("utf-8"),
         # No name in it may end the element.
         "description": json.dumps(description).replace("<", "\\u003c"),
-        "data": "\n".join(_element(part, values) for part, values in parts.items()),
+        "data": "\n".join(elements),
     }
     text = folder.joinpath("scene.html").read_text("utf-8")
     for word, filling in texts.items():
