@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,7 +11,15 @@ import psutil
 import pytest
 import torch
 
-from devrf.system.memory import free_host_memory, gib, is_oom, numbers
+from devrf.system.memory import (
+    free_cache,
+    free_host_memory,
+    gib,
+    is_oom,
+    numbers,
+    own_memory,
+)
+from devrf.system.process import tune_for_cpu
 
 MIB = 2**20
 GPU = "CUDA out of memory. Tried to allocate 20.00 MiB. GPU 0 has a total capacity of 23.68 GiB"
@@ -83,3 +92,15 @@ def test_the_numbers_of_an_error(said: str, asked: str) -> None:
 
 def test_bytes_in_gib() -> None:
     assert [gib(n * 2**30) for n in (21.34, 1.16, 0.0342)] == ["21.3", "1.2", "0.034"]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="another C library")
+def test_what_the_c_library_keeps_is_freed() -> None:
+    tune_for_cpu()
+    filled = [torch.ones(2**21) for _ in range(16)]  # of 8 MiB, in the heap
+    last = torch.ones(2**18)  # so that what is freed is not the heap's end
+    del filled
+    kept = own_memory()
+    free_cache(torch.device("cpu"))
+    assert kept - own_memory() > 100 * MIB
+    assert last.all()

@@ -181,8 +181,6 @@ def _learn(run: RunContext, learning: Names) -> None:
             raise DevrfError(f"{run.folder}: not there on every node; {shared}")
         for name in run.learnable(learning):
             _take(run, name, partial(learn, name=name))
-            # What a stage's trainer holds in circles would count as the next stage's memory.
-            free_cache(run.device)
 
 
 def _take(run: RunContext, name: str, step: Step) -> None:
@@ -191,6 +189,8 @@ def _take(run: RunContext, name: str, step: Step) -> None:
     known = OmegaConf.select(run.config, rays) is not None
     with shortage_in_words(name, run.device, rays if known else None):
         files = step(run)
+    # What a step leaves, a trainer that is held in circles, would count as the next step's memory.
+    free_cache(run.device)
     note_done(run, name, files)
     run.step_began = time.perf_counter()
 

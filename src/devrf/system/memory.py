@@ -12,6 +12,7 @@ import psutil
 import torch
 
 from devrf.errors import DevrfError
+from devrf.system.process import return_free_memory
 
 # Messages of torch's allocators and libraries (oneDNN's do not mention memory); on a GPU the error
 # has a class of its own.
@@ -102,13 +103,14 @@ def is_oom(error: BaseException) -> bool:
 
 
 def free_cache(device: torch.device) -> None:
-    """Free what torch keeps without using it.
+    """Free what torch and the C library keep without using it.
 
     What an error's traceback holds stays: call this after the ``except`` block.
     """
     gc.collect()
     if device.type == "cuda":
         torch.cuda.empty_cache()
+    return_free_memory()
 
 
 @contextmanager
