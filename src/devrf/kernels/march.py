@@ -76,8 +76,8 @@ class _March(torch.autograd.Function):
         # Without displacements there is an array that is not read.
         moves = density.new_empty(0, 3) if displacement is None else displacement.contiguous()
         inputs = [geometry, lines, medium.path.surroundings.distances.flatten()]
-        inputs += [density.contiguous(), moves, visible_start, visible, visible_count]
-        inputs += [significant_count, transmittance]
+        inputs += [density.contiguous(), moves, int(device.type == "cpu"), visible_start]
+        inputs += [visible, visible_count, significant_count, transmittance]
         kernel = march_kernel(isinstance(rays, ContractedRays))
         launch(kernel, len(rays), inputs, device, grain=GRAIN_OF_RAYS)
 
@@ -405,16 +405,24 @@ def march_kernel(contracted: bool) -> wp.Kernel:
         distances: wp.array(dtype=wp.uint8),
         density: wp.array(dtype=Density),
         displacements: wp.array(dtype=wp.vec3),
+        in_order: int,
         visible_start: wp.array(dtype=wp.int64),
         visible: wp.array(dtype=VisibleSample),
         visible_count: wp.array(dtype=int),
         significant_count: wp.array(dtype=int),
         transmittance: wp.array(dtype=float),
     ):
-        """τ_i and w_i = T_i α_i of each ray's visible samples, and T_end."""
+        """τ_i and w_i = T_i α_i of each ray's visible samples, and T_end.
+
+        Where rays are followed ``in_order``, one after another, each ray's samples begin where
+        those of the ray before end: what is written lies close together. Else each has its room.
+        """
         number = first + wp.tid()
         ray = rays[number]
         start = int(visible_start[number])
+        if in_order == 1 and number > first:
+            start = int(visible_start[number - 1]) + visible_count[number - 1]
+            visible_start[number] = wp.int64(start)
         count = int(0)
         significant = int(0)
         left = float(1.0)

@@ -22,11 +22,9 @@ from devrf.rendering.output import ColorChange, RenderedImage
 from devrf.rendering.sampling import RenderSettings
 from devrf.system.threads import one_thread
 
-# Rays at once: on a CPU so many that what a chunk costs by itself, 0.8 ms, is little (in unbounded
-# scenes a ray has tens of samples to colour), and no more than whose samples fit 32 MB, beyond
-# which memory is mapped anew (docs/notebook/costs.md#tiles); on a GPU what keeps it busy and fits.
+# Rays at once: on a CPU so many that what a chunk costs by itself, 0.8 ms, is little
+# (docs/notebook/costs.md#tiles); on a GPU what keeps it busy and fits.
 ON_CPU = 2**14
-UNBOUNDED_ON_CPU = 4096
 ON_GPU = 2**15
 # Points of a grid that are worth several threads.
 MANY = 2**20
@@ -80,9 +78,7 @@ class DeVRFView:
     @property
     def chunk(self) -> int:
         """Rays that are best rendered at once."""
-        if self.canonical.density.values.is_cuda:
-            return ON_GPU
-        return ON_CPU if self.space.is_linear else UNBOUNDED_ON_CPU
+        return ON_GPU if self.canonical.density.values.is_cuda else ON_CPU
 
     @property
     def picture_settings(self) -> RenderSettings:
