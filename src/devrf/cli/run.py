@@ -189,7 +189,7 @@ def _take(run: RunContext, name: str, step: Step) -> None:
     known = OmegaConf.select(run.config, rays) is not None
     with shortage_in_words(name, run.device, rays if known else None):
         files = step(run)
-    # What a step leaves, a trainer that is held in circles, would count as the next step's memory.
+    # What a step leaves, as a trainer held in circles, would count as the next step's memory.
     free_cache(run.device)
     note_done(run, name, files)
     run.step_began = time.perf_counter()

@@ -414,8 +414,9 @@ def march_kernel(contracted: bool) -> wp.Kernel:
     ):
         """τ_i and w_i = T_i α_i of each ray's visible samples, and T_end.
 
-        Where rays are followed ``in_order``, one after another, each ray's samples begin where
-        those of the ray before end: what is written lies close together. Else each has its room.
+        Where a launch's part follows its rays ``in_order``, one after another in one thread, as on
+        a CPU, each ray's samples begin where those of the ray before end: what is written lies
+        close together. Else each has its room.
         """
         number = first + wp.tid()
         ray = rays[number]

@@ -34,7 +34,8 @@ def tune_for_cpu() -> None:
     ``MALLOC_ARENA_MAX`` says otherwise: what heaps of their own kept was 0.06 to 0.14 GB of the
     quickstart's 1.2.
 
-    Of no effect once torch is loaded, on a GPU, or where the C library is not glibc.
+    What threads do is fixed once torch is loaded; the rest has no effect where the C library is not
+    glibc.
     """
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", "1000")
@@ -49,7 +50,7 @@ def tune_for_cpu() -> None:
 
 
 def return_free_memory() -> None:
-    """Give back to the system what the C library has kept since :func:`tune_for_cpu`."""
+    """Give back to the system what the C library keeps free; nothing where that is not glibc."""
     trim = _of_glibc("malloc_trim")
     if trim is not None:
         trim(0)
