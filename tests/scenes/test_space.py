@@ -22,8 +22,8 @@ from devrf.scenes.bounds import (
     depth_range,
     inward_bounds,
 )
-from devrf.scenes.scene import Bounds, Views
-from devrf.scenes.space import NEAR_SHARE, SHELL, inward_space
+from devrf.scenes.scene import Bounds, Capture, Scene, Views
+from devrf.scenes.space import NEAR_SHARE, SHELL, dynamic_only, inward_space
 
 
 def test_axes_meet_where_the_cameras_look(ring_cameras):
@@ -121,3 +121,41 @@ def test_a_given_box_is_the_inner_box(ball_views: Callable[..., Views]) -> None:
         chosen(views, "contracted", near=math.inf)
     with pytest.raises(DevrfError, match=r"not 9 and 3; the cameras say data.near=\S+ data.far="):
         chosen(views, "world", near=9.0, far=3.0)
+
+
+def film(views: Views, **options: Any) -> Scene:
+    """A scene whose captures are both the same images."""
+    space, bounds = chosen(views, "contracted", **options)
+    capture = Capture(train=views, test=views)
+    return Scene("film", "inward", capture, capture, bounds, "white", space)
+
+
+def test_without_its_static_set_a_scene_keeps_bounds_that_it_does_not_owe_to_it(
+    ball_views: Callable[..., Views],
+) -> None:
+    views = ball_views(PLACES, 0.4, channels=3)
+    scene = film(views, bound_scale=2.0)
+    alone = dynamic_only(scene)
+    assert alone.bounds == scene.bounds and alone.space == scene.space
+    assert alone.static.train.times.tolist() == [0.0] * 4
+
+    moved = views.cameras.camera_to_world.clone()
+    moved[:, :, 3] *= 2
+    farther = replace(views, cameras=replace(views.cameras, camera_to_world=moved))
+    found = replace(film(farther), dynamic=scene.dynamic)
+    assert found.static.train is not found.dynamic.train
+    assert dynamic_only(found).space == film(views).space != found.space
+    given = replace(film(farther, box=BOX, near=0.2), dynamic=scene.dynamic)
+    assert dynamic_only(given).bounds == given.bounds
+
+
+def test_cameras_that_look_in_one_direction_need_not_tell_where_a_given_box_is(
+    ball_views: Callable[..., Views],
+) -> None:
+    views = ball_views(PLACES, 0.4, channels=3)
+    where = views.cameras.positions
+    parallel = Cameras.looking_at(
+        where, where - torch.tensor([0.0, 1, 0]), focal=20, width=16, height=16
+    )
+    scene = film(replace(views, cameras=parallel), box=BOX, near=0.2)
+    assert dynamic_only(scene).space.inner(scene.bounds.box) == BOX

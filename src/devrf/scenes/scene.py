@@ -165,6 +165,7 @@ class Bounds:
             its centre, so that motion has room; not used when ``motion`` is known.
         source: where the motion box came from, in words, for the log.
         limited: whether motion has no more room than the box: it was given, and nothing is known.
+        box_given: whether the box was stated, not found from the static cameras.
         reason: why the scene is learned in its space, in words.
         box_source: where the box came from, in words.
     """
@@ -176,6 +177,7 @@ class Bounds:
     scale: float
     source: str
     limited: bool = False
+    box_given: bool = False
     reason: str = ""
     box_source: str = ""
 

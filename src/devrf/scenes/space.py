@@ -64,17 +64,17 @@ def inward_space(
     Raises:
         DevrfError: the cameras do not say where the scene is, or near is not before far.
     """
-    box_given = "data.box is given" if box else ""
+    given = "data.box is given" if box else ""
     masks = "the images have alpha masks" if static.cut_out else "the images have no alpha masks"
     if choice == "world" or (choice == "auto" and (static.cut_out or box)):
         bounds = inward_bounds(
             static, dynamic, everyone, bound_scale=bound_scale, near=near, far=far, box=box
         )
-        why = "data.space=world" if choice == "world" else box_given or masks
-        where = box_given or "what the static cameras all see"
-        return WORLD, replace(bounds, reason=why, box_source=where)
+        why = "data.space=world" if choice == "world" else given or masks
+        where = given or "what the static cameras all see"
+        return WORLD, replace(bounds, box_given=box is not None, reason=why, box_source=where)
     inner = box or box_from_cameras(static.cameras)
-    where = box_given
+    where = given
     if box is None:
         where = "what the static cameras all see"
         motion = motion_box(dynamic, inner) if dynamic is not None and dynamic.cut_out else None
@@ -93,7 +93,15 @@ def inward_space(
         raise scene_error("data.near", f"expected a distance of 0 or more, not {near:g}")
     why = "data.space=contracted" if choice == "contracted" else f"{masks}, data.box is not given"
     return space, Bounds(
-        space.box, near, math.inf, None, 1.0, "the box", reason=why, box_source=where
+        box=space.box,
+        near=near,
+        far=math.inf,
+        motion=None,
+        scale=1.0,
+        source="the box",
+        box_given=box is not None,
+        reason=why,
+        box_source=where,
     )
 
 
@@ -148,8 +156,9 @@ def centred(static: Capture, dynamic: Capture) -> tuple[Capture, Capture]:
 def dynamic_only(scene: Scene) -> Scene:
     """The scene without its static set: the dynamic images of time 0 stand in for it.
 
-    Bounds are found anew, from the dynamic training cameras alone; DevrfError if these do not
-    tell.
+    Bounds that the static cameras have told are found anew, from the dynamic training cameras
+    alone; DevrfError if these do not tell. A box that was given stays, and so do the bounds of a
+    film, whose images are both captures.
     """
     views = scene.dynamic.train
     held_out = scene.dynamic.test
@@ -157,6 +166,8 @@ def dynamic_only(scene: Scene) -> Scene:
     if isinstance(scene.space, NormalizedDevice):
         bounds = forward_bounds([views], scene.space, "all that the dynamic cameras see")
         return replace(scene, static=at_rest, bounds=bounds)
+    if scene.bounds.box_given or scene.static.train is views:
+        return replace(scene, static=at_rest)
     choice: SpaceChoice = "world" if scene.space.is_linear else "contracted"
     space, bounds = inward_space(choice, views, views, [views, held_out])
     return replace(scene, static=at_rest, bounds=bounds, space=space)
