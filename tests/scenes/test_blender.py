@@ -16,7 +16,9 @@ import numpy as np
 import pytest
 import torch
 
+from devrf.data.priors import without_priors
 from devrf.scenes.formats.blender import BlenderReader
+from devrf.scenes.space import dynamic_only
 
 
 def test_published_layout(scene_folder):
@@ -31,7 +33,7 @@ def test_published_layout(scene_folder):
     assert train.names[3] == "dynamic_2views/train/r_003.png"
     assert train.pixels[3, 10, 15].tolist() == [3, 100, 200, 255]
     assert scene.clock.times == (0.0, 0.5, 1.0)
-    assert train.flow is None
+    assert train.flow is None and not scene.is_film
     assert scene.static.train.times.tolist() == [0] * 6
     assert scene.static.train.view.tolist() == list(range(6))
 
@@ -116,6 +118,15 @@ def test_single_folder_learns_the_static_scene_from_early_images(single_folder, 
     assert scene.bounds.motion is None  # never two cameras at one time
     whole = BlenderReader(single_folder).read()
     assert len(whole.static.train) == 8 and len(whole.static.test) == 3
+
+
+@pytest.mark.parametrize("static_until", [0.5, 1.0])
+def test_a_film_keeps_its_bounds_where_a_method_has_no_static_set(single_folder, static_until):
+    read = BlenderReader(single_folder, static_until=static_until, near=0.3, far=9.0).read()
+    for scene in (read, without_priors(read)):
+        assert scene.is_film
+        alone = dynamic_only(scene)
+        assert alone.bounds == scene.bounds and (alone.bounds.near, alone.bounds.far) == (0.3, 9.0)
 
 
 @pytest.mark.parametrize(("name", "images"), [("lego", 2), ("other", 3)])

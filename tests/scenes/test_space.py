@@ -95,6 +95,7 @@ def test_alpha_masks_and_a_given_box_mean_the_world(ball_views: Callable[..., Vi
     space, bounds = chosen(ball_views(PLACES, 0.4, channels=3), box=BOX)
     assert space == WORLD and bounds.reason == "data.box is given"
     assert bounds.box == BOX and bounds.limited and "data.box" in bounds.source
+    assert bounds.box_given and not chosen(ball_views(PLACES, 0.4))[1].box_given
 
 
 def test_without_alpha_masks_the_scene_is_unbounded(ball_views: Callable[..., Views]) -> None:
@@ -117,6 +118,8 @@ def test_a_given_box_is_the_inner_box(ball_views: Callable[..., Views]) -> None:
     assert wider.longest == pytest.approx(
         2 * chosen(ball_views(PLACES, 0.4, channels=3))[1].box.longest
     )
+    space, bounds = chosen(views, "contracted", box=BOX, bound_scale=2.0)
+    assert space.inner(bounds.box) == BOX.scaled(2.0) and bounds.box_source.endswith("x 2")
     with pytest.raises(DevrfError, match="data.near"):
         chosen(views, "contracted", near=math.inf)
     with pytest.raises(DevrfError, match=r"not 9 and 3; the cameras say data.near=\S+ data.far="):
@@ -139,11 +142,14 @@ def test_without_its_static_set_a_scene_keeps_bounds_that_it_does_not_owe_to_it(
     assert alone.bounds == scene.bounds and alone.space == scene.space
     assert alone.static.train.times.tolist() == [0.0] * 4
 
+    assert scene.is_film
+
     moved = views.cameras.camera_to_world.clone()
     moved[:, :, 3] *= 2
-    farther = replace(views, cameras=replace(views.cameras, camera_to_world=moved))
+    cameras = replace(views.cameras, camera_to_world=moved)
+    farther = replace(views, cameras=cameras, names=tuple(f"static {n}" for n in views.names))
     found = replace(film(farther), dynamic=scene.dynamic)
-    assert found.static.train is not found.dynamic.train
+    assert not found.is_film
     assert dynamic_only(found).space == film(views).space != found.space
     given = replace(film(farther, box=BOX, near=0.2), dynamic=scene.dynamic)
     assert dynamic_only(given).bounds == given.bounds
@@ -157,5 +163,5 @@ def test_cameras_that_look_in_one_direction_need_not_tell_where_a_given_box_is(
     parallel = Cameras.looking_at(
         where, where - torch.tensor([0.0, 1, 0]), focal=20, width=16, height=16
     )
-    scene = film(replace(views, cameras=parallel), box=BOX, near=0.2)
-    assert dynamic_only(scene).space.inner(scene.bounds.box) == BOX
+    alone = dynamic_only(film(replace(views, cameras=parallel), box=BOX, near=0.2))
+    assert alone.space.inner(alone.bounds.box) == BOX

@@ -10,6 +10,8 @@ import pytest
 
 from devrf.scenes.sparse_model import (
     AROUND,
+    LEFT_OUT,
+    LEFT_OUT_OF_FILM,
     ModelImage,
     SparseModel,
     ndc_holds,
@@ -60,3 +62,13 @@ def test_hand_held_cameras_share_contraction_around_their_points(scattered):
     low, high = (np.array(corner) for corner in world.box)
     inside = ((world.points.numpy() > low) & (world.points.numpy() < high)).all(axis=1)
     assert inside.mean() > 0.8
+
+
+@pytest.mark.parametrize("left_out", [LEFT_OUT, LEFT_OUT_OF_FILM])
+def test_the_inner_box_leaves_out_points_at_each_face(left_out):
+    world = normalised(model(NEAR_ONE_ANOTHER, turns=(-30, 30)), "inward", left_out=left_out)
+    low, high = (np.array(corner) for corner in world.box)
+    margin = (high - low) / 12  # a tenth of what is between, on both sides
+    around = world.points[world.points.norm(dim=1) < AROUND].numpy()
+    for beyond in (around < low + margin, around > high - margin):
+        assert beyond.mean(axis=0) * 100 == pytest.approx(left_out, abs=100 / len(around))

@@ -63,9 +63,7 @@ def with_equal_exposure(scene: Scene, choice: Exposure) -> Scene:
             ``none`` changes nothing.
     """
     train = scene.dynamic.train
-    # Without a static set images of the film stand in for it.
-    film = {*scene.static.train.names} & {*train.names}
-    possible = film and scene.moves and train.by_moving_camera and not train.cut_out
+    possible = scene.is_film and scene.moves and train.by_moving_camera and not train.cut_out
     theta = exposures(train) if possible and choice != "none" else None
     if theta is None:
         if choice == "equal":

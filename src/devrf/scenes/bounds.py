@@ -175,7 +175,7 @@ def inward_bounds(
             f"expected 0 <= near < far, not {near:g} and {far:g}; the cameras say "
             f"data.near={nearest:.3g} data.far={farthest:.3g}",
         )
-    return Bounds(box, near, far, motion, scale, source, limited)
+    return Bounds(box, near, far, motion, scale, source, limited, box_given=box_is_given)
 
 
 # Cosine of the steepest angle, about 84 degrees, to −z: beyond it the box grows without bound.

@@ -165,7 +165,7 @@ class Bounds:
             its centre, so that motion has room; not used when ``motion`` is known.
         source: where the motion box came from, in words, for the log.
         limited: whether motion has no more room than the box: it was given, and nothing is known.
-        box_given: whether the box was stated, not found from the static cameras.
+        box_given: whether the box was given by options or files, not found from the cameras.
         reason: why the scene is learned in its space, in words.
         box_source: where the box came from, in words.
     """
@@ -222,6 +222,11 @@ class Scene:
 
         for name in ("static", "dynamic"):
             object.__setattr__(self, name, getattr(self, name).mapped(with_frames))
+
+    @property
+    def is_film(self) -> bool:
+        """Whether there is no static set: images of the dynamic capture stand in for it."""
+        return not {*self.static.train.names}.isdisjoint(self.dynamic.train.names)
 
     @property
     def at_rest(self) -> Views:

@@ -56,7 +56,7 @@ def inward_space(
         dynamic: training views in motion; None: the scene is at rest.
         everyone: all views, test included.
         bound_scale: as for :func:`~devrf.scenes.bounds.inward_bounds`; a number makes the inner
-            box of contracted space so much larger, unless it is given.
+            box of contracted space so much larger.
         near: distance in world units, or None for the cameras to say.
         far: distance in world units, or None; contracted space is unbounded.
         box: the scene's box, or None.
@@ -72,7 +72,7 @@ def inward_space(
         )
         why = "data.space=world" if choice == "world" else given or masks
         where = given or "what the static cameras all see"
-        return WORLD, replace(bounds, box_given=box is not None, reason=why, box_source=where)
+        return WORLD, replace(bounds, reason=why, box_source=where)
     inner = box or box_from_cameras(static.cameras)
     where = given
     if box is None:
@@ -81,9 +81,9 @@ def inward_space(
         if motion is not None:
             inner = inner.union(motion)
             where += ", and where the silhouettes move"
-        if bound_scale != "auto":
-            inner = inner.scaled(float(bound_scale))
-            where += f" x {float(bound_scale):g}"
+    if bound_scale != "auto":
+        inner = inner.scaled(float(bound_scale))
+        where += f" x {float(bound_scale):g}"
     space = ContractedSpace(inner.low, inner.high, SHELL)
     if near is None:
         middle = static.cameras.positions.new_tensor(inner.middle)
@@ -157,8 +157,8 @@ def dynamic_only(scene: Scene) -> Scene:
     """The scene without its static set: the dynamic images of time 0 stand in for it.
 
     Bounds that the static cameras have told are found anew, from the dynamic training cameras
-    alone; DevrfError if these do not tell. A box that was given stays, and so do the bounds of a
-    film, whose images are both captures.
+    alone; DevrfError if these do not tell. Those of a film stay, and so do a box that was given,
+    near and far beside it.
     """
     views = scene.dynamic.train
     held_out = scene.dynamic.test
@@ -166,7 +166,7 @@ def dynamic_only(scene: Scene) -> Scene:
     if isinstance(scene.space, NormalizedDevice):
         bounds = forward_bounds([views], scene.space, "all that the dynamic cameras see")
         return replace(scene, static=at_rest, bounds=bounds)
-    if scene.bounds.box_given or scene.static.train is views:
+    if scene.is_film or scene.bounds.box_given:
         return replace(scene, static=at_rest)
     choice: SpaceChoice = "world" if scene.space.is_linear else "contracted"
     space, bounds = inward_space(choice, views, views, [views, held_out])

@@ -168,6 +168,11 @@ WIDEST = 1.7
 LEAST_POINTS = 50
 # So many per cent of the points on either side may be wrong.
 OUTLIERS = 1.0
+# So many per cent of the points around the middle lie beyond each face of the inner box, before
+# its margin is added. Of a film they are more, so that voxels are finer where it looks: films are
+# learned by methods that also move what is outside the box.
+LEFT_OUT = 2.0
+LEFT_OUT_OF_FILM = 5.0
 # In the forward-facing world, the unit that makes the nearest point's distance 1/0.75: LLFF's.
 NEAREST = 1 / 0.75
 # Median distance of cameras around a scene from its middle, in world units.
@@ -196,17 +201,22 @@ class World:
     box: tuple[Corner, Corner] | None
 
 
-def normalised(model: SparseModel, facing: Facing = "auto") -> World:
+def normalised(model: SparseModel, facing: Facing = "auto", *, left_out: float = LEFT_OUT) -> World:
     """The scene of a model in a world of its own origin, axes and unit.
 
-    ``facing`` says from where the cameras look. DevrfError if points or cameras do not tell.
+    ``facing`` says from where the cameras look; ``left_out`` how many per cent of the points lie
+    beyond each face of the inner box before it has its margin, where points give it. DevrfError if
+    points or cameras do not tell.
     """
     poses = model.poses
     points = torch.from_numpy(model.points)
     near, far = _depth_range(model)
     if facing == "auto":
         facing = "forward" if widest_angle(poses) <= ONE_SIDE else "inward"
-    world = (_forward if facing == "forward" else _inward)(poses, points, near, far)
+    if facing == "forward":
+        world = _forward(poses, points, near, far)
+    else:
+        world = _inward(poses, points, near, far, left_out)
     here = bool(in_reach(world.poses[:, :, 3]).all())
     if not here or not 0 < world.near < world.far <= FARTHEST:  # NaN compares false
         raise scene_error(
@@ -277,7 +287,7 @@ def _forward(poses: Tensor, points: Tensor, near: float, far: float) -> World:
     return World(poses, points, space="ndc", near=1.0, far=far * scale, box=None)
 
 
-def _inward(poses: Tensor, points: Tensor, near: float, far: float) -> World:
+def _inward(poses: Tensor, points: Tensor, near: float, far: float, left_out: float) -> World:
     axes_meet = nearest_point(poses[:, :, 3], poses[:, :, 2], 1e-2)
     # Of cameras that do not go round it, the axes meet anywhere, or behind them.
     if axes_meet is not None and (widest_angle(poses) <= ONE_SIDE or _is_behind(axes_meet, poses)):
@@ -300,8 +310,8 @@ def _inward(poses: Tensor, points: Tensor, near: float, far: float) -> World:
     around = points[points.norm(dim=1) < AROUND]
     if len(around) < 10:
         around = points
-    low = np.percentile(around.numpy(), 2 * OUTLIERS, axis=0).clip(-AROUND, AROUND)
-    high = np.percentile(around.numpy(), 100 - 2 * OUTLIERS, axis=0).clip(-AROUND, AROUND)
+    low = np.percentile(around.numpy(), left_out, axis=0).clip(-AROUND, AROUND)
+    high = np.percentile(around.numpy(), 100 - left_out, axis=0).clip(-AROUND, AROUND)
     margin = 0.1 * np.maximum(high - low, 0.1 * AROUND)
     inner = Box.of((low - margin).tolist(), (high + margin).tolist())
     return World(poses, points, "contracted", near, far, (inner.low, inner.high))

@@ -26,7 +26,15 @@ from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.scenes.footage import frame_count, is_folder, pictures
 from devrf.scenes.formats.nerfstudio import FILE
-from devrf.scenes.sparse_model import AROUND, SparseModel, World, ndc_holds, normalised
+from devrf.scenes.sparse_model import (
+    AROUND,
+    LEFT_OUT,
+    LEFT_OUT_OF_FILM,
+    SparseModel,
+    World,
+    ndc_holds,
+    normalised,
+)
 from devrf.scenes.splits import every_nth
 from devrf.system.files import make_folder, read_record, write_json
 from devrf.system.plain_data import built
@@ -85,7 +93,8 @@ def scene_from_footage(settings: CaptureSettings) -> Path:
     facing = settings.facing
     if facing == "auto" and settings.monocular:
         facing = "forward" if ndc_holds(model) else "inward"
-    world = normalised(model, facing)
+    left_out = LEFT_OUT_OF_FILM if settings.monocular else LEFT_OUT
+    world = normalised(model, facing, left_out=left_out)
     if settings.facing == "auto":
         facing = "forward" if world.space == "ndc" else "inward"
         log.info("cameras look %s-facing; capture.facing says otherwise", facing)
