@@ -127,7 +127,8 @@ def test_a_given_box_is_the_inner_box(ball_views: Callable[..., Views]) -> None:
 
 
 def film(views: Views, **options: Any) -> Scene:
-    """A scene whose captures are both the same images."""
+    """A scene whose captures are both the same images, each from a place of its own."""
+    views = replace(views, view=torch.arange(len(views)))
     space, bounds = chosen(views, "contracted", **options)
     capture = Capture(train=views, test=views)
     return Scene("film", "inward", capture, capture, bounds, "white", space)

@@ -225,8 +225,14 @@ class Scene:
 
     @property
     def is_film(self) -> bool:
-        """Whether there is no static set: images of the dynamic capture stand in for it."""
-        return not {*self.static.train.names}.isdisjoint(self.dynamic.train.names)
+        """Whether a camera that moves took all images: there is no static set.
+
+        Images of the film stand in for it. Of two captures the fixed cameras' first images may
+        belong to both.
+        """
+        film = self.dynamic.train
+        shared = not {*self.static.train.names}.isdisjoint(film.names)
+        return shared and film.by_moving_camera
 
     @property
     def at_rest(self) -> Views:

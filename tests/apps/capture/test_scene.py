@@ -134,6 +134,16 @@ def test_cameras_in_a_row_share_ndc(capture, structure):
     assert all(name.startswith("images/view3/") for name in scene.dynamic.test.names)
 
 
+def test_the_box_of_a_film_leaves_out_more_points(capture, footage, structure):
+    structure.model = row  # the axes do not meet: points tell the box
+    usual = capture(facing="inward", holdout=6)
+    film = capture(static=None, views=[footage[0]], offsets=None, facing="inward", holdout=6)
+    scenes = (usual, film)
+    assert [scene.is_film for scene in scenes] == [False, True]
+    wide, tight = (Box.of(scene.space.low, scene.space.high).longest for scene in scenes)
+    assert 0.7 * wide < tight < 0.98 * wide
+
+
 def test_alpha_masks_make_a_world_of_the_thing_and_are_found_again(
     capture, footage, structure, tmp_path
 ):
