@@ -142,7 +142,6 @@ def test_without_its_static_set_a_scene_keeps_bounds_that_it_does_not_owe_to_it(
     alone = dynamic_only(scene)
     assert alone.bounds == scene.bounds and alone.space == scene.space
     assert alone.static.train.times.tolist() == [0.0] * 4
-
     assert scene.is_film
 
     moved = views.cameras.camera_to_world.clone()
