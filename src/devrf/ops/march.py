@@ -154,8 +154,7 @@ def march(rays: Rays, medium: Medium) -> Samples:
 def samples_in_box(rays: Rays, path: Path) -> tuple[Tensor, Tensor, Tensor]:
     """Ray (S,), distance (S,) and position (S, 3) of all samples, in empty space, too."""
     entry, count = steps_through(rays, path.box, step=path.step, near=path.near, far=path.far)
-    ray = torch.repeat_interleave(count)
-    number = torch.arange(len(ray), device=ray.device) - (count.cumsum(0) - count)[ray]
+    ray, number = numbered(count)
     distance = entry[ray] + path.step * number
     return ray, distance, rays.at(ray, distance)
 
@@ -180,3 +179,10 @@ def steps_through(
     entry, leave = box.crossing(rays, near, far)
     count = torch.where(leave >= entry, ((leave - entry) / step + EXIT).floor() + 1, 0.0)
     return entry, count.long()
+
+
+def numbered(count: Tensor) -> tuple[Tensor, Tensor]:
+    """The ray (S,) int64 of each sample of rays that have so many (R,), and its number on it."""
+    ray = torch.repeat_interleave(count)
+    first = (count.cumsum(0) - count).index_select(0, ray)
+    return ray, torch.arange(len(ray), device=ray.device) - first

@@ -9,15 +9,18 @@ import torch
 
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
+from devrf.geometry.space import WORLD
 from devrf.methods.nerf.occupancy import OccupancyFrames
+from devrf.methods.nerf.placement import Placement
 from devrf.methods.nerf.samples import (
     RaySamples,
+    accumulated,
     flattened,
     importance,
     limits,
     stratified,
-    volume_render,
 )
+from devrf.ops.compositing import composite
 from devrf.scenes.scene import Scene
 
 
@@ -61,9 +64,9 @@ def test_two_samples_composite_by_hand() -> None:
         torch.tensor([0, 0]), torch.tensor([1.0, 2.0]), torch.ones(2), torch.zeros(2, 3), 1
     )
     red, green = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
-    seen = volume_render(
-        samples, torch.full((2,), math.log(2)), torch.tensor([red, green]), torch.ones(3)
-    )
+    weight, end = composite(torch.full((2,), math.log(2)), samples.ray, samples.rays)
+    color = weight[:, None] * torch.tensor([red, green])
+    seen = accumulated(samples, weight, color, end, torch.ones(3))
     torch.testing.assert_close(seen.color[0], torch.tensor([0.75, 0.5, 0.25]))
     assert seen.transmittance.item() == pytest.approx(0.25)
     assert seen.depth.item() == pytest.approx((0.5 * 1 + 0.25 * 2) / 0.75)
@@ -98,3 +101,12 @@ def test_the_hull_of_each_frame_holds_its_shape(tiny_scene: Scene) -> None:
     shares = occupancy.mask.flatten(1).float().mean(dim=1)
     # Eight static views carve frame 0 further than two views carve the others.
     assert 0 < shares[0] < shares[1:].min() < 1
+
+
+def test_normalised_samples_have_points_and_lengths_in_halves_of_the_longest_edge() -> None:
+    placement = Placement(Box((0.0, 0.0, 0.0), (8.0, 4.0, 4.0)), WORLD)
+    samples = flattened(along_x(1), torch.tensor([[3.0, 5.0]]), torch.tensor([7.0]))
+    normalised = samples.normalised(placement)
+    assert normalised.points.tolist() == [[-1.0, -0.5, -0.5], [-0.5, -0.5, -0.5]]
+    assert normalised.length.tolist() == [0.5, 0.5]
+    assert normalised.distance.tolist() == [3.0, 5.0]

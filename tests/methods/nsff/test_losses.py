@@ -102,7 +102,7 @@ def test_what_does_not_return_costs_where_it_is_seen(
 def test_certainty_has_no_entropy_and_occlusion_is_counted(
     placed: NSFF, batch: RayBatch, compared: Compared
 ) -> None:
-    samples = len(placed(batch).points)
+    samples = len(placed(batch).samples.ray)
     for v, expected in ((1.0, 0.0), (0.5, 0.5 * math.log(2)), (0.0, 0.0)):
         renders = compared(placed, batch, static={"blend": torch.full((samples,), v)})
         assert TERMS["blend_entropy"](renders).item() == pytest.approx(expected, abs=1e-6)
@@ -130,7 +130,7 @@ def opaque_surface(model: NSFF, batch: RayBatch, distance: torch.Tensor) -> Blen
         zeros, torch.zeros(count, 3), torch.zeros(count, 2, 3), torch.zeros(count, 2)
     )
     depths = (torch.full((count,), 50.0), zeros)
-    return replace(output, samples=samples, points=points, dynamic=dynamic, depths=depths)
+    return replace(output, samples=samples, dynamic=dynamic, depths=depths)
 
 
 def test_exact_surfaces_agree_with_the_priors(

@@ -9,10 +9,11 @@ import pytest
 import torch
 
 from devrf.data.batch import RayBatch
-from devrf.methods.nerf.samples import volume_render
+from devrf.methods.nerf.samples import accumulated
 from devrf.methods.nsff.fields import BACKWARD, FORWARD
 from devrf.methods.nsff.model import NSFF
 from devrf.methods.nsff.renders import Renders
+from devrf.ops.compositing import composite
 from devrf.rendering.view import MovingView
 from devrf.scenes.scene import Scene
 
@@ -40,7 +41,9 @@ def test_without_a_share_it_is_a_static_field(
     out = compared(placed, batch).output
     samples = out.samples
     density = torch.nn.functional.softplus(out.static.raw) * placed.settings.density_scale
-    plain = volume_render(samples, density, out.static.color, batch.background)
+    weight, end = composite(density * samples.length, samples.ray, samples.rays)
+    weighed = weight[:, None] * out.static.color
+    plain = accumulated(samples, weight, weighed, end, batch.background)
     torch.testing.assert_close(out.color, plain.color, atol=1e-5, rtol=1e-5)
     later = placed(replace(batch, time=torch.ones_like(batch.time)))
     torch.testing.assert_close(later.color, out.color, atol=1e-5, rtol=1e-5)
@@ -70,7 +73,7 @@ def test_a_translation_is_chained(placed: NSFF, batch: RayBatch, compared: Compa
     assert after.exists.all() and not before.exists.any() and len(before.sample) == 0
     assert (renders.trust(before) == 0).all() and (renders.trust(after) > 0).all()
     further = renders.chained()
-    start = renders.output.points
+    start = renders.output.samples.points
     step = torch.tensor([0.05, 0.0, -0.02])
     torch.testing.assert_close(further.points, start + 2 * step, atol=1e-5, rtol=0)
     torch.testing.assert_close(after.points, start + step, atol=1e-5, rtol=0)
@@ -91,7 +94,9 @@ def test_what_is_dynamic_moves_in_pictures_frame_by_frame(
     for v, time, steps in ((1, 0.75, 0.5), (1, 0.5, 1.0), (1, 0.0, 2.0), (0, 0.0, 0.0)):
         share(placed, v)
         out = placed.render_rays(rays, torch.ones(3), torch.zeros(3))
-        moved = placed.placement.world(out.points + steps * torch.tensor([-0.05, 0.0, 0.02]))
+        moved = placed.placement.world(
+            out.samples.points + steps * torch.tensor([-0.05, 0.0, 0.02])
+        )
         weight, ray = (out.blend.dynamic + out.blend.static)[:, None], out.samples.ray
         flows = weight * (camera.project_into(0, moved)[0] - pixels[ray])
         flow, mass = view.induced_flow(rays, pixels, camera, time)

@@ -16,7 +16,7 @@ from devrf.methods.kplanes.planes import SixPlanes, sum_of
 from devrf.methods.kplanes.proposals import Proposal, drawn_edges, histogram_error, intervals
 from devrf.methods.kplanes.settings import KPlanesSettings
 from devrf.methods.nerf.placed_model import SurfacedField
-from devrf.methods.nerf.samples import limits, volume_render
+from devrf.methods.nerf.samples import limits
 from devrf.ops.compositing import composite
 from devrf.ops.photometric import distortion
 from devrf.rendering.output import RenderOutput
@@ -76,51 +76,31 @@ class KPlanes(SurfacedField):
         self._teaches = step < FIRST or step % every == 0
 
     def coordinates(self, points: Tensor, time: Tensor) -> Tensor:
-        """[0, 1]⁴ (S, 4) of points (S, 3) in the box, and of times (S,)."""
+        """[0, 1]⁴ (S, 4) of points (S, 3) in normalised space, and of times (S,)."""
         low, high = self.box.corners(points)
-        return torch.cat([(points - low) / (high - low), time[:, None]], dim=1)
+        share = (self.placement.fields(points) - low) / (high - low)
+        return torch.cat([share, time[:, None]], dim=1)
 
-    def optical_depth(self, points: Tensor, time: Tensor, length: float) -> Tensor:
-        """τ (S,) of ways of ``length`` at points (S, 3) in normalised space."""
-        where = self.coordinates(self.placement.fields(points), time)
-        return self.decoder.density(self.planes(where))[0] * length
+    def sigma(self, points: Tensor, time: Tensor, ray: Tensor) -> tuple[Tensor, Tensor]:
+        """σ (S,), and what the decoder colours."""
+        where = self.coordinates(points, time.index_select(0, ray))
+        return self.decoder.density(self.planes(where))
 
-    def point_colors(self, points: Tensor, viewdirs: Tensor, time: Tensor) -> Tensor:
-        """RGB (S, 3) of points in normalised space."""
-        where = self.coordinates(self.placement.fields(points), time)
-        each = torch.arange(len(points), device=points.device)
-        return self.decoder.rgb(self.decoder.density(self.planes(where))[1], viewdirs, each)
+    def rgb(self, features: Tensor, viewdirs: Tensor, ray: Tensor) -> Tensor:
+        """RGB (S, 3)."""
+        return self.decoder.rgb(features, viewdirs, ray)
 
     def render_rays(
         self, rays: Rays, time: Tensor, background: Tensor, *, jitter: bool = False
     ) -> RenderOutput:
-        """What rays see.
-
-        ``extras`` has ``weight``, ``ray`` and ``distance`` (S,) of samples in normalised space, and
-        ``histogram`` (), the error of the rounds.
-        """
-        rounds: list[tuple[Tensor, Tensor]] = []
-        edges = background
+        """What rays see; of proposals, ``extras`` also has ``histogram`` (), the rounds' error."""
         if self.settings.sampling == "occupancy":
-            samples = self.march(rays, time, jitter=jitter)
-        else:
-            edges, rounds = self._proposed(rays, time, jitter=jitter)
-            samples = intervals(rays, edges)
-        if not self.space.is_linear:
-            samples = samples.unbounded()
-        where = self.coordinates(samples.points, time.index_select(0, samples.ray))
-        density, further = self.decoder.density(self.planes(where))
-        color = self.decoder.rgb(further, rays.viewdirs, samples.ray)
-        unit = self.placement.half_edge
-        output = volume_render(samples.scaled(unit), density.float(), color.float(), background)
-        weight = output.extras["weight"]
-        errors = [
-            histogram_error(edges, weight.view(len(rays), -1), before, proposed)
-            for before, proposed in rounds
-        ]
-        nothing = weight.new_zeros(())
-        extras = {"distance": samples.distance / unit, "histogram": sum_of([nothing, *errors])}
-        return replace(output, extras={**output.extras, **extras})
+            return super().render_rays(rays, time, background, jitter=jitter)
+        edges, rounds = self._proposed(rays, time, jitter=jitter)
+        output = self.rendered(intervals(rays, edges), rays, time, background)
+        weight = output.extras["weight"].view(len(rays), -1)
+        errors = [histogram_error(edges, weight, before, proposed) for before, proposed in rounds]
+        return replace(output, extras={**output.extras, "histogram": sum_of(errors)})
 
     def _proposed(
         self, rays: Rays, time: Tensor, *, jitter: bool
@@ -133,7 +113,7 @@ class KPlanes(SurfacedField):
         rounds: list[tuple[Tensor, Tensor]] = []
         for proposal, count in zip(self.proposals, s.proposal_samples, strict=True):
             edges = drawn_edges(edges, weight, count, jitter=jitter)
-            samples = intervals(rays, edges).scaled(self.placement.half_edge)
+            samples = intervals(rays, edges).normalised(self.placement)
             where = self.coordinates(samples.points, time.index_select(0, samples.ray))
             with torch.set_grad_enabled(torch.is_grad_enabled() and self._teaches):
                 depth = proposal(where).float() * samples.length
@@ -158,9 +138,12 @@ class KPlanes(SurfacedField):
             "smooth": self.planes.roughness,
             "change": lambda: sum_of([each.change() for each in (self.planes, *rounds)]),
             "smooth_proposals": lambda: sum_of([nothing, *(each.roughness() for each in rounds)]),
-            "histogram": lambda: extras["histogram"],
+            "histogram": lambda: extras.get("histogram", nothing),
             "distortion": lambda: distortion(
-                extras["weight"], extras["distance"], extras["ray"], len(batch.time)
+                extras["weight"],
+                extras["distance"] / self.placement.half_edge,
+                extras["ray"],
+                len(batch.time),
             ),
         }
         nothing = output.color.new_zeros(())

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Collection, Iterable
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -12,15 +13,8 @@ from torch import Tensor, nn
 from devrf.data.batch import RayBatch
 from devrf.geometry.rays import Rays
 from devrf.methods.nerf.networks import RadianceField
-from devrf.methods.nerf.placed_model import SurfacedField
-from devrf.methods.nerf.samples import (
-    RaySamples,
-    flattened,
-    importance,
-    limits,
-    stratified,
-    volume_render,
-)
+from devrf.methods.nerf.placed_model import Sigma, SurfacedField
+from devrf.methods.nerf.samples import RaySamples, flattened, importance, limits, stratified
 from devrf.methods.nerf.settings import FieldSettings
 from devrf.ops.compositing import composite
 from devrf.rendering.output import RenderOutput
@@ -72,86 +66,54 @@ class DeformableField(SurfacedField):
                 (beside if name.startswith("trunk.beside.") else base).append(parameter)
         return {"canonical": base, "canonical_ambient": beside} if beside else {"canonical": base}
 
+    def sigma(
+        self, points: Tensor, time: Tensor, ray: Tensor, field: RadianceField | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """σ (S,) where points lead, in T or another ``field``, and what colours come from."""
+        canonical, ambient = self.deform(points, time.index_select(0, ray))
+        return (field or self.canonical).sigma(canonical, ambient)
+
+    def rgb(self, features: Tensor, viewdirs: Tensor, ray: Tensor) -> Tensor:
+        """RGB (S, 3) of T."""
+        return self.canonical.rgb(features, viewdirs, ray)
+
     def render_rays(
         self, rays: Rays, time: Tensor, background: Tensor, *, jitter: bool = False
     ) -> RenderOutput:
-        """What rays see, and samples.
+        """What rays see: even samples, and more where these have weight, if not by occupancy.
 
-        ``extras`` has ``points`` (S, 3) x in normalised space, ``time``, ``ray`` and ``weight``
-        (S,) of the S samples. If a coarse field learns, it also has ``coarse_color`` (R, 3), and
-        the same of the coarse samples with ``coarse_`` before their names.
+        If a coarse field learns, ``extras`` also has ``coarse_color`` (R, 3), and what there is of
+        fine samples with ``coarse_`` before its name.
         """
-        if self.settings.sampling == "occupancy":
-            samples = self.march(rays, time, jitter=jitter)
-            return self._rendered(self.canonical, samples, rays, time, background)
-        samples, coarse = self._by_weight(rays, time, background, jitter=jitter)
-        fine = self._rendered(self.canonical, samples, rays, time, background)
-        if coarse is None:
-            return fine
-        beside = {f"coarse_{name}": value for name, value in coarse.extras.items()}
-        return replace(fine, extras={**fine.extras, "coarse_color": coarse.color, **beside})
-
-    def _rendered(
-        self,
-        field: RadianceField,
-        samples: RaySamples,
-        rays: Rays,
-        time: Tensor,
-        background: Tensor,
-    ) -> RenderOutput:
-        """The render of samples in a radiance field."""
-        if not self.space.is_linear:
-            samples = samples.unbounded()
-        points = self.placement.normalised(samples.points)
-        when = time.index_select(0, samples.ray)
-        canonical, ambient = self.deform(points, when)
-        density, color = field(canonical, rays.viewdirs, samples.ray, ambient)
-        scaled = samples.scaled(self.placement.half_edge)
-        output = volume_render(scaled, density, color, background)
-        return replace(output, extras={**output.extras, "points": points, "time": when})
-
-    def _by_weight(
-        self, rays: Rays, time: Tensor, background: Tensor, *, jitter: bool
-    ) -> tuple[RaySamples, RenderOutput | None]:
-        """Even samples and more where these have weight; the render of a learning coarse field."""
         s = self.settings
-        field = self.coarse or self.canonical
+        if s.sampling == "occupancy":
+            return super().render_rays(rays, time, background, jitter=jitter)
         near, far = limits(rays, self.box, self.depth_limits)
         distance = stratified(near, far, s.coarse, jitter=jitter)
-        first = flattened(rays, distance, far)
-        output = None
+        samples = flattened(rays, distance, far)
+        sigma = partial(self.sigma, field=self.coarse)
+        beside: dict[str, Tensor] = {}
         if self.coarse is not None and jitter:
-            output = self._rendered(field, first, rays, time, background)
-            weight = output.extras["weight"].detach()
+            coarse = self.rendered(
+                samples, rays, time, background, sigma=sigma, rgb=self.coarse.rgb
+            )
+            beside = {f"coarse_{name}": value for name, value in coarse.extras.items()}
+            beside["coarse_color"] = coarse.color
+            weight = coarse.extras["weight"].detach()
         else:
-            weight = self._weights(field, first, time)
+            weight = self._weights(samples, time, sigma)
         with torch.no_grad():
             drawn = importance(distance, weight.view_as(distance), near, far, s.fine, jitter=jitter)
             distance, _ = torch.cat([distance, drawn], dim=1).sort(dim=1)
-        return flattened(rays, distance, far), output
+        fine = self.rendered(flattened(rays, distance, far), rays, time, background)
+        return replace(fine, extras={**fine.extras, **beside})
 
     @torch.no_grad()
-    def _weights(self, field: RadianceField, samples: RaySamples, time: Tensor) -> Tensor:
+    def _weights(self, samples: RaySamples, time: Tensor, sigma: Sigma) -> Tensor:
         """Weights (S,) of samples, from their densities alone."""
-        points = self.placement.normalised(samples.points)
-        when = time.index_select(0, samples.ray)
-        canonical, ambient = self.deform(points, when)
-        density = field.sigma(canonical, ambient)
-        length = samples.length / self.placement.half_edge
-        weight, _ = composite(density * length, samples.ray, samples.rays)
-        return weight
-
-    def optical_depth(self, points: Tensor, time: Tensor, length: float) -> Tensor:
-        """τ (S,) of the canonical field, where the points lead."""
-        canonical, ambient = self.deform(points, time)
-        return self.canonical.sigma(canonical, ambient) * length
-
-    def point_colors(self, points: Tensor, viewdirs: Tensor, time: Tensor) -> Tensor:
-        """RGB (S, 3) of the canonical field, where the points lead."""
-        canonical, ambient = self.deform(points, time)
-        each = torch.arange(len(points), device=points.device)
-        color: Tensor = self.canonical(canonical, viewdirs, each, ambient)[1]
-        return color
+        samples = samples.normalised(self.placement)
+        density, _ = sigma(samples.points, time, samples.ray)
+        return composite(density * samples.length, samples.ray, samples.rays)[0]
 
     def loss_terms(
         self, output: RenderOutput, batch: RayBatch, names: Collection[str]

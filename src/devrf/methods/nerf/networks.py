@@ -209,7 +209,6 @@ class RadianceField(nn.Module):
         *,
         inputs: int = 3,
         ambient: int = 0,
-        further: int = 0,
     ) -> None:
         """Build the network.
 
@@ -217,14 +216,12 @@ class RadianceField(nn.Module):
             settings: sizes.
             inputs: length of x; a time may be a part of it.
             ambient: length of what enters the trunk beside γ(x).
-            further: numbers of one more linear head on the trunk; 0: there is none.
         """
         super().__init__()
         s = self._settings = settings
         self.encode_position = SinusoidalEncoding(inputs, s.bands)
         self.trunk = Trunk(self.encode_position.size, s.width, s.depth, s.skip, beside=ambient)
         self.density = nn.Linear(s.width, 1)
-        self.further = nn.Linear(s.width, further) if further else None
         self.color = ColorBranch(s.width, s.direction_bands)
         initialise(self, s.initialisation)
 
@@ -237,47 +234,24 @@ class RadianceField(nn.Module):
             return nullcontext()
         return torch.autocast(device.type, torch.bfloat16)
 
-    def forward(
-        self, points: Tensor, viewdirs: Tensor, ray: Tensor, ambient: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Densities and colours of samples.
+    def hidden(self, points: Tensor, ambient: Tensor | None = None) -> Tensor:
+        """What density and colour come from, (S, width).
 
         Args:
             points: (S, inputs) in normalised space, [−1, 1] inside the box.
-            viewdirs: (R, 3) unit viewing directions of the rays.
-            ray: (S,) int64, the ray of each sample.
             ambient: (S, ambient) what enters beside γ(x), or None where nothing does.
-
-        Returns:
-            σ (S,) ≥ 0 per unit of normalised space, and RGB (S, 3) in [0, 1].
         """
+        x: Tensor = self.trunk(self.encode_position(points), ambient)
+        return x
+
+    def sigma(self, points: Tensor, ambient: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """σ (S,) ≥ 0 per unit of normalised space, and what it came from; arguments likewise."""
         with self.reduced():
-            raw, logits, _ = self.heads(points, viewdirs, ray, ambient)
-            density = self._activated(raw)
-            color = torch.sigmoid(logits)
-        return density.float(), color.float()
+            x = self.hidden(points, ambient)
+            raw = self.density(x)[:, 0]
+            return (nn.functional.softplus(raw) * self._settings.density_scale).float(), x
 
-    def sigma(self, points: Tensor, ambient: Tensor | None = None) -> Tensor:
-        """σ (S,) alone, for samples whose colour does not count; arguments as above."""
+    def rgb(self, hidden: Tensor, viewdirs: Tensor, ray: Tensor) -> Tensor:
+        """RGB (S, 3) in [0, 1] of samples of the rays ``ray`` (S,), whose directions are (R, 3)."""
         with self.reduced():
-            return self._activated(self.raw_density(points, ambient)).float()
-
-    def heads(
-        self, points: Tensor, viewdirs: Tensor, ray: Tensor, ambient: Tensor | None = None
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Density (S,) and RGB (S, 3) before their activations, and the further head's numbers.
-
-        Arguments as for :meth:`forward`.
-        """
-        x = self.trunk(self.encode_position(points), ambient)
-        density = self.density(x)[:, 0]
-        further = x[:, :0] if self.further is None else self.further(x)
-        return density, self.color(x, viewdirs, ray), further
-
-    def raw_density(self, points: Tensor, ambient: Tensor | None = None) -> Tensor:
-        """Density (S,) alone before its activation; arguments as for :meth:`forward`."""
-        raw: Tensor = self.density(self.trunk(self.encode_position(points), ambient))
-        return raw[:, 0]
-
-    def _activated(self, raw: Tensor) -> Tensor:
-        return nn.functional.softplus(raw) * self._settings.density_scale
+            return torch.sigmoid(self.color(hidden, viewdirs, ray)).float()

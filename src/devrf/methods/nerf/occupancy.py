@@ -11,8 +11,8 @@ from torch import Tensor
 from devrf.checkpoints.stored_grids import StoredShape
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
-from devrf.methods.nerf.samples import RaySamples
-from devrf.ops.march import steps_through
+from devrf.methods.nerf.samples import RaySamples, last_of_ray
+from devrf.ops.march import numbered, steps_through
 from devrf.rendering.occupancy import dilate
 from devrf.scenes.scene import Scene
 from devrf.scenes.silhouettes import visual_hull
@@ -182,9 +182,7 @@ class OccupancyFrames(StoredShape):
         """
         near, far = depths
         entry, count = steps_through(rays, box, step=step, near=near, far=far)
-        ray = torch.repeat_interleave(count)
-        first = (count.cumsum(0) - count).index_select(0, ray)
-        number = torch.arange(len(ray), device=ray.device) - first
+        ray, number = numbered(count)
         offset = torch.rand_like(entry) if jitter else torch.full_like(entry, 0.5)
         shifted = number + offset.index_select(0, ray)
         distance = entry.index_select(0, ray) + shifted * step
@@ -192,7 +190,7 @@ class OccupancyFrames(StoredShape):
         masked, occupied = self._may_be(rays.at(ray, distance), pair, box)
         if occupied is not None:
             # The last sample of a ray stays: it may stand for all that is behind it.
-            masked &= occupied | (number == (count - 1).index_select(0, ray))
+            masked &= occupied | last_of_ray(ray)
         index = masked.nonzero()[:, 0]
         kept = ray.index_select(0, index)
         return RaySamples.at(rays, kept, distance.index_select(0, index), step)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any, ClassVar, Self
 
 import torch
@@ -19,7 +19,8 @@ from devrf.geometry.space import WORLD, Space, space_config, space_from
 from devrf.methods.base import RayTrainable
 from devrf.methods.nerf.occupancy import OccupancyFrames
 from devrf.methods.nerf.placement import Placement
-from devrf.methods.nerf.samples import RaySamples
+from devrf.methods.nerf.samples import RaySamples, accumulated
+from devrf.ops.compositing import composite
 from devrf.rendering.output import RenderedImage, RenderOutput
 from devrf.rendering.view import SurfaceField
 from devrf.scenes.scene import Scene
@@ -166,12 +167,78 @@ class NeuralField(PlacedModel):
         return RayView(self, self.render_rays, time, half=half)
 
 
+# Of points (S, 3) in normalised space, times (R,) of rays, and the ray (S,) int64 of each point:
+# densities (S,) per unit of that space, and features (S, ·) that colours are made of.
+Sigma = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+# Of such features, unit viewing directions (R, 3) of rays, and the ray of each: RGB (S, 3).
+Color = Callable[[Tensor, Tensor, Tensor], Tensor]
+
+
 class SurfacedField(NeuralField):
-    """Networks whose surface can be taken at any time."""
+    """A density and a colour of each point and time: what rays see of it, and its surface.
+
+    Attributes:
+        least_weight: samples with no more weight are not coloured; 0: all are.
+    """
+
+    least_weight: float = 0.0
 
     @abstractmethod
-    def point_colors(self, points: Tensor, viewdirs: Tensor, time: Tensor) -> Tensor:
-        """RGB (S, 3) at points (S, 3) in normalised space, seen along unit directions (S, 3)."""
+    def sigma(self, points: Tensor, time: Tensor, ray: Tensor) -> tuple[Tensor, Tensor]:
+        """σ (S,) and what :meth:`rgb` takes; see :data:`Sigma`."""
+
+    @abstractmethod
+    def rgb(self, features: Tensor, viewdirs: Tensor, ray: Tensor) -> Tensor:
+        """RGB (S, 3) in [0, 1]; see :data:`Color`."""
+
+    def optical_depth(self, points: Tensor, time: Tensor, length: float) -> Tensor:
+        """τ (S,) = σ · length."""
+        each = torch.arange(len(points), device=points.device)
+        return self.sigma(points, time, each)[0] * length
+
+    def render_rays(
+        self, rays: Rays, time: Tensor, background: Tensor, *, jitter: bool = False
+    ) -> RenderOutput:
+        """What rays see by even steps; ``extras`` as of :meth:`rendered`."""
+        return self.rendered(self.march(rays, time, jitter=jitter), rays, time, background)
+
+    def rendered(
+        self,
+        samples: RaySamples,
+        rays: Rays,
+        time: Tensor,
+        background: Tensor,
+        *,
+        sigma: Sigma | None = None,
+        rgb: Color | None = None,
+    ) -> RenderOutput:
+        """The render of samples in the fields' space, or by another ``sigma`` and ``rgb``.
+
+        ``extras`` has, of the K samples that were coloured, ``points`` (K, 3) in normalised space,
+        ``time``, ``ray``, ``distance`` and ``weight`` (K,), and ``sample_color`` (K, 3).
+        """
+        if not self.space.is_linear:
+            samples = samples.unbounded()
+        samples = samples.normalised(self.placement)
+        density, features = (sigma or self.sigma)(samples.points, time, samples.ray)
+        depth = density.float() * samples.length
+        weight, transmittance = composite(depth, samples.ray, samples.rays)
+        if self.least_weight > 0:
+            shown = (weight > self.least_weight).nonzero()[:, 0]
+            samples = samples[shown]
+            weight = weight.index_select(0, shown)
+            features = features.index_select(0, shown)
+        color = (rgb or self.rgb)(features, rays.viewdirs, samples.ray).float()
+        output = accumulated(samples, weight, weight[:, None] * color, transmittance, background)
+        extras = {
+            "points": samples.points,
+            "time": time.index_select(0, samples.ray),
+            "ray": samples.ray,
+            "distance": samples.distance,
+            "weight": weight,
+            "sample_color": color,
+        }
+        return replace(output, extras=extras)
 
     def surface_at(self, time: float) -> SurfaceField:
         """The scene at ``time``."""
@@ -209,7 +276,8 @@ class SurfaceAtTime:
         """RGB (M, 3) at ``points`` (M, 3) of the fields' space, along directions (M, 3)."""
         place = self._model.placement.normalised(points)
         time = torch.full_like(place[:, 0], self._time)
-        return self._model.point_colors(place, viewdirs, time)
+        each = torch.arange(len(points), device=points.device)
+        return self._model.rgb(self._model.sigma(place, time, each)[1], viewdirs, each)
 
 
 class RayView:

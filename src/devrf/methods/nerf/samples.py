@@ -9,7 +9,8 @@ from torch import Tensor
 
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
-from devrf.ops.compositing import composite, mean_distance, sum_by_ray
+from devrf.methods.nerf.placement import Placement
+from devrf.ops.compositing import mean_distance, sum_by_ray
 from devrf.rendering.output import RenderOutput
 
 # A length that is opaque at any density that a softplus gives.
@@ -53,9 +54,10 @@ class RaySamples:
             rays=self.rays,
         )
 
-    def scaled(self, unit: float) -> RaySamples:
-        """The same samples, their lengths in units of ``unit`` (of the fields' space)."""
-        return replace(self, length=self.length / unit)
+    def normalised(self, placement: Placement) -> RaySamples:
+        """The same samples, their points and lengths in normalised space."""
+        points = placement.normalised(self.points)
+        return replace(self, points=points, length=self.length / placement.half_edge)
 
     def unbounded(self) -> RaySamples:
         """The same samples, the last of each ray standing for all that is behind it."""
@@ -68,29 +70,12 @@ def last_of_ray(ray: Tensor) -> Tensor:
     return ray != following
 
 
-def volume_render(
-    samples: RaySamples, density: Tensor, color: Tensor, background: Tensor
-) -> RenderOutput:
-    """C = Σ w_i c_i + T_end · background with α_i = 1 − exp(−σ_i δ_i).
-
-    Args:
-        samples: S samples of R rays.
-        density: (S,) σ per unit of the samples' lengths.
-        color: (S, 3) RGB.
-        background: (3,) or (R, 3) RGB.
-
-    Returns:
-        ``extras`` has the ``weight`` (S,) and the ``ray`` (S,) of the samples.
-    """
-    weight, transmittance = composite(density * samples.length, samples.ray, samples.rays)
-    output = accumulated(samples, weight, weight[:, None] * color, transmittance, background)
-    return replace(output, extras={"weight": weight, "ray": samples.ray})
-
-
 def accumulated(
     samples: RaySamples, weight: Tensor, color: Tensor, transmittance: Tensor, background: Tensor
 ) -> RenderOutput:
     """C = Σ w_i c_i + T_end · background, and the samples' mean distance.
+
+    Weights and transmittance are those of :func:`~devrf.ops.compositing.composite`.
 
     Args:
         samples: S samples of R rays.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from devrf.methods.nerf.networks import RadianceField
+from devrf.methods.nerf.networks import RadianceField, initialise
 from devrf.methods.nerf.samples import last_of_ray
 from devrf.methods.nsff.settings import NSFFSettings
 from devrf.ops.compositing import composite, sum_by_ray
@@ -120,21 +120,37 @@ class DynamicSamples:
     occlusion: Tensor
 
 
-class StaticField(RadianceField):
+class HeadedField(RadianceField):
+    """A radiance field that has one more linear head on its trunk."""
+
+    def __init__(self, settings: NSFFSettings, *, inputs: int, further: int) -> None:
+        """For points of length ``inputs``, with so many ``further`` numbers of each."""
+        super().__init__(settings, inputs=inputs)
+        self.further = nn.Linear(settings.width, further)
+        initialise(self.further, settings.initialisation)
+
+    def heads(self, points: Tensor, viewdirs: Tensor, ray: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Raw density (S,), RGB (S, 3), and the further numbers of points (S, inputs)."""
+        with self.reduced():
+            x = self.hidden(points)
+            raw = self.density(x)[:, 0]
+            further = self.further(x)
+        return raw.float(), self.rgb(x, viewdirs, ray), further.float()
+
+
+class StaticField(HeadedField):
     """S(γ(x), γ(d)) → σ_s, c_s, v (docs/methods/nsff.md#model)."""
 
     def __init__(self, settings: NSFFSettings) -> None:
-        super().__init__(settings, further=1)
+        super().__init__(settings, inputs=3, further=1)
 
     def at(self, points: Tensor, viewdirs: Tensor, ray: Tensor) -> StaticSamples:
-        """The field at points (S, 3); other arguments as for :meth:`forward`."""
-        with self.reduced():
-            raw, color, share = self.heads(points, viewdirs, ray)
-        share = torch.sigmoid(share[:, 0].float())
-        return StaticSamples(raw.float(), torch.sigmoid(color.float()), share)
+        """The field at points (S, 3) of the rays ``ray`` (S,), whose directions are (R, 3)."""
+        raw, color, share = self.heads(points, viewdirs, ray)
+        return StaticSamples(raw, color, torch.sigmoid(share[:, 0]))
 
 
-class DynamicField(RadianceField):
+class DynamicField(HeadedField):
     """D(γ(x, 2t − 1), γ(d)) → σ_d, c_d, f⁺, f⁻, o⁺, o⁻ (docs/methods/nsff.md#model).
 
     Attributes:
@@ -144,20 +160,15 @@ class DynamicField(RadianceField):
     def __init__(self, settings: NSFFSettings) -> None:
         super().__init__(settings, inputs=4, further=8)
         self.reach = 1.0
-        assert self.further is not None
         with torch.no_grad():
             self.further.weight[:6].uniform_(-SMALL, SMALL)
             self.further.bias[:6].zero_()
 
     def at(self, points: Tensor, time: Tensor, viewdirs: Tensor, ray: Tensor) -> DynamicSamples:
-        """The field at points (S, 3) and times (S,) in [0, 1]; else as :meth:`forward`."""
-        with self.reduced():
-            raw, color, motion = self.heads(with_time(points, time), viewdirs, ray)
-        motion = motion.float()
+        """The field at points (S, 3) and times (S,) in [0, 1]; else as the static one."""
+        raw, color, motion = self.heads(with_time(points, time), viewdirs, ray)
         flow = self.reach * torch.tanh(motion[:, :6]).view(-1, 2, 3)
-        color = torch.sigmoid(color.float())
-        occlusion = torch.sigmoid(motion[:, 6:])
-        return DynamicSamples(raw.float(), color, flow, occlusion)
+        return DynamicSamples(raw, color, flow, torch.sigmoid(motion[:, 6:]))
 
 
 def with_time(points: Tensor, time: Tensor) -> Tensor:

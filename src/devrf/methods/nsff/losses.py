@@ -71,13 +71,13 @@ def small_flow(r: Renders) -> Tensor:
 def smooth_space(r: Renders) -> Tensor:
     """‖Δ_k (X' − X)‖₁ between neighbours on a ray, X' = X + flow in Euclidean space."""
     out = r.output
-    start = r.placement.euclidean(out.points)
-    near = r.placement.within(out.points, SPACE_SHARE)
+    start = r.placement.euclidean(out.samples.points)
+    near = r.placement.within(out.samples.points, SPACE_SHARE)
     ray = out.samples.ray
     pair = ((ray[1:] == ray[:-1]) & near[1:] & near[:-1])[:, None]
     terms = []
     for side in (FORWARD, BACKWARD):
-        moved = r.placement.euclidean(out.points + out.dynamic.flow[:, side]) - start
+        moved = r.placement.euclidean(out.samples.points + out.dynamic.flow[:, side]) - start
         terms.append(_mean((moved[1:] - moved[:-1]).abs(), pair))
     return torch.stack(terms).sum()
 
@@ -87,7 +87,7 @@ def smooth_time(r: Renders) -> Tensor:
 
     There the flow that led to the neighbour is chained with the one that leads on from it.
     """
-    own = r.output.points
+    own = r.output.samples.points
     near = r.near
     after = own + r.output.dynamic.flow[:, FORWARD]
     before = own + r.output.dynamic.flow[:, BACKWARD]
@@ -145,7 +145,7 @@ def flow(r: Renders) -> Tensor:
     terms = []
     for side in (FORWARD, BACKWARD):
         observed, valid = r.priors.flow(r.batch, side)
-        place = weight[:, None] * out.points + moving[:, None] * out.dynamic.flow[:, side]
+        place = weight[:, None] * out.samples.points + moving[:, None] * out.dynamic.flow[:, side]
         mass = sum_by_ray(weight, ray, r.rays)
         mean = sum_by_ray(place, ray, r.rays) / mass.clamp(min=1e-3)[:, None]
         camera = r.priors.neighbour[r.batch.image, side]

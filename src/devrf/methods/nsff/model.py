@@ -91,9 +91,9 @@ class NSFF(NeuralField):
 
     def optical_depth(self, points: Tensor, time: Tensor, length: float) -> Tensor:
         """τ (S,) of the denser field."""
-        static = self.fields.static.raw_density(points)
-        dynamic = self.fields.dynamic.raw_density(with_time(points, time))
-        return self.fields.optical_depth(torch.maximum(static, dynamic), length, 0.0)
+        static, _ = self.fields.static.sigma(points)
+        dynamic, _ = self.fields.dynamic.sigma(with_time(points, time))
+        return torch.maximum(static, dynamic) * length
 
     @property
     def _first(self) -> int:
@@ -137,10 +137,10 @@ class NSFF(NeuralField):
         # Where masks cut the scene out it ends with its box; else the last sample is all behind it.
         unbounded = not (self.cut_out and self.space.is_linear)
         samples = samples.unbounded() if unbounded else samples
-        samples = samples.scaled(self.placement.half_edge)
+        samples = samples.normalised(self.placement)
         ray = samples.ray
         fields = self.fields
-        points = self.placement.normalised(samples.points)
+        points = samples.points
         static = fields.static.at(points, rays.viewdirs, ray)
         dynamic = fields.dynamic.at(points, time.index_select(0, ray), rays.viewdirs, ray)
         noise = fields.noise(static.raw)
@@ -157,7 +157,6 @@ class NSFF(NeuralField):
             depth=output.depth,
             transmittance=output.transmittance,
             samples=samples,
-            points=points,
             static=static,
             dynamic=dynamic,
             depths=(dynamic_depth, static_depth),
@@ -216,10 +215,10 @@ class FlowingView(RayView):
         out = self._model.render_rays(rays, now, black)
         ray = out.samples.ray
         blend = out.blend
-        there = self._moved(out.points, rays.viewdirs, ray, time)
+        there = self._moved(out.samples.points, rays.viewdirs, ray, time)
         placement = self._model.placement
         moving = cameras.project_into(0, placement.world(there))[0] - pixels[ray]
-        still = cameras.project_into(0, placement.world(out.points))[0] - pixels[ray]
+        still = cameras.project_into(0, placement.world(out.samples.points))[0] - pixels[ray]
         total = blend.dynamic[:, None] * moving + blend.static[:, None] * still
         mass = sum_by_ray(blend.dynamic + blend.static, ray, len(rays))
         return sum_by_ray(total, ray, len(rays)) / mass.clamp(min=LEAST_MASS)[:, None], mass

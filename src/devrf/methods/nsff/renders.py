@@ -29,8 +29,7 @@ class BlendedOutput(RenderOutput):
     """A rendering of R rays from S samples, and what it was made of.
 
     Attributes:
-        samples: lengths in normalised units.
-        points: (S, 3) the samples in normalised space.
+        samples: in normalised space.
         static: the static field there.
         dynamic: the dynamic field there, at the rays' times.
         depths: (S,) optical depths of the dynamic and of the static field alone.
@@ -38,7 +37,6 @@ class BlendedOutput(RenderOutput):
     """
 
     samples: RaySamples
-    points: Tensor
     static: StaticSamples
     dynamic: DynamicSamples
     depths: tuple[Tensor, Tensor]
@@ -151,8 +149,8 @@ class Renders:
                 side,
                 frame=self.batch.frame,
                 exists=torch.ones_like(self.batch.time, dtype=torch.bool),
-                sample=torch.arange(len(self.output.points), device=self.batch.time.device),
-                points=self.output.points,
+                sample=torch.arange(len(self.output.samples.points), device=self.batch.time.device),
+                points=self.output.samples.points,
                 dynamic=self.output.dynamic,
             )
             for side in sides

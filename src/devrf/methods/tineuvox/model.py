@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import replace
 from typing import Any, ClassVar
 
 import torch
@@ -12,14 +11,11 @@ from torch import Tensor, nn
 
 from devrf.data.batch import RayBatch
 from devrf.geometry.box import Box
-from devrf.geometry.rays import Rays
 from devrf.geometry.space import Space
 from devrf.methods.nerf.networks import SinusoidalEncoding, linear_by_ray
 from devrf.methods.nerf.placed_model import SurfacedField
-from devrf.methods.nerf.samples import accumulated
 from devrf.methods.tineuvox.networks import MultiDistanceGrid, RadianceNetwork
 from devrf.methods.tineuvox.settings import TiNeuVoxSettings
-from devrf.ops.compositing import composite
 from devrf.ops.photometric import background_entropy, per_sample_color
 from devrf.ops.trilinear import Shape
 from devrf.rendering.output import RenderOutput
@@ -70,6 +66,7 @@ class TiNeuVox(SurfacedField):
         if s.starts_still:
             for unmoved in (last.weight, last.bias, self.radiance.trunk.weight[:, -code:]):
                 nn.init.zeros_(unmoved)
+        self.least_weight = s.weight_threshold
         self.density_shift = math.log(1 / (1 - s.alpha_init) - 1)
         self.place()
 
@@ -78,6 +75,7 @@ class TiNeuVox(SurfacedField):
         super().set_place(box, space, depths)
         x, y, z = (edge / box.longest for edge in box.size)
         self.grid_box = Box((-x, -y, -z), (x, y, z))
+        # As large as it will be, since this tells the memory that learning takes.
         self.grid.resize(self._shape_after(len(self.settings.upsample_at)))
 
     def setup(self, scene: Scene) -> None:
@@ -115,14 +113,9 @@ class TiNeuVox(SurfacedField):
         """So many voxels of the present grid, in the fields' space."""
         return self.settings.step * self.box.voxel_size(math.prod(self.grid.shape))
 
-    def hidden(self, points: Tensor, code: Tensor, ray: Tensor) -> Tensor:
-        """What density and colour come from, (S, width).
-
-        Args:
-            points: (S, 3) x in normalised space.
-            code: (R, size) of rays' times.
-            ray: (S,) the ray of each point.
-        """
+    def sigma(self, points: Tensor, time: Tensor, ray: Tensor) -> tuple[Tensor, Tensor]:
+        """softplus(raw + log(1/(1 − α_init) − 1)) per :attr:`base_voxel`, and what it came from."""
+        code = self.time(time[:, None])
         position = self.encode(points)
         first, *further = self.deformation
         assert isinstance(first, nn.Linear)
@@ -130,49 +123,13 @@ class TiNeuVox(SurfacedField):
         for layer in further:
             displacement = layer(displacement)
         features = self.grid(points + displacement, self.grid_box)
-        return self.radiance.hidden(features, position, code, ray)
+        hidden = self.radiance.hidden(features, position, code, ray)
+        density = nn.functional.softplus(self.radiance.density(hidden)[:, 0] + self.density_shift)
+        return density * (self.placement.half_edge / self.base_voxel), hidden
 
-    def hidden_of_each(self, points: Tensor, time: Tensor) -> Tensor:
-        """The same of points (S, 3) that have times (S,) of their own."""
-        each = torch.arange(len(points), device=points.device)
-        return self.hidden(points, self.time(time[:, None]), each)
-
-    def density(self, hidden: Tensor) -> Tensor:
-        """σ (S,) = softplus(raw + log(1/(1 − α_init) − 1)), per :attr:`base_voxel`."""
-        return nn.functional.softplus(self.radiance.raw_density(hidden) + self.density_shift)
-
-    def optical_depth(self, points: Tensor, time: Tensor, length: float) -> Tensor:
-        """τ (S,) of ways of ``length``."""
-        way = length * self.placement.half_edge / self.base_voxel
-        return self.density(self.hidden_of_each(points, time)) * way
-
-    def point_colors(self, points: Tensor, viewdirs: Tensor, time: Tensor) -> Tensor:
-        """RGB (S, 3) of points in normalised space."""
-        each = torch.arange(len(points), device=points.device)
-        return self.radiance.rgb(self.hidden_of_each(points, time), viewdirs, each)
-
-    def render_rays(
-        self, rays: Rays, time: Tensor, background: Tensor, *, jitter: bool = False
-    ) -> RenderOutput:
-        """What rays see.
-
-        ``extras`` has ``weight`` (K,), ``ray`` (K,) and ``sample_color`` (K, 3) of the samples that
-        were coloured.
-        """
-        samples = self.march(rays, time, jitter=jitter)
-        if not self.space.is_linear:
-            samples = samples.unbounded()
-        code = self.time(time[:, None])
-        hidden = self.hidden(self.placement.normalised(samples.points), code, samples.ray)
-        depth = self.density(hidden).float() * samples.scaled(self.base_voxel).length
-        weight, transmittance = composite(depth, samples.ray, samples.rays)
-        shown = (weight > self.settings.weight_threshold).nonzero()[:, 0]
-        samples = samples[shown]
-        weight = weight.index_select(0, shown)
-        color = self.radiance.rgb(hidden.index_select(0, shown), rays.viewdirs, samples.ray).float()
-        output = accumulated(samples, weight, weight[:, None] * color, transmittance, background)
-        extras = {"weight": weight, "ray": samples.ray, "sample_color": color}
-        return replace(output, extras=extras)
+    def rgb(self, features: Tensor, viewdirs: Tensor, ray: Tensor) -> Tensor:
+        """RGB (S, 3)."""
+        return torch.sigmoid(self.radiance.color(features, viewdirs, ray))
 
     def loss_terms(
         self, output: RenderOutput, batch: RayBatch, names: Collection[str]

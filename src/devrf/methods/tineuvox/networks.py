@@ -80,12 +80,3 @@ class RadianceNetwork(nn.Module):
         """
         parts = [self.encode_feature(features), position]
         return linear_by_ray(self.trunk, parts, code, ray).relu_()
-
-    def raw_density(self, hidden: Tensor) -> Tensor:
-        """Densities (S,) before their activation."""
-        raw: Tensor = self.density(hidden)
-        return raw[:, 0]
-
-    def rgb(self, hidden: Tensor, viewdirs: Tensor, ray: Tensor) -> Tensor:
-        """RGB (S, 3) in [0, 1] of samples of the rays ``ray`` (S,), whose directions are (R, 3)."""
-        return torch.sigmoid(self.color(hidden, viewdirs, ray))
