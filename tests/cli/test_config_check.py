@@ -85,7 +85,7 @@ def test_a_part_may_take_anything():
         ({"loss__fien": {"color": 3.0}}, "loss.fien.color: no such key"),
         ({"sizes__inner__size": "big"}, "sizes.inner.size: expected a valid integer, not 'big'"),
         ({"loss__fine__color": "high"}, "loss.fine.color: expected a valid number, not 'high'"),
-        ({"seed": -1}, "seed: expected greater than or equal to 0, not -1"),
+        ({"seed": -1}, "seed: expected at least 0, not -1"),
         ({"seed": None}, "seed: expected a valid integer, not None"),
         ({"outer__root": "${nowhere}"}, "nowhere"),
     ],

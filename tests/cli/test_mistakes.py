@@ -39,15 +39,15 @@ MISTAKES = {
         ["protocol=joint"],
         "protocol: method=devrf does not learn by protocol=joint",
     ),
-    "seed out of range": (["seed=-1"], "seed: expected greater than or equal to 0, not -1"),
+    "seed out of range": (["seed=-1"], "seed: expected at least 0, not -1"),
     "steps of no length": (["sampling.step=0"], "sampling.step: expected at least 0.01, not 0"),
     "samples of which none counts": (
         ["sampling.alpha_threshold=1"],
-        "sampling.alpha_threshold: expected at least 0 and below 1, not 1",
+        "sampling.alpha_threshold: expected below 1, not 1",
     ),
     "an opacity that is none": (
         ["sampling.search_alpha_threshold=nan"],
-        "sampling.search_alpha_threshold: expected at least 0 and below 1, not nan",
+        "sampling.search_alpha_threshold: expected below 1, not nan",
     ),
     "a level without a side": (
         ["schedule.deformation.levels.4={iterations:2}", "schedule.deformation.levels.3=null"],

@@ -127,15 +127,15 @@ def test_an_embedded_scene_may_come_without_flow():
     assert module.scene.dynamic.train.flow is None
     module.provide({"forward_flow"})
     assert module.scene.dynamic.train.forward_flow is None
-    with pytest.raises(DevrfError, match="data.flow: should be 'exact' or 'none', not 'dis'"):
+    with pytest.raises(DevrfError, match="data.flow: expected 'exact' or 'none', not 'dis'"):
         ProceduralDataModule("robot", flow="dis")
 
 
 def test_options_are_checked_before_anything_is_read():
     inward = "'auto', 'files', 'dis', 'raft' or 'none'"
-    with pytest.raises(DevrfError, match=f"data.flow: should be {inward}, not 'farneback'"):
+    with pytest.raises(DevrfError, match=f"data.flow: expected {inward}, not 'farneback'"):
         InwardFacingDataModule("nowhere", flow="farneback")
-    with pytest.raises(DevrfError, match="data.flow: should be 'auto', 'dis', 'raft' or 'none'"):
+    with pytest.raises(DevrfError, match="data.flow: expected 'auto', 'dis', 'raft' or 'none'"):
         RecordedDataModule(READERS["nerfies"], "nowhere", flow="files")
     with pytest.raises(DevrfError, match="data.rot: no such option"):
         ForwardFacingDataModule("nowhere", rot=3)

@@ -223,7 +223,7 @@ def pose(first: object) -> list[list[object]]:
         (
             TRAIN,
             in_first_frame("transform_matrix", pose(NAN)),
-            "transform_matrix[0][0]: should be a finite number, not nan",
+            "transform_matrix[0][0]: expected a finite number, not nan",
         ),
         (TRAIN, in_first_frame("transform_matrix", pose(-1)), "no rigid transform"),
         (MOVING, in_first_frame("time", 1.5), "frames[0].time: 1.5 is outside [0, 1]"),
@@ -278,7 +278,7 @@ def test_fixed_views_without_times_have_to_take_turns(scene_folder, message_of):
     ("options", "said"),
     [
         ({"downscale": 4}, "8x6 px"),
-        ({"background": "grey"}, "data.background: should be 'white', 'black' or 'random'"),
+        ({"background": "grey"}, "data.background: expected 'white', 'black' or 'random'"),
         *(({"bound_scale": scale}, "data.bound_scale") for scale in (0.5, "large")),
         ({"box": 3}, "data.box"),
     ],

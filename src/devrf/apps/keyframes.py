@@ -23,8 +23,9 @@ from devrf.apps.video import MAX_FRAMES
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.files import Number, Positive, read_json
-from devrf.scenes.validation import first_error, in_reach, is_rotation, scene_error
+from devrf.scenes.validation import in_reach, is_rotation, scene_error
 from devrf.system.files import write_json
+from devrf.system.options import first_error
 
 
 @dataclass(frozen=True)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 from textwrap import wrap
-from typing import Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import torch
+from pydantic import dataclasses as checked
 from torch import Tensor
 
 from devrf.apps.images import (
@@ -24,7 +24,7 @@ from devrf.apps.images import (
     write_image,
 )
 from devrf.checkpoints.checkpoint import Viewpoints
-from devrf.errors import DevrfError, expect
+from devrf.errors import DevrfError
 from devrf.evaluation.held_out import HeldOutView, background_value, compare, exposed, truth_image
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
@@ -32,6 +32,7 @@ from devrf.metrics.image import psnr
 from devrf.rendering.renderer import Renderer
 from devrf.rendering.view import Viewable
 from devrf.scenes.scene import Background, Views
+from devrf.system.options import Count, Options, Share
 
 log = logging.getLogger(__name__)
 
@@ -44,18 +45,16 @@ DEPTH = "depth: near is bright"
 HEADINGS = ("truth", "rendered", "error: 0 to 0.25 or more", DEPTH)
 
 
-@dataclass(frozen=True)
-class StillSettings:
+@checked.dataclass(frozen=True)
+class StillSettings(Options):
     """Settings of ``stage=still``; ``conf/still/default.yaml`` says what each does."""
 
-    view: Literal["held_out"] | int = "held_out"
-    time: float = 0.5
-    height: int | None = None
-    half: bool = True
+    key: ClassVar[str] = "still"
 
-    def __post_init__(self) -> None:
-        expect(0 <= self.time <= 1, "still.time", "0 to 1", self.time)
-        expect(self.height is None or self.height >= 1, "still.height", "at least 1", self.height)
+    view: Literal["held_out"] | int = "held_out"
+    time: Share = 0.5
+    height: Count | None = None
+    half: bool = True
 
     def name(self, moves: bool) -> str:
         """What the image's file is called, without its suffix: ``still_held_out_t0.5_h800``.

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import groupby
+from typing import Annotated, ClassVar
 
 import torch
+from annotated_types import Ge, Gt, Le
+from pydantic import FiniteFloat
+from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from devrf.apps.images import image_grid, scaled
 from devrf.apps.still import DEPTH, sized, still
-from devrf.errors import expect
 from devrf.evaluation.held_out import background_value, truth_image
 from devrf.geometry.cameras import Cameras
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Background, Views
+from devrf.system.options import Options, Positive, Share
 
 # More frames than this are a mistake: an hour at 25 a second.
 MAX_FRAMES = 90_000
@@ -28,34 +32,20 @@ MIN_FRAMES = 24
 
 
 @dataclass(frozen=True)
-class VideoSettings:
+class VideoSettings(Options):
     """Settings of ``stage=render``; ``conf/video/default.yaml`` says what each does."""
 
-    frames: int = 120
-    fps: float = 24
-    orbit_turns: float = 1.0
-    orbit_elevation: float | None = None
-    height: int | None = None
-    max_seconds: float | None = None
+    key: ClassVar[str] = "video"
+
+    frames: Annotated[int, Ge(1), Le(MAX_FRAMES)] = 120
+    fps: Annotated[float, Gt(0), Le(1000)] = 24
+    orbit_turns: FiniteFloat = 1.0
+    orbit_elevation: FiniteFloat | None = None
+    height: Annotated[int, Ge(MIN_HEIGHT)] | None = None
+    max_seconds: Positive | None = None
     half: bool = True
     path: str | None = None
-    time: float = 0.5
-
-    def __post_init__(self) -> None:
-        height = self.height
-        max_seconds = self.max_seconds
-        expect(0 <= self.time <= 1, "video.time", "0 to 1", self.time)
-        expect(0 < self.frames <= MAX_FRAMES, "video.frames", f"1 to {MAX_FRAMES}", self.frames)
-        expect(0 < self.fps <= 1000, "video.fps", "more than 0, at most 1000", self.fps)
-        orbit = math.isfinite(self.orbit_turns) and math.isfinite(self.orbit_elevation or 0)
-        expect(
-            orbit, "video.orbit_turns", "a number, as of video.orbit_elevation", self.orbit_turns
-        )
-        high_enough = height is None or height >= MIN_HEIGHT
-        expect(high_enough, "video.height", f"at least {MIN_HEIGHT}", height)
-        expect(
-            max_seconds is None or max_seconds > 0, "video.max_seconds", "more than 0", max_seconds
-        )
+    time: Share = 0.5
 
     def sized(self, cameras: Cameras) -> Cameras:
         """Captured cameras with images of the video's size."""

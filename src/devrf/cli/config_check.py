@@ -62,6 +62,8 @@ def check_config(config: DictConfig) -> None:
     # Imported here: --help is answered before it has loaded.
     from pydantic import TypeAdapter, ValidationError
 
+    from devrf.system.options import expectation
+
     raw: Any = OmegaConf.to_container(config)
     text = json.dumps(raw, default=str, ensure_ascii=False)
     for key in sorted(OmegaConf.missing_keys(config)) if MISSING in text else ():
@@ -81,8 +83,7 @@ def check_config(config: DictConfig) -> None:
                 lacking = [other["loc"][-1] for other in error.errors() if other["type"] in LEFT]
                 raise unknown_key(where, [*beside, *lacking]) from None
             alike = [other["msg"] for other in issues if _place(raw, other["loc"])[0] == where]
-            wanted = [message.removeprefix("Input should be ") for message in alike]
-            expected = " or ".join(dict.fromkeys(wanted))
+            expected = " or ".join(dict.fromkeys(map(expectation, alike)))
             if issue["type"] in BUILT:
                 expected = "a section with _target_"
             value = issue["input"]

@@ -48,7 +48,7 @@ class ProceduralDataModule(SceneDataModule):
         self.recipe = recipe(*shape, **numbers)
         self.export = None if export is None else Path(export)
         if flow not in FLOWS:
-            raise scene_error("data.flow", f"should be 'exact' or 'none', not {flow!r}")
+            raise scene_error("data.flow", f"expected 'exact' or 'none', not {flow!r}")
         self.flow = flow
 
     def load(self) -> Scene:

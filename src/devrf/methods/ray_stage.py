@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from dataclasses import replace
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
+from annotated_types import Ge, Lt
+from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
@@ -23,11 +25,12 @@ from devrf.methods.protocol import ProtocolStage
 from devrf.methods.weighted_loss import counted_weights, visibility, weighted_sum
 from devrf.scenes.scene import Views
 from devrf.scenes.space import dynamic_only
+from devrf.system.options import Count, Options, Positive
 from devrf.system.profiling import span
 
 
 @dataclass(frozen=True)
-class RaySchedule:
+class RaySchedule(Options):
     """How long a method learns, on how many rays, and how fast.
 
     Attributes:
@@ -48,35 +51,26 @@ class RaySchedule:
         iterations_per_step: optimiser iterations in one Lightning step.
     """
 
-    iterations: int
-    rays: int
-    learning_rate: float
+    key: ClassVar[str] = "ray_stage.schedule"
+
+    iterations: Count
+    rays: Count
+    learning_rate: Positive
     final_learning_rate: float
     betas: Sequence[float] = (0.9, 0.999)
     eps: float = 1e-8
-    curriculum: float = 0.0
-    centre_crop: int = 0
-    times_per_batch: int | None = None
-    rays_without_hull: int | None = None
+    curriculum: Annotated[float, Ge(0), Lt(1)] = 0.0
+    centre_crop: Annotated[int, Ge(0)] = 0
+    times_per_batch: Count | None = None
+    rays_without_hull: Count | None = None
     decay: Literal["exponential", "cosine"] = "exponential"
-    warmup: float = 0.0
-    iterations_per_step: int = 10
+    warmup: Annotated[float, Ge(0), Lt(1)] = 0.0
+    iterations_per_step: Count = 10
 
     def __post_init__(self) -> None:
-        key = "ray_stage.schedule"
-        for name in ("iterations", "rays", "iterations_per_step"):
-            number = getattr(self, name)
-            expect(number >= 1, f"{key}.{name}", "at least 1", number)
-        for name in ("times_per_batch", "rays_without_hull"):
-            number = getattr(self, name)
-            expect(number is None or number >= 1, f"{key}.{name}", "at least 1, or null", number)
-        expect(self.centre_crop >= 0, f"{key}.centre_crop", "at least 0", self.centre_crop)
-        for name in ("curriculum", "warmup"):
-            share = getattr(self, name)
-            expect(0 <= share < 1, f"{key}.{name}", "0 or more, below 1", share)
         positive = self.final_learning_rate > 0 or self.decay == "cosine"
         expected = "more than 0, or decay=cosine"
-        expect(positive, f"{key}.final_learning_rate", expected, self.final_learning_rate)
+        expect(positive, f"{self.key}.final_learning_rate", expected, self.final_learning_rate)
 
 
 class RayStage(Stage):

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
-from devrf.errors import expect
+from annotated_types import Ge
+from pydantic.dataclasses import dataclass
+
+from devrf.system.options import Options
 
 # The least distance between samples, in voxels: with less a ray fills memory and shows no more.
 FINEST = 0.01
 
 
 @dataclass(frozen=True)
-class RenderSettings:
+class RenderSettings(Options):
     """How rays are sampled at the present resolution.
 
     Attributes:
@@ -22,10 +25,9 @@ class RenderSettings:
         far: distance behind which nothing is sampled, likewise.
     """
 
-    step: float
+    key: ClassVar[str] = "sampling"
+
+    step: Annotated[float, Ge(FINEST)]
     alpha_threshold: float
     near: float
     far: float
-
-    def __post_init__(self) -> None:
-        expect(self.step >= FINEST, "sampling.step", f"at least {FINEST}", self.step)

@@ -15,7 +15,8 @@ import numpy.typing as npt
 from pydantic import AfterValidator, BaseModel, Field, ValidationError
 
 from devrf.errors import DevrfError
-from devrf.scenes.validation import LARGEST, abbreviated, first_error, scene_error
+from devrf.scenes.validation import LARGEST, scene_error
+from devrf.system.options import abbreviated, first_error
 
 Numbers = npt.NDArray[np.float64]
 

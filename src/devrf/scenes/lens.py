@@ -10,7 +10,8 @@ from pydantic import AfterValidator, BaseModel
 
 from devrf.geometry.cameras import Distortion
 from devrf.scenes.files import Number, Positive
-from devrf.scenes.validation import abbreviated, same_shape, scene_error
+from devrf.scenes.validation import same_shape, scene_error
+from devrf.system.options import abbreviated
 
 # Focal lengths as shares of the image's longer side: a view of 0.0006 to 178.9 degrees.
 LEAST_FOCAL = 0.01

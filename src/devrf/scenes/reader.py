@@ -17,7 +17,8 @@ from devrf.scenes.image_folders import Downscale, Missing, SizeAt, whole_factor
 from devrf.scenes.scene import Background, Capture, OpticalFlow, Scene, Views
 from devrf.scenes.space import SpaceChoice, centred, forward_facing_scene, inward_space
 from devrf.scenes.transforms import SceneBounds
-from devrf.scenes.validation import LARGEST, Options, checked_box, scene_error
+from devrf.scenes.validation import LARGEST, checked_box, scene_error
+from devrf.system.options import Options
 
 FlowSource = Literal["auto", "files", "dis", "raft", "none"]
 Exposure = Literal["auto", "equal", "none"]
@@ -72,6 +73,7 @@ class SceneReader(Options, ABC):
         DevrfError: an option is wrong; the message names it.
     """
 
+    key: ClassVar[str] = "data"
     root: str | Path
     _: KW_ONLY
     name: str | None = None

@@ -3,84 +3,27 @@
 from __future__ import annotations
 
 import math
-import reprlib
 from collections.abc import Callable
-from typing import Any
 
 import psutil
 import torch
-from pydantic import ConfigDict, ValidationError, model_validator
-from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
+from devrf.system.options import one_line
 
 # Below this the fields see nothing and the window of SSIM does not fit.
 MIN_SIDE = 8
 # Numbers become float32 tensors: what overflows there is as bad as infinity.
 LARGEST = 3e38
-# A name in a file can be of any length; a message has to be read.
-LONGEST_MESSAGE = 480
-LONGEST_VALUE = 60
 # Sides are rounded when images are made smaller; beyond this they were cropped or turned.
 SAME_SHAPE = 0.05
-
-_brief = reprlib.Repr()
-_brief.maxlevel = 2
 
 
 def scene_error(where: object, what: str) -> DevrfError:
     """The error ``where: what`` in one line."""
-    return DevrfError(_shortened(" ".join(f"{where}: {what}".split()), LONGEST_MESSAGE))
-
-
-def first_error(error: ValidationError, where: str) -> DevrfError:
-    """The first thing that pydantic found wrong: key, expectation, and the value that was given.
-
-    Args:
-        error: what a model or an adapter raised.
-        where: what comes before the key: ``FILE: `` for values in a file, ``data.`` for options.
-    """
-    first = error.errors(include_url=False)[0]
-    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"])
-    place = f"{where}{key.removeprefix('.')}" if key else where.rstrip(": .")
-    if first["type"] == "json_invalid":
-        return scene_error(place, f"not valid JSON ({first['ctx']['error']}); write it again")
-    if first["type"] == "missing":
-        return scene_error(place, "is missing; add it")
-    if first["type"] == "unexpected_keyword_argument":
-        return scene_error(place, "no such option; correct its name")
-    if first["type"] == "value_error":  # raised by a validator of ours
-        return scene_error(place, str(first["ctx"]["error"]))
-    expected = first["msg"].removeprefix("Input ").replace(" after validation", "")
-    # For lists that are too short or too long, the message says the length itself.
-    value = "" if ", not " in expected else f", not {abbreviated(first['input'])}"
-    return scene_error(place, f"{expected[0].lower()}{expected[1:]}{value}; correct it")
-
-
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class Options:
-    """Options of a scene, checked when they are set; a wrong one is a DevrfError of one line."""
-
-    @model_validator(mode="wrap")
-    @classmethod
-    def _in_one_line(cls, value: Any, validate: Any) -> Any:
-        try:
-            return validate(value)
-        except ValidationError as error:
-            raise first_error(error, "data.") from None
-
-
-def abbreviated(value: object) -> str:
-    """A value from a file as a message shows it: however large or deep, in a few words."""
-    return _shortened(_brief.repr(value), LONGEST_VALUE)
-
-
-def _shortened(text: str, most: int) -> str:
-    """``text``, its middle left out where it is longer than ``most`` characters."""
-    half = most // 2 - 2
-    return text if len(text) <= most else f"{text[:half]}...{text[-half:]}"
+    return DevrfError(one_line(where, what))
 
 
 def reduced_size(width: int, height: int, downscale: int, where: object) -> tuple[int, int]:

@@ -150,7 +150,7 @@ def test_deformation_phases_tile_every_schedule(levels, frames, coarse_to_fine):
         (lambda: CanonicalSchedule(upsample_at=(1000, 1000)), "canonical.upsample_at"),
         (lambda: CanonicalSchedule(side=2), "canonical.upsample_at"),  # 8 voxels, halved four times
         (lambda: CanonicalSchedule(rays=0), "canonical.rays"),
-        (lambda: DeformationSchedule(levels=()), "deformation.levels: expected at least one"),
+        (lambda: DeformationSchedule(levels=()), "deformation.levels: expected at least 1 item"),
         (lambda: DeformationSchedule(with_level(5, iterations=0)), "levels.5.iterations"),
         (lambda: DeformationSchedule(with_level(2, other_terms=-1)), "levels.2.other_terms"),
     ],

@@ -138,7 +138,7 @@ def test_without_harmonics_colors_are_the_same_from_all_sides() -> None:
         here = decoder.rgb(further, viewdirs, ray)
         there = decoder.rgb(further, -viewdirs, ray)
         assert torch.equal(here, there) == same
-    with pytest.raises(DevrfError, match="harmonics: expected 0 to 3"):
+    with pytest.raises(DevrfError, match="harmonics: expected 3 with decoder=explicit"):
         replace(TINY, harmonics=0, decoder="explicit")
 
 
@@ -254,7 +254,7 @@ def test_scenes_of_every_space_are_learned_and_come_back(
 
 
 def test_impossible_sizes_are_refused() -> None:
-    with pytest.raises(DevrfError, match="proposal_samples: expected numbers from 2, as many as"):
+    with pytest.raises(DevrfError, match="proposal_samples: expected as many numbers as"):
         replace(TINY, proposal_samples=(8,))
-    with pytest.raises(DevrfError, match="scales: expected one or more numbers"):
+    with pytest.raises(DevrfError, match="scales: expected at least 1 item"):
         replace(TINY, scales=())

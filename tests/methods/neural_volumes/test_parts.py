@@ -185,5 +185,5 @@ def test_the_total_variation_of_log_opacity() -> None:
     ],
 )
 def test_sizes_that_cannot_be_are_named(key: str, value: object) -> None:
-    with pytest.raises(DevrfError, match=f"ray_stage.model.settings.{key}: "):
+    with pytest.raises(DevrfError, match=rf"ray_stage\.model\.settings\.{key}\b"):
         replace(NeuralVolumesSettings(), **{key: value})  # type: ignore[arg-type]

@@ -107,7 +107,7 @@ def test_priors_fall_tenfold_after_each_beginning() -> None:
 @pytest.mark.parametrize(
     ("make", "key"),
     [
-        (lambda: NSFFSettings(width=1), r"settings\.width: .* 1$"),
+        (lambda: NSFFSettings(width=1), r"settings\.width: expected at least 2, not 1;"),
         (lambda: NSFFSettings(flow_reach=0.0), r"settings\.flow_reach"),
         (lambda: Warmup(min_frames=300), r"settings\.warmup\.min_frames: .*250"),
     ],

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal, cast
+from typing import Annotated, ClassVar, Literal, cast
 
 import torch
+from annotated_types import Ge, Gt, Le, Lt, MinLen
+from pydantic import FiniteFloat
+from pydantic import dataclasses as checked
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -19,48 +21,43 @@ from devrf.geometry.clock import FrameClock
 from devrf.methods.base import Renderable
 from devrf.metrics.geometric import SOLID
 from devrf.rendering.renderer import Renderer, points_at_depth
+from devrf.system.options import Count, Options, Share
 
 Format = Literal["gltf", "html", "ply", "obj", "splats", "usd"]
 Up = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
+Finite = Annotated[FiniteFloat, Gt(0)]
 
 
-@dataclass(frozen=True)
-class ExportSettings:
+@checked.dataclass(frozen=True)
+class ExportSettings(Options):
     """Settings of ``stage=export``; ``conf/export/default.yaml`` says what each does."""
+
+    key: ClassVar[str] = "export"
 
     format: Format = "gltf"
     content: Literal["auto", "surface", "points"] = "auto"
-    threshold: float = 0.1
-    side: int | None = None
-    faces: int = 20_000
-    pieces: float = 0.01
-    reach: float = 10.0
+    threshold: Annotated[float, Gt(0), Lt(1)] = 0.1
+    side: Annotated[int, Ge(2), Le(1024)] | None = None
+    faces: Annotated[int, Ge(4)] = 20_000
+    pieces: Share = 0.01
+    reach: Finite = 10.0
     colors: Literal["normal", "mean"] = "mean"
-    points: int = 20_000
-    times: Sequence[float] | None = None
-    fps: float | None = None
-    seconds: float = 3.0
+    points: Count = 20_000
+    times: Annotated[Sequence[float], MinLen(1)] | None = None
+    fps: Finite | None = None
+    seconds: Finite = 3.0
     up: Up = "auto"
-    metres: float = 1.0
+    metres: Finite = 1.0
     into: str | Path | None = None
 
     def __post_init__(self) -> None:
-        side_fits = self.side is None or 2 <= self.side <= 1024
-        expect(0 < self.threshold < 1, "export.threshold", "between 0 and 1", self.threshold)
-        expect(side_fits, "export.side", "2 to 1024", self.side)
-        expect(self.faces >= 4, "export.faces", "at least 4", self.faces)
-        expect(self.points >= 1, "export.points", "at least 1", self.points)
-        expect(0 <= self.pieces <= 1, "export.pieces", "0 to 1", self.pieces)
-        for name in ("reach", "fps", "seconds", "metres"):
-            value = getattr(self, name)
-            expect(value is None or 0 < value < math.inf, f"export.{name}", "more than 0", value)
         if self.times is None:
             return
         if self.fps is not None:
             raise DevrfError("export.times: export.fps also says which times; give one of them")
         rising = all(a < b for a, b in pairwise([-1e-9, *self.times, 1 + 1e-9]))
         ascending = "ascending times from 0 to 1"
-        expect(len(self.times) > 0 and rising, "export.times", ascending, list(self.times))
+        expect(rising, "export.times", ascending, list(self.times))
 
     def export_times(self, clock: FrameClock) -> tuple[float, ...]:
         """The times to export, of a scene whose training frames have the clock's times."""

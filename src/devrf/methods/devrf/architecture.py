@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Annotated, ClassVar
 
 import torch
+from annotated_types import Ge, Gt, Le, Lt
+from pydantic.dataclasses import dataclass
 from torch import Tensor
 
-from devrf.errors import DevrfError, expect
+from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.space import Space
 from devrf.methods.devrf.canonical_field import CanonicalField, ColorDecoder, SigmoidColor
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.scenes.scene import Scene
+from devrf.system.options import Options
 
 log = logging.getLogger(__name__)
 
@@ -25,7 +29,7 @@ FEWEST, MOST = 32, 256
 
 
 @dataclass(frozen=True)
-class Architecture:
+class Architecture(Options):
     """Sizes of the canonical field; the defaults are the paper's, inward-facing.
 
     Attributes:
@@ -40,20 +44,16 @@ class Architecture:
         aspect: in NDC, grid points across a unit of x to those across a unit of y.
     """
 
-    channels: int = 12
+    key: ClassVar[str] = "field"
+
+    channels: Annotated[int, Ge(1), Le(256)] = 12
     width: int = 128
-    frequencies: int = 4
+    frequencies: Annotated[int, Ge(0), Le(16)] = 4
     alpha_init: float = 1e-2
-    contracted_opacity: float = 0.65
+    contracted_opacity: Annotated[float, Gt(0), Lt(1)] = 0.65
     search_alpha_init: float = 1e-6
     planes: int | None = None
     aspect: float = 1.0
-
-    def __post_init__(self) -> None:
-        good = 0 < self.contracted_opacity < 1
-        expect(good, "field.contracted_opacity", "between 0 and 1", self.contracted_opacity)
-        expect(0 <= self.frequencies <= 16, "field.frequencies", "0 to 16", self.frequencies)
-        expect(0 < self.channels <= 256, "field.channels", "1 to 256", self.channels)
 
     def in_space(self, space: Space, side: float) -> Architecture:
         """The sizes that hold in ``space`` for a grid of ``side`` voxels along an edge."""

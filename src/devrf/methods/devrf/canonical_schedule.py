@@ -6,18 +6,17 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from typing import Annotated, ClassVar
+
+from annotated_types import Ge, Gt, Le
+from pydantic import dataclasses as checked
 
 from devrf.engine.phase import Phase
 from devrf.errors import DevrfError, expect
 from devrf.geometry.space import Space
+from devrf.system.options import Count, NotNegative, Options, Several
 
-# The least value of the schedule's numbers.
-LEAST = {
-    **dict.fromkeys(("search_iterations", "dense_tv_iterations", "view_dependence_start"), 0),
-    **dict.fromkeys(("unbounded_distortion", "density_drop"), 0),
-    **dict.fromkeys(("iterations", "decay_iterations", "rays", "min_views", "epochs"), 1),
-    **dict.fromkeys(("side", "search_side", "unbounded_initial_side", "occupancy_every"), 2),
-}
+Side = Annotated[float, Ge(2)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,8 +34,8 @@ class CanonicalPhase(Phase):
         return float(self.voxels ** (1 / 3))
 
 
-@dataclass(frozen=True)
-class CanonicalSchedule:
+@checked.dataclass(frozen=True)
+class CanonicalSchedule(Options):
     """The canonical stage's phases; the defaults are the paper's, inward-facing.
 
     See docs/method.md#geometry-search, #radiance-field, #forward-facing and #scene-contraction.
@@ -66,46 +65,41 @@ class CanonicalSchedule:
         crop: forward-facing, whether the grid gives up empty depths (docs/method.md#crop).
     """
 
-    search_iterations: int = 5000
-    search_side: int = 100
+    key: ClassVar[str] = "schedule.canonical"
+
+    search_iterations: Annotated[int, Ge(0)] = 5000
+    search_side: Several = 100
     visual_hull_init: bool = False
-    iterations: int = 20000
-    side: float = 160
+    iterations: Count = 20000
+    side: Side = 160
     upsample_at: Sequence[int] = (1000, 2000, 3000, 4000)
-    decay_iterations: int = 20000
+    decay_iterations: Count = 20000
     restart_at_growth: bool = True
-    density_drop: float = 1.0
-    occupancy_every: int | None = 1000
-    rays: int = 8192
-    min_views: int = 3
-    dense_tv_iterations: int = 0
-    voxels_per_pixel: float | None = None
-    epochs: float | None = None
-    view_dependence_start: int | None = None
-    unbounded_initial_side: float | None = 26
-    unbounded_distortion: float = 0.01
+    density_drop: NotNegative = 1.0
+    occupancy_every: Several | None = 1000
+    rays: Count = 8192
+    min_views: Count = 3
+    dense_tv_iterations: Annotated[int, Ge(0)] = 0
+    voxels_per_pixel: Annotated[float, Gt(0), Le(4)] | None = None
+    epochs: Annotated[float, Ge(1)] | None = None
+    view_dependence_start: Annotated[int, Ge(0)] | None = None
+    unbounded_initial_side: Side | None = 26
+    unbounded_distortion: NotNegative = 0.01
     first_frames: bool = False
     crop: bool = False
     phases: tuple[CanonicalPhase, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        key = "schedule.canonical"
-        limit = self.voxels_per_pixel
-        for name, least in LEAST.items():
-            value = getattr(self, name)
-            expect(value is None or value >= least, f"{key}.{name}", f"at least {least}", value)
-        fits = limit is None or 0 < limit <= 4
-        expect(fits, f"{key}.voxels_per_pixel", "above 0, at most 4, or null", limit)
         doublings = len(self.upsample_at)
         edges = [0, *self.upsample_at, self.iterations]
         if self.side**3 < 8 * 2**doublings:
             raise DevrfError(
-                f"{key}.upsample_at: {doublings} of them are too many for side {self.side}; start "
-                "from 8 voxels or more"
+                f"{self.key}.upsample_at: {doublings} of them are too many for side {self.side}; "
+                "start from 8 voxels or more"
             )
         ascend = all(a < b for a, b in pairwise(edges))
         between = f"ascending numbers between 0 and iterations ({self.iterations})"
-        expect(ascend, f"{key}.upsample_at", between, list(self.upsample_at))
+        expect(ascend, f"{self.key}.upsample_at", between, list(self.upsample_at))
         offset = self.search_iterations
         phases = []
         if offset:

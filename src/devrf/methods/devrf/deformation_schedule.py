@@ -7,10 +7,14 @@ from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
-from typing import Any
+from typing import Annotated, Any, ClassVar
+
+from annotated_types import MinLen
+from pydantic import dataclasses as checked
 
 from devrf.engine.phase import Phase
 from devrf.errors import DevrfError, expect
+from devrf.system.options import Count, Options, Positive, Several
 
 # Motion grids of this side take Adam about as long as a batch of rays takes; estimated.
 FINE_SIDE = 160
@@ -70,8 +74,8 @@ class DeformationPhase(Phase):
         return self.learning_rate_factor * math.pow(self.lr_final_factor, share)
 
 
-@dataclass(frozen=True)
-class DeformationSchedule:
+@checked.dataclass(frozen=True)
+class DeformationSchedule(Options):
     """The deformation stage's visits; the defaults are the paper's, inward-facing.
 
     See docs/method.md#coarse-to-fine. Frame 0 is the identity; its share of a level's iterations
@@ -87,11 +91,13 @@ class DeformationSchedule:
             None: voxels are cubes.
     """
 
-    levels: Sequence[Level] = PAPER_LEVELS
+    key: ClassVar[str] = "schedule.deformation"
+
+    levels: Annotated[Sequence[Level], MinLen(1)] = PAPER_LEVELS
     coarse_to_fine: bool = True
-    decay: float = 10 ** (-1 / 4)
-    rays: int = 8192
-    planes: int | None = None
+    decay: Positive = 10 ** (-1 / 4)
+    rays: Count = 8192
+    planes: Several | None = None
 
     @classmethod
     def from_rows(cls, levels: Mapping[str, Level | None], **settings: Any) -> DeformationSchedule:
@@ -115,14 +121,8 @@ class DeformationSchedule:
         return cls(numbered, **settings)
 
     def __post_init__(self) -> None:
-        key = "schedule.deformation"
-        expect(len(self.levels) > 0, f"{key}.levels", "at least one", "none")
-        expect(self.rays >= 1, f"{key}.rays", "at least 1", self.rays)
-        expect(self.decay > 0, f"{key}.decay", "more than 0", self.decay)
-        dense = self.planes is None or self.planes >= 2
-        expect(dense, f"{key}.planes", "at least 2, or null", self.planes)
         for number, level in enumerate(self.levels, 1):
-            _check_level(f"{key}.levels.{number}", level)
+            _check_level(f"{self.key}.levels.{number}", level)
         if not self.coarse_to_fine:
             iterations = sum(level.iterations for level in self.levels)
             finest = replace(self.levels[-1], iterations=iterations, lr_factor=None)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, ClassVar, Literal
 
 import torch
+from annotated_types import Ge, Gt, Le, Lt
+from pydantic.dataclasses import dataclass
 
-from devrf.errors import expect
 from devrf.rendering.sampling import FINEST
 from devrf.system.device import multiplies_bfloat16
+from devrf.system.options import Options, Positive
 
+Opacity = Annotated[float, Ge(0), Lt(1)]
 # What the colour network computes in.
 Precision = Literal["auto", "float32", "bfloat16"]
 
@@ -51,7 +53,7 @@ class CanonicalRates:
 
 
 @dataclass(frozen=True)
-class Sampling:
+class Sampling(Options):
     """How rays are sampled (docs/method.md#rays).
 
     Attributes:
@@ -61,20 +63,16 @@ class Sampling:
         occupancy_threshold: opacity of a step up to which a cell counts as empty.
     """
 
-    step: float = 0.5
-    alpha_threshold: float = 1e-4
-    search_alpha_threshold: float = 1e-7
-    occupancy_threshold: float = 1e-3
+    key: ClassVar[str] = "sampling"
 
-    def __post_init__(self) -> None:
-        expect(self.step >= FINEST, "sampling.step", f"at least {FINEST}", self.step)
-        for key in ("alpha_threshold", "search_alpha_threshold", "occupancy_threshold"):
-            value = getattr(self, key)
-            expect(0 <= value < 1, f"sampling.{key}", "at least 0 and below 1", value)
+    step: Annotated[float, Ge(FINEST)] = 0.5
+    alpha_threshold: Opacity = 1e-4
+    search_alpha_threshold: Opacity = 1e-7
+    occupancy_threshold: Opacity = 1e-3
 
 
 @dataclass(frozen=True)
-class MotionSettings:
+class MotionSettings(Options):
     """How the deformation field is learned, beside its schedule (docs/method.md#departures).
 
     Attributes:
@@ -90,22 +88,18 @@ class MotionSettings:
         min_rel_improvement: of a visit's loss, in two Lightning steps; with less it ends early.
     """
 
+    key: ClassVar[str] = "schedule.motion"
+
     learning_rate: float = 1e-3
     unit: Literal["world", "box"] = "world"
     views: Literal["one", "all"] = "one"
     pixels: Literal["all", "occupied"] = "all"
-    epochs: float | None = None
+    epochs: Positive | None = None
     occupancy_every: int = 25
     adam_state: Literal["fresh", "carried"] = "fresh"
     store: Literal["auto", "device", "host"] = "auto"
     store_half: bool | Literal["auto"] = "auto"
-    min_rel_improvement: float | None = None
-
-    def __post_init__(self) -> None:
-        gain, epochs, key = self.min_rel_improvement, self.epochs, "schedule.motion"
-        expect(epochs is None or epochs > 0, f"{key}.epochs", "above 0, or null", epochs)
-        some = gain is None or 0 < gain <= 1
-        expect(some, f"{key}.min_rel_improvement", "above 0, at most 1, or null", gain)
+    min_rel_improvement: Annotated[float, Gt(0), Le(1)] | None = None
 
     def stored_half(self, device: torch.device) -> bool:
         """Whether frames are kept in half precision while a stage learns on ``device``."""

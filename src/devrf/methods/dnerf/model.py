@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
+from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
 from devrf.data.batch import RayBatch
 from devrf.methods.nerf.deformable import DeformableField
 from devrf.methods.nerf.networks import SinusoidalEncoding, Trunk
-from devrf.methods.nerf.settings import FieldSettings
+from devrf.methods.nerf.settings import Bands, FieldSettings
 from devrf.rendering.output import RenderOutput
 
 # The last layer's weights begin in ±SMALL, so that the first displacements are next to zero.
@@ -57,7 +57,7 @@ class DNeRFSettings(FieldSettings):
 
     deformation_width: int = 256
     deformation_depth: int = 8
-    time_bands: int = 10
+    time_bands: Bands = 10
 
 
 class DNeRF(DeformableField):

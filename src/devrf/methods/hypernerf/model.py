@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import torch
+from annotated_types import Ge, Le
+from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
 from devrf.methods.nerf.networks import (
@@ -16,9 +17,10 @@ from devrf.methods.nerf.networks import (
     initialise,
     octave_window,
 )
-from devrf.methods.nerf.settings import FieldSettings
+from devrf.methods.nerf.settings import Bands, FieldSettings
 from devrf.methods.nerfies.model import Nerfies, NerfiesSettings
 from devrf.methods.protocol import ProtocolStage
+from devrf.system.options import Count, Share
 
 # Standard deviation of the last layer's first weights: all of space begins at w = 0, nearly.
 SMALL = 1e-5
@@ -65,19 +67,17 @@ class HyperNeRFSettings(NerfiesSettings):
     """
 
     slicing: Literal["surface", "plane"] = "surface"
-    ambient: int = 2
-    ambient_bands: int = 1
-    ambient_delay: float = 0.004
-    ambient_window: float = 0.04
+    ambient: Count = 2
+    ambient_bands: Annotated[int, Ge(1), Le(32)] = 1
+    ambient_delay: Share = 0.004
+    ambient_window: Share = 0.04
     slicing_width: int = 64
     slicing_depth: int = 6
     slicing_skip: int | None = 4
-    slicing_bands: int = 6
+    slicing_bands: Bands = 6
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.check_least(1, "ambient", "ambient_bands")
-        self.check_least(0, "ambient_delay", "ambient_window")
         delay = self.ambient_delay
         together = delay + self.ambient_window <= 1
         self.check("ambient_window", together, f"at most 1 with ambient_delay ({delay})")

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from devrf.methods.nerf.settings import OccupancySettings
+from annotated_types import Ge, Le, MinLen
+from pydantic.dataclasses import dataclass
+
+from devrf.methods.nerf.settings import OccupancySettings, Samples
+from devrf.system.options import Count, Several
 
 Pairing = Literal["product", "hexplane"]
 HIGHEST_DEGREE = 3  # of spherical harmonics
@@ -36,37 +39,25 @@ class KPlanesSettings(OccupancySettings):
 
     hull: bool = False
     empty_from: float | None = 0.05
-    resolution: int = 64
-    scales: Sequence[int] = (1, 2, 4, 8)
-    time_resolution: int | None = None
-    channels: int = 32
+    resolution: Several = 64
+    scales: Annotated[Sequence[Count], MinLen(1)] = (1, 2, 4, 8)
+    time_resolution: Several | None = None
+    channels: Count = 32
     pairing: Pairing = "product"
     decoder: Literal["hybrid", "explicit"] = "hybrid"
-    width: int = 64
-    harmonics: int = HIGHEST_DEGREE
-    basis_width: int = 128
-    basis_depth: int = 4
+    width: Several = 64
+    harmonics: Annotated[int, Ge(0), Le(HIGHEST_DEGREE)] = HIGHEST_DEGREE
+    basis_width: Several = 128
+    basis_depth: Count = 4
     sampling: Literal["occupancy", "proposals"] = "occupancy"
-    steps: int = 256
-    samples: int = 48
-    proposal_samples: Sequence[int] = (256, 128)
-    proposal_resolutions: Sequence[int] = (64, 128)
-    proposal_channels: int = 8
+    steps: Samples = 256
+    samples: Samples = 48
+    proposal_samples: Annotated[Sequence[Samples], MinLen(1)] = (256, 128)
+    proposal_resolutions: Sequence[Several] = (64, 128)
+    proposal_channels: Count = 8
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        self.check_least(2, "resolution", "width", "basis_width")
-        self.check_least(1, "channels", "basis_depth", "proposal_channels")
-        self.check_samples("steps", "samples")
-        degree = self.harmonics
-        fit = degree == HIGHEST_DEGREE or (
-            0 <= degree < HIGHEST_DEGREE and self.decoder == "hybrid"
-        )
-        self.check("harmonics", fit, "0 to 3; 3 with decoder=explicit, which has none")
-        fit = len(self.scales) > 0 and min(self.scales) >= 1
-        self.check("scales", fit, "one or more numbers above 0")
-        points = self.time_resolution
-        self.check("time_resolution", points is None or points >= 2, "at least 2, or null")
-        rounds = len(self.proposal_samples) == len(self.proposal_resolutions) > 0
-        fit = rounds and min(*self.proposal_samples, *self.proposal_resolutions) >= 2
-        self.check("proposal_samples", fit, "numbers from 2, as many as proposal_resolutions")
+        fit = self.harmonics == HIGHEST_DEGREE or self.decoder == "hybrid"
+        self.check("harmonics", fit, "3 with decoder=explicit, which has none")
+        fit = len(self.proposal_samples) == len(self.proposal_resolutions)
+        self.check("proposal_samples", fit, "as many numbers as proposal_resolutions has")

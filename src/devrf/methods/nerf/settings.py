@@ -2,46 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
+
+from annotated_types import Ge, Le
+from pydantic.dataclasses import dataclass
 
 from devrf.errors import expect
+from devrf.system.options import Options, Several, Share
 
 Initialisation = Literal["uniform", "glorot"]
 Precision = Literal["auto", "float32", "bfloat16"]
 
-# The most samples of a ray.
-SAMPLES = 1024
-# The most octaves of an encoding.
-BANDS = 32
+# Samples of a ray; octaves of an encoding.
+Samples = Annotated[int, Ge(2), Le(1024)]
+Bands = Annotated[int, Ge(0), Le(32)]
 
 
-class CheckedSettings:
-    """Settings of a method that refuse impossible values."""
+@dataclass(frozen=True)
+class MethodSettings(Options):
+    """Sizes and sampling of a method."""
 
     key: ClassVar[str] = "ray_stage.model.settings"
 
     def check(self, name: str, holds: bool, expected: str) -> None:
-        """Refuse the setting ``name`` unless a condition ``holds``.
-
-        Raises:
-            DevrfError: it does not.
-        """
+        """Refuse by a DevrfError the setting ``name`` unless a condition ``holds``."""
         expect(holds, f"{self.key}.{name}", expected, getattr(self, name))
-
-    def check_least(self, minimum: int, *names: str) -> None:
-        """Refuse settings below ``minimum``; raises as :meth:`check`."""
-        for name in names:
-            self.check(name, getattr(self, name) >= minimum, f"at least {minimum}")
-
-    def check_samples(self, *names: str) -> None:
-        """Refuse numbers of a ray's samples below 2 or above the most; raises likewise."""
-        for name in names:
-            self.check(name, 2 <= getattr(self, name) <= SAMPLES, f"2 to {SAMPLES}")
 
 
 @dataclass(frozen=True)
-class OccupancySettings(CheckedSettings):
+class OccupancySettings(MethodSettings):
     """How empty space is skipped.
 
     Attributes:
@@ -52,16 +41,9 @@ class OccupancySettings(CheckedSettings):
             after this share of a stage; None: never.
     """
 
-    occupancy_side: int = 128
+    occupancy_side: Several = 128
     hull: bool = True
-    empty_from: float | None = 0.25
-
-    def __post_init__(self) -> None:
-        self.check_least(2, "occupancy_side")
-        for name in (field.name for field in fields(self) if field.name.endswith("bands")):
-            self.check(name, 0 <= getattr(self, name) <= BANDS, f"0 to {BANDS}")
-        share = self.empty_from
-        self.check("empty_from", share is None or 0 <= share <= 1, "0 to 1, or null")
+    empty_from: Share | None = 0.25
 
 
 @dataclass(frozen=True)
@@ -81,20 +63,15 @@ class PlacedSettings(OccupancySettings):
         steps: samples along the box's diagonal (occupancy).
     """
 
-    width: int = 256
-    depth: int = 8
+    width: Several = 256
+    depth: Several = 8
     skip: int | None = 5
-    bands: int = 10
-    direction_bands: int = 4
+    bands: Bands = 10
+    direction_bands: Bands = 4
     density_scale: float = 10.0
     initialisation: Initialisation = "uniform"
     precision: Precision = "float32"
-    steps: int = 128
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.check_least(2, "width", "depth")
-        self.check_samples("steps")
+    steps: Samples = 128
 
 
 @dataclass(frozen=True)
@@ -111,13 +88,11 @@ class FieldSettings(PlacedSettings):
     """
 
     sampling: Literal["hierarchical", "occupancy"] = "hierarchical"
-    coarse: int = 64
-    fine: int = 128
+    coarse: Samples = 64
+    fine: Samples = 128
     separate_coarse: bool = False
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        self.check_samples("coarse", "fine")
         possible = self.sampling == "hierarchical" or not self.separate_coarse
         self.check(
             "separate_coarse", possible, "false, as sampling=occupancy has no coarse samples"

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import torch
+from annotated_types import Ge
+from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
 from devrf.data.batch import RayBatch
@@ -19,10 +20,11 @@ from devrf.methods.nerf.networks import (
     initialise,
     octave_window,
 )
-from devrf.methods.nerf.settings import FieldSettings, Initialisation
+from devrf.methods.nerf.settings import Bands, FieldSettings, Initialisation, Samples
 from devrf.methods.nerfies.elastic import SCALE, drawn, jacobians, robust, strain
 from devrf.methods.protocol import ProtocolStage
 from devrf.rendering.output import RenderOutput
+from devrf.system.options import Share
 
 # The heads' weights begin in [0, SMALL), so that the first motions are next to none.
 SMALL = 1e-4
@@ -77,24 +79,19 @@ class NerfiesSettings(FieldSettings):
     """
 
     skip: int | None = 4
-    bands: int = 8
+    bands: Bands = 8
     initialisation: Initialisation = "glorot"
-    coarse: int = 128
-    fine: int = 128
+    coarse: Samples = 128
+    fine: Samples = 128
     separate_coarse: bool = True
     code: int = 8
     warp_width: int = 128
     warp_depth: int = 6
     warp_skip: int | None = 4
-    warp_bands: int = 6
-    window: float = 0.32
+    warp_bands: Bands = 6
+    window: Share = 0.32
     elastic: Literal["drawn", "full"] = "drawn"
-    elastic_rays: int = 0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.check("window", 0 <= self.window <= 1, "a share from 0 to 1")
-        self.check_least(0, "elastic_rays")
+    elastic_rays: Annotated[int, Ge(0)] = 0
 
 
 class Nerfies(DeformableField):

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from devrf.methods.nerf.settings import CheckedSettings
+from annotated_types import Ge, Len
+from pydantic.dataclasses import dataclass
+
+from devrf.methods.nerf.settings import MethodSettings
+from devrf.system.options import Count, Positive, Several
+
+# Channels of layers, each of which halves or doubles.
+Levels = Annotated[Sequence[Count], Len(1, 8)]
 
 
 @dataclass(frozen=True)
-class NeuralVolumesSettings(CheckedSettings):
+class NeuralVolumesSettings(MethodSettings):
     """Sizes and sampling; the defaults are the published ones (docs/methods/neural_volumes.md).
 
     Attributes:
@@ -34,33 +40,24 @@ class NeuralVolumesSettings(CheckedSettings):
         occupancy_side: the hulls have about side³ cells.
     """
 
-    code: int = 256
-    encoder_views: int = 3
+    code: Count = 256
+    encoder_views: Count = 3
     encoder_size: Sequence[int] = (512, 384)
-    encoder_channels: Sequence[int] = (64, 64, 128, 128, 256, 256, 256)
-    encoder_width: int = 512
-    template_channels: Sequence[int] = (1024, 512, 512, 256, 256, 128, 128)
+    encoder_channels: Levels = (64, 64, 128, 128, 256, 256, 256)
+    encoder_width: Count = 512
+    template_channels: Levels = (1024, 512, 512, 256, 256, 128, 128)
     warp: Literal["affinemix", "conv"] = "affinemix"
-    warp_side: int = 32
-    maps: int = 16
+    warp_side: Several = 32
+    maps: Count = 16
     identity_start: bool = False
-    warp_channels: Sequence[int] = (1024, 512, 512, 256, 256)
-    warp_scale: float = 2 / 1024
-    density_scale: float = 1.0
-    step: float = 4 / 256
+    warp_channels: Levels = (1024, 512, 512, 256, 256)
+    warp_scale: Positive = 2 / 1024
+    density_scale: Positive = 1.0
+    step: Annotated[float, Ge(1 / 512)] = 4 / 256
     hull: bool = False
-    occupancy_side: int = 128
+    occupancy_side: Several = 128
 
     def __post_init__(self) -> None:
-        self.check_least(1, "code", "encoder_views", "encoder_width", "maps")
-        self.check_least(2, "occupancy_side", "warp_side")
-        for name in ("density_scale", "warp_scale"):
-            self.check(name, getattr(self, name) > 0, "more than 0")
-        self.check("step", self.step >= 1 / 512, "at least 1/512")
-        for name in ("encoder_channels", "template_channels", "warp_channels"):
-            channels = getattr(self, name)
-            self.check(name, len(channels) <= 8, "at most 8 levels")
-            self.check(name, channels and min(channels) >= 1, "one or more numbers above 0")
         multiple = 2 ** len(self.encoder_channels)
         fits = [edge >= multiple and edge % multiple == 0 for edge in self.encoder_size]
         self.check("encoder_size", fits == [True, True], f"two multiples of {multiple}")

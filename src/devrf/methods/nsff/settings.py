@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from dataclasses import field
+from typing import Annotated, ClassVar, Literal
 
-from devrf.methods.nerf.settings import CheckedSettings, PlacedSettings
+from annotated_types import Ge
+from pydantic.dataclasses import dataclass
+
+from devrf.methods.nerf.settings import MethodSettings, PlacedSettings, Samples
+from devrf.system.options import Count, NotNegative, Positive
 
 
 @dataclass(frozen=True)
-class Warmup(CheckedSettings):
+class Warmup(MethodSettings):
     """N₀ iterations in which motion is begun, as data (docs/methods/nsff.md#schedule).
 
     Attributes:
@@ -20,16 +24,15 @@ class Warmup(CheckedSettings):
         prior_decay: by what depth and flow priors are divided after each N₀.
     """
 
-    key: ClassVar[str] = f"{CheckedSettings.key}.warmup"
+    key: ClassVar[str] = f"{MethodSettings.key}.warmup"
 
-    steps_per_frame: int = 1000
+    steps_per_frame: Count = 1000
     min_frames: int = 30
     max_frames: int = 250
     chained_from: float = 2.0
-    prior_decay: float = 10.0
+    prior_decay: Annotated[float, Ge(1)] = 10.0
 
     def __post_init__(self) -> None:
-        self.check_least(1, "steps_per_frame", "prior_decay")
         limit = self.max_frames
         self.check("min_frames", 1 <= self.min_frames <= limit, f"1 … max_frames ({limit})")
 
@@ -61,19 +64,11 @@ class NSFFSettings(PlacedSettings):
         warmup: when the losses change.
     """
 
-    density_noise: float = 1.0
-    flow_reach: float | None = None
+    density_noise: NotNegative = 1.0
+    flow_reach: Positive | None = None
     blend: Literal["v", "additive"] = "v"
     sampling: Literal["stratified", "occupancy"] = "stratified"
-    samples: int = 128
+    samples: Samples = 128
     neighbours: Literal["both", "one"] = "both"
-    hard_rays: int = 512
+    hard_rays: Annotated[int, Ge(0)] = 512
     warmup: Warmup = field(default_factory=Warmup)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if isinstance(self.warmup, dict):  # as a checkpoint has it
-            object.__setattr__(self, "warmup", Warmup(**self.warmup))
-        self.check_samples("samples")
-        self.check_least(0, "hard_rays", "density_noise")
-        self.check("flow_reach", self.flow_reach is None or self.flow_reach > 0, "more than 0")

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
-from devrf.methods.nerf.settings import OccupancySettings
+from annotated_types import Ge, Gt, Lt, MinLen
+from pydantic.dataclasses import dataclass
+
+from devrf.methods.nerf.settings import Bands, OccupancySettings
 from devrf.rendering.sampling import FINEST
+from devrf.system.options import Count, NotNegative, Positive, Several
 
 
 @dataclass(frozen=True)
@@ -39,34 +42,25 @@ class TiNeuVoxSettings(OccupancySettings):
 
     hull: bool = False
     empty_from: float | None = None
-    side: int = 160
-    channels: int = 6
-    strides: Sequence[int] = (1, 2, 4)
+    side: Several = 160
+    channels: Count = 6
+    strides: Annotated[Sequence[Count], MinLen(1)] = (1, 2, 4)
     upsample_at: Sequence[float] = (0.1, 0.2, 0.3)
-    width: int = 256
-    bands: int = 10
-    direction_bands: int = 4
-    time_bands: int = 8
-    feature_bands: int = 2
-    alpha_init: float = 1e-3
-    step: float = 0.5
-    weight_threshold: float = 1e-4
-    grid_rate: float = 100.0
-    motion_rate: float = 0.75
+    width: Several = 256
+    bands: Bands = 10
+    direction_bands: Bands = 4
+    time_bands: Bands = 8
+    feature_bands: Bands = 2
+    alpha_init: Annotated[float, Gt(0), Lt(1)] = 1e-3
+    step: Annotated[float, Ge(FINEST)] = 0.5
+    weight_threshold: NotNegative = 1e-4
+    grid_rate: Positive = 100.0
+    motion_rate: Positive = 0.75
     starts_still: bool = False
-    tv: float = 0.0
+    tv: NotNegative = 0.0
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        self.check_least(2, "side", "width")
-        self.check_least(1, "channels")
-        self.check_least(0, "weight_threshold", "tv")
-        self.check("alpha_init", 0 < self.alpha_init < 1, "between 0 and 1")
-        self.check("step", self.step >= FINEST, f"at least {FINEST}")
-        for name in ("grid_rate", "motion_rate"):
-            self.check(name, getattr(self, name) > 0, "more than 0")
-        strides = self.strides
-        fit = bool(strides) and min(strides) >= 1 and not any(max(strides) % s for s in strides)
-        self.check("strides", fit, "numbers above 0 that divide the largest")
+        fit = not any(max(self.strides) % stride for stride in self.strides)
+        self.check("strides", fit, "numbers that divide the largest")
         shares = [0.0, *self.upsample_at, 1.0]
         self.check("upsample_at", shares == sorted(shares), "ascending shares from 0 to 1")

@@ -17,7 +17,8 @@ from devrf.scenes.formats.nerfies import ItemsReader, Listed
 from devrf.scenes.image_folders import Downscale, ImageFolder
 from devrf.scenes.images import image_at
 from devrf.scenes.splits import every_nth
-from devrf.scenes.validation import abbreviated, scene_error
+from devrf.scenes.validation import scene_error
+from devrf.system.options import abbreviated
 
 log = logging.getLogger(__name__)
 

@@ -40,7 +40,8 @@ from devrf.scenes.reader import EstimatedFlow, Holdout, InwardReader, Time
 from devrf.scenes.scene import Capture, Scene
 from devrf.scenes.splits import every_nth
 from devrf.scenes.transforms import Transforms
-from devrf.scenes.validation import FARTHEST, abbreviated, check_poses, scene_error
+from devrf.scenes.validation import FARTHEST, check_poses, scene_error
+from devrf.system.options import abbreviated
 
 log = logging.getLogger(__name__)
 

@@ -21,7 +21,8 @@ from devrf.scenes.reader import Count, EstimatedFlow, Holdout, PosedReader, Time
 from devrf.scenes.scene import Scene
 from devrf.scenes.splits import at_rest, distinct_poses, every_nth, in_motion, one_moment
 from devrf.scenes.transforms import TIME_TOLERANCE, Transforms, read_transforms
-from devrf.scenes.validation import abbreviated, scene_error
+from devrf.scenes.validation import scene_error
+from devrf.system.options import abbreviated
 
 log = logging.getLogger(__name__)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import KW_ONLY
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import torch
 from pydantic import Field, model_validator
@@ -33,7 +33,8 @@ from devrf.scenes.procedural.surroundings import REACH, STEPS, Backdrop, Room, S
 from devrf.scenes.scene import Bounds, Capture, Scene
 from devrf.scenes.space import inward_space
 from devrf.scenes.splits import every_nth
-from devrf.scenes.validation import MIN_SIDE, Options, scene_error
+from devrf.scenes.validation import MIN_SIDE, scene_error
+from devrf.system.options import Options
 from devrf.system.threads import one_thread
 
 Side = Annotated[int, Field(strict=True, ge=MIN_SIDE, le=4096)]
@@ -67,6 +68,7 @@ class Recipe(Options, ABC):
         DevrfError: a number is out of range; the message names it.
     """
 
+    key: ClassVar[str] = "data"
     _: KW_ONLY
     width: Side = 96
     height: Side = 96
