@@ -53,6 +53,11 @@ MISTAKES = {
         ["schedule.deformation.levels.4={iterations:2}", "schedule.deformation.levels.3=null"],
         "schedule.deformation.levels: expected rows 1 to 3 with side and iterations",
     ),
+    "a level of a grid of one point": (
+        ["schedule.deformation.levels.2.side=1"],
+        "schedule.deformation.levels.2.side: expected at least 2, not 1",
+    ),
+    "no times to export": (["export.times=[]"], "export.times: expected at least 1 item, not 0"),
     "unknown key of a level": (
         ["+schedule.deformation.levels.3.sides=4"],
         "schedule.deformation.levels.3.sides: no such key; did you mean",

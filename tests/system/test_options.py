@@ -23,6 +23,7 @@ class Some(Options):
     opacity: Annotated[float, Ge(0), Lt(1)] = 0.5
     sides: Annotated[Sequence[Count], MinLen(1)] = (1, 2)
     kind: Literal["one", "other"] = "one"
+    width: Count | Literal["auto"] = "auto"
 
 
 @pytest.mark.parametrize(
@@ -34,6 +35,7 @@ class Some(Options):
         (lambda: Some(1, sides=()), "part.some.sides: expected at least 1 item, not 0; correct it"),
         (lambda: Some(1, sides=[3, 0]), "part.some.sides[1]: expected at least 1, not 0; correct"),
         (lambda: Some(1, kind="neither"), "part.some.kind: expected 'one' or 'other', not 'neith"),
+        (lambda: Some(1, width=0), "part.some.width: expected at least 1 or 'auto', not 0"),
         (lambda: Some(), "part.some.rays: is missing; add it"),
         (lambda: Some(1, ray=2), "part.some.ray: no such option; correct its name"),
         (lambda: replace(Some(1), rays=-1), "part.some.rays: expected at least 1, not -1"),
@@ -49,9 +51,18 @@ def test_values_that_can_be_are_kept() -> None:
     assert Some(3, sides=[4]) == Some(rays=3, opacity=0.5, sides=[4], kind="one")
 
 
+def test_too_many_values_are_a_mistake_of_the_caller() -> None:
+    with pytest.raises(TypeError, match="too many positional arguments"):
+        Some(1, 0.5, (1,), "one", 5, 6)  # type: ignore[call-arg]
+    with pytest.raises(TypeError, match="rays: given twice"):
+        Some(1, rays=2)  # type: ignore[misc]
+
+
 def test_pydantic_speaks_as_the_project_does() -> None:
-    assert expectation("Input should be greater than or equal to 2") == "at least 2"
-    assert expectation("Input should be less than or equal to 1") == "at most 1"
-    assert expectation("List should have at least 1 item after validation, not 0") == (
-        "at least 1 item, not 0"
-    )
+    least = "Input should be greater than or equal to 2"
+    assert expectation([least], "1") == "expected at least 2, not 1"
+    either = [least, "Input should be 'auto'"]
+    assert expectation(either, "'one'") == "expected at least 2 or 'auto', not 'one'"
+    empty = "List should have at least 1 item after validation, not 0"
+    assert expectation([empty], "[]") == "expected at least 1 item, not 0"
+    assert expectation(["Odd input"], "3") == "odd input, not 3"

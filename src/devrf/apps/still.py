@@ -9,8 +9,8 @@ from pathlib import Path
 from textwrap import wrap
 from typing import ClassVar, Literal, NamedTuple
 
+import pydantic.dataclasses
 import torch
-from pydantic import dataclasses as checked
 from torch import Tensor
 
 from devrf.apps.images import (
@@ -45,7 +45,7 @@ DEPTH = "depth: near is bright"
 HEADINGS = ("truth", "rendered", "error: 0 to 0.25 or more", DEPTH)
 
 
-@checked.dataclass(frozen=True)
+@pydantic.dataclasses.dataclass(frozen=True)
 class StillSettings(Options):
     """Settings of ``stage=still``; ``conf/still/default.yaml`` says what each does."""
 

@@ -83,12 +83,13 @@ def check_config(config: DictConfig) -> None:
                 lacking = [other["loc"][-1] for other in error.errors() if other["type"] in LEFT]
                 raise unknown_key(where, [*beside, *lacking]) from None
             alike = [other["msg"] for other in issues if _place(raw, other["loc"])[0] == where]
-            expected = " or ".join(dict.fromkeys(map(expectation, alike)))
-            if issue["type"] in BUILT:
-                expected = "a section with _target_"
             value = issue["input"]
-            meant = did_you_mean(value, re.findall("'([^']+)'", expected), f"{where}=")
-            raise DevrfError(f"{where}: expected {expected}, not {value!r}{meant}") from None
+            said = expectation(alike, repr(value))
+            choices = re.findall("'([^']+)'", said.rpartition(", not ")[0])
+            meant = did_you_mean(value, choices, f"{where}=")
+            if issue["type"] in BUILT:
+                said = f"expected a section with _target_, not {value!r}"
+            raise DevrfError(f"{where}: {said}{meant}") from None
 
 
 def _is_left_to_the_part(issue: Mapping[str, Any]) -> bool:
@@ -154,7 +155,7 @@ def _parameters(target: str, path: str) -> dict[str, Any]:
     own_init = inspect.isclass(part) and not is_dataclass(part)
     hints: dict[str, Any] = {}
     with suppress(NameError, TypeError):  # names imported only for a type checker
-        hints = get_type_hints(part.__init__ if own_init else part)
+        hints = get_type_hints(part.__init__ if own_init else part, include_extras=True)
     types = {
         "**" if p.kind is p.VAR_KEYWORD else p.name: hints.get(p.name, Any) for p in parameters
     }

@@ -25,7 +25,7 @@ from devrf.methods.protocol import ProtocolStage
 from devrf.methods.weighted_loss import counted_weights, visibility, weighted_sum
 from devrf.scenes.scene import Views
 from devrf.scenes.space import dynamic_only
-from devrf.system.options import Count, Options, Positive
+from devrf.system.options import Count, Options, Positive, Whole
 from devrf.system.profiling import span
 
 
@@ -60,7 +60,7 @@ class RaySchedule(Options):
     betas: Sequence[float] = (0.9, 0.999)
     eps: float = 1e-8
     curriculum: Annotated[float, Ge(0), Lt(1)] = 0.0
-    centre_crop: Annotated[int, Ge(0)] = 0
+    centre_crop: Whole = 0
     times_per_batch: Count | None = None
     rays_without_hull: Count | None = None
     decay: Literal["exponential", "cosine"] = "exponential"

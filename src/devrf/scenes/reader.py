@@ -18,17 +18,13 @@ from devrf.scenes.scene import Background, Capture, OpticalFlow, Scene, Views
 from devrf.scenes.space import SpaceChoice, centred, forward_facing_scene, inward_space
 from devrf.scenes.transforms import SceneBounds
 from devrf.scenes.validation import LARGEST, checked_box, scene_error
-from devrf.system.options import Options
+from devrf.system.options import Count, Options, Several
 
 FlowSource = Literal["auto", "files", "dis", "raft", "none"]
 Exposure = Literal["auto", "equal", "none"]
 # The flow sources of layouts that have no place for flow files.
 EstimatedFlow = Literal["auto", "dis", "raft", "none"]
 
-Count = Annotated[int, Field(strict=True, ge=1)]
-SeveralFrames = Annotated[int, Field(strict=True, ge=2)]
-# One image of so many is held out.
-Holdout = Annotated[int, Field(strict=True, ge=2)]
 Time = Annotated[Number, Field(ge=0, le=1)]
 
 
@@ -82,7 +78,7 @@ class SceneReader(Options, ABC):
     flow: FlowSource = "auto"
     flow_cache: str | Path | None = None
     exposure: Exposure = "auto"
-    frames: SeveralFrames | None = None
+    frames: Several | None = None
     validation: bool = False
 
     factor: ClassVar[int] = 1
@@ -134,7 +130,7 @@ class FixedViewsReader(SceneReader):
     dynamic: str | None = None
     downscale: Downscale = "auto"
     test_view: Annotated[int, Field(strict=True)] = -1
-    holdout: Holdout = 8
+    holdout: Several = 8
     train_views: Count | None = None
 
 

@@ -5,26 +5,27 @@ from __future__ import annotations
 import re
 import reprlib
 from collections.abc import Sequence
-from dataclasses import fields
+from inspect import signature
 from typing import Annotated, Any, ClassVar
 
-from annotated_types import Ge, Gt, Le
-from pydantic import ConfigDict, ValidationError, model_validator
+from pydantic import ConfigDict, Field, ValidationError, model_validator
 from pydantic.dataclasses import dataclass
+from pydantic_core import ArgsKwargs
 
 from devrf.errors import DevrfError
 
 # Types of settings: how many, how many that make a grid or a series, shares, and factors.
-Count = Annotated[int, Ge(1)]
-Several = Annotated[int, Ge(2)]
-Share = Annotated[float, Ge(0), Le(1)]
-NotNegative = Annotated[float, Ge(0)]
-Positive = Annotated[float, Gt(0)]
+Whole = Annotated[int, Field(strict=True, ge=0)]
+Count = Annotated[int, Field(strict=True, ge=1)]
+Several = Annotated[int, Field(strict=True, ge=2)]
+Share = Annotated[float, Field(strict=True, ge=0, le=1)]
+NotNegative = Annotated[float, Field(strict=True, ge=0)]
+Positive = Annotated[float, Field(strict=True, gt=0)]
 
 # A value can be of any length; a message has to be read.
 LONGEST_MESSAGE = 480
 LONGEST_VALUE = 60
-# What pydantic says of a number, and what this project does.
+# Pydantic's words for the range of a number, and this project's.
 WORDS = {
     "greater than or equal to": "at least",
     "less than or equal to": "at most",
@@ -52,24 +53,27 @@ def _shortened(text: str, most: int) -> str:
     return text if len(text) <= most else f"{text[:half]}...{text[-half:]}"
 
 
-def first_error(error: ValidationError, where: str, arguments: Sequence[str] = ()) -> DevrfError:
+def first_error(error: ValidationError, where: str, *, in_file: bool = True) -> DevrfError:
     """The first thing that pydantic found wrong: key, expectation, and the value that was given.
 
     Args:
         error: what a model or an adapter raised.
         where: what comes before the key: ``FILE: `` for values in a file, ``data.`` for options.
-        arguments: names of what may be given by its place.
+        in_file: whether the value is in a file; an option may have one of several types.
     """
-    first = error.errors(include_url=False)[0]
-    loc = first["loc"]
-    if arguments and isinstance(loc[0], int):
-        loc = (arguments[loc[0]], *loc[1:])
+    issues = error.errors(include_url=False)
+    alike = issues[:1]
+    loc = issues[0]["loc"]
+    if not in_file:
+        alike = [issue for issue in issues if issue["loc"][:1] == loc[:1]]
+        # The other parts name types that pydantic tried.
+        loc = (*loc[:1], *(part for part in loc[1:] if isinstance(part, int)))
     key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc)
     place = f"{where}{key.removeprefix('.')}" if key else where.rstrip(": .")
-    return DevrfError(one_line(place, _complaint(first)))
+    return DevrfError(one_line(place, _complaint(issues[0], [issue["msg"] for issue in alike])))
 
 
-def _complaint(issue: Any) -> str:
+def _complaint(issue: Any, alike: Sequence[str]) -> str:
     if issue["type"] == "json_invalid":
         return f"not valid JSON ({issue['ctx']['error']}); write it again"
     if issue["type"] == "missing":
@@ -78,16 +82,20 @@ def _complaint(issue: Any) -> str:
         return "no such option; correct its name"
     if issue["type"] == "value_error":  # raised by a validator of ours
         return str(issue["ctx"]["error"])
-    expected = expectation(issue["msg"])
+    return f"{expectation(alike, abbreviated(issue['input']))}; correct it"
+
+
+def expectation(messages: Sequence[str], value: str) -> str:
+    """``expected at least 1, not 0`` of "Input should be greater than or equal to 1" and 0.
+
+    Several ``messages`` of pydantic say what else the value might be.
+    """
+    said = " or ".join(dict.fromkeys(re.sub(r"^\w+ should (be|have) ", "", m) for m in messages))
+    said = re.sub("|".join(WORDS), lambda found: WORDS[found[0]], said)
+    said = said.replace(" after validation", "")
+    said = f"expected {said}" if " should " in messages[0] else f"{said[0].lower()}{said[1:]}"
     # For lists that are too short or too long, the message says the length itself.
-    value = "" if ", not " in expected else f", not {abbreviated(issue['input'])}"
-    return f"expected {expected}{value}; correct it"
-
-
-def expectation(message: str) -> str:
-    """What pydantic expects, as ``at least 1`` of "Input should be greater than or equal to 1"."""
-    message = re.sub(r"^\w+ should (be|have) ", "", message).replace(" after validation", "")
-    return re.sub("|".join(WORDS), lambda found: WORDS[found[0]], message)
+    return said if ", not " in said else f"{said}, not {value}"
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -105,7 +113,13 @@ class Options:
     @model_validator(mode="wrap")
     @classmethod
     def _in_one_line(cls, value: Any, validate: Any) -> Any:
+        if not isinstance(value, ArgsKwargs):
+            return validate(value)  # a part of something larger, which knows the whole key
+        given = signature(cls).bind_partial(*value.args).arguments
+        named = value.kwargs or {}
+        if twice := ", ".join(given.keys() & named):
+            raise TypeError(f"{cls.__name__}: {twice}: given twice")
         try:
-            return validate(value)
+            return validate(ArgsKwargs((), given | named))
         except ValidationError as error:
-            raise first_error(error, f"{cls.key}.", [field.name for field in fields(cls)]) from None
+            raise first_error(error, f"{cls.key}.", in_file=False) from None

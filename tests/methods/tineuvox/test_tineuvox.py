@@ -99,6 +99,25 @@ def test_a_model_that_starts_still_is_the_same_at_all_times() -> None:
         assert torch.allclose(early, late) == starts_still
 
 
+@torch.no_grad()
+def test_samples_of_little_weight_hide_what_is_behind_but_have_no_color(
+    tiny_scene: Scene, some_rays: Any
+) -> None:
+    torch.manual_seed(0)
+    model = TiNeuVox(replace(TINY, weight_threshold=0.0)).eval()
+    model.setup(tiny_scene)
+    whole = model(some_rays)
+    weight = whole.extras["weight"]
+    model.least_weight = float(weight.median())
+    shown = weight > model.least_weight
+    part = model(some_rays)
+    assert 0 < shown.sum() < len(shown)
+    assert torch.equal(part.extras["weight"], weight[shown])
+    assert torch.equal(part.extras["sample_color"], whole.extras["sample_color"][shown])
+    assert torch.equal(part.transmittance, whole.transmittance)
+    assert (part.color <= whole.color + 1e-6).all() and not torch.equal(part.color, whole.color)
+
+
 def test_terms_by_hand(tiny_scene: Scene, some_rays: Any) -> None:
     model = TiNeuVox(TINY)
     model.setup(tiny_scene)

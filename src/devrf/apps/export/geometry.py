@@ -8,10 +8,10 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, cast
 
+import pydantic.dataclasses
 import torch
 from annotated_types import Ge, Gt, Le, Lt, MinLen
 from pydantic import FiniteFloat
-from pydantic import dataclasses as checked
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -25,10 +25,10 @@ from devrf.system.options import Count, Options, Share
 
 Format = Literal["gltf", "html", "ply", "obj", "splats", "usd"]
 Up = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
-Finite = Annotated[FiniteFloat, Gt(0)]
+PositiveFinite = Annotated[FiniteFloat, Gt(0)]
 
 
-@checked.dataclass(frozen=True)
+@pydantic.dataclasses.dataclass(frozen=True)
 class ExportSettings(Options):
     """Settings of ``stage=export``; ``conf/export/default.yaml`` says what each does."""
 
@@ -40,14 +40,14 @@ class ExportSettings(Options):
     side: Annotated[int, Ge(2), Le(1024)] | None = None
     faces: Annotated[int, Ge(4)] = 20_000
     pieces: Share = 0.01
-    reach: Finite = 10.0
+    reach: PositiveFinite = 10.0
     colors: Literal["normal", "mean"] = "mean"
     points: Count = 20_000
     times: Annotated[Sequence[float], MinLen(1)] | None = None
-    fps: Finite | None = None
-    seconds: Finite = 3.0
+    fps: PositiveFinite | None = None
+    seconds: PositiveFinite = 3.0
     up: Up = "auto"
-    metres: Finite = 1.0
+    metres: PositiveFinite = 1.0
     into: str | Path | None = None
 
     def __post_init__(self) -> None:

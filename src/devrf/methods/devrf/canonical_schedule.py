@@ -8,13 +8,13 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Annotated, ClassVar
 
+import pydantic.dataclasses
 from annotated_types import Ge, Gt, Le
-from pydantic import dataclasses as checked
 
 from devrf.engine.phase import Phase
 from devrf.errors import DevrfError, expect
 from devrf.geometry.space import Space
-from devrf.system.options import Count, NotNegative, Options, Several
+from devrf.system.options import Count, NotNegative, Options, Several, Whole
 
 Side = Annotated[float, Ge(2)]
 
@@ -34,7 +34,7 @@ class CanonicalPhase(Phase):
         return float(self.voxels ** (1 / 3))
 
 
-@checked.dataclass(frozen=True)
+@pydantic.dataclasses.dataclass(frozen=True)
 class CanonicalSchedule(Options):
     """The canonical stage's phases; the defaults are the paper's, inward-facing.
 
@@ -67,7 +67,7 @@ class CanonicalSchedule(Options):
 
     key: ClassVar[str] = "schedule.canonical"
 
-    search_iterations: Annotated[int, Ge(0)] = 5000
+    search_iterations: Whole = 5000
     search_side: Several = 100
     visual_hull_init: bool = False
     iterations: Count = 20000
@@ -79,10 +79,10 @@ class CanonicalSchedule(Options):
     occupancy_every: Several | None = 1000
     rays: Count = 8192
     min_views: Count = 3
-    dense_tv_iterations: Annotated[int, Ge(0)] = 0
+    dense_tv_iterations: Whole = 0
     voxels_per_pixel: Annotated[float, Gt(0), Le(4)] | None = None
     epochs: Annotated[float, Ge(1)] | None = None
-    view_dependence_start: Annotated[int, Ge(0)] | None = None
+    view_dependence_start: Whole | None = None
     unbounded_initial_side: Side | None = 26
     unbounded_distortion: NotNegative = 0.01
     first_frames: bool = False

@@ -9,19 +9,19 @@ from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 from typing import Annotated, Any, ClassVar
 
+import pydantic.dataclasses
 from annotated_types import MinLen
-from pydantic import dataclasses as checked
 
 from devrf.engine.phase import Phase
-from devrf.errors import DevrfError, expect
-from devrf.system.options import Count, Options, Positive, Several
+from devrf.errors import DevrfError
+from devrf.system.options import Count, NotNegative, Options, Positive, Several
 
 # Motion grids of this side take Adam about as long as a batch of rays takes; estimated.
 FINE_SIDE = 160
 
 
-@dataclass(frozen=True)
-class Level:
+@pydantic.dataclasses.dataclass(frozen=True)
+class Level(Options):
     """One resolution of the motion grids, and how the frames are learned at it.
 
     Attributes:
@@ -33,11 +33,13 @@ class Level:
         other_terms: factor of the weights of all terms of ``loss.deformation`` but ``render``.
     """
 
-    side: int
-    iterations: int
-    lr_factor: float | None = None
-    lr_final_factor: float = 1.0
-    other_terms: float = 1.0
+    key: ClassVar[str] = "schedule.deformation.levels"
+
+    side: Several
+    iterations: Count
+    lr_factor: Positive | None = None
+    lr_final_factor: Positive = 1.0
+    other_terms: NotNegative = 1.0
 
 
 PAPER_LEVELS = (Level(10, 200), Level(20, 100), Level(40, 100), Level(80, 50), Level(160, 50))
@@ -74,7 +76,7 @@ class DeformationPhase(Phase):
         return self.learning_rate_factor * math.pow(self.lr_final_factor, share)
 
 
-@checked.dataclass(frozen=True)
+@pydantic.dataclasses.dataclass(frozen=True)
 class DeformationSchedule(Options):
     """The deformation stage's visits; the defaults are the paper's, inward-facing.
 
@@ -121,8 +123,6 @@ class DeformationSchedule(Options):
         return cls(numbered, **settings)
 
     def __post_init__(self) -> None:
-        for number, level in enumerate(self.levels, 1):
-            _check_level(f"{self.key}.levels.{number}", level)
         if not self.coarse_to_fine:
             iterations = sum(level.iterations for level in self.levels)
             finest = replace(self.levels[-1], iterations=iterations, lr_factor=None)
@@ -187,14 +187,3 @@ def converged(losses: Sequence[float], min_rel_improvement: float) -> bool:
     if len(losses) < 3:
         return False
     return min(losses[-2:]) > (1 - min_rel_improvement) * min(losses[:-2])
-
-
-def _check_level(key: str, level: Level) -> None:
-    """Check what holds for every level; ``key`` is that of its row."""
-    for name, least in (("side", 2), ("iterations", 1)):
-        value = getattr(level, name)
-        expect(value >= least, f"{key}.{name}", f"at least {least}", value)
-    expect(level.other_terms >= 0, f"{key}.other_terms", "at least 0", level.other_terms)
-    for name in ("lr_factor", "lr_final_factor"):
-        factor = getattr(level, name)
-        expect(factor is None or factor > 0, f"{key}.{name}", "more than 0", factor)

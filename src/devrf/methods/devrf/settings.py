@@ -10,7 +10,7 @@ from pydantic.dataclasses import dataclass
 
 from devrf.rendering.sampling import FINEST
 from devrf.system.device import multiplies_bfloat16
-from devrf.system.options import Options, Positive
+from devrf.system.options import NotNegative, Options, Positive
 
 Opacity = Annotated[float, Ge(0), Lt(1)]
 # What the colour network computes in.
@@ -44,12 +44,14 @@ DEFORMATION_LOSS = {
 
 
 @dataclass(frozen=True)
-class CanonicalRates:
+class CanonicalRates(Options):
     """Base learning rates of the canonical field's parts, by name (docs/method.md#optimiser)."""
 
-    density: float = 0.1
-    color: float = 0.1
-    decoder: float = 1e-3
+    key: ClassVar[str] = "schedule.rates"
+
+    density: NotNegative = 0.1
+    color: NotNegative = 0.1
+    decoder: NotNegative = 1e-3
 
 
 @dataclass(frozen=True)

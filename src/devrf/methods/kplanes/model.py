@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from devrf.data.batch import RayBatch
+from devrf.geometry.box import constant
 from devrf.geometry.rays import Rays
 from devrf.methods.kplanes.decoders import ExplicitDecoder, HybridDecoder
 from devrf.methods.kplanes.planes import SixPlanes, sum_of
@@ -77,8 +78,8 @@ class KPlanes(SurfacedField):
 
     def coordinates(self, points: Tensor, time: Tensor) -> Tensor:
         """[0, 1]⁴ (S, 4) of points (S, 3) in normalised space, and of times (S,)."""
-        low, high = self.box.corners(points)
-        share = (self.placement.fields(points) - low) / (high - low)
+        edges = tuple(edge / self.placement.half_edge for edge in self.box.size)
+        share = points / constant(edges, points.dtype, points.device) + 0.5
         return torch.cat([share, time[:, None]], dim=1)
 
     def sigma(self, points: Tensor, time: Tensor, ray: Tensor) -> tuple[Tensor, Tensor]:

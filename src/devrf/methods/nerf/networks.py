@@ -254,4 +254,5 @@ class RadianceField(nn.Module):
     def rgb(self, hidden: Tensor, viewdirs: Tensor, ray: Tensor) -> Tensor:
         """RGB (S, 3) in [0, 1] of samples of the rays ``ray`` (S,), whose directions are (R, 3)."""
         with self.reduced():
-            return torch.sigmoid(self.color(hidden, viewdirs, ray)).float()
+            logits = self.color(hidden, viewdirs, ray)
+        return torch.sigmoid(logits.float())

@@ -215,7 +215,8 @@ class SurfacedField(NeuralField):
         """The render of samples in the fields' space, or by another ``sigma`` and ``rgb``.
 
         ``extras`` has, of the K samples that were coloured, ``points`` (K, 3) in normalised space,
-        ``time``, ``ray``, ``distance`` and ``weight`` (K,), and ``sample_color`` (K, 3).
+        ``time``, ``ray``, ``distance`` (in units of the ray's direction) and ``weight`` (K,), and
+        ``sample_color`` (K, 3).
         """
         if not self.space.is_linear:
             samples = samples.unbounded()

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from devrf.geometry.box import Box
+from devrf.geometry.box import Box, constant
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.space import Space
 
@@ -40,7 +40,7 @@ class Placement:
 
     def normalised(self, points: Tensor) -> Tensor:
         """Normalised points (..., 3) of the fields' space."""
-        return (points - points.new_tensor(self.box.middle)) / self.half_edge
+        return (points - constant(self.box.middle, points.dtype, points.device)) / self.half_edge
 
     def fields(self, points: Tensor) -> Tensor:
         """Points (..., 3) of the fields' space: the inverse of :meth:`normalised`."""

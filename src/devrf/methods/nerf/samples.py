@@ -24,8 +24,8 @@ class RaySamples:
     Attributes:
         ray: (S,) int64, the ray of each sample.
         distance: (S,) along the ray, in units of its direction.
-        length: (S,) of the stretch that each sample stands for, in units of the box.
-        points: (S, 3) positions in the fields' space.
+        length: (S,) of the stretch that each sample stands for, in units of the points' space.
+        points: (S, 3) positions in the fields' space, or in normalised space.
         rays: R.
     """
 
@@ -55,7 +55,7 @@ class RaySamples:
         )
 
     def normalised(self, placement: Placement) -> RaySamples:
-        """The same samples, their points and lengths in normalised space."""
+        """The same samples, points and lengths in normalised space; distances stay as they are."""
         points = placement.normalised(self.points)
         return replace(self, points=points, length=self.length / placement.half_edge)
 

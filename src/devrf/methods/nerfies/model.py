@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
-from typing import Annotated, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import torch
-from annotated_types import Ge
 from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
@@ -24,7 +23,7 @@ from devrf.methods.nerf.settings import Bands, FieldSettings, Initialisation, Sa
 from devrf.methods.nerfies.elastic import SCALE, drawn, jacobians, robust, strain
 from devrf.methods.protocol import ProtocolStage
 from devrf.rendering.output import RenderOutput
-from devrf.system.options import Share
+from devrf.system.options import Share, Whole
 
 # The heads' weights begin in [0, SMALL), so that the first motions are next to none.
 SMALL = 1e-4
@@ -91,7 +90,7 @@ class NerfiesSettings(FieldSettings):
     warp_bands: Bands = 6
     window: Share = 0.32
     elastic: Literal["drawn", "full"] = "drawn"
-    elastic_rays: Annotated[int, Ge(0)] = 0
+    elastic_rays: Whole = 0
 
 
 class Nerfies(DeformableField):

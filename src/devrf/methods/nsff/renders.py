@@ -29,7 +29,7 @@ class BlendedOutput(RenderOutput):
     """A rendering of R rays from S samples, and what it was made of.
 
     Attributes:
-        samples: in normalised space.
+        samples: their points and lengths in normalised space.
         static: the static field there.
         dynamic: the dynamic field there, at the rays' times.
         depths: (S,) optical depths of the dynamic and of the static field alone.

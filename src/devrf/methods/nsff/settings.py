@@ -9,7 +9,7 @@ from annotated_types import Ge
 from pydantic.dataclasses import dataclass
 
 from devrf.methods.nerf.settings import MethodSettings, PlacedSettings, Samples
-from devrf.system.options import Count, NotNegative, Positive
+from devrf.system.options import Count, NotNegative, Positive, Whole
 
 
 @dataclass(frozen=True)
@@ -70,5 +70,5 @@ class NSFFSettings(PlacedSettings):
     sampling: Literal["stratified", "occupancy"] = "stratified"
     samples: Samples = 128
     neighbours: Literal["both", "one"] = "both"
-    hard_rays: Annotated[int, Ge(0)] = 512
+    hard_rays: Whole = 512
     warmup: Warmup = field(default_factory=Warmup)

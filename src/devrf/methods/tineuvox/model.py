@@ -75,7 +75,7 @@ class TiNeuVox(SurfacedField):
         super().set_place(box, space, depths)
         x, y, z = (edge / box.longest for edge in box.size)
         self.grid_box = Box((-x, -y, -z), (x, y, z))
-        # As large as it will be, since this tells the memory that learning takes.
+        # Its full size: how much memory a run needs is estimated before ``setup``.
         self.grid.resize(self._shape_after(len(self.settings.upsample_at)))
 
     def setup(self, scene: Scene) -> None:
@@ -114,7 +114,10 @@ class TiNeuVox(SurfacedField):
         return self.settings.step * self.box.voxel_size(math.prod(self.grid.shape))
 
     def sigma(self, points: Tensor, time: Tensor, ray: Tensor) -> tuple[Tensor, Tensor]:
-        """softplus(raw + log(1/(1 − α_init) − 1)) per :attr:`base_voxel`, and what it came from."""
+        """σ (S,) and what it came from.
+
+        It is softplus(raw + log(1/(1 − α_init) − 1)) per :attr:`base_voxel`, in normalised units.
+        """
         code = self.time(time[:, None])
         position = self.encode(points)
         first, *further = self.deformation

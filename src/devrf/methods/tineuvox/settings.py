@@ -10,7 +10,7 @@ from pydantic.dataclasses import dataclass
 
 from devrf.methods.nerf.settings import Bands, OccupancySettings
 from devrf.rendering.sampling import FINEST
-from devrf.system.options import Count, NotNegative, Positive, Several
+from devrf.system.options import Count, NotNegative, Positive, Several, Share
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class TiNeuVoxSettings(OccupancySettings):
     side: Several = 160
     channels: Count = 6
     strides: Annotated[Sequence[Count], MinLen(1)] = (1, 2, 4)
-    upsample_at: Sequence[float] = (0.1, 0.2, 0.3)
+    upsample_at: Sequence[Share] = (0.1, 0.2, 0.3)
     width: Several = 256
     bands: Bands = 10
     direction_bands: Bands = 4

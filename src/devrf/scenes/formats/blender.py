@@ -14,11 +14,12 @@ from devrf.scenes.flow_files import FlowDirection, read_flow
 from devrf.scenes.image_folders import Missing
 from devrf.scenes.images import image_size
 from devrf.scenes.layout import Layout, fewer, load_layout, one_capture, static_alone
-from devrf.scenes.reader import Count, InwardReader, Time
+from devrf.scenes.reader import InwardReader, Time
 from devrf.scenes.scene import OpticalFlow, Scene, Views
 from devrf.scenes.splits import at_rest, in_motion
 from devrf.scenes.transforms import Transforms, read_transforms
 from devrf.scenes.view_folders import chosen_dynamic, dynamic_folders
+from devrf.system.options import Count
 
 log = logging.getLogger(__name__)
 

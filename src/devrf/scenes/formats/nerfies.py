@@ -36,12 +36,12 @@ from devrf.scenes.image_folders import (
 from devrf.scenes.layout import fewer, load_layout, one_capture
 from devrf.scenes.lens import Intrinsics
 from devrf.scenes.masks import Masks
-from devrf.scenes.reader import EstimatedFlow, Holdout, InwardReader, Time
+from devrf.scenes.reader import EstimatedFlow, InwardReader, Time
 from devrf.scenes.scene import Capture, Scene
 from devrf.scenes.splits import every_nth
 from devrf.scenes.transforms import Transforms
 from devrf.scenes.validation import FARTHEST, check_poses, scene_error
-from devrf.system.options import abbreviated
+from devrf.system.options import Several, abbreviated
 
 log = logging.getLogger(__name__)
 
@@ -160,7 +160,7 @@ class ItemsReader(InwardReader):
 
     _: KW_ONLY
     flow: EstimatedFlow = "auto"
-    holdout: Holdout = 8
+    holdout: Several = 8
     static_until: Time = 1.0
 
     @abstractmethod

@@ -17,12 +17,12 @@ from devrf.scenes.image_folders import Downscale
 from devrf.scenes.images import image_at
 from devrf.scenes.layout import Layout, fewer, load_layout, one_capture, static_alone
 from devrf.scenes.masks import Masks
-from devrf.scenes.reader import Count, EstimatedFlow, Holdout, PosedReader, Time
+from devrf.scenes.reader import EstimatedFlow, PosedReader, Time
 from devrf.scenes.scene import Scene
 from devrf.scenes.splits import at_rest, distinct_poses, every_nth, in_motion, one_moment
 from devrf.scenes.transforms import TIME_TOLERANCE, Transforms, read_transforms
 from devrf.scenes.validation import scene_error
-from devrf.system.options import abbreviated
+from devrf.system.options import Count, Several, abbreviated
 
 log = logging.getLogger(__name__)
 
@@ -63,7 +63,7 @@ class NerfstudioReader(PosedReader):
     downscale: Downscale = "auto"
     flow: EstimatedFlow = "auto"
     train_views: Count | None = None
-    holdout: Holdout = 8
+    holdout: Several = 8
     times: Literal["file", "order"] = "file"
     static_until: Time | None = None
     masks: Masks = "ignore"

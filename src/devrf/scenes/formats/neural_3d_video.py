@@ -10,12 +10,10 @@ import time
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import pydantic
 import torch
-from pydantic import Field
 from torch import Tensor
 
 from devrf.scenes.files import Positive, entries, scene_folder
@@ -23,12 +21,13 @@ from devrf.scenes.footage import FilmHeader, Size, chosen, film_header
 from devrf.scenes.formats.llff_poses import PosedSet, read_static_poses
 from devrf.scenes.image_folders import Downscale
 from devrf.scenes.images import in_threads
-from devrf.scenes.reader import Count, EstimatedFlow, SceneReader, SeveralFrames
+from devrf.scenes.reader import EstimatedFlow, SceneReader
 from devrf.scenes.resampling import shrink_pixels
 from devrf.scenes.scene import Capture, Scene, Views
 from devrf.scenes.space import forward_facing_scene
 from devrf.scenes.splits import pinholes
 from devrf.scenes.validation import check_memory, reduced_size, scene_error
+from devrf.system.options import Count, Several, Whole
 
 log = logging.getLogger(__name__)
 
@@ -138,11 +137,11 @@ class Neural3DVideoReader(SceneReader):
     _: KW_ONLY
     downscale: Downscale = "auto"
     flow: EstimatedFlow = "auto"
-    test_view: Annotated[int, Field(strict=True, ge=0)] = 0
+    test_view: Whole = 0
     near: Positive = 1.0
     train_views: Count | None = None
-    length: SeveralFrames | None = None
-    frames: SeveralFrames | None = 50
+    length: Several | None = None
+    frames: Several | None = 50
 
     def read(self) -> Scene:
         """See :meth:`devrf.scenes.reader.SceneReader.read`."""

@@ -34,7 +34,7 @@ from devrf.scenes.scene import Bounds, Capture, Scene
 from devrf.scenes.space import inward_space
 from devrf.scenes.splits import every_nth
 from devrf.scenes.validation import MIN_SIDE, scene_error
-from devrf.system.options import Options
+from devrf.system.options import Options, Whole
 from devrf.system.threads import one_thread
 
 Side = Annotated[int, Field(strict=True, ge=MIN_SIDE, le=4096)]
@@ -78,7 +78,7 @@ class Recipe(Options, ABC):
     speed: Speed = 1.0
     supersample: Annotated[int, Field(strict=True, ge=1, le=16)] = 2
     light: Annotated[float, Field(strict=True, ge=0, le=1)] = 0.2
-    scene_seed: Annotated[int, Field(strict=True, ge=0)] = 0
+    scene_seed: Whole = 0
     sliding: bool = False
     novel_times_every: Annotated[int, Field(strict=True, ge=2)] | None = None
 
@@ -87,7 +87,7 @@ class Recipe(Options, ABC):
         if self.novel_times_every is not None and self.novel_times_every >= self.frames:
             raise scene_error(
                 "data.novel_times_every",
-                f"should be less than data.frames={self.frames}, not {self.novel_times_every}",
+                f"expected below data.frames={self.frames}, not {self.novel_times_every}",
             )
         return self
 
