@@ -13,6 +13,7 @@ from devrf.methods.nerf.networks import (
     Trunk,
     initialise,
     linear_by_ray,
+    mlp,
     octave_window,
 )
 
@@ -99,3 +100,9 @@ def test_a_frame_has_its_own_code_and_a_time_between_two_a_mixture() -> None:
     codes(torch.tensor([0.5])).sum().backward()  # and learns it alone
     assert codes.table.weight.grad is not None
     assert codes.table.weight.grad.tolist() == [[0.0, 0.0], [1.0, 1.0], [0.0, 0.0]]
+
+
+def test_an_mlp_has_so_many_hidden_layers() -> None:
+    layers = mlp(3, width=5, depth=2, outputs=4, bias=False)
+    assert [tuple(p.shape) for p in layers.parameters()] == [(5, 3), (5, 5), (4, 5)]
+    assert mlp(3, width=5, depth=1, outputs=4)[-1].bias.shape == (4,)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import torch
 from torch import Tensor, nn
 
 from devrf.geometry.box import constant
 from devrf.methods.kplanes.settings import KPlanesSettings
+from devrf.methods.nerf.networks import mlp
 
 # Of spherical harmonics of degrees 0 to 3: √(1/4π), √(3/4π), √(15/4π), √(5/16π) and so on.
 FACTORS = (
@@ -40,23 +39,14 @@ def spherical_harmonics(directions: Tensor) -> Tensor:
     return torch.stack(values, dim=1) * constant(FACTORS, x.dtype, x.device)
 
 
-def network(inputs: int, width: int, depth: int, outputs: int) -> nn.Sequential:
-    """Linear layers without biases, ``depth`` hidden ones of ``width`` units, with ReLU between."""
-    sizes = [inputs, *[width] * depth]
-    layers: list[nn.Module] = []
-    for before, after in pairwise(sizes):
-        layers += [nn.Linear(before, after, bias=False), nn.ReLU()]
-    return nn.Sequential(*layers, nn.Linear(sizes[-1], outputs, bias=False))
-
-
 class HybridDecoder(nn.Module):
     """Features → density and 15 numbers; these and the direction → colour."""
 
     def __init__(self, size: int, settings: KPlanesSettings) -> None:
         super().__init__()
-        self.geometry = network(size, settings.width, 1, FURTHER + 1)
+        self.geometry = mlp(size, settings.width, 1, FURTHER + 1, bias=False)
         self._directions = (settings.harmonics + 1) ** 2
-        self.color = network(FURTHER + self._directions, settings.width, 2, 3)
+        self.color = mlp(FURTHER + self._directions, settings.width, 2, 3, bias=False)
 
     def density(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """σ (S,), and what :meth:`rgb` takes, of features (S, size)."""
@@ -76,7 +66,7 @@ class ExplicitDecoder(nn.Module):
     def __init__(self, size: int, settings: KPlanesSettings) -> None:
         super().__init__()
         self.geometry = nn.Linear(size, 1, bias=False)
-        self.basis = network(3, settings.basis_width, settings.basis_depth, 3 * size)
+        self.basis = mlp(3, settings.basis_width, settings.basis_depth, 3 * size, bias=False)
 
     def density(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """σ (S,), and the features (S, size) themselves, which :meth:`rgb` takes."""

@@ -6,9 +6,10 @@ import torch
 from torch import Tensor, nn
 
 from devrf.geometry.rays import Rays
-from devrf.methods.kplanes.decoders import density_of, network
+from devrf.methods.kplanes.decoders import density_of
 from devrf.methods.kplanes.planes import SixPlanes
 from devrf.methods.kplanes.settings import KPlanesSettings
+from devrf.methods.nerf.networks import mlp
 from devrf.methods.nerf.samples import RaySamples, drawn
 
 # Added to each weight before samples are drawn by it.
@@ -26,7 +27,7 @@ class Proposal(nn.Module):
         super().__init__()
         channels = settings.proposal_channels
         self.planes = SixPlanes(channels, [resolution], time_resolution, highest=0.15)
-        layers = network(channels, WIDTH, 1, 1)
+        layers = mlp(channels, WIDTH, 1, 1, bias=False)
         self.decoder = (
             layers if settings.decoder == "hybrid" else nn.Sequential(layers[0], layers[2])
         )

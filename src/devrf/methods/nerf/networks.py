@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -43,6 +44,15 @@ class SinusoidalEncoding(nn.Module):
             factor = window.repeat_interleave(values.shape[-1])
             waves = [wave * factor for wave in waves]
         return torch.cat([values, *waves] if self._identity else waves, dim=-1)
+
+
+def mlp(inputs: int, width: int, depth: int, outputs: int, *, bias: bool = True) -> nn.Sequential:
+    """Linear layers, ``depth`` hidden ones of ``width`` units, with ReLU between."""
+    sizes = [inputs, *[width] * depth]
+    layers: list[nn.Module] = []
+    for before, after in pairwise(sizes):
+        layers += [nn.Linear(before, after, bias=bias), nn.ReLU()]
+    return nn.Sequential(*layers, nn.Linear(sizes[-1], outputs, bias=bias))
 
 
 def octave_window(opened: Tensor, bands: int) -> Tensor:

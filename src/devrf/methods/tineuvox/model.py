@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from devrf.data.batch import RayBatch
 from devrf.geometry.box import Box
 from devrf.geometry.space import Space
-from devrf.methods.nerf.networks import SinusoidalEncoding, linear_by_ray
+from devrf.methods.nerf.networks import SinusoidalEncoding, linear_by_ray, mlp
 from devrf.methods.nerf.placed_model import SurfacedField
 from devrf.methods.tineuvox.networks import MultiDistanceGrid, RadianceNetwork
 from devrf.methods.tineuvox.settings import TiNeuVoxSettings
@@ -48,23 +48,12 @@ class TiNeuVox(SurfacedField):
         self.grid = MultiDistanceGrid(s.channels, s.strides)
         encode_time = SinusoidalEncoding(1, s.time_bands)
         code = 5 * s.channels
-        self.time = nn.Sequential(
-            encode_time,
-            nn.Linear(encode_time.size, s.width),
-            nn.ReLU(),
-            nn.Linear(s.width, code),
-        )
-        last = nn.Linear(s.width, 3)
-        self.deformation = nn.Sequential(
-            nn.Linear(self.encode.size + code, s.width),
-            nn.ReLU(),
-            nn.Linear(s.width, s.width),
-            nn.ReLU(),
-            last,
-        )
+        self.time = nn.Sequential(encode_time, *mlp(encode_time.size, s.width, 1, code))
+        self.deformation = mlp(self.encode.size + code, s.width, 2, 3)
         self.radiance = RadianceNetwork(s, self.encode.size, code)
         if s.starts_still:
-            for unmoved in (last.weight, last.bias, self.radiance.trunk.weight[:, -code:]):
+            still = [*self.deformation[-1].parameters(), self.radiance.trunk.weight[:, -code:]]
+            for unmoved in still:
                 nn.init.zeros_(unmoved)
         self.least_weight = s.weight_threshold
         self.density_shift = math.log(1 / (1 - s.alpha_init) - 1)
