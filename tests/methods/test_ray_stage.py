@@ -126,6 +126,14 @@ def test_a_batch_may_have_fewer_rays_where_no_masks_tell_what_is_empty(
     assert sizes == [32, 7]
 
 
+def test_steps_may_be_smaller_where_no_masks_tell_what_is_empty(ray_stage: Make, fit: Fit) -> None:
+    for hull, rate in ((True, 2e-3), (False, 5e-4)):
+        rates = {"learning_rate": 2e-3, "learning_rate_without_hull": 5e-4}
+        stage = fit(ray_stage(DNeRF(replace(TINY, hull=hull)), **rates))
+        assert {group["base_lr"] for group in stage.optimizer.param_groups} == {rate}
+        assert stage.learning_rate_factor(0) == 1
+
+
 def test_a_method_may_learn_before_random_colours_where_all_images_have_masks(
     ray_stage: Make, fit: Fit, tiny_scene: Scene, serve: Callable[[Scene], SceneDataModule]
 ) -> None:

@@ -39,6 +39,8 @@ class RaySchedule(Options):
         rays_without_hull: of a batch where no masks tell which space is empty, so that a ray has
             more samples; None: as many.
         learning_rate: of Adam at the first iteration of a stage.
+        learning_rate_without_hull: the same where no masks tell which space is empty, which large
+            steps may fill with fog; None: as elsewhere.
         final_learning_rate: at its last.
         decay: of the rate in between: ``exponential``, or half a ``cosine``.
         warmup: share of a stage during which the rate grows evenly from nothing, beside its decay.
@@ -63,6 +65,7 @@ class RaySchedule(Options):
     centre_crop: Whole = 0
     times_per_batch: Count | None = None
     rays_without_hull: Count | None = None
+    learning_rate_without_hull: Positive | None = None
     decay: Literal["exponential", "cosine"] = "exponential"
     warmup: Annotated[float, Ge(0), Lt(1)] = 0.0
     iterations_per_step: Count = 10
@@ -169,12 +172,16 @@ class RayStage(Stage):
         self.scene_model.follow(self.step_of_protocol)
         if hasattr(self, "optimizer"):
             return
+        schedule = self.schedule
+        highest = schedule.learning_rate
+        if not self.scene_model.has_hull:
+            highest = schedule.learning_rate_without_hull or highest
         groups = self.scene_model.param_groups()
         for group in groups:
-            rate = self.schedule.learning_rate * group.pop("rate", 1.0)
+            rate = highest * group.pop("rate", 1.0)
             group.update(lr=rate, base_lr=rate)
-        first, second = self.schedule.betas
-        self.optimizer = GridAdam(groups, betas=(first, second), eps=self.schedule.eps)
+        first, second = schedule.betas
+        self.optimizer = GridAdam(groups, betas=(first, second), eps=schedule.eps)
 
     def enter(self, phase: Phase) -> None:
         """Let grids grow; when the stage begins or goes on, gather the pixels to draw from."""

@@ -44,6 +44,7 @@ class KPlanes(SurfacedField):
         "color", "tv", "smooth", "change", "smooth_proposals", "histogram", "distortion",
     )  # fmt: skip
     random_background: ClassVar[bool] = True
+    keeps_batches: ClassVar[bool] = True  # large steps need whole ones
     settings_class = KPlanesSettings
     settings: KPlanesSettings
 
