@@ -41,7 +41,7 @@ class RaySchedule(Options):
         learning_rate: of Adam at the first iteration of a stage.
         learning_rate_without_hull: the same where no masks tell which space is empty, which large
             steps may fill with fog; None: as elsewhere.
-        final_learning_rate: at its last.
+        final_learning_rate: at its last; without a hull as many times less as the first.
         decay: of the rate in between: ``exponential``, or half a ``cosine``.
         warmup: share of a stage during which the rate grows evenly from nothing, beside its decay.
         betas: of Adam.

@@ -9,8 +9,8 @@ from pydantic.dataclasses import dataclass
 
 from devrf.system.options import Options
 
-# The least distance between samples, in voxels: with less a ray fills memory and shows no more.
-FINEST = 0.01
+# A distance between samples, in voxels: with less a ray fills memory and shows no more.
+Step = Annotated[float, Ge(0.01)]
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class RenderSettings(Options):
 
     key: ClassVar[str] = "sampling"
 
-    step: Annotated[float, Ge(FINEST)]
+    step: Step
     alpha_threshold: float
     near: float
     far: float

@@ -8,7 +8,7 @@ import torch
 from annotated_types import Ge, Gt, Le, Lt
 from pydantic.dataclasses import dataclass
 
-from devrf.rendering.sampling import FINEST
+from devrf.rendering.sampling import Step
 from devrf.system.device import multiplies_bfloat16
 from devrf.system.options import NotNegative, Options, Positive
 
@@ -67,7 +67,7 @@ class Sampling(Options):
 
     key: ClassVar[str] = "sampling"
 
-    step: Annotated[float, Ge(FINEST)] = 0.5
+    step: Step = 0.5
     alpha_threshold: Opacity = 1e-4
     search_alpha_threshold: Opacity = 1e-7
     occupancy_threshold: Opacity = 1e-3

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import Annotated, ClassVar, Literal
 
 import torch
-from annotated_types import Ge, Le
+from annotated_types import Ge
 from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
@@ -68,7 +68,7 @@ class HyperNeRFSettings(NerfiesSettings):
 
     slicing: Literal["surface", "plane"] = "surface"
     ambient: Count = 2
-    ambient_bands: Annotated[int, Ge(1), Le(32)] = 1
+    ambient_bands: Annotated[Bands, Ge(1)] = 1
     ambient_delay: Share = 0.004
     ambient_window: Share = 0.04
     slicing_width: int = 64

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Annotated, ClassVar
 
-from annotated_types import Ge, Gt, Lt, MinLen
+from annotated_types import Gt, Lt, MinLen
 from pydantic.dataclasses import dataclass
 
 from devrf.methods.nerf.settings import Bands, OccupancySettings
-from devrf.rendering.sampling import FINEST
+from devrf.rendering.sampling import Step
 from devrf.system.options import Count, NotNegative, Positive, Several, Share
 
 
@@ -52,7 +52,7 @@ class TiNeuVoxSettings(OccupancySettings):
     time_bands: Bands = 8
     feature_bands: Bands = 2
     alpha_init: Annotated[float, Gt(0), Lt(1)] = 1e-3
-    step: Annotated[float, Ge(FINEST)] = 0.5
+    step: Step = 0.5
     weight_threshold: NotNegative = 1e-4
     grid_rate: Positive = 100.0
     motion_rate: Positive = 0.75

@@ -34,7 +34,7 @@ from devrf.scenes.scene import Bounds, Capture, Scene
 from devrf.scenes.space import inward_space
 from devrf.scenes.splits import every_nth
 from devrf.scenes.validation import MIN_SIDE, scene_error
-from devrf.system.options import Options, Whole
+from devrf.system.options import Options, Several, Share, Whole
 from devrf.system.threads import one_thread
 
 Side = Annotated[int, Field(strict=True, ge=MIN_SIDE, le=4096)]
@@ -77,10 +77,10 @@ class Recipe(Options, ABC):
     frames: Frames = 14
     speed: Speed = 1.0
     supersample: Annotated[int, Field(strict=True, ge=1, le=16)] = 2
-    light: Annotated[float, Field(strict=True, ge=0, le=1)] = 0.2
+    light: Share = 0.2
     scene_seed: Whole = 0
     sliding: bool = False
-    novel_times_every: Annotated[int, Field(strict=True, ge=2)] | None = None
+    novel_times_every: Several | None = None
 
     @model_validator(mode="after")
     def _some_frames_are_learned_from(self) -> Recipe:
