@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +15,8 @@ import torch
 
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.scenes.formats.llff import LlffReader
+from devrf.scenes.formats.llff_poses import PosedSet
+from devrf.scenes.lens import Intrinsics
 from devrf.scenes.scene import Views
 
 
@@ -184,6 +188,35 @@ def test_the_cameras_that_nr_nerf_publishes(llff_folder):
     cameras = LlffReader(root).read().dynamic.train.cameras
     torch.testing.assert_close(cameras.camera_to_world, expected.camera_to_world)
     assert torch.equal(cameras.focal, expected.focal)
+
+
+def test_the_near_plane_of_a_video_by_hand():
+    """Eleven cameras look along −z: one stray point, and a camera that has gone 1 forward."""
+    poses = torch.eye(4, dtype=torch.float64)[:3].repeat(11, 1, 1)
+    bounds = torch.tensor([[0.1, 9.0], *[[4.0, 9.0]] * 10], dtype=torch.float64)
+    intrinsics = (Intrinsics(None, (20.0, 20.0), (12.0, 8.0), (24, 16)),) * 11
+    side_by_side = PosedSet(Path("video"), poses, intrinsics, bounds)
+    assert side_by_side.near_plane() == pytest.approx(3.0)
+    moved = poses.clone()
+    moved[5, 2, 3] = -1.0
+    # What nine of ten see is at 4 or more; the camera that went forward is at 1.
+    assert replace(side_by_side, poses=moved).near_plane() == pytest.approx(1 + 0.75 * 3)
+    # Never nearer than the unit of LLFF's worlds.
+    assert replace(side_by_side, bounds=bounds / 10).near_plane() == 1.0
+
+
+def test_only_a_video_has_a_near_plane_of_its_own(llff_folder):
+    def near(**options: Any) -> float:
+        space = LlffReader(llff_folder.static, **options).read().space
+        assert isinstance(space, NormalizedDevice)
+        return space.near
+
+    rows = llff_folder.static_rows()
+    rows[1:, 15] *= 1.6  # one camera in nine sees what is nearest
+    llff_folder.save(STATIC, rows)
+    assert near(monocular=False) == 1.0
+    assert near(monocular=True) > 1.2
+    assert near(monocular=True, near=0.7) == 0.7
 
 
 STATIC = "static/poses_bounds.npy"

@@ -14,6 +14,7 @@ from devrf.scenes.flow_files import FlowDirection, stacked_flow
 from devrf.scenes.formats.llff_poses import (
     POSES,
     PRECOMPUTED,
+    PosedSet,
     read_dynamic_poses,
     read_precomputed_poses,
     read_static_poses,
@@ -53,20 +54,21 @@ class LlffReader(FixedViewsReader):
 
     Attributes:
         near: distance of the near plane from the average camera, in the world's unit; the nearest
-            point of the static scene is at 1/0.75.
+            point of the static scene is at 1/0.75. None: 1; of a video, whose camera comes nearer,
+            :meth:`~devrf.scenes.formats.llff_poses.PosedSet.near_plane`.
         monocular: whether LLFF's images are a video; None: where NR-NeRF's ``precomputed.json`` is.
         static_until: in a video, the latest time of an image that counts as static.
     """
 
     _: KW_ONLY
-    near: Positive = 1.0
+    near: Positive | None = None
     monocular: bool | None = None
     static_until: Time = 1.0
 
     def read(self) -> Scene:
         """See :meth:`devrf.scenes.reader.SceneReader.read`."""
         folder = scene_folder(self.root)
-        layout, downscale, views = self._layout(folder)
+        layout, downscale, views, near = self._layout(folder)
         layout, thinned = fewer(layout, self.train_views, self.frames)
         smaller = views[0].downscale if views else None
         static, dynamic = load_layout(layout, folder, downscale, dynamic_downscale=smaller)
@@ -76,35 +78,39 @@ class LlffReader(FixedViewsReader):
             flow = _flow(dynamic.train, layout.dynamic_train, views, "bwd")
             dynamic = replace(dynamic, train=replace(dynamic.train, flow=flow))
         name = self.name_of(folder)
-        return forward_facing_scene(name, static, dynamic, self.near, self.background)
+        return forward_facing_scene(name, static, dynamic, self.near or near, self.background)
 
     def forward_flow(self, views: Views) -> OpticalFlow | None:
         """See :meth:`devrf.scenes.reader.SceneReader.forward_flow`."""
-        layout, _, folders = self._layout(scene_folder(self.root))
+        layout, _, folders, _ = self._layout(scene_folder(self.root))
         layout, thinned = fewer(layout, self.train_views, self.frames)
         if not folders or thinned:
             return None
         return _flow(views, layout.dynamic_train, folders, "fwd")
 
-    def _layout(self, folder: Path) -> tuple[Layout, int, list[ViewFolder]]:
-        """The splits, by what static images are made smaller, and the fixed views learned from."""
-        posed = static_folder(folder)
+    def _layout(self, folder: Path) -> tuple[Layout, int, list[ViewFolder], float]:
+        """The splits, by what static images are made smaller, the fixed views learned from, near.
+
+        The last is the distance of the near plane unless :attr:`near` says it.
+        """
+        static = static_folder(folder)
         moving = bool(dynamic_folders(folder)) or self.dynamic
         if moving and self.monocular:
             raise scene_error(
                 "data.monocular", f"{folder} has fixed views, so it is no video; leave it null"
             )
-        factor = self.choose_factor(folder_size(posed))
-        source = image_folder(posed, factor)
+        factor = self.choose_factor(folder_size(static))
+        source = image_folder(static, factor)
+        posed = _read_cameras(static)
         images = _posed_images(posed, source.path)
         video = self.monocular
         if video is None:
-            video = not moving and os.path.isfile(posed / PRECOMPUTED)
+            video = not moving and os.path.isfile(static / PRECOMPUTED)
         if video:
-            return self._video(images), source.downscale, []
+            return self._video(images), source.downscale, [], posed.near_plane()
         train, test = (images[part] for part in every_nth(len(images.images), self.holdout, 0))
         if not moving:
-            return static_alone(train, test, "there are no times"), source.downscale, []
+            return static_alone(train, test, "there are no times"), source.downscale, [], 1.0
         folder = chosen_dynamic(folder, self.dynamic)
         views = view_folders(folder, factor)
         cameras = read_dynamic_poses(folder)
@@ -124,7 +130,7 @@ class LlffReader(FixedViewsReader):
             dynamic_train=moving_train,
             dynamic_test=moving_test,
         )
-        return layout, source.downscale, views[:unseen] + views[unseen + 1 :]
+        return layout, source.downscale, views[:unseen] + views[unseen + 1 :], 1.0
 
     def _video(self, images: Transforms) -> Layout:
         """The splits of images by one moving camera, in the order of their times."""
@@ -148,11 +154,15 @@ def static_folder(root: Path) -> Path:
     return existing_folder(static)
 
 
-def _posed_images(folder: Path, source: Path) -> Transforms:
-    """All images in ``source`` with the cameras of ``poses_bounds.npy``, or NR-NeRF's file."""
+def _read_cameras(folder: Path) -> PosedSet:
+    """The cameras of ``poses_bounds.npy``, or NR-NeRF's file, normalised."""
     alone = os.path.isfile(folder / PRECOMPUTED) and not os.path.isfile(folder / POSES)
     read = read_precomputed_poses if alone else read_static_poses
-    posed = read(folder).normalised()
+    return read(folder).normalised()
+
+
+def _posed_images(posed: PosedSet, source: Path) -> Transforms:
+    """All images in ``source`` with their cameras."""
     images = listed_images(source)
     if len(images) != len(posed):
         raise scene_error(

@@ -30,6 +30,8 @@ PRECOMPUTED = "precomputed.json"
 BOUND_FACTOR = 0.75
 # A camera's least depth below this share of their median is taken for that of a stray point.
 STRAY_SHARE = 0.5
+# So many cameras of a video, for some of its frames, may see stray points that are farther away.
+STRAY_CAMERAS = 0.1
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,18 @@ class PosedSet:
                 self.file, "its cameras are too far from one another; correct positions and depths"
             )
         return replace(self, poses=poses, bounds=self.bounds * scale)
+
+    def near_plane(self) -> float:
+        """Distance from the origin of a plane before what cameras see that move along −z, too.
+
+        It is :data:`BOUND_FACTOR` of the way from the foremost camera to the nearest point, which
+        for cameras side by side is the unit of :meth:`normalised`; and that at least.
+        """
+        position = self.poses[:, 2, 3]
+        depth = self.bounds[:, 0] * self.poses[:, 2, 2] - position
+        foremost = -float(position.min())
+        nearest = float(depth.quantile(STRAY_CAMERAS))
+        return max(1.0, foremost + BOUND_FACTOR * (nearest - foremost))
 
 
 def read_static_poses(folder: Path) -> PosedSet:
