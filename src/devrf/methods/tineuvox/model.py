@@ -37,6 +37,7 @@ class TiNeuVox(SurfacedField):
 
     name: ClassVar[str] = "tineuvox"
     losses: ClassVar[tuple[str, ...]] = ("color", "background_entropy", "sample_color")
+    keeps_batches: ClassVar[bool] = True  # large steps need whole ones
     settings_class = TiNeuVoxSettings
     settings: TiNeuVoxSettings
 
