@@ -106,11 +106,12 @@ class LlffReader(FixedViewsReader):
         video = self.monocular
         if video is None:
             video = not moving and os.path.isfile(static / PRECOMPUTED)
+        near = posed.near_plane() if video else 1.0
         if video:
-            return self._video(images), source.downscale, [], posed.near_plane()
+            return self._video(images), source.downscale, [], near
         train, test = (images[part] for part in every_nth(len(images.images), self.holdout, 0))
         if not moving:
-            return static_alone(train, test, "there are no times"), source.downscale, [], 1.0
+            return static_alone(train, test, "there are no times"), source.downscale, [], near
         folder = chosen_dynamic(folder, self.dynamic)
         views = view_folders(folder, factor)
         cameras = read_dynamic_poses(folder)
@@ -130,7 +131,7 @@ class LlffReader(FixedViewsReader):
             dynamic_train=moving_train,
             dynamic_test=moving_test,
         )
-        return layout, source.downscale, views[:unseen] + views[unseen + 1 :], 1.0
+        return layout, source.downscale, views[:unseen] + views[unseen + 1 :], near
 
     def _video(self, images: Transforms) -> Layout:
         """The splits of images by one moving camera, in the order of their times."""

@@ -30,7 +30,7 @@ PRECOMPUTED = "precomputed.json"
 BOUND_FACTOR = 0.75
 # A camera's least depth below this share of their median is taken for that of a stray point.
 STRAY_SHARE = 0.5
-# So many cameras of a video, for some of its frames, may see stray points that are farther away.
+# So many of a video's cameras may see stray points, too: those that are beyond that share.
 STRAY_CAMERAS = 0.1
 
 
@@ -84,10 +84,10 @@ class PosedSet:
         return replace(self, poses=poses, bounds=self.bounds * scale)
 
     def near_plane(self) -> float:
-        """Distance from the origin of a plane before what cameras see that move along −z, too.
+        """Distance from the origin of a plane before what a camera sees that moves along −z, too.
 
-        It is :data:`BOUND_FACTOR` of the way from the foremost camera to the nearest point, which
-        for cameras side by side is the unit of :meth:`normalised`; and that at least.
+        It is :data:`BOUND_FACTOR` of the way from the foremost position to the nearest point, but
+        for what :data:`STRAY_CAMERAS` see alone; at least 1, LLFF's plane in a normalised set.
         """
         position = self.poses[:, 2, 3]
         depth = self.bounds[:, 0] * self.poses[:, 2, 2] - position
