@@ -278,10 +278,14 @@ class CanonicalStage(Stage):
     @torch.no_grad()
     def update_occupancy(self) -> None:
         """Find the occupancy at rest on the field's own grid, within the one before."""
+        assert self.phase is not None
         sampling = self.sampling
         field = self.scene_model.canonical
         threshold = sampling.occupancy_threshold
-        if not self.scene_model.space.is_linear:
+        if self.phase.kind == "search":
+            # The search begins far fainter than what counts as occupied at its end.
+            threshold = sampling.search_alpha_threshold
+        elif not self.scene_model.space.is_linear:
             # Fog in unbounded space clears until it is not coloured, and no further.
             threshold = max(threshold, sampling.alpha_threshold)
         self._keep_occupied(field.voxel_alpha(sampling.step) > threshold)

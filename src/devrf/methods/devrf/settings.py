@@ -61,7 +61,8 @@ class Sampling(Options):
     Attributes:
         step: distance between samples in voxels.
         alpha_threshold: samples of a lower opacity, and then of a lower weight, get no colour.
-        search_alpha_threshold: the same in the geometry search, which begins almost transparent.
+        search_alpha_threshold: the same in the geometry search, which begins almost transparent;
+            there it is what empties cells, too.
         occupancy_threshold: opacity of a step up to which a cell counts as empty.
     """
 
