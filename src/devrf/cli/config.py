@@ -92,6 +92,8 @@ def run_folder(_root_: Any) -> str:
         parts.append(chosen.ablation)
     if (chosen.method, chosen.protocol) != ("devrf", "two_stage"):
         parts += [chosen.method, chosen.protocol]
+    if _root_.rehearse:
+        parts.append("rehearsal")
     return f"outputs/{scene_name(_root_)}/{'-'.join(parts)}"
 
 

@@ -28,6 +28,7 @@ ROOT: dict[str, Any] = {
     "stage": str,
     "method": str,
     "seed": Annotated[int, Ge(0), Lt(2**32)],
+    "rehearse": bool,
     "resume": bool,
     "memory_check": bool,
     "priors": Literal["all", "none"],

@@ -16,6 +16,7 @@ from lightning.pytorch.strategies import Strategy
 from omegaconf import DictConfig, OmegaConf
 
 from devrf.apps.fitting import SIZE
+from devrf.apps.rehearsal import LONGEST, RehearsedStage
 from devrf.apps.trackers import Tracker, trackers
 from devrf.checkpoints.checkpoint import (
     OWN_REST,
@@ -36,6 +37,7 @@ from devrf.errors import DevrfError, expect
 from devrf.evaluation.objective import VALIDATION
 from devrf.evaluation.suite import Evaluation
 from devrf.methods.protocol import Protocol
+from devrf.scenes.reduced import reduced
 from devrf.scenes.scene import Scene
 
 if TYPE_CHECKING:
@@ -61,6 +63,11 @@ class RunContext(ExitStack):
         strategy: the configured trainer's: its device, rank and number of processes.
         leads: whether this process writes files and logs: rank 0, or the only one.
         device: the trainer's.
+        rehearses: whether ``rehearse=true`` asks for all that the run does, in minutes.
+        rehearsed: what the stages of a rehearsal came to, by name.
+        whole_settings: in a rehearsal, the arguments of the run's own stages, by name.
+        whole_scene: in a rehearsal, the scene with images of their own size, until what the run
+            itself needs has been estimated.
         is_trial: whether ``trainer.fast_dev_run`` asks for a step of each stage, with nothing kept.
         tried: what the stages of a trial came to, by name.
         chooses_size: whether the images' size is left to this run.
@@ -80,6 +87,12 @@ class RunContext(ExitStack):
         self.strategy = _strategy(config)
         self.leads = bool(self.strategy.is_global_zero)
         self.device = self.strategy.root_device
+        self.rehearses = bool(config.rehearse)
+        self.rehearsed: dict[str, RehearsedStage] = {}
+        self.whole_settings: dict[str, dict[str, Any]] = {}
+        self.whole_scene: Scene | None = None
+        if self.rehearses:  # its schedules are short enough
+            config.schedule.seconds = None
         self.is_trial = bool(config.trainer.get("fast_dev_run"))
         self.tried: dict[str, LoadedCheckpoint] = {}
         self.chooses_size = False
@@ -102,7 +115,13 @@ class RunContext(ExitStack):
         built: SceneDataModule = instantiate(data)
         built.priors = self.config.priors
         built.validation = self.config.objective.startswith(f"{VALIDATION}.")
+        if self.rehearses:
+            built.change = self._rehearsed_scene
         return built
+
+    def _rehearsed_scene(self, scene: Scene) -> Scene:
+        self.whole_scene = scene
+        return reduced(scene, LONGEST)
 
     @property
     def scene(self) -> Scene:
@@ -156,19 +175,24 @@ class RunContext(ExitStack):
         build: partial[Stage] = instantiate(self.config[key], _partial_=True, _convert_="all")
         if key == "ray_stage":
             build.keywords["model"].check_protocol(protocol.name)
-            return partial(build, step=protocol[name], static_share=protocol.static_share)
-        build.func.check_settings(**build.keywords)  # type: ignore[attr-defined]
-        own = f"true, as the stages of method={method} freeze what they build on"
-        expect(protocol.freeze is True, "protocol.freeze", own, protocol.freeze)
+            build = partial(build, step=protocol[name], static_share=protocol.static_share)
+        else:
+            build.func.check_settings(**build.keywords)  # type: ignore[attr-defined]
+            own = f"true, as the stages of method={method} freeze what they build on"
+            expect(protocol.freeze is True, "protocol.freeze", own, protocol.freeze)
+        if self.rehearses:
+            stage: type[Stage] = build.func  # type: ignore[assignment]
+            self.whole_settings[name] = build.keywords
+            build = partial(stage, **stage.rehearsed(build.keywords))
         return build
 
     @cached_property
     def logger(self) -> Any:
-        """The logger of all steps, False in a trial and in other processes than rank 0.
+        """The logger of all steps; False in a trial, in a rehearsal, in processes but rank 0.
 
         Giving a tracker the config begins its run: use it once the config has been checked.
         """
-        if not self.leads or self.is_trial:
+        if not self.leads or self.is_trial or self.rehearses:
             return False
         logger = instantiate(self.config.logger)
         for tracker in trackers([logger]):

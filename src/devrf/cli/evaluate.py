@@ -18,6 +18,7 @@ from devrf.apps.records import (
     tracked_scores,
     write_frames,
 )
+from devrf.apps.rehearsal import REHEARSAL
 from devrf.apps.still import write_contact_sheet
 from devrf.checkpoints.file_metadata import digest_of
 from devrf.cli.config import choices
@@ -83,6 +84,7 @@ def evaluate(run: RunContext) -> list[Path]:
     ran["wall_seconds"]["evaluate"] = run.step_seconds
     # A report takes metrics.json for what a finished run has reached.
     metrics = "metrics.json" if standing is None else "metrics-unfinished.json"
+    metrics = REHEARSAL if run.rehearses else metrics
     write_json(run.folder / metrics, {**head, **without_motion, **sections, "run": ran})
     shown = shown_sections(sections)
     for name, values in shown.items():

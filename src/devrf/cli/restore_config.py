@@ -47,7 +47,7 @@ PLACES = {"data.export", "data.flow_cache", "evaluation.download"}
 # Of another method's run these are taken over.
 OF_A_SCENE = {"data", "facing", "seed"}
 # What is set without a section.
-ALONE = {"seed", "priors", "deterministic", "decoder_precision"}
+ALONE = {"seed", "priors", "deterministic", "decoder_precision", "rehearse"}
 # An option's name leads to no other folder than its group's; a key is a path of plain names.
 OPTION = re.compile(r"(?!null$)[\w-]+", re.ASCII | re.IGNORECASE)
 KEY = re.compile(r"/?[\w-]+([./][\w-]+){0,15}", re.ASCII)

@@ -73,7 +73,7 @@ def deciding_settings(config: DictConfig, stage: str) -> dict[str, Any]:
     settings = {"method": config.method, "seed": config.seed}
     for section in ("data", stage) if stage in config else ("data", "ray_stage", "protocol"):
         settings |= _values(config, section)
-    for key, usual in (("schedule.seconds", None), ("priors", "all")):
+    for key, usual in (("schedule.seconds", None), ("priors", "all"), ("rehearse", False)):
         if (value := OmegaConf.select(config, key)) != usual:
             settings[key] = value
     # As a checkpoint's JSON gives it back.

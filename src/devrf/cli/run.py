@@ -26,6 +26,7 @@ from devrf.cli.evaluate import evaluate
 from devrf.cli.memory import compare
 from devrf.cli.messages import as_own_errors
 from devrf.cli.preparation import capture, fetch, inspect, prepare, say_next, selfcheck
+from devrf.cli.rehearse import begin_anew, conclude
 from devrf.cli.render import export, render, still, view, write_scene_page
 from devrf.cli.resume import done, note_done, unfinished
 from devrf.cli.run_folder import archive_previous
@@ -60,6 +61,7 @@ AFTER_LEARNING: dict[str, Step] = {
     "render": render,
     "page": write_scene_page,
 }
+REHEARSED_STEPS = ("evaluate", "still")
 # What a run's folder may hold that a person looks at first, and what to try next.
 RESULTS = ("metrics.json", "images", "videos", "checkpoints")
 NEXT = ("stage=still still.time=0.35 still.height=400", "stage=view")
@@ -106,6 +108,8 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
             compile_ahead({config.field.channels}, run.device)
         if learning and run.is_trial:
             steps = ()  # nothing of it is worth a score or a video
+        elif learning and run.rehearses:
+            steps = tuple(REHEARSED_STEPS)
         with shortage_in_words(config.stage, run.device, None):  # of networks that are too wide
             _check(run, learning, steps)
         if learning:
@@ -115,8 +119,10 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
         for name in steps if run.leads or not learning else ():
             if not (learning and done(run, name)):
                 _take(run, name, AFTER_LEARNING.get(name) or STEPS[name])
-    scored = "evaluate" in steps and run.leads and unfinished(run) is None
-    return _ended(run, steps) if scored else None
+        if learning and run.rehearses and run.leads:
+            conclude(run)
+        scored = "evaluate" in steps and run.leads and not run.rehearses
+        return _ended(run, steps) if scored and unfinished(run) is None else None
 
 
 def _prepare_to_learn(run: RunContext, requested: Names, steps: Names) -> None:
@@ -125,6 +131,9 @@ def _prepare_to_learn(run: RunContext, requested: Names, steps: Names) -> None:
     if learning != requested:
         left = ", ".join(learning + steps)
         log.info("%s is at rest: %s; no motion is learned", run.config.scene, left)
+    if run.rehearses:
+        begin_anew(run)
+        return
     resume = run.config.resume
     names = [name for name in learning if not (resume and run.own_checkpoint(name).is_file())]
     looks = names and run.config.memory_check

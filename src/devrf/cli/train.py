@@ -12,6 +12,7 @@ from lightning import Trainer
 from omegaconf import OmegaConf
 
 from devrf.apps.records import in_words
+from devrf.apps.rehearsal import RehearsedStage
 from devrf.callbacks import PeriodicCheckpoint, StopOnSignal, TrainingRecord
 from devrf.callbacks.csv_logger import ResumableCSVLogger
 from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, save_checkpoint
@@ -85,6 +86,14 @@ def _fit(run: RunContext, stage: Stage, begin: ResumePoint) -> None:
         if run.leads and finished and not run.is_trial:
             _keep(run, trainer, stage)
         strategy.barrier("the checkpoint is written")
+    if run.rehearses:
+        run.rehearsed[stage.name] = RehearsedStage(
+            capture=stage.capture,
+            iterations=stage.iterations_done,
+            whole=stage.iterations_of(run.whole_settings[stage.name], run.scene),
+            events={name: count for name, count in stage.events.items() if count},
+            planned=dict(stage.planned_events),
+        )
     where = saving.left_at(stage)
     if stopping:
         again = "run the same command again to go on"

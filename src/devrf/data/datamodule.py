@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 from itertools import repeat
 from typing import Any
 
@@ -29,6 +29,8 @@ class SceneDataModule(LightningDataModule, ABC):
     priors: Priors = "all"
     # Whether validation views are served, too, where the scene has any.
     validation = False
+    # What is made of the scene that was read; None: it is served as it is.
+    change: Callable[[Scene], Scene] | None = None
 
     def __init__(self) -> None:
         super().__init__()
@@ -44,7 +46,8 @@ class SceneDataModule(LightningDataModule, ABC):
         """The scene, on the host."""
         if self._scene is None:
             scene = self.load()
-            self._scene = without_priors(scene) if self.priors == "none" else scene
+            scene = without_priors(scene) if self.priors == "none" else scene
+            self._scene = scene if self.change is None else self.change(scene)
         return self._scene
 
     def provide(self, priors: Collection[str]) -> None:

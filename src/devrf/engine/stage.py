@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import reduce
@@ -113,6 +114,7 @@ class Stage(LightningModule, ABC):
         earlier_configs: the same of the stages that this one builds on, by name.
         command: what the command chose and set that learns, as its checkpoints hold it.
         protocol: the name of the protocol that the stage is a part of, if any.
+        events: what has happened since the stage was set up in this process, and how often.
     """
 
     name: str
@@ -151,6 +153,7 @@ class Stage(LightningModule, ABC):
         self.earlier_configs: dict[str, dict[str, Any]] = {}
         self.command: dict[str, Any] = {}
         self.protocol: str | None = None
+        self.events: Counter[str] = Counter()
         self._plain_background: Tensor | None = None
         self._progress: dict[str, Any] | None = None
         self._finished: dict[str, Any] | None = None
@@ -325,6 +328,25 @@ class Stage(LightningModule, ABC):
     def current_model(self) -> LearnedModel:
         """The model, with everything learned so far written back to it."""
         return self.scene_model
+
+    @property
+    def planned_events(self) -> Mapping[str, int]:
+        """What the whole schedule brings about, and how often, by the names of :attr:`events`."""
+        return {}
+
+    @classmethod
+    def iterations_of(cls, settings: Mapping[str, Any], scene: Scene) -> int:
+        """Iterations, for a scene, of the stage with these arguments, which is not built."""
+        raise NotImplementedError
+
+    @classmethod
+    def rehearsed(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
+        """The arguments of the stage, made to fit into seconds on a CPU.
+
+        The schedule is scaled, so that all that happens still does; batches, grids and networks
+        are smaller. All else is as it was.
+        """
+        return {**settings}
 
     @classmethod
     def check_settings(cls, **settings: Any) -> None:

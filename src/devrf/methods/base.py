@@ -230,6 +230,17 @@ class RayTrainable(Renderable):
         """Called when a stage of a protocol begins: keeps its frozen parts as they are."""
         self.freeze(step.frozen)
 
+    def rehearsed(self, factor: float) -> RayTrainable:
+        """The method, not set up yet, at a size for seconds on a CPU and ``factor`` times as long.
+
+        Nothing is left out: what it samples by, and what it says of its losses, is as it was.
+        """
+        return self
+
+    def milestones(self, total: int) -> Mapping[str, int]:
+        """What :meth:`on_iteration` brings about in a stage of ``total`` iterations: when each."""
+        return {}
+
     def on_iteration(self, step: int, total: int) -> None:
         """Called before iteration ``step`` of ``total``: for encoding windows and curricula."""
 

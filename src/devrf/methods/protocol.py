@@ -37,6 +37,10 @@ class ProtocolStage:
         holds, expected = 0 < self.iterations <= 1, "a share above 0, at most 1"
         expect(holds, f"{key}.iterations", expected, self.iterations)
 
+    def share_of(self, iterations: int) -> int:
+        """The stage's share of a method's iterations."""
+        return max(1, round(iterations * self.iterations))
+
 
 @dataclass(frozen=True)
 class Protocol:

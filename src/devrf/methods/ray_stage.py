@@ -23,10 +23,18 @@ from devrf.errors import expect
 from devrf.methods.base import RayTrainable
 from devrf.methods.protocol import ProtocolStage
 from devrf.methods.weighted_loss import counted_weights, visibility, weighted_sum
-from devrf.scenes.scene import Views
+from devrf.scenes.scene import Scene, Views
 from devrf.scenes.space import dynamic_only
 from devrf.system.options import Count, Options, Positive, Whole
 from devrf.system.profiling import span
+
+# What happens in the course of a stage, beside what a method says.
+GROWN = "grids grown"
+# What a rehearsal has: at most so many iterations, rays and times of a batch; at least this rate.
+REHEARSED_ITERATIONS = 600
+REHEARSED_RAYS = 256
+REHEARSED_TIMES = 2
+REHEARSED_RATE = 2e-3
 
 
 @dataclass(frozen=True)
@@ -74,6 +82,14 @@ class RaySchedule(Options):
         positive = self.final_learning_rate > 0 or self.decay == "cosine"
         expected = "more than 0, or decay=cosine"
         expect(positive, f"{self.key}.final_learning_rate", expected, self.final_learning_rate)
+
+    def scaled(self, factor: float) -> RaySchedule:
+        """The schedule in ``factor`` times its iterations; the other numbers are shares of them."""
+        return replace(
+            self,
+            iterations=max(1, round(self.iterations * factor)),
+            centre_crop=math.ceil(self.centre_crop * factor),
+        )
 
 
 class RayStage(Stage):
@@ -126,10 +142,62 @@ class RayStage(Stage):
         self._rays = schedule.rays
         self._random_background = False
 
+    @classmethod
+    def iterations_of(cls, settings: Mapping[str, Any], scene: Scene) -> int:
+        """The stage's share of the schedule."""
+        schedule: RaySchedule = settings["schedule"]
+        step: ProtocolStage = settings["step"]
+        return step.share_of(schedule.iterations)
+
+    @classmethod
+    def rehearsed(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
+        """Small networks and batches; rates at which networks learn in hundreds of iterations."""
+        schedule: RaySchedule = settings["schedule"]
+        model: RayTrainable = settings["model"]
+        factor = min(1.0, REHEARSED_ITERATIONS / schedule.iterations)
+        rate = max(schedule.learning_rate, REHEARSED_RATE)
+        final = schedule.final_learning_rate * rate / schedule.learning_rate
+        times = schedule.times_per_batch
+        return {
+            **settings,
+            "schedule": replace(
+                schedule.scaled(factor),
+                rays=min(schedule.rays, REHEARSED_RAYS),
+                rays_without_hull=None,
+                learning_rate=rate,
+                learning_rate_without_hull=None,
+                final_learning_rate=final,
+                times_per_batch=None if times is None else min(times, REHEARSED_TIMES),
+            ),
+            "model": model.rehearsed(factor),
+        }
+
+    @property
+    def planned_events(self) -> Mapping[str, int]:
+        """Growths of grids, curricula, and what the method itself does in time."""
+        total = self.total_iterations
+        grown = sum(0 < iteration < total for iteration in self.scene_model.growths(total))
+        reached = [name for name, at in self._milestones.items() if at < total]
+        return {**({GROWN: grown} if grown else {}), **dict.fromkeys(reached, 1)}
+
+    @property
+    def _milestones(self) -> dict[str, int]:
+        """The iterations of what happens once, beside growths of grids."""
+        schedule = self.schedule
+        total = self.total_iterations
+        milestones = dict(self.scene_model.milestones(total))
+        if schedule.curriculum:
+            milestones["all frames shown"] = math.ceil(schedule.curriculum * total)
+        if schedule.centre_crop:
+            milestones["whole images shown"] = schedule.centre_crop
+        if schedule.warmup:
+            milestones["rate grown"] = math.ceil(schedule.warmup * total)
+        return milestones
+
     @property
     def total_iterations(self) -> int:
         """The stage's share of the schedule."""
-        return max(1, round(self.schedule.iterations * self.step_of_protocol.iterations))
+        return self.step_of_protocol.share_of(self.schedule.iterations)
 
     @property
     def resolution(self) -> tuple[int, ...]:
@@ -185,8 +253,9 @@ class RayStage(Stage):
 
     def enter(self, phase: Phase) -> None:
         """Let grids grow; when the stage begins or goes on, gather the pixels to draw from."""
-        self.phase = phase
         growths = self.scene_model.growths(self.total_iterations)
+        self.events[GROWN] += self.phase is not None
+        self.phase = phase
         self.scene_model.grow(sum(iteration <= phase.start for iteration in growths))
         for index, group in enumerate(self.scene_model.param_groups()):
             present = self.optimizer.param_groups[index]["params"]
@@ -210,6 +279,8 @@ class RayStage(Stage):
     def prepare(self) -> None:
         """Let the model follow the schedule."""
         self.scene_model.on_iteration(self.iteration, self.total_iterations)
+        for name, at in self._milestones.items():
+            self.events[name] += self.previous_iteration < at <= self.iteration
 
     def draw(self) -> Pixels:
         """Random pixels: of the static images first, where both captures are learned from.

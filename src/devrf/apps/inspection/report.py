@@ -37,9 +37,9 @@ def inspection_text(
     advice = [*advice_on(scene), *([] if shortage is None else [shortage])]
     verdict = f"problems found: {len(advice)}" if advice else "no problems found"
     return Group(
-        _titled_table("what was found", scene_facts(scene)),
-        _titled_table("images", image_facts(scene), HEADING),
-        _titled_table("what a run will need, estimated", requirements),
+        titled_table("what was found", scene_facts(scene)),
+        titled_table("images", image_facts(scene), HEADING),
+        titled_table("what a run will need, estimated", requirements),
         Text(verdict, style="bold yellow" if advice else "bold green"),
         *(
             Text.assemble((f"  {where}", "yellow"), f": {problem}; ", (remedy, "italic"))
@@ -64,7 +64,7 @@ def as_text(shown: RenderableType) -> str:
     return "\n".join(map(str.rstrip, console.export_text().splitlines()))
 
 
-def _titled_table(
+def titled_table(
     title: str, rows: Sequence[Sequence[str]], heading: Sequence[str] | None = None
 ) -> RenderableType:
     """An indented table of text with a title above and an empty line below."""

@@ -236,10 +236,13 @@ class CanonicalField(nn.Module):
         assert isinstance(self.decoder, ColorDecoder)
         nn.init.zeros_(self.decoder.from_direction.weight)
 
-    def learn_directions(self, whether: bool) -> None:
-        """Let the network learn from viewing directions, or not."""
-        if isinstance(self.decoder, ColorDecoder):
-            self.decoder.learns_directions = whether
+    def learn_directions(self, whether: bool) -> bool:
+        """Let the network learn from viewing directions, or not; whether it did not before."""
+        if not isinstance(self.decoder, ColorDecoder):
+            return False
+        begins = whether and not self.decoder.learns_directions
+        self.decoder.learns_directions = whether
+        return begins
 
     def resize(self, voxels: int) -> None:
         """Resample both grids to about ``voxels`` voxels; new parameters result."""

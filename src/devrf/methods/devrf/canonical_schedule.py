@@ -18,6 +18,13 @@ from devrf.system.options import Count, NotNegative, Options, Several, Whole
 
 Side = Annotated[float, Ge(2)]
 
+# What happens in the course of the stage.
+SEARCHED = "geometry searched"
+GROWN = "grids grown"
+RENEWED = "occupancy renewed"
+DIRECTIONS = "view dependence begun"
+SMOOTHED_LESS = "total variation of touched voxels alone"
+
 
 @dataclass(frozen=True, kw_only=True)
 class CanonicalPhase(Phase):
@@ -116,6 +123,50 @@ class CanonicalSchedule(Options):
     def total(self) -> int:
         """Iterations of the whole stage."""
         return self.search_iterations + self.iterations
+
+    def scaled(self, factor: float) -> CanonicalSchedule:
+        """The schedule in ``factor`` times its iterations: every event happens, in its order.
+
+        Each phase keeps one iteration at least.
+        """
+
+        def whole(iterations: float, least: int = 0) -> int:
+            return max(least, round(iterations * factor))
+
+        upsample_at: list[int] = []
+        for iteration in self.upsample_at:
+            upsample_at.append(whole(iteration, least=upsample_at[-1] + 1 if upsample_at else 1))
+        searches = self.search_iterations > 0
+        smooths = self.dense_tv_iterations > 0
+        late = self.view_dependence_start
+        every = self.occupancy_every
+        return replace(
+            self,
+            search_iterations=whole(self.search_iterations, least=1 if searches else 0),
+            iterations=whole(self.iterations, least=upsample_at[-1] + 1 if upsample_at else 1),
+            upsample_at=tuple(upsample_at),
+            decay_iterations=whole(self.decay_iterations, least=1),
+            occupancy_every=None if every is None else whole(every, least=2),
+            dense_tv_iterations=whole(self.dense_tv_iterations, least=1 if smooths else 0),
+            view_dependence_start=None if late is None else whole(late, least=1 if late else 0),
+        )
+
+    @property
+    def events(self) -> dict[str, int]:
+        """What the schedule brings about, and how often, as :attr:`Stage.events` counts it."""
+        lengths = (self.search_iterations, self.iterations)
+        every = self.occupancy_every
+        renewals = 0 if every is None else sum((n - 1 + every // 2) // every for n in lengths if n)
+        late = 0 < (self.view_dependence_start or 0) < self.iterations
+        smooths_less = 0 < self.dense_tv_iterations < self.iterations
+        counts = {
+            SEARCHED: int(self.search_iterations > 0),
+            GROWN: len(self.upsample_at),
+            RENEWED: renewals,
+            DIRECTIONS: int(late),
+            SMOOTHED_LESS: int(smooths_less),
+        }
+        return {name: count for name, count in counts.items() if count}
 
     def phase(self, iteration: int) -> CanonicalPhase:
         """The phase that ``iteration`` belongs to; the last one from the end on."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import torch
@@ -16,7 +16,15 @@ from devrf.engine.stage import Stage
 from devrf.errors import DevrfError
 from devrf.methods.devrf.architecture import Architecture, fitted_to, resolved_voxels
 from devrf.methods.devrf.canonical_field import CanonicalField
-from devrf.methods.devrf.canonical_schedule import CanonicalPhase, CanonicalSchedule
+from devrf.methods.devrf.canonical_schedule import (
+    DIRECTIONS,
+    GROWN,
+    RENEWED,
+    SEARCHED,
+    SMOOTHED_LESS,
+    CanonicalPhase,
+    CanonicalSchedule,
+)
 from devrf.methods.devrf.extensions.depth_crop import crop_to_visible
 from devrf.methods.devrf.free_space import possibly_occupied, view_count_weight
 from devrf.methods.devrf.losses import (
@@ -41,7 +49,7 @@ from devrf.methods.weighted_loss import counted_weights
 from devrf.ops.photometric import distortion
 from devrf.rendering.occupancy import Occupancy, bounding_box, dilate
 from devrf.rendering.sampling import RenderSettings
-from devrf.scenes.scene import CaptureName, ImagesName, Views
+from devrf.scenes.scene import CaptureName, ImagesName, Scene, Views
 from devrf.system.profiling import span
 
 log = logging.getLogger(__name__)
@@ -49,6 +57,11 @@ log = logging.getLogger(__name__)
 # Where fewer of the iterations were made, a field in which nothing is to be seen is not due to
 # wrong settings.
 LEAST_DONE = 1 / 4
+# What a rehearsal has at most: iterations, rays, voxels along an edge.
+REHEARSED_ITERATIONS = 1000
+REHEARSED_RAYS = 512
+REHEARSED_SIDE = 48
+REHEARSED_SEARCH_SIDE = 40
 
 
 class CanonicalStage(Stage):
@@ -105,6 +118,40 @@ class CanonicalStage(Stage):
             weights, self.tv[kind] = apart_from_total_variation(loss, key)
             self.weights[kind] = counted_weights(weights, PHOTOMETRIC_TERMS, key)
         self.pool: PixelPool | None = None
+
+    @classmethod
+    def iterations_of(cls, settings: Mapping[str, Any], scene: Scene) -> int:
+        """Of search and radiance field; contracted space has no search."""
+        schedule: CanonicalSchedule = settings["schedule"]
+        return schedule.in_space(scene.space).total
+
+    @classmethod
+    def rehearsed(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
+        """Grids of few voxels, and a search that begins as much less faint as it is shorter.
+
+        How long the search takes to see anything goes with the reciprocal of the opacity that it
+        begins with: gradients are as faint, and far below Adam's epsilon.
+        """
+        schedule: CanonicalSchedule = settings["schedule"]
+        architecture: Architecture = settings["architecture"]
+        factor = min(1.0, REHEARSED_ITERATIONS / schedule.total)
+        faint = architecture.search_alpha_init
+        return {
+            **settings,
+            "schedule": replace(
+                schedule.scaled(factor),
+                search_side=min(schedule.search_side, REHEARSED_SEARCH_SIDE),
+                side=min(schedule.side, REHEARSED_SIDE),
+                rays=min(schedule.rays, REHEARSED_RAYS),
+            ),
+            "architecture": replace(architecture, search_alpha_init=min(faint / factor, 1e-2)),
+            "iterations_per_step": min(settings["iterations_per_step"], 10),
+        }
+
+    @property
+    def planned_events(self) -> Mapping[str, int]:
+        """Of the schedule."""
+        return self.schedule.events
 
     @property
     def total_iterations(self) -> int:
@@ -204,8 +251,10 @@ class CanonicalStage(Stage):
         self.phase = phase
         if previous is not None and previous.kind != phase.kind:
             self._begin_fine(phase)
+            self.events[SEARCHED] += 1
         elif previous is not None:
             self._grow(phase)
+            self.events[GROWN] += 1
         self.restore(phase, {})
 
     def restore(self, phase: CanonicalPhase, state: dict[str, Any]) -> None:
@@ -370,14 +419,18 @@ class CanonicalStage(Stage):
         if renews:
             self.update_occupancy()
             self._choose_pixels()
+            self.events[RENEWED] += 1
         touched_only = not schedule.smooths_all(self.iteration)
+        smooths_less = touched_only and not groups[0]["touched_only"]
         changed = renews or touched_only != groups[0]["touched_only"]
+        self.events[SMOOTHED_LESS] += smooths_less
         for group in groups:
             group["touched_only"] = touched_only
         if changed:
             self._look_for_gradients()
         learns = schedule.learns_directions(self.iteration)
-        self.scene_model.canonical.learn_directions(learns)
+        begun = self.scene_model.canonical.learn_directions(learns)
+        self.events[DIRECTIONS] += begun
 
     def draw(self) -> Pixels:
         """Random pixels of all images."""

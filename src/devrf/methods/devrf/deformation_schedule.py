@@ -19,6 +19,11 @@ from devrf.system.options import Count, NotNegative, Options, Positive, Several
 # Motion grids of this side take Adam about as long as a batch of rays takes; estimated.
 FINE_SIDE = 160
 
+# What happens in the course of the stage.
+LEVELS = "levels begun"
+GROWN = "grids grown"
+VISITS = "visits of frames"
+
 
 @pydantic.dataclasses.dataclass(frozen=True)
 class Level(Options):
@@ -127,6 +132,37 @@ class DeformationSchedule(Options):
             iterations = sum(level.iterations for level in self.levels)
             finest = replace(self.levels[-1], iterations=iterations, lr_factor=None)
             object.__setattr__(self, "levels", (finest,))
+
+    def scaled(self, factor: float) -> DeformationSchedule:
+        """The schedule in ``factor`` times its iterations; each visit keeps one at least."""
+        rows = [replace(r, iterations=max(1, round(r.iterations * factor))) for r in self.levels]
+        return replace(self, levels=rows)
+
+    def with_finest(self, side: int) -> DeformationSchedule:
+        """The schedule with grids of at most about ``side``³ voxels, as many of them different.
+
+        Steps from level to level shrink alike, on a logarithmic scale.
+        """
+        sides = [row.side for row in self.levels]
+        coarsest = min(sides)
+        finest = max(sides)
+        if finest <= side:
+            return self
+        first = min(coarsest, side // 2)
+        steps = math.log(finest / coarsest)
+        power = math.log(side / first) / steps if steps else 0.0
+        rows = [
+            replace(row, side=round(side * (row.side / finest) ** power)) for row in self.levels
+        ]
+        planes = self.planes and max(2, round(self.planes * side / finest))
+        return replace(self, levels=rows, planes=planes)
+
+    def events(self, frames: int) -> dict[str, int]:
+        """What the schedule brings about, and how often, as :attr:`Stage.events` counts it."""
+        levels = len(self.levels)
+        grown = sum(a.side != b.side for a, b in pairwise(self.levels))
+        counts = {LEVELS: levels, GROWN: grown, VISITS: levels * (frames - 1)}
+        return {name: count for name, count in counts.items() if count}
 
     def grid(self, level: int) -> tuple[int, int | None]:
         """About how many voxels the motion grids of a level have, and their planes, if given."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -19,6 +20,9 @@ from devrf.errors import DevrfError
 from devrf.methods.devrf.active_frame import ActiveFrame
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformation_schedule import (
+    GROWN,
+    LEVELS,
+    VISITS,
     DeformationPhase,
     DeformationSchedule,
     converged,
@@ -37,10 +41,15 @@ from devrf.methods.devrf.settings import (
 )
 from devrf.methods.devrf.volume_rendering import possible_occupancy, render
 from devrf.rendering.output import ColorChange
-from devrf.scenes.scene import CaptureName, Views
+from devrf.scenes.scene import CaptureName, Scene, Views
 from devrf.system.profiling import span
 
 log = logging.getLogger(__name__)
+
+# What a rehearsal has at most: iterations of a frame, rays, voxels along an edge.
+REHEARSED_ITERATIONS = 25
+REHEARSED_RAYS = 512
+REHEARSED_SIDE = 40
 
 
 class DeformationStage(Stage):
@@ -125,6 +134,30 @@ class DeformationStage(Stage):
         extensions = tuple(settings.get("extensions", {}).values())
         MotionLoss(settings["loss"], extensions, settings["schedule"])
 
+    @classmethod
+    def iterations_of(cls, settings: Mapping[str, Any], scene: Scene) -> int:
+        """Of all levels and frames."""
+        schedule: DeformationSchedule = settings["schedule"]
+        return schedule.total(len(scene.clock))
+
+    @classmethod
+    def rehearsed(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
+        """Few iterations of each frame, in which voxels move as far, on motion grids of few."""
+        schedule: DeformationSchedule = settings["schedule"]
+        factor = min(1.0, REHEARSED_ITERATIONS / sum(row.iterations for row in schedule.levels))
+        scaled = schedule.scaled(factor).with_finest(REHEARSED_SIDE)
+        return {
+            **settings,
+            "schedule": replace(scaled, rays=min(schedule.rays, REHEARSED_RAYS)),
+            "motion": settings["motion"].scaled(factor),
+            "iterations_per_step": min(settings["iterations_per_step"], 10),
+        }
+
+    @property
+    def planned_events(self) -> Mapping[str, int]:
+        """Of the schedule."""
+        return self.schedule.events(len(self.field.clock))
+
     @property
     def field(self) -> DeformationField:
         """The deformation field; what the active frame learns may not be written back yet."""
@@ -196,9 +229,12 @@ class DeformationStage(Stage):
         previous = self.phase
         self.phase = phase
         self._write_back()
+        self.events[VISITS] += 1
+        self.events[LEVELS] += previous is None or previous.level != phase.level
         if previous is not None and previous.level != phase.level:
             self._free()
             self.field.resize(*self.schedule.grid(phase.level))
+            self.events[GROWN] += previous.side != phase.side
         if phase.init_from_previous:
             self.field.frames.copy_previous(phase.frame)
         for extension in self.extensions:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated, ClassVar, Literal
 
 import torch
@@ -103,6 +104,11 @@ class MotionSettings(Options):
     store: Literal["auto", "device", "host"] = "auto"
     store_half: bool | Literal["auto"] = "auto"
     min_rel_improvement: Annotated[float, Gt(0), Le(1)] | None = None
+
+    def scaled(self, factor: float) -> MotionSettings:
+        """The settings for ``factor`` times the iterations, in which voxels move as far."""
+        every = max(1, round(self.occupancy_every * factor))
+        return replace(self, learning_rate=self.learning_rate / factor, occupancy_every=every)
 
     def stored_half(self, device: torch.device) -> bool:
         """Whether frames are kept in half precision while a stage learns on ``device``."""

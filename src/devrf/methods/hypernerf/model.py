@@ -119,6 +119,13 @@ class HyperNeRF(Nerfies):
         super().follow(step)
         self._shut = step.capture == "static"
 
+    def milestones(self, total: int) -> dict[str, int]:
+        """When ambient space is open, if it opens."""
+        s = self.settings
+        opened = round((s.ambient_delay + s.ambient_window) * total)
+        further = {} if self._shut else {"ambient space open": opened}
+        return {**super().milestones(total), **further}
+
     def on_iteration(self, step: int, total: int) -> None:
         """Open the warp's octaves, and those of w: β grows evenly from 0 after a delay."""
         super().on_iteration(step, total)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from dataclasses import replace
+from typing import Annotated, Literal, Self
 
 from annotated_types import Ge, Le, MinLen
 from pydantic.dataclasses import dataclass
@@ -55,6 +56,17 @@ class KPlanesSettings(OccupancySettings):
     proposal_samples: Annotated[Sequence[Samples], MinLen(1)] = (256, 128)
     proposal_resolutions: Sequence[Several] = (64, 128)
     proposal_channels: Count = 8
+
+    def rehearsed(self, factor: float) -> Self:
+        """Coarse planes, few samples."""
+        return replace(
+            super().rehearsed(factor),
+            resolution=min(self.resolution, 16),
+            steps=min(self.steps, 64),
+            samples=min(self.samples, 24),
+            proposal_samples=[min(count, 48) for count in self.proposal_samples],
+            proposal_resolutions=[min(side, 32) for side in self.proposal_resolutions],
+        )
 
     def __post_init__(self) -> None:
         fit = self.harmonics == HIGHEST_DEGREE or self.decoder == "hybrid"

@@ -71,6 +71,10 @@ class PlacedModel(RayTrainable):
         """Take the frames' times; a method with codes for them makes these here."""
         self.clock = FrameClock(times)
 
+    def rehearsed(self, factor: float) -> Self:
+        """Of smaller settings."""
+        return type(self)(self.settings.rehearsed(factor))
+
     @property
     def has_hull(self) -> bool:
         """Whether the occupancy was carved from alpha masks."""
@@ -114,6 +118,12 @@ class NeuralField(PlacedModel):
             self.occupancy = OccupancyFrames.of(
                 scene, self.box, s.occupancy_side, hull=s.hull, empty_from=s.empty_from
             ).to(self.device)
+
+    def milestones(self, total: int) -> dict[str, int]:
+        """From when on space that the fields leave empty is not sampled, if it ever is."""
+        share = self.settings.empty_from
+        learns = share is not None and self.occupancy.learned.opacity.numel() > 0
+        return {"empty space left out": round(share * total)} if learns else {}
 
     def on_iteration(self, step: int, total: int) -> None:
         """Look where the fields are empty."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from dataclasses import replace
+from typing import Annotated, ClassVar, Literal, Self
 
 from annotated_types import Ge, Le
 from pydantic.dataclasses import dataclass
@@ -24,6 +25,10 @@ class MethodSettings(Options):
 
     key: ClassVar[str] = "ray_stage.model.settings"
 
+    def rehearsed(self, factor: float) -> Self:
+        """The settings at sizes for seconds on a CPU, in ``factor`` times the iterations."""
+        return self
+
     def check(self, name: str, holds: bool, expected: str) -> None:
         """Refuse by a DevrfError the setting ``name`` unless a condition ``holds``."""
         expect(holds, f"{self.key}.{name}", expected, getattr(self, name))
@@ -44,6 +49,10 @@ class OccupancySettings(MethodSettings):
     occupancy_side: Several = 128
     hull: bool = True
     empty_from: Share | None = 0.25
+
+    def rehearsed(self, factor: float) -> Self:
+        """Coarser masks."""
+        return replace(super().rehearsed(factor), occupancy_side=min(self.occupancy_side, 32))
 
 
 @dataclass(frozen=True)
@@ -73,6 +82,11 @@ class PlacedSettings(OccupancySettings):
     precision: Precision = "float32"
     steps: Samples = 128
 
+    def rehearsed(self, factor: float) -> Self:
+        """Narrow networks, few samples."""
+        smaller = super().rehearsed(factor)
+        return replace(smaller, width=min(self.width, 64), steps=min(self.steps, 64))
+
 
 @dataclass(frozen=True)
 class FieldSettings(PlacedSettings):
@@ -91,6 +105,11 @@ class FieldSettings(PlacedSettings):
     coarse: Samples = 64
     fine: Samples = 128
     separate_coarse: bool = False
+
+    def rehearsed(self, factor: float) -> Self:
+        """Few samples."""
+        smaller = super().rehearsed(factor)
+        return replace(smaller, coarse=min(self.coarse, 24), fine=min(self.fine, 24))
 
     def __post_init__(self) -> None:
         possible = self.sampling == "hierarchical" or not self.separate_coarse

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
-from typing import ClassVar, Literal
+from dataclasses import replace
+from typing import ClassVar, Literal, Self
 
 import torch
 from pydantic.dataclasses import dataclass
@@ -92,6 +93,10 @@ class NerfiesSettings(FieldSettings):
     elastic: Literal["drawn", "full"] = "drawn"
     elastic_rays: Whole = 0
 
+    def rehearsed(self, factor: float) -> Self:
+        """A narrow warp, too."""
+        return replace(super().rehearsed(factor), warp_width=min(self.warp_width, 64))
+
 
 class Nerfies(DeformableField):
     """(σ, c) = T(W(x, ω_t), d).
@@ -130,6 +135,11 @@ class Nerfies(DeformableField):
         """What is learned from the static images alone is the canonical state."""
         super().follow(step)
         self.rest_is_canonical |= step.capture == "static"
+
+    def milestones(self, total: int) -> dict[str, int]:
+        """When all of the warp's octaves are open."""
+        opened = round(self.settings.window * total)
+        return {**super().milestones(total), "octaves of the warp open": opened}
 
     def on_iteration(self, step: int, total: int) -> None:
         """Open the warp's octaves: α grows evenly from 0. Look where the field is empty."""

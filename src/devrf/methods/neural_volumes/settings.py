@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from dataclasses import replace
+from typing import Annotated, Literal, Self
 
 from annotated_types import Ge, Len
 from pydantic.dataclasses import dataclass
@@ -56,6 +57,22 @@ class NeuralVolumesSettings(MethodSettings):
     step: Annotated[float, Ge(1 / 512)] = 4 / 256
     hull: bool = False
     occupancy_side: Several = 128
+
+    def rehearsed(self, factor: float) -> Self:
+        """A volume and a warp of few voxels, by layers of few channels; small encoded images."""
+        multiple = 2 ** len(self.encoder_channels)
+        return replace(
+            super().rehearsed(factor),
+            code=min(self.code, 64),
+            encoder_size=[min(edge, multiple) for edge in self.encoder_size],
+            encoder_channels=[min(channels, 32) for channels in self.encoder_channels],
+            encoder_width=min(self.encoder_width, 64),
+            template_channels=[min(channels, 64) for channels in self.template_channels[:5]],
+            warp_side=min(self.warp_side, 16),
+            warp_channels=[min(channels, 32) for channels in self.warp_channels[:4]],
+            step=max(self.step, 1 / 16),
+            occupancy_side=min(self.occupancy_side, 32),
+        )
 
     def __post_init__(self) -> None:
         multiple = 2 ** len(self.encoder_channels)

@@ -84,6 +84,12 @@ class NSFF(NeuralField):
         fields = self.fields
         return {"static": fields.static.parameters(), "dynamic": fields.dynamic.parameters()}
 
+    def milestones(self, total: int) -> dict[str, int]:
+        """When priors count less, and when frames two steps away begin to count."""
+        chained = round(self.settings.warmup.chained_from * self._first)
+        known = {"priors counted less": self._first, "frames two steps away counted": chained}
+        return {**super().milestones(total), **{k: n for k, n in known.items() if n < total}}
+
     def on_iteration(self, step: int, total: int) -> None:
         """Remember the iteration: weights change every N₀. Look where the fields are empty."""
         self._step = step

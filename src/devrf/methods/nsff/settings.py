@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import field
-from typing import Annotated, ClassVar, Literal
+from dataclasses import field, replace
+from typing import Annotated, ClassVar, Literal, Self
 
 from annotated_types import Ge
 from pydantic.dataclasses import dataclass
@@ -35,6 +35,10 @@ class Warmup(MethodSettings):
     def __post_init__(self) -> None:
         limit = self.max_frames
         self.check("min_frames", 1 <= self.min_frames <= limit, f"1 … max_frames ({limit})")
+
+    def scaled(self, factor: float) -> Warmup:
+        """The same in ``factor`` times the iterations."""
+        return replace(self, steps_per_frame=max(1, round(self.steps_per_frame * factor)))
 
     def steps(self, frames: int) -> int:
         """N₀ of a scene of so many frames."""
@@ -72,3 +76,12 @@ class NSFFSettings(PlacedSettings):
     neighbours: Literal["both", "one"] = "both"
     hard_rays: Whole = 512
     warmup: Warmup = field(default_factory=Warmup)
+
+    def rehearsed(self, factor: float) -> Self:
+        """Few samples, too, and a shorter beginning."""
+        return replace(
+            super().rehearsed(factor),
+            samples=min(self.samples, 48),
+            hard_rays=min(self.hard_rays, 64),
+            warmup=self.warmup.scaled(factor),
+        )

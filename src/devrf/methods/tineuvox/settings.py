@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, ClassVar
+from dataclasses import replace
+from typing import Annotated, ClassVar, Self
 
 from annotated_types import Gt, Lt, MinLen
 from pydantic.dataclasses import dataclass
@@ -58,6 +59,11 @@ class TiNeuVoxSettings(OccupancySettings):
     motion_rate: Positive = 0.75
     starts_still: bool = False
     tv: NotNegative = 0.0
+
+    def rehearsed(self, factor: float) -> Self:
+        """A coarse grid, narrow networks."""
+        smaller = super().rehearsed(factor)
+        return replace(smaller, side=min(self.side, 48), width=min(self.width, 64))
 
     def __post_init__(self) -> None:
         fit = not any(max(self.strides) % stride for stride in self.strides)

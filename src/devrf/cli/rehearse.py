@@ -1,0 +1,72 @@
+"""``rehearse=true``: all that a run does, at sizes for minutes on a CPU, and what it came to.
+
+The settings are the run's own. Its schedules are scaled, so that every event happens in its order;
+batches, grids, networks and images are smaller (:meth:`~devrf.engine.stage.Stage.rehearsed`). What
+it leaves is no run: it has a folder of its own, ``rehearsal.json`` in place of ``metrics.json``, so
+that no report compares it, and checkpoints that no run goes on with. It begins anew each time.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+
+from rich.filesize import decimal
+
+from devrf.apps.inspection.report import show
+from devrf.apps.needs import needs_table
+from devrf.apps.rehearsal import (
+    REHEARSAL,
+    record,
+    rehearsal_tables,
+    shortfalls,
+    single_color_psnr,
+)
+from devrf.checkpoints.checkpoint import metadata_of
+from devrf.cli.context import RunContext
+from devrf.cli.memory import needs
+from devrf.errors import DevrfError
+from devrf.system.files import read_record, write_json
+
+log = logging.getLogger(__name__)
+
+
+# The setting that tells a rehearsal's checkpoints from a run's.
+KEY = "rehearse"
+
+
+def begin_anew(run: RunContext) -> None:
+    """Remove what an earlier rehearsal has learned in the folder.
+
+    Raises:
+        DevrfError: a run's own checkpoints are there.
+    """
+    found = sorted((run.folder / "checkpoints").glob("*.ckpt"))
+    for path in found:
+        if KEY not in metadata_of(path).training_config:
+            raise DevrfError(
+                f"{path}: of a run; a rehearsal needs a folder of its own, hydra.run.dir=FOLDER"
+            )
+    for path in found:
+        path.unlink()
+
+
+def conclude(run: RunContext) -> None:
+    """Say what each stage came to, and what the run itself needs; write it to the record.
+
+    Raises:
+        DevrfError: a stage has learned nothing, or what was planned did not take place.
+    """
+    path = run.folder / REHEARSAL
+    scores = json.loads(read_record(path))
+    sections = {name: scores[name] for name in run.scene.captures if name in scores}
+    blank = {capture: single_color_psnr(run.scene, capture) for capture in run.scene.captures}
+    assert run.whole_scene is not None
+    table = needs_table(run.whole_scene, needs(run, run.config, run.whole_scene))
+    rows = [(name, decimal(round(size))) for name, size in table]
+    show(rehearsal_tables(run.rehearsed, sections, blank, rows))
+    reasons = shortfalls(run.rehearsed, sections, blank)
+    write_json(path, {**scores, "rehearsal": record(run.rehearsed, blank, reasons)})
+    if reasons:
+        raise DevrfError(f"rehearse: {'; '.join(reasons)}; {path} has the figures")
+    log.info("rehearsed: every stage learns, and all that is planned takes place (%s)", path)

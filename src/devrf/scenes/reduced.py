@@ -1,0 +1,75 @@
+"""A scene of smaller images: what a rehearsal learns from."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from devrf.geometry.ndc import NormalizedDevice
+from devrf.scenes.resampling import shrink_flow, shrink_pixels
+from devrf.scenes.scene import OpticalFlow, Scene, Views
+from devrf.scenes.validation import MIN_SIDE
+
+
+def reduced(scene: Scene, longest: int) -> Scene:
+    """The scene with images of at most ``longest`` pixels a side; bounds and times stay.
+
+    Sides keep their proportion, but are no shorter than what a reader takes.
+    """
+    smaller: dict[int, Views] = {}
+
+    def of(views: Views) -> Views:
+        # A film's images are both captures: they stay one.
+        if id(views) not in smaller:
+            smaller[id(views)] = _reduced_views(views, longest)
+        return smaller[id(views)]
+
+    space = scene.space
+    if isinstance(space, NormalizedDevice):
+        width, height = _size(space.width, space.height, longest)
+        focal = (space.focal[0] * width / space.width, space.focal[1] * height / space.height)
+        space = replace(space, width=width, height=height, focal=focal)
+    static = scene.static.mapped(of)
+    return replace(scene, static=static, dynamic=scene.dynamic.mapped(of), space=space)
+
+
+def _size(width: int, height: int, longest: int) -> tuple[int, int]:
+    """Width and height in pixels, the longer one at most ``longest``."""
+    scale = min(1.0, longest / max(width, height))
+    return max(round(width * scale), MIN_SIDE), max(round(height * scale), MIN_SIDE)
+
+
+def _reduced_views(views: Views, longest: int) -> Views:
+    width, height = _size(views.width, views.height, longest)
+    if (width, height) == (views.width, views.height):
+        return views
+    further: dict[str, Any] = {}
+    for name in ("flow", "forward_flow"):
+        if (flow := getattr(views, name)) is not None:
+            further[name] = _reduced_flow(flow, width, height)
+    # Whether a pixel counts, and how far away it is, is not averaged: the middle one tells.
+    rows = ((torch.arange(height) + 0.5) * views.height / height).long()
+    columns = ((torch.arange(width) + 0.5) * views.width / width).long()
+    for name in ("depth", "valid_mask", "exposure_mask"):
+        if (of_pixels := getattr(views, name)) is not None:
+            further[name] = of_pixels[:, rows[:, None], columns]
+    return replace(
+        views,
+        pixels=_stacked([shrink_pixels(p.numpy(), width, height) for p in views.pixels]),
+        cameras=views.cameras.resized(width, height),
+        **further,
+    )
+
+
+def _reduced_flow(flow: OpticalFlow, width: int, height: int) -> OpticalFlow:
+    both = zip(flow.vectors, flow.valid, strict=True)
+    shrunk = [shrink_flow(v.numpy(), valid.numpy(), width, height) for v, valid in both]
+    return OpticalFlow(_stacked([v for v, _ in shrunk]), _stacked([valid for _, valid in shrunk]))
+
+
+def _stacked(arrays: list[np.ndarray]) -> Tensor:
+    return torch.from_numpy(np.stack(arrays))
