@@ -85,6 +85,7 @@ PUBLISHED = {
             "resolution": 64, "scales": [1, 2, 4, 8], "channels": 32, "width": 64,
             "basis_width": 128, "basis_depth": 4, "samples": 48, "proposal_samples": [256, 128],
             "proposal_resolutions": [64, 128], "proposal_channels": 8,
+            "annealing": 1000, "teaching": 5000,
         },
         "schedule": {
             "iterations": 30_001, "rays": 4096, "learning_rate": 0.01, "final_learning_rate": 0,

@@ -173,18 +173,19 @@ class RunContext(ExitStack):
             does = f"method={method} does not learn by protocol={protocol.name}"
             raise DevrfError(f"protocol: {does}; it has no stage {name!r}")
         build: partial[Stage] = instantiate(self.config[key], _partial_=True, _convert_="all")
+        stage: type[Stage] = build.func  # type: ignore[assignment]
+        by_protocol: dict[str, Any] = {}
         if key == "ray_stage":
             build.keywords["model"].check_protocol(protocol.name)
-            build = partial(build, step=protocol[name], static_share=protocol.static_share)
+            by_protocol = {"step": protocol[name], "static_share": protocol.static_share}
         else:
-            build.func.check_settings(**build.keywords)  # type: ignore[attr-defined]
+            stage.check_settings(**build.keywords)
             own = f"true, as the stages of method={method} freeze what they build on"
             expect(protocol.freeze is True, "protocol.freeze", own, protocol.freeze)
         if self.rehearses:
-            stage: type[Stage] = build.func  # type: ignore[assignment]
-            self.whole_settings[name] = build.keywords
-            build = partial(stage, **stage.rehearsed(build.keywords))
-        return build
+            self.whole_settings[name] = settings = build.keywords | by_protocol
+            return partial(stage, **stage.rehearsed(settings))
+        return partial(build, **by_protocol)
 
     @cached_property
     def logger(self) -> Any:

@@ -31,10 +31,11 @@ from devrf.system.profiling import span
 # What happens in the course of a stage, beside what a method says.
 GROWN = "grids grown"
 # What a rehearsal has: at most so many iterations, rays and times of a batch; at least this rate.
-REHEARSED_ITERATIONS = 600
+REHEARSED_ITERATIONS = 800
 REHEARSED_RAYS = 256
 REHEARSED_TIMES = 2
 REHEARSED_RATE = 2e-3
+REHEARSED_CROP = 0.25
 
 
 @dataclass(frozen=True)
@@ -155,17 +156,23 @@ class RayStage(Stage):
         schedule: RaySchedule = settings["schedule"]
         model: RayTrainable = settings["model"]
         factor = min(1.0, REHEARSED_ITERATIONS / schedule.iterations)
-        rate = max(schedule.learning_rate, REHEARSED_RATE)
-        final = schedule.final_learning_rate * rate / schedule.learning_rate
+        usual = schedule.learning_rate
+        rate = min(max(usual, REHEARSED_RATE), 10 * usual)
+        final = schedule.final_learning_rate * rate / usual
         times = schedule.times_per_batch
+        scaled = schedule.scaled(factor)
+        # Few iterations may end in the background's colour unless they begin with the foreground.
+        centre_crop = max(scaled.centre_crop, round(REHEARSED_CROP * scaled.iterations))
         return {
             **settings,
             "schedule": replace(
-                schedule.scaled(factor),
-                rays=min(schedule.rays, REHEARSED_RAYS),
+                scaled,
+                # Where a batch has few times, its rays are not what takes time.
+                rays=min(schedule.rays, REHEARSED_RAYS * (1 if times is None else 16)),
                 rays_without_hull=None,
                 learning_rate=rate,
                 learning_rate_without_hull=None,
+                centre_crop=centre_crop,
                 final_learning_rate=final,
                 times_per_batch=None if times is None else min(times, REHEARSED_TIMES),
             ),

@@ -35,24 +35,29 @@ def background_entropy(transmittance: Tensor) -> Tensor:
     return -(torch.xlogy(p, p) + torch.xlogy(1 - p, 1 - p)).mean()
 
 
-def distortion(weight: Tensor, distance: Tensor, ray: Tensor, rays: int) -> Tensor:
-    """(1/R) Σ_i Σ_j w_i w_j |s_i − s_j| over the pairs of samples of each ray.
+def distortion(
+    weight: Tensor, distance: Tensor, ray: Tensor, rays: int, length: Tensor | None = None
+) -> Tensor:
+    """(1/R) (Σ_i Σ_j w_i w_j |s_i − s_j| + ⅓ Σ_i w_i² δ_i) over the samples of each ray.
 
-    mip-NeRF 360's distortion loss without its term of single samples, whose steps are equal here.
+    mip-NeRF 360's distortion loss (equation 15).
 
     Args:
         weight: (K,) w of the samples.
         distance: (K,) s of the samples, ascending along each ray.
         ray: (K,) int64, ascending.
         rays: R.
+        length: (K,) δ of the samples, in the unit of s; None leaves out their own term.
     """
     edges = firsts(ray, rays)
     mass, reached = (
         sums_before(running_sum(values), edges, ray).to(weight.dtype)
         for values in (weight, weight * distance)
     )
-    total: Tensor = (weight * (distance * mass - reached)).sum()
-    return 2 * total / rays
+    total: Tensor = 2 * (weight * (distance * mass - reached)).sum()
+    if length is not None:
+        total = total + (weight.square() * length).sum() / 3
+    return total / rays
 
 
 def alpha_mask_error(transmittance: Tensor, alpha: Tensor | None) -> Tensor:

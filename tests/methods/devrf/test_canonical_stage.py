@@ -31,7 +31,7 @@ CARVED = CanonicalSchedule(
     rays=256,
 )
 SEARCHED = CanonicalSchedule(
-    search_iterations=200, search_side=12, iterations=10, side=12, upsample_at=(), rays=256
+    search_iterations=200, search_side=24, iterations=10, side=12, upsample_at=(), rays=256
 )
 
 
@@ -163,7 +163,8 @@ def test_a_search_that_a_budget_has_cut_short_leaves_all_to_the_radiance_field(
     trainer(watch, max_epochs=1).fit(stage, datamodule=datamodule)
     assert stage.iterations_done == 2 and stage.iteration == stage.total_iterations
     assert "nothing is found yet, for want of time" in caplog.text
-    assert stage.scene_model.occupancy.share > 0.9
+    # All that three cameras see.
+    assert stage.scene_model.occupancy.share > 0.3
 
 
 def test_afterwards_what_is_not_occupied_is_empty(learned):
@@ -208,11 +209,14 @@ def test_no_matter_is_possible_where_too_few_cameras_look(tiny_scene):
     seen = view_count(views.cameras, points)
     assert 0 < (seen < 3).float().mean() < 1
     apart = {
-        n: possibly_occupied(scene, views, (12, 12, 12), carve=False, min_views=n) for n in (1, 3)
+        n: possibly_occupied(scene, views, scene.bounds.box, (12, 12, 12), carve=False, min_views=n)
+        for n in (1, 3)
     }
     assert torch.equal(apart[3], apart[1] & (seen >= 3))
     # A capture of fewer views than that is kept whole.
-    everywhere = possibly_occupied(scene, views, (12, 12, 12), carve=False, min_views=1000)
+    everywhere = possibly_occupied(
+        scene, views, scene.bounds.box, (12, 12, 12), carve=False, min_views=1000
+    )
     assert torch.equal(everywhere, apart[1])
 
 

@@ -114,6 +114,15 @@ def test_distortion_by_hand():
     assert weight.grad.tolist() == pytest.approx([0.4375, 0.5625, 0.875, 0.0])
 
 
+def test_samples_of_unequal_lengths_are_spread_by_themselves_too():
+    weight = torch.tensor([0.5, 0.25, 0.75])
+    distance, ray = torch.tensor([1.0, 3.0, 2.0]), torch.tensor([0, 0, 1])
+    length = torch.tensor([2.0, 1.0, 4.0])
+    own = (0.5**2 * 2 + 0.25**2 * 1 + 0.75**2 * 4) / 3
+    spread = distortion(weight, distance, ray, 2, length)
+    assert spread.item() == pytest.approx((2 * 0.5 * 0.25 * 2 + own) / 2)
+
+
 def test_alpha_mask_by_hand_and_without_one(prediction):
     # T − (1 − alpha) = 0.25, 0, −0.3.
     assert PHOTOMETRIC_TERMS["alpha_mask"](prediction).item() == pytest.approx((0.0625 + 0.09) / 3)

@@ -177,24 +177,46 @@ def test_a_proposal_that_bounds_the_weights_has_no_error() -> None:
     bounding = torch.tensor([[0.5, 0.1]])
     assert histogram_error(edges, weight, proposed_edges, bounding) == 0
     lower = torch.tensor([[0.25, 0.1]])
-    # Only the second interval has more than the 0.25 of the one that it lies in.
-    expected = (0.3 - 0.25) ** 2 / 0.3
+    # Only the second of three intervals has more than the 0.25 of the one that it lies in.
+    expected = (0.3 - 0.25) ** 2 / 0.3 / 3
     assert histogram_error(edges, weight, proposed_edges, lower).item() == pytest.approx(
         expected, rel=1e-4
     )
 
 
-def test_proposals_learn_ever_less_often_and_sharpen() -> None:
+@pytest.mark.parametrize("total", [30_001, 120_001])
+def test_proposals_learn_ever_less_often_and_sharpen_however_long_a_stage_is(total: int) -> None:
     model = KPlanes(replace(TINY, sampling="proposals"))
     taught = []
-    for step in range(30000):
-        model.on_iteration(step, 30000)
+    for step in range(6000):
+        model.on_iteration(step, total)
         taught.append(model._teaches)
-        if step in (0, 500, 1000):
-            f = step / 1000
-            assert model._sharpness == pytest.approx(10 * f / (9 * f + 1))
+        if step in (0, 500, 1000, 5999):
+            f = min(step / 1000, 1)
+            assert model.sharpness == pytest.approx(10 * f / (9 * f + 1))
     assert all(taught[:10])
-    assert sum(taught[:600]) > 500 and sum(taught[-100:]) == 20
+    assert sum(taught[:600]) > 500 and sum(taught[-1000:]) == 200
+    assert model.milestones(total) == {"weights sharpened": 1000, "proposals learn rarely": 5000}
+
+
+def test_the_distortion_of_proposals_has_the_lengths_of_their_intervals(
+    tiny_scene: Scene, some_rays: Any
+) -> None:
+    model = KPlanes(replace(TINY, sampling="proposals", hull=False))
+    model.setup(tiny_scene)
+    output = model(some_rays)
+    extras = output.extras
+    weight, distance, length = (
+        extras[name].view(len(some_rays.time), -1) for name in ("weight", "distance", "length")
+    )
+    # The middles of intervals that follow one another are half of both apart.
+    torch.testing.assert_close(distance.diff(dim=1), (length[:, 1:] + length[:, :-1]) / 2)
+    apart = (distance[:, :, None] - distance[:, None]).abs()
+    pairs = (weight[:, :, None] * weight[:, None] * apart).sum(dim=(1, 2))
+    own = (weight.square() * length).sum(dim=1) / 3
+    expected = (pairs + own).mean() / model.placement.half_edge
+    terms = model.loss_terms(output, some_rays, {"distortion"})
+    torch.testing.assert_close(terms["distortion"], expected, atol=1e-6, rtol=1e-4)
 
 
 def test_time_has_half_as_many_points_as_frames() -> None:

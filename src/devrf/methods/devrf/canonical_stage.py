@@ -26,7 +26,7 @@ from devrf.methods.devrf.canonical_schedule import (
     CanonicalSchedule,
 )
 from devrf.methods.devrf.extensions.depth_crop import crop_to_visible
-from devrf.methods.devrf.free_space import possibly_occupied, view_count_weight
+from devrf.methods.devrf.free_space import possibly_occupied, searched_box, view_count_weight
 from devrf.methods.devrf.losses import (
     PHOTOMETRIC_TERMS,
     Prediction,
@@ -194,7 +194,6 @@ class CanonicalStage(Stage):
         self.architecture = architecture
         if schedule.side != side:
             log.info("schedule.canonical.side: %g is %.4g here", side, schedule.side)
-        box = self.scene.bounds.box
         views = self.scene.training_views(self.images[0])
         if schedule.first_frames and self.scene.moves and views is self.scene.static.train:
             log.info(
@@ -202,9 +201,12 @@ class CanonicalStage(Stage):
                 "static ones in size or masks, or are by one camera that moves"
             )
         first = schedule.phase(0)
+        carve = schedule.visual_hull_init or first.kind != "search"
+        box = searched_box(self.scene, carve=carve)
         possible = possibly_occupied(
             self.scene,
             views,
+            box,
             box.grid_shape(schedule.search_side**3),
             carve=schedule.visual_hull_init,
             min_views=schedule.min_views,

@@ -5,29 +5,45 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
+from devrf.scenes.bounds import box_of_frusta
 from devrf.scenes.scene import Scene, Views
 from devrf.scenes.silhouettes import visual_hull
+
+
+def searched_box(scene: Scene, *, carve: bool) -> Box:
+    """Where the geometry search looks: all that the static cameras see between near and far.
+
+    That is the authors' box, a good deal larger than what all cameras see, and so has voxels that
+    more rays meet. It is the scene's own box where that was given, is not in world space, or is
+    carved (``carve``) by a visual hull.
+    """
+    bounds = scene.bounds
+    if carve or bounds.box_given or scene.kind != "inward" or not scene.space.is_linear:
+        return bounds.box
+    return box_of_frusta(scene.static.train.cameras, bounds.near, bounds.far).union(bounds.box)
 
 
 def possibly_occupied(
     scene: Scene,
     views: Views,
+    box: Box,
     shape: tuple[int, int, int],
     *,
     carve: bool,
     min_views: int = 1,
     device: torch.device | None = None,
 ) -> Tensor:
-    """Where something can be at rest: (X, Y, Z) bool on the host, on a grid over the scene's box.
+    """Where something can be at rest: (X, Y, Z) bool on the host, on a grid over ``box``.
 
     Not nearer to a camera of ``views`` than its near plane, and not where fewer than ``min_views``
     of them look, if there are so many: fog would explain their images. ``carve`` leaves nothing
     outside the visual hull, if the images have alpha masks and all show the rest state, and the box
     is not unbounded. It is found on ``device``; None: on the host.
     """
-    box, space = scene.bounds.box, scene.space
+    space = scene.space
     cameras = views.cameras if device is None else views.cameras.to(device)
     possible = torch.ones(shape, dtype=torch.bool, device=device)
     points = space.to_world(box.grid_points(shape, cameras.focal))

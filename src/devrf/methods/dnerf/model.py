@@ -61,9 +61,12 @@ class DNeRFSettings(FieldSettings):
     time_bands: Bands = 10
 
     def rehearsed(self, factor: float) -> Self:
-        """A narrow deformation, too."""
-        smaller = super().rehearsed(factor)
-        return replace(smaller, deformation_width=min(self.deformation_width, 64))
+        """A small deformation, too."""
+        return replace(
+            super().rehearsed(factor),
+            deformation_width=min(self.deformation_width, 64),
+            deformation_depth=min(self.deformation_depth, 4),
+        )
 
 
 class DNeRF(DeformableField):

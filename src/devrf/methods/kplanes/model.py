@@ -22,13 +22,11 @@ from devrf.ops.compositing import composite
 from devrf.ops.photometric import distortion
 from devrf.rendering.output import RenderOutput
 
-# Proposals learn in the first iterations, then ever less often, up to a share of a stage.
+# Proposals learn in the first iterations, then ever less often, in the end in one of so many.
 FIRST = 10
 RARELY = 5
-TAUGHT = 1 / 6
-# The exponent of weights is SLOPE f / ((SLOPE − 1) f + 1), f growing to 1 in a share of a stage.
+# The exponent of weights is SLOPE f / ((SLOPE − 1) f + 1), f growing to 1.
 SLOPE = 10
-ANNEALED = 1 / 30
 
 
 class KPlanes(SurfacedField):
@@ -37,6 +35,7 @@ class KPlanes(SurfacedField):
     Attributes:
         planes: f.
         proposals: the fields of the rounds, where these tell the samples.
+        sharpness: the exponent of the weights by which samples are drawn.
     """
 
     name: ClassVar[str] = "kplanes"
@@ -46,13 +45,14 @@ class KPlanes(SurfacedField):
     random_background: ClassVar[bool] = True
     keeps_batches: ClassVar[bool] = True  # large steps need whole ones
     settings_class = KPlanesSettings
+    remembered: ClassVar[tuple[str, ...]] = ("sharpness",)
     settings: KPlanesSettings
 
     def __init__(self, settings: KPlanesSettings | None = None) -> None:
         """Build planes and decoder, as published if no settings are given."""
         s = settings or KPlanesSettings()
         super().__init__(s)
-        self._sharpness = 1.0
+        self.sharpness = 1.0
         self._teaches = True
         self.place()
         decoder = HybridDecoder if s.decoder == "hybrid" else ExplicitDecoder
@@ -69,12 +69,20 @@ class KPlanes(SurfacedField):
         rounds = s.proposal_resolutions if s.sampling == "proposals" else ()
         self.proposals = nn.ModuleList(Proposal(side, points, s) for side in rounds).to(device)
 
+    def milestones(self, total: int) -> dict[str, int]:
+        """When weights are as sharp, and proposals learn as rarely, as they ever do."""
+        s = self.settings
+        known = {"weights sharpened": s.annealing, "proposals learn rarely": s.teaching}
+        last = {k: n for k, n in known.items() if n < total and s.sampling == "proposals"}
+        return {**super().milestones(total), **last}
+
     def on_iteration(self, step: int, total: int) -> None:
         """Sharpen the rounds' weights, let proposals learn ever less often, skip empty space."""
         super().on_iteration(step, total)
-        done = min(1.0, step / (ANNEALED * total))
-        self._sharpness = SLOPE * done / ((SLOPE - 1) * done + 1)
-        every = round(1 + (RARELY - 1) * min(1.0, step / (TAUGHT * total)))
+        s = self.settings
+        done = min(1.0, step / s.annealing)
+        self.sharpness = SLOPE * done / ((SLOPE - 1) * done + 1)
+        every = round(1 + (RARELY - 1) * min(1.0, step / s.teaching))
         self._teaches = step < FIRST or step % every == 0
 
     def coordinates(self, points: Tensor, time: Tensor) -> Tensor:
@@ -95,14 +103,19 @@ class KPlanes(SurfacedField):
     def render_rays(
         self, rays: Rays, time: Tensor, background: Tensor, *, jitter: bool = False
     ) -> RenderOutput:
-        """What rays see; of proposals, ``extras`` also has ``histogram`` (), the rounds' error."""
+        """What rays see.
+
+        Of proposals, ``extras`` also has ``histogram`` (), the rounds' error, and of the samples
+        ``length`` (K,), in units of the ray's direction.
+        """
         if self.settings.sampling == "occupancy":
             return super().render_rays(rays, time, background, jitter=jitter)
         edges, rounds = self._proposed(rays, time, jitter=jitter)
         output = self.rendered(intervals(rays, edges), rays, time, background)
         weight = output.extras["weight"].view(len(rays), -1)
         errors = [histogram_error(edges, weight, before, proposed) for before, proposed in rounds]
-        return replace(output, extras={**output.extras, "histogram": sum_of(errors)})
+        further = {"histogram": sum_of(errors), "length": edges.diff(dim=1).reshape(-1)}
+        return replace(output, extras={**output.extras, **further})
 
     def _proposed(
         self, rays: Rays, time: Tensor, *, jitter: bool
@@ -121,7 +134,7 @@ class KPlanes(SurfacedField):
                 depth = proposal(where).float() * samples.length
                 proposed, _ = composite(depth, samples.ray, samples.rays)
             rounds.append((edges, proposed.view(len(rays), count)))
-            weight = rounds[-1][1].detach() ** self._sharpness
+            weight = rounds[-1][1].detach() ** self.sharpness
         return drawn_edges(edges, weight, s.samples, jitter=jitter), rounds
 
     def loss_terms(
@@ -134,6 +147,8 @@ class KPlanes(SurfacedField):
         """
         rounds = [proposal.planes for proposal in cast("list[Proposal]", [*self.proposals])]
         extras = output.extras
+        # Even steps are of one length.
+        length = extras.get("length", torch.full_like(extras["weight"], self.step_length))
         known: dict[str, Callable[[], Tensor]] = {
             "color": lambda: nn.functional.mse_loss(output.color, batch.color),
             "tv": lambda: sum_of([each.total_variation() for each in (self.planes, *rounds)]),
@@ -146,6 +161,7 @@ class KPlanes(SurfacedField):
                 extras["distance"] / self.placement.half_edge,
                 extras["ray"],
                 len(batch.time),
+                length=length / self.placement.half_edge,
             ),
         }
         nothing = output.color.new_zeros(())

@@ -58,7 +58,9 @@ def drawn_edges(edges: Tensor, weight: Tensor, count: int, *, jitter: bool) -> T
 def histogram_error(
     edges: Tensor, weight: Tensor, proposed_edges: Tensor, proposed: Tensor
 ) -> Tensor:
-    """Mean over rays of Σ_i max(0, w_i − b_i)² / w_i (mip-NeRF 360, equation 13).
+    """Mean over rays and intervals of max(0, w_i − b_i)² / w_i (mip-NeRF 360, equation 13).
+
+    The equation is a sum over a ray's intervals; the mean is the release's.
 
     w_i is the ``weight`` (R, N) between ``edges`` (R, N + 1) i and i + 1, and has no gradient; b_i
     the sum of the ``proposed`` (R, M) over those between ``proposed_edges`` that overlap with it.
@@ -69,4 +71,4 @@ def histogram_error(
     after = torch.searchsorted(proposed_edges, edges[:, 1:].contiguous())
     bound = reached.gather(1, after.clamp(0, last)) - reached.gather(1, first.clamp(0, last))
     weight = weight.detach()
-    return ((weight - bound).clamp(min=0).square() / (weight + LEAST)).sum(dim=1).mean()
+    return ((weight - bound).clamp(min=0).square() / (weight + LEAST)).mean()

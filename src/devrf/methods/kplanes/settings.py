@@ -36,6 +36,8 @@ class KPlanesSettings(OccupancySettings):
         samples: of a ray in the end (proposals).
         proposal_samples, proposal_resolutions: of a ray and of the planes, of each round before.
         proposal_channels: numbers of a point of these planes.
+        annealing: iterations in which the weights that samples are drawn by are sharpened.
+        teaching: iterations in which proposals come to learn ever less often.
     """
 
     hull: bool = False
@@ -56,6 +58,8 @@ class KPlanesSettings(OccupancySettings):
     proposal_samples: Annotated[Sequence[Samples], MinLen(1)] = (256, 128)
     proposal_resolutions: Sequence[Several] = (64, 128)
     proposal_channels: Count = 8
+    annealing: Count = 1000
+    teaching: Count = 5000
 
     def rehearsed(self, factor: float) -> Self:
         """Coarse planes, few samples."""
@@ -66,6 +70,8 @@ class KPlanesSettings(OccupancySettings):
             samples=min(self.samples, 24),
             proposal_samples=[min(count, 48) for count in self.proposal_samples],
             proposal_resolutions=[min(side, 32) for side in self.proposal_resolutions],
+            annealing=max(1, round(self.annealing * factor)),
+            teaching=max(1, round(self.teaching * factor)),
         )
 
     def __post_init__(self) -> None:

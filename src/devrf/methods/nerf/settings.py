@@ -83,9 +83,14 @@ class PlacedSettings(OccupancySettings):
     steps: Samples = 128
 
     def rehearsed(self, factor: float) -> Self:
-        """Narrow networks, few samples."""
-        smaller = super().rehearsed(factor)
-        return replace(smaller, width=min(self.width, 64), steps=min(self.steps, 64))
+        """Narrow networks of few layers, which learn from the first iteration on; few samples."""
+        return replace(
+            super().rehearsed(factor),
+            width=min(self.width, 64),
+            depth=min(self.depth, 4),
+            skip=None if self.depth > 4 else self.skip,
+            steps=min(self.steps, 64),
+        )
 
 
 @dataclass(frozen=True)

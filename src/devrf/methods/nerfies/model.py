@@ -94,8 +94,13 @@ class NerfiesSettings(FieldSettings):
     elastic_rays: Whole = 0
 
     def rehearsed(self, factor: float) -> Self:
-        """A narrow warp, too."""
-        return replace(super().rehearsed(factor), warp_width=min(self.warp_width, 64))
+        """A small warp, too."""
+        return replace(
+            super().rehearsed(factor),
+            warp_width=min(self.warp_width, 64),
+            warp_depth=min(self.warp_depth, 4),
+            warp_skip=None if self.warp_depth > 4 else self.warp_skip,
+        )
 
 
 class Nerfies(DeformableField):

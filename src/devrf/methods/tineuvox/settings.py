@@ -33,7 +33,7 @@ class TiNeuVoxSettings(OccupancySettings):
         step: distance between samples, in voxels of the present grid.
         weight_threshold: samples with a lower weight are not coloured.
         grid_rate: factor of the learning rate of the grid.
-        motion_rate: the same of the networks of time and displacement.
+        motion_rate: the same of the network of displacements.
         starts_still: displacements begin at 0, and so does what the time changes in density and
             colour: what is learned first is at rest.
         tv: weight of the grid's total variation over the rays of a batch.
