@@ -49,6 +49,18 @@ def test_camera_angle_becomes_a_focal_length_and_a_known_pixel(scene_folder):
     assert float(depth) == pytest.approx(4, abs=1e-5)
 
 
+def test_images_are_made_smaller_as_the_release_does_if_asked_to(scene_folder):
+    whole = BlenderReader(scene_folder.root).read().static.train.pixels.float()
+    by_alpha, straight = (
+        BlenderReader(scene_folder.root, downscale=2, alpha_weighted=weighted).read()
+        for weighted in (True, False)
+    )
+    count, height, width, channels = whole.shape
+    means = whole.view(count, height // 2, 2, width // 2, 2, channels).mean(dim=(2, 4))
+    assert (straight.static.train.pixels.float() - means).abs().max() <= 0.5
+    assert torch.equal(by_alpha.static.train.pixels[..., 3], straight.static.train.pixels[..., 3])
+
+
 def test_downscale_scales_each_axis_by_what_is_left_of_it(scene_folder):
     # 32×24 by 3: 10×8, so the focal lengths scale by 10/32 and 8/24.
     train = BlenderReader(scene_folder.root, downscale=3).read().dynamic.train

@@ -160,13 +160,27 @@ def test_space_and_box_by_hand(llff_folder):
 
 def test_a_stray_point_does_not_set_the_near_plane(llff_folder, caplog):
     caplog.set_level("INFO")
-    expected = LlffReader(llff_folder.root).read().static.train.cameras.positions
+    expected = LlffReader(llff_folder.static).read().static.train.cameras.positions
     rows = llff_folder.static_rows()
     rows[[4, 7], 15] = 0.02, 2.9  # the others are 6 and 7: half of their median is 3.5
     llff_folder.save(STATIC, rows)
-    cameras = LlffReader(llff_folder.root).read().static.train.cameras
+    cameras = LlffReader(llff_folder.static).read().static.train.cameras
     torch.testing.assert_close(cameras.positions, expected)
     assert "2 cameras see stray points before them: the nearest depth is 6, not 0.02" in caplog.text
+
+
+def test_beside_fixed_views_a_stray_point_sets_the_unit_as_in_their_file(llff_folder, caplog):
+    caplog.set_level("INFO")
+    before = LlffReader(llff_folder.root).read()
+    rows = llff_folder.static_rows()
+    rows[4, 15] = 2.7  # the least depth of the others is 6: LLFF's own unit is 0.75 · 2.7
+    llff_folder.save(STATIC, rows)
+    scene = LlffReader(llff_folder.root).read()
+    static, moving = (capture.train.cameras for capture in (scene.static, scene.dynamic))
+    torch.testing.assert_close(static.positions, before.static.train.cameras.positions * (6 / 2.7))
+    # What is in LLFF's unit already is taken as it is.
+    torch.testing.assert_close(moving.positions, before.dynamic.train.cameras.positions)
+    assert "stray" not in caplog.text
 
 
 def test_the_cameras_that_nr_nerf_publishes(llff_folder):

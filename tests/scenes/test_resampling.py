@@ -9,7 +9,7 @@ import torch
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Distortion
 from devrf.scenes.lens import Lens
-from devrf.scenes.resampling import as_pinhole, look_up_pixels
+from devrf.scenes.resampling import as_pinhole, look_up_pixels, shrink_pixels
 
 BARREL = Distortion((-0.2, 0.05, 0.0, 0.0), (0.004, -0.006))
 PINCUSHION = Distortion((0.15, 0.02, 0.01, 0.0), (-0.004, 0.003))
@@ -52,6 +52,13 @@ def test_colours_behind_the_matte_do_not_bleed_in():
     places = np.array([[[1.0, 0.5], [1.5, 0.5], [0.5, 0.5]]], dtype=np.float32)
     between = look_up_pixels(image, places)
     assert between[0].tolist() == [[200, 100, 50, 128], [0, 0, 0, 0], [200, 100, 50, 255]]
+
+
+def test_half_of_an_image_by_alpha_and_each_channel_by_itself():
+    image = np.array([[[200, 100, 50, 255], [0, 255, 0, 0]]] * 2, dtype=np.uint8)
+    assert shrink_pixels(image, 1, 1).tolist() == [[[200, 100, 50, 128]]]
+    # Whatever is behind a zero alpha counts as much: (200 + 0) / 2, (100 + 255) / 2, 25, 127.5.
+    assert shrink_pixels(image, 1, 1, alpha_weighted=False).tolist() == [[[100, 178, 25, 128]]]
 
 
 def test_a_lens_that_folds_is_an_error_that_names_the_image():

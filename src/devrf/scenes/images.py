@@ -195,17 +195,19 @@ def load_images(
     downscale: int,
     cameras: Sequence[Size | None] | None = None,
     finish: Finish | None = None,
+    *,
+    alpha_weighted: bool = True,
 ) -> Loaded:
     """Read images of one size, a few at a time.
 
     Args:
         paths: at least one existing file, 8 bits a channel, with or without alpha.
-        downscale: integer factor ≥ 1; each side becomes floor(side / downscale), by area averages
-            of premultiplied colours.
+        downscale: integer factor ≥ 1; each side becomes floor(side / downscale), by area averages.
         cameras: (width, height) of the images that each camera is for, of any scale; None if it
             is unknown, for one image or for all.
         finish: what to make of each RGBA image, by its position, before it is made smaller; images
             without alpha come to it opaque.
+        alpha_weighted: whether colours are weighted by their alpha in these averages.
 
     Raises:
         DevrfError: a file cannot be read, differs in size from the first one, or would fall under 8
@@ -227,7 +229,7 @@ def load_images(
         image = decode(paths[index], headers[index], "RGBA" if alpha else "RGB")
         image = image if finish is None else finish(index, image)
         if (width, height) != (first.width, first.height):
-            image = shrink_pixels(image, width, height)
+            image = shrink_pixels(image, width, height, alpha_weighted=alpha_weighted)
         pixels[index] = image
 
     in_threads(fill, range(len(paths)), (first.width, first.height))

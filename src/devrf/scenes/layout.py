@@ -166,13 +166,19 @@ def load_layout(
     downscale: int,
     masks: Masks = "none",
     dynamic_downscale: int | None = None,
+    *,
+    alpha_weighted: bool = True,
 ) -> tuple[Capture, Capture]:
     """The static and the dynamic capture, images read from below the scene's folder ``root``.
 
     Images are made smaller by ``downscale``, the dynamic ones by ``dynamic_downscale`` where they
-    are not of the size of the static ones; ``masks`` is as for
+    are not of the size of the static ones; ``masks`` and ``alpha_weighted`` are as for
     :func:`devrf.scenes.splits.load_views`.
     """
+
+    def load(split: Split, by: int) -> Views:
+        return load_views(split, root, by, masks, alpha_weighted=alpha_weighted)
+
     moving = downscale if dynamic_downscale is None else dynamic_downscale
     loaded: list[tuple[Split, Views]] = []
     for split, by in (
@@ -183,11 +189,11 @@ def load_layout(
     ):
         # Without a static set the captures share files: read them once.
         twin = next((v for s, v in loaded if _same_images(s, split)), None)
-        loaded.append((split, twin or load_views(split, root, by, masks)))
+        loaded.append((split, twin or load(split, by)))
     static_train, static_test, dynamic_train, dynamic_test = (views for _, views in loaded)
     validation = None
     if layout.validation is not None:
-        validation = load_views(layout.validation, root, moving, masks)
+        validation = load(layout.validation, moving)
     return Capture(static_train, static_test), Capture(dynamic_train, dynamic_test, validation)
 
 

@@ -27,12 +27,19 @@ def area_average(image: Array, width: int, height: int) -> Array:
     return np.asarray(mean, dtype=np.float32).reshape(height, width, image.shape[2])
 
 
-def shrink_pixels(image: Pixels, width: int, height: int) -> Pixels:
-    """An 8-bit image averaged over areas; colours are weighted by their alpha.
+def shrink_pixels(image: Pixels, width: int, height: int, *, alpha_weighted: bool = True) -> Pixels:
+    """An 8-bit image averaged over areas, colours ``alpha_weighted`` or each channel by itself.
 
-    Images (H, W, 1, 3 or 4) are uint8, their alpha not premultiplied; black where alpha is 0.
+    Images (H, W, 1, 3 or 4) are uint8, their alpha not premultiplied; weighted colours are black
+    where alpha is 0.
     """
-    return _weighted_by_alpha(image, lambda values: area_average(values, width, height))
+
+    def averaged(values: Array) -> Array:
+        return area_average(values, width, height)
+
+    if alpha_weighted:
+        return _weighted_by_alpha(image, averaged)
+    return _rounded(averaged(image.astype(np.float32)))
 
 
 def look_up_pixels(image: Pixels, source: Array) -> Pixels:
@@ -64,7 +71,11 @@ def _weighted_by_alpha(image: Pixels, linear: Callable[[Array], Array]) -> Pixel
         color = filtered[..., :3]
         alpha = filtered[..., 3:]
         filtered[..., :3] = np.divide(color, alpha, out=np.zeros_like(color), where=alpha > 0)
-    return (filtered + 0.5).clip(0, 255).astype(np.uint8)
+    return _rounded(filtered)
+
+
+def _rounded(values: Array) -> Pixels:
+    return (values + 0.5).clip(0, 255).astype(np.uint8)
 
 
 def shrink_flow(

@@ -183,12 +183,20 @@ def at_times(split: Split, times: Tensor) -> Split:
     return split.where(gap <= FrameClock.TOLERANCE)
 
 
-def load_views(split: Split, root: Path, downscale: int, masks: Masks = "none") -> Views:
+def load_views(
+    split: Split,
+    root: Path,
+    downscale: int,
+    masks: Masks = "none",
+    *,
+    alpha_weighted: bool = True,
+) -> Views:
     """Read the used images of a split, made smaller by ``downscale``; their cameras are pinholes.
 
     Images of a lens with distortion are undistorted, and masks with them. ``root`` is the scene's
-    folder, ``masks`` what the masks that the file lists are taken for. DevrfError if an image, a
-    mask or a lens is wrong, or they do not go together.
+    folder, ``masks`` what the masks that the file lists are taken for, ``alpha_weighted`` as for
+    :func:`devrf.scenes.images.load_images`. DevrfError if an image, a mask or a lens is wrong, or
+    they do not go together.
     """
     used = split.index
     files = [split.transforms.images[i] for i in used.tolist()]
@@ -198,7 +206,7 @@ def load_views(split: Split, root: Path, downscale: int, masks: Masks = "none") 
         [split.transforms.masks[i] for i in used.tolist()] if split.transforms.masks else []
     )
     finish = cutting_out(mask_files, sizes, files) if masks == "alpha" else None
-    loaded = load_images(files, downscale, sizes, finish)
+    loaded = load_images(files, downscale, sizes, finish, alpha_weighted=alpha_weighted)
     height, width = loaded.pixels.shape[1:3]
     distorted = [
         known.lens(loaded.width, loaded.height, file).scaled(

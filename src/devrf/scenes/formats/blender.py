@@ -40,18 +40,22 @@ class BlenderReader(InwardReader):
         dynamic: which ``dynamic_*views`` folder, where there are several.
         train_views: train on the first so many dynamic views; None: all.
         static_until: without a static set, the latest time of an image that counts as static.
+        alpha_weighted: whether colours are weighted by their alpha where images are made smaller;
+            DeVRF's authors average each channel by itself.
     """
 
     _: KW_ONLY
     dynamic: str | None = None
     train_views: Count | None = None
     static_until: Time = 1.0
+    alpha_weighted: bool = True
 
     def read(self) -> Scene:
         """See :meth:`devrf.scenes.reader.SceneReader.read`."""
         folder = scene_folder(self.root)
         layout, thinned, flow_folder = self._layout(folder)
-        static, dynamic = load_layout(layout, folder, self.choose_factor(layout.size_at))
+        factor = self.choose_factor(layout.size_at)
+        static, dynamic = load_layout(layout, folder, factor, alpha_weighted=self.alpha_weighted)
         if layout.moves and self.wants_flow_files:
             flow = self._flow(dynamic.train, layout, thinned, flow_folder, "bwd")
             dynamic = replace(dynamic, train=replace(dynamic.train, flow=flow))

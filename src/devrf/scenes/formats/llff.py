@@ -101,7 +101,8 @@ class LlffReader(FixedViewsReader):
             )
         factor = self.choose_factor(folder_size(static))
         source = image_folder(static, factor)
-        posed = _read_cameras(static)
+        # The cameras of fixed views are in LLFF's own unit, and the static ones have to be, too.
+        posed = _read_cameras(static, with_strays=bool(moving))
         images = _posed_images(posed, source.path)
         video = self.monocular
         if video is None:
@@ -155,11 +156,11 @@ def static_folder(root: Path) -> Path:
     return existing_folder(static)
 
 
-def _read_cameras(folder: Path) -> PosedSet:
+def _read_cameras(folder: Path, *, with_strays: bool) -> PosedSet:
     """The cameras of ``poses_bounds.npy``, or NR-NeRF's file, normalised."""
     alone = os.path.isfile(folder / PRECOMPUTED) and not os.path.isfile(folder / POSES)
     read = read_precomputed_poses if alone else read_static_poses
-    return read(folder).normalised()
+    return read(folder).normalised(with_strays=with_strays)
 
 
 def _posed_images(posed: PosedSet, source: Path) -> Transforms:

@@ -53,14 +53,14 @@ class PosedSet:
     def __len__(self) -> int:
         return self.poses.shape[0]
 
-    def normalised(self) -> PosedSet:
+    def normalised(self, *, with_strays: bool) -> PosedSet:
         """The set in units of 0.75 · its least depth, its average pose the identity.
 
-        Least depths of stray points do not count. DevrfError if the cameras look in too different
-        directions, or are too far apart.
+        Least depths of stray points count only ``with_strays``, as LLFF's own unit has them. A
+        DevrfError if the cameras look in too different directions, or are too far apart.
         """
         least = self.bounds[:, 0]
-        agreed = least[least >= STRAY_SHARE * least.median()]
+        agreed = least[(least >= STRAY_SHARE * least.median()) | with_strays]
         if stray := len(least) - len(agreed):
             depths = f"the nearest depth is {float(agreed.min()):.3g}, not {float(least.min()):.3g}"
             log.info("%s: %d cameras see stray points before them: %s", self.file, stray, depths)

@@ -153,7 +153,7 @@ class Neural3DVideoReader(SceneReader):
                 posed.file,
                 f"has {len(posed)} cameras, but there are {len(videos.paths)} videos; remove some",
             )
-        posed = posed.normalised()
+        posed = posed.normalised(with_strays=False)
         test, train = self._split(videos)
         frames, times = self._moments(videos)
         width, height = videos.header.size
