@@ -3,35 +3,50 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from statistics import fmean
 from typing import Any, Literal
 
 import torch
 from rich.console import Group, RenderableType
+from torch import Tensor
 
 from devrf.apps.images import evenly
 from devrf.apps.inspection.report import titled_table
-from devrf.evaluation.held_out import background_value, truth_image
-from devrf.metrics.image import psnr, psnr_masked
-from devrf.scenes.scene import CaptureName, Scene
+from devrf.evaluation.held_out import background_value, score
+from devrf.methods.base import Renderable
+from devrf.metrics.image import psnr
+from devrf.rendering.renderer import Renderer
+from devrf.scenes.reduced import reduced
+from devrf.scenes.scene import Capture, CaptureName, Scene
 
 # The scores of a rehearsal, and what took place in it; of a run they are in metrics.json.
 REHEARSAL = "rehearsal.json"
-# A rehearsal's images have at most so many pixels a side.
+# A rehearsal's images have at most so many pixels a side, and so many of a set are looked at.
 LONGEST = 64
+LOOKED_AT = 6
 # A stage has learned something where it is so much better than a picture of one colour, in dB,
-# and motion where it is so much better than the scene at rest.
+# and motion where it is so much better than the scene at rest: on images that it learned from,
+# since the few iterations of a rehearsal do not tell what new views will show.
 LEAST_GAIN = 1.0
 LEAST_MOTION = 0.05
-# Images of which the mean colour is taken.
-SAMPLED = 32
 
 ALL: tuple[CaptureName, ...] = ("static", "dynamic")
 
-# By capture: scores as in metrics.json; the PSNR of a picture of one colour.
-Sections = Mapping[CaptureName, Mapping[str, Any]]
-Blank = Mapping[CaptureName, float]
+
+@dataclass(frozen=True)
+class Learned:
+    """How well some images that were learned from are rendered; PSNR in dB, means over them.
+
+    Attributes:
+        psnr: of the renderings.
+        blank: of the best picture of one colour.
+        rest_pose: of the scene at rest; None for images at rest.
+    """
+
+    psnr: float
+    blank: float
+    rest_pose: float | None
 
 
 @dataclass(frozen=True)
@@ -53,59 +68,68 @@ class RehearsedStage:
     planned: Mapping[str, int]
 
 
-def single_color_psnr(scene: Scene, capture: CaptureName) -> float:
-    """PSNR (dB) of the best picture of one colour, in the mean over a capture's held-out images.
+def for_rehearsal(scene: Scene) -> Scene:
+    """The scene with small images, and few of them held out."""
 
-    That colour is the background's, or the mean of the images that are learned from.
-    """
-    views = scene.capture(capture).test
-    learned = scene.capture(capture).train
-    images = [truth_image(learned, k, scene.background) for k in evenly(len(learned), SAMPLED)]
-    mean = torch.stack([image.mean(dim=(0, 1)) for image in images]).mean(dim=0)
+    def few_held_out(capture: Capture) -> Capture:
+        shown = torch.tensor(evenly(len(capture.test), LOOKED_AT))
+        return replace(capture, test=capture.test[shown])
 
-    def score(color: torch.Tensor) -> float:
-        values = []
-        for index in range(len(views)):
-            truth = truth_image(views, index, scene.background)
-            valid = views.valid_mask_of(index)
-            picture = color.expand_as(truth)
-            masked = None if valid is None else psnr_masked(picture, truth, valid)
-            values.append(psnr(picture, truth) if masked is None else masked)
-        return fmean(values)
-
-    return max(score(mean), score(torch.full((3,), background_value(scene.background))))
+    small = reduced(scene, LONGEST)
+    if scene.static.test is scene.dynamic.test:  # of a film
+        static = few_held_out(small.static)
+        return replace(small, static=static, dynamic=replace(small.dynamic, test=static.test))
+    return replace(small, static=few_held_out(small.static), dynamic=few_held_out(small.dynamic))
 
 
-def shortfalls(stages: Mapping[str, RehearsedStage], sections: Sections, blank: Blank) -> list[str]:
+def learned(model: Renderable, scene: Scene, capture: CaptureName) -> Learned:
+    """How well some of a capture's training images are rendered."""
+    train = scene.capture(capture).train
+    views = train[torch.tensor(evenly(len(train), LOOKED_AT))]
+    renderer = Renderer(model)
+    time = 0.0 if capture == "static" else None
+    scored = [score(renderer, views, k, scene.background, time=time) for k in range(len(views))]
+    truths = [view.truth for view in scored]
+    mean = torch.stack([truth.mean(dim=(0, 1)) for truth in truths]).mean(dim=0)
+    background = torch.full((3,), background_value(scene.background))
+
+    def of_color(color: Tensor) -> float:
+        return fmean(psnr(color.expand_as(truth), truth) for truth in truths)
+
+    return Learned(
+        psnr=fmean(view.psnr for view in scored),
+        blank=max(of_color(mean), of_color(background)),
+        rest_pose=fmean(v.rest_pose_psnr for v in scored) if capture == "dynamic" else None,
+    )
+
+
+def shortfalls(
+    stages: Mapping[str, RehearsedStage], reached: Mapping[CaptureName, Learned]
+) -> list[str]:
     """Why the run itself should not be begun: what a stage did not learn, what did not take place.
 
     Args:
         stages: what was rehearsed, by name.
-        sections: the scores of each capture, as in ``metrics.json``.
-        blank: PSNR of a picture of one colour, by capture.
+        reached: what was learned of each capture.
     """
     reasons: list[str] = []
     for name, stage in stages.items():
-        captures = ALL if stage.capture == "both" else (stage.capture,)
-        for capture in captures:
-            if capture not in sections:
+        for capture in ALL if stage.capture == "both" else (stage.capture,):
+            if (of := reached.get(capture)) is None:
                 continue
-            reached = sections[capture]["psnr"]
-            if not reached >= blank[capture] + LEAST_GAIN:
+            # NaN compares false.
+            if not of.psnr >= of.blank + LEAST_GAIN:
                 reasons.append(
-                    f"the {name} stage has learned nothing: {reached:.2f} dB on {capture} images, "
-                    f"a picture of one colour {blank[capture]:.2f}"
+                    f"the {name} stage has learned nothing of the {capture} images: "
+                    f"{of.psnr:.2f} dB, where one colour has {of.blank:.2f}"
                 )
-        rest = sections.get("dynamic", {}).get("rest_pose_psnr")
-        if "dynamic" in captures and rest is not None and not reasons:
-            reached = sections["dynamic"]["psnr"]
-            if not reached >= rest + LEAST_MOTION:
+            elif of.rest_pose is not None and not of.psnr >= of.rest_pose + LEAST_MOTION:
                 reasons.append(
-                    f"the {name} stage has learned no motion: {reached:.2f} dB, the scene at rest "
-                    f"{rest:.2f}"
+                    f"the {name} stage has learned no motion: {of.psnr:.2f} dB, where the scene "
+                    f"at rest has {of.rest_pose:.2f}"
                 )
         reasons += [
-            f"the {name} stage: {event} {stage.events.get(event, 0)} times of {count}"
+            f"{event} {stage.events.get(event, 0)} times of {count} in the {name} stage"
             for event, count in stage.planned.items()
             if stage.events.get(event, 0) != count
         ]
@@ -114,33 +138,30 @@ def shortfalls(stages: Mapping[str, RehearsedStage], sections: Sections, blank: 
 
 def rehearsal_tables(
     stages: Mapping[str, RehearsedStage],
-    sections: Sections,
-    blank: Blank,
+    reached: Mapping[CaptureName, Learned],
+    held_out: Mapping[CaptureName, float],
     needs: Sequence[tuple[str, str]],
 ) -> RenderableType:
-    """What each stage reached, what took place, and what the run itself ``needs``, for people."""
-    reached = [
-        (
-            capture,
-            f"{section['psnr']:.2f} dB",
-            f"{blank[capture]:.2f} dB",
-            _in_db(section.get("rest_pose_psnr")),
-        )
-        for capture, section in sections.items()
-        if capture in blank
+    """What was reached, what took place, and what the run itself ``needs``, for people.
+
+    ``held_out`` is the PSNR of each capture's held-out images.
+    """
+    rows = [
+        (capture, *map(_in_db, (of.psnr, of.blank, of.rest_pose, held_out.get(capture))))
+        for capture, of in reached.items()
+    ]
+    lengths = [
+        (name, f"{stage.iterations:,} of {stage.whole:,}".replace(",", " "))
+        for name, stage in stages.items()
     ]
     events = [
         (name, f"{event}: {stage.events.get(event, 0)} of {count}")
         for name, stage in stages.items()
         for event, count in stage.planned.items()
     ]
-    lengths = [
-        (name, f"{stage.iterations:,} of {stage.whole:,}".replace(",", " "))
-        for name, stage in stages.items()
-    ]
-    heading = ("held-out images", "reached", "one colour", "scene at rest")
+    heading = ("images", "learned", "one colour", "scene at rest", "held-out images")
     return Group(
-        titled_table("what was learned", reached, heading),
+        titled_table("what was learned", rows, heading),
         titled_table("iterations", lengths),
         *([titled_table("what took place", events)] if events else []),
         titled_table("what the run itself will need, estimated", needs),
@@ -148,12 +169,14 @@ def rehearsal_tables(
 
 
 def record(
-    stages: Mapping[str, RehearsedStage], blank: Blank, reasons: Sequence[str]
+    stages: Mapping[str, RehearsedStage],
+    reached: Mapping[CaptureName, Learned],
+    reasons: Sequence[str],
 ) -> dict[str, Any]:
     """What ``rehearsal.json`` has beside scores and provenance."""
     return {
         "stages": {name: asdict(stage) for name, stage in stages.items()},
-        "single_color_psnr": {capture: round(value, 4) for capture, value in blank.items()},
+        "learned": {capture: asdict(of) for capture, of in reached.items()},
         "shortfalls": list(reasons),
     }
 

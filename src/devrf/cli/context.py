@@ -16,7 +16,7 @@ from lightning.pytorch.strategies import Strategy
 from omegaconf import DictConfig, OmegaConf
 
 from devrf.apps.fitting import SIZE
-from devrf.apps.rehearsal import LONGEST, RehearsedStage
+from devrf.apps.rehearsal import RehearsedStage, for_rehearsal
 from devrf.apps.trackers import Tracker, trackers
 from devrf.checkpoints.checkpoint import (
     OWN_REST,
@@ -37,7 +37,6 @@ from devrf.errors import DevrfError, expect
 from devrf.evaluation.objective import VALIDATION
 from devrf.evaluation.suite import Evaluation
 from devrf.methods.protocol import Protocol
-from devrf.scenes.reduced import reduced
 from devrf.scenes.scene import Scene
 
 if TYPE_CHECKING:
@@ -121,7 +120,7 @@ class RunContext(ExitStack):
 
     def _rehearsed_scene(self, scene: Scene) -> Scene:
         self.whole_scene = scene
-        return reduced(scene, LONGEST)
+        return for_rehearsal(scene)
 
     @property
     def scene(self) -> Scene:

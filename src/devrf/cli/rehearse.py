@@ -17,10 +17,10 @@ from devrf.apps.inspection.report import show
 from devrf.apps.needs import needs_table
 from devrf.apps.rehearsal import (
     REHEARSAL,
+    learned,
     record,
     rehearsal_tables,
     shortfalls,
-    single_color_psnr,
 )
 from devrf.checkpoints.checkpoint import metadata_of
 from devrf.cli.context import RunContext
@@ -59,14 +59,16 @@ def conclude(run: RunContext) -> None:
     """
     path = run.folder / REHEARSAL
     scores = json.loads(read_record(path))
-    sections = {name: scores[name] for name in run.scene.captures if name in scores}
-    blank = {capture: single_color_psnr(run.scene, capture) for capture in run.scene.captures}
+    model = run.load(scene=run.scene).model
+    captures = [name for name in run.scene.captures if name in scores]
+    reached = {capture: learned(model, run.scene, capture) for capture in captures}
+    held_out = {capture: scores[capture]["psnr"] for capture in captures}
     assert run.whole_scene is not None
     table = needs_table(run.whole_scene, needs(run, run.config, run.whole_scene))
     rows = [(name, decimal(round(size))) for name, size in table]
-    show(rehearsal_tables(run.rehearsed, sections, blank, rows))
-    reasons = shortfalls(run.rehearsed, sections, blank)
-    write_json(path, {**scores, "rehearsal": record(run.rehearsed, blank, reasons)})
+    show(rehearsal_tables(run.rehearsed, reached, held_out, rows))
+    reasons = shortfalls(run.rehearsed, reached)
+    write_json(path, {**scores, "rehearsal": record(run.rehearsed, reached, reasons)})
     if reasons:
         raise DevrfError(f"rehearse: {'; '.join(reasons)}; {path} has the figures")
     log.info("rehearsed: every stage learns, and all that is planned takes place (%s)", path)

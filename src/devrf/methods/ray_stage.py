@@ -31,7 +31,7 @@ from devrf.system.profiling import span
 # What happens in the course of a stage, beside what a method says.
 GROWN = "grids grown"
 # What a rehearsal has: at most so many iterations, rays and times of a batch; at least this rate.
-REHEARSED_ITERATIONS = 800
+REHEARSED_ITERATIONS = 300
 REHEARSED_RAYS = 256
 REHEARSED_TIMES = 2
 REHEARSED_RATE = 2e-3
