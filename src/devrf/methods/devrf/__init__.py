@@ -7,6 +7,6 @@
 5. Deformation stage: ``deformation_schedule``, ``motion_loss``, ``extension`` (what may be
    added), ``deformation_stage``.
 
-``settings`` has the defaults of the stages and ``voxel_stage`` what they share; ``model`` and
-``view`` are the learned scene. ``extensions`` has what goes beyond the paper.
+``settings`` has the defaults of the stages, which are :class:`devrf.engine.stage.Stage`;
+``model`` and ``view`` are the learned scene. ``extensions`` has what goes beyond the paper.
 """

@@ -20,6 +20,7 @@ from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField, ColorDecoder
 from devrf.methods.devrf.deformation_field import DeformationField, GridWarp
 from devrf.methods.devrf.frame_store import NAMES, FrameField, fits_on_device
+from devrf.methods.devrf.settings import decoder_dtype
 from devrf.methods.devrf.view import CanonicalSurface, DeVRFView
 from devrf.methods.devrf.volume_rendering import deformed_occupancy
 from devrf.ops.trilinear import shape_of
@@ -144,6 +145,7 @@ class DeVRFModel(Renderable):
             self.space,
             time,
             self.color_change(time),
+            decoder_dtype("auto" if half else "float32", self.device),
         )
 
     def surface(self) -> CanonicalSurface:

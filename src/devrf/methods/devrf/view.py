@@ -45,6 +45,7 @@ class DeVRFView:
         space: the space that the fields live in.
         time: t in [0, 1].
         color_change: what is added to the colours' logits at that time; None: nothing.
+        precision: what pictures' colour network computes in.
         at_rest: whether the warp of this time is the identity.
     """
 
@@ -55,6 +56,7 @@ class DeVRFView:
     space: Space
     time: float
     color_change: ColorChange | None = None
+    precision: torch.dtype = torch.float32
     at_rest: bool = field(init=False)
     _warp: GridWarp | None = field(init=False, default=None)
 
@@ -97,6 +99,7 @@ class DeVRFView:
             self.picture_settings,
             background,
             self._warp,
+            precision=self.precision,
             color_change=self.color_change,
         )
         return RenderedImage.of(output)
