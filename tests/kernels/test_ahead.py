@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
-import threading
-
 import torch
 
 from devrf.geometry.box import Box
 from devrf.kernels.adam import adam_kernel, adam_step
-from devrf.kernels.ahead import compile_ahead
+from devrf.kernels.ahead import compile_ahead, grid_kernels
 from devrf.kernels.look_up import add_kernel, look_up, look_up_kernel, slope_kernel
+from devrf.kernels.march import march_kernel
+from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.dnerf.model import DNeRF
+from devrf.methods.kplanes.model import KPlanes
+from devrf.methods.kplanes.settings import KPlanesSettings
+from devrf.methods.ray_stage import RayStage
+from devrf.methods.tineuvox.model import TiNeuVox
+from devrf.methods.tineuvox.settings import TiNeuVoxSettings
 from devrf.ops.adam import AdamRule
 
 CHANNELS = 5  # no other test's
 
 
 def test_what_was_compiled_ahead_is_not_compiled_again() -> None:
-    before = set(threading.enumerate())
-    compile_ahead({CHANNELS}, torch.device("cpu"))
-    for thread in set(threading.enumerate()) - before:
-        thread.join()
+    compile_ahead(grid_kernels({CHANNELS}), torch.device("cpu")).join()
     made = (look_up_kernel, slope_kernel, add_kernel, adam_kernel)
     modules = [make(CHANNELS).module for make in made]
     built = [set(module.execs) for module in modules]
@@ -31,3 +35,14 @@ def test_what_was_compiled_ahead_is_not_compiled_again() -> None:
     with torch.no_grad():
         adam_step(grid, grid.grad, torch.zeros_like(grid), torch.zeros_like(grid), AdamRule(0.1, 1))
     assert [set(module.execs) for module in modules] == built
+
+
+def test_methods_with_grids_say_which_kernels_they_take() -> None:
+    proposals = KPlanesSettings(sampling="proposals", channels=7, proposal_channels=2, resolution=4)
+    planes = RayStage.kernels({"model": KPlanes(proposals)})
+    assert {look_up_kernel(7), look_up_kernel(2), adam_kernel(7)} <= set(planes)
+    voxels = RayStage.kernels({"model": TiNeuVox(TiNeuVoxSettings(side=8, channels=9))})
+    assert look_up_kernel(9) in voxels and march_kernel(False) not in voxels
+    assert RayStage.kernels({"model": DNeRF()}) == []
+    stage = CanonicalStage.kernels({"architecture": Architecture(channels=11)})
+    assert {march_kernel(False), look_up_kernel(3), look_up_kernel(11)} <= set(stage)

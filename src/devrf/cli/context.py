@@ -64,7 +64,8 @@ class RunContext(ExitStack):
         device: the trainer's.
         rehearses: whether ``rehearse=true`` asks for all that the run does, in minutes.
         rehearsed: what the stages of a rehearsal came to, by name.
-        whole_settings: in a rehearsal, the arguments of the run's own stages, by name.
+        whole_stages: the class of each stage, and its arguments in the run itself, by name; known
+            once it has a builder.
         whole_scene: in a rehearsal, the scene with images of their own size, until what the run
             itself needs has been estimated.
         is_trial: whether ``trainer.fast_dev_run`` asks for a step of each stage, with nothing kept.
@@ -88,7 +89,7 @@ class RunContext(ExitStack):
         self.device = self.strategy.root_device
         self.rehearses = bool(config.rehearse)
         self.rehearsed: dict[str, RehearsedStage] = {}
-        self.whole_settings: dict[str, dict[str, Any]] = {}
+        self.whole_stages: dict[str, tuple[type[Stage], dict[str, Any]]] = {}
         self.whole_scene: Scene | None = None
         if self.rehearses:  # its schedules are short enough
             config.schedule.seconds = None
@@ -181,8 +182,9 @@ class RunContext(ExitStack):
             stage.check_settings(**build.keywords)
             own = f"true, as the stages of method={method} freeze what they build on"
             expect(protocol.freeze is True, "protocol.freeze", own, protocol.freeze)
+        settings = build.keywords | by_protocol
+        self.whole_stages[name] = (stage, settings)
         if self.rehearses:
-            self.whole_settings[name] = settings = build.keywords | by_protocol
             return partial(stage, **stage.rehearsed(settings))
         return partial(build, **by_protocol)
 

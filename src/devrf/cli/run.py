@@ -104,8 +104,6 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
     runtime.choose(config.kernels, deterministic=config.deterministic)
     with RunContext(config, folder) as run:
         learning, steps = plan(config.stage, run.learning_stages)
-        if learning and "field" in config:  # while the scene is read
-            compile_ahead({config.field.channels}, run.device)
         if learning and run.is_trial:
             steps = ()  # nothing of it is worth a score or a video
         elif learning and run.rehearses:
@@ -113,8 +111,13 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
         with shortage_in_words(config.stage, run.device, None):  # of networks that are too wide
             _check(run, learning, steps)
         if learning:
+            stages = [run.whole_stages[name] for name in run.learning_stages]
+            kernels = dict.fromkeys(k for stage, of in stages for k in stage.kernels(of))
+            compiling = compile_ahead([*kernels], run.device)  # while the scene is read
             if run.leads:
                 _prepare_to_learn(run, learning, steps)
+            if config.schedule.seconds is not None:  # which are of learning alone
+                compiling.join()
             _learn(run, learning)
         for name in steps if run.leads or not learning else ():
             if not (learning and done(run, name)):

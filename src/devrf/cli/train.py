@@ -87,10 +87,11 @@ def _fit(run: RunContext, stage: Stage, begin: ResumePoint) -> None:
             _keep(run, trainer, stage)
         strategy.barrier("the checkpoint is written")
     if run.rehearses:
+        _, settings = run.whole_stages[stage.name]
         run.rehearsed[stage.name] = RehearsedStage(
             capture=stage.capture,
             iterations=stage.iterations_done,
-            whole=stage.iterations_of(run.whole_settings[stage.name], run.scene),
+            whole=stage.iterations_of(settings, run.scene),
             events={name: count for name, count in stage.events.items() if count},
             planned=dict(stage.planned_events),
         )

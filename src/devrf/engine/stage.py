@@ -17,6 +17,7 @@ import torch
 from lightning import LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
+from warp import Kernel
 
 from devrf.checkpoints.checkpoint import (
     MODEL,
@@ -333,6 +334,11 @@ class Stage(LightningModule, ABC):
     def planned_events(self) -> Mapping[str, int]:
         """What the whole schedule brings about, and how often, by the names of :attr:`events`."""
         return {}
+
+    @classmethod
+    def kernels(cls, settings: Mapping[str, Any]) -> Sequence[Kernel]:
+        """What a stage with these arguments launches, to be compiled before it learns."""
+        return ()
 
     @classmethod
     def iterations_of(cls, settings: Mapping[str, Any], scene: Scene) -> int:

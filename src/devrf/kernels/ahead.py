@@ -21,25 +21,33 @@ WAITED = 1.0
 THREADS = {"cpu": 1, "cuda": 256}
 
 
-def compile_ahead(channels: Collection[int], device: torch.device) -> None:
-    """Compile DeVRF's kernels, or load them, in a thread of its own.
-
-    One line says so if that takes long.
-
-    Args:
-        channels: of the grids that are looked up, beside densities and displacements.
-        device: where the kernels will run.
-    """
-    if not take(torch.empty(0, device=device)):
-        return
+def march_kernels() -> list[wp.Kernel]:
+    """What marches along rays, and their adjoints."""
     kernels = [march.enter_kernel, march.march_kernel(False), march.keep_significant_kernel]
     kernels += [march.adjoint_kernel, look_up.add_kernel(1), adam.total_variation_kernel(1)]
-    for count in sorted({3, *channels}):
+    # The last is for contracted space.
+    return [*kernels, adam.adam_kernel(1), march.march_kernel(True)]
+
+
+def grid_kernels(channels: Collection[int]) -> list[wp.Kernel]:
+    """What looks up, and steps, grids of these numbers of channels."""
+    kernels: list[wp.Kernel] = []
+    for count in sorted({*channels}):
         kernels += [look_up.look_up_kernel(count), look_up.slope_kernel(count)]
         kernels += [look_up.add_kernel(count), adam.total_variation_kernel(count)]
-    kernels += [adam.adam_kernel(count) for count in sorted({1, *channels})]
-    kernels.append(march.march_kernel(True))  # in contracted space
-    Thread(target=_compile, args=(kernels, device), daemon=True).start()
+        kernels.append(adam.adam_kernel(count))
+    return kernels
+
+
+def compile_ahead(kernels: Sequence[wp.Kernel], device: torch.device) -> Thread:
+    """Compile kernels, or load them, in a thread of its own, which is returned.
+
+    One line says so if that takes long; nothing is done where PyTorch takes their place.
+    """
+    wanted = kernels if take(torch.empty(0, device=device)) else ()
+    thread = Thread(target=_compile, args=(wanted, device), daemon=True)
+    thread.start()
+    return thread
 
 
 def _compile(kernels: Sequence[wp.Kernel], device: torch.device) -> None:

@@ -260,6 +260,11 @@ class RayTrainable(Renderable):
         """
 
     @property
+    def grid_channels(self) -> Collection[int]:
+        """Channels of its grids, for whose numbers kernels are compiled before it learns."""
+        return ()
+
+    @property
     def sample_outputs(self) -> int:
         """How many numbers all layers give for one sample of a ray, to estimate memory by."""
         return sum(layer.out_features for layer in self.modules() if isinstance(layer, nn.Linear))

@@ -12,6 +12,7 @@ import torch
 from annotated_types import Ge, Lt
 from pydantic.dataclasses import dataclass
 from torch import Tensor
+from warp import Kernel
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import FramePool, Pixels, RayBatch, concatenated, gather_batch
@@ -20,6 +21,7 @@ from devrf.engine.grid_adam import GridAdam
 from devrf.engine.phase import Phase
 from devrf.engine.stage import Stage
 from devrf.errors import expect
+from devrf.kernels.ahead import grid_kernels
 from devrf.methods.base import RayTrainable
 from devrf.methods.protocol import ProtocolStage
 from devrf.methods.weighted_loss import counted_weights, visibility, weighted_sum
@@ -31,7 +33,7 @@ from devrf.system.profiling import span
 # What happens in the course of a stage, beside what a method says.
 GROWN = "grids grown"
 # What a rehearsal has: at most so many iterations, rays and times of a batch; at least this rate.
-REHEARSED_ITERATIONS = 300
+REHEARSED_ITERATIONS = 800
 REHEARSED_RAYS = 256
 REHEARSED_TIMES = 2
 REHEARSED_RATE = 2e-3
@@ -142,6 +144,12 @@ class RayStage(Stage):
         self._centres: list[FramePool] = []
         self._rays = schedule.rays
         self._random_background = False
+
+    @classmethod
+    def kernels(cls, settings: Mapping[str, Any]) -> Sequence[Kernel]:
+        """Look-ups and steps of the method's grids."""
+        model: RayTrainable = settings["model"]
+        return grid_kernels(model.grid_channels)
 
     @classmethod
     def iterations_of(cls, settings: Mapping[str, Any], scene: Scene) -> int:

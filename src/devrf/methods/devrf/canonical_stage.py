@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
 import torch
 from torch import Tensor
+from warp import Kernel
 
 from devrf.data.batch import PixelPool, Pixels, gather_batch
 from devrf.engine.grid_adam import GridAdam
 from devrf.engine.stage import Stage
 from devrf.errors import DevrfError
+from devrf.kernels.ahead import grid_kernels, march_kernels
 from devrf.methods.devrf.architecture import Architecture, fitted_to, resolved_voxels
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.canonical_schedule import (
@@ -118,6 +120,12 @@ class CanonicalStage(Stage):
             weights, self.tv[kind] = apart_from_total_variation(loss, key)
             self.weights[kind] = counted_weights(weights, PHOTOMETRIC_TERMS, key)
         self.pool: PixelPool | None = None
+
+    @classmethod
+    def kernels(cls, settings: Mapping[str, Any]) -> Sequence[Kernel]:
+        """Of both stages: the march, and look-ups of features, search colours, displacements."""
+        architecture: Architecture = settings["architecture"]
+        return [*march_kernels(), *grid_kernels({3, architecture.channels})]
 
     @classmethod
     def iterations_of(cls, settings: Mapping[str, Any], scene: Scene) -> int:

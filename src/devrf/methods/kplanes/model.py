@@ -167,6 +167,12 @@ class KPlanes(SurfacedField):
         nothing = output.color.new_zeros(())
         return {name: known[name]() for name in self.losses if name in names}
 
+    @property
+    def grid_channels(self) -> Collection[int]:
+        """Of the field's planes, and of proposals'."""
+        s = self.settings
+        return (s.channels, *([s.proposal_channels] if s.sampling == "proposals" else []))
+
     def parts(self) -> dict[str, Iterable[nn.Parameter]]:
         """What space alone says, with the decoder; what time says; the proposals."""
         return {

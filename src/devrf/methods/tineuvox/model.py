@@ -78,6 +78,11 @@ class TiNeuVox(SurfacedField):
         """Grid points along x, y, z."""
         return self.grid.shape
 
+    @property
+    def grid_channels(self) -> Collection[int]:
+        """Of V."""
+        return (self.settings.channels,)
+
     def growths(self, total: int) -> Sequence[int]:
         """As the settings say."""
         return [round(share * total) for share in self.settings.upsample_at]
