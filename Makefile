@@ -4,6 +4,8 @@
 # make house        lines and files of each folder, the longest files, circles of imports
 # make gpu-check    install into .venv and check what this machine's GPU does, in minutes;
 #                   with INSTALL_FIRST=no by $(PYTHON) and the packages that it has
+# make rehearse     rehearse every setting that is made for a GPU, on embedded scenes: an hour on
+#                   two cores
 # make fuzz         what is too long for make test: fuzz tests of files with many inputs
 #                   (make test has 60)
 # make format       format the code and mend what the linter can
@@ -22,7 +24,7 @@ INSTALL := $(BIN)/python -m pip install --disable-pip-version-check \
 PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile \
 	--no-loadscope-reorder --durations 15
 
-.PHONY: quickstart test docs house gpu-check fuzz format shell clean
+.PHONY: quickstart test docs house gpu-check rehearse fuzz format shell clean
 
 quickstart: $(VENV)/.installed
 	$(BIN)/python -m devrf experiment=quickstart
@@ -48,6 +50,9 @@ house: $(VENV)/.installed-dev
 
 gpu-check: $(if $(filter no,$(INSTALL_FIRST)),,$(VENV)/.installed)
 	$(if $(filter no,$(INSTALL_FIRST)),PYTHONPATH=src:$(PYTHONPATH) $(PYTHON),$(BIN)/python) -m devrf stage=selfcheck
+
+rehearse: $(VENV)/.installed
+	$(BIN)/python benchmarks/rehearse.py
 
 fuzz: $(VENV)/.installed-dev
 	DEVRF_FUZZ_INPUTS=100000 $(PYTEST) tests/scenes/test_damaged_files.py

@@ -20,8 +20,6 @@ from devrf.rendering.renderer import Renderer
 from devrf.scenes.reduced import reduced
 from devrf.scenes.scene import Capture, CaptureName, Scene
 
-# The scores of a rehearsal, and what took place in it; of a run they are in metrics.json.
-REHEARSAL = "rehearsal.json"
 # A rehearsal's images have at most so many pixels a side, and so many of a set are looked at.
 LONGEST = 64
 LOOKED_AT = 6

@@ -12,6 +12,8 @@ from typing import Literal
 
 from devrf.errors import DevrfError, expect
 
+# The scores of a rehearsal, and what took place in it; of a run they are in metrics.json.
+REHEARSAL = "rehearsal.json"
 # capture.alpha_masks=subtract
 SUBTRACT = "subtract"
 

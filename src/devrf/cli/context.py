@@ -16,7 +16,7 @@ from lightning.pytorch.strategies import Strategy
 from omegaconf import DictConfig, OmegaConf
 
 from devrf.apps.fitting import SIZE
-from devrf.apps.rehearsal import RehearsedStage, for_rehearsal
+from devrf.apps.rehearsal import LONGEST, RehearsedStage, for_rehearsal
 from devrf.apps.trackers import Tracker, trackers
 from devrf.checkpoints.checkpoint import (
     OWN_REST,
@@ -91,8 +91,9 @@ class RunContext(ExitStack):
         self.rehearsed: dict[str, RehearsedStage] = {}
         self.whole_stages: dict[str, tuple[type[Stage], dict[str, Any]]] = {}
         self.whole_scene: Scene | None = None
-        if self.rehearses:  # its schedules are short enough
+        if self.rehearses:  # its schedules are short enough, its pictures small
             config.schedule.seconds = None
+            config.still.height = config.still.height or LONGEST
         self.is_trial = bool(config.trainer.get("fast_dev_run"))
         self.tried: dict[str, LoadedCheckpoint] = {}
         self.chooses_size = False

@@ -18,7 +18,7 @@ from devrf.apps.records import (
     tracked_scores,
     write_frames,
 )
-from devrf.apps.rehearsal import REHEARSAL
+from devrf.apps.settings import REHEARSAL
 from devrf.apps.still import write_contact_sheet
 from devrf.checkpoints.file_metadata import digest_of
 from devrf.cli.config import choices

@@ -16,12 +16,12 @@ from rich.filesize import decimal
 from devrf.apps.inspection.report import show
 from devrf.apps.needs import needs_table
 from devrf.apps.rehearsal import (
-    REHEARSAL,
     learned,
     record,
     rehearsal_tables,
     shortfalls,
 )
+from devrf.apps.settings import REHEARSAL
 from devrf.checkpoints.checkpoint import metadata_of
 from devrf.cli.context import RunContext
 from devrf.cli.memory import needs

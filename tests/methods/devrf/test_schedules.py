@@ -18,6 +18,7 @@ from devrf.methods.devrf.deformation_schedule import (
     DeformationSchedule,
     Level,
 )
+from devrf.methods.devrf.settings import MotionSettings
 
 
 def with_level(number: int, **other: Any) -> list[Level]:
@@ -186,3 +187,87 @@ def test_a_level_may_have_a_rate_of_its_own():
     rates = [(p.learning_rate_factor, p.lr_final_factor) for p in phases]
     assert rates == [(1, 1), (0.5, 1), (0.3, 0.1)]
     assert phases[2].learning_rate_at(phases[2].stop) == pytest.approx(0.03)
+
+
+# The paper's, and one that has every event.
+SCHEDULES = {
+    "inward": CanonicalSchedule(),
+    "forward": CanonicalSchedule(
+        search_iterations=0,
+        side=203.2,
+        upsample_at=(2000, 4000, 6000, 8000),
+        dense_tv_iterations=10_000,
+        view_dependence_start=5000,
+    ),
+}
+
+
+def test_events_of_the_papers_schedule():
+    assert SCHEDULES["inward"].events == {
+        "geometry searched": 1,
+        "grids grown": 4,
+        "occupancy renewed": 5 + 20,  # at 500, 1500, … of the search, and of the radiance field
+    }
+    assert SCHEDULES["forward"].events == {
+        "grids grown": 4,
+        "occupancy renewed": 20,
+        "view dependence begun": 1,
+        "total variation of touched voxels alone": 1,
+    }
+    events = DeformationSchedule().events(frames=50)
+    assert events == {"levels begun": 5, "grids grown": 4, "visits of frames": 5 * 49}
+
+
+@pytest.mark.parametrize("name", SCHEDULES)
+@pytest.mark.parametrize("factor", [1.0, 0.31, 1 / 20, 1 / 42])
+def test_a_scaled_schedule_has_the_same_events_in_the_same_order(name, factor):
+    schedule = SCHEDULES[name]
+    scaled = schedule.scaled(factor)
+    assert scaled.total == pytest.approx(factor * schedule.total, abs=1)
+    assert scaled.events.keys() == schedule.events.keys()
+    for event, count in schedule.events.items():
+        assert scaled.events[event] == pytest.approx(count, rel=0.1)
+    phases, shorter = (in_order(s.phase, s.total) for s in (schedule, scaled))
+    assert [(p.kind, p.voxels) for p in shorter] == [(p.kind, p.voxels) for p in phases]
+    for phase, short in zip(phases, shorter, strict=True):
+        assert short.stop == pytest.approx(factor * phase.stop, abs=1)
+        # Rates have fallen as far.
+        fallen = [
+            s.learning_rate_factor(p.stop - 1) for s, p in ((schedule, phase), (scaled, short))
+        ]
+        assert fallen[1] == pytest.approx(fallen[0], abs=0.05)
+    assert schedule.scaled(1.0) == schedule
+
+
+def test_whatever_the_factor_each_phase_keeps_an_iteration():
+    scaled = CanonicalSchedule().scaled(1e-6)
+    assert [p.stop - p.start for p in in_order(scaled.phase, scaled.total)] == [1] * 6
+    levels = DeformationSchedule().scaled(1e-6).levels
+    assert [level.iterations for level in levels] == [1] * 5
+
+
+def test_motion_is_scaled_visit_by_visit_and_reaches_as_far():
+    schedule = DeformationSchedule()
+    scaled = schedule.scaled(0.1)
+    before, after = (deformation_phases(s, frames=9) for s in (schedule, scaled))
+    assert [(p.frame, p.level, p.side) for p in after] == [
+        (p.frame, p.level, p.side) for p in before
+    ]
+    assert [level.iterations for level in scaled.levels] == [20, 10, 10, 5, 5]
+    motion = MotionSettings()
+    # A voxel moves by its rate in each of its iterations, at most; and is looked at as often.
+    assert motion.scaled(0.1).learning_rate * 20 == pytest.approx(motion.learning_rate * 200)
+    assert (motion.occupancy_every, motion.scaled(0.1).occupancy_every) == (25, 2)
+
+
+@pytest.mark.parametrize(
+    "sides", [[10, 20, 40, 80, 160], [8, 16, 32, 64, 128], [40, 80, 160], [160]]
+)
+def test_coarser_grids_grow_as_often(sides):
+    levels = [Level(side, 10) for side in sides]
+    coarser = DeformationSchedule(levels, planes=128).with_finest(40)
+    found = [level.side for level in coarser.levels]
+    assert found[-1] == 40 and sorted(set(found)) == found and found[0] <= sides[0]
+    assert coarser.grid(len(sides) - 1)[1] == round(128 * 40 / sides[-1])
+    unchanged = DeformationSchedule([Level(12, 36), Level(12, 18), Level(32, 18)])
+    assert unchanged.with_finest(40) == unchanged

@@ -12,6 +12,7 @@ from typing import Any
 
 import pandas as pd
 
+from devrf.apps.settings import REHEARSAL
 from devrf.errors import DevrfError
 from devrf.system.files import read_record
 
@@ -50,7 +51,8 @@ class Collection:
             ``folder`` is relative to the one searched; ``train_seconds`` and ``peak_gpu_gb`` (GiB)
             are of the whole run, NaN unless every stage recorded its own.
         failures: a row for each failed job; ``mistake``: whether the user can correct it.
-        skipped: a line for each file that could not be read, with the reason.
+        skipped: a line for each file that could not be read, with the reason, and one for
+            rehearsals.
     """
 
     folder: Path
@@ -69,9 +71,11 @@ def collect(folder: Path) -> Collection:
         raise DevrfError(f"report.runs: no folder {folder}; give the folder that holds the runs")
     records: dict[str, list[dict[str, Any]]] = {"finished": [], "failed": []}
     skipped: list[str] = []
+    rehearsals = 0
     for walked, inner, _ in os.walk(folder):
         inner[:] = sorted((name for name in inner if not name.startswith(".")), key=_natural)
         place = Path(walked)
+        rehearsals += (place / REHEARSAL).is_file()
         name = folder.resolve().name if place == folder else place.relative_to(folder).as_posix()
         for file, status, read in (
             (place / "failure.json", "failed", _failed),
@@ -85,6 +89,8 @@ def collect(folder: Path) -> Collection:
                 skipped.append(f"{file}: skipped; it is damaged, or not as devrf writes it")
             else:
                 records[status].append({**record, "folder": name, "path": place, "status": status})
+    if rehearsals:
+        skipped.append(f"{rehearsals} of the folders hold a rehearsal, which is no run")
     runs = _frame(records["finished"])
     failures = _frame(records["failed"])
     return Collection(folder, runs, failures, tuple(skipped))

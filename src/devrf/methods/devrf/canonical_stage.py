@@ -59,9 +59,10 @@ log = logging.getLogger(__name__)
 # Where fewer of the iterations were made, a field in which nothing is to be seen is not due to
 # wrong settings.
 LEAST_DONE = 1 / 4
-# What a rehearsal has at most: iterations, rays, voxels along an edge.
-REHEARSED_ITERATIONS = 1000
-REHEARSED_RAYS = 512
+# What a rehearsal has at most: iterations, rays, units of a layer, voxels along an edge.
+REHEARSED_ITERATIONS = 600
+REHEARSED_RAYS = 256
+REHEARSED_WIDTH = 64
 REHEARSED_SIDE = 48
 REHEARSED_SEARCH_SIDE = 40
 
@@ -144,6 +145,7 @@ class CanonicalStage(Stage):
         architecture: Architecture = settings["architecture"]
         factor = min(1.0, REHEARSED_ITERATIONS / schedule.total)
         faint = architecture.search_alpha_init
+        planes = architecture.planes
         return {
             **settings,
             "schedule": replace(
@@ -152,7 +154,12 @@ class CanonicalStage(Stage):
                 side=min(schedule.side, REHEARSED_SIDE),
                 rays=min(schedule.rays, REHEARSED_RAYS),
             ),
-            "architecture": replace(architecture, search_alpha_init=min(faint / factor, 1e-2)),
+            "architecture": replace(
+                architecture,
+                width=min(architecture.width, REHEARSED_WIDTH),
+                planes=planes and min(planes, REHEARSED_SIDE),
+                search_alpha_init=min(faint / factor, 1e-2),
+            ),
             "iterations_per_step": min(settings["iterations_per_step"], 10),
         }
 

@@ -48,7 +48,7 @@ log = logging.getLogger(__name__)
 
 # What a rehearsal has at most: iterations of a frame, rays, voxels along an edge.
 REHEARSED_ITERATIONS = 25
-REHEARSED_RAYS = 512
+REHEARSED_RAYS = 256
 REHEARSED_SIDE = 40
 
 

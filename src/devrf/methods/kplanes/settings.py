@@ -62,10 +62,13 @@ class KPlanesSettings(OccupancySettings):
     teaching: Count = 5000
 
     def rehearsed(self, factor: float) -> Self:
-        """Coarse planes, few samples."""
+        """Coarse planes of few channels, few samples."""
+        times = self.time_resolution
         return replace(
             super().rehearsed(factor),
-            resolution=min(self.resolution, 16),
+            resolution=min(self.resolution, 12),
+            time_resolution=times and min(times, 16),
+            channels=min(self.channels, 8),
             steps=min(self.steps, 64),
             samples=min(self.samples, 24),
             proposal_samples=[min(count, 48) for count in self.proposal_samples],

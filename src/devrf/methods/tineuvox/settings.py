@@ -63,7 +63,7 @@ class TiNeuVoxSettings(OccupancySettings):
     def rehearsed(self, factor: float) -> Self:
         """A coarse grid, narrow networks."""
         smaller = super().rehearsed(factor)
-        return replace(smaller, side=min(self.side, 48), width=min(self.width, 64))
+        return replace(smaller, side=min(self.side, 32), width=min(self.width, 64))
 
     def __post_init__(self) -> None:
         fit = not any(max(self.strides) % stride for stride in self.strides)
