@@ -15,12 +15,7 @@ from rich.filesize import decimal
 
 from devrf.apps.inspection.report import show
 from devrf.apps.needs import needs_table
-from devrf.apps.rehearsal import (
-    learned,
-    record,
-    rehearsal_tables,
-    shortfalls,
-)
+from devrf.apps.rehearsal import learned, record, rehearsal_tables, shortfalls
 from devrf.apps.settings import REHEARSAL
 from devrf.checkpoints.checkpoint import metadata_of
 from devrf.cli.context import RunContext
@@ -29,7 +24,6 @@ from devrf.errors import DevrfError
 from devrf.system.files import read_record, write_json
 
 log = logging.getLogger(__name__)
-
 
 # The setting that tells a rehearsal's checkpoints from a run's.
 KEY = "rehearse"

@@ -6,6 +6,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal
 
 import torch
@@ -195,9 +196,9 @@ class RayStage(Stage):
         reached = [name for name, at in self._milestones.items() if at < total]
         return {**({GROWN: grown} if grown else {}), **dict.fromkeys(reached, 1)}
 
-    @property
+    @cached_property
     def _milestones(self) -> dict[str, int]:
-        """The iterations of what happens once, beside growths of grids."""
+        """The iterations of what happens once, beside growths of grids; known once it learns."""
         schedule = self.schedule
         total = self.total_iterations
         milestones = dict(self.scene_model.milestones(total))
