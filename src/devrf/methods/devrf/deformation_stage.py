@@ -46,10 +46,12 @@ from devrf.system.profiling import span
 
 log = logging.getLogger(__name__)
 
-# What a rehearsal has at most: iterations of a frame, rays, voxels along an edge.
+# What a rehearsal has at most: iterations of a frame, rays, voxels along an edge, and, of the box's
+# longest edge, what a voxel moves in a step.
 REHEARSED_ITERATIONS = 25
 REHEARSED_RAYS = 256
 REHEARSED_SIDE = 40
+REHEARSED_RATE = 1e-2
 
 
 class DeformationStage(Stage):
@@ -146,10 +148,13 @@ class DeformationStage(Stage):
         schedule: DeformationSchedule = settings["schedule"]
         factor = min(1.0, REHEARSED_ITERATIONS / sum(row.iterations for row in schedule.levels))
         scaled = schedule.scaled(factor).with_finest(REHEARSED_SIDE)
+        motion: MotionSettings = settings["motion"].scaled(factor)
+        if motion.unit == "box":  # of which a step is a small part
+            motion = replace(motion, learning_rate=min(motion.learning_rate, REHEARSED_RATE))
         return {
             **settings,
             "schedule": replace(scaled, rays=min(schedule.rays, REHEARSED_RAYS)),
-            "motion": settings["motion"].scaled(factor),
+            "motion": motion,
             "iterations_per_step": min(settings["iterations_per_step"], 10),
         }
 
