@@ -34,6 +34,7 @@ def forwarding(**anything: object) -> None:
 BASE = f"""
 stage: pipeline
 seed: 0
+rehearse: false
 resume: true
 memory_check: true
 priors: all

@@ -24,7 +24,7 @@ PEER = ("experiment=peer_paper", "protocol=joint", "rehearse=true", *SCENE)
 def shorter(monkeypatch: pytest.MonkeyPatch) -> None:
     """Half of a rehearsal's iterations, or less: these scenes are small."""
     monkeypatch.setattr(canonical_stage, "REHEARSED_ITERATIONS", 300)
-    monkeypatch.setattr(ray_stage, "REHEARSED_ITERATIONS", 200)
+    monkeypatch.setattr(ray_stage, "REHEARSED_ITERATIONS", 140)
 
 
 @pytest.fixture(scope="module")
