@@ -53,7 +53,7 @@ def rehearsals(stand_ins: Path) -> Iterator[tuple[str, ...]]:
         yield "method=kplanes", "protocol=joint", f"profile={profile}"
     yield "method=kplanes", "protocol=joint", "profile=kplanes_video", "data=procedural_forward"
     yield "method=tineuvox", "protocol=joint", "profile=tineuvox_light"
-    yield "experiment=phone_gpu", "data.camera=handheld"
+    yield "experiment=phone_gpu", "data=procedural_forward", "data.camera=handheld"
 
 
 def main() -> None:
