@@ -104,6 +104,16 @@ def test_a_rehearsal_is_no_run(paper, devrf_in):
     assert not (place / "metrics.json").exists()
 
 
+def test_a_stage_is_rehearsed_alone_on_what_was_rehearsed_before(paper, devrf_in):
+    folder, _ = paper
+    place = folder / "outputs/robot/paper-rehearsal"
+    before = (place / "checkpoints/canonical.ckpt").stat().st_mtime_ns
+    done = devrf_in(folder, *PAPER, "stage=deformation")
+    assert done.status == 0, done.err
+    assert (place / "checkpoints/canonical.ckpt").stat().st_mtime_ns == before
+    assert list(record(place)["rehearsal"]["stages"]) == ["deformation"]
+
+
 def test_a_rehearsal_leaves_a_run_alone(trained, devrf_in, tmp_path):
     folder, _ = trained
     before = (folder / "checkpoints/canonical.ckpt").stat().st_mtime_ns

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Sequence
 
 from rich.filesize import decimal
 
@@ -29,8 +30,8 @@ log = logging.getLogger(__name__)
 KEY = "rehearse"
 
 
-def begin_anew(run: RunContext) -> None:
-    """Remove what an earlier rehearsal has learned in the folder.
+def begin_anew(run: RunContext, learning: Sequence[str]) -> None:
+    """Remove what an earlier rehearsal has learned in the folder of these stages and later ones.
 
     Raises:
         DevrfError: a run's own checkpoints are there.
@@ -41,8 +42,10 @@ def begin_anew(run: RunContext) -> None:
             raise DevrfError(
                 f"{path}: of a run; a rehearsal needs a folder of its own, hydra.run.dir=FOLDER"
             )
+    kept = run.learning_stages[: run.learning_stages.index(learning[0])]
     for path in found:
-        path.unlink()
+        if path.stem.partition("-")[0] not in kept:
+            path.unlink()
 
 
 def conclude(run: RunContext) -> None:

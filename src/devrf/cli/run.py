@@ -107,11 +107,13 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
         if learning and run.is_trial:
             steps = ()  # nothing of it is worth a score or a video
         elif learning and run.rehearses:
-            steps = tuple(REHEARSED_STEPS)
+            steps = REHEARSED_STEPS
         with shortage_in_words(config.stage, run.device, None):  # of networks that are too wide
             _check(run, learning, steps)
         if learning:
             stages = [run.whole_stages[name] for name in run.learning_stages]
+            if run.rehearses:
+                stages = [(stage, stage.rehearsed(settings)) for stage, settings in stages]
             kernels = dict.fromkeys(k for stage, of in stages for k in stage.kernels(of))
             compiling = compile_ahead([*kernels], run.device)  # while the scene is read
             if run.leads:
@@ -135,7 +137,7 @@ def _prepare_to_learn(run: RunContext, requested: Names, steps: Names) -> None:
         left = ", ".join(learning + steps)
         log.info("%s is at rest: %s; no motion is learned", run.config.scene, left)
     if run.rehearses:
-        begin_anew(run)
+        begin_anew(run, learning)
         return
     resume = run.config.resume
     names = [name for name in learning if not (resume and run.own_checkpoint(name).is_file())]
