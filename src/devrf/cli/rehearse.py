@@ -19,6 +19,7 @@ from devrf.apps.needs import needs_table
 from devrf.apps.rehearsal import learned, record, rehearsal_tables, shortfalls
 from devrf.apps.settings import REHEARSAL
 from devrf.checkpoints.checkpoint import metadata_of
+from devrf.checkpoints.progress import progress_files
 from devrf.cli.context import RunContext
 from devrf.cli.memory import needs
 from devrf.errors import DevrfError
@@ -42,10 +43,10 @@ def begin_anew(run: RunContext, learning: Sequence[str]) -> None:
             raise DevrfError(
                 f"{path}: of a run; a rehearsal needs a folder of its own, hydra.run.dir=FOLDER"
             )
-    kept = run.learning_stages[: run.learning_stages.index(learning[0])]
-    for path in found:
-        if path.stem.partition("-")[0] not in kept:
-            path.unlink()
+    for name in run.learning_stages[run.learning_stages.index(learning[0]) :]:
+        own = run.own_checkpoint(name)
+        for path in (own, *progress_files(own.parent, name)):
+            path.unlink(missing_ok=True)
 
 
 def conclude(run: RunContext) -> None:
