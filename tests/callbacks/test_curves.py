@@ -91,7 +91,8 @@ def test_the_curve_of_a_stage_has_every_step(learn, tmp_path, monkeypatch):
     )
     album = Album()
     learn(album, Meter(), Previews(times=3), TrainingCurve(tmp_path / "images"))
-    ((stage, batches, previews, grids),) = drawn
+    ((stage, batches, previews, grids, frames),) = drawn
+    assert frames == []  # all times at once
     assert stage == "canonical" and [iteration for iteration, _ in batches] == list(range(1, 13))
     logged = {row["step"]: row["static/psnr"] for row in album.rows if "static/psnr" in row}
     assert {k: psnr for k, psnr in batches if k in logged} == pytest.approx(logged)

@@ -19,6 +19,7 @@ from devrf.scenes.export import export
 from devrf.scenes.procedural import ProceduralScene
 
 TRAINING = {"seconds", "iterations", "iterations_per_second", "peak_gpu_gb", "num_rollbacks"}
+TRAINING |= {"lost_frames"}
 FURTHER = {"ms_ssim", "lpips", "depth_error", "flow_error"}
 NO_METRICS = "evaluation.metrics=[]"  # beside PSNR and SSIM
 MASKED = {"psnr_masked", "ssim_masked", "lpips_masked", "ssim_covisible", "lpips_covisible"}
@@ -58,6 +59,11 @@ def test_metrics_have_the_documented_keys(trained):
     # 24 x 20 pixels are too few for MS-SSIM's scales; the flow of what is at rest has no error.
     assert found["canonical"]["ms_ssim"] is None and found["canonical"]["flow_error"] is None
     assert found["deformation"]["psnr_masked"] > 0 and found["deformation"]["flow_error"] > 0
+    # Of three frames the first is at rest: the two others are learned one by one.
+    assert found["canonical"]["lost_frames"] is None and found["deformation"]["lost_frames"] == 0
+    fitted = found["run"]["frame_psnr"]
+    assert set(fitted) == {"deformation"} and len(fitted["deformation"]) == 2
+    assert all(5 < psnr < 60 for psnr in fitted["deformation"])
 
 
 def test_a_run_says_how_it_came_about(trained):

@@ -160,7 +160,8 @@ def data_record(scene: Scene) -> dict[str, Any]:
 def learning_record(metadata: CheckpointMetadata, stages: Sequence[str]) -> dict[str, Any]:
     """How the ``stages`` were learned: settings, seconds, and the memory that torch held.
 
-    ``settings`` are those that decided what was learned, by config key, in all stages.
+    ``settings`` are those that decided what was learned, by config key, in all stages;
+    ``frame_psnr`` the training PSNR of frames 1, 2, … in dB, where frames were learned singly.
     """
     settings: dict[str, Any] = {}
     for of_stage in (*metadata.earlier_configs.values(), metadata.training_config):
@@ -173,6 +174,9 @@ def learning_record(metadata: CheckpointMetadata, stages: Sequence[str]) -> dict
         "wall_seconds": {name: record.get("wall_seconds") for name, record in records.items()},
         "execution": {
             n: {key: record.get(key) for key in EXECUTION} for n, record in records.items()
+        },
+        "frame_psnr": {
+            n: record["frame_psnr"] for n, record in records.items() if "frame_psnr" in record
         },
     }
 
@@ -238,9 +242,11 @@ def peak_host_memory() -> float | None:
 
 
 def in_words(values: Mapping[str, Any]) -> str:
-    """``name value, name value, …`` on one line, rounded, without unknown values."""
+    """``name value, name value, …`` on one line, rounded, without lists and unknown values."""
     return ", ".join(
-        f"{key} {rounded(value)}" for key, value in values.items() if value is not None
+        f"{key} {rounded(value)}"
+        for key, value in values.items()
+        if value is not None and not isinstance(value, list)
     )
 
 

@@ -2,6 +2,7 @@
 
 from devrf.callbacks.curves import Meter, Previews, TrainingCurve
 from devrf.callbacks.divergence_guard import DivergenceGuard
+from devrf.callbacks.frame_fit import FrameFit
 from devrf.callbacks.periodic_checkpoint import PeriodicCheckpoint, StopOnSignal
 from devrf.callbacks.progress import Progress
 from devrf.callbacks.schedule import GridUpscaling, LearningRateDecay
@@ -11,6 +12,7 @@ from devrf.callbacks.training_record import TrainingRecord
 __all__ = [
     "GridUpscaling",
     "DivergenceGuard",
+    "FrameFit",
     "LearningRateDecay",
     "Meter",
     "Previews",

@@ -27,14 +27,18 @@ Numbers = dict[str, float]
 AT_ONCE = 200
 
 
-def batch_psnr(means: Mapping[str, Tensor]) -> Tensor | None:
-    """PSNR () in dB of a step's batches; None where no loss is the error of colours.
+def batch_error(means: Mapping[str, Tensor]) -> Tensor | None:
+    """Mean squared error () of a step's pixels, in [0, 1]; None where no loss is that.
 
     Args:
-        means: the step's mean losses () by name; ``color`` or ``render`` is the mean squared
-            error of pixels in [0, 1].
+        means: the step's mean losses () by name; ``color`` or ``render`` is that error.
     """
-    error = means.get("color", means.get("render"))
+    return means.get("color", means.get("render"))
+
+
+def batch_psnr(means: Mapping[str, Tensor]) -> Tensor | None:
+    """PSNR () in dB of a step's batches; None where no loss is the error of colours."""
+    error = batch_error(means)
     return None if error is None else -10 * error.detach().clamp_min(1e-12).log10()
 
 
@@ -248,7 +252,9 @@ class TrainingCurve(Callback):
             point for other in callbacks if isinstance(other, Previews) for point in other.psnr
         ]
         path = self.folder / f"training_{pl_module.name}.png"
+        frames = pl_module.record.get("frame_psnr") or []  # of a FrameFit
+        assert isinstance(frames, list)
         try:
-            write_training_curve(path, pl_module.name, self._points, previews, self._grids)
+            write_training_curve(path, pl_module.name, self._points, previews, self._grids, frames)
         except OSError as error:  # a full disk must not cost what was learned
             log.warning("%s: %s; the curve is not drawn", path, error.strerror)

@@ -54,7 +54,7 @@ SIDE = 2**14
 # The most that one side of an image is longer than the other.
 ASPECT = 16
 # What training took: by name, numbers, and words that say how it ran.
-TrainingFigures = dict[str, int | float | str | None]
+TrainingFigures = dict[str, int | float | str | list[float] | None]
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,14 @@ from typing import Any
 from devrf.errors import DevrfError, did_you_mean
 
 # Figures of the training, from the checkpoint, that stand beside the scores.
-TRAINING = ("seconds", "iterations", "iterations_per_second", "peak_gpu_gb", "num_rollbacks")
+TRAINING = (
+    "seconds",
+    "iterations",
+    "iterations_per_second",
+    "peak_gpu_gb",
+    "num_rollbacks",
+    "lost_frames",
+)
 # Numbers of both sections of metrics.json, and of the dynamic one. Their second names are those of
 # DeVRF's stages.
 SCORES = ("psnr", "ssim")

@@ -296,14 +296,16 @@ def write_training_curve(
     batches: Sequence[tuple[int, float]],
     previews: Sequence[tuple[int, float]] = (),
     grids: Sequence[tuple[int, str]] = (),
+    frames: Sequence[float] = (),
 ) -> None:
     """Plot (iteration, PSNR in dB) of at least one training batch, and write it as a PNG.
 
     ``previews`` are the same of a held-out view; at iterations of ``grids`` the grid took that
-    size.
+    size. ``frames`` is the training PSNR of frames 1, 2, … in their last visit: a second plot.
     """
-    figure = Figure(figsize=(8.0, 4.2), dpi=120, layout="constrained")
-    axes = figure.subplots()
+    panels = 2 if frames else 1
+    figure = Figure(figsize=(8.0, 4.2 * panels), dpi=120, layout="constrained")
+    axes = figure.subplots(panels, squeeze=False)[0, 0]
     curve = pd.Series(dict(batches), dtype=float)
     mean = curve.rolling(max(1, round(WINDOW * len(curve))), min_periods=1).mean()
     axes.plot(curve.index, curve, color=BATCHES, linewidth=0.9, label="batches")
@@ -317,6 +319,10 @@ def write_training_curve(
             axes.text(iteration, 1, f" {shape}", transform=axes.get_xaxis_transform(), color="0.4")
     axes.set(xlabel="iteration", ylabel="PSNR (dB)")
     axes.set_title(f"{stage}: PSNR of the training batches", loc="left", pad=20)
-    figure.legend(loc="outside lower center", ncols=3)
+    if frames:
+        figure.axes[1].plot(range(1, len(frames) + 1), frames, ".-", color=MEAN)
+        figure.axes[1].set(xlabel="frame", ylabel="PSNR (dB)")
+        figure.axes[1].set_title("the last visit of each frame", loc="left")
+    axes.legend(loc="lower right", ncols=3)
     with atomic_write(path) as partial:
         figure.savefig(partial, format="png", dpi="figure")

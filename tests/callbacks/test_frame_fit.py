@@ -1,0 +1,94 @@
+"""How each frame is fitted in its last visit, and which frames are lost."""
+
+from __future__ import annotations
+
+import logging
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from devrf.callbacks.frame_fit import FrameFit, complaint, in_ranges, lost
+from devrf.engine.phase import Phase
+from devrf.engine.stage import Stage
+
+TRAINER: Any = SimpleNamespace(is_global_zero=True)
+
+
+class Visiting(Stage):
+    """A stage as far as a callback sees it."""
+
+    def __init__(self) -> None:
+        self.__dict__["phase"] = None
+        self.__dict__["record"] = {"seconds": 1.0}
+        self.__dict__["name"] = "deformation"
+
+    total_iterations = resolution = learning_rate_factor = phase_at = enter = draw = None
+    loss = restore = None
+
+
+Visiting.__abstractmethods__ = frozenset()
+
+
+def visit(fit: FrameFit, stage: Stage, start: int, frame: int | None, *errors: float) -> None:
+    """Steps of these errors in the visit of ``frame`` that begins at ``start``."""
+    stage.__dict__["phase"] = Phase(kind="", start=start, stop=start + 10, frame=frame)
+    for error in errors:
+        fit.on_train_batch_end(TRAINER, stage, {"render": torch.tensor(error)}, None, 0)
+
+
+def test_a_frame_is_measured_by_the_mean_error_of_its_last_visit(caplog):
+    fit, stage = FrameFit(), Visiting()
+    fit.setup(TRAINER, stage, "fit")
+    fit.on_train_start(TRAINER, stage)
+    visit(fit, stage, 0, 1, 0.1, 0.1)
+    visit(fit, stage, 10, 2, 0.5)
+    visit(fit, stage, 20, 1, 0.003, 0.001)  # backwards would do as well
+    visit(fit, stage, 30, 2, 1e-3)
+    visit(fit, stage, 40, 3, 0.01)
+    assert fit.psnr == {1: pytest.approx(26.9897), 2: pytest.approx(30), 3: pytest.approx(20)}
+    with caplog.at_level(logging.WARNING):
+        fit.on_train_end(TRAINER, stage)
+    assert stage.record == {"seconds": 1.0, "lost_frames": 1, "frame_psnr": [26.99, 30.0, 20.0]}
+    said = "frame 3 fits worse than the rest: 20.0 dB, the others 28.5"
+    assert caplog.messages == [f"deformation: {said}"]
+
+
+def test_a_visit_that_was_interrupted_goes_on():
+    whole, stage = FrameFit(), Visiting()
+    whole.on_train_start(TRAINER, stage)
+    visit(whole, stage, 0, 1, 0.1)
+    visit(whole, stage, 10, 1, 0.02, 0.01)
+
+    first, second = FrameFit(), FrameFit()
+    stage = Visiting()
+    first.on_train_start(TRAINER, stage)
+    visit(first, stage, 0, 1, 0.1)
+    visit(first, stage, 10, 1, 0.02)
+    second.setup(TRAINER, stage, "fit")
+    second.load_state_dict(first.state_dict())
+    second.on_train_start(TRAINER, stage)  # the phase was restored
+    visit(second, stage, 10, 1, 0.01)
+    assert second.psnr == pytest.approx(whole.psnr) == {1: pytest.approx(18.2391)}
+
+
+def test_times_that_are_learned_at_once_have_no_figures():
+    fit, stage = FrameFit(), Visiting()
+    visit(fit, stage, 0, None, 0.1)
+    fit.on_train_end(TRAINER, stage)
+    assert fit.psnr == {} and stage.record == {"seconds": 1.0}
+
+
+def test_lost_frames_are_four_decibels_below_the_median():
+    psnr = {1: 35.0, 2: 30.9, 3: 35.0, 4: 31.1, 5: 36.0}
+    assert lost(psnr) == [2]
+    assert lost({1: 20.0}) == []
+
+
+def test_frames_in_words():
+    assert in_ranges([3]) == "3"
+    assert in_ranges([1, 2, 5, 20, 21, 22]) == "1 to 2, 5, 20 to 22"
+    psnr = {1: 37.0, 2: 25.0, 3: 25.0, 4: 37.0, 5: 37.0}
+    said = "frames 2 to 3 fit worse than the rest: 25.0 dB, the others 37.0"
+    assert complaint(psnr, lost(psnr)) == said
