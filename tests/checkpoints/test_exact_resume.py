@@ -32,6 +32,7 @@ from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.extension import Extension
 from devrf.methods.devrf.extensions.color_residual import ColorResidual
+from devrf.methods.devrf.extensions.frame_start import StartFromBest
 from devrf.methods.devrf.extensions.priors import Elastic
 from devrf.methods.devrf.extensions.tracks import StartAlongFlow
 from devrf.methods.devrf.settings import MotionSettings
@@ -171,6 +172,20 @@ def test_frames_that_are_left_early_go_on_exactly(learn, rest):
     build = deformation(rest, MOVING, early, tracks=StartAlongFlow("tracks"))
     # Mid-visit at both levels.
     assert_same(learn(build, 2, 19), learn(build))
+
+
+def test_starts_from_the_best_and_a_level_backwards_go_on_exactly(learn, rest):
+    rows = (Level(4, 6), Level(6, 4, backwards=True), Level(6, 3))
+    schedule = replace(MOVING, levels=rows)
+    starts = {"frame_start": StartFromBest(levels=3, rays=32)}
+    build = deformation(rest, schedule, OFTEN, **starts)
+    whole = learn(build)
+    # At a frame's end, mid-visit, at the end of a level, at the end of the first frame backwards.
+    assert_same(learn(build, 12, 14, 18, 26, 31), whole)
+    forwards = replace(MOVING, levels=(*MOVING.levels, Level(6, 3)))
+    other = learn(deformation(rest, forwards, OFTEN, **starts))
+    with pytest.raises(AssertionError):  # the level makes a difference
+        assert_same(other["fields"], whole["fields"])
 
 
 def test_colours_that_change_go_on_exactly(learn, rest):

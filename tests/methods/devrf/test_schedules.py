@@ -124,13 +124,28 @@ def test_frames_are_visited_one_after_another():
     assert [p.init_from_previous for p in phases] == [False, True, True, False, False, False]
 
 
+def test_a_level_may_go_through_the_frames_backwards():
+    schedule = DeformationSchedule((Level(4, 6), Level(6, 4, backwards=True)))
+    assert course(schedule, 4)[3:] == [(1, 3, 24, 32), (1, 2, 32, 36), (1, 1, 36, 40)]
+    assert [p.step for p in deformation_phases(schedule, 4)] == [1, 1, 1, -1, -1, -1]
+    # Without coarse to fine there is one level, and it begins at rest.
+    alone = replace(schedule, coarse_to_fine=False)
+    assert [p.frame for p in deformation_phases(alone, 4)] == [1, 2, 3]
+
+
 @given(
-    st.lists(st.tuples(st.integers(2, 99), st.integers(1, 9)), min_size=1, max_size=5),
+    st.lists(
+        st.tuples(st.integers(2, 99), st.integers(1, 9), st.booleans()), min_size=1, max_size=5
+    ),
     st.integers(2, 12),
     st.booleans(),
 )
 def test_deformation_phases_tile_every_schedule(levels, frames, coarse_to_fine):
-    schedule = DeformationSchedule([Level(*level) for level in levels], coarse_to_fine)
+    rows = [
+        Level(side, iterations, backwards=level > 0 and backwards)
+        for level, (side, iterations, backwards) in enumerate(levels)
+    ]
+    schedule = DeformationSchedule(rows, coarse_to_fine)
     phases = deformation_phases(schedule, frames)
     assert phases[0].start == 0 and phases[-1].stop == schedule.total(frames)
     for phase, after in zip(phases, phases[1:], strict=False):
@@ -138,7 +153,11 @@ def test_deformation_phases_tile_every_schedule(levels, frames, coarse_to_fine):
     for phase in phases:
         assert {schedule.phase(k, frames) for k in range(phase.start, phase.stop)} == {phase}
     depth = len(levels) if coarse_to_fine else 1
-    visits = [(level, frame) for level in range(depth) for frame in range(1, frames)]
+    visits = [
+        (level, frame)
+        for level in range(depth)
+        for frame in range(1, frames)[:: -1 if coarse_to_fine and rows[level].backwards else 1]
+    ]
     assert [(p.level, p.frame) for p in phases] == visits
     begun = [[p.start for p in phases if p.level == level][0] for level in range(depth)]
     assert begun == [0, *schedule.growths(frames)]
@@ -159,6 +178,10 @@ def test_deformation_phases_tile_every_schedule(levels, frames, coarse_to_fine):
         (
             lambda: DeformationSchedule(with_level(2, other_terms=-1)),
             "levels.other_terms: expected at least 0",
+        ),
+        (
+            lambda: DeformationSchedule(with_level(1, backwards=True)),
+            "levels.1.backwards: expected false",
         ),
     ],
 )

@@ -40,6 +40,7 @@ ABLATIONS = {
     "without_masks": "Ours w/o masks' loss",
     "without_shading": "Ours w/o shading",
     "without_finishing": "Ours w/o finishing level",
+    "without_frame_start": "Ours w/o starts from the best",
     "without_crop": "Ours w/o crop",
     "without_last_level": "Ours w/o last level",
 }

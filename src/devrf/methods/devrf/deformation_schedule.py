@@ -36,6 +36,8 @@ class Level(Options):
             the side has changed.
         lr_final_factor: what the learning rate falls to in a visit, exponentially.
         other_terms: factor of the weights of all terms of ``loss.deformation`` but ``render``.
+        backwards: whether frames are gone through from the last to the first; not at the coarsest
+            level, which begins at rest.
     """
 
     key: ClassVar[str] = "schedule.deformation.levels"
@@ -45,6 +47,7 @@ class Level(Options):
     lr_factor: Positive | None = None
     lr_final_factor: Positive = 1.0
     other_terms: NotNegative = 1.0
+    backwards: bool = False
 
 
 PAPER_LEVELS = (Level(10, 200), Level(20, 100), Level(40, 100), Level(80, 50), Level(160, 50))
@@ -61,6 +64,7 @@ class DeformationPhase(Phase):
         learning_rate_factor: what the learning rate is multiplied by at the visit's start.
         lr_final_factor: what it has been multiplied by further at the visit's end.
         init_from_previous: whether the frame starts from the result of the frame before it.
+        step: 1, or −1 where frames are gone through from the last to the first.
     """
 
     frame: int
@@ -69,6 +73,7 @@ class DeformationPhase(Phase):
     learning_rate_factor: float
     lr_final_factor: float
     init_from_previous: bool
+    step: int = 1
 
     @property
     def cost(self) -> float:
@@ -130,8 +135,15 @@ class DeformationSchedule(Options):
     def __post_init__(self) -> None:
         if not self.coarse_to_fine:
             iterations = sum(level.iterations for level in self.levels)
-            finest = replace(self.levels[-1], iterations=iterations, lr_factor=None)
+            finest = replace(
+                self.levels[-1], iterations=iterations, lr_factor=None, backwards=False
+            )
             object.__setattr__(self, "levels", (finest,))
+        if self.levels[0].backwards:
+            raise DevrfError(
+                "schedule.deformation.levels.1.backwards: expected false, not true: the first "
+                "level goes on from the scene at rest, which is frame 0"
+            )
 
     def scaled(self, factor: float) -> DeformationSchedule:
         """The schedule in ``factor`` times its iterations; each visit keeps one at least."""
@@ -195,19 +207,20 @@ class DeformationSchedule(Options):
         begins = [0, *self.growths(frames)]
         level = bisect_right(begins, iteration) - 1
         row = self.levels[level]
-        # Frame 1 takes the share of frame 0, too.
+        # The frame that is visited first takes the share of frame 0, too.
         share = (iteration - begins[level]) // row.iterations
-        frame = min(max(share, 1), frames - 1)
+        place = min(max(share, 1), frames - 1)
         return DeformationPhase(
             kind=f"level {level + 1}",
-            start=begins[level] + (frame if frame > 1 else 0) * row.iterations,
-            stop=begins[level] + (frame + 1) * row.iterations,
-            frame=frame,
+            start=begins[level] + (place if place > 1 else 0) * row.iterations,
+            stop=begins[level] + (place + 1) * row.iterations,
+            frame=frames - place if row.backwards else place,
             level=level,
             side=row.side,
             learning_rate_factor=self.learning_rate_factor(level),
             lr_final_factor=row.lr_final_factor,
-            init_from_previous=level == 0 and frame > 1,
+            init_from_previous=level == 0 and place > 1,
+            step=-1 if row.backwards else 1,
         )
 
 

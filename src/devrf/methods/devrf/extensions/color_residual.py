@@ -63,9 +63,9 @@ class ResidualField(ColorField, StoredShape):
         return partial(look_up, grid, box=self.box)
 
     @torch.no_grad()
-    def copy_previous(self, frame: int) -> None:
-        """Initialise ``frame``, from 1 on, from the frame before it."""
-        self.values[frame] = self.values[frame - 1]
+    def copy(self, source: int, frame: int) -> None:
+        """Initialise ``frame``, from 1 on, from another."""
+        self.values[frame] = self.values[source]
 
 
 class ColorResidual(Extension):
@@ -188,8 +188,10 @@ class ColorResidual(Extension):
     def initialise(self, stage: DeformationStage, phase: DeformationPhase) -> None:
         """At the first level that learns it, start a frame from the one visited before it."""
         field = stage.scene_model.color_residual
+        before = phase.frame - phase.step
         if isinstance(field, ResidualField) and phase.level == self._first:
-            field.copy_previous(phase.frame)
+            if before < len(field.clock):  # backwards, the last frame is the first
+                field.copy(before, phase.frame)
 
     def color_change(self, frame: ActiveFrame) -> ColorChange | None:
         """q → A_t(q), as learned so far."""

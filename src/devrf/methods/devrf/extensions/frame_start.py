@@ -1,0 +1,145 @@
+"""A visit to a frame starts from the best of several candidates (docs/method.md#frame-start)."""
+
+from __future__ import annotations
+
+import logging
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool3d, pad
+
+from devrf.data.batch import all_pixels, gather_batch
+from devrf.engine.ddp import broadcast
+from devrf.errors import expect
+from devrf.geometry.box import Box
+from devrf.kernels.look_up import look_up
+from devrf.methods.devrf.deformation_schedule import DeformationPhase
+from devrf.methods.devrf.deformation_stage import DeformationStage
+from devrf.methods.devrf.extension import Extension
+from devrf.methods.devrf.frame_store import Directions
+from devrf.methods.devrf.pixel_pools import images_of
+from devrf.methods.devrf.volume_rendering import possible_occupancy, render
+from devrf.ops.photometric import color_error
+
+log = logging.getLogger(__name__)
+
+# Rounds of the search for where what arrives at a point was one frame before.
+ROUNDS = 2
+
+
+class StartFromBest(Extension):
+    """Starts each visit from the candidate that shows the frame's images best.
+
+    The candidates are what the frame has already, and what the frame visited before it has: as it
+    is, carried on along its velocity, and along its velocity smoothed. At the coarsest level the
+    frame has a copy of the one before.
+    """
+
+    def __init__(self, levels: int = 0, rays: int = 4096) -> None:
+        """Say when candidates are looked at.
+
+        Args:
+            levels: so many of the coarsest levels; 0: none.
+            rays: pixels of all the frame's images that candidates are compared by.
+        """
+        key = "schedule.extensions.frame_start"
+        expect(levels >= 0, f"{key}.levels", "at least 0", levels)
+        expect(rays >= 1, f"{key}.rays", "at least 1", rays)
+        self._levels = levels
+        self._rays = rays
+
+    def initialise(self, stage: DeformationStage, phase: DeformationPhase) -> None:
+        """Give the frame the displacements of the best candidate."""
+        if phase.level >= self._levels:
+            return
+        found = candidates(stage, phase)
+        if len(found) < 2:
+            return
+        errors = self._errors(stage, phase.frame, list(found.values()))
+        best = min(zip(errors, found, strict=True))[1]
+        log.debug("%s frame %d: %s", phase.kind, phase.frame, dict(zip(found, errors, strict=True)))
+        field = stage.field
+        field.frames.write(phase.frame, found[best])
+        # Each process has looked at pixels of its own.
+        broadcast([field.to_canonical[phase.frame], field.to_time[phase.frame]])
+
+    @torch.no_grad()
+    def _errors(self, stage: DeformationStage, frame: int, starts: list[Directions]) -> list[float]:
+        """Mean squared colour error of each start, on the same pixels of all the frame's images."""
+        views = stage.views
+        model = stage.scene_model
+        pool = all_pixels(views, images_of(views, frame))
+        rays = max(1, round(stage.batch_share * self._rays))
+        image, flat = pool.draw(rays, stage.generator)
+        background = stage.background(image)
+        batch = gather_batch(views, image, flat, background, space=model.space)
+        errors = []
+        for backward, _ in starts:
+            warp = stage.field.warp_by(backward)
+            output = render(
+                batch.rays,
+                model.canonical,
+                possible_occupancy(model.occupancy, warp),
+                model.settings,
+                batch.background,
+                warp=warp,
+                precision=stage.decoder_dtype,
+            )
+            errors.append(float(color_error(output.color, batch.color)))
+        return errors
+
+
+@torch.no_grad()
+def candidates(stage: DeformationStage, phase: DeformationPhase) -> dict[str, Directions]:
+    """What a visit may start from, by name; the frame's own displacements are the first."""
+    field = stage.field
+    like = field.frames.here.new_empty(*field.shape, 3)
+
+    def read(number: int) -> Directions:
+        pair = (torch.empty_like(like), torch.empty_like(like))
+        field.frames.read(number, pair)
+        return pair
+
+    found = {"own": read(phase.frame)}
+    near = phase.frame - phase.step
+    far = near - phase.step
+    frames = range(len(field.clock))
+    if near not in frames:
+        return found
+    one = read(near)
+    if phase.level:
+        found["as before"] = one
+    if far in frames:
+        velocity = one[1] - read(far)[1]
+        found["carried along"] = carried(one, velocity, field.box)
+        found["carried along, smoothed"] = carried(one, smoothed(velocity), field.box)
+    return found
+
+
+def carried(start: Directions, way: Tensor, box: Box) -> Directions:
+    """Displacements a frame later than ``start``, if all goes on along ``way``.
+
+    Δ_f' = Δ_f + v, and Δ_b'(x) = Δ_b(x') − v(q), where x' = x − v(q) is where what is at x now was
+    before, and q = x' + Δ_b(x') its canonical point: displacements go with the thing that moves.
+
+    Args:
+        start: (X, Y, Z, 3) Δ_b and Δ_f.
+        way: (X, Y, Z, 3) v, how far each canonical point goes.
+        box: where the grids live.
+    """
+    backward, forward = start
+    shape = backward.shape
+    points = box.grid_points((shape[0], shape[1], shape[2]), backward).view(-1, 3)
+    was = points
+    for _ in range(ROUNDS):
+        canonical = was + look_up(backward, was, box)
+        step = look_up(way, canonical, box)
+        was = points - step
+    return (look_up(backward, was, box) - step).view(shape), forward + way
+
+
+def smoothed(grid: Tensor) -> Tensor:
+    """Means of a grid (X, Y, Z, C) over the 3³ points around each; beyond its border it goes on."""
+    channels_first = grid.permute(3, 0, 1, 2)[None]
+    means = avg_pool3d(pad(channels_first, (1,) * 6, mode="replicate"), 3, stride=1)
+    return means[0].permute(1, 2, 3, 0).contiguous()
