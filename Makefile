@@ -6,6 +6,7 @@
 #                   with INSTALL_FIRST=no by $(PYTHON) and the packages that it has
 # make rehearse     rehearse every setting that is made for a GPU, on embedded scenes: an hour on
 #                   two cores
+# make chance       learn small moving scenes by several seeds, and count the frames that are lost
 # make fuzz         what is too long for make test: fuzz tests of files with many inputs
 #                   (make test has 60)
 # make format       format the code and mend what the linter can
@@ -24,7 +25,7 @@ INSTALL := $(BIN)/python -m pip install --disable-pip-version-check \
 PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile \
 	--no-loadscope-reorder --durations 15
 
-.PHONY: quickstart test docs house gpu-check rehearse fuzz format shell clean
+.PHONY: quickstart test docs house gpu-check rehearse chance fuzz format shell clean
 
 quickstart: $(VENV)/.installed
 	$(BIN)/python -m devrf experiment=quickstart
@@ -53,6 +54,9 @@ gpu-check: $(if $(filter no,$(INSTALL_FIRST)),,$(VENV)/.installed)
 
 rehearse: $(VENV)/.installed
 	$(BIN)/python benchmarks/rehearse.py
+
+chance: $(VENV)/.installed
+	$(BIN)/python benchmarks/robust_motion.py --small
 
 fuzz: $(VENV)/.installed-dev
 	DEVRF_FUZZ_INPUTS=100000 $(PYTEST) tests/scenes/test_damaged_files.py
