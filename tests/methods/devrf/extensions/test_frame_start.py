@@ -2,12 +2,74 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 import torch
 
 from devrf.geometry.box import Box
 from devrf.kernels.look_up import look_up
-from devrf.methods.devrf.extensions.frame_start import carried, smoothed
+from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule, Level
+from devrf.methods.devrf.extensions import frame_start
+from devrf.methods.devrf.extensions.frame_start import (
+    StartFromBest,
+    candidates,
+    carried,
+    smoothed,
+)
+from devrf.methods.devrf.frame_store import FrameStore
+
+# Four frames. Level 0: 1, 2, 3 in iterations 0, 2, 3; level 1: 3, 2, 1 in 4, 6, 7.
+BACK = DeformationSchedule((Level(2, 1), Level(2, 1, backwards=True)))
+
+
+@pytest.fixture
+def stage(cube: Box) -> Any:
+    """A stage as far as candidates see it."""
+    frames = FrameStore(4, (2, 2, 2))
+    field = SimpleNamespace(
+        frames=frames,
+        shape=frames.shape,
+        clock=range(4),
+        box=cube,
+        to_canonical=frames.to_canonical,
+        to_time=frames.to_time,
+    )
+    return SimpleNamespace(field=field)
+
+
+def phase(iteration: int) -> DeformationPhase:
+    return BACK.phase(iteration, 4)
+
+
+@pytest.mark.parametrize(
+    ("iteration", "frame", "names"),
+    [
+        (0, 1, ["own"]),  # there is nothing before the scene at rest
+        (3, 3, ["own", "carried along", "carried along, smoothed"]),
+        (4, 3, ["own"]),  # backwards the last frame is the first
+        (6, 2, ["own", "as before"]),
+        (7, 1, ["own", "as before", "carried along", "carried along, smoothed"]),
+    ],
+)
+def test_what_a_visit_may_start_from(stage, iteration, frame, names):
+    assert phase(iteration).frame == frame
+    assert list(candidates(stage, phase(iteration))) == names
+
+
+def test_the_candidate_of_the_least_error_is_what_the_frame_gets(stage, monkeypatch):
+    starts = {
+        name: (torch.full((2, 2, 2, 3), value), torch.full((2, 2, 2, 3), -value))
+        for name, value in (("own", 1.0), ("as before", 2.0), ("carried along", 3.0))
+    }
+    monkeypatch.setattr(frame_start, "candidates", lambda *_: starts)
+    monkeypatch.setattr(StartFromBest, "_errors", lambda *_: [0.3, 0.1, 0.2])
+    StartFromBest(levels=1).initialise(stage, phase(7))  # of the second level
+    assert not stage.field.to_time.any()
+    StartFromBest(levels=2).initialise(stage, phase(7))
+    assert (stage.field.to_canonical[1] == 2).all() and (stage.field.to_time[1] == -2).all()
+    assert not stage.field.to_time[2:].any()
 
 
 def test_a_translation_goes_on_as_it_was(cube: Box):
