@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import codecs
 import os
+import re
 import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
@@ -94,23 +95,48 @@ def entries(folder: Path) -> list[Path]:
 def inside(root: Path, folder: Path, name: str, file: Path) -> Path:
     """Where ``name``, text in ``file``, leads from ``folder``: a path somewhere below ``root``.
 
-    ``..`` is taken out of the text itself; links that lie in the scene's folder are followed.
-    Whether there is such a file is not looked up. DevrfError if the name leads outside, or no file
-    can have it.
+    ``..`` is taken out of the text itself; links that lie in the scene's folder are followed; back
+    slashes part folders, too. An absolute path on another machine is taken for its tail of which
+    the folder is there. Whether there is such a file is not looked up. DevrfError if the name leads
+    outside, or no file can have it.
     """
     if "\0" in name:
         raise scene_error(file, f"{abbreviated(name)} is not a path; correct it")
+    path = name.replace("\\", "/")
+    if from_elsewhere(root, name):
+        path = _tail(root, folder, os.path.normpath(path)) or path
     inner = (
-        os.path.relpath(name, root)
-        if os.path.isabs(name)
-        else os.path.normpath(folder.relative_to(root) / name)
+        os.path.relpath(path, root)
+        if os.path.isabs(path)
+        else os.path.normpath(folder.relative_to(root) / path)
     )
-    if inner == os.curdir or inner.split(os.sep)[0] == os.pardir:
+    if inner == os.curdir or inner.split(os.sep)[0] == os.pardir or _DRIVE.match(path):
         raise scene_error(
             file,
             f"{abbreviated(name)} leads outside the scene's folder {root}; put the file into it",
         )
     return root / inner
+
+
+_DRIVE = re.compile(r"[A-Za-z]:[/\\]")
+
+
+def from_elsewhere(root: Path, name: str) -> bool:
+    """Whether ``name`` is an absolute path, of any system, that does not lead below ``root``."""
+    below = os.path.normpath(name).startswith(os.path.join(os.path.normpath(root), ""))
+    return bool(_DRIVE.match(name)) or (name[:1] in ("/", "\\") and not below)
+
+
+def _tail(root: Path, folder: Path, path: str) -> str | None:
+    """Where the longest tail of an absolute path leads from ``folder``, or else from ``root``."""
+    parts = PurePosixPath(path).parts[1:]
+    for above in (folder, root):
+        for start in range(len(parts)):
+            place = above.joinpath(*parts[start:])
+            there = os.path.isdir(place.parent) if start < len(parts) - 1 else os.path.isfile(place)
+            if there:
+                return os.path.relpath(place, folder)
+    return None
 
 
 def read_json(file: Path, kind: type[Content], purpose: str) -> Content:

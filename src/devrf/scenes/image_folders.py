@@ -1,4 +1,4 @@
-"""Folders of images: which size to read, how much smaller to make it, which images are absent."""
+"""Folders of images: which size to read, and how much smaller to make it."""
 
 from __future__ import annotations
 
@@ -6,22 +6,21 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import torch
 from pydantic import PlainValidator
 
 from devrf.errors import DevrfError
-from devrf.scenes.files import entries, inside
-from devrf.scenes.images import SUFFIXES, image_at, image_size
+from devrf.scenes.files import entries
+from devrf.scenes.images import SUFFIXES, image_size, unread
+from devrf.scenes.names import in_order
 from devrf.scenes.validation import scene_error
 
 log = logging.getLogger(__name__)
-
-_DIGITS = re.compile(r"(\d+)")
 
 
 @dataclass(frozen=True)
@@ -68,11 +67,10 @@ def image_folder(
     return ImageFolder(folders[best], downscale // best)
 
 
-def listed_images(folder: Path, *, numbered: bool = False) -> list[Path]:
+def listed_images(folder: Path, *, by_characters: bool = False) -> list[Path]:
     """The image files in ``folder``, at least one, else DevrfError, in order of their names.
 
-    ``numbered``: in the order of :func:`by_number`; else names are compared by characters, which is
-    the order of COLMAP's poses.
+    For the order and ``by_characters`` see :func:`~devrf.scenes.names.in_order`.
     """
     images = [
         path
@@ -80,17 +78,8 @@ def listed_images(folder: Path, *, numbered: bool = False) -> list[Path]:
         if path.suffix.lower() in SUFFIXES and path.name[0] != "." and os.path.isfile(path)
     ]
     if not images:
-        raise scene_error(folder, f"no images (looked for {', '.join(SUFFIXES)}); add them")
-    return sorted(images, key=lambda path: by_number(path.name) if numbered else [path.name])
-
-
-def by_number(name: str) -> list[object]:
-    """A key to sort names by: runs of digits count as numbers, so that 10.png comes after 9.png.
-
-    Text and numbers in turn: any two such lists can be compared.
-    """
-    pieces = _DIGITS.split(name)
-    return [int(piece) if k % 2 else piece for k, piece in enumerate(pieces)]
+        raise scene_error(folder, f"no images (looked for {', '.join(SUFFIXES)}){unread(folder)}")
+    return in_order(images, name=lambda path: path.name, where=folder, by_characters=by_characters)
 
 
 # Images with a shorter side of fewer pixels teach little.
@@ -164,42 +153,3 @@ def folder_size(parent: Path, *, full: str = "images", reduced: str = "images_{}
         return width // source.downscale, height // source.downscale
 
     return size_at
-
-
-Missing = Literal["error", "skip"]
-
-
-def present_images(
-    names: Sequence[str], file: Path, root: Path, missing: Missing
-) -> dict[int, Path]:
-    """The existing images that ``file`` lists, by their positions in the list.
-
-    Args:
-        names: of N images, relative to the file's folder, with or without their suffix.
-        file: the file that lists them.
-        root: the scene's folder, which no name may leave.
-        missing: whether absent images are an error, or left out with one warning.
-
-    Raises:
-        DevrfError: an image is absent and must not be, or all are.
-    """
-    places = [inside(root, file.parent, name, file) for name in names]
-    present = {k: image for k, place in enumerate(places) if (image := image_at(place)) is not None}
-    absent = [place for k, place in enumerate(places) if k not in present]
-    if absent and (missing == "error" or not present):
-        add = "add them" if len(absent) > 1 else "correct its name or add it"
-        skip = ", or leave out what is absent with data.missing=skip" if present else ""
-        raise scene_error(
-            absent[0],
-            f"no such image (looked for {', '.join(SUFFIXES)}); {len(absent)} of the {len(names)} "
-            f"images in {file.name} are absent: {add}{skip}",
-        )
-    if absent:
-        log.warning(
-            "%s: %d of the %d images are absent and left out, %s the first of them",
-            file,
-            len(absent),
-            len(names),
-            absent[0].relative_to(root),
-        )
-    return present

@@ -23,15 +23,19 @@ import torch
 from PIL import ExifTags, Image
 from torch import Tensor
 
-from devrf.scenes.files import decoding
+from devrf.scenes.files import decoding, entries
 from devrf.scenes.resampling import shrink_pixels
 from devrf.scenes.validation import check_memory, reduced_size, same_shape, scene_error
 
 log = logging.getLogger(__name__)
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 # By content, not by name. Pillow reads many more formats, some by starting other programs.
-FORMATS = ("PNG", "JPEG", "WEBP")
+FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
+# Suffixes of images in formats that are not read.
+UNREAD = frozenset(
+    ".heic .heif .avif .jxl .jp2 .exr .hdr .tga .ppm .gif .dng .cr2 .cr3 .nef .arw".split()
+)
 # 16-bit and float greys have no fixed white; the rest converts to 8 bits without a choice.
 DEEP_MODES = ("I", "F", "I;16", "I;16B", "I;16L", "I;16N")
 # How the stored image becomes the one to be seen, by its EXIF orientation; 1 is as it is.
@@ -70,15 +74,12 @@ class Header:
     ambiguous_orientation: bool = False
 
 
-def image_at(path: Path) -> Path | None:
-    """The file at ``path``, or at ``path`` with an image suffix appended; None: there is none."""
-    candidates = [path.with_name(path.name + suffix) for suffix in SUFFIXES]
-    if path.suffix.lower() in SUFFIXES:
-        candidates.insert(0, path)
-    for candidate in candidates:
-        if os.path.isfile(candidate):  # Path.is_file raises on names that are too long
-            return candidate
-    return None
+def unread(folder: Path) -> str:
+    """What to do about images in ``folder`` in formats that are not read; empty: there are none."""
+    kinds = {path.suffix.lower() for path in entries(folder)} & UNREAD
+    if not kinds:
+        return ""
+    return f"; {', '.join(sorted(kinds))} files are there, which are not read: convert them to PNG"
 
 
 def _open(path: Path) -> Image.Image:

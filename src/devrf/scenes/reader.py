@@ -13,7 +13,8 @@ from pydantic.dataclasses import dataclass
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.scenes.files import Number
-from devrf.scenes.image_folders import Downscale, Missing, SizeAt, whole_factor
+from devrf.scenes.image_folders import Downscale, SizeAt, whole_factor
+from devrf.scenes.names import Missing
 from devrf.scenes.scene import Background, Capture, OpticalFlow, Scene, Views
 from devrf.scenes.space import SpaceChoice, centred, forward_facing_scene, inward_space
 from devrf.scenes.transforms import SceneBounds

@@ -11,15 +11,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from torch import Tensor
 
 from devrf.scenes.files import Name, Number, Positive, Vector3, Vector4, inside, read_json
-from devrf.scenes.image_folders import Missing, by_number, present_images
 from devrf.scenes.lens import CameraKeys, Intrinsics, frame_intrinsics, intrinsics_of
+from devrf.scenes.names import ImageFinder, Missing, in_order, present_images
 from devrf.scenes.validation import check_poses, scene_error
 
 TIME_TOLERANCE = 1e-6
@@ -39,12 +39,15 @@ class Frame(CameraKeys):
         transform_matrix: 4×4 or 3×4 camera-to-world, OpenGL axes, world units.
         time: in [0, 1]; None where no frame has one.
         mask_path: a grey image, relative to the file's folder.
+        timestep_index: with ``timestamp``, what other programs say of time; not read.
     """
 
     file_path: Name
     transform_matrix: Annotated[list[Vector4], Field(fail_fast=True, min_length=3, max_length=4)]
     time: Annotated[Number, AfterValidator(_time)] | None = None
     mask_path: Name | None = None
+    timestep_index: Any = None
+    timestamp: Any = None
 
 
 FileNames = Annotated[list[Name], Field(fail_fast=True)]
@@ -100,6 +103,7 @@ class Transforms:
             they were not asked for.
         skipped: how many images of the file are absent, and left out.
         bounds: where the scene is, if the file says so.
+        unread_times: keys of frames that say something of time, but are not read.
     """
 
     file: Path
@@ -110,6 +114,7 @@ class Transforms:
     masks: tuple[Path | None, ...] | None = None
     skipped: int = 0
     bounds: SceneBounds | None = None
+    unread_times: tuple[str, ...] = ()
 
     def __getitem__(self, index: Sequence[int]) -> Transforms:
         """The images at the positions ``index``, in that order."""
@@ -129,13 +134,13 @@ def read_transforms(
     *,
     masked: bool = False,
     missing: Missing = "error",
-    in_order: bool = False,
+    times_by_order: bool = False,
 ) -> tuple[TransformsFile, Transforms]:
     """What a transforms file below ``root``, the scene's folder, says, and its posed images.
 
     ``masked``: whether ``mask_path`` is followed, too; ``missing``: as for
-    :func:`devrf.scenes.image_folders.present_images`; ``in_order``: times are spread evenly over
-    the images in the order of their names, whatever the file says of times.
+    :func:`devrf.scenes.names.present_images`; ``times_by_order``: times are spread evenly over the
+    images in the order of their names, whatever the file says of times.
 
     Raises:
         DevrfError: the file or an image is missing, a value is wrong (NaN, a time outside [0, 1], a
@@ -146,8 +151,8 @@ def read_transforms(
     frames = [listing.frames[index] for index in images]
     where = [f"{file}: frames[{index}]" for index in images]
     times = [frame.time for frame in frames]
-    if in_order:
-        names = sorted((frame.file_path for frame in frames), key=by_number)
+    if times_by_order:
+        names = in_order((frame.file_path for frame in frames), name=str, where=file)
         moments = {name: k / max(len(names) - 1, 1) for k, name in enumerate(names)}
         times = [moments[frame.file_path] for frame in frames]
     known = [t for t in times if t is not None]
@@ -166,17 +171,38 @@ def read_transforms(
         tuple(images.values()),
         poses.float(),
         tuple(known) or None,
-        tuple(_mask(frame, file, root) for frame in frames) if masked else None,
+        _masks(frames, file, root) if masked else None,
         skipped=len(listing.frames) - len(frames),
         bounds=listing.scene_bounds,
+        unread_times=tuple(
+            key
+            for key in ("timestep_index", "timestamp")
+            if any(getattr(frame, key) is not None for frame in frames)
+        ),
     )
     return listing, transforms
 
 
-def _mask(frame: Frame, file: Path, root: Path) -> Path | None:
-    if frame.mask_path is None:
-        return None
-    path = inside(root, file.parent, frame.mask_path, file)
-    if not os.path.isfile(path):
-        raise scene_error(path, "no such mask; correct mask_path, or set data.masks=none")
-    return path
+def any_image(file: Path, root: Path) -> bool:
+    """Whether any image is there that a transforms file below ``root`` lists, if there is one."""
+    if not os.path.isfile(file):
+        return False
+    listing = read_json(file, TransformsFile, "every capture needs its posed images")
+    finder = ImageFinder(root)
+    places = (inside(root, file.parent, frame.file_path, file) for frame in listing.frames)
+    return any(finder.find(place) is not None for place in places)
+
+
+def _masks(frames: Sequence[Frame], file: Path, root: Path) -> tuple[Path | None, ...]:
+    finder = ImageFinder(root)
+
+    def mask(name: str | None) -> Path | None:
+        if name is None:
+            return None
+        place = inside(root, file.parent, name, file)
+        found = finder.find(place)
+        if found is None:
+            raise scene_error(place, "no such mask; correct mask_path, or set data.masks=none")
+        return found
+
+    return tuple(mask(frame.mask_path) for frame in frames)

@@ -85,7 +85,7 @@ def view_folders(folder: Path, downscale: int) -> list[ViewFolder]:
     views: list[ViewFolder] = []
     for _, path in sorted(numbered.items()):
         source = image_folder(path, downscale)
-        images = listed_images(source.path, numbered=True)
+        images = listed_images(source.path)
         if views and len(images) != len(views[0].images):
             raise scene_error(
                 source.path,

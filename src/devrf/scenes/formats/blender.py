@@ -11,9 +11,9 @@ from pydantic.dataclasses import dataclass
 
 from devrf.scenes.files import existing_folder, scene_folder
 from devrf.scenes.flow_files import FlowDirection, read_flow
-from devrf.scenes.image_folders import Missing
 from devrf.scenes.images import image_size
 from devrf.scenes.layout import Layout, fewer, load_layout, one_capture, static_alone
+from devrf.scenes.names import Missing
 from devrf.scenes.reader import InwardReader, Time
 from devrf.scenes.scene import OpticalFlow, Scene, Views
 from devrf.scenes.splits import at_rest, in_motion

@@ -9,10 +9,10 @@ from pathlib import Path, PurePosixPath
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
-from devrf.scenes.files import scene_folder
-from devrf.scenes.image_folders import Downscale, ImageFolder, image_folder, present_images
-from devrf.scenes.images import image_at
+from devrf.scenes.files import inside, scene_folder
+from devrf.scenes.image_folders import Downscale, ImageFolder, image_folder
 from devrf.scenes.layout import Layout, fewer, load_layout, static_alone
+from devrf.scenes.names import ImageFinder, present_images
 from devrf.scenes.reader import EstimatedFlow, FixedViewsReader, PosedReader
 from devrf.scenes.scene import Scene
 from devrf.scenes.sparse_model import (
@@ -43,7 +43,8 @@ def images_of(model: SparseModel, root: Path, factor: int) -> ImageFolder:
     """The folder of the model's images, which are read ``factor`` times smaller; or DevrfError."""
     source = image_folder(root, factor)
     # Smaller images that LLFF's tools have written have names of their own.
-    renamed = image_at(source.path / model.images[0].name) is None
+    first = inside(root, source.path, model.images[0].name, model.folder / "images")
+    renamed = ImageFinder(root).find(first) is None
     if renamed and source.path.name != IMAGES and os.path.isdir(root / IMAGES):
         return ImageFolder(root / IMAGES, factor)
     return source
@@ -119,8 +120,9 @@ class ColmapReader(PosedReader, FixedViewsReader):
     ) -> tuple[Layout, int | None]:
         """The splits, and by what the images of fixed views are yet to be made smaller."""
         lenses = model.intrinsics
-        names = [os.path.relpath(source / image.name, model.folder) for image in model.images]
-        present = present_images(names, model.folder / "images", folder, self.missing)
+        names = [image.name for image in model.images]
+        listing = model.folder / "images"
+        present = present_images(names, listing, folder, self.missing, relative_to=source)
         if len(present) < 2:
             raise scene_error(model.folder, "poses one image, expected one more to hold out")
         positions = list(present)

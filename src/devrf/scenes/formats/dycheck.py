@@ -15,7 +15,7 @@ from pydantic.dataclasses import dataclass
 from devrf.scenes.files import Ids, Number, inside, read_json
 from devrf.scenes.formats.nerfies import ItemsReader, Listed
 from devrf.scenes.image_folders import Downscale, ImageFolder
-from devrf.scenes.images import image_at
+from devrf.scenes.names import ImageFinder
 from devrf.scenes.splits import every_nth
 from devrf.scenes.validation import scene_error
 from devrf.system.options import abbreviated
@@ -90,7 +90,7 @@ class DycheckReader(ItemsReader):
             place = Path(COVISIBLE, size, "val")
             if os.path.isdir(folder / place):
                 files = (inside(folder, folder, f"{place}/{item}", folder / SPLITS) for item in ids)
-                return tuple(map(image_at, files))
+                return tuple(map(ImageFinder(folder).find, files))
         return (None,) * len(ids)
 
 

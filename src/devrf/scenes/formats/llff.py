@@ -22,6 +22,7 @@ from devrf.scenes.formats.llff_poses import (
 from devrf.scenes.image_folders import folder_size, image_folder, listed_images
 from devrf.scenes.images import image_size
 from devrf.scenes.layout import Layout, fewer, load_layout, static_alone, without_static_set
+from devrf.scenes.names import in_order
 from devrf.scenes.reader import FixedViewsReader, Time
 from devrf.scenes.scene import OpticalFlow, Scene, Views
 from devrf.scenes.space import forward_facing_scene
@@ -139,7 +140,10 @@ class LlffReader(FixedViewsReader):
         count = len(images.images)
         if count < 3:
             raise scene_error(images.file, f"a video of {count} images; expected at least 3")
-        timed = replace(images, times=tuple(k / (count - 1) for k in range(count)))
+        order = in_order(
+            range(count), name=lambda k: images.images[k].name, where=images.images[0].parent
+        )
+        timed = replace(images[order], times=tuple(k / (count - 1) for k in range(count)))
         train, test = (in_motion(timed[part]) for part in every_nth(count, self.holdout))
         times = None if self.frames is None else evenly_spread(train.times, self.frames)
         # The static set of a video is thinned out, too.
@@ -165,7 +169,7 @@ def _read_cameras(folder: Path, *, with_strays: bool) -> PosedSet:
 
 def _posed_images(posed: PosedSet, source: Path) -> Transforms:
     """All images in ``source`` with their cameras."""
-    images = listed_images(source)
+    images = listed_images(source, by_characters=True)
     if len(images) != len(posed):
         raise scene_error(
             posed.file,

@@ -31,11 +31,11 @@ from devrf.scenes.image_folders import (
     ImageFolder,
     folder_size,
     image_folder,
-    present_images,
 )
 from devrf.scenes.layout import fewer, load_layout, one_capture
 from devrf.scenes.lens import Intrinsics
 from devrf.scenes.masks import Masks
+from devrf.scenes.names import present_images
 from devrf.scenes.reader import EstimatedFlow, InwardReader, Time
 from devrf.scenes.scene import Capture, Scene
 from devrf.scenes.splits import every_nth

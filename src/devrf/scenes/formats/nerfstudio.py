@@ -14,9 +14,9 @@ from torch import Tensor
 
 from devrf.scenes.files import inside, scene_folder
 from devrf.scenes.image_folders import Downscale
-from devrf.scenes.images import image_at
 from devrf.scenes.layout import Layout, fewer, load_layout, one_capture, static_alone
 from devrf.scenes.masks import Masks
+from devrf.scenes.names import ImageFinder
 from devrf.scenes.reader import EstimatedFlow, PosedReader, Time
 from devrf.scenes.scene import Scene
 from devrf.scenes.splits import at_rest, distinct_poses, every_nth, in_motion, one_moment
@@ -115,7 +115,7 @@ def _splits(
         root,
         masked=options.masks != "none",
         missing=options.missing,
-        in_order=options.times == "order",
+        times_by_order=options.times == "order",
     )
     count = len(transforms.images)
     listed = {
@@ -143,8 +143,9 @@ def _listed(names: list[str] | None, split: str, transforms: Transforms, root: P
     """Positions in the file, ascending, of the images that it lists for a split."""
     position = {image: i for i, image in enumerate(transforms.images)}
     positions = list[int]()
+    finder = ImageFinder(root)
     for name in names or []:
-        image = image_at(inside(root, transforms.file.parent, name, transforms.file))
+        image = finder.find(inside(root, transforms.file.parent, name, transforms.file))
         if image is None and transforms.skipped:
             continue
         if image not in position:
