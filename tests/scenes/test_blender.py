@@ -282,6 +282,7 @@ def test_fixed_views_without_times_have_to_take_turns(scene_folder, message_of):
 
     path = scene_folder.root / MOVING
     scene_folder.edit(path, shuffle)
+    scene_folder.edit(scene_folder.dynamic / "transforms_test.json", shuffle)
     message = message_of(scene_folder.root)
     assert str(path) in message and "2 fixed views do not take turns" in message
 

@@ -22,6 +22,7 @@ from devrf.scenes.splits import (
     in_motion,
     load_views,
     one_moment,
+    standing,
 )
 from devrf.scenes.transforms import Transforms
 from devrf.scenes.validation import scene_error
@@ -83,6 +84,15 @@ def _poses_and_times(split: Split) -> Tensor:
 def static_alone(train: Transforms, test: Transforms, why: str) -> Layout:
     """The layout of a scene at rest, whose images all show one moment; ``why`` is for the log."""
     log.info("%s: %s: all images show one moment, the scene is at rest", train.file, why)
+    if cameras := standing(torch.cat([train.poses, test.poses])):
+        unread = f", not {' or '.join(train.unread_times)}" * bool(train.unread_times)
+        log.warning(
+            "%s: %s, as if the scene moved, but is learned at rest; if it moves, give each "
+            'frame its "time" in [0, 1]%s',
+            train.file,
+            cameras,
+            unread,
+        )
     train_set = at_one_moment(train)
     test_set = at_one_moment(test)
     return Layout(train_set, test_set, train_set, test_set)

@@ -96,6 +96,34 @@ def stand_still(pose: Tensor) -> bool:
     return len(pose) >= 2 * (int(pose.max()) + 1)
 
 
+# Where at least this share of images is by cameras that have others, too, the scene may well move.
+MANY_AGAIN = 0.25
+
+
+def standing(poses: Tensor) -> str | None:
+    """``4 cameras stand still for 6 images each``, by poses (N, 3, 4); None where few do."""
+    images = torch.bincount(distinct_poses(poses))
+    again = images[images > 1]
+    if int(again.sum()) < MANY_AGAIN * len(poses) or not len(again):
+        return None
+    cameras = "a camera stands" if len(again) == 1 else f"{len(again)} cameras stand"
+    least, most = int(again.min()), int(again.max())
+    count = f"{most} images each" if least == most else f"{least} to {most} images each"
+    return f"{cameras} still for {count.removesuffix(' each') if len(again) == 1 else count}"
+
+
+def check_timed_alike(*sets: Transforms) -> None:
+    """DevrfError if images of a file have several times and those of another none."""
+    timed = [transforms for transforms in sets if transforms.times is not None]
+    untimed = [transforms for transforms in sets if transforms.times is None]
+    if untimed and not one_moment(*timed):
+        raise scene_error(
+            untimed[0].file,
+            f'its frames have no "time", but those of {timed[0].file.name} have; give each its '
+            "time in [0, 1]",
+        )
+
+
 def at_rest(transforms: Transforms) -> Split:
     """A split of a scene at rest: every image its own view, time 0 unless the file says more."""
     count = len(transforms.images)

@@ -16,6 +16,7 @@ from devrf.geometry.clock import FrameClock
 from devrf.scenes.bounds import box_from_cameras
 from devrf.scenes.optical_flow import estimator, flow_between, frame_pairs
 from devrf.scenes.scene import Scene, Views
+from devrf.scenes.splits import standing
 
 # Largest gap between neighbouring static views, as seen from the box's middle, in degrees.
 WIDEST_GAP = 120.0
@@ -281,10 +282,16 @@ def _masks(scene: Scene) -> Iterator[Advice]:
 
 
 def _times(scene: Scene) -> Iterator[Advice]:
-    if not scene.moves:
-        return
     views = scene.dynamic.train
     clock = scene.clock
+    if not scene.moves:
+        if cameras := standing(views.cameras.camera_to_world):
+            yield Advice(
+                "static training set",
+                f"{cameras}, as if the scene moved, but all images have one time",
+                "if it moves, give each image its time",
+            )
+        return
     first = float(views.times.min())
     if first > FrameClock.TOLERANCE:
         yield Advice(

@@ -16,8 +16,15 @@ from devrf.scenes.layout import Layout, fewer, load_layout, one_capture, static_
 from devrf.scenes.names import Missing
 from devrf.scenes.reader import InwardReader, Time
 from devrf.scenes.scene import OpticalFlow, Scene, Views
-from devrf.scenes.splits import at_rest, in_motion
-from devrf.scenes.transforms import Transforms, read_transforms
+from devrf.scenes.splits import (
+    at_rest,
+    check_timed_alike,
+    distinct_poses,
+    every_nth,
+    in_motion,
+    stand_still,
+)
+from devrf.scenes.transforms import Transforms, any_image, read_transforms
 from devrf.scenes.view_folders import chosen_dynamic, dynamic_folders
 from devrf.system.options import Count
 
@@ -25,6 +32,8 @@ log = logging.getLogger(__name__)
 
 # The scene of D-NeRF's whose test images show it otherwise than those that are learned from.
 SCORED_ON_VAL = "lego"
+# One training image in so many is held out where no held-out image is there.
+HOLDOUT = 8
 
 
 @dataclass(frozen=True)
@@ -34,7 +43,9 @@ class BlenderReader(InwardReader):
     Two layouts: ``static/``, next to ``dynamic_<V>views/`` unless the scene is at rest; or the
     JSON files in ``root`` itself: with times (D-NeRF) the static capture is taken from the training
     images, without them (NeRF-synthetic) the scene is at rest. Without ``transforms_test.json``
-    ``transforms_val.json`` is held out; beside it, it is the validation split.
+    ``transforms_val.json`` is held out; beside it, it is the validation split. Where none of the
+    held-out images is there, some of the others are held out: one in :data:`HOLDOUT`, or the last
+    of three fixed cameras or more.
 
     Attributes:
         dynamic: which ``dynamic_*views`` folder, where there are several.
@@ -77,6 +88,7 @@ class BlenderReader(InwardReader):
             if layout.moves and root.name == SCORED_ON_VAL and os.path.isfile(val):
                 log.info("%s: scored on its val split: its test split shows another scene", root)
                 _, test = read_transforms(val, root, missing=self.missing)
+                check_timed_alike(train, test)
                 layout = one_capture(train, test, self.static_until)
         elif self.dynamic is None and not dynamic_folders(root):
             train, test = _train_and_test(static, root, self.missing)
@@ -95,7 +107,9 @@ class BlenderReader(InwardReader):
         test_file = layout.dynamic_test.transforms.file
         val = test_file.with_name("transforms_val.json")
         if self.validation and val != test_file and os.path.isfile(val):
-            layout = layout.with_validation(read_transforms(val, root, missing=self.missing)[1])
+            _, validation = read_transforms(val, root, missing=self.missing)
+            check_timed_alike(layout.dynamic_train.transforms, validation)
+            layout = layout.with_validation(validation)
         return *fewer(layout, self.train_views, self.frames), flow_folder
 
     def _flow(
@@ -107,7 +121,7 @@ class BlenderReader(InwardReader):
             log.info("flow files dropped: data.frames=%s leaves out neighbours", self.frames)
             return None
         if split.transforms.skipped:
-            log.info("flow files dropped: they are numbered by images of which some are absent")
+            log.info("flow files dropped: they are numbered by images of which some are left out")
             return None
         if any(not known.distortion.none for known in split.transforms.intrinsics):
             log.warning("flow files in %s left out: they are of images before undistortion", folder)
@@ -128,8 +142,32 @@ class BlenderReader(InwardReader):
 
 def _train_and_test(folder: Path, root: Path, missing: Missing) -> tuple[Transforms, Transforms]:
     """The images of a capture to learn from, and those held out."""
-    test = folder / "transforms_test.json"
-    val = folder / "transforms_val.json"
-    held_out = val if os.path.isfile(val) and not os.path.isfile(test) else test
-    _, train = read_transforms(folder / "transforms_train.json", root, missing=missing)
-    return train, read_transforms(held_out, root, missing=missing)[1]
+    file = folder / "transforms_train.json"
+    _, train = read_transforms(file, root, missing=missing)
+    test, val = (folder / f"transforms_{split}.json" for split in ("test", "val"))
+    held_out = next((listing for listing in (test, val) if any_image(listing, root)), None)
+    parts = None if held_out else _held_out_of(train)
+    if parts is None:
+        _, tested = read_transforms(held_out or test, root, missing=missing)
+        check_timed_alike(train, tested)
+        return train, tested
+    learned, scored = parts
+    log.warning(
+        "%s: no image of it is there; %d of the %d of %s are held out in their place",
+        test,
+        len(scored),
+        len(train.images),
+        file.name,
+    )
+    # Flow files are numbered by the images of the whole list.
+    return replace(train[learned], skipped=train.skipped + len(scored)), train[scored]
+
+
+def _held_out_of(train: Transforms) -> tuple[list[int], list[int]] | None:
+    """Positions to learn from and to hold out: the last of three fixed cameras or more, or some."""
+    camera = distinct_poses(train.poses)
+    if not stand_still(camera):
+        return every_nth(len(camera), HOLDOUT) if len(camera) > 1 else None
+    last = camera == camera.max()
+    parts = ((~last).nonzero()[:, 0].tolist(), last.nonzero()[:, 0].tolist())
+    return parts if int(camera.max()) >= 2 else None

@@ -1,0 +1,126 @@
+"""Times are read, or said to be missing: none is made up."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from devrf.apps.inspection.advice import advice_on
+from devrf.scenes.formats.blender import BlenderReader
+from devrf.scenes.formats.nerfstudio import NerfstudioReader
+
+
+def drop_times(content: dict[str, Any]) -> None:
+    for frame in content["frames"]:
+        frame.pop("time", None)
+
+
+@pytest.mark.parametrize(("bare", "timed"), [("test", "train"), ("train", "test")])
+def test_in_one_file_and_not_in_the_other(scene_folder, refusal, bare, timed):
+    file = scene_folder.dynamic / f"transforms_{bare}.json"
+    scene_folder.edit(file, drop_times)
+    message = refusal(BlenderReader, scene_folder.root)
+    assert message.startswith(f'{file}: its frames have no "time", but those of transforms_{timed}')
+
+
+def test_in_dnerfs_layout(single_folder, scene_folder, refusal):
+    file = single_folder / "transforms_test.json"
+    scene_folder.edit(file, drop_times)
+    assert refusal(BlenderReader, single_folder).startswith(f"{file}: its frames have no ")
+
+
+def test_of_a_validation_split(single_folder, scene_folder, refusal):
+    text = (single_folder / "transforms_test.json").read_text()
+    (single_folder / "transforms_val.json").write_text(text)
+    scene_folder.edit(single_folder / "transforms_val.json", drop_times)
+    message = refusal(BlenderReader, single_folder, validation=True)
+    assert message.startswith(f"{single_folder}/transforms_val.json: its frames have no ")
+
+
+def test_one_time_for_all_is_as_good_as_none(scene_folder):
+    def at_zero(content: dict[str, Any]) -> None:
+        for frame in content["frames"]:
+            frame["time"] = 0.0
+
+    scene_folder.edit(scene_folder.static / "transforms_train.json", at_zero)
+    assert not BlenderReader(scene_folder.root).read().static.train.times.any()
+
+
+def test_poses_that_come_again_without_times(tmp_path, balls, caplog):
+    root = tmp_path / "scene"
+    balls.write(root, [0.0] * 24)
+
+    def by_four_cameras(content: dict[str, Any]) -> None:
+        drop_times(content)
+        for k, frame in enumerate(content["frames"]):
+            frame["transform_matrix"] = content["frames"][k % 4]["transform_matrix"]
+            frame["timestep_index"] = k // 4
+
+    balls.edit(root, by_four_cameras)
+    scene = NerfstudioReader(root).read()
+    assert (
+        f"{root}/transforms.json: 4 cameras stand still for 6 images each, as if the scene moved, "
+        'but is learned at rest; if it moves, give each frame its "time" in [0, 1], not '
+        "timestep_index"
+    ) in caplog.messages
+    assert any("stand still for" in str(advice) for advice in advice_on(scene))
+
+
+def test_a_moving_camera_that_comes_back_is_no_tripod(tmp_path, balls, caplog):
+    root = tmp_path / "scene"
+    balls.write(root, [0.0] * 24)
+
+    def end_where_it_began(content: dict[str, Any]) -> None:
+        drop_times(content)
+        content["frames"][-1]["transform_matrix"] = content["frames"][0]["transform_matrix"]
+
+    balls.edit(root, end_where_it_began)
+    NerfstudioReader(root).read()
+    assert "stand" not in caplog.text
+
+
+def test_held_out_images_that_were_never_rendered(single_folder, caplog):
+    """Two images in place of every eighth one are held out of the training images."""
+    for image in (single_folder / "test").iterdir():
+        image.unlink()
+    scene = BlenderReader(single_folder).read()
+    assert scene.dynamic.test.names == ("train/r_007.png",)
+    assert scene.dynamic.train.names == tuple(f"train/r_00{k}.png" for k in range(7))
+    assert torch.equal(scene.dynamic.train.times, torch.arange(7) / 7)
+    assert (
+        f"{single_folder}/transforms_test.json: no image of it is there; 1 of the 8 of "
+        "transforms_train.json are held out in their place"
+    ) in caplog.messages
+
+
+def test_then_the_validation_images_are_taken_first(single_folder):
+    text = (single_folder / "transforms_test.json").read_text()
+    (single_folder / "transforms_val.json").write_text(text.replace("test/", "val/"))
+    (single_folder / "test").rename(single_folder / "val")
+    assert BlenderReader(single_folder).read().dynamic.test.names[0] == "val/r_000.png"
+
+
+def test_of_fixed_cameras_one_is_held_out(scene_folder, caplog):
+    train = scene_folder.dynamic / "transforms_train.json"
+
+    def third_camera(content: dict[str, Any]) -> None:
+        poses = [frame["transform_matrix"] for frame in content["frames"][:2]]
+        high = [[*row[:3], row[3] + 0.1] if row[3] else row for row in poses[0]]
+        for k, frame in enumerate(content["frames"]):
+            frame["transform_matrix"] = (*poses, high)[k % 3]
+            frame["time"] = float(k // 3)
+
+    scene_folder.edit(train, third_camera)
+    (scene_folder.dynamic / "transforms_test.json").unlink()
+    dynamic = BlenderReader(scene_folder.root).read().dynamic
+    assert dynamic.test.names == tuple(f"dynamic_2views/train/r_00{k}.png" for k in (2, 5))
+    assert dynamic.train.view.tolist() == [0, 1, 0, 1]
+    assert "2 of the 6 of transforms_train.json are held out" in caplog.text
+
+
+def test_of_two_cameras_none_can_be_held_out(scene_folder, refusal):
+    (scene_folder.dynamic / "transforms_test.json").unlink()
+    message = refusal(BlenderReader, scene_folder.root)
+    assert message.startswith(f"{scene_folder.dynamic}/transforms_test.json: no such file")
