@@ -169,3 +169,47 @@ def test_formats_that_are_not_read_are_named(llff_folder, refusal):
     message = refusal(LlffReader, llff_folder.root)
     assert message.startswith(f"{images}: no images")
     assert ".heic files are there, which are not read: convert them" in message
+
+
+POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n"
+
+
+@pytest.mark.parametrize("file", ["train/r_001.png", "transforms_train.json"])
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [(POINTER, "run git lfs pull"), (b"\n<!DOCTYPE html><html>", "download the file again")],
+)
+def test_what_stands_in_a_files_place(scene_folder, refusal, file, content, said):
+    (scene_folder.static / file).write_bytes(content)
+    message = refusal(BlenderReader, scene_folder.root)
+    assert message.startswith(str(scene_folder.static / file)) and message.endswith(said)
+
+
+def test_an_archive_is_to_be_unpacked(tmp_path, refusal):
+    (tmp_path / "scene.zip").write_bytes(b"PK")
+    assert "is an archive; unpack it" in refusal(BlenderReader, tmp_path / "scene.zip")
+
+
+def test_images_of_which_nothing_is_seen(scene_folder, refusal):
+    for file in (scene_folder.static / "train").iterdir():
+        iio.imwrite(file, np.zeros((24, 32, 4), np.uint8))
+    message = refusal(BlenderReader, scene_folder.root)
+    assert message.startswith(f"{scene_folder.static}/train/r_000.png: its alpha is 0 everywhere")
+
+
+def test_a_list_of_one_image(tmp_path, balls, refusal):
+    root = tmp_path / "scene"
+    balls.write(root, [0.0])
+    message = refusal(NerfstudioReader, root)
+    assert message == f"{root}/transforms.json: lists one image; add more, one of them to hold out"
+
+
+def test_a_matrix_that_is_transposed(scene_folder, refusal):
+    def transpose(content):
+        for frame in content["frames"]:
+            frame["transform_matrix"] = np.transpose(frame["transform_matrix"]).tolist()
+
+    scene_folder.edit(scene_folder.static / "transforms_train.json", transpose)
+    message = refusal(BlenderReader, scene_folder.root)
+    assert "frames[0].transform_matrix: its last row is " in message
+    assert "expected 0, 0, 0, 1; correct it, or transpose" in message

@@ -48,6 +48,52 @@ def test_depth_range_holds_the_sphere_around_the_box(ring_cameras, cube):
     assert far == pytest.approx(4 + math.sqrt(3), abs=1e-5)
 
 
+def _transposed(poses: torch.Tensor) -> torch.Tensor:
+    return torch.cat([poses[:, :, :3].mT, poses[:, :, 3:]], dim=2)
+
+
+def _to_camera(poses: torch.Tensor) -> torch.Tensor:
+    rotation = poses[:, :, :3].mT
+    return torch.cat([rotation, -rotation @ poses[:, :, 3:]], dim=2)
+
+
+def _opencv(poses: torch.Tensor) -> torch.Tensor:
+    return poses * torch.tensor([1.0, -1, -1, 1])
+
+
+@pytest.mark.parametrize(
+    ("written", "said"),
+    [
+        (_opencv, "in OpenCV's axes (y down, z ahead): negate the second and third column"),
+        (_to_camera, "from world to camera: invert each matrix; else set data.box"),
+        (
+            lambda poses: _to_camera(_opencv(poses)),
+            "from world to camera: invert each matrix, then",
+        ),
+        (_transposed, "transposed: transpose each rotation"),
+    ],
+)
+def test_poses_of_another_convention_are_named(ring_cameras, written, said):
+    cameras = ring_cameras(9, width=40, height=30, angle=0.7)
+    read = replace(cameras, camera_to_world=written(cameras.camera_to_world))
+    with pytest.raises(DevrfError) as caught:
+        axes_meet(read)
+    assert f"poses look as if they were {said}" in str(caught.value)
+
+
+def test_cameras_that_wander_are_of_no_other_convention(ring_cameras):
+    """Handheld, they look past the point by 25 degrees."""
+    cameras = ring_cameras(12, width=40, height=30, angle=0.7)
+    angle = torch.tensor(25.0).deg2rad() * torch.tensor([1.0, -1.0]).repeat(6)
+    aside = torch.eye(3).repeat(12, 1, 1)
+    aside[:, 0, 0] = aside[:, 2, 2] = angle.cos()
+    aside[:, 0, 2] = angle.sin()
+    aside[:, 2, 0] = -angle.sin()
+    poses = cameras.camera_to_world.clone()
+    poses[:, :, :3] = poses[:, :, :3] @ aside
+    axes_meet(replace(cameras, camera_to_world=poses))
+
+
 def test_parallel_axes_ask_for_a_box():
     where = torch.tensor([[0.0, 4, 0], [0.5, 4, 0], [1, 4, 0.3]])
     cameras = Cameras.looking_at(

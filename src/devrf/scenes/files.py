@@ -54,7 +54,26 @@ def decoding(path: Path, what: str, remedy: str) -> Iterator[None]:
     # Any exception: what decoders raise depends on the format and the damage.
     except Exception as error:
         reason = str(error) or type(error).__name__
-        raise scene_error(path, f"not a readable {what} ({reason}); {remedy}") from None
+        raise scene_error(
+            path, f"not a readable {what} ({reason}); {_stands_in(path) or remedy}"
+        ) from None
+
+
+def _stands_in(path: Path) -> str:
+    """What to do about a file that only stands for the one of its name; empty if it does not."""
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(64).lower()
+    except OSError:
+        return ""
+    if start.startswith(b"version https://git-lfs"):
+        return "it is a Git LFS pointer: run git lfs pull"
+    if start.lstrip().startswith((b"<!doctype html", b"<html")):
+        return "it is a web page: download the file again"
+    return ""
+
+
+ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar")
 
 
 def scene_folder(root: str | Path) -> Path:
@@ -68,6 +87,8 @@ def scene_folder(root: str | Path) -> Path:
 def existing_folder(folder: Path) -> Path:
     """``folder`` itself, or DevrfError if there is no such folder."""
     if os.path.isfile(folder):
+        if folder.suffix.lower() in ARCHIVES:
+            raise scene_error(folder, "is an archive; unpack it, and set data.root to its folder")
         parent = shlex.quote(f"data.root={folder.parent}")
         raise scene_error(folder, f"is a file, expected the scene's folder; write {parent}")
     if not os.path.isdir(folder):  # unlike Path.is_dir it raises on nothing
@@ -151,6 +172,8 @@ def read_json(file: Path, kind: type[Content], purpose: str) -> Content:
     except OSError as error:
         raise scene_error(file, f"cannot be read ({error.strerror}); {purpose}") from None
     except ValidationError as error:
+        if remedy := _stands_in(file):
+            raise scene_error(file, f"not JSON; {remedy}") from None
         raise first_error(error, f"{file}: ") from None
 
 

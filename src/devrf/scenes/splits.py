@@ -235,6 +235,12 @@ def load_views(
     )
     finish = cutting_out(mask_files, sizes, files) if masks == "alpha" else None
     loaded = load_images(files, downscale, sizes, finish, alpha_weighted=alpha_weighted)
+    if loaded.pixels.shape[3] == 4 and not bool(loaded.pixels[..., 3].any()):
+        raise scene_error(
+            files[0],
+            f"its alpha is 0 everywhere, and that of all {len(files)} images of its set: nothing "
+            "of them would be seen; save them without alpha, or with that of the subject",
+        )
     height, width = loaded.pixels.shape[1:3]
     distorted = [
         known.lens(loaded.width, loaded.height, file).scaled(

@@ -13,6 +13,7 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import torch
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from torch import Tensor
@@ -23,12 +24,23 @@ from devrf.scenes.names import ImageFinder, Missing, in_order, present_images
 from devrf.scenes.validation import check_poses, scene_error
 
 TIME_TOLERANCE = 1e-6
+# By how much the last row of a matrix may differ from 0, 0, 0, 1.
+LAST_ROW = 1e-3
 
 
 def _time(time: float) -> float:
     if not -TIME_TOLERANCE <= time <= 1 + TIME_TOLERANCE:
         raise ValueError(f"{time:g} is outside [0, 1]; rescale the times")
     return min(max(time, 0.0), 1.0)
+
+
+def _upright(matrix: list[Vector4]) -> list[Vector4]:
+    if len(matrix) == 4 and not np.allclose(matrix[3], (0, 0, 0, 1), atol=LAST_ROW):
+        raise ValueError(
+            f"its last row is {', '.join(f'{x:g}' for x in matrix[3])}, expected 0, 0, 0, 1; "
+            "correct it, or transpose the matrix if it has them in its last column"
+        )
+    return matrix
 
 
 class Frame(CameraKeys):
@@ -43,7 +55,11 @@ class Frame(CameraKeys):
     """
 
     file_path: Name
-    transform_matrix: Annotated[list[Vector4], Field(fail_fast=True, min_length=3, max_length=4)]
+    transform_matrix: Annotated[
+        list[Vector4],
+        Field(fail_fast=True, min_length=3, max_length=4),
+        AfterValidator(_upright),
+    ]
     time: Annotated[Number, AfterValidator(_time)] | None = None
     mask_path: Name | None = None
     timestep_index: Any = None

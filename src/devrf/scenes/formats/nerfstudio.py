@@ -118,6 +118,8 @@ def _splits(
         times_by_order=options.times == "order",
     )
     count = len(transforms.images)
+    if count == 1:
+        raise scene_error(file, "lists one image; add more, one of them to hold out")
     listed = {
         split: _listed(getattr(listing, f"{split}_filenames"), split, transforms, root)
         for split in ("train", "val", "test")
@@ -127,7 +129,7 @@ def _splits(
     train = listed["train"] or [i for i in range(count) if i not in elsewhere]
     if listed["train"] and not test:
         test = sorted(set(range(count)) - set(train))
-    elif not test and count > 1:
+    elif not test:
         train, test = every_nth(count, options.holdout)
     if not train or not test or set(train) & set(test):
         raise scene_error(
