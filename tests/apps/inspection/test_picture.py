@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -79,3 +80,9 @@ def test_what_alpha_or_masks_leave_out_is_chequered(tiny_scene):
         image = shown(changed, 0)
         assert (image[:, :12] == [255, 0, 0]).all()
         assert set(image[:, 12:].reshape(-1).tolist()) == {232, 255}
+
+
+def test_letters_that_the_font_lacks_are_drawn_without_a_warning(tiny_scene, tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        write_inspection_picture(tmp_path / "page.png", replace(tiny_scene, name="旗"))

@@ -16,13 +16,13 @@ from matplotlib.patheffects import withStroke
 from PIL import Image
 from torch import Tensor
 
+from devrf.apps.figures import write_figure
 from devrf.apps.images import evenly, flow_colors, flow_wheel, short_name, to_bytes
 from devrf.apps.inspection.layout import box_middle, box_points, common_up, horizontal_axes
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.optical_flow import frame_pairs
 from devrf.scenes.scene import OpticalFlow, Scene, Views
-from devrf.system.files import atomic_write
 
 # The page's width, and the heights of its parts, in inches of 100 pixels.
 WIDTH = 16.0
@@ -56,8 +56,7 @@ Section = tuple[str, Sequence[Sequence[Tile]]]
 
 def write_inspection_picture(path: Path, scene: Scene) -> None:
     """Write the page of a scene as a PNG, 1600 pixels wide and as high as it needs to be."""
-    with atomic_write(path) as partial:
-        inspection_figure(scene).savefig(partial, format="png", dpi="figure")
+    write_figure(path, inspection_figure(scene))
 
 
 def inspection_figure(scene: Scene) -> Figure:

@@ -16,10 +16,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
 
+from devrf.apps.figures import write_figure
 from devrf.apps.report.labels import METHODS
 from devrf.apps.report.runs import DEFAULT_METHOD, metric_over_time
 from devrf.apps.report.table import LPIPS, PSNR, SSIM, TIME, Block, Table
-from devrf.system.files import atomic_write
 
 # The palette of Okabe and Ito, distinguishable with colour-blindness; then each time the colour
 # furthest in CIELAB from those before, from white and from grey. Other dashes every eight colours.
@@ -324,5 +324,4 @@ def write_training_curve(
         figure.axes[1].set(xlabel="frame", ylabel="PSNR (dB)")
         figure.axes[1].set_title("the last visit of each frame", loc="left")
     axes.legend(loc="lower right", ncols=3)
-    with atomic_write(path) as partial:
-        figure.savefig(partial, format="png", dpi="figure")
+    write_figure(path, figure)

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 from PIL import Image, ImageDraw
 
+from devrf.apps.figures import write_figure
 from devrf.apps.report.plots import file_name, plots
 from devrf.apps.report.runs import collect
 from devrf.apps.report.table import Table, tabulate
@@ -18,7 +19,7 @@ from devrf.apps.report.text import latex, markdown, plain
 from devrf.apps.settings import ReportSettings
 from devrf.apps.video_file import fitted_font, write_pictures
 from devrf.errors import DevrfError
-from devrf.system.files import atomic_write, write_text
+from devrf.system.files import write_text
 
 # Pictures a second of the videos that show rows side by side.
 FPS = 10
@@ -73,8 +74,7 @@ def _write_plots(table: Table, folder: Path) -> dict[str, str]:
     links: dict[str, str] = {}
     for plot in plots(table):
         for suffix in (".png", ".pdf"):
-            with atomic_write(folder / "figures" / f"{plot.name}{suffix}") as partial:
-                plot.figure.savefig(partial)
+            write_figure(folder / "figures" / f"{plot.name}{suffix}", plot.figure)
         links[plot.shows] = f"figures/{plot.name}.png"
     return links
 
