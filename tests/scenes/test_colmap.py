@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import logging
 import shutil
 from collections.abc import Callable
 from functools import partial
@@ -17,7 +18,7 @@ from devrf.data.kind import faces_forward
 from devrf.geometry.cameras import Distortion
 from devrf.scenes.formats.colmap import ColmapReader
 from devrf.scenes.lens import Lens
-from devrf.scenes.sparse_model import normalised, read_model
+from devrf.scenes.sparse_model import normalised, read_model, scene_model
 
 # Not square, the principal point off the middle.
 WIDTH, HEIGHT, COUNT = 80, 60, 17
@@ -122,6 +123,62 @@ def test_smaller_images_are_used_where_they_are(folder):
     assert torch.equal(again.pixels, averaged.pixels)
 
 
+def test_smaller_images_that_are_not_complete_are_passed_over(folder, caplog):
+    shutil.copytree(folder / "images", folder / "images_2")
+    (folder / "images_2/round/img_03.png").unlink()
+    with caplog.at_level(logging.INFO):
+        scene = ColmapReader(folder, downscale=2).read()
+    assert len(scene.static.train) + len(scene.static.test) == COUNT
+    assert scene.static.train.names[0].startswith("images/") and scene.static.train.width == 40
+    assert "images_2 lacks 1 of the 17 posed images: those in images/ are made" in caplog.text
+
+
+def test_the_model_of_most_images_is_read_and_the_others_are_named(
+    folder, ring_cameras, write_sparse, caplog
+):
+    (folder / "sparse/0").rename(folder / "sparse/12")
+    ring = ring_cameras(COUNT, width=WIDTH, height=HEIGHT, angle=0.9)
+    write_sparse(folder / "sparse/0", ring[:3], NAMES[:3], POINTS)
+    (folder / "sparse/1").mkdir()
+    (folder / "sparse/1/cameras.txt").write_text("")
+    with caplog.at_level(logging.INFO):
+        scene = ColmapReader(folder, downscale=1).read()
+    assert len(scene.static.train) + len(scene.static.test) == COUNT
+    line = "sparse/12 is read, which poses the most images, 17; left alone: "
+    lines = [record.getMessage() for record in caplog.records if line in record.getMessage()]
+    assert len(lines) == 1
+    assert "sparse/0 (3 images)" in lines[0] and "sparse/1 (no images.txt)" in lines[0]
+    shutil.copytree(folder / "sparse/12", folder / "sparse/2")
+    assert scene_model(folder)[0].folder == folder / "sparse/2"  # the first of equal ones
+
+
+def test_images_without_a_pose_are_said(folder, ring_cameras, write_sparse, caplog):
+    ColmapReader(folder, downscale=1).read()
+    assert "are posed" not in caplog.text
+    shutil.rmtree(folder / "sparse/0")
+    ring = ring_cameras(COUNT, width=WIDTH, height=HEIGHT, angle=0.9)
+    write_sparse(folder / "sparse/0", ring[:15], NAMES[:15], POINTS)
+    ColmapReader(folder, downscale=1).read()
+    warnings = [record for record in caplog.records if record.levelname == "WARNING"]
+    assert len(warnings) == 1
+    assert f"15 of the 17 images in {folder}/images are posed" in warnings[0].getMessage()
+
+
+def test_a_camera_that_took_no_image_is_not_read(folder):
+    file = folder / "sparse/0/cameras.txt"
+    file.write_text(file.read_text() + "9 OPENCV_FISHEYE 80 60 88 84 42 28 0 0 0 0\n")
+    assert sorted(read_model(folder / "sparse/0").cameras) == [1]
+
+
+def test_full_opencv_is_read_where_nothing_divides(folder, message_of):
+    rewrite(folder, "cameras", " OPENCV ", " FULL_OPENCV ")
+    rewrite(folder, "cameras", "\n", " 0.05 0 0 0\n")
+    (lens,) = {known.distortion for known in read_model(folder / "sparse/0").intrinsics}
+    assert lens == Distortion((-0.3, 0.1, 0.05, 0.0), (0.006, -0.008))
+    rewrite(folder, "cameras", " 0.05 0 0 0\n", " 0.05 0 0.01 0\n")
+    assert "camera model FULL_OPENCV is not supported" in message_of(folder)
+
+
 @pytest.fixture
 def moving(folder) -> Path:
     """Three fixed cameras of three frames stand where 00, 02 and 04 were taken."""
@@ -164,6 +221,14 @@ def test_fixed_views_are_posed_by_an_image_of_each(moving, message_of):
         (
             lambda root: rewrite(root, "cameras", " OPENCV ", " OPENCV_FISHEYE "),
             "sparse/0: camera model OPENCV_FISHEYE is not supported, only SIMPLE_PINHOLE",
+        ),
+        (
+            lambda root: (root / "sparse/0/points3D.txt").rename(root / "sparse/0/points3D.ply"),
+            "sparse/0/points3D.txt: no such file; a COLMAP model is cameras, images, points3D",
+        ),
+        (
+            lambda root: rewrite(root, "images", "round/img_", "my photo_"),
+            "sparse/0: poses 'my' twice; text models cut names at spaces",
         ),
     ],
 )

@@ -9,7 +9,7 @@ import pytest
 
 from devrf.data.recorded import InwardFacingDataModule
 from devrf.errors import DevrfError
-from devrf.scenes.formats import recognise
+from devrf.scenes.formats import check_choice, recognise
 
 PARTS = ("cameras", "images", "points3D")
 MODEL = [f"sparse/0/{part}.bin" for part in PARTS]
@@ -25,6 +25,7 @@ LAYOUTS = {
     "Neural 3D Video": ("neural_3d_video", ["poses_bounds.npy", "cam00.mp4", "cam01.mp4"]),
     "COLMAP": ("colmap", [*MODEL, "images/0.jpg"]),
     "COLMAP, one folder less": ("colmap", [f"sparse/{part}.txt" for part in PARTS]),
+    "COLMAP's second model": ("colmap", [f"sparse/1/{part}.bin" for part in PARTS]),
     "COLMAP, as nerfstudio leaves it": ("colmap", [f"colmap/{name}" for name in MODEL]),
     # mip-NeRF 360 has both; a video says its times, a model of COLMAP does not.
     "COLMAP beside LLFF": ("colmap", ["poses_bounds.npy", *MODEL]),
@@ -59,7 +60,7 @@ def test_what_each_layout_lacks_is_said_in_one_line(tmp_path: Path) -> None:
         "DeVRF: no static/transforms_train.json",
         "D-NeRF, NeRF-synthetic: no transforms_train.json",
         "instant-ngp: no transforms.json",
-        "COLMAP: no sparse/**/cameras.*",
+        "COLMAP: no sparse/0/cameras.bin",
         "LLFF: no poses_bounds.npy",
         "set data.root to the scene's folder",
     ):
@@ -70,7 +71,28 @@ def test_what_each_layout_lacks_is_said_in_one_line(tmp_path: Path) -> None:
 def test_an_incomplete_model_is_left_alone_and_said(tmp_path: Path) -> None:
     layout = recognise(touch(tmp_path, ["poses_bounds.npy", *MODEL[:2]]))
     assert layout.choice == "forward"
-    assert "its sparse/ is incomplete, no sparse/**/points3D.*: left alone" in layout.remark
+    assert "its sparse/ is incomplete, no sparse/0/points3D.bin: left alone" in layout.remark
+
+
+@pytest.mark.parametrize(
+    ("files", "missing"),
+    [
+        ([*MODEL[:2], "sparse/0/points3D.ply", "images/0.jpg"], "sparse/0/points3D.bin"),
+        (["sparse/0/images.txt", "sparse/0/points3D.txt"], "sparse/0/cameras.txt"),
+        # Parts of two models are none.
+        ([*MODEL[:2], "sparse/1/points3D.bin"], "sparse/0/points3D.bin"),
+        (["colmap/sparse/0/cameras.bin", "colmap/sparse/0/points3D.bin"], "sparse/0/images.bin"),
+    ],
+)
+def test_the_missing_file_of_a_model_is_named(tmp_path: Path, files, missing) -> None:
+    touch(tmp_path, files)
+    with pytest.raises(DevrfError, match=f"{missing}: no such file; a COLMAP model is ") as caught:
+        recognise(tmp_path)
+    assert len(str(caught.value).splitlines()) == 1
+    touch(tmp_path, ["transforms.json"])
+    with pytest.raises(DevrfError, match=f"{missing}: no such file"):
+        check_choice(tmp_path, "colmap")
+    assert recognise(tmp_path).choice == "nerfstudio"
 
 
 @pytest.mark.parametrize(

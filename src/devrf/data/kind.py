@@ -15,7 +15,7 @@ from devrf.scenes.files import read_json
 from devrf.scenes.formats.dycheck import DycheckReader
 from devrf.scenes.formats.llff_poses import PRECOMPUTED
 from devrf.scenes.formats.nerfies import NerfiesReader
-from devrf.scenes.sparse_model import ONE_SIDE, model_folder, read_model, widest_angle
+from devrf.scenes.sparse_model import ONE_SIDE, scene_model, widest_angle
 from devrf.scenes.splits import distinct_poses, distinct_times, stand_still
 from devrf.scenes.transforms import TransformsFile
 from devrf.scenes.view_folders import dynamic_folders
@@ -37,8 +37,7 @@ def faces_forward(choice: str, root: str | Path, space: str | None) -> bool:
         bounds = [listing.scene_bounds for listing in listings if listing is not None]
         return any(known is not None and known.space == "ndc" for known in bounds)
     with suppress(DevrfError):
-        place = model_folder(folder)
-        return place is not None and widest_angle(read_model(place).poses) <= ONE_SIDE
+        return widest_angle(scene_model(folder)[0].poses) <= ONE_SIDE
     return False
 
 

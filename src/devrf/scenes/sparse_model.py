@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import importlib
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from importlib.util import find_spec
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,20 +18,27 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.poses import average_pose, relative_to
 from devrf.scenes.bounds import LEAST_COSINE, nearest_point
-from devrf.scenes.files import decoding
+from devrf.scenes.files import decoding, entries
+from devrf.scenes.image_folders import by_number
 from devrf.scenes.lens import CameraKeys, Intrinsics, intrinsics_of
 from devrf.scenes.validation import FARTHEST, in_reach, scene_error
+from devrf.system.options import abbreviated
 
-# Parameters of each camera model that can be read, in COLMAP's order.
+# The files of a model, binary or as text.
+PARTS = ("cameras", "images", "points3D")
+# Parameters of each camera model that can be read, in COLMAP's order; further ones have to be 0.
 PARAMETERS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
     "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    # Its next three parameters divide the radial terms.
+    "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"),
 }
 
 
@@ -100,14 +108,76 @@ class SparseModel:
         return -(away @ pose[:, 2])
 
 
-def model_folder(root: Path) -> Path | None:
-    """Where a scene's model is: ``sparse/0``, ``sparse`` or ``colmap/sparse/0``; None: nowhere."""
-    for inner in ("sparse/0", "sparse", "colmap/sparse/0"):
-        for suffix in ("bin", "txt"):
-            files = (root / inner / f"{part}.{suffix}" for part in ("cameras", "images"))
-            if all(map(os.path.isfile, files)):
-                return root / inner
-    return None
+@dataclass(frozen=True)
+class ModelFolders:
+    """The folders of a scene that hold a model, or a part of one.
+
+    Attributes:
+        whole: those with all files of a model, ``sparse/0`` first.
+        missing: the first file that each of the others lacks, by the folder.
+    """
+
+    whole: list[Path] = field(default_factory=list)
+    missing: dict[Path, Path] = field(default_factory=dict)
+
+    @property
+    def lacks(self) -> Path | None:
+        """The missing file, where no model is whole, but some files of one are there."""
+        return None if self.whole else next(iter(self.missing.values()), None)
+
+    def check(self) -> None:
+        """DevrfError that names the missing file, if :attr:`lacks` says that there is one."""
+        if self.lacks is not None:
+            raise scene_error(
+                self.lacks,
+                f"no such file; a COLMAP model is {', '.join(PARTS)}, all .bin or all .txt: copy "
+                "it from where the mapper wrote it, or run the mapper again",
+            )
+
+
+def model_folders(root: Path) -> ModelFolders:
+    """Where models are: in folders of ``sparse/``, in it, and in the same below ``colmap/``."""
+    found = ModelFolders()
+    for above in (root / "sparse", root / "colmap/sparse"):
+        inner = [path for path in entries(above) if path.is_dir()] if os.path.isdir(above) else []
+        for folder in (*sorted(inner, key=lambda path: by_number(path.name)), above):
+            lacks = [
+                [file for part in PARTS if not os.path.isfile(file := folder / f"{part}.{suffix}")]
+                for suffix in ("bin", "txt")
+            ]
+            fewest = min(lacks, key=len)
+            if not fewest:
+                found.whole.append(folder)
+            elif len(fewest) < len(PARTS):
+                found.missing[folder] = fewest[0]
+    return found
+
+
+def scene_model(root: Path) -> tuple[SparseModel, list[str]]:
+    """The model of a scene that poses the most images, of equal ones the first; and the others.
+
+    The mapper writes several where it cannot join all images. The others are in words, for the
+    log. DevrfError where there is no model, or none can be read; the message says what is missing.
+    """
+    found = model_folders(root)
+    found.check()
+    models = dict[Path, Any]()
+    others = {folder: f"no {file.name}" for folder, file in found.missing.items()}
+    errors = list[DevrfError]()
+    for folder in found.whole:
+        try:
+            models[folder] = _opened(folder)
+            others[folder] = f"{models[folder].num_reg_images()} images"
+        except DevrfError as error:
+            errors.append(error)
+            others[folder] = "not readable"
+    if not models:
+        nothing = "no COLMAP model; set data.root to the folder of sparse/ and images/"
+        raise errors[0] if errors else scene_error(root, nothing)
+    best = max(models, key=lambda folder: models[folder].num_reg_images())
+    del others[best]
+    words = [f"{folder.relative_to(root)} ({what})" for folder, what in others.items()]
+    return _of_reconstruction(best, models[best]), words
 
 
 def read_model(folder: Path) -> SparseModel:
@@ -115,31 +185,49 @@ def read_model(folder: Path) -> SparseModel:
 
     DevrfError without pycolmap, for a missing or damaged file, or an unknown camera model.
     """
+    return _of_reconstruction(folder, _opened(folder))
+
+
+def _opened(folder: Path) -> Any:
+    """The pycolmap.Reconstruction in a folder."""
     if find_spec("pycolmap") is None:
         raise scene_error(folder, 'pycolmap reads it; run pip install "devrf[capture]"')
     library: Any = importlib.import_module("pycolmap")
     library.logging.minloglevel = 3
     with decoding(folder, "COLMAP model", "run COLMAP's mapper again"):
-        model = library.Reconstruction(folder)
-        numbers = np.array(sorted(model.point3D_ids()), np.int64)
-        points = np.array([model.point3D(n).xyz for n in numbers.tolist()], np.float64)
-        cameras = {number: _camera(folder, camera) for number, camera in model.cameras.items()}
-        images = [_image(image) for image in model.images.values() if image.has_pose]
+        return library.Reconstruction(folder)
+
+
+def _of_reconstruction(folder: Path, model: Any) -> SparseModel:
+    images = [_image(image) for image in model.images.values() if image.has_pose]
     if not images:
         raise scene_error(folder, "poses no image; run COLMAP's mapper again")
     ordered = tuple(sorted(images, key=lambda image: image.name))
+    for before, after in pairwise(ordered):
+        if before.name == after.name:
+            raise scene_error(
+                folder,
+                f"poses {abbreviated(after.name)} twice; text models cut names at spaces: rename "
+                "the images, and run COLMAP again",
+            )
+    used = sorted({image.camera for image in images})
+    cameras = {number: _camera(folder, model.cameras[number]) for number in used}
+    numbers = np.array(sorted(model.point3D_ids()), np.int64)
+    points = np.array([model.point3D(n).xyz for n in numbers.tolist()], np.float64)
     return SparseModel(folder, cameras, ordered, points.reshape(-1, 3), numbers)
 
 
 def _camera(folder: Path, camera: Any) -> dict[str, float]:
     model = str(camera.model_name)
-    if model not in PARAMETERS:
+    names = PARAMETERS.get(model, ())
+    values = camera.params.tolist()
+    if not names or any(values[len(names) :]):
         raise scene_error(
             folder,
-            f"camera model {model} is not supported, only {', '.join(PARAMETERS)}; run COLMAP's "
-            "image_undistorter, and give its folder",
+            f"camera model {model} is not supported, only {', '.join(PARAMETERS)} (k4 to k6 all "
+            "0); run COLMAP's image_undistorter, and give its folder",
         )
-    parameters = dict(zip(PARAMETERS[model], camera.params.tolist(), strict=True))
+    parameters = dict(zip(names, values, strict=False))
     focal = parameters.pop("f", 0.0)
     fx = parameters.pop("fx", focal)
     fy = parameters.pop("fy", focal)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from devrf.scenes.files import entries, scene_folder
 from devrf.scenes.images import SUFFIXES
+from devrf.scenes.sparse_model import PARTS, model_folders
 from devrf.scenes.validation import scene_error
 
 
@@ -34,9 +35,8 @@ class KnownLayout:
         return [name for name in self.files if not any(map(os.path.isfile, root.glob(name)))]
 
 
-COLMAP = KnownLayout(
-    "colmap", "COLMAP", ("sparse/**/cameras.*", "sparse/**/images.*", "sparse/**/points3D.*")
-)
+# Where else its models may be, and in which form, says model_folders.
+COLMAP = KnownLayout("colmap", "COLMAP", tuple(f"sparse/0/{part}.bin" for part in PARTS))
 # A folder with files of several layouts has the first of them: layouts of two captures come before
 # those of one, and files that say more about the images before files that say less.
 LAYOUTS = (
@@ -49,7 +49,6 @@ LAYOUTS = (
     KnownLayout("nerfstudio", "nerfstudio, instant-ngp", ("transforms.json",)),
     KnownLayout("neural_3d_video", "Neural 3D Video", ("poses_bounds.npy", "cam*.mp4")),
     KnownLayout("forward", "NR-NeRF", ("precomputed.json",)),
-    replace(COLMAP, files=tuple(f"colmap/{file}" for file in COLMAP.files)),
     COLMAP,
     KnownLayout("forward", "LLFF", ("poses_bounds.npy",)),
 )
@@ -63,14 +62,16 @@ def recognise(root: str | Path) -> KnownLayout:
     chosen = fitting[0]
     others = sorted({layout.choice for layout in fitting} - {chosen.choice})
     also = f"; it would fit data={' and data='.join(others)} too" if others else ""
-    if COLMAP not in fitting and os.path.isdir(folder / "sparse"):
-        also += f"; its sparse/ is incomplete, no {', '.join(COLMAP.missing(folder))}: left alone"
+    if COLMAP not in fitting and (file := model_folders(folder).lacks):
+        also += f"; its sparse/ is incomplete, no {file.relative_to(folder)}: left alone"
     return replace(chosen, remark=also)
 
 
 def check_choice(root: str | Path, choice: str) -> None:
     """DevrfError that names the right option, if ``data=choice`` does not read such a folder."""
     folder, fitting = _fitting(root)
+    if choice == COLMAP.choice:
+        model_folders(folder).check()
     if all(layout.choice != choice for layout in fitting):
         layout = fitting[0]
         raise scene_error(
@@ -88,6 +89,7 @@ def _fitting(root: str | Path) -> tuple[Path, list[KnownLayout]]:
     folder = scene_folder(root)
     fitting = _layouts(folder)
     if not fitting:
+        model_folders(folder).check()
         raise scene_error(folder, _of_no_layout(folder))
     return folder, fitting
 
@@ -95,7 +97,14 @@ def _fitting(root: str | Path) -> tuple[Path, list[KnownLayout]]:
 def _layouts(folder: Path) -> list[KnownLayout]:
     """The layouts that a folder has, the preferred one first; installed packages' come before."""
     installed = [point.load() for point in entry_points(group="devrf.layouts")]
-    return [layout for layout in (*installed, *LAYOUTS) if not layout.missing(folder)]
+    known = (*installed, *LAYOUTS)
+    return [layout for layout in known if _fits(layout, folder)]
+
+
+def _fits(layout: KnownLayout, folder: Path) -> bool:
+    if layout is COLMAP:
+        return bool(model_folders(folder).whole)
+    return not layout.missing(folder)
 
 
 def _of_no_layout(folder: Path) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from dataclasses import KW_ONLY
 from pathlib import Path, PurePosixPath
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from devrf.scenes.files import inside, scene_folder
 from devrf.scenes.image_folders import Downscale, ImageFolder, image_folder
+from devrf.scenes.images import SUFFIXES
 from devrf.scenes.layout import Layout, fewer, load_layout, static_alone
 from devrf.scenes.names import ImageFinder, present_images
 from devrf.scenes.reader import EstimatedFlow, FixedViewsReader, PosedReader
@@ -19,9 +21,8 @@ from devrf.scenes.sparse_model import (
     Facing,
     SparseModel,
     World,
-    model_folder,
     normalised,
-    read_model,
+    scene_model,
 )
 from devrf.scenes.splits import at_rest, every_nth
 from devrf.scenes.transforms import SceneBounds, Transforms
@@ -34,20 +35,57 @@ from devrf.scenes.view_folders import (
     view_folders,
 )
 
+log = logging.getLogger(__name__)
+
 IMAGES = "images"
+# A larger share of the images without a pose is worth a warning.
+UNPOSED = 0.05
 # How the cameras face the scene, by ``data.space``; other spaces: inward.
 FACING: dict[str, Facing] = {"auto": "auto", "ndc": "forward"}
 
 
 def images_of(model: SparseModel, root: Path, factor: int) -> ImageFolder:
-    """The folder of the model's images, which are read ``factor`` times smaller; or DevrfError."""
+    """The folder of the model's images, which are read ``factor`` times smaller; or DevrfError.
+
+    A folder of smaller images is passed over if ``images/`` has more of them: LLFF's tools rename
+    what they make smaller, and copies may be incomplete.
+    """
     source = image_folder(root, factor)
-    # Smaller images that LLFF's tools have written have names of their own.
-    first = inside(root, source.path, model.images[0].name, model.folder / "images")
-    renamed = ImageFinder(root).find(first) is None
-    if renamed and source.path.name != IMAGES and os.path.isdir(root / IMAGES):
-        return ImageFolder(root / IMAGES, factor)
-    return source
+    full = root / IMAGES
+    if source.path == full or not os.path.isdir(full):
+        return source
+
+    finder = ImageFinder(root)
+
+    def absent(folder: Path) -> int:
+        places = (inside(root, folder, image.name, model.folder) for image in model.images)
+        return sum(finder.find(place) is None for place in places)
+
+    lacks = absent(source.path)
+    if lacks <= absent(full):
+        return source
+    log.info(
+        "%s lacks %d of the %d posed images: those in %s/ are made smaller",
+        source.path,
+        lacks,
+        len(model.images),
+        IMAGES,
+    )
+    return ImageFolder(full, factor)
+
+
+def warn_of_unposed(posed: int, folder: Path) -> None:
+    """Warn if a good part of the images in a folder is not among the ``posed`` ones."""
+    files = (path for path in folder.rglob("[!.]*") if path.suffix.lower() in SUFFIXES)
+    total = sum(map(os.path.isfile, files))
+    if total - posed > UNPOSED * total:
+        log.warning(
+            "%d of the %d images in %s are posed, the others are left out; for more of them, "
+            "film with more overlap, or run COLMAP's mapper again",
+            posed,
+            total,
+            folder,
+        )
 
 
 def fixed_cameras(model: SparseModel, folder: Path, count: int) -> list[int]:
@@ -74,7 +112,9 @@ def fixed_cameras(model: SparseModel, folder: Path, count: int) -> list[int]:
 
 @dataclass(frozen=True)
 class ColmapReader(PosedReader, FixedViewsReader):
-    """Reads COLMAP's ``sparse/0`` (or ``sparse``), binary or as text, and ``images/``.
+    """Reads COLMAP's ``sparse/0``, binary or as text, and ``images/``.
+
+    Of several models in ``sparse/`` that with the most images is read.
 
     The scene is at rest, unless there are folders ``dynamic_<V>views/view1`` … of fixed cameras, as
     in DeVRF's forward-facing layout; the model then poses an image of each, ``view1.png`` or in
@@ -97,12 +137,14 @@ class ColmapReader(PosedReader, FixedViewsReader):
     def read(self) -> Scene:
         """See :meth:`devrf.scenes.reader.SceneReader.read`."""
         folder = scene_folder(self.root)
-        place = model_folder(folder)
-        if place is None:
-            raise scene_error(
-                folder, "no COLMAP model; set data.root to the folder of sparse/ and images/"
+        model, others = scene_model(folder)
+        if others:
+            log.info(
+                "%s is read, which poses the most images, %d; left alone: %s",
+                model.folder,
+                len(model.images),
+                ", ".join(others),
             )
-        model = read_model(place)
         world = normalised(model, FACING.get(self.space, "inward"))
         camera = model.cameras[model.images[0].camera]
         width = int(camera["w"])
@@ -123,6 +165,7 @@ class ColmapReader(PosedReader, FixedViewsReader):
         names = [image.name for image in model.images]
         listing = model.folder / "images"
         present = present_images(names, listing, folder, self.missing, relative_to=source)
+        warn_of_unposed(len(present), source)
         if len(present) < 2:
             raise scene_error(model.folder, "poses one image, expected one more to hold out")
         positions = list(present)
