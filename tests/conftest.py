@@ -253,9 +253,9 @@ def sparse_model(
     (folder / "cameras.txt").write_text(f"1 {model} {cameras.width} {cameras.height} {numbers}\n")
     lines = []
     for k, pose in enumerate(cameras.camera_to_world.double()):
-        turn = (pose[:, :3] * pose.new_tensor([1, -1, -1])).T
-        x, y, z, w = Rotation.from_matrix(turn.numpy()).as_quat().tolist()
-        moved = (-turn @ pose[:, 3]).tolist()
+        turn = Rotation.from_matrix((pose[:, :3] * pose.new_tensor([1, -1, -1])).T.numpy())
+        x, y, z, w = turn.as_quat().tolist()
+        moved = (-turn.as_matrix() @ pose[:, 3].numpy()).tolist()
         lines.append(" ".join(map(repr, (k + 1, w, x, y, z, *moved, 1))) + f" {names[k]}")
         lines.append(" ".join(f"0.5 0.5 {number}" for number in range(len(points))))
     (folder / "images.txt").write_text("\n".join(lines) + "\n")

@@ -125,6 +125,8 @@ CONTRADICTIONS: dict[str, Callable[[dict[str, Any]], object]] = {
     "no class of a field": lambda data: data["devrf"]["model"].update(color_residual=0),
     "a mask of other rank": lambda data: data["state_dict"].update({MASK: torch.ones(2, 2) > 0}),
     "colours of one point": lambda data: data["state_dict"].update({COLOR: torch.ones(1, 1, 1, 4)}),
+    "an offset of two": lambda data: data["viewpoints"].update(offset=(1.0, 2.0)),
+    "an offset without end": lambda data: data["viewpoints"].update(offset=(math.inf, 0.0, 0.0)),
     "cameras of double precision": lambda data: data["viewpoints"]["held_out"].update(
         focal=torch.ones(1, 2).double()
     ),
@@ -134,6 +136,15 @@ CONTRADICTIONS: dict[str, Callable[[dict[str, Any]], object]] = {
 @pytest.mark.parametrize("change", CONTRADICTIONS.values(), ids=list(CONTRADICTIONS))
 def test_a_checkpoint_that_contradicts_itself_is_refused(canonical, change):
     refusal(edit(canonical, change))
+
+
+def test_the_offset_of_the_world_comes_back(canonical):
+    assert load_checkpoint(canonical).viewpoints.offset == (0, 0, 0)
+    far = (500_000.0, 5_600_000.0, 200.0)
+    edit(canonical, lambda data: data["viewpoints"].update(offset=far))
+    assert load_checkpoint(canonical).viewpoints.offset == far
+    edit(canonical, lambda data: data["viewpoints"].pop("offset"))  # an earlier version's
+    assert load_checkpoint(canonical).viewpoints.offset == (0, 0, 0)
 
 
 GRID = "scene_model.canonical.density.values"

@@ -38,6 +38,27 @@ def test_published_layout(scene_folder):
     assert scene.static.train.view.tolist() == list(range(6))
 
 
+def test_fixed_cameras_a_metre_apart_are_two_however_far_away(scene_folder):
+    """Both cameras count as one where they are compared with their distance from the origin."""
+    near = BlenderReader(scene_folder.root).read()
+
+    def carry(content: dict[str, Any]) -> None:
+        for frame in content["frames"]:
+            for row, step in zip(frame["transform_matrix"], (5e6, -3e6, 4e6), strict=False):
+                row[3] += step
+
+    for folder in (scene_folder.static, scene_folder.dynamic):
+        for split in ("train", "test"):
+            scene_folder.edit(folder / f"transforms_{split}.json", carry)
+    far = BlenderReader(scene_folder.root).read()
+    assert far.offset == (5e6, -3e6, 4e6)
+    assert far.dynamic.train.view.tolist() == [0, 1, 0, 1, 0, 1]
+    for name in ("static", "dynamic"):
+        poses = near.capture(name).test.cameras.camera_to_world
+        moved = far.capture(name).test.cameras.camera_to_world
+        torch.testing.assert_close(moved, poses, rtol=0, atol=1e-6)
+
+
 def test_camera_angle_becomes_a_focal_length_and_a_known_pixel(scene_folder):
     cameras = BlenderReader(scene_folder.root).read().static.train.cameras
     focal = 16 / math.tan(0.4)

@@ -6,6 +6,7 @@ import importlib
 import logging
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -16,6 +17,7 @@ import torch
 
 from devrf.data.kind import faces_forward
 from devrf.geometry.cameras import Distortion
+from devrf.geometry.offset import added
 from devrf.scenes.formats.colmap import ColmapReader
 from devrf.scenes.lens import Lens
 from devrf.scenes.sparse_model import normalised, read_model, scene_model
@@ -78,6 +80,26 @@ def test_the_world_is_upright_around_what_is_looked_at(folder):
 def opaque(folder: Path) -> None:
     for path in (folder / "images/round").iterdir():
         iio.imwrite(path, iio.imread(path)[..., :3])
+
+
+def test_a_model_far_from_the_origin_is_read_as_the_same_near_it(
+    folder, ring_cameras, write_sparse
+):
+    near = ColmapReader(folder, downscale=1).read()
+    far = torch.tensor([500_000.0, 5_600_000.0, 200.0], dtype=torch.float64)
+    ring = ring_cameras(COUNT, width=WIDTH, height=HEIGHT, angle=0.9)
+    poses = added(ring.camera_to_world, tuple(far.tolist()))
+    shutil.rmtree(folder / "sparse/0")
+    cameras = replace(ring, camera_to_world=poses)
+    write_sparse(folder / "sparse/0", cameras, NAMES, POINTS.double() + far, "OPENCV", OPENCV)
+    again = ColmapReader(folder, downscale=1).read()
+    assert again.offset == (0, 0, 0)  # the world has an origin of its own
+    torch.testing.assert_close(
+        again.static.train.cameras.camera_to_world,
+        near.static.train.cameras.camera_to_world,
+        rtol=0,
+        atol=1e-5,
+    )
 
 
 def test_photographs_are_of_a_scene_without_end(folder):

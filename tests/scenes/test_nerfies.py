@@ -74,6 +74,25 @@ def test_points_fall_on_the_pixels_that_show_them(folder, balls_are_where_they_p
     assert (scene.bounds.near, scene.bounds.far) == (0.5, 9.0)
 
 
+def test_positions_far_from_the_center_keep_their_digits(folder):
+    near = NerfiesReader(folder.root, downscale=1, space="world").read()
+    for item in IDS:
+        folder.edit(
+            f"camera/{item}.json",
+            lambda c: c.update(position=[p + 4e6 for p in c["position"]]),
+        )
+    for item in IDS:  # opaque: the box is all that cameras see up to far
+        image = iio.imread(folder.root / f"rgb/1x/{item}.png")
+        iio.imwrite(folder.root / f"rgb/1x/{item}.png", image[..., :3])
+    far = NerfiesReader(folder.root, downscale=1, space="world").read()
+    assert far.offset == (1e6, 1e6, 1e6)  # of a world a quarter as large
+    positions = near.dynamic.train.cameras.positions
+    torch.testing.assert_close(far.dynamic.train.cameras.positions, positions, rtol=0, atol=1e-5)
+    assert far.bounds.box.contains(torch.zeros(3)) and far.bounds.box.longest < 40
+    folder.edit("scene.json", lambda c: c.update(center=[p + 4e6 for p in c["center"]]))
+    assert NerfiesReader(folder.root, downscale=1).read().offset == (0, 0, 0)
+
+
 def test_splits_times_and_the_stand_in_for_a_static_set(folder, caplog):
     with caplog.at_level(logging.WARNING):
         scene = NerfiesReader(folder.root, downscale=1, static_until=0.3).read()

@@ -7,13 +7,16 @@ import logging
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
+from devrf.data.kind import by_one_camera
 from devrf.geometry.cameras import Distortion
 from devrf.scenes.formats.nerfstudio import NerfstudioReader
 from devrf.scenes.lens import Lens
+from devrf.scenes.scene import Scene, Views
 
 WIDTH, HEIGHT = 80, 60
 
@@ -191,6 +194,52 @@ def test_two_folders(tmp_path, balls_are_where_they_project, balls):
     balls.edit(root / "dynamic", lambda c: c.update(lists))
     validation = NerfstudioReader(root, validation=True).read().dynamic.validation
     assert validation is not None and validation.names == ("dynamic/images/r_003.png",)
+
+
+FAR = (500_000.0, 5_600_000.0, 200.0)
+
+
+def carry(content: dict[str, Any]) -> None:
+    """Move a file's cameras far from the origin."""
+    for frame in content["frames"]:
+        for row, step in zip(frame["transform_matrix"], FAR, strict=False):
+            row[3] += step
+
+
+def test_a_world_far_from_the_origin_is_read_as_the_same_near_it(tmp_path, balls, caplog):
+    """Cameras at a distance of 4 from the balls; the second capture has the first one's offset."""
+    root = tmp_path / "scene"
+    balls.write(root / "static", None)
+    balls.write(root / "dynamic", [0.0, 0.0, 0.5, 0.5, 1.0, 1.0], views=2, turn=0.4)
+    near = NerfstudioReader(root, holdout=6, box=[[-1.5, -1.5, -1], [1.5, 1.5, 1]]).read()
+    assert near.offset == (0, 0, 0) and "far from the origin" not in caplog.text
+    for capture in ("static", "dynamic"):
+        balls.edit(root / capture, carry)
+    box = [[499_998.5, 5_599_998.5, 199.0], [500_001.5, 5_600_001.5, 201.0]]
+    with caplog.at_level(logging.INFO):
+        far = NerfstudioReader(root, holdout=6, box=box).read()
+    assert far.offset == FAR and far.bounds == near.bounds
+    assert caplog.text.count("scene is far from the origin: 500000, 5600000, 200 is sub") == 1
+    assert far.fingerprint != near.fingerprint
+    for ours, same in zip(parts(far), parts(near), strict=True):
+        poses = same.cameras.camera_to_world
+        torch.testing.assert_close(ours.cameras.camera_to_world, poses, rtol=0, atol=1e-6)
+        assert torch.equal(ours.view, same.view)
+    assert by_one_camera("nerfstudio", root / "dynamic") is False
+    # What devrf itself says of the scene is in the world of the file.
+    balls.edit(root / "static", lambda c: c.update(scene_bounds={"space": "world", "box": box}))
+    assert NerfstudioReader(root, holdout=6).read().bounds.box == near.bounds.box
+
+
+def test_a_film_far_from_the_origin_is_one_of_a_moving_camera(moving, balls):
+    balls.edit(moving, carry)
+    assert by_one_camera("nerfstudio", moving)
+    film = NerfstudioReader(moving).read()
+    assert film.is_film and film.offset == FAR
+
+
+def parts(scene: Scene) -> list[Views]:
+    return [v for capture in (scene.static, scene.dynamic) for v in (capture.train, capture.test)]
 
 
 @pytest.mark.parametrize(

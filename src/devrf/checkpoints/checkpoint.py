@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -23,6 +24,7 @@ from devrf.checkpoints.stored_class import StoredClass, stored_class
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
+from devrf.geometry.offset import NO_OFFSET, Offset
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Background, Scene
 from devrf.system.memory import OutOfMemoryError, is_oom
@@ -103,6 +105,7 @@ class Viewpoints:
         held_out: the camera of the first held-out image of the moving scene: one camera.
         followed: when each of the ``dynamic`` cameras was there, if they are those of one moving
             camera; else empty.
+        offset: what was subtracted from the positions (:mod:`devrf.geometry.offset`).
     """
 
     background: Background
@@ -111,6 +114,7 @@ class Viewpoints:
     dynamic: Cameras
     held_out: Cameras
     followed: tuple[float, ...] = ()
+    offset: Offset = NO_OFFSET
 
     @classmethod
     def of(cls, scene: Scene) -> Viewpoints:
@@ -122,7 +126,8 @@ class Viewpoints:
         held_out = scene.dynamic.test.cameras[[0]]
         moving = scene.moves and train.by_moving_camera and len(train) > 1
         times = tuple(train.times[first].tolist()) if moving else ()
-        return cls(scene.background, scene.clock, static, train.cameras[first], held_out, times)
+        dynamic = train.cameras[first]
+        return cls(scene.background, scene.clock, static, dynamic, held_out, times, scene.offset)
 
     @classmethod
     def stored(cls, entry: dict[str, Any]) -> Viewpoints | None:
@@ -141,7 +146,10 @@ class Viewpoints:
         if len(followed) not in (0, len(cameras["dynamic"])):
             raise ValueError("times of other cameras")
         clock = built(FrameClock, entry["clock"])
-        return cls(**{**entry, **cameras, "clock": clock, "followed": followed})
+        offset = built(tuple[float, float, float], entry.get("offset", NO_OFFSET))
+        if not all(map(math.isfinite, offset)):
+            raise ValueError("an offset without end")
+        return cls(**{**entry, **cameras, "clock": clock, "followed": followed, "offset": offset})
 
 
 @dataclass(frozen=True)

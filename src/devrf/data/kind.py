@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 
 from devrf.errors import DevrfError
+from devrf.geometry.offset import offset_of, subtracted
 from devrf.scenes.files import read_json
 from devrf.scenes.formats.dycheck import DycheckReader
 from devrf.scenes.formats.llff_poses import PRECOMPUTED
@@ -62,9 +63,11 @@ def by_one_camera(choice: str, root: str | Path, *, ordered: bool = False) -> bo
         return False
     told = [frame.time for frame in listing.frames if frame.time is not None]
     times = torch.arange(len(listing.frames)) if ordered else torch.tensor(told)
-    poses = torch.tensor([frame.transform_matrix[:3] for frame in listing.frames])
+    poses = torch.tensor(
+        [frame.transform_matrix[:3] for frame in listing.frames], dtype=torch.float64
+    )
     alone = 1 < len(times) == len(distinct_times(times))
-    return alone and not stand_still(distinct_poses(poses))
+    return alone and not stand_still(distinct_poses(subtracted(poses, offset_of(poses)).float()))
 
 
 def _transforms(file: Path) -> TransformsFile | None:

@@ -46,6 +46,13 @@ class Box:
         x, y, z = ((a + b) / 2 for a, b in zip(self.low, self.high, strict=True))
         return x, y, z
 
+    def moved(self, by: tuple[float, float, float]) -> Box:
+        """The box moved along (x, y, z)."""
+        return Box.of(
+            [v + step for v, step in zip(self.low, by, strict=True)],
+            [v + step for v, step in zip(self.high, by, strict=True)],
+        )
+
     @property
     def longest(self) -> float:
         """The longest edge."""

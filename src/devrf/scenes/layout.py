@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from devrf.geometry.offset import Offset
 from devrf.scenes.images import image_size
 from devrf.scenes.masks import Masks
 from devrf.scenes.scene import Capture, Views
@@ -47,6 +48,11 @@ class Layout:
     dynamic_train: Split
     dynamic_test: Split
     validation: Split | None = None
+
+    @property
+    def offset(self) -> Offset:
+        """What is subtracted from positions: one offset for all files of the scene."""
+        return self.static_train.transforms.offset
 
     @property
     def moves(self) -> bool:

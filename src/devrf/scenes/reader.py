@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
 from dataclasses import KW_ONLY, replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from pydantic.dataclasses import dataclass
 
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
+from devrf.geometry.offset import NO_OFFSET, Offset
 from devrf.scenes.files import Number
 from devrf.scenes.image_folders import Downscale, SizeAt, whole_factor
 from devrf.scenes.names import Missing
@@ -20,6 +22,8 @@ from devrf.scenes.space import SpaceChoice, centred, forward_facing_scene, inwar
 from devrf.scenes.transforms import SceneBounds
 from devrf.scenes.validation import LARGEST, checked_box, scene_error
 from devrf.system.options import Count, Options, Several
+
+log = logging.getLogger(__name__)
 
 FlowSource = Literal["auto", "files", "dis", "raft", "none"]
 Exposure = Literal["auto", "equal", "none"]
@@ -160,8 +164,24 @@ class InwardReader(SceneReader):
     missing: Missing = "error"
     space: SpaceChoice = "auto"
 
-    def scene(self, folder: Path, static: Capture, dynamic: Capture) -> Scene:
-        """The scene of two captures that were read from ``folder``, its bounds found."""
+    def scene(
+        self, folder: Path, static: Capture, dynamic: Capture, offset: Offset = NO_OFFSET
+    ) -> Scene:
+        """The scene of two captures that were read from ``folder``, its bounds found.
+
+        ``offset`` is subtracted from their positions already, and here from the box.
+        """
+        name = self.name_of(folder)
+        box = self.box
+        if any(offset):
+            log.info(
+                "%s is far from the origin: %s is subtracted from positions, and added again to "
+                "all that is written",
+                name,
+                ", ".join(f"{value:.12g}" for value in offset),
+            )
+            x, y, z = offset
+            box = box and box.moved((-x, -y, -z))
         space, bounds = inward_space(
             self.space,
             static.train,
@@ -170,10 +190,9 @@ class InwardReader(SceneReader):
             bound_scale=self.bound_scale,
             near=self.near,
             far=self.far,
-            box=self.box,
+            box=box,
         )
-        name = self.name_of(folder)
-        return Scene(name, "inward", static, dynamic, bounds, self.background, space)
+        return Scene(name, "inward", static, dynamic, bounds, self.background, space, offset)
 
 
 @dataclass(frozen=True)
@@ -197,15 +216,17 @@ class PosedReader(InwardReader):
         dynamic: Capture,
         stated: SceneBounds | None,
         source: str,
+        offset: Offset = NO_OFFSET,
     ) -> Scene:
         """The scene of two captures, which for a scene always at rest are one.
 
-        ``stated`` says where it is, if that is known, and ``source``, in words, who states it.
+        ``stated`` says where it is, if that is known, and ``source``, in words, who states it;
+        ``offset`` is subtracted from their positions already.
         DevrfError if neither options nor cameras do.
         """
         reader = _with_bounds(self, stated)
         if reader.space != "ndc":
-            scene = reader.scene(folder, static, dynamic)
+            scene = reader.scene(folder, static, dynamic, offset)
             reason = scene.bounds.reason if reader.space == self.space else source
             box_is_stated = self.box is None and reader.box is not None
             box_source = source if box_is_stated else scene.bounds.box_source

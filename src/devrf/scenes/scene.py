@@ -13,6 +13,7 @@ from torch import Tensor
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
+from devrf.geometry.offset import NO_OFFSET, Offset
 from devrf.geometry.space import WORLD, Space
 
 Background = Literal["white", "black", "random"]
@@ -200,6 +201,8 @@ class Scene:
         bounds: where the scene is.
         background: what is behind the alpha mask.
         space: the space that the fields live in, and in which ``bounds`` are given.
+        offset: what was subtracted from all positions of the capture's world
+            (:mod:`devrf.geometry.offset`); 0 near the origin.
     """
 
     name: str
@@ -209,6 +212,7 @@ class Scene:
     bounds: Bounds
     background: Background
     space: Space = WORLD
+    offset: Offset = NO_OFFSET
 
     def __post_init__(self) -> None:
         clock = self.clock
@@ -292,6 +296,8 @@ class Scene:
     def fingerprint(self) -> str:
         """A short hash of cameras, times and image sizes: tells one scene from another."""
         digest = hashlib.sha256(self.kind.encode())
+        if any(self.offset):
+            digest.update(f"{self.offset}".encode())
         for capture in (self.static, self.dynamic):
             for views in (capture.train, capture.test):
                 digest.update(f"{tuple(views.pixels.shape)}".encode())

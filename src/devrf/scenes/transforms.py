@@ -18,6 +18,7 @@ import torch
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from torch import Tensor
 
+from devrf.geometry.offset import NO_OFFSET, Offset, offset_of, subtracted
 from devrf.scenes.files import Name, Number, Positive, Vector3, Vector4, inside, read_json
 from devrf.scenes.lens import CameraKeys, Intrinsics, frame_intrinsics, intrinsics_of
 from devrf.scenes.names import ImageFinder, Missing, in_order, present_images
@@ -113,13 +114,14 @@ class Transforms:
         file: the JSON file.
         intrinsics: N, one an image; the same object where images share it.
         images: N existing files inside the scene's folder.
-        poses: (N, 3, 4) float32 camera-to-world, OpenGL axes, world units.
+        poses: (N, 3, 4) float32 camera-to-world, OpenGL axes, world units, without ``offset``.
         times: N times in [0, 1], or None when the file gives none.
         masks: N existing files inside the scene's folder, None for an image without one; None if
             they were not asked for.
         skipped: how many images of the file are absent, and left out.
-        bounds: where the scene is, if the file says so.
+        bounds: where the scene is, if the file says so, in the world of the file.
         unread_times: keys of frames that say something of time, but are not read.
+        offset: what is subtracted from positions (:mod:`devrf.geometry.offset`).
     """
 
     file: Path
@@ -131,6 +133,7 @@ class Transforms:
     skipped: int = 0
     bounds: SceneBounds | None = None
     unread_times: tuple[str, ...] = ()
+    offset: Offset = NO_OFFSET
 
     def __getitem__(self, index: Sequence[int]) -> Transforms:
         """The images at the positions ``index``, in that order."""
@@ -151,12 +154,14 @@ def read_transforms(
     masked: bool = False,
     missing: Missing = "error",
     times_by_order: bool = False,
+    offset: Offset | None = None,
 ) -> tuple[TransformsFile, Transforms]:
     """What a transforms file below ``root``, the scene's folder, says, and its posed images.
 
     ``masked``: whether ``mask_path`` is followed, too; ``missing``: as for
     :func:`devrf.scenes.names.present_images`; ``times_by_order``: times are spread evenly over the
-    images in the order of their names, whatever the file says of times.
+    images in the order of their names, whatever the file says of times; ``offset``: that of the
+    scene's other files, None for the first one.
 
     Raises:
         DevrfError: the file or an image is missing, a value is wrong (NaN, a time outside [0, 1], a
@@ -179,13 +184,14 @@ def read_transforms(
         )
     poses = torch.tensor([frame.transform_matrix[:3] for frame in frames], dtype=torch.float64)
     check_poses(poses, lambda index: f"{where[index]}: transform_matrix")
+    offset = offset_of(poses) if offset is None else offset
     lenses = [frame_intrinsics(listing, f, at) for f, at in zip(frames, where, strict=True)]
     shared = cache(lambda: intrinsics_of(listing, file))  # asked for only where it is needed
     transforms = Transforms(
         file,
         tuple(own or shared() for own in lenses),
         tuple(images.values()),
-        poses.float(),
+        subtracted(poses, offset).float(),
         tuple(known) or None,
         _masks(frames, file, root) if masked else None,
         skipped=len(listing.frames) - len(frames),
@@ -195,6 +201,7 @@ def read_transforms(
             for key in ("timestep_index", "timestamp")
             if any(getattr(frame, key) is not None for frame in frames)
         ),
+        offset=offset,
     )
     return listing, transforms
 

@@ -102,6 +102,9 @@ def scene_facts(scene: Scene) -> list[Row]:
             text += f", drift by {100 * drift:.1f} % over all"
             text += ": try schedule.extensions.color_residual.learn=always" * (drift >= CHANGING)
         rows.append(("colours along the flow", text))
+    if any(scene.offset):
+        offset = ", ".join(f"{value:.12g}" for value in scene.offset)
+        rows.insert(4, ("offset", f"{offset}: to be added to the box and the room for motion"))
     gap = widest_gap(scene)
     if gap is not None:
         rows.insert(2, ("static views", f"widest sector without one: {gap:.0f} degrees"))

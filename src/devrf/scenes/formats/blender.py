@@ -9,6 +9,7 @@ from pathlib import Path
 
 from pydantic.dataclasses import dataclass
 
+from devrf.geometry.offset import Offset
 from devrf.scenes.files import existing_folder, scene_folder
 from devrf.scenes.flow_files import FlowDirection, read_flow
 from devrf.scenes.images import image_size
@@ -70,7 +71,7 @@ class BlenderReader(InwardReader):
         if layout.moves and self.wants_flow_files:
             flow = self._flow(dynamic.train, layout, thinned, flow_folder, "bwd")
             dynamic = replace(dynamic, train=replace(dynamic.train, flow=flow))
-        return self.scene(folder, static, dynamic)
+        return self.scene(folder, static, dynamic, layout.offset)
 
     def forward_flow(self, views: Views) -> OpticalFlow | None:
         """See :meth:`devrf.scenes.reader.SceneReader.forward_flow`."""
@@ -87,7 +88,7 @@ class BlenderReader(InwardReader):
             val = root / "transforms_val.json"
             if layout.moves and root.name == SCORED_ON_VAL and os.path.isfile(val):
                 log.info("%s: scored on its val split: its test split shows another scene", root)
-                _, test = read_transforms(val, root, missing=self.missing)
+                _, test = read_transforms(val, root, missing=self.missing, offset=train.offset)
                 check_timed_alike(train, test)
                 layout = one_capture(train, test, self.static_until)
         elif self.dynamic is None and not dynamic_folders(root):
@@ -96,7 +97,7 @@ class BlenderReader(InwardReader):
         else:
             moving = chosen_dynamic(root, self.dynamic)
             train, test = _train_and_test(existing_folder(static), root, self.missing)
-            moving_train, moving_test = _train_and_test(moving, root, self.missing)
+            moving_train, moving_test = _train_and_test(moving, root, self.missing, train.offset)
             layout = Layout(
                 static_train=at_rest(train),
                 static_test=at_rest(test),
@@ -107,7 +108,7 @@ class BlenderReader(InwardReader):
         test_file = layout.dynamic_test.transforms.file
         val = test_file.with_name("transforms_val.json")
         if self.validation and val != test_file and os.path.isfile(val):
-            _, validation = read_transforms(val, root, missing=self.missing)
+            _, validation = read_transforms(val, root, missing=self.missing, offset=layout.offset)
             check_timed_alike(layout.dynamic_train.transforms, validation)
             layout = layout.with_validation(validation)
         return *fewer(layout, self.train_views, self.frames), flow_folder
@@ -140,15 +141,17 @@ class BlenderReader(InwardReader):
         )
 
 
-def _train_and_test(folder: Path, root: Path, missing: Missing) -> tuple[Transforms, Transforms]:
-    """The images of a capture to learn from, and those held out."""
+def _train_and_test(
+    folder: Path, root: Path, missing: Missing, offset: Offset | None = None
+) -> tuple[Transforms, Transforms]:
+    """The images of a capture to learn from, and those held out; ``offset``: another capture's."""
     file = folder / "transforms_train.json"
-    _, train = read_transforms(file, root, missing=missing)
+    _, train = read_transforms(file, root, missing=missing, offset=offset)
     test, val = (folder / f"transforms_{split}.json" for split in ("test", "val"))
     held_out = next((listing for listing in (test, val) if any_image(listing, root)), None)
     parts = None if held_out else _held_out_of(train)
     if parts is None:
-        _, tested = read_transforms(held_out or test, root, missing=missing)
+        _, tested = read_transforms(held_out or test, root, missing=missing, offset=train.offset)
         check_timed_alike(train, tested)
         return train, tested
     learned, scored = parts

@@ -15,6 +15,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from devrf.geometry.cameras import Distortion
+from devrf.geometry.offset import Offset, offset_of, subtracted
 from devrf.scenes.bounds import FALLBACK_BOUND_SCALE, axes_do_meet, box_of_frusta
 from devrf.scenes.files import (
     Ids,
@@ -65,7 +66,12 @@ class World(BaseModel):
 
 
 def placed(
-    reader: InwardReader, folder: Path, world: World, static: Capture, dynamic: Capture
+    reader: InwardReader,
+    folder: Path,
+    world: World,
+    static: Capture,
+    dynamic: Capture,
+    offset: Offset,
 ) -> Scene:
     """The scene of two captures; near and far are from the options, or else from the world."""
     near = world.near if reader.near is None else reader.near
@@ -74,12 +80,12 @@ def placed(
     cameras = static.train.cameras
     wide = reader.box is None and not static.train.cut_out and 0 <= near < far
     if not wide or (reader.space != "world" and axes_do_meet(cameras)):
-        return options.scene(folder, static, dynamic)
+        return options.scene(folder, static, dynamic, offset)
     # Without alpha masks the backdrop is to be learned too.
-    frusta_box = box_of_frusta(cameras, near, far)
+    frusta_box = box_of_frusta(cameras, near, far).moved(offset)
     scale = FALLBACK_BOUND_SCALE if reader.bound_scale == "auto" else reader.bound_scale
     options = replace(options, box=frusta_box, space="world", bound_scale=scale)
-    scene = options.scene(folder, static, dynamic)
+    scene = options.scene(folder, static, dynamic, offset)
     why = "data.space=world" if reader.space == "world" else "the cameras look in one direction"
     bounds = replace(scene.bounds, reason=why, box_source="all that the cameras see up to far")
     return replace(scene, bounds=bounds)
@@ -114,7 +120,7 @@ class Camera(BaseModel):
 
 
 def read_camera(folder: Path, item: str, world: World) -> tuple[Tensor, Intrinsics]:
-    """Camera-to-world (3, 4) float32, OpenGL axes, world units, and intrinsics of the full image.
+    """Camera-to-world (3, 4) float64, OpenGL axes, world units, and intrinsics of the full image.
 
     DevrfError if the camera file of the image with the id ``item`` is missing or wrong.
     """
@@ -135,7 +141,7 @@ def read_camera(folder: Path, item: str, world: World) -> tuple[Tensor, Intrinsi
         Distortion((*camera.radial_distortion, 0.0), camera.tangential_distortion),
         camera.skew,
     )
-    return pose.float(), intrinsics
+    return pose, intrinsics
 
 
 # N ids, and the positions of those to learn from and of those held out.
@@ -197,6 +203,8 @@ class ItemsReader(InwardReader):
                 listing, "all images to learn from, or all that are held out, are absent; add them"
             )
         cameras = [read_camera(folder, item, world) for item in ids]
+        poses = torch.stack([pose for pose, _ in cameras])
+        offset = offset_of(poses)
         moments = self.moments(folder, ids)
         masks = self.masks_of(folder, ids, images)
         first = min(moments)
@@ -205,15 +213,16 @@ class ItemsReader(InwardReader):
             listing,
             tuple(intrinsics for _, intrinsics in cameras),
             tuple(present.values()),
-            torch.stack([pose for pose, _ in cameras]),
+            subtracted(poses, offset).float(),
             tuple((moment - first) / span for moment in moments),
             masks,
+            offset=offset,
         )
         layout = one_capture(posed[train], posed[test], self.static_until)
         layout, _ = fewer(layout, None, self.frames)
         ignored: Masks = "none" if masks is None else "ignore"
         static, dynamic = load_layout(layout, folder, images.downscale, ignored)
-        return placed(self, folder, world, static, dynamic)
+        return placed(self, folder, world, static, dynamic, offset)
 
 
 class _Dataset(BaseModel):

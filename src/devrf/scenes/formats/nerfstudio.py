@@ -12,6 +12,7 @@ import torch
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
+from devrf.geometry.offset import Offset
 from devrf.scenes.files import inside, scene_folder
 from devrf.scenes.image_folders import Downscale
 from devrf.scenes.layout import Layout, fewer, load_layout, one_capture, static_alone
@@ -76,7 +77,8 @@ class NerfstudioReader(PosedReader):
         factor = self.choose_factor(layout.size_at)
         static, dynamic = load_layout(layout, folder, factor, self.masks)
         bounds = layout.static_train.transforms.bounds
-        return self.placed(folder, static, dynamic, bounds, f"scene_bounds in {FILE}")
+        stater = f"scene_bounds in {FILE}"
+        return self.placed(folder, static, dynamic, bounds, stater, layout.offset)
 
 
 def _layout(root: Path, options: NerfstudioReader) -> Layout:
@@ -94,7 +96,7 @@ def _layout(root: Path, options: NerfstudioReader) -> Layout:
         return layout.with_validation(validation)
     static_train = at_rest(train)
     static_test = at_rest(test)
-    train, test, validation = _splits(moving, root, options)
+    train, test, validation = _splits(moving, root, options, train.offset)
     if train.times is None:
         raise scene_error(moving, 'its frames have no "time"; give every frame its time in [0, 1]')
     layout = Layout(
@@ -107,15 +109,19 @@ def _layout(root: Path, options: NerfstudioReader) -> Layout:
 
 
 def _splits(
-    file: Path, root: Path, options: NerfstudioReader
+    file: Path, root: Path, options: NerfstudioReader, offset: Offset | None = None
 ) -> tuple[Transforms, Transforms, Transforms]:
-    """The images of a file to learn from, to test on, and in its validation list, if asked for."""
+    """The images of a file to learn from, to test on, and in its validation list, if asked for.
+
+    ``offset`` is that of the scene's other file, if it has been read.
+    """
     listing, transforms = read_transforms(
         file,
         root,
         masked=options.masks != "none",
         missing=options.missing,
         times_by_order=options.times == "order",
+        offset=offset,
     )
     count = len(transforms.images)
     if count == 1:
