@@ -109,6 +109,21 @@ def test_what_is_saved_is_read(tmp_path):
         assert (one.fov, one.time, one.seconds) == (given.fov, given.time, given.seconds - 1)
 
 
+def test_files_have_the_positions_of_the_captures_world(tmp_path):
+    offset = (500_000.0, 5_600_000.0, 200.0)
+    further = torch.cat([POSE[:, :3], torch.tensor([[1.1], [2.2], [3.3]])], dim=1)
+    keyframes = (Keyframe(POSE, 50.0, 0.2, 0.0), Keyframe(further, 50.0, 0.8, 1.0))
+    write_path(tmp_path / "a.json", CameraPath(keyframes, 1.5, 4.0), 200, offset)
+    saved = json.loads((tmp_path / "a.json").read_text())
+    for matrix in (saved["keyframes"][1]["matrix"], saved["camera_path"][-1]["camera_to_world"]):
+        assert matrix[3::4][:3] == pytest.approx([500_001.1, 5_600_002.2, 203.3], rel=0, abs=1e-6)
+    for path in (
+        read_path(tmp_path / "a.json", offset),
+        path_from((tmp_path / "a.json").read_bytes(), "a", offset),
+    ):
+        torch.testing.assert_close(path.keyframes[1].camera_to_world, further, rtol=0, atol=1e-6)
+
+
 def test_nerfstudios_file_gives_a_keyframe_for_each_camera():
     camera = {"camera_to_world": MATRIX, "fov": 40, "aspect": 1.25}
     # As its viewer writes keyframes: without seconds; in earlier versions with a matrix in text.

@@ -51,6 +51,21 @@ def test_what_is_exported_reads_back_exactly(scene: Scene, tmp_path: Path) -> No
     assert [f["transform_matrix"] for f in validation] == [f["transform_matrix"] for f in test]
 
 
+def test_positions_that_are_written_have_the_offset(scene: Scene, tmp_path: Path) -> None:
+    far = replace(scene, offset=(500_000.0, 5_600_000.0, 200.0))
+    export(far, tmp_path / "robot")
+    file = tmp_path / "robot/static/transforms_train.json"
+    frames = json.loads(file.read_text())["frames"]
+    matrices = torch.tensor([f["transform_matrix"] for f in frames], dtype=torch.float64)
+    place = scene.static.train.cameras.positions.double() + torch.tensor(far.offset).double()
+    torch.testing.assert_close(matrices[:, :3, 3], place, rtol=1e-15, atol=0)
+    again = BlenderReader(tmp_path / "robot").read()
+    assert again.offset == far.offset
+    torch.testing.assert_close(
+        again.dynamic.train.cameras.camera_to_world, scene.dynamic.train.cameras.camera_to_world
+    )
+
+
 def test_an_empty_folder_is_filled_and_a_used_one_is_kept(scene: Scene, tmp_path: Path) -> None:
     used, empty = tmp_path / "used", tmp_path / "empty"
     used.mkdir()

@@ -22,6 +22,7 @@ from devrf.apps.camera_paths import NAMES
 from devrf.apps.video import MAX_FRAMES
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
+from devrf.geometry.offset import NO_OFFSET, Offset, added, subtracted
 from devrf.scenes.files import Number, Positive, read_json
 from devrf.scenes.validation import in_reach, is_rotation, scene_error
 from devrf.system.files import write_json
@@ -204,8 +205,10 @@ class _PathFile(BaseModel):
     fps: Positive = 24.0
 
 
-def read_path(file: Path) -> CameraPath:
-    """The camera path in a file.
+def read_path(file: Path, offset: Offset = NO_OFFSET) -> CameraPath:
+    """The camera path in a file, whose positions are of the capture's world.
+
+    ``offset`` is the scene's (:mod:`devrf.geometry.offset`), and subtracted from them.
 
     nerfstudio's viewer and renderer read these files, too. Its own have ``camera_path``, a camera
     for each frame: ``camera_to_world`` (4×4, row by row, OpenGL axes), ``fov`` (vertical, degrees),
@@ -217,23 +220,27 @@ def read_path(file: Path) -> CameraPath:
         DevrfError: there is no such file, or it is no camera path.
     """
     remedy = f"give video.path {', '.join(NAMES)}, or a file that the viewer saved"
-    return _path(read_json(file, _PathFile, remedy), file)
+    return _path(read_json(file, _PathFile, remedy), file, offset)
 
 
-def path_from(content: bytes, name: str) -> CameraPath:
+def path_from(content: bytes, name: str, offset: Offset = NO_OFFSET) -> CameraPath:
     """As :func:`read_path`, from the ``content`` of a file called ``name``."""
     try:
-        return _path(_PathFile.model_validate_json(content), name)
+        return _path(_PathFile.model_validate_json(content), name, offset)
     except ValidationError as error:
         raise first_error(error, f"{name}: ") from None
 
 
-def write_path(file: Path, path: CameraPath, height: int) -> None:
-    """Write a camera path, whole or not at all; ``height`` is that of nerfstudio's frames."""
+def write_path(file: Path, path: CameraPath, height: int, offset: Offset = NO_OFFSET) -> None:
+    """Write a camera path, whole or not at all; ``height`` is that of nerfstudio's frames.
+
+    ``offset`` is the scene's (:mod:`devrf.geometry.offset`), and added to positions.
+    """
 
     def entry(keyframe: Keyframe, matrix: str) -> dict[str, Any]:
+        pose = added(keyframe.camera_to_world, offset)
         return {
-            matrix: [*keyframe.camera_to_world.flatten().tolist(), 0.0, 0.0, 0.0, 1.0],
+            matrix: [*pose.flatten().tolist(), 0.0, 0.0, 0.0, 1.0],
             "fov": keyframe.fov,
             "aspect": path.aspect,
             "render_time": keyframe.time,
@@ -257,19 +264,20 @@ def write_path(file: Path, path: CameraPath, height: int) -> None:
     write_json(file, content)
 
 
-def _path(content: _PathFile, where: object) -> CameraPath:
+def _path(content: _PathFile, where: object, offset: Offset) -> CameraPath:
     cameras = content.camera_path
     last = max(len(content.camera_path) - 1, 1)
+
+    def placed(matrix: list[float]) -> Tensor:
+        return subtracted(_pose(matrix), offset).float()
+
     keyframes = [
-        Keyframe(
-            _pose(keyframe.matrix).float(), keyframe.fov, keyframe.render_time, keyframe.seconds
-        )
+        Keyframe(placed(keyframe.matrix), keyframe.fov, keyframe.render_time, keyframe.seconds)
         for keyframe in content.keyframes
     ]
     for k, camera in enumerate(cameras if not keyframes else ()):
         time = k / last if camera.render_time is None else camera.render_time
-        pose = _pose(camera.matrix).float()
-        keyframes.append(Keyframe(pose, camera.fov, time, k / content.fps))
+        keyframes.append(Keyframe(placed(camera.matrix), camera.fov, time, k / content.fps))
     if not keyframes:
         raise scene_error(
             where, "holds no camera path; expected keyframes with seconds, or camera_path"

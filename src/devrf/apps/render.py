@@ -34,6 +34,7 @@ from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
 from devrf.geometry.cameras import Cameras
+from devrf.geometry.offset import NO_OFFSET, Offset
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Views
 
@@ -49,15 +50,15 @@ class Video(NamedTuple):
     pictures: Iterator[Tensor]
 
 
-def camera_path(settings: VideoSettings) -> CameraPath | None:
-    """The keyframes of the file ``video.path``, if it is one.
+def camera_path(settings: VideoSettings, offset: Offset = NO_OFFSET) -> CameraPath | None:
+    """The keyframes of the file ``video.path``, if it is one, without the scene's ``offset``.
 
     Raises:
         DevrfError: it holds no camera path, or one of too many frames.
     """
     if settings.path is None or settings.path in NAMES:
         return None
-    path = read_path(Path(settings.path))
+    path = read_path(Path(settings.path), offset)
     _ = path.frames
     return path
 
@@ -74,7 +75,7 @@ def videos(
     if settings.path == FOLLOWED and not viewpoints.followed:
         expected = "another way, since it was not one moving camera that saw the scene move"
         raise DevrfError(f"video.path: expected {expected}, not {FOLLOWED}")
-    path = camera_path(settings)
+    path = camera_path(settings, viewpoints.offset)
     if path is not None:
         settings = replace(settings, frames=path.frames, fps=path.fps)
     settings = _within_limit(settings, renderer, settings.sized(viewpoints.held_out))

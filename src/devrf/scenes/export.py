@@ -7,6 +7,7 @@ import os
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.ndc import NormalizedDevice
+from devrf.geometry.offset import added
 from devrf.scenes.files import Numbers
 from devrf.scenes.flow_files import write_flow
 from devrf.scenes.formats.llff_poses import BOUND_FACTOR
@@ -64,13 +66,25 @@ def export(scene: Scene, folder: Path) -> None:
     It is an embedded one: all images of one focal length, their principal points in the middle;
     fixed cameras stand still, and one of them is held out. What one camera has filmed by hand is
     written for ``data=nerfstudio``. ``folder`` is a new or an empty one.
-    DevrfError if it is in use or cannot be written, or a frame is left out by some views of a
-    forward-facing scene.
+    Positions are those of the capture's world. DevrfError if it is in use or cannot be written, or
+    a frame is left out by some views of a forward-facing scene.
     """
     write = _export_blender if scene.kind == "inward" else _export_llff
     if scene.dynamic.train.by_moving_camera:
         write = _export_film
-    write(scene, folder)
+    write(_in_capture_world(scene), folder)
+
+
+def _in_capture_world(scene: Scene) -> Scene:
+    """The scene with its offset added to all cameras, whose poses are in double precision then."""
+    if not any(scene.offset):
+        return scene
+
+    def moved(views: Views) -> Views:
+        poses = added(views.cameras.camera_to_world, scene.offset)
+        return replace(views, cameras=replace(views.cameras, camera_to_world=poses))
+
+    return replace(scene, static=scene.static.mapped(moved), dynamic=scene.dynamic.mapped(moved))
 
 
 def _export_film(scene: Scene, folder: Path) -> None:

@@ -15,7 +15,7 @@ from pxr import Gf, Usd, UsdGeom
 
 from devrf.apps.export.geometry import ExportSettings, MovingMesh, UpFrame, carried, seen_points
 from devrf.apps.export.gltf import write_gltf
-from devrf.apps.export.sequence import mesh_files, write_sequence
+from devrf.apps.export.sequence import mesh_files, point_file, write_sequence
 from devrf.apps.export.surface import surface_of
 from devrf.apps.export.usd import write_usd
 from devrf.rendering.renderer import Renderer
@@ -187,6 +187,48 @@ def test_a_file_a_time_and_an_index(tmp_path, mesh, format):
     # What an earlier, longer sequence left is gone; what is not its own stays.
     assert not (tmp_path / f"frame_0009.{format}").exists()
     assert (tmp_path / "frame_notes.txt").exists()
+
+
+FAR = (500_000.0, 5_600_000.0, 200.0)
+
+
+@pytest.mark.parametrize("format", ["ply", "obj"])
+def test_files_far_from_the_origin_keep_their_digits(tmp_path, mesh, format):
+    write_sequence(tmp_path, format, TIMES, mesh_files(mesh, FAR), "surface", SECONDS)
+    read = trimesh.load_mesh(tmp_path / f"frame_0003.{format}", process=False)
+    expected = mesh.vertices[3].double().numpy() + FAR
+    np.testing.assert_allclose(read.vertices, expected, rtol=0, atol=1e-6)
+    assert (read.faces == mesh.faces.numpy()).all()
+    assert (read.visual.vertex_colors[:, 0] > 250).all()
+
+
+def test_points_far_from_the_origin_keep_their_digits(tmp_path):
+    points = torch.rand(5, 3)
+    colors = torch.tensor([[1.0, 0.0, 0.0]]).expand(5, 3)
+    write_sequence(tmp_path, "ply", (0.0,), [point_file(points, colors, FAR)], "points", SECONDS)
+    read = trimesh.load(tmp_path / "frame_0000.ply")
+    np.testing.assert_allclose(read.vertices, points.double().numpy() + FAR, rtol=0, atol=1e-9)
+    assert (read.colors == [255, 0, 0, 255]).all()
+
+
+def test_gltf_and_usd_move_everything_far_from_the_origin(tmp_path, mesh, around):
+    frame = UpFrame.of(around, "z", 2.0, FAR)  # x, z, −y
+    origin = np.array([1_000_000.0, 400.0, -11_200_000.0])
+    cameras = {"static_1": around[[1]]}
+    eye = frame.points(around.positions[1]).double().numpy() + origin
+    vertices = frame.points(mesh.vertices[0]).double().numpy() + origin
+    write_gltf(tmp_path / "ball.glb", mesh, cameras, frame, SECONDS)
+    scene = trimesh.load_scene(tmp_path / "ball.glb", process=False)
+    np.testing.assert_allclose(scene.to_mesh().vertices, vertices, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(scene.camera_transform[:3, 3], eye, rtol=0, atol=1e-5)
+    write_usd(tmp_path / "ball.usdc", mesh, cameras, frame, SECONDS)
+    stage = Usd.Stage.Open(str(tmp_path / "ball.usdc"))
+    camera = UsdGeom.Camera(stage.GetPrimAtPath("/scene/cameras/static_1")).GetCamera(0)
+    np.testing.assert_allclose(camera.frustum.position, eye, rtol=0, atol=1e-5)
+    shape = UsdGeom.Mesh(stage.GetPrimAtPath("/scene/mesh"))
+    way = shape.ComputeLocalToWorldTransform(0)
+    placed = way.Transform(Gf.Vec3d(*map(float, shape.GetPointsAttr().Get(0)[7])))
+    np.testing.assert_allclose(placed, vertices[7], rtol=0, atol=1e-5)
 
 
 def test_points_lie_on_the_ball_at_its_time(moving_ball, around):

@@ -56,6 +56,11 @@ def test_a_triangle_by_hand(tmp_path):
     with ZipFile(path) as archive:
         index = json.loads(archive.read("index.json"))
     assert index["frames"][1] == {"file": "frame_0001.ply", "time": 1.0, "seconds": 3.0}
+    assert "origin" not in index
+    far = UpFrame(torch.eye(3), 2.0, "y", (500_000.0, 5_600_000.0, 200.0))
+    write_splats(path, mesh, {}, far, 3.0)
+    with ZipFile(path) as archive:
+        assert json.loads(archive.read("index.json"))["origin"] == [1_000_000, -11_200_000, -400]
 
 
 def test_gaussians_go_with_the_field_and_lie_in_the_surface(moving_ball, around, tmp_path):

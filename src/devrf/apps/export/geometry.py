@@ -18,6 +18,7 @@ from torch.nn.functional import normalize
 from devrf.errors import DevrfError, expect
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
+from devrf.geometry.offset import NO_OFFSET, Offset
 from devrf.methods.base import Renderable
 from devrf.metrics.geometric import SOLID
 from devrf.rendering.renderer import Renderer, points_at_depth
@@ -77,14 +78,16 @@ class UpFrame:
         rotation: (3, 3) axes of the world onto axes of the frame.
         metres: length of a unit of the world.
         up: the world's axis that becomes y.
+        offset: of the scene in the capture's world (:mod:`devrf.geometry.offset`).
     """
 
     rotation: Tensor
     metres: float
     up: str
+    offset: Offset = NO_OFFSET
 
     @classmethod
-    def of(cls, cameras: Cameras, up: Up, metres: float) -> UpFrame:
+    def of(cls, cameras: Cameras, up: Up, metres: float, offset: Offset = NO_OFFSET) -> UpFrame:
         """The frame of a scene; ``auto`` takes the axis nearest to the cameras' mean up."""
         if up == "auto":
             mean = cameras.camera_to_world[:, :, 1].mean(dim=0)
@@ -96,18 +99,28 @@ class UpFrame:
         y = torch.zeros(3)
         x[1 if axis == 0 else 0] = 1.0
         y[axis] = sign
-        return cls(torch.stack([x, y, torch.linalg.cross(x, y)]), metres, up)
+        return cls(torch.stack([x, y, torch.linalg.cross(x, y)]), metres, up, offset)
+
+    @property
+    def origin(self) -> list[float]:
+        """x, y, z of the scene's origin in the frame, in double precision.
+
+        It has to be added to :meth:`points`, which are of float32.
+        """
+        rotation = self.rotation.double()
+        origin: list[float] = (self.metres * (rotation @ rotation.new_tensor(self.offset))).tolist()
+        return origin
 
     def points(self, points: Tensor) -> Tensor:
-        """Points (..., 3) of the world in the frame."""
+        """Points (..., 3) of the scene in the frame, from :attr:`origin`."""
         return self.metres * (points @ self.rotation.T)
 
     def pose(self, camera: Cameras) -> Tensor:
-        """Camera-to-frame (4, 4) float64 of one camera of the world, OpenGL axes."""
+        """Camera-to-frame (4, 4) float64 of one camera of the scene, OpenGL axes."""
         pose = camera.camera_to_world[0]
         camera_to_frame = torch.eye(4, dtype=torch.float64)
         camera_to_frame[:3, :3] = self.rotation @ pose[:, :3]
-        camera_to_frame[:3, 3] = self.points(pose[:, 3])
+        camera_to_frame[:3, 3] = self.points(pose[:, 3]) + camera_to_frame.new_tensor(self.origin)
         return camera_to_frame
 
 
@@ -131,7 +144,7 @@ class MovingMesh:
     """A mesh at T times, ascending in [0, 1].
 
     Attributes:
-        vertices: (T, V, 3) float32, in the capture's world.
+        vertices: (T, V, 3) float32, in the scene's world.
         faces: (F, 3) int64, counter-clockwise from outside.
         colors: (V, 3) RGB in [0, 1], sRGB.
     """

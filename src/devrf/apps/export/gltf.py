@@ -50,8 +50,9 @@ def write_gltf(
     frames. Its colours are light that the cameras saw, so its material is unlit; the normals serve
     those who give it another material.
 
-    Mesh and ``cameras``, one each by name, are in the capture's world; principal points are taken
-    to be the centres. Time 0 to 1 takes ``seconds``.
+    Mesh and ``cameras``, one each by name, are in the scene's world; principal points are taken to
+    be the centres. Far from the origin the mesh's node moves it there, since arrays are of float32.
+    Time 0 to 1 takes ``seconds``.
     """
     content = _Content()
     vertices = frame.points(mesh.vertices)
@@ -82,6 +83,8 @@ def write_gltf(
         ]
     mesh_entry: dict[str, Any] = {"name": "scene", "primitives": [primitive]}
     nodes: list[dict[str, Any]] = [{"name": "scene", "mesh": 0}]
+    if any(frame.offset):
+        nodes[0]["translation"] = frame.origin
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": f"devrf {devrf.__version__}"},
         "scene": 0,

@@ -95,11 +95,11 @@ def _write_mesh(
     """Write in the wanted format; the file, or the folder of files."""
     if settings.format not in SINGLE:
         path = folder / settings.format
-        drawn = mesh_files(mesh)
+        drawn = mesh_files(mesh, viewpoints.offset)
         write_sequence(path, settings.format, mesh.times, drawn, "surface", settings.seconds)
         return path
     name, write = SINGLE[settings.format]
-    frame = UpFrame.of(viewpoints.static, settings.up, settings.metres)
+    frame = UpFrame.of(viewpoints.static, settings.up, settings.metres, viewpoints.offset)
     write(folder / name, mesh, _named_cameras(viewpoints), frame, settings.seconds)
     return folder / name
 
@@ -116,7 +116,8 @@ def _meshes(
         assert field is not None
         surface = surface_of(model, field, viewpoints.static, settings)
         vertices = model.space.to_world(surface.points)[None]
-        yield from mesh_files(MovingMesh((time,), vertices, surface.faces, surface.colors))
+        mesh = MovingMesh((time,), vertices, surface.faces, surface.colors)
+        yield from mesh_files(mesh, viewpoints.offset)
 
 
 def _write_points(
@@ -136,7 +137,7 @@ def _write_points(
         for time in times:
             points, colors = seen_points(renderer, viewpoints.static, time, behind, settings.points)
             max_points = max(max_points, len(points))
-            yield point_file(points, colors)
+            yield point_file(points, colors, viewpoints.offset)
 
     clouds = followed(drawn(), len(times), "points")
     write_sequence(folder, "ply", times, clouds, "points", settings.seconds)

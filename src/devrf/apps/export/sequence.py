@@ -6,10 +6,12 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from torch import Tensor
 
 from devrf.apps.export.geometry import MovingMesh
 from devrf.apps.images import to_bytes
+from devrf.geometry.offset import NO_OFFSET, Offset
 from devrf.system.files import atomic_write, write_json
 
 FRAME = "world: the axes and the unit of the capture"
@@ -18,21 +20,22 @@ FRAME = "world: the axes and the unit of the capture"
 Drawn = Any
 
 
-def mesh_files(mesh: MovingMesh) -> Iterable[Drawn]:
-    """The mesh at each of its times."""
+def mesh_files(mesh: MovingMesh, offset: Offset = NO_OFFSET) -> Iterable[Drawn]:
+    """The mesh at each of its times, moved by ``offset`` to the capture's world."""
     import trimesh  # an extra
 
     colors = to_bytes(mesh.colors).numpy()
     faces = mesh.faces.numpy()
     for vertices in mesh.vertices:
-        yield trimesh.Trimesh(vertices.numpy(), faces, vertex_colors=colors, process=False)
+        placed = vertices.double().numpy() + offset
+        yield trimesh.Trimesh(placed, faces, vertex_colors=colors, process=False)
 
 
-def point_file(points: Tensor, colors: Tensor) -> Drawn:
-    """The points (N, 3) of a time, with their colours (N, 3) in [0, 1]."""
+def point_file(points: Tensor, colors: Tensor, offset: Offset = NO_OFFSET) -> Drawn:
+    """The points (N, 3) of a time, moved by ``offset``, with their colours (N, 3) in [0, 1]."""
     import trimesh
 
-    return trimesh.PointCloud(points.numpy(), colors=to_bytes(colors).numpy())
+    return trimesh.PointCloud(points.double().numpy() + offset, colors=to_bytes(colors).numpy())
 
 
 def write_sequence(
@@ -53,9 +56,25 @@ def write_sequence(
     for number, (time, geometry) in enumerate(zip(times, drawn, strict=True)):
         name = f"frame_{number:04d}.{format}"
         with atomic_write(folder / name) as partial:
-            geometry.export(str(partial), file_type=format)
+            partial.write_bytes(_content(geometry, format))
         frames.append({"file": name, "time": time, "seconds": time * seconds})
     write_json(folder / "index.json", {"content": content, "frame": FRAME, "frames": frames})
     for path in folder.glob(f"frame_[0-9]*.{format}"):
         if path.name not in {frame["file"] for frame in frames}:
             path.unlink()
+
+
+def _content(geometry: Drawn, format: str) -> bytes:
+    """A file; positions in a PLY are doubles where float32, which trimesh writes, rounds them."""
+    written = geometry.export(file_type=format)
+    content: bytes = written.encode() if isinstance(written, str) else written
+    places = np.asarray(geometry.vertices)
+    if format != "ply" or (places.astype(np.float32) == places).all():
+        return content
+    header, end, body = content.partition(b"end_header\n")
+    wide = np.empty(len(places), [("place", "<f8", 3), ("rgba", "u1", 4)])
+    single = np.frombuffer(body, [("place", "<f4", 3), ("rgba", "u1", 4)], count=len(places))
+    wide["place"] = places
+    wide["rgba"] = single["rgba"]
+    header = header.replace(b"property float", b"property double")
+    return header + end + wide.tobytes() + body[single.nbytes :]

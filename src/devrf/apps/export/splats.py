@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
 import numpy as np
@@ -40,8 +41,10 @@ def write_splats(
 ) -> None:
     """Write ``frame_0000.ply`` and so on, and ``index.json``, in a zip.
 
-    A flat Gaussian lies on each vertex. Files of splats hold no ``cameras``. Other arguments are as
-    for :func:`~devrf.apps.export.gltf.write_gltf`, but for y, which is down.
+    A flat Gaussian lies on each vertex. Far from the origin, positions are relative to the
+    ``origin`` that the index states, since they are of float32. Files of splats hold no
+    ``cameras``. Other arguments are as for :func:`~devrf.apps.export.gltf.write_gltf`, but for y,
+    which is down.
     """
     frames = []
     with atomic_write(path) as partial, ZipFile(partial, "w", ZIP_DEFLATED) as archive:
@@ -52,7 +55,9 @@ def write_splats(
             # An entry without a date: the same splats are the same file.
             archive.writestr(ZipInfo(name), content, ZIP_DEFLATED)
             frames.append({"file": name, "time": time, "seconds": time * seconds})
-        index = {"content": "splats", "frame": "y down, metres", "frames": frames}
+        index: dict[str, Any] = {"content": "splats", "frame": "y down, metres", "frames": frames}
+        if any(frame.offset):
+            index["origin"] = [sign * v for sign, v in zip(DOWN, frame.origin, strict=True)]
         archive.writestr(ZipInfo("index.json"), json.dumps(index, indent=2), ZIP_DEFLATED)
 
 

@@ -34,6 +34,8 @@ def write_usd(
     root = UsdGeom.Xform.Define(stage, "/scene")
     stage.SetDefaultPrim(root.GetPrim())
     shape = UsdGeom.Mesh.Define(stage, "/scene/mesh")
+    if any(frame.offset):
+        shape.AddTranslateOp().Set(Gf.Vec3d(frame.origin))
     shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     shape.CreateDoubleSidedAttr(True)
     shape.CreateFaceVertexCountsAttr(Vt.IntArray([3] * len(mesh.faces)))

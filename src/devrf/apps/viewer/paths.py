@@ -28,6 +28,7 @@ from devrf.apps.viewer.cameras import from_browser
 from devrf.apps.viewer.controls import choice_of, number_of, set_value
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
+from devrf.geometry.offset import Offset
 from devrf.rendering.view import Viewable
 
 # Keyframes of a known path, and the seconds that it takes to go round.
@@ -90,13 +91,14 @@ class PathPanel:
         time: Callable[[], float],
         fly: Callable[[CameraPath], None],
         changed: Callable[[], None],
+        offset: Offset,
     ) -> None:
         """Put the panel on the page.
 
         ``folder`` is the run's, and ``run`` the overrides that name it in a command; ``height`` the
         rows of frames, for files that say so; ``presets`` are keyframes from the current ``time``
         in [0, 1]. ``fly`` shows a path from its beginning to its end; ``changed`` is called when a
-        path appears in the scene, or vanishes.
+        path appears in the scene, or vanishes. Positions in files have the scene's ``offset``.
         """
         self.keyframes: tuple[Keyframe, ...] = ()
         self._server = server
@@ -105,6 +107,7 @@ class PathPanel:
         self._height = height
         self._time = time
         self._changed = changed
+        self._offset = offset
         self._line: viser.LineSegmentsHandle | None = None
         gui = server.gui
         with gui.add_folder("Video", expand_by_default=False):
@@ -184,14 +187,14 @@ class PathPanel:
 
     def _save(self, _: object) -> None:
         file = self._folder / "paths" / f"{check_name(self._name.value)}.json"
-        write_path(file, self.path(), self._height)
+        write_path(file, self.path(), self._height, self._offset)
         words = ["python", "-m", "devrf", "stage=render", *self._run, f"video.path={file}"]
         set_value(self._command, shlex.join(words))
         self._command.visible = True
 
     def _load(self, _: object) -> None:
         upload = self._upload.value
-        path = path_from(upload.content, upload.name)
+        path = path_from(upload.content, upload.name, self._offset)
         self._take(path.keyframes)
         set_value(self._fps, min(max(path.fps, 1.0), 120.0))
         set_value(self._aspect, min(max(path.aspect, 0.1), 10.0))

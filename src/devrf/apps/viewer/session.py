@@ -77,6 +77,7 @@ class Session:
             time=lambda: self.controls.playback.time,
             fly=self._fly,
             changed=self.refresh,
+            offset=viewpoints.offset,
         )
         self._frusta = FrustaLayer(self.server, viewpoints.static, scene)
         self.controls.dynamic.visible = scene is not None and scene.moves

@@ -253,6 +253,7 @@ def _description(model: DeVRFModel, viewpoints: Viewpoints) -> dict[str, Any]:
         "uniforms": uniforms,
         "times": [0.0] if motion is None else motion.clock.times,
         "up": upward(static).tolist(),
+        "offset": viewpoints.offset,
         "frustum": frustum_depth(static),
         "cameras": list(described(model, viewpoints)),
     }

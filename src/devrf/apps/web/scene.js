@@ -322,8 +322,10 @@ class Page {
   /** Camera and time in a link; the pose is what camera paths of stage=render have. */
   get link() {
     const { right, up, backward, eye, distance, fov, middle } = this.camera;
-    const rows = [0, 1, 2].map((k) => [right[k], up[k], backward[k], eye[k]]);
-    const pose = rows.flat().map((value) => value.toPrecision(7));
+    const offset = this.scene.offset; // of the capture's world, far from the origin
+    const rows = [0, 1, 2].map((k) => [right[k], up[k], backward[k], eye[k] + offset[k]]);
+    const digits = offset.some(Boolean) ? 15 : 7;
+    const pose = rows.flat().map((value) => value.toPrecision(digits));
     const lens = `&fov=${(fov * 180) / Math.PI}&middle=${middle}`;
     return `#pose=${pose}&distance=${distance}${lens}&time=${this.time}`;
   }
@@ -333,7 +335,9 @@ class Page {
     const words = new URLSearchParams(location.hash.slice(1));
     const [distance, fov, time] = ["distance", "fov", "time"].map((k) => parseFloat(words.get(k)));
     const list = (name, otherwise) => (words.get(name) ?? otherwise).split(",").map(parseFloat);
-    const [pose, middle] = [list("pose", ""), list("middle", "0,0")];
+    const [given, middle] = [list("pose", ""), list("middle", "0,0")];
+    const { offset } = this.scene;
+    const pose = given.map((value, k) => (k % 4 === 3 ? value - offset[(k - 3) / 4] : value));
     const numbers = pose.length === 12 && [...pose, middle[0], middle[1]].every(Number.isFinite);
     const poses = numbers && distance > 0 && fov > 0;
     if (poses) this.camera = Camera.of({ pose, distance, fov: (fov * Math.PI) / 180, middle });
