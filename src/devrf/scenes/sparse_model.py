@@ -23,8 +23,8 @@ from devrf.geometry.box import Box
 from devrf.geometry.poses import average_pose, relative_to
 from devrf.scenes.bounds import LEAST_COSINE, nearest_point
 from devrf.scenes.files import decoding, entries
-from devrf.scenes.image_folders import by_number
 from devrf.scenes.lens import CameraKeys, Intrinsics, intrinsics_of
+from devrf.scenes.names import in_order
 from devrf.scenes.validation import FARTHEST, in_reach, scene_error
 from devrf.system.options import abbreviated
 
@@ -140,7 +140,7 @@ def model_folders(root: Path) -> ModelFolders:
     found = ModelFolders()
     for above in (root / "sparse", root / "colmap/sparse"):
         inner = [path for path in entries(above) if path.is_dir()] if os.path.isdir(above) else []
-        for folder in (*sorted(inner, key=lambda path: by_number(path.name)), above):
+        for folder in (*in_order(inner, name=lambda path: path.name, where=above), above):
             lacks = [
                 [file for part in PARTS if not os.path.isfile(file := folder / f"{part}.{suffix}")]
                 for suffix in ("bin", "txt")
