@@ -107,7 +107,7 @@ def test_of_fixed_cameras_one_is_held_out(scene_folder, caplog):
 
     def third_camera(content: dict[str, Any]) -> None:
         poses = [frame["transform_matrix"] for frame in content["frames"][:2]]
-        high = [[*row[:3], row[3] + 0.1] if row[3] else row for row in poses[0]]
+        high = [[*row[:3], row[3] + 0.1] for row in poses[0][:3]]
         for k, frame in enumerate(content["frames"]):
             frame["transform_matrix"] = (*poses, high)[k % 3]
             frame["time"] = float(k // 3)
