@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import logging
 import os
+import re
+import subprocess
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from io import BufferedReader
+from itertools import count
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
 
 import cv2
+import imageio_ffmpeg
 import numpy as np
 import numpy.typing as npt
 
@@ -17,12 +23,23 @@ from devrf.scenes.files import existing_file
 from devrf.scenes.image_folders import listed_images
 from devrf.scenes.validation import scene_error
 
+log = logging.getLogger(__name__)
+
 # 8-bit RGB, (H, W, 3).
 Picture = npt.NDArray[np.uint8]
 # Width, height.
 Size = tuple[int, int]
 
+# Suffixes of videos; FFmpeg tells what they are by their content.
+VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mts", ".m2ts", ".3gp")
+
 _REMEDY = "convert it, for example to H.264 in an mp4 file"
+# A film that has fewer of its frames, and ends before this share of its duration, was cut off.
+_WHOLE = 0.95
+# Lines of FFmpeg's log: a frame, numbered from 0, and its time in microseconds; how long the file
+# says that it is.
+_FRAME = re.compile(rb" n: *(\d+) pts: *(-?\d+) ")
+_DURATION = re.compile(rb"Duration: (\d+):(\d+):(\d+\.\d+)")
 
 
 def is_folder(path: Path) -> bool:
@@ -32,117 +49,190 @@ def is_folder(path: Path) -> bool:
 
 @dataclass(frozen=True)
 class FilmHeader:
-    """What a video says of itself.
+    """What footage says of itself.
 
     Attributes:
-        size: width and height of its frames in pixels.
-        frames: how many it has; not to be relied on, cameras and converters miscount.
+        size: width and height of its frames in pixels, turned as the file says, pixels square.
+        frames: how many it has; of a video not to be relied on, cameras and converters miscount.
+        rate: frames a second, on average; 1 of photographs.
     """
 
     size: Size
     frames: int
+    rate: float = field(compare=False)
 
 
 def film_header(path: Path) -> FilmHeader:
-    """What a video says of itself, no frame decoded; DevrfError if it is none."""
-    with _opened(path) as video:
-        width = int(video.get(cv2.CAP_PROP_FRAME_WIDTH))
-        height = int(video.get(cv2.CAP_PROP_FRAME_HEIGHT))
-        frames = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
-    return FilmHeader((width, height), frames)
-
-
-def frame_count(path: Path) -> int:
-    """How many frames the footage claims to have, at least 1: for progress, not to rely on."""
-    return max(1, len(listed_images(path)) if is_folder(path) else film_header(path).frames)
-
-
-def pictures(path: Path) -> Iterator[tuple[float, Picture]]:
-    """Time in seconds since the first frame, and each frame, turned as its file says.
-
-    The times of photographs are their positions. DevrfError if it is no footage.
-    """
-    if is_folder(path):
-        for position, file in enumerate(listed_images(path)):
-            yield float(position), _photograph(file)
-        return
-    with _opened(path) as video:
-        yield from _frames(path, video)
-
-
-def chosen(path: Path, positions: Sequence[int]) -> Iterator[tuple[int, Picture]]:
-    """The frames at ``positions``, ascending, each with its position; no others are kept.
-
-    DevrfError if it is no footage, or ends before the last position.
-    """
-    wanted = set(positions)
-    last = max(positions)
+    """What footage says of itself, no frame of a video decoded; DevrfError if it is none."""
     if is_folder(path):
         files = listed_images(path)
-        for position in sorted(wanted):
-            yield position, _photograph(files[position])
-        return
-    with _opened(path) as video:
-        for position in range(last + 1):
-            read = video.grab()
-            image = None
-            if read and position in wanted:
-                read, image = video.retrieve()
-            if not read:
-                raise scene_error(
-                    path, f"ends after {position} frames, expected {last + 1}; convert it again"
-                )
-            if image is not None:
-                yield position, _rgb(image)
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
+        height, width = _photograph(files[0]).shape[:2]
+        return FilmHeader((width, height), len(files), 1.0)
     existing_file(path, "give a video that is there")
     # FFmpeg and OpenCV would print on stderr what is said here in a line.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
     video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     cv2.utils.logging.setLogLevel(level)
-    try:
-        if not video.isOpened():
-            raise scene_error(path, f"not a readable video; {_REMEDY}")
-        yield video
-    finally:
-        video.release()
+    width, height, frames, turn = (
+        int(video.get(key))
+        for key in (
+            cv2.CAP_PROP_FRAME_WIDTH,
+            cv2.CAP_PROP_FRAME_HEIGHT,
+            cv2.CAP_PROP_FRAME_COUNT,
+            cv2.CAP_PROP_ORIENTATION_META,
+        )
+    )
+    rate = video.get(cv2.CAP_PROP_FPS)
+    aspect = video.get(cv2.CAP_PROP_SAR_NUM) / (video.get(cv2.CAP_PROP_SAR_DEN) or 1)
+    opened = video.isOpened()
+    video.release()
+    if not opened or not 0 < rate < 10_000:
+        raise scene_error(path, f"not a readable video; {_REMEDY}")
+    # The width of a pixel as it is stored over its height; 0: not stated.
+    if aspect > 0 and turn % 180:
+        height = round(height * aspect)
+    elif aspect > 0:
+        width = round(width * aspect)
+    return FilmHeader((width, height), frames, rate)
 
 
-def _frames(path: Path, video: cv2.VideoCapture) -> Iterator[tuple[float, Picture]]:
-    rate = float(video.get(cv2.CAP_PROP_FPS))
-    if not 0 < rate < 10_000:
-        raise scene_error(path, f"states no frame rate; {_REMEDY}")
-    position = 0
-    last = -1.0
-    while True:
-        read, image = video.read()
-        if not read:
-            break
-        # Phones do not keep their rate; frames without times are taken to be evenly spaced.
-        time = float(video.get(cv2.CAP_PROP_POS_MSEC)) / 1000
-        if not time > last:
-            time = last + 1 / rate if position else 0.0
-        yield time, _rgb(image)
-        position += 1
-        last = time
-    if position < 2:
+def frame_count(path: Path) -> int:
+    """How many frames the footage claims to have, at least 1: for progress, not to rely on."""
+    return max(1, film_header(path).frames)
+
+
+def pictures(path: Path) -> Iterator[tuple[float, Picture]]:
+    """Time in seconds since the first frame, and each frame, as :func:`chosen` gives them.
+
+    The times of photographs are their positions. DevrfError if it is no footage. A warning says
+    that a video ends well before its stated end.
+    """
+    if is_folder(path):
+        for position, file in enumerate(listed_images(path)):
+            yield float(position), _photograph(file)
+        return
+    for _, time, picture in _decoded(path):
+        yield time, picture
+
+
+def chosen(path: Path, positions: Sequence[int]) -> Iterator[tuple[int, Picture]]:
+    """The frames at ``positions``, ascending, each with its position; no others are kept.
+
+    They are turned as their file says, pixels are square, and interlaced frames of a video are
+    deinterlaced. DevrfError if it is no footage, or ends before the last position.
+    """
+    wanted = sorted(set(positions))
+    if is_folder(path):
+        files = listed_images(path)
+        for position in wanted:
+            yield position, _photograph(files[position])
+        return
+    for position, _, picture in _decoded(path, wanted):
+        yield position, picture
+
+
+def _decoded(
+    path: Path, wanted: Sequence[int] | None = None
+) -> Iterator[tuple[int, float, Picture]]:
+    """Position, time in seconds since the first frame, and picture: of all frames, or of some."""
+    header = film_header(path)
+    width, height = header.size
+    with _ffmpeg(path, header.size, wanted) as (frames, lines):
+        shown = _shown(path, lines, header.rate)
+        position, time = -1, 0.0
+        for target in count() if wanted is None else wanted:
+            picture = np.empty((height, width, 3), np.uint8)
+            if frames.readinto(picture.data) < picture.nbytes:
+                break
+            # FFmpeg has written a frame's line before the frame.
+            while position < target:
+                position, time = next(shown)
+            yield position, time, picture
+        else:
+            return
+        *_, (position, time) = [(position, time), *shown]
+        lines.seek(0)
+        said = lines.read()
+    number = position + 1
+    if wanted is not None:
+        raise scene_error(
+            path, f"ends after {number} frames, expected {wanted[-1] + 1}; convert it again"
+        )
+    if number < 2:
         raise scene_error(
             path,
-            f"a video of {position or 'no'} frame{'s' * (position != 1)}, expected at least 2; "
+            f"a video of {number or 'no'} frame{'s' * (number != 1)}, expected at least 2; "
             f"give a longer one, or {_REMEDY}",
         )
+    # Frames that an edit leaves out are counted, too, and where no number is stated it is a guess
+    # from the duration, which may be that of the sound: only both together tell.
+    duration = header.frames / header.rate
+    if (match := _DURATION.search(said)) and b"Input #0, avi" not in said:  # FFmpeg corrects AVI's
+        hours, minutes, seconds = map(float, match.groups())
+        duration = 3600 * hours + 60 * minutes + seconds
+    if number < _WHOLE * header.frames and time + 1 / header.rate < _WHOLE * duration:
+        log.warning(
+            "%s: ends after %d frames, but states %d; if it was cut off, copy it again",
+            *(path, number, header.frames),
+        )
+
+
+def _shown(path: Path, lines: BufferedReader, rate: float) -> Iterator[tuple[int, float]]:
+    """Position and time of each frame that FFmpeg has decoded so far."""
+    start = time = 0.0
+    matches = (match for line in iter(lines.readline, b"") if (match := _FRAME.search(line)))
+    for position, match in enumerate(matches):
+        if int(match[1]) != position:  # FFmpeg counts anew
+            raise scene_error(
+                path, f"frame {position} has not the size or colours of those before it; {_REMEDY}"
+            )
+        stamp = int(match[2]) / 1e6
+        if position == 0:
+            start = stamp
+        else:
+            # Phones do not keep their rate; a frame without a time of its own is one step later.
+            time = stamp - start if stamp - start > time else time + 1 / rate
+        yield position, time
+
+
+@contextmanager
+def _ffmpeg(
+    path: Path, size: Size, wanted: Sequence[int] | None
+) -> Iterator[tuple[BufferedReader, BufferedReader]]:
+    """FFmpeg at work: the pixels of the wanted frames, one after the other, and its log."""
+    kept = "1" if wanted is None else "+".join(f"eq(n,{position})" for position in wanted)
+    filters = (
+        "yadif=deint=interlaced,settb=1/1000000,showinfo=checksum=0,"
+        f"select='{kept}',scale={size[0]}:{size[1]}"
+    )
+    try:
+        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-nostdin", "-nostats"]
+    except RuntimeError as error:
+        raise scene_error(path, f"cannot be read without FFmpeg ({error})") from None
+    # Half a frame at the end of what is there is left out, and so are cover pictures (V).
+    command += ["-fflags", "+discardcorrupt", "-i", f"file:{path}", "-map", "0:V:0"]
+    command += ["-vf", filters, "-fps_mode", "passthrough"]
+    command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "pipe:1"]
+    with TemporaryDirectory() as folder:
+        # A file: of two pipes one could fill while the other is waited for.
+        log_file = Path(folder) / "log"
+        with (
+            log_file.open("wb") as stderr,
+            log_file.open("rb") as lines,
+            subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=stderr
+            ) as process,
+        ):
+            assert isinstance(process.stdout, BufferedReader)
+            try:
+                yield process.stdout, lines
+            finally:
+                process.kill()
 
 
 def _photograph(file: Path) -> Picture:
     image = cv2.imread(str(file), cv2.IMREAD_COLOR)
     if image is None:
         raise scene_error(file, "not a readable image; convert it to PNG or JPEG")
-    return _rgb(image)
-
-
-def _rgb(image: npt.NDArray[Any]) -> Picture:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)

@@ -18,7 +18,7 @@ from torch import Tensor
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
-from devrf.scenes.footage import Picture, chosen, is_folder, pictures
+from devrf.scenes.footage import VIDEOS, Picture, chosen, is_folder, pictures
 from devrf.scenes.image_folders import listed_images
 from devrf.scenes.masks import HALF, WHITE, read_mask
 from devrf.scenes.scene import Views
@@ -108,8 +108,6 @@ def fitted(picture: Picture, size: Size) -> Picture:
 
 # 8-bit grey, (H, W): white is kept, black is background.
 Mask = npt.NDArray[np.uint8]
-
-VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm")
 
 
 def alpha_masks_of(

@@ -43,7 +43,7 @@ from devrf.system.progress import followed
 log = logging.getLogger(__name__)
 
 # Part of every key: a new version makes earlier results invalid.
-VERSION = 2
+VERSION = 3
 # Folders below the scene's: the results of the steps, and the images.
 WORK = "capture"
 IMAGES = "images"

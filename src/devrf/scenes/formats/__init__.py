@@ -9,6 +9,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 from devrf.scenes.files import entries, scene_folder
+from devrf.scenes.footage import VIDEOS
 from devrf.scenes.images import SUFFIXES
 from devrf.scenes.sparse_model import PARTS, model_folders
 from devrf.scenes.validation import scene_error
@@ -52,8 +53,6 @@ LAYOUTS = (
     COLMAP,
     KnownLayout("forward", "LLFF", ("poses_bounds.npy",)),
 )
-# Suffixes of footage, of which stage=capture makes scenes.
-VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 
 
 def recognise(root: str | Path) -> KnownLayout:

@@ -1,0 +1,169 @@
+"""Films as cameras and converters write them: right frames at right times, or one line."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from PIL import Image
+
+from devrf.errors import DevrfError
+from devrf.scenes.footage import chosen, film_header, pictures
+
+WIDTH, HEIGHT, FRAMES, RATE = 96, 64, 12, 10
+
+
+def frame(k: int) -> np.ndarray:
+    """A red bar above, a blue one on the left; a grey patch, its level 20 k, says which it is."""
+    picture = np.full((HEIGHT, WIDTH, 3), 60, np.uint8)
+    picture[:16] = (250, 20, 20)
+    picture[16:, :16] = (20, 20, 250)
+    picture[32:56, 40:72] = 20 * k
+    return picture
+
+
+def number(picture: np.ndarray) -> int:
+    """Which frame it is, by its patch."""
+    height, width = picture.shape[:2]
+    patch = picture[height * 5 // 8 : height * 3 // 4, width // 2 : width * 5 // 8]
+    return round(float(patch.mean()) / 20)
+
+
+def ffmpeg(*arguments: object) -> None:
+    words = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-y", *map(str, arguments)]
+    subprocess.run(words, check=True, capture_output=True)
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory) -> Path:
+    """A pattern of files of all frames."""
+    folder = tmp_path_factory.mktemp("frames")
+    for k in range(FRAMES):
+        Image.fromarray(frame(k)).save(folder / f"{k:02d}.png")
+    return folder / "%02d.png"
+
+
+@pytest.fixture
+def film(tmp_path, frames):
+    """Writes a film by FFmpeg's options; returns its path."""
+
+    def write(name: str, *options: str) -> Path:
+        ffmpeg("-r", RATE, "-i", frames, *options, tmp_path / name)
+        return tmp_path / name
+
+    return write
+
+
+H264 = ("-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "8")
+KINDS = {
+    "plain.mp4": H264,
+    "interlaced.mp4": (*H264, "-vf", "setfield=tff", "-x264-params", "tff=1"),
+    "interlaced.mkv": (*H264, "-vf", "setfield=bff", "-x264-params", "bff=1"),
+    "camcorder.avi": (
+        *("-vf", "setfield=tff", "-c:v", "mpeg2video", "-q:v", "2"),
+        *("-flags", "+ildct+ilme"),
+    ),
+    "av1.mp4": ("-c:v", "libsvtav1", "-crf", "10"),
+    "ten_bit.mp4": ("-c:v", "libx264", "-pix_fmt", "yuv420p10le", "-crf", "8"),
+    "vp9 [1], 50%.webm": ("-c:v", "libvpx-vp9", "-crf", "8", "-b:v", "0"),
+    "moving.gif": (),
+}
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_every_frame_is_read_once_at_its_time(film, name):
+    path = film(name, *KINDS[name])
+    assert film_header(path).size == (WIDTH, HEIGHT)
+    times, shown = zip(*pictures(path), strict=True)
+    assert times == pytest.approx(np.arange(FRAMES) / RATE, abs=1e-3)
+    assert [number(picture) for picture in shown] == list(range(FRAMES))
+    assert shown[0][4:12, 30:].reshape(-1, 3).mean(axis=0) == pytest.approx([250, 20, 20], abs=6)
+    assert shown[0][24:56, 4:12].reshape(-1, 3).mean(axis=0) == pytest.approx([20, 20, 250], abs=6)
+    some = [(position, number(picture)) for position, picture in chosen(path, [9, 2, 2, 11])]
+    assert some == [(2, 2), (9, 9), (11, 11)]
+
+
+def test_pixels_are_square_and_frames_upright(film, tmp_path):
+    path = film("wide.mp4", *H264, "-vf", "setsar=4/3")
+    assert film_header(path).size == (128, 64)
+    _, picture = next(pictures(path))
+    assert picture.shape == (64, 128, 3)
+    assert picture[4:12].reshape(-1, 3).mean(axis=0) == pytest.approx([250, 20, 20], abs=6)
+    ffmpeg("-display_rotation", 90, "-i", path, "-c", "copy", tmp_path / "turned.mp4")
+    assert film_header(tmp_path / "turned.mp4").size == (64, 128)
+    # A quarter turn to the left.
+    _, picture = next(pictures(tmp_path / "turned.mp4"))
+    assert picture.shape == (128, 64, 3)
+    assert picture[:, 4:12].reshape(-1, 3).mean(axis=0) == pytest.approx([250, 20, 20], abs=6)
+
+
+def test_times_are_those_of_the_frames_and_an_edit_is_followed(film, tmp_path, caplog):
+    slower = "setpts='round(if(lt(N,6),N,2*N-6)/10/TB)'"
+    path = film("slower.mp4", *H264, "-vf", slower, "-fps_mode", "vfr")
+    times = [time for time, _ in pictures(path)]
+    assert times == pytest.approx([*np.arange(6) / 10, *(0.6 + np.arange(6) / 5)], abs=1e-3)
+    ffmpeg("-ss", 0.4, "-i", film("whole.mp4", *H264), "-c", "copy", tmp_path / "trimmed.mp4")
+    times, shown = zip(*pictures(tmp_path / "trimmed.mp4"), strict=True)
+    assert [number(picture) for picture in shown] == list(range(4, FRAMES))
+    assert times == pytest.approx(np.arange(FRAMES - 4) / RATE, abs=1e-3)
+    assert not caplog.records
+
+
+def cut(path: Path) -> Path:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 6 // 10])
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("cut.mp4", (*H264, "-g", "1", "-movflags", "+faststart")),
+        ("cut.mkv", ("-c:v", "ffv1")),
+        ("cut.avi", ("-c:v", "rawvideo", "-pix_fmt", "bgr24")),
+    ],
+)
+def test_a_film_that_was_cut_off_is_said(film, caplog, name, options):
+    path = cut(film(name, *options))
+    shown = [number(picture) for _, picture in pictures(path)]
+    assert 2 <= len(shown) < 10 and shown == list(range(len(shown)))
+    (record,) = caplog.records
+    assert f"{name}: ends after {len(shown)} frames, but states 12;" in record.getMessage()
+    with pytest.raises(DevrfError, match=rf"{name}: ends after {len(shown)} frames, expected 12"):
+        list(chosen(path, [0, 11]))
+
+
+def test_sound_that_lasts_longer_is_no_cut(film, tmp_path, caplog):
+    sound = ("-f", "lavfi", "-i", "sine=d=4", "-map", "0", "-map", "1", "-c:v", "copy")
+    ffmpeg("-i", film("silent.mp4", *H264), *sound, tmp_path / "sound.mp4")
+    assert len(list(pictures(tmp_path / "sound.mp4"))) == FRAMES and not caplog.records
+
+
+def test_what_is_no_film_is_one_line(film, tmp_path, frames):
+    (tmp_path / "empty.mp4").touch()
+    ffmpeg("-f", "lavfi", "-i", "sine=d=1", "-c:a", "aac", tmp_path / "sound.m4a")
+    film("one.mp4", *H264, "-frames:v", "1")
+    ffmpeg("-i", film("small.mp4", *H264, "-s", "48x32"), "-c", "copy", tmp_path / "small.ts")
+    ffmpeg("-i", film("large.mp4", *H264), "-c", "copy", tmp_path / "joined.ts")
+    with (tmp_path / "joined.ts").open("ab") as joined:
+        joined.write((tmp_path / "small.ts").read_bytes())
+    for name, said in (
+        ("empty.mp4", "not a readable video; convert it"),
+        ("sound.m4a", "not a readable video; convert it"),
+        ("one.mp4", "a video of 1 frame, expected at least 2"),
+        ("joined.ts", "has not the size or colours of those before it"),
+        ("nowhere.mp4", "no such file"),
+    ):
+        with pytest.raises(DevrfError) as caught:
+            list(pictures(tmp_path / name))
+        assert str(caught.value).startswith(str(tmp_path / name)) and said in str(caught.value)
+
+
+def test_a_cover_picture_is_no_film(film, tmp_path, frames):
+    streams = ("-map", "0", "-map", "1", "-c:v:0", "mjpeg", "-c:v:1", "copy")
+    cover = ("-i", str(frames) % 5, "-i", film("bare.mp4", *H264))
+    ffmpeg(*cover, *streams, "-disposition:v:0", "attached_pic", tmp_path / "cover.mp4")
+    shown = [number(picture) for _, picture in pictures(tmp_path / "cover.mp4")]
+    assert shown == list(range(FRAMES))
