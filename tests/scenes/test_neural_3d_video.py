@@ -10,9 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from devrf.apps.video_file import write_pictures
 from devrf.geometry.cameras import Cameras
+from devrf.scenes.formats import recognise
 from devrf.scenes.formats.neural_3d_video import Neural3DVideoReader
 
 # Not square. The numbers of the videos leave some out.
@@ -84,6 +86,29 @@ def test_some_frames_some_cameras_another_held_out(folder):
     assert colours(scene.dynamic.test) == [(3, t) for t in (0, 2, 4)]
 
 
+def as_images(path: Path, into: str = "") -> None:
+    """A video's frames in a folder in its place, as ``0.png`` and so on."""
+    (path.with_suffix("") / into).mkdir(parents=True)
+    for t, picture in enumerate(film(NAMES.index(path.name))):
+        Image.fromarray(picture).save(path.with_suffix("") / into / f"{t}.png")
+    path.unlink()
+
+
+def test_frames_may_be_images_and_videos_have_any_suffix(folder):
+    as_images(folder / "cam00.mp4")
+    as_images(folder / "cam03.mp4", "images")
+    (folder / "cam02.mp4").rename(folder / "cam02.MOV")
+    # Some of its frames, for a program that wants images: the video is read.
+    (folder / "cam10").mkdir()
+    Image.new("RGB", (WIDTH, HEIGHT)).save(folder / "cam10/0.png")
+    assert recognise(folder).choice == "neural_3d_video"
+    scene = Neural3DVideoReader(folder, downscale=1, frames=None).read()
+    train = scene.dynamic.train
+    assert colours(train) == [(k, t) for t in range(FRAMES) for k in (1, 2, 3)]
+    assert colours(scene.dynamic.test) == [(0, t) for t in range(FRAMES)]
+    assert train.names[3:6] == ("cam02.MOV frame 1", "cam03 frame 1", "cam10.mp4 frame 1")
+
+
 def poses(folder: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
     np.save(folder / "poses_bounds.npy", change(np.load(folder / "poses_bounds.npy")))
 
@@ -101,7 +126,15 @@ def poses(folder: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
         ),
         (
             lambda root: [path.unlink() for path in root.glob("cam*")],
-            "coffee: 0 videos cam00.mp4, cam01.mp4, …, expected",
+            "coffee: 0 videos cam00.mp4, cam01.mp4, …, or folders",
+        ),
+        (
+            lambda root: as_images(root / "cam03.mp4") or (root / "cam03/6.png").unlink(),
+            "cam03: 6 frames of 32x24 px, but cam00.mp4 has 7 frames of 32x24 px",
+        ),
+        (
+            lambda root: shutil.copy(root / "cam03.mp4", root / "cam3.mkv"),
+            "cam3.mkv: has the number of cam03.mp4, too; remove one of them",
         ),
         (
             lambda root: poses(root, lambda rows: rows * np.where(np.arange(17) == 4, 2, 1)),

@@ -36,6 +36,11 @@ class KnownLayout:
         return [name for name in self.files if not any(map(os.path.isfile, root.glob(name)))]
 
 
+def _in_any_case(suffix: str) -> str:
+    """A pattern of the suffix in letters of any size."""
+    return "".join(f"[{letter}{letter.upper()}]" for letter in suffix)
+
+
 # Where else its models may be, and in which form, says model_folders.
 COLMAP = KnownLayout("colmap", "COLMAP", tuple(f"sparse/0/{part}.bin" for part in PARTS))
 # A folder with files of several layouts has the first of them: layouts of two captures come before
@@ -48,7 +53,10 @@ LAYOUTS = (
     KnownLayout("nerfstudio", "nerfstudio", ("static/transforms.json",)),
     KnownLayout("inward", "D-NeRF, NeRF-synthetic", ("transforms_train.json",)),
     KnownLayout("nerfstudio", "nerfstudio, instant-ngp", ("transforms.json",)),
-    KnownLayout("neural_3d_video", "Neural 3D Video", ("poses_bounds.npy", "cam*.mp4")),
+    *(
+        KnownLayout("neural_3d_video", "Neural 3D Video", ("poses_bounds.npy", f"cam[0-9]*{kind}"))
+        for kind in ("/*", "/images/*", *map(_in_any_case, VIDEOS))
+    ),
     KnownLayout("forward", "NR-NeRF", ("precomputed.json",)),
     COLMAP,
     KnownLayout("forward", "LLFF", ("poses_bounds.npy",)),

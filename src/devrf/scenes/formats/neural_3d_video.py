@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from devrf.scenes.files import Positive, entries, scene_folder
-from devrf.scenes.footage import FilmHeader, Size, chosen, film_header
+from devrf.scenes.footage import VIDEOS, FilmHeader, Size, chosen, film_header
 from devrf.scenes.formats.llff_poses import PosedSet, read_static_poses
 from devrf.scenes.image_folders import Downscale
 from devrf.scenes.images import in_threads
@@ -31,48 +31,62 @@ from devrf.system.options import Count, Several, Whole
 
 log = logging.getLogger(__name__)
 
-_VIDEO = re.compile(r"cam(\d{1,6})\.mp4", re.IGNORECASE)
+# A video, or a folder.
+_NAME = re.compile(rf"cam(\d{{1,6}})({'|'.join(map(re.escape, VIDEOS))})?", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
 class CameraVideos:
-    """Videos of one length and one size.
+    """Videos, or their frames as folders of images, of one length and one size.
 
     Attributes:
-        paths: V files in the order of their names.
+        names: V names, in their order, of the files or folders.
         numbers: V numbers in these names.
+        paths: V files, or folders of images.
         header: what each of them says of itself.
     """
 
-    paths: tuple[Path, ...]
+    names: tuple[str, ...]
     numbers: tuple[int, ...]
+    paths: tuple[Path, ...]
     header: FilmHeader
 
 
 def camera_videos(folder: Path) -> CameraVideos:
-    """The videos in a folder; their frames are not read yet.
+    """The videos in a folder, or folders of their frames; no frames of videos are read yet.
 
+    Where there are both of one number, the video is taken: its frames may be some, or smaller.
     DevrfError if they are fewer than two, one cannot be read, or they differ in length or size.
     """
-    numbers = {
+    named = {
         path: int(match[1])
         for path in entries(folder)
-        if (match := _VIDEO.fullmatch(path.name)) and os.path.isfile(path)
+        if (match := _NAME.fullmatch(path.name))
+        and (os.path.isfile(path) if path.suffix.lower() in VIDEOS else os.path.isdir(path))
     }
+    filmed = [number for path, number in named.items() if path.suffix]
+    numbers = {p: number for p, number in named.items() if p.suffix or number not in filmed}
+    twice = [path for path, number in numbers.items() if [*numbers.values()].count(number) > 1]
+    if twice:
+        raise scene_error(twice[1], f"has the number of {twice[0].name}, too; remove one of them")
     if len(numbers) < 2:
         raise scene_error(
             folder,
-            f"{len(numbers)} videos cam00.mp4, cam01.mp4, …, expected 2 or more; set data.root",
+            f"{len(numbers)} videos cam00.mp4, cam01.mp4, …, or folders cam00, cam01, … of their "
+            "frames, expected 2 or more; set data.root",
         )
-    headers = {path: film_header(path) for path in numbers}
-    first, header = next(iter(headers.items()))
-    for path, other in headers.items():
+    paths = [path / "images" if os.path.isdir(path / "images") else path for path in numbers]
+    headers = [film_header(path) for path in paths]
+    header = headers[0]
+    for path, other in zip(paths, headers, strict=True):
         if other != header or other.frames < 2:
             raise scene_error(
                 path,
-                f"{_in_words(other)}, but {first.name} has {_in_words(header)}; cut or convert it",
+                f"{_in_words(other)}, but {paths[0].relative_to(folder)} has {_in_words(header)}; "
+                "cut or convert it",
             )
-    return CameraVideos(tuple(numbers), tuple(numbers.values()), header)
+    names = tuple(path.name for path in numbers)
+    return CameraVideos(names, tuple(numbers.values()), tuple(paths), header)
 
 
 def _in_words(header: FilmHeader) -> str:
@@ -119,6 +133,8 @@ def read_frames(
 @pydantic.dataclasses.dataclass(frozen=True)
 class Neural3DVideoReader(SceneReader):
     """Reads ``poses_bounds.npy`` and ``cam00.mp4``, ``cam01.mp4`` … of one length.
+
+    In place of a video there may be a folder of its frames, ``cam00/`` or ``cam00/images/``.
 
     Row k of the poses is the camera of the k-th video in the order of names: numbers may be left
     out. No camera moves. The static set is the first frame of every camera, the dynamic set the
@@ -168,10 +184,10 @@ class Neural3DVideoReader(SceneReader):
     def _split(self, videos: CameraVideos) -> tuple[int, list[int]]:
         """Positions of the held-out video and of those to learn from."""
         if self.test_view not in videos.numbers:
-            names = ", ".join(path.name for path in videos.paths)
             raise scene_error(
                 "data.test_view",
-                f"{self.test_view} is the number of none of the videos ({names}); give one of them",
+                f"{self.test_view} is the number of none of the videos "
+                f"({', '.join(videos.names)}); give one of them",
             )
         test = videos.numbers.index(self.test_view)
         train = [k for k in range(len(videos.paths)) if k != test]
@@ -216,5 +232,5 @@ def _views(
         pinholes(posed.poses[chosen], lenses, width, height)[view],
         times.repeat_interleave(len(chosen)),
         view,
-        tuple(f"{path.name} frame {frame}" for frame in frames for path in paths),
+        tuple(f"{videos.names[video]} frame {frame}" for frame in frames for video in chosen),
     )
