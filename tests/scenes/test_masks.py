@@ -93,16 +93,31 @@ def test_only_some_images_have_one(root):
         NerfstudioReader(root, masks="alpha").read()
 
 
-@pytest.mark.parametrize("kind", ["labels", "1", "RGB"])
-def test_any_grey_file_is_a_mask(root, kind):
+FILES = {
+    "labels": lambda: Image.fromarray(half(1)),
+    "bits": lambda: Image.fromarray(half()).convert("1"),
+    "RGB": lambda: Image.fromarray(half()).convert("RGB"),
+    "alpha of black": lambda: Image.fromarray(np.dstack([0 * half()] * 3 + [half()])),
+    "alpha of white": lambda: Image.fromarray(np.dstack([half()] * 4)),
+}
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_grey_files_and_alpha_channels_are_masks(root, kind):
     plain(root)
     for k in range(9):
-        image = Image.fromarray(half(1 if kind == "labels" else 255))
-        image = image if kind == "labels" else image.convert(kind)
-        image.save(root / f"masks/{k}.png")
+        FILES[kind]().save(root / f"masks/{k}.png")
     valid = NerfstudioReader(root).read().dynamic.train.valid_mask
     assert valid is not None
     assert bool(valid[:, :, : WIDTH // 2].all()) and not bool(valid[:, :, WIDTH // 2 :].any())
+
+
+def test_noise_in_a_black_mask_is_no_label(root):
+    plain(root)
+    # What a network gives for an image without the subject.
+    paint(root, 2, half(1))
+    train = NerfstudioReader(root, masks="alpha").read().dynamic.train
+    assert train.pixels[..., 3].amax(dim=(1, 2)).sort().values.tolist() == [1, *[255] * 7]
 
 
 @pytest.mark.parametrize(
@@ -115,7 +130,19 @@ def test_any_grey_file_is_a_mask(root, kind):
         (lambda r: paint(r, 1, half()[:, :40]), "masks/1.png: 40x60 px, but its image"),
         (
             lambda r: paint(r, 1, np.stack([half(), half(), 255 - half()], axis=2)),
-            "masks/1.png: a mask with colours or an alpha channel",
+            "masks/1.png: a mask with colours",
+        ),
+        (
+            lambda r: paint(r, 1, np.stack([half(), half().T.reshape(HEIGHT, WIDTH)], axis=2)),
+            "masks/1.png: a mask whose colours and alpha channel differ",
+        ),
+        (
+            lambda r: [paint(r, k, half(2) // (1 + k % 2)) for k in range(9)],
+            "masks: masks of labels 0, 1, 2, expected black and white",
+        ),
+        (
+            lambda r: [paint(r, k, half(38)) for k in range(9)],
+            "masks: masks of labels 0, 38, expected black and white",
         ),
         (lambda r: paint(r, 4, 0 * half()), "masks/4.png: leaves nothing"),
     ],

@@ -1,4 +1,4 @@
-"""Masks beside images (nerfstudio's ``mask_path``): grey files, black where they leave out.
+"""Masks beside images (nerfstudio's ``mask_path``): black where they leave out, white elsewhere.
 
 What a mask leaves out is either to be ignored (a passer-by, a tripod: nerfstudio's meaning) or
 known to be background (everything around a person). A file does not say which; the user does.
@@ -7,7 +7,7 @@ known to be background (everything around a person). A file does not say which; 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -16,10 +16,11 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from devrf.scenes.images import Finish, Size, decode, in_threads, read_header
+from devrf.scenes.images import Finish, Header, Size, decode, in_threads, read_header
 from devrf.scenes.lens import Lens
 from devrf.scenes.resampling import as_pinhole, shrink_pixels
 from devrf.scenes.validation import check_memory, scene_error
+from devrf.system.options import abbreviated
 
 log = logging.getLogger(__name__)
 
@@ -35,18 +36,45 @@ HALF = 127
 GREY_NOISE = 16
 
 
-def read_mask(path: Path, image: tuple[int, int], camera: Size | None, name: object) -> Grey:
+def white_in(masks: Iterable[Grey], where: object) -> int:
+    """The value of white in masks that belong together: 255, or 1 where they are labels 0 and 1.
+
+    One mask alone does not tell: a frame without its subject is black, up to noise. DevrfError if
+    no value of any is nearer to white than to black, and they are no such labels.
+    """
+    values = set[int]()
+    for mask in masks:
+        if int(mask.max()) > HALF:
+            return WHITE
+        values.update(np.unique(mask).tolist())
+    if max(values) > 1:
+        raise scene_error(
+            where,
+            f"masks of labels {abbreviated(sorted(values))[1:-1]}, expected black and white; make "
+            "the labels that are to be kept 255, and the others 0",
+        )
+    return max(values) or WHITE
+
+
+def white_in_files(paths: Sequence[Path]) -> int:
+    """:func:`white_in` mask files; DevrfError, too, if one is no mask."""
+    return white_in((_grey(path, read_header(path)) for path in paths), paths[0].parent)
+
+
+def read_mask(
+    path: Path, image: tuple[int, int], camera: Size | None, name: object, white: int
+) -> Grey:
     """One mask (H, W) uint8, at the size of its image.
 
     Args:
-        path: a file of 8 bits a channel that is grey and opaque. Labels 0 and 1 are black and
-            white.
+        path: a file of 8 bits a channel that is grey, or whose alpha channel is the mask.
         image: (width, height) of the image's file.
         camera: (width, height) that its camera is for; a mask may be given at that size, too.
         name: the image, for messages.
+        white: the value in the file that becomes 255, by :func:`white_in_files`.
 
     Raises:
-        DevrfError: the file cannot be read, has another size, or is not grey.
+        DevrfError: the file cannot be read, has another size, or is no mask.
     """
     header = read_header(path, image)
     size = (header.width, header.height)
@@ -56,16 +84,27 @@ def read_mask(path: Path, image: tuple[int, int], camera: Size | None, name: obj
             path,
             f"{size[0]}x{size[1]} px, but its image {name} has {image[0]}x{image[1]} px; resize it",
         )
-    pixels = decode(path, header, "RGBA")
-    spread = pixels[..., :3].max(axis=2) - pixels[..., :3].min(axis=2)
-    if int(spread.max()) > GREY_NOISE or int(pixels[..., 3].min()) < WHITE:
-        raise scene_error(path, "a mask with colours or an alpha channel; give one channel")
-    grey = np.ascontiguousarray(pixels[..., :1])
-    if int(grey.max()) == 1:
-        grey *= WHITE
+    grey = _grey(path, header) * np.uint8(WHITE // white)
     if size != image:
-        grey = shrink_pixels(grey, image[0], image[1])
-    return grey[..., 0]
+        grey = shrink_pixels(grey[..., None], image[0], image[1])[..., 0]
+    return grey
+
+
+def _grey(path: Path, header: Header) -> Grey:
+    """The values (H, W) of a mask as its file has them."""
+    pixels = decode(path, header, "RGBA")
+    colors = pixels[..., :3]
+    alpha = pixels[..., 3]
+    if int(alpha.min()) == WHITE:
+        if int(np.ptp(colors, axis=2).max()) > GREY_NOISE:
+            raise scene_error(path, "a mask with colours; give one channel, black and white")
+        return np.ascontiguousarray(pixels[..., 0])
+    # An alpha mask: what shows is of one colour, or as light as it is opaque.
+    seen = colors[alpha > 0]
+    plain = len(seen) == 0 or int(np.ptp(seen, axis=0).max()) <= GREY_NOISE
+    if not plain and np.abs(colors - alpha[..., None].astype(np.int16)).max() > GREY_NOISE:
+        raise scene_error(path, "a mask whose colours and alpha channel differ; give one channel")
+    return np.ascontiguousarray(alpha)
 
 
 def cutting_out(
@@ -83,11 +122,12 @@ def cutting_out(
             names[list(paths).index(None)],
             "has no mask_path although others have; with data.masks=alpha give every image a mask",
         )
+    white = white_in_files(masks)
     log.info("masks of %d images are their alpha masks", len(masks))
 
     def finish(index: int, image: Grey) -> Grey:
         height, width = image.shape[:2]
-        mask = read_mask(masks[index], (width, height), cameras[index], names[index])
+        mask = read_mask(masks[index], (width, height), cameras[index], names[index], white)
         cut = image.copy()
         cut[..., 3] = np.minimum(image[..., 3], mask)
         return cut
@@ -125,11 +165,12 @@ def valid_pixels(
     width, height = size
     check_memory(len(paths) * width * height, names[0].parent, f"{len(masked)} masks")
     masks = np.full((len(paths), height, width, 1), WHITE, dtype=np.uint8)
+    white = white_in_files([path for path in paths if path is not None])
 
     def fill(k: int) -> None:
         path = paths[k]
         assert path is not None
-        light = read_mask(path, image, cameras[k], names[k]) > HALF
+        light = read_mask(path, image, cameras[k], names[k], white) > HALF
         sharp = light[..., None].astype(np.uint8) * np.uint8(WHITE)
         masks[k] = sharp if size == image else shrink_pixels(sharp, width, height)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import cv2
@@ -14,6 +15,7 @@ from devrf.apps.capture.images import (
     Chosen,
     alpha_masks_of,
     box_of_motion,
+    chosen_masks,
     common_size,
     fitted,
     still_masks,
@@ -163,6 +165,21 @@ def test_masks_of_a_video_are_a_folder_or_a_video(walk, masks, tmp_path, film):
         assert image[..., 3].astype(float).mean() == pytest.approx(level, abs=3)
 
 
+def test_films_of_one_name_have_masks_of_their_own(walk, masks, tmp_path):
+    left, right, top = (tmp_path / name / "walk.mp4" for name in ("left", "right", "top"))
+    films = (left, right, top)
+    with pytest.raises(DevrfError, match=r"masks/walk: masks of .*left/walk\.mp4 or of ") as both:
+        alpha_masks_of(masks, left, 4, others=films)
+    assert f"give {masks}/left/walk and {masks}/right/walk" in str(both.value)
+    shutil.copytree(masks / "walk", masks / "left" / "walk")
+    (masks / "right").mkdir()
+    shutil.copy(walk, masks / "right" / "walk.MOV")
+    found = [alpha_masks_of(masks, path, 4, others=films) for path in films]
+    assert found == [masks / "left/walk", masks / "right/walk.MOV", masks / "walk"]
+    with pytest.raises(DevrfError, match=r"walk\.MOV: 4 alpha masks, but .* has 8 frames"):
+        alpha_masks_of(masks, right, 8)
+
+
 def test_photographs_have_masks_of_their_names(tmp_path, textured, masks):
     (tmp_path / "walk").mkdir()
     for k in (1, 3):
@@ -186,6 +203,21 @@ def test_masks_that_do_not_fit_are_refused(walk, masks, tmp_path):
     cv2.imwrite(str(masks / "walk" / "2.png"), mask(0, (32, 24)))
     with pytest.raises(DevrfError, match=r"2\.png: 32x24 px"):
         written(Chosen(walk, "static", (2,), masks / "walk"), tmp_path / "images")
+
+
+def test_masks_are_alpha_channels_and_labels_0_and_1_of_all_frames_together(masks, walk):
+    folder = masks / "walk"
+    for k in range(4):
+        cv2.imwrite(str(folder / f"{k}.png"), np.dstack([0 * np.dstack([mask(k)] * 3), mask(k)]))
+    shown = list(chosen_masks(folder, walk, [1, 3], SIZE))
+    assert (shown[0] == mask(1)).all() and (shown[1] == mask(3)).all()
+    for k in range(4):
+        cv2.imwrite(str(folder / f"{k}.png"), np.minimum(mask(0), k % 2))
+    (one,) = chosen_masks(folder, walk, [1], SIZE)
+    assert (one == mask(0)).all()
+    cv2.imwrite(str(folder / "0.png"), np.minimum(mask(0), 38))
+    with pytest.raises(DevrfError, match=r"walk: masks of labels 0, 1, 38, expected black"):
+        list(chosen_masks(folder, walk, [1], SIZE))
 
 
 def test_masks_of_what_moves_are_black_or_white_in_the_images_size(walk, masks, tmp_path):

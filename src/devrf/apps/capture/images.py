@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import repeat
 from pathlib import Path
@@ -18,9 +18,10 @@ from torch import Tensor
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
-from devrf.scenes.footage import VIDEOS, Picture, chosen, is_folder, pictures
+from devrf.scenes.files import entries
+from devrf.scenes.footage import VIDEOS, Picture, chosen, frame_count, is_folder, pictures
 from devrf.scenes.image_folders import listed_images
-from devrf.scenes.masks import HALF, WHITE, read_mask
+from devrf.scenes.masks import HALF, WHITE, read_mask, white_in, white_in_files
 from devrf.scenes.scene import Views
 from devrf.scenes.silhouettes import motion_box
 
@@ -111,38 +112,70 @@ Mask = npt.NDArray[np.uint8]
 
 
 def alpha_masks_of(
-    folder: Path, footage: Path, count: int, key: str = "capture.alpha_masks"
+    folder: Path,
+    footage: Path,
+    count: int,
+    key: str = "capture.alpha_masks",
+    others: Iterable[Path] = (),
 ) -> Path:
     """The alpha masks of some footage: ``<folder>/<its name without suffix>``, a folder or a video.
 
-    For photographs it is a folder with a file of each one's name. For a video of ``count`` frames
-    it is a folder of as many images, in the order of their names, or a video of as many frames.
-    ``key`` is the setting that gives ``folder``: masks of what moves are laid out in the same way.
+    ``<folder>/<name of the footage's folder>/<its name without suffix>`` is looked for first.
+
+    Args:
+        folder: holds the masks of all footage.
+        footage: of photographs the masks are a folder with a file of each one's name; of a video
+            a folder of as many images, in the order of their names, or a video of as many frames.
+        count: how many frames it has.
+        key: the setting that gives ``folder``: masks of what moves are laid out in the same way.
+        others: all footage, whose masks these may not be, too.
 
     Raises:
-        DevrfError: there are none, or not of all frames.
+        DevrfError: there are none, or not of all frames, or they may be those of other footage.
     """
     if not folder.is_dir():
         raise DevrfError(f"{folder}: no such folder of masks; correct {key}, or leave it out")
-    place = folder / footage.stem
-    if not place.is_dir():
-        videos = (folder / f"{footage.stem}{suffix}" for suffix in VIDEOS)
-        video = next((path for path in videos if path.is_file()), None)
-        if video is None or is_folder(footage):
-            raise DevrfError(
-                f"{place}: no such folder, expected the alpha masks of {footage}; add it with an "
-                f"image for each {'photograph' if is_folder(footage) else 'frame'}"
-            )
-        return video
+    nested, plain = _places(folder, footage)
+    place = _masks_at(folder, footage)
+    if place is None:
+        raise DevrfError(
+            f"{plain}: no such folder, expected the alpha masks of {footage}; add it with an "
+            f"image for each {'photograph' if is_folder(footage) else 'frame'}"
+        )
+    for other in others:
+        if other.resolve() != footage.resolve() and _masks_at(folder, other) == place:
+            apart, _ = _places(folder, other)
+            remedy = f"give {nested} and {apart}" if apart != nested else "rename one of them"
+            raise DevrfError(f"{place}: masks of {footage} or of {other}? {remedy}")
+    # The header of a video of masks may be a little off.
+    slack = 0.0 if is_folder(place) else 0.05 * count
     if is_folder(footage):
         for photograph in listed_images(footage):
             _of_photograph(place, photograph)
-    elif len(listed_images(place)) != count:
+    elif abs(frame_count(place) - count) > slack:
         raise DevrfError(
-            f"{place}: {len(listed_images(place))} alpha masks, but {footage} has {count} frames; "
+            f"{place}: {frame_count(place)} alpha masks, but {footage} has {count} frames; "
             "give an image for each frame, in the order of their names"
         )
     return place
+
+
+def _places(folder: Path, footage: Path) -> tuple[Path, Path]:
+    """Where its masks may be, without a suffix: by the footage's folder and name, or its name."""
+    name = footage.name if is_folder(footage) else footage.stem
+    return folder / footage.absolute().parent.name / name, folder / name
+
+
+def _masks_at(folder: Path, footage: Path) -> Path | None:
+    """The first folder, or video of a video, at one of these places."""
+    for place in _places(folder, footage):
+        if place.is_dir():
+            return place
+        if not is_folder(footage) and place.parent.is_dir():
+            for path in entries(place.parent):
+                if path.stem == place.name and path.suffix.lower() in VIDEOS:
+                    return path
+    return None
 
 
 def chosen_masks(
@@ -157,9 +190,11 @@ def chosen_masks(
         files = listed_images(masks)
         if is_folder(footage):
             files = [_of_photograph(masks, photograph) for photograph in listed_images(footage)]
+        white = white_in_files(files)
         for position in positions:
-            yield read_mask(files[position], size, None, footage)
+            yield read_mask(files[position], size, None, footage, white)
         return
+    white = white_in((_grey(picture) for _, picture in pictures(masks)), masks)
     for _, picture in chosen(masks, positions):
         height, width = picture.shape[:2]
         if (width, height) != size:
@@ -167,8 +202,12 @@ def chosen_masks(
                 f"{masks}: {width}x{height} px, but {footage} has {size[0]}x{size[1]} px; give "
                 "masks of its size"
             )
-        # Grey as it is, whatever compression has made of its colours.
-        yield picture.mean(axis=2).round().astype(np.uint8)
+        yield _grey(picture) * np.uint8(WHITE // white)
+
+
+def _grey(picture: Picture) -> Mask:
+    """A mask from a video, grey as it is, whatever compression has made of its colours."""
+    return np.asarray(picture.mean(axis=2).round(), np.uint8)
 
 
 def still_masks(images: Path, footage: Chosen) -> dict[str, Mask]:

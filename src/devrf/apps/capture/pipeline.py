@@ -73,11 +73,14 @@ def scene_from_footage(settings: CaptureSettings) -> Path:
     masks: dict[Path, Path] = {}
     if settings.alpha_masks is not None and not settings.subtracts:
         folder = Path(settings.alpha_masks).expanduser()
-        masks = {path: alpha_masks_of(folder, path, len(s.times)) for path, s in surveys.items()}
+        masks = {
+            path: alpha_masks_of(folder, path, len(s.times), others=surveys)
+            for path, s in surveys.items()
+        }
     still = None
     if settings.masks is not None:
         folder = Path(settings.masks).expanduser()
-        still = alpha_masks_of(folder, static, len(sharp), "capture.masks")
+        still = alpha_masks_of(folder, static, len(sharp), "capture.masks", surveys)
     moving = Chosen(static, "static", tuple(picked), masks.get(static), still)
     clock = Timeline((), ())
     if views:
