@@ -77,6 +77,19 @@ def test_frames_belong_to_the_cameras_of_their_rows(folder):
     assert (train.names[4], test.names[6]) == ("cam03.mp4 frame 1", "cam00.mp4 frame 6")
 
 
+def test_rows_go_by_characters(folder, caplog):
+    """cam20 comes before cam8, as LLFF has it, and the log says so."""
+    caplog.set_level("INFO")
+    before = Neural3DVideoReader(folder).read().dynamic.test
+    names = sorted(path for path in folder.iterdir() if path.suffix == ".mp4")
+    for number, path in zip((20, 28, 8, 9), names, strict=True):
+        path.rename(folder / f"cam{number}.mp4")
+    after = Neural3DVideoReader(folder, test_view=20).read().dynamic.test
+    assert torch.equal(after.cameras.camera_to_world, before.cameras.camera_to_world)
+    assert torch.equal(after.pixels, before.pixels)
+    assert "in the order of their characters: cam20.mp4 before cam8.mp4" in caplog.text
+
+
 def test_some_frames_some_cameras_another_held_out(folder):
     scene = Neural3DVideoReader(
         folder, downscale=1, frames=3, length=5, test_view=10, train_views=2

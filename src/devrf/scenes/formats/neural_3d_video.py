@@ -21,6 +21,7 @@ from devrf.scenes.footage import VIDEOS, FilmHeader, Size, chosen, film_header
 from devrf.scenes.formats.llff_poses import PosedSet, read_static_poses
 from devrf.scenes.image_folders import Downscale
 from devrf.scenes.images import in_threads
+from devrf.scenes.names import in_order
 from devrf.scenes.reader import EstimatedFlow, SceneReader
 from devrf.scenes.resampling import shrink_pixels
 from devrf.scenes.scene import Capture, Scene, Views
@@ -58,12 +59,14 @@ def camera_videos(folder: Path) -> CameraVideos:
     Where there are both of one number, the video is taken: its frames may be some, or smaller.
     DevrfError if they are fewer than two, one cannot be read, or they differ in length or size.
     """
-    named = {
-        path: int(match[1])
+    places = [
+        path
         for path in entries(folder)
-        if (match := _NAME.fullmatch(path.name))
+        if _NAME.fullmatch(path.name)
         and (os.path.isfile(path) if path.suffix.lower() in VIDEOS else os.path.isdir(path))
-    }
+    ]
+    ordered = in_order(places, name=lambda path: path.name, where=folder, by_characters=True)
+    named = {path: int(path.stem[len("cam") :]) for path in ordered}
     filmed = [number for path, number in named.items() if path.suffix]
     numbers = {p: number for p, number in named.items() if p.suffix or number not in filmed}
     twice = [path for path, number in numbers.items() if [*numbers.values()].count(number) > 1]
