@@ -342,16 +342,40 @@ def write_nerfstudio(scene: Scene, root: Path) -> None:
     root.mkdir(parents=True)
     frames: list[dict[str, Any]] = []
     for name, (views, i) in in_one_list(scene).items():
-        iio.imwrite(root / f"{name}.png", views.pixels[i].numpy())
-        pose = [*views.cameras.camera_to_world[i].tolist(), [0, 0, 0, 1]]
-        time = float(views.times[i])
-        frames.append({"file_path": f"{name}.png", "time": time, "transform_matrix": pose})
-    cameras = scene.static.train.cameras
-    (fx, fy), (cx, cy) = cameras.focal[0].tolist(), cameras.center[0].tolist()
-    content = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": cameras.width, "h": cameras.height}
+        view = views.single(i)
+        iio.imwrite(root / f"{name}.png", view.pixels[0].numpy())
+        pose = [*view.cameras.camera_to_world[0].tolist(), [0, 0, 0, 1]]
+        (fx, fy), (cx, cy) = view.cameras.focal[0].tolist(), view.cameras.center[0].tolist()
+        lens = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": view.width, "h": view.height}
+        placed = {"time": float(view.times[0]), "transform_matrix": pose}
+        frames.append({"file_path": f"{name}.png", **placed, **lens})
     names = [frame["file_path"] for frame in frames]
-    content |= {"frames": frames, "test_filenames": [n for n in names if n.startswith("test")]}
-    put_json(root / "transforms.json", content)
+    listed = {"frames": frames, "test_filenames": [n for n in names if n.startswith("test")]}
+    put_json(root / "transforms.json", listed)
+
+
+def cut(views: Views) -> Views:
+    """The views with every second image cut to 18 of its columns, and the others to 16 rows."""
+    height, width = views.pixels.shape[1:3]
+    sizes = torch.tensor([[18, height], [width, 16]]).repeat(len(views), 1)[: len(views)]
+    across = torch.arange(width) < sizes[:, :1, None]
+    inside = across & (torch.arange(height) < sizes[:, 1:])[..., None]
+    black = torch.tensor([0, 0, 0, 255], dtype=torch.uint8)[: views.pixels.shape[3]]
+    flow = views.flow and replace(views.flow, valid=views.flow.valid & inside)
+    return replace(
+        views,
+        pixels=torch.where(inside[..., None], views.pixels, black),
+        cameras=replace(views.cameras, sizes=sizes),
+        valid_mask=inside,
+        flow=flow,
+    )
+
+
+@pytest.fixture(scope="session")
+def two_sizes(tiny_scene: Scene) -> Scene:
+    """The tiny scene with images of 18×18 and of 24×16 pixels in turn."""
+    static, dynamic = tiny_scene.static.mapped(cut), tiny_scene.dynamic.mapped(cut)
+    return replace(tiny_scene, static=static, dynamic=dynamic)
 
 
 def write_nerfies(scene: Scene, root: Path, size: str = "4x") -> None:

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image, ImageOps
 
-from devrf.errors import DevrfError
 from devrf.scenes.images import decode, image_size, load_images, read_header
 
 WIDE, HIGH = (24, 16), (16, 24)
@@ -54,8 +53,17 @@ def test_a_set_is_of_one_size_once_it_is_turned(tmp_path, caplog):
     paths = [photo(tmp_path / "0.jpg", 1), photo(tmp_path / "1.jpg", 6, HIGH)]
     with caplog.at_level(logging.INFO):
         loaded = load_images(paths, 2, [WIDE, WIDE])
-    assert loaded.pixels.shape == (2, 8, 12, 3) and (loaded.width, loaded.height) == WIDE
+    assert loaded.pixels.shape == (2, 8, 12, 3) and loaded.files == [WIDE, WIDE]
     assert not bool(loaded.ambiguous_orientation.any())
     assert "1 of them turned as their EXIF orientation says" in caplog.text
-    with pytest.raises(DevrfError, match="1.jpg: 16x24 px, but .*0.jpg of the same set has 24x16"):
-        load_images(paths, 1)
+    # Without cameras none is turned, and they are of two sizes.
+    loaded = load_images(paths, 1)
+    assert loaded.pixels.shape == (2, 24, 24, 3) and loaded.sizes == [WIDE, HIGH]
+    assert np.array_equal(loaded.pixels[1, :, :16].numpy(), pixels(paths[1], None))
+    assert not bool(loaded.pixels[0, 16:].any() | loaded.pixels[1, :, 16:].any())
+
+
+def test_nearly_square_images_are_turned_too(tmp_path):
+    path = photo(tmp_path / "a.jpg", 6, (50, 48))
+    assert image_size(path, (48, 50)) == (48, 50)
+    assert not read_header(path, (48, 50)).ambiguous_orientation

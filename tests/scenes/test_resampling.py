@@ -24,7 +24,7 @@ def test_straight_lines_come_out_straight(distortion, skew, lens_directions):
     direction = lens_directions(lens, WIDTH, HEIGHT)
     coded = ((direction + 1.5) * 80).round().clamp(0, 255).to(torch.uint8)
     image = torch.cat([coded, coded[..., :1]], dim=-1)
-    pixels, (plain,) = as_pinhole(image[None], [lens], ["image"])
+    pixels, (plain,) = as_pinhole(image[None], [lens], ["image"], [(WIDTH, HEIGHT)])
     assert plain.pinhole and plain.center == lens.center
     zoom = plain.focal[0] / 70
     assert zoom == pytest.approx(plain.focal[1] / 60) and zoom >= 1
@@ -41,6 +41,7 @@ def test_a_pincushion_is_zoomed_until_nothing_is_missing():
         torch.zeros(1, HEIGHT, WIDTH, 3, dtype=torch.uint8),
         [Lens((70.0, 70.0), (48.0, 32.0), PINCUSHION)],
         ["image"],
+        [(WIDTH, HEIGHT)],
     )
     corner = torch.tensor([47.5, 31.5]) / plain.focal[0]
     reached = PINCUSHION.distort(corner) * 70
@@ -65,4 +66,4 @@ def test_a_lens_that_folds_is_an_error_that_names_the_image():
     folded = Lens((12.0, 12.0), (48.0, 32.0), Distortion((-3.0, 0.0, 0.0, 0.0)))
     image = torch.zeros(1, HEIGHT, WIDTH, 3, dtype=torch.uint8)
     with pytest.raises(DevrfError, match=r"view_7\.png"):
-        as_pinhole(image, [folded], ["view_7.png"])
+        as_pinhole(image, [folded], ["view_7.png"], [(WIDTH, HEIGHT)])

@@ -214,6 +214,7 @@ def _looking(cameras: Cameras, positions: Tensor, target: Tensor, up: Tensor) ->
 
 def _with_one_lens(cameras: Cameras, poses: Tensor) -> Cameras:
     """Cameras at ``poses`` (N, 3, 4), all with the mean focal length of the captured ones."""
+    cameras = cameras.of_commonest_size()
     focal = cameras.focal.mean().expand(len(poses), 2)
     center = focal.new_tensor([cameras.width / 2, cameras.height / 2]).expand(len(poses), 2)
     return Cameras(poses, focal, center, cameras.width, cameras.height)
@@ -246,14 +247,14 @@ def looked_at(model: Viewable, cameras: Cameras, ahead: Callable[[], float]) -> 
 
 def focus_distance(renderer: Renderer, cameras: Cameras) -> float:
     """Median depth along the optical axis, world units, of what the first camera sees at rest."""
-    cameras = cameras.to(renderer.device)
-    rays = cameras.image_rays(0)
+    camera = cameras.single(0).to(renderer.device)
+    rays = camera.image_rays(0)
     image = renderer.picture(rays, 0.0, 1.0)
     solid = (image.opacity > 0.5).nonzero()[:, 0]
     if len(solid) == 0:
         return float(cameras.positions.norm(dim=1).mean()) + 1.0
     points = points_at_depth(renderer.model.space, rays[solid], image.depth[solid])
-    _, depth = cameras.project_into(0, points)
+    _, depth = camera.project_into(0, points)
     return float(depth.median())
 
 

@@ -58,7 +58,7 @@ def frustum_depth(cameras: Cameras) -> float:
 def thumbnail(scene: Scene, views: Views, index: int) -> Tensor:
     """The image ``index`` of views as a frustum shows it: (H', W', 3) uint8 on the host."""
     image = truth_image(views, index, scene.background)
-    return to_bytes(scaled(image, min(views.height, ROWS)))
+    return to_bytes(scaled(image, min(len(image), ROWS)))
 
 
 def described(model: Viewable, viewpoints: Viewpoints) -> Iterator[dict[str, Any]]:
@@ -72,7 +72,7 @@ def described(model: Viewable, viewpoints: Viewpoints) -> Iterator[dict[str, Any
     """
     target = looked_at(model, viewpoints.static, lambda: distance_ahead(viewpoints.static))
     for kind, k, times in _shown(viewpoints):
-        camera = (viewpoints.dynamic if kind == "dynamic" else viewpoints.static)[[k]]
+        camera = (viewpoints.dynamic if kind == "dynamic" else viewpoints.static).single(k)
         fx, fy = camera.focal[0].tolist()
         cx, cy = camera.center[0].tolist()
         way = target - camera.positions[0]

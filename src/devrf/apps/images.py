@@ -107,12 +107,14 @@ def image_grid(
     labels: Sequence[Sequence[str]] = (),
     text: int | None = None,
 ) -> Tensor:
-    """A picture (H', W', 3), uint8, of images (H, W, 3) in [0, 1] of one size, and fitted text.
+    """A picture (H', W', 3), uint8, of images (H, W, 3) in [0, 1], and fitted text.
 
-    ``headings`` stand above each column, ``labels`` are lines left of each row. ``text`` is its
-    height in pixels; None: a twentieth of that of the images, within limits.
+    Images of several sizes are in the middle of places for the largest. ``headings`` stand above
+    each column, ``labels`` are lines left of each row. ``text`` is its height in pixels; None: a
+    twentieth of that of the images, within limits.
     """
-    height, width = rows[0][0].shape[:2]
+    height = max(image.shape[0] for row in rows for image in row)
+    width = max(image.shape[1] for row in rows for image in row)
     size = text or min(max(round(TEXT * height), SMALLEST_TEXT), LARGEST_TEXT)
     gap = size // 3 + 1
     widths = (font(size).getlength(line) for label in labels for line in label)
@@ -130,7 +132,7 @@ def image_grid(
     for number, row in enumerate(rows):
         y = top + number * (height + gap)
         for x, image in zip(columns, row, strict=True):
-            page.paste(Image.fromarray(to_bytes(image).cpu().numpy()), (x, y))
+            page.paste(Image.fromarray(centred(image, height, width).cpu().numpy()), (x, y))
             if x != columns[0]:
                 pen.line((x - gap // 2 - 1, y, x - gap // 2 - 1, y + height - 1), LINE)
         if number:
@@ -140,6 +142,15 @@ def image_grid(
             middle = (left / 2, y + height / 2)
             pen.multiline_text(middle, lines, INK, font(size), "mm", spacing=gap, align="center")
     return torch.from_numpy(np.array(page))
+
+
+def centred(image: Tensor, height: int, width: int) -> Tensor:
+    """An image (H, W, 3), in [0, 1] or uint8, in the middle of a white one: uint8."""
+    top = (height - image.shape[0]) // 2
+    left = (width - image.shape[1]) // 2
+    bottom = height - image.shape[0] - top
+    right = width - image.shape[1] - left
+    return torch.nn.functional.pad(to_bytes(image), (0, 0, left, right, top, bottom), value=255)
 
 
 def scaled(image: Tensor, height: int, width: int | None = None) -> Tensor:

@@ -140,15 +140,18 @@ def frame_rows(
 
 
 def data_record(scene: Scene) -> dict[str, Any]:
-    """How much data a scene has: kind, frames, views; of held-out images size, number, exposure."""
+    """How much data a scene has: kind, frames, views; of held-out images size, number, exposure.
+
+    The size is the commonest.
+    """
     test = scene.dynamic.test
-    height, width = test.pixels.shape[1:3]
+    commonest = test.cameras.of_commonest_size()
     # Half of each held-out image has told its exposure, and is not scored.
     halved = {} if test.exposure_mask is None else {"exposure": "equal"}
     frames = scene.clock.frames_of(scene.dynamic.train.times)
     return {
         "kind": scene.kind,
-        "image_size": [width, height],
+        "image_size": [commonest.width, commonest.height],
         "frames": len(scene.clock) if scene.moves else None,
         # A camera that moves is one view, however many images it took.
         "train_views": int(frames.bincount().max()) if scene.moves else None,

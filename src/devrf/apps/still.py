@@ -85,7 +85,11 @@ class StillSettings(Options):
 
 
 def sized(cameras: Cameras, height: int | None) -> Cameras:
-    """The cameras with images ``height`` pixels high; None: as high as they are, at least 400."""
+    """The cameras with images ``height`` pixels high; None: as high as they are, at least 400.
+
+    Images of several sizes become those of the commonest.
+    """
+    cameras = cameras.of_commonest_size()
     return cameras.of_height(max(cameras.height, READABLE) if height is None else height)
 
 
@@ -99,12 +103,14 @@ def still(
 ) -> tuple[Tensor, Tensor]:
     """Colour (H, W, 3) and depth as colours (H, W, 3) of what camera ``index`` sees, in [0, 1].
 
-    ``background`` is a grey level; what is outside a ``crop`` is left out.
+    They are of the size of that camera's image. ``background`` is a grey level; what is outside a
+    ``crop`` is left out.
     """
     model = renderer.model
-    shape = (cameras.height, cameras.width)
-    image = renderer.view(cameras, index, time, background, crop)
-    near, far = model.space.depth_range(model.box, model.depth_limits, cameras.positions[index])
+    camera = cameras.single(index)
+    shape = (camera.height, camera.width)
+    image = renderer.view(camera, 0, time, background, crop)
+    near, far = model.space.depth_range(model.box, model.depth_limits, camera.positions[0])
     depth = image.depth.view(shape).cpu()
     opacity = image.opacity.view(shape).cpu()
     color = image.color.view(*shape, 3).clamp(0, 1).cpu()

@@ -14,8 +14,8 @@ from pydantic import FiniteFloat
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
-from devrf.apps.images import image_grid, scaled
-from devrf.apps.still import DEPTH, sized, still
+from devrf.apps.images import centred, image_grid, scaled
+from devrf.apps.still import DEPTH, READABLE, sized, still
 from devrf.evaluation.held_out import background_value, truth_image
 from devrf.geometry.cameras import Cameras
 from devrf.rendering.renderer import Renderer
@@ -92,11 +92,13 @@ def held_out_pictures(
 ) -> Iterator[Tensor]:
     """Truth, rendering and depth (H', W', 3) side by side.
 
+    Images of several sizes are at one scale, in places for the widest and the highest.
     ``images`` are those of the ``views`` to show, one a frame (:func:`held_out_images`). Where a
     camera took several, time runs from 0 to 1. Where each is of a place of its own, it is shown at
     its own time: from there nothing was taken at another.
     """
-    cameras = settings.sized(views.cameras)
+    rows = max(views.height, READABLE) if settings.height is None else settings.height
+    cameras = views.cameras.of_height(rows)
     behind = background_value(background)
     larger = ", enlarged" if cameras.height > views.height else ""
     times = torch.linspace(0, 1, len(images)).tolist()
@@ -106,15 +108,17 @@ def held_out_pictures(
     for (image, time), frames in groupby(shots):
         color, depth = still(renderer, cameras, time, behind, image)
         # Resized from its own size, not rendered: it shows what there is to compare with.
-        truth = scaled(truth_image(views, image, background), cameras.height, cameras.width)
+        truth = truth_image(views, image, background)
+        size = f"({truth.shape[1]}x{truth.shape[0]}{larger})"
+        truth = scaled(truth, color.shape[0], color.shape[1])
         at = ""
         at_time = ""
         if renderer.model.moves:
             at = f" at {float(views.times[image]):.2f}"
             at_time = f" at time {time:.2f}"
-        size = f"({views.width}x{views.height}{larger})"
         headings = [f"truth{at} {size}", f"rendered{at_time}", DEPTH]
-        picture = image_grid([[truth, color, depth]], headings)
+        shown = [centred(tile, cameras.height, cameras.width) for tile in (truth, color, depth)]
+        picture = image_grid([shown], headings)
         yield from (picture for _ in frames)
 
 

@@ -123,7 +123,7 @@ class Viewpoints:
         views = torch.unique(train.view) if scene.moves else ()
         first = [int((train.view == view).nonzero()[0]) for view in views]
         static = scene.static.train.cameras
-        held_out = scene.dynamic.test.cameras[[0]]
+        held_out = scene.dynamic.test.cameras.single(0)
         moving = scene.moves and train.by_moving_camera and len(train) > 1
         times = tuple(train.times[first].tolist()) if moving else ()
         dynamic = train.cameras[first]
@@ -139,9 +139,10 @@ class Viewpoints:
             raise ValueError("no camera")
         for camera in cameras.values():
             camera.check()
-            sides = sorted((camera.width, camera.height))
-            if not 0 < sides[0] <= sides[1] <= min(SIDE, ASPECT * sides[0]):
-                raise ValueError("an image of a size that cannot be")
+            sizes = {(camera.width, camera.height), *map(tuple, camera.extents.tolist())}
+            for sides in map(sorted, sizes):
+                if not 0 < sides[0] <= sides[1] <= min(SIDE, ASPECT * sides[0]):
+                    raise ValueError("an image of a size that cannot be")
         followed = built(tuple[float, ...], entry.get("followed", ()))
         if len(followed) not in (0, len(cameras["dynamic"])):
             raise ValueError("times of other cameras")

@@ -106,11 +106,13 @@ class FramePool:
         images = torch.arange(len(views), device=views.frames.device)
         pool = all_pixels(views, images)
         if centre:
-            inside = torch.zeros(views.height, views.width, dtype=torch.bool, device=images.device)
-            top = views.height // 4
-            left = views.width // 4
-            inside[top : views.height - top, left : views.width - left] = True
-            middle = wanted_pixels(views, images, inside.flatten().repeat(len(views), 1))
+            width, height = views.cameras.extents.to(images.device).long()[:, :, None].unbind(1)
+            column = torch.arange(views.width, device=images.device)
+            row = torch.arange(views.height, device=images.device)
+            across = (column >= width // 4) & (column < width - width // 4)
+            down = (row >= height // 4) & (row < height - height // 4)
+            inside = down[:, :, None] & across[:, None]
+            middle = wanted_pixels(views, images, inside.flatten(1))
             pool = middle if len(middle) else pool
         frame = views.frames[pool.image.long()]
         order = frame.argsort(stable=True)

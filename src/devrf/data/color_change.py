@@ -113,8 +113,8 @@ def _inside(views: Views, image: int) -> Tensor:
     outside = torch.zeros(views.height, views.width, dtype=torch.bool)
     if views.has_alpha:
         outside |= views.pixels[image, ..., 3] < 253
-    if (valid := views.valid_mask_of(image)) is not None:
-        outside |= ~valid
+    if views.valid_mask is not None:
+        outside |= ~views.valid_mask[image]
     grown = max_pool2d(outside[None, None].float(), 2 * MARGIN + 1, stride=1, padding=MARGIN)
     return grown[0, 0] < 0.5
 

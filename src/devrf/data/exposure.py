@@ -192,8 +192,8 @@ def _ratio(film: Views, image: int, other: int, flow: Tensor, valid: Tensor) -> 
 
 def _halved(views: Views) -> Views:
     """Held-out views of which the left halves tell the gain, and the right ones are scored."""
-    left = torch.zeros_like(views.pixels[..., 0], dtype=torch.bool)
-    left[:, :, : views.width // 2] = True
+    middle = views.cameras.extents[:, :1, None] // 2
+    left = (torch.arange(views.width) < middle).expand(views.pixels.shape[:3])
     known = torch.ones_like(left) if views.valid_mask is None else views.valid_mask
     scored = known & ~left
     # What is only seen on the left is scored there.

@@ -75,21 +75,22 @@ def score(
     time = own_time if time is None else time
     truth = truth_image(views, index, background)
     behind = background_value(background)
-    rendered = renderer.view(views.cameras, index, time, behind)
-    prediction = exposed(_image(rendered, views), truth, views, index)
+    camera = views.cameras.single(index)
+    rendered = renderer.view(camera, 0, time, behind)
+    prediction = exposed(_image(rendered, truth), truth, views, index)
     valid_mask = views.valid_mask_of(index)
     compared = compare(prediction, truth, valid_mask)
     psnr = _psnr(compared, truth, valid_mask)
     if rest_pose_psnr is None:
         rest_pose_psnr = psnr
         if not renderer.at(time).at_rest:
-            rest = _image(renderer.view(views.cameras, index, 0.0, behind), views)
+            rest = _image(renderer.view(camera, 0, 0.0, behind), truth)
             rest = compare(exposed(rest, truth, views, index), truth, valid_mask)
             rest_pose_psnr = _psnr(rest, truth, valid_mask)
     further: dict[str, float | None] = {}
     opacity = rendered.opacity.cpu().view(truth.shape[:2])
     if suite is not None and suite.metrics:
-        rays = views.cameras.image_rays(index)
+        rays = camera.image_rays(0)
         points = points_at_depth(renderer.model.space, rays, rendered.depth.cpu())
         distance = (points - rays.origins).norm(dim=1).view(truth.shape[:2])
         further = suite.scores(
@@ -158,7 +159,8 @@ def exposed(prediction: Tensor, truth: Tensor, views: Views, index: int) -> Tens
         return prediction
     low, high = TELLING
     within = (torch.minimum(prediction, truth) > low) & (torch.maximum(prediction, truth) < high)
-    told = views.exposure_mask[index].cpu()[..., None] & within
+    height, width = truth.shape[:2]
+    told = views.exposure_mask[index, :height, :width].cpu()[..., None] & within
     squares = (prediction.square() * told).sum(dim=(0, 1))
     gain = (prediction * truth * told).sum(dim=(0, 1)) / squares.clamp(min=1e-6)
     gain = torch.where(squares > 0, gain, 1.0).clamp(1 / LARGEST_GAIN, LARGEST_GAIN)
@@ -183,8 +185,11 @@ def _ssim(compared: Tensor, truth: Tensor, valid_mask: Tensor | None) -> float:
 
 
 def truth_image(views: Views, index: int, background: Background) -> Tensor:
-    """A held-out image (H, W, 3) in [0, 1] on the background (white where that is random)."""
-    value = views.pixels[index].float() / 255
+    """A held-out image (H, W, 3) in [0, 1] on the background (white where that is random).
+
+    It is of its own size.
+    """
+    value = views.single(index).pixels[0].float() / 255
     if not views.has_alpha:
         return value
     behind = background_value(background)
@@ -196,5 +201,5 @@ def background_value(background: Background) -> float:
     return 0.0 if background == "black" else 1.0
 
 
-def _image(image: RenderedImage, views: Views) -> Tensor:
-    return image.color.view(views.height, views.width, 3).clamp(0, 1).cpu()
+def _image(image: RenderedImage, truth: Tensor) -> Tensor:
+    return image.color.view(truth.shape).clamp(0, 1).cpu()

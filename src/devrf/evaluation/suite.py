@@ -43,10 +43,9 @@ class MetricInput:
     @property
     def mask(self) -> Tensor:
         """(H, W) bool, inside the alpha mask at valid pixels; nowhere True without one."""
-        pixels = self.views.pixels[self.index]
         if not self.views.has_alpha:
-            return torch.zeros(pixels.shape[:2], dtype=torch.bool)
-        inside = pixels[..., 3].cpu() > 127
+            return torch.zeros(self.truth.shape[:2], dtype=torch.bool)
+        inside = self.views.single(self.index).pixels[0, ..., 3].cpu() > 127
         return inside if self.valid_mask is None else inside & self.valid_mask
 
     @property
@@ -81,10 +80,10 @@ def _lpips_covisible(inputs: MetricInput) -> float | None:
 
 
 def _depth_error(inputs: MetricInput) -> float | None:
-    truth = inputs.views.depth
+    truth = inputs.views.single(inputs.index).depth
     if truth is None:
         return None
-    return depth_error(inputs.depth, inputs.opacity, truth[inputs.index].cpu())
+    return depth_error(inputs.depth, inputs.opacity, truth[0].cpu())
 
 
 # By name, in the order of tables; None where a view has nothing to compare with.
@@ -163,6 +162,7 @@ def flow_error(renderer: Renderer, views: Views, index: int) -> float | None:
     if views.flow is None:
         return None
     before = int(previous_images(views)[index])
+    # On the raster of all: flow beside an image is not valid.
     flat = views.flow.valid[index].flatten().nonzero()[:, 0]
     if before == index or len(flat) == 0:
         return None

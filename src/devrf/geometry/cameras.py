@@ -6,6 +6,7 @@ rounded to TF32 on a GPU: at 400 pixels that is a fifth of a pixel.
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, replace
 
 import torch
@@ -16,7 +17,7 @@ from devrf.geometry.rays import Rays
 
 @dataclass(frozen=True)
 class Cameras:
-    """N pinhole cameras that share one image size.
+    """N pinhole cameras whose images lie on one raster.
 
     The camera looks along its negative z axis (OpenGL axes: x right, y up, z backwards). Pixel
     coordinates are (x, y) with (0, 0) the outer corner of the top-left pixel, so the centre of
@@ -26,8 +27,10 @@ class Cameras:
         camera_to_world: (N, 3, 4) rigid transforms, world units.
         focal: (N, 2) focal lengths fx, fy in pixels.
         center: (N, 2) principal points cx, cy in pixels.
-        width: image width in pixels.
-        height: image height in pixels.
+        width: the raster's width in pixels.
+        height: the raster's height in pixels.
+        sizes: (N, 2) int64, width and height of each image, which is the top left of the raster;
+            None: all are as large as the raster.
     """
 
     camera_to_world: Tensor
@@ -35,6 +38,7 @@ class Cameras:
     center: Tensor
     width: int
     height: int
+    sizes: Tensor | None = None
 
     def check(self) -> None:
         """Check what was read from a file.
@@ -51,6 +55,11 @@ class Cameras:
         finite = single and all(bool(tensor.isfinite().all()) for tensor in tensors)
         if not finite or not bool((self.focal > 0).all()):
             raise ValueError("a camera that is not finite, or sees nothing")
+        if self.sizes is not None:
+            raster = torch.tensor([self.width, self.height])
+            whole = self.sizes.dtype == torch.int64 and self.sizes.shape == (count, 2)
+            if not whole or not bool(((self.sizes >= 1) & (self.sizes <= raster)).all()):
+                raise ValueError("images that are not of the raster")
 
     def __len__(self) -> int:
         return self.camera_to_world.shape[0]
@@ -62,16 +71,56 @@ class Cameras:
             camera_to_world=self.camera_to_world[index],
             focal=self.focal[index],
             center=self.center[index],
+            sizes=None if self.sizes is None else self.sizes[index],
+        )
+
+    @property
+    def extents(self) -> Tensor:
+        """(N, 2) width and height of each image in pixels, in floating point."""
+        if self.sizes is None:
+            return self.center.new_tensor([self.width, self.height]).expand(len(self), 2)
+        return self.sizes.to(self.center)
+
+    def size_of(self, index: int) -> tuple[int, int]:
+        """Width and height of one image in pixels."""
+        if self.sizes is None:
+            return self.width, self.height
+        width, height = self.sizes[index].tolist()
+        return width, height
+
+    def single(self, index: int) -> Cameras:
+        """One of the cameras alone, its raster that of its image."""
+        width, height = self.size_of(index)
+        return replace(self[index : index + 1], width=width, height=height, sizes=None)
+
+    def of_commonest_size(self) -> Cameras:
+        """The cameras with images of one size, the commonest.
+
+        Those of another size have the lens of the first of that one.
+        """
+        if self.sizes is None:
+            return self
+        sizes = [tuple(size) for size in self.sizes.tolist()]
+        commonest = Counter(sizes).most_common(1)[0][0]
+        first = sizes.index(commonest)
+        lens = [k if size == commonest else first for k, size in enumerate(sizes)]
+        return replace(
+            self.single(first),
+            camera_to_world=self.camera_to_world,
+            focal=self.focal[lens],
+            center=self.center[lens],
         )
 
     def joined(self, *others: Cameras) -> Cameras:
-        """These cameras and ``others``, of the same image size."""
+        """These cameras and ``others``, on the same raster."""
         parts = (self, *others)
+        several = any(cameras.sizes is not None for cameras in parts)
         return replace(
             self,
             camera_to_world=torch.cat([cameras.camera_to_world for cameras in parts]),
             focal=torch.cat([cameras.focal for cameras in parts]),
             center=torch.cat([cameras.center for cameras in parts]),
+            sizes=torch.cat([c.extents.long() for c in parts]) if several else None,
         )
 
     @property
@@ -164,9 +213,17 @@ class Cameras:
         return Rays(position.expand(len(directions), 3).contiguous(), directions, directions)
 
     def resized(self, width: int, height: int) -> Cameras:
-        """The same cameras with images of another size (each axis scaled by its own factor)."""
+        """The same cameras on another raster (each axis scaled by its own factor)."""
         scale = self.focal.new_tensor([width / self.width, height / self.height])
-        return Cameras(self.camera_to_world, self.focal * scale, self.center * scale, width, height)
+        sizes = None if self.sizes is None else (self.sizes * scale).long().clamp(min=1)
+        return replace(
+            self,
+            focal=self.focal * scale,
+            center=self.center * scale,
+            width=width,
+            height=height,
+            sizes=sizes,
+        )
 
     def of_height(self, height: int) -> Cameras:
         """The same cameras with images ``height`` pixels high and as wide as they were for it."""
@@ -179,6 +236,7 @@ class Cameras:
             camera_to_world=self.camera_to_world.to(device),
             focal=self.focal.to(device),
             center=self.center.to(device),
+            sizes=None if self.sizes is None else self.sizes.to(device),
         )
 
     @staticmethod

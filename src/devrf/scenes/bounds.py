@@ -137,8 +137,7 @@ def seen_radius(cameras: Cameras, center: Tensor) -> float:
     distance · sin(half of the smaller field of view); a principal point off the middle counts
     with its nearer edge.
     """
-    size = cameras.center.new_tensor([cameras.width, cameras.height])
-    edge = torch.minimum(cameras.center, size - cameras.center) / cameras.focal
+    edge = torch.minimum(cameras.center, cameras.extents - cameras.center) / cameras.focal
     half_angle = torch.atan(edge.clamp(min=1e-3)).amin(dim=1)
     distance = (cameras.positions - center).norm(dim=1)
     return float((distance * half_angle.sin()).median())
@@ -172,9 +171,9 @@ def box_of_frusta(cameras: Cameras, near: float, far: float) -> Box:
     # Ends of rays lie on a sphere, which bulges between its corners: the grid has to be this fine.
     steps = torch.linspace(0, 1, 17).to(cameras.center)
     share = torch.cartesian_prod(steps, steps)
-    pixels = share * share.new_tensor([cameras.width, cameras.height])
-    camera = torch.arange(len(cameras)).repeat_interleave(len(pixels))
-    rays = cameras.rays(camera, pixels.repeat(len(cameras), 1))
+    pixels = share * cameras.extents[:, None]
+    camera = torch.arange(len(cameras)).repeat_interleave(len(share))
+    rays = cameras.rays(camera, pixels.flatten(0, 1))
     ends = torch.cat([rays.origins + rays.directions * distance for distance in (near, far)])
     return resolved_box(ends.amin(dim=0), ends.amax(dim=0))
 
@@ -285,8 +284,8 @@ def box_between(
 def _seen(views: Views, space: NormalizedDevice, depths: tuple[float, float]) -> Tensor:
     """NDC (8 · N, 3) of the rays through the corners of N images at two ``depths`` z'."""
     cameras = views.cameras
-    edge = [(0, 0), (cameras.width, 0), (0, cameras.height), (cameras.width, cameras.height)]
-    corners = torch.tensor(edge, dtype=cameras.focal.dtype).repeat(len(cameras), 1)
+    edge = cameras.focal.new_tensor([(0, 0), (1, 0), (0, 1), (1, 1)])
+    corners = (edge * cameras.extents[:, None]).flatten(0, 1)
     image = torch.arange(len(cameras)).repeat_interleave(len(edge))
     rays = cameras.rays(image, corners)
     steep = (-rays.directions[:, 2] < LEAST_COSINE).nonzero().flatten()

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.offset import added
@@ -63,7 +64,8 @@ _VALIDATION_VIEWS = 4
 def export(scene: Scene, folder: Path) -> None:
     """Write ``scene`` for ``data=inward`` or ``data=forward`` to read, as its kind says.
 
-    It is an embedded one: all images of one focal length, their principal points in the middle;
+    It is an embedded one: images of one size have one focal length, and principal points are in the
+    middle;
     fixed cameras stand still, and one of them is held out. What one camera has filmed by hand is
     written for ``data=nerfstudio``. ``folder`` is a new or an empty one.
     Positions are those of the capture's world. DevrfError if it is in use or cannot be written, or
@@ -110,28 +112,30 @@ def _export_film(scene: Scene, folder: Path) -> None:
             for k, (name, pose, time) in enumerate(posed):
                 matrix = [*pose, [0.0, 0.0, 0.0, 1.0]]
                 frame = {"file_path": name, "time": time, "transform_matrix": matrix}
+                if views.cameras.sizes is not None:
+                    frame |= _lens(views.cameras, k)
                 if (mask := views.valid_mask_of(k)) is not None:
                     frame["mask_path"] = f"masks/{k:03d}.png"
                     (partial / "masks").mkdir(exist_ok=True)
                     iio.imwrite(partial / frame["mask_path"], mask.numpy().astype(np.uint8) * 255)
                 frames.append(frame)
-        cameras = scene.dynamic.train.cameras
-        fx, fy = cameras.focal[0].tolist()
-        cx, cy = cameras.center[0].tolist()
         content = {
             "camera_model": "PINHOLE",
-            "fl_x": fx,
-            "fl_y": fy,
-            "cx": cx,
-            "cy": cy,
-            "w": cameras.width,
-            "h": cameras.height,
+            **_lens(scene.dynamic.train.cameras, 0),
             "scene_bounds": bounds,
             "frames": frames,
             "train_filenames": names["images"],
             "test_filenames": names["others"],
         }
         write_json(partial / "transforms.json", content)
+
+
+def _lens(cameras: Cameras, index: int) -> dict[str, float]:
+    """What a transforms file says of a pinhole, in pixels."""
+    fx, fy = cameras.focal[index].tolist()
+    cx, cy = cameras.center[index].tolist()
+    width, height = cameras.size_of(index)
+    return {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": width, "h": height}
 
 
 def _export_blender(scene: Scene, folder: Path) -> None:
@@ -156,7 +160,7 @@ def _write_capture(capture: Capture, folder: Path) -> None:
     if capture.train.flow is not None:
         # The first images of the views have no earlier one.
         later = (capture.train.times > 0).nonzero().flatten().tolist()
-        write_flow(folder / "train_flow", capture.train.flow, later)
+        write_flow(folder / "train_flow", capture.train, later)
 
 
 def _write_split(views: Views, split: str, folder: Path) -> None:
@@ -167,6 +171,7 @@ def _write_split(views: Views, split: str, folder: Path) -> None:
             "time": time,
             # A float32 becomes the float64 of the same value, which JSON keeps digit for digit.
             "transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]],
+            **({} if views.cameras.sizes is None else _lens(views.cameras, k)),
         }
         for k, (pose, time) in enumerate(
             zip(views.cameras.camera_to_world, views.times.tolist(), strict=True)
@@ -239,7 +244,7 @@ def _farthest(everyone: list[Views]) -> float:
 
 def _intrinsics(views: Views, factor: int) -> Numbers:
     """[H, W, focal] (N, 3) of images larger by ``factor``."""
-    sides = np.tile([views.height, views.width], (len(views), 1))
+    sides = views.cameras.extents.flip(1).double().cpu().numpy()
     focal = views.cameras.focal[:, :1].double().cpu().numpy()
     return np.concatenate([sides, focal], axis=1) * factor
 
@@ -261,7 +266,7 @@ def _write_moving(views: list[Views], bounds: Numbers, folder: Path) -> None:
         _write_images(view, range(len(view)), images)
         if view.flow is not None and number < len(views):
             flow_folder = images.with_name(f"{images.name}_flow")
-            write_flow(flow_folder, view.flow, range(1, len(view)))
+            write_flow(flow_folder, view, range(1, len(view)))
         pose = _double(view.cameras.camera_to_world[0])
         matrices.append(np.concatenate([pose, _intrinsics(view, 1)[:1].T], axis=1))
     np.save(folder / "poses.npy", np.stack(matrices))
@@ -276,5 +281,6 @@ def _double(poses: Tensor) -> Numbers:
 
 def _write_images(views: Views, numbers: Iterable[int], folder: Path, prefix: str = "") -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    for k, pixels in zip(numbers, views.pixels, strict=True):
-        iio.imwrite(folder / f"{prefix}{k:03d}.png", pixels.cpu().numpy())
+    for image, k in enumerate(numbers):
+        pixels = views.single(image).pixels[0].cpu().numpy()
+        iio.imwrite(folder / f"{prefix}{k:03d}.png", pixels)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import math
 import os
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,8 +16,9 @@ import numpy.typing as npt
 import torch
 
 from devrf.errors import DevrfError
+from devrf.geometry.cameras import Cameras
 from devrf.scenes.files import decoding
-from devrf.scenes.images import in_threads
+from devrf.scenes.images import in_threads, raster_of
 from devrf.scenes.resampling import shrink_flow
 from devrf.scenes.scene import OpticalFlow, Views
 from devrf.scenes.validation import check_memory, scene_error
@@ -67,8 +69,8 @@ def read_flow(
     folder: Path,
     index: Sequence[int],
     expected: Sequence[bool],
-    source_size: tuple[int, int],
-    size: tuple[int, int],
+    source_sizes: Sequence[tuple[int, int]],
+    cameras: Cameras,
     direction: FlowDirection = "bwd",
 ) -> OpticalFlow | None:
     """The backward flow (``fwd``: forward) of N images in ``<index>_<direction>.npz``.
@@ -77,8 +79,8 @@ def read_flow(
         folder: where the files lie.
         index: N positions in the list of frames, which the files are numbered by.
         expected: N flags: whether the image has an earlier frame (a later one), and so a file.
-        source_size: (width, height) of the images before downscaling.
-        size: (width, height) after downscaling: the flow's pixels.
+        source_sizes: N (width, height) of the images before downscaling.
+        cameras: N, of the images after downscaling: the flow's pixels.
         direction: backward or forward.
 
     Returns:
@@ -94,7 +96,7 @@ def read_flow(
         log.info("no optical flow: no NNN_%s.npz in %s", direction, folder)
         return None
     warn_of_missing(len(present), len(files), folder)
-    return stacked_flow(present, len(index), source_size, size)
+    return stacked_flow(present, source_sizes, cameras)
 
 
 def warn_of_missing(present: int, expected: int, folder: Path) -> None:
@@ -109,43 +111,45 @@ def warn_of_missing(present: int, expected: int, folder: Path) -> None:
 
 
 def stacked_flow(
-    files: Mapping[int, Path], count: int, source_size: tuple[int, int], size: tuple[int, int]
+    files: Mapping[int, Path], source_sizes: Sequence[tuple[int, int]], cameras: Cameras
 ) -> OpticalFlow:
-    """The flow of ``count`` images; those without one of the ``files`` (at least one) have none.
+    """The flow of N images; those without one of the ``files`` (at least one) have none.
 
-    ``source_size`` is their (width, height) before downscaling, ``size`` after it: the flow's
-    pixels.
+    ``source_sizes`` are N (width, height) before downscaling, ``cameras`` those of the images after
+    it: the flow's pixels.
     """
     start = time.perf_counter()
-    source_width, source_height = source_size
-    width, height = size
+    raster = (len(cameras), cameras.height, cameras.width)
     folder = next(iter(files.values())).parent
-    check_memory(count * width * height * _BYTES, folder, f"the flow of {count} images")
-    vectors = np.zeros((count, height, width, 2), dtype=np.float32)
-    valid = np.zeros((count, height, width), dtype=np.bool_)
+    check_memory(math.prod(raster) * _BYTES, folder, f"the flow of {len(cameras)} images")
+    vectors = np.zeros((*raster, 2), dtype=np.float32)
+    valid = np.zeros(raster, dtype=np.bool_)
 
     def fill(row: int) -> None:
-        flow, mask = read_flow_file(files[row], source_width, source_height)
-        if size != source_size:
+        flow, mask = read_flow_file(files[row], source_sizes[row][0], source_sizes[row][1])
+        width, height = cameras.size_of(row)
+        if (width, height) != source_sizes[row]:
             flow, mask = shrink_flow(flow, mask, width, height)
-        vectors[row] = flow
-        valid[row] = mask
+        vectors[row, :height, :width] = flow
+        valid[row, :height, :width] = mask
 
-    in_threads(fill, files, source_size)
+    in_threads(fill, files, raster_of(source_sizes))
     log.info(
         "read %d flow files from %s in %.1f s", len(files), folder, time.perf_counter() - start
     )
     return OpticalFlow(torch.from_numpy(vectors), torch.from_numpy(valid))
 
 
-def write_flow(folder: Path, flow: OpticalFlow, images: Iterable[int]) -> None:
-    """Write ``<index>_bwd.npz`` of ``images`` into ``folder``, which is made."""
+def write_flow(folder: Path, views: Views, images: Iterable[int]) -> None:
+    """Write ``<index>_bwd.npz`` of ``images``, which have flow, into ``folder``, which is made."""
     folder.mkdir()
     for k in images:
+        flow = views.single(k).flow
+        assert flow is not None
         np.savez_compressed(
             folder / f"{k:03d}_bwd.npz",
-            flow=flow.vectors[k].float().cpu().numpy(),
-            mask=flow.valid[k].cpu().numpy(),
+            flow=flow.vectors[0].float().cpu().numpy(),
+            mask=flow.valid[0].cpu().numpy(),
         )
 
 

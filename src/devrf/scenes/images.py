@@ -169,17 +169,24 @@ class Loaded:
     """The images of one set.
 
     Attributes:
-        pixels: (N, H, W, 3 or 4) uint8 after downscaling, alpha not premultiplied.
-        width: columns of the files, before downscaling.
-        height: rows of the files, before downscaling.
+        pixels: (N, H, W, 3 or 4) uint8 after downscaling, alpha not premultiplied. H and W are
+            those of the highest and of the widest; others are at the top left, beside them opaque
+            black.
+        files: N widths and heights of the files, before downscaling.
+        sizes: N widths and heights after it.
         ambiguous_orientation: (N,) bool, images that are read as they are stored although their
             EXIF orientation asks for a turn, which nothing confirms or refutes.
     """
 
     pixels: Tensor
-    width: int
-    height: int
+    files: list[tuple[int, int]]
+    sizes: list[tuple[int, int]]
     ambiguous_orientation: Tensor
+
+
+def raster_of(sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:
+    """The least (width, height) that holds each of some images."""
+    return max(width for width, _ in sizes), max(height for _, height in sizes)
 
 
 def in_threads(work: Callable[[int], object], items: Iterable[int], size: Size) -> None:
@@ -201,7 +208,7 @@ def load_images(
     *,
     alpha_weighted: bool = True,
 ) -> Loaded:
-    """Read images of one size, a few at a time.
+    """Read images, a few at a time.
 
     Args:
         paths: at least one existing file, 8 bits a channel, with or without alpha.
@@ -213,29 +220,39 @@ def load_images(
         alpha_weighted: whether colours are weighted by their alpha in these averages.
 
     Raises:
-        DevrfError: a file cannot be read, differs in size from the first one, or would fall under 8
-            px a side; or there are more than fit into memory.
+        DevrfError: a file cannot be read, or would fall under 8 px a side; or there are more than
+            fit into memory.
     """
     start = time.perf_counter()
-    headers = _headers(paths, cameras or [None] * len(paths))
-    first = headers[0]
-    width, height = reduced_size(first.width, first.height, downscale, paths[0])
+    with ThreadPoolExecutor(8) as pool:
+        headers = list(pool.map(read_header, paths, cameras or [None] * len(paths)))
+    files = [(header.width, header.height) for header in headers]
+    sizes = [
+        reduced_size(header.width, header.height, downscale, path)
+        for header, path in zip(headers, paths, strict=True)
+    ]
+    width, height = raster_of(sizes)
+    several = len(set(sizes)) > 1
     alpha = finish is not None or any(header.has_alpha for header in headers)
     shape = (len(paths), height, width, 4 if alpha else 3)
-    what = f"{len(paths)} images of {width}x{height} px"
+    what = f"{len(paths)} images of {'several sizes up to ' * several}{width}x{height} px"
     check_memory(math.prod(shape), paths[0].parent, what)
     # NumPy in the threads: each would otherwise start a team of torch threads of its own.
     pixels = np.empty(shape, dtype=np.uint8)
+    if several:
+        pixels[:] = 0
+        pixels[..., 3:] = 255  # beside an image nothing is cut out
 
     def fill(index: int) -> None:
         # An image without alpha in a set with alpha is opaque: WebP drops a full alpha channel.
         image = decode(paths[index], headers[index], "RGBA" if alpha else "RGB")
         image = image if finish is None else finish(index, image)
-        if (width, height) != (first.width, first.height):
-            image = shrink_pixels(image, width, height, alpha_weighted=alpha_weighted)
-        pixels[index] = image
+        columns, rows = sizes[index]
+        if sizes[index] != files[index]:
+            image = shrink_pixels(image, columns, rows, alpha_weighted=alpha_weighted)
+        pixels[index, :rows, :columns] = image
 
-    in_threads(fill, range(len(paths)), (first.width, first.height))
+    in_threads(fill, range(len(paths)), raster_of(files))
     log.info("read %s from %s in %.1f s", what, paths[0].parent, time.perf_counter() - start)
     if turned := sum(header.turn != 1 for header in headers):
         log.info(
@@ -243,19 +260,4 @@ def load_images(
             turned,
         )
     ambiguous_orientation = torch.tensor([header.ambiguous_orientation for header in headers])
-    return Loaded(torch.from_numpy(pixels), first.width, first.height, ambiguous_orientation)
-
-
-def _headers(paths: Sequence[Path], cameras: Sequence[Size | None]) -> list[Header]:
-    """What each file claims to be, nothing decoded; DevrfError unless all are of one size."""
-    with ThreadPoolExecutor(8) as pool:
-        headers = list(pool.map(read_header, paths, cameras))
-    first = headers[0]
-    for path, header in zip(paths, headers, strict=True):
-        if (header.width, header.height) != (first.width, first.height):
-            raise scene_error(
-                path,
-                f"{header.width}x{header.height} px, but {paths[0]} of the same set has "
-                f"{first.width}x{first.height} px; bring all images to one size",
-            )
-    return headers
+    return Loaded(torch.from_numpy(pixels), files, sizes, ambiguous_orientation)

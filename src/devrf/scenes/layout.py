@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from devrf.geometry.offset import Offset
-from devrf.scenes.images import image_size
+from devrf.scenes.images import Size, image_size
 from devrf.scenes.masks import Masks
 from devrf.scenes.scene import Capture, Views
 from devrf.scenes.splits import (
@@ -60,11 +61,19 @@ class Layout:
         return self.dynamic_train is not self.static_train
 
     def size_at(self, factor: int) -> tuple[int, int]:
-        """Width and height in pixels of the static images made smaller by ``factor``."""
-        transforms = self.static_train.transforms
-        first = int(self.static_train.index[0])
-        width, height = image_size(transforms.images[first], transforms.intrinsics[first].size)
+        """Width and height in pixels of the longest static image made smaller by ``factor``."""
+        width, height = self._longest
         return width // factor, height // factor
+
+    @cached_property
+    def _longest(self) -> tuple[int, int]:
+        transforms = self.static_train.transforms
+        first: dict[Size | None, int] = {}
+        for k in self.static_train.index.tolist():
+            # Images whose cameras are for one size are of one size, too.
+            first.setdefault(transforms.intrinsics[k].size, k)
+        sizes = [image_size(transforms.images[k], camera) for camera, k in first.items()]
+        return max(sizes, key=max)
 
     def with_validation(self, transforms: Transforms) -> Layout:
         """The layout with a validation split, of the images that are not learned from or tested on.

@@ -16,7 +16,15 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from devrf.scenes.images import Finish, Header, Size, decode, in_threads, read_header
+from devrf.scenes.images import (
+    Finish,
+    Header,
+    Size,
+    decode,
+    in_threads,
+    raster_of,
+    read_header,
+)
 from devrf.scenes.lens import Lens
 from devrf.scenes.resampling import as_pinhole, shrink_pixels
 from devrf.scenes.validation import check_memory, scene_error
@@ -137,20 +145,21 @@ def cutting_out(
 
 def valid_pixels(
     paths: Sequence[Path | None],
-    image: tuple[int, int],
-    size: tuple[int, int],
+    images: Sequence[tuple[int, int]],
+    sizes: Sequence[tuple[int, int]],
     cameras: Sequence[Size | None],
     lenses: Sequence[Lens],
     names: Sequence[Path],
 ) -> Tensor | None:
     """Which pixels (N, H, W) are valid, after downscaling and undistortion; None: all of them.
 
-    A pixel is valid if all source pixels that it is made of are.
+    A pixel is valid if all source pixels that it is made of are. What is beside an image, where
+    others are larger, is not.
 
     Args:
-        paths: N masks; None for an image that is valid as a whole.
-        image: (width, height) of the images' files.
-        size: (width, height) after downscaling.
+        paths: N masks, None for an image that is valid as a whole; or empty.
+        images: N (width, height) of the images' files.
+        sizes: N (width, height) after downscaling.
         cameras: N sizes that the cameras are for, or None.
         lenses: N, in pixels of the smaller images, before undistortion.
         names: N images, for messages.
@@ -160,28 +169,33 @@ def valid_pixels(
             memory.
     """
     masked = [k for k, path in enumerate(paths) if path is not None]
-    if not masked:
+    if not masked and len(set(sizes)) == 1:
         return None
-    width, height = size
-    check_memory(len(paths) * width * height, names[0].parent, f"{len(masked)} masks")
-    masks = np.full((len(paths), height, width, 1), WHITE, dtype=np.uint8)
+    width, height = raster_of(sizes)
+    check_memory(len(sizes) * width * height, names[0].parent, f"{len(sizes)} masks")
+    masks = np.zeros((len(sizes), height, width, 1), dtype=np.uint8)
+    for mask, (columns, rows) in zip(masks, sizes, strict=True):
+        mask[:rows, :columns] = WHITE
     white = white_in_files([path for path in paths if path is not None])
 
     def fill(k: int) -> None:
         path = paths[k]
         assert path is not None
-        light = read_mask(path, image, cameras[k], names[k], white) > HALF
+        light = read_mask(path, images[k], cameras[k], names[k], white) > HALF
         sharp = light[..., None].astype(np.uint8) * np.uint8(WHITE)
-        masks[k] = sharp if size == image else shrink_pixels(sharp, width, height)
+        columns, rows = sizes[k]
+        whole = sizes[k] == images[k]
+        masks[k, :rows, :columns] = sharp if whole else shrink_pixels(sharp, columns, rows)
 
-    in_threads(fill, masked, image)
-    pixels, _ = as_pinhole(torch.from_numpy(masks), lenses, names)
+    in_threads(fill, masked, raster_of(images))
+    pixels, _ = as_pinhole(torch.from_numpy(masks), lenses, names, sizes)
     valid_mask = pixels[..., 0] == WHITE
     for k in masked:
         if not bool(valid_mask[k].any()):
             raise scene_error(
                 paths[k], f"leaves nothing of {names[k]} to learn from; leave the image out"
             )
-    share = 100 * float((~valid_mask).float().mean())
-    log.info("masks of %d images leave out %.1f %% of the pixels of all", len(masked), share)
+    if masked:
+        share = 100 - 100 * int(valid_mask.sum()) / sum(columns * rows for columns, rows in sizes)
+        log.info("masks of %d images leave out %.1f %% of the pixels of all", len(masked), share)
     return valid_mask

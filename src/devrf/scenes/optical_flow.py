@@ -152,8 +152,9 @@ def estimate_flow(
     for number, pair in enumerate(pairs, 1):
         image, other = pair[::-1] if forward else pair
         vectors, valid = flow_between(views, image, other, between)
-        flow.valid[image] = valid
-        flow.vectors[image] = vectors * valid[..., None]
+        height, width = valid.shape
+        flow.valid[image, :height, :width] = valid
+        flow.vectors[image, :height, :width] = vectors * valid[..., None]
         if number % 100 == 0:
             log.info("optical flow: %d of %d pairs", number, len(pairs))
     seconds = time.perf_counter() - start
@@ -164,14 +165,19 @@ def estimate_flow(
 
 
 def flow_between(views: Views, image: int, other: int, between: Estimator) -> tuple[Tensor, Tensor]:
-    """Flow (H, W, 2) of an image to another, in pixels, and where it is valid, (H, W) bool."""
-    now = _on_white(views.pixels[image])
-    then = _on_white(views.pixels[other])
+    """Flow (H, W, 2) of an image to another, in pixels, and where it is valid, (H, W) bool.
+
+    Of images of two sizes it is that of the part at the top left that both have.
+    """
+    sizes = [views.cameras.size_of(k) for k in (image, other)]
+    width = min(columns for columns, _ in sizes)
+    height = min(rows for _, rows in sizes)
+    now, then = (_on_white(views.pixels[k, :height, :width]) for k in (image, other))
     there = between(now, then)
     back = between(then, now)
     valid = consistent(there, back)
     if views.has_alpha:
-        valid &= views.pixels[image, ..., 3].cpu() > ALPHA_THRESHOLD
+        valid &= views.pixels[image, :height, :width, 3].cpu() > ALPHA_THRESHOLD
     return there, valid
 
 

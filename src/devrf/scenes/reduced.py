@@ -57,10 +57,17 @@ def _reduced_views(views: Views, longest: int) -> Views:
     for name in ("depth", "valid_mask", "exposure_mask"):
         if (of_pixels := getattr(views, name)) is not None:
             further[name] = of_pixels[:, rows[:, None], columns]
+    cameras = views.cameras.resized(width, height)
+    if cameras.sizes is not None:
+        sizes = cameras.sizes.clamp(min=MIN_SIDE)
+        cameras = replace(cameras, sizes=sizes)
+        across = torch.arange(width) < sizes[:, :1, None]
+        # Pixels that are partly beside an image are left out.
+        further["valid_mask"] &= across & (torch.arange(height) < sizes[:, 1:])[..., None]
     return replace(
         views,
         pixels=_stacked([shrink_pixels(p.numpy(), width, height) for p in views.pixels]),
-        cameras=views.cameras.resized(width, height),
+        cameras=cameras,
         **further,
     )
 

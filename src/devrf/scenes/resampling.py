@@ -104,7 +104,10 @@ _HALVINGS = 24
 
 
 def as_pinhole(
-    pixels: Tensor, lenses: Sequence[Lens], names: Sequence[object]
+    pixels: Tensor,
+    lenses: Sequence[Lens],
+    names: Sequence[object],
+    sizes: Sequence[tuple[int, int]],
 ) -> tuple[Tensor, tuple[Lens, ...]]:
     """Undistort the images that need it, bilinearly.
 
@@ -115,15 +118,16 @@ def as_pinhole(
         pixels: (N, H, W, 1, 3 or 4) uint8, alpha not premultiplied; changed in place.
         lenses: N, in pixels of these images; those returned have no distortion and skew.
         names: N, for messages.
+        sizes: N (width, height): of how much, at the top left, each image is.
 
     Raises:
         DevrfError: a distortion is so strong that the image folds over.
     """
-    height, width = pixels.shape[1:3]
     plain = list(lenses)
     for row, lens in enumerate(lenses):
         if lens.pinhole:
             continue
+        width, height = sizes[row]
         view = _pinhole_view(lens, width, height)
         if view is None:
             raise scene_error(
@@ -131,7 +135,8 @@ def as_pinhole(
                 "the distortion is so strong that the image folds over; undistort it first",
             )
         plain[row], source = view
-        pixels[row] = torch.from_numpy(look_up_pixels(pixels[row].numpy(), source.numpy()))
+        image = pixels[row, :height, :width]
+        image.copy_(torch.from_numpy(look_up_pixels(image.numpy(), source.numpy())))
     return pixels, tuple(plain)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
 
@@ -40,11 +40,14 @@ class OpticalFlow:
 
 @dataclass(frozen=True)
 class Views:
-    """N posed images of one size.
+    """N posed images on one raster.
+
+    Images smaller than the raster (``cameras.sizes``) are at its top left. Beside them pixels are
+    opaque black, and not valid.
 
     Attributes:
         pixels: (N, H, W, 3 or 4) uint8, RGB or RGBA (alpha not premultiplied).
-        cameras: N cameras of the same width and height, world units.
+        cameras: N cameras on that raster, world units.
         times: (N,) float32 in [0, 1].
         view: (N,) int64, which fixed camera took the image (0 … V−1); in a static set, or for a
             moving camera, the image's own number.
@@ -81,12 +84,12 @@ class Views:
 
     @property
     def width(self) -> int:
-        """Image width in pixels."""
+        """The raster's width in pixels."""
         return self.pixels.shape[2]
 
     @property
     def height(self) -> int:
-        """Image height in pixels."""
+        """The raster's height in pixels."""
         return self.pixels.shape[1]
 
     @property
@@ -111,9 +114,33 @@ class Views:
             names=tuple(self.names[i] for i in index.tolist()),
         )
 
+    def single(self, image: int) -> Views:
+        """One of the images alone, its raster no larger than itself; nothing is copied.
+
+        It has a ``valid_mask`` if some of its pixels are not valid, or that of images of one size.
+        """
+        place = slice(image, image + 1)
+        view = replace(self.mapped(lambda of_views: of_views[place]), names=self.names[place])
+        if self.cameras.sizes is None:
+            return view
+        width, height = self.cameras.size_of(image)
+
+        def cropped(of_views: Any) -> Any:
+            of_pixels = isinstance(of_views, Tensor) and of_views.ndim > 2
+            return of_views[:, :height, :width] if of_pixels else of_views
+
+        view = replace(view.mapped(cropped), cameras=self.cameras.single(image))
+        valid = view.valid_mask
+        return replace(view, valid_mask=None) if valid is None or bool(valid.all()) else view
+
+    def singles(self) -> Iterator[Views]:
+        """Each of the images alone, see :meth:`single`."""
+        return map(self.single, range(len(self)))
+
     def valid_mask_of(self, image: int) -> Tensor | None:
-        """(H, W) bool on the host, the valid pixels of an image; None: all of them."""
-        return None if self.valid_mask is None else self.valid_mask[image].cpu()
+        """(H, W) bool on the host, the valid pixels of a :meth:`single` image; None: all."""
+        valid_mask = self.single(image).valid_mask
+        return None if valid_mask is None else valid_mask[0].cpu()
 
     def to(self, device: torch.device | str) -> Views:
         """The same views on ``device``; images stay uint8."""
@@ -301,6 +328,8 @@ class Scene:
         for capture in (self.static, self.dynamic):
             for views in (capture.train, capture.test):
                 digest.update(f"{tuple(views.pixels.shape)}".encode())
-                for part in (views.cameras.camera_to_world, views.cameras.focal, views.times):
+                cameras = views.cameras
+                parts = [cameras.camera_to_world, cameras.focal, views.times]
+                for part in parts if cameras.sizes is None else [*parts, cameras.sizes]:
                     digest.update(part.float().cpu().numpy().tobytes())
         return digest.hexdigest()[:16]

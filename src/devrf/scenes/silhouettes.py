@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from devrf.geometry.box import Box
+from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
 from devrf.scenes.scene import Views
 
@@ -56,19 +57,19 @@ def motion_box(views: Views, box: Box, *, resolution: int = 64, search: float = 
     low, high = area.corners(views.cameras.positions)
     distance = float((views.cameras.positions - (low + high) / 2).norm(dim=1).median())
     masks = _silhouettes(views, _reach(views, cell, distance, float(views.cameras.focal.amax())))
-    cached: dict[int, Array] = {}
+    cached: dict[tuple[int, tuple[int, int]], Array] = {}
     hull = np.zeros(len(points), dtype=np.bool_)
     for images in frames:
         # Only points not yet in the union need a look; each view leaves fewer of them.
         left = np.flatnonzero(~hull)
         inside_views = np.zeros(len(left), dtype=np.int64)
         for image in images:
-            number = int(views.view[image])
-            if number not in cached:
+            seen = (int(views.view[image]), views.cameras.size_of(image))
+            if seen not in cached:
                 if len(cached) >= 16:  # moving cameras: no projection is asked for twice
                     cached.clear()
-                cached[number] = _pixel_index(views, image, points)
-            verdict = masks[image][cached[number][left]]
+                cached[seen] = _pixel_index(views.cameras.single(image), points)
+            verdict = masks[image][cached[seen][left]]
             keep = verdict != OUTSIDE
             left = left[keep]
             inside_views = inside_views[keep] + (verdict[keep] == INSIDE)
@@ -103,25 +104,25 @@ def _reach(views: Views, cell: float, distance: float, focal: float) -> int:
     return max(1, min(math.ceil(pixels), max(views.width, views.height)))
 
 
-def _silhouettes(views: Views, reach: int) -> Array:
-    """(N, H·W + 1) uint8: whether a pixel is INSIDE or OUTSIDE the dilated silhouette.
+def _silhouettes(views: Views, reach: int) -> list[Array]:
+    """N times (H·W + 1,) uint8: whether a pixel is INSIDE or OUTSIDE the dilated silhouette.
 
     Pixels that are not valid are UNSEEN. The last entry stands for all that is beyond the image:
     OUTSIDE, or UNSEEN where the image's border cuts the silhouette or the whole object off.
     """
-    solid = views.pixels[..., 3].cpu().numpy() > ALPHA_THRESHOLD
-    count, height, width = solid.shape
-    unknown = np.zeros_like(solid) if views.valid_mask is None else ~views.valid_mask.cpu().numpy()
-    solid &= ~unknown
-    perhaps = solid | unknown
-    at_border = perhaps[:, [0, -1]].any(axis=(1, 2)) | perhaps[:, :, [0, -1]].any(axis=(1, 2))
-    cut_off = at_border | ~solid.any(axis=(1, 2))
-    codes = np.empty((count, height * width + 1), dtype=np.uint8)
-    grown = [_dilated(mask, reach) for mask in solid.astype(np.uint8)]
-    codes[:, :-1] = np.stack(grown).reshape(count, -1)
-    codes[:, :-1][unknown.reshape(count, -1)] = UNSEEN
-    codes[:, -1] = np.where(cut_off, UNSEEN, OUTSIDE)
-    return codes
+
+    def silhouette(view: Views) -> Array:
+        solid = view.pixels[0, ..., 3].cpu().numpy() > ALPHA_THRESHOLD
+        valid = view.valid_mask_of(0)
+        unknown = np.zeros_like(solid) if valid is None else ~valid.numpy()
+        solid &= ~unknown
+        perhaps = solid | unknown
+        cut_off = perhaps[[0, -1]].any() or perhaps[:, [0, -1]].any() or not solid.any()
+        grown = _dilated(solid.astype(np.uint8), reach)
+        codes = np.where(unknown, UNSEEN, grown).ravel()
+        return np.append(codes, UNSEEN if cut_off else OUTSIDE).astype(np.uint8)
+
+    return [silhouette(view) for view in views.singles()]
 
 
 def _dilated(mask: Array, reach: int) -> Array:
@@ -129,14 +130,15 @@ def _dilated(mask: Array, reach: int) -> Array:
     return cv2.dilate(mask, np.ones((2 * reach + 1,) * 2, dtype=np.uint8))
 
 
-def _pixel_index(views: Views, image: int, points: Tensor) -> Array:
+def _pixel_index(camera: Cameras, points: Tensor) -> Array:
     """(P,) where each point falls in the flattened image; H·W where the image does not hold it."""
-    camera = torch.full((len(points),), image, device=points.device)
-    pixels, depth = views.cameras.project(camera, points)
+    width, height = camera.width, camera.height
+    which = torch.zeros(len(points), dtype=torch.long, device=points.device)
+    pixels, depth = camera.project(which, points)
     column, row = pixels.floor().unbind(-1)
-    held = (depth > 0) & (column >= 0) & (column < views.width) & (row >= 0) & (row < views.height)
-    index = row.long() * views.width + column.long()
-    return torch.where(held, index, views.width * views.height).cpu().numpy()
+    held = (depth > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    index = row.long() * width + column.long()
+    return torch.where(held, index, width * height).cpu().numpy()
 
 
 def visual_hull(
@@ -171,13 +173,14 @@ def visual_hull(
         position = views.cameras.positions[k]
         nearest = float((position - box.nearest(position)).norm())
         reach = _reach(views, cell, nearest, float(views.cameras.focal[k].max()))
-        solid = views.pixels[k, :, :, 3]
-        if views.valid_mask is not None:
-            solid = solid.masked_fill(~views.valid_mask[k], 255)
+        view = views.single(k)
+        solid = view.pixels[0, :, :, 3]
+        if view.valid_mask is not None:
+            solid = solid.masked_fill(~view.valid_mask[0], 255)
         grown = torch.from_numpy(_dilated(solid.cpu().numpy(), reach)).to(points.device)
         x, y = pixel.floor().long().unbind(-1)
-        in_image = (depth > 0) & (x >= 0) & (x < views.width) & (y >= 0) & (y < views.height)
-        row = torch.where(in_image, y * views.width + x, 0)
+        in_image = (depth > 0) & (x >= 0) & (x < view.width) & (y >= 0) & (y < view.height)
+        row = torch.where(in_image, y * view.width + x, 0)
         border = torch.cat([solid[[0, -1]].flatten(), solid[:, [0, -1]].flatten()])
         ends = whole_in_view and bool(solid.any()) and not bool(border.any())
         held[left[torch.where(in_image, grown.view(-1)[row] == 0, ends)]] = False

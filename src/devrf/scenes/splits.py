@@ -13,13 +13,13 @@ from torch import Tensor
 
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
-from devrf.scenes.images import load_images
-from devrf.scenes.lens import Lens
+from devrf.scenes.images import image_size, load_images, raster_of
+from devrf.scenes.lens import Intrinsics, Lens
 from devrf.scenes.masks import Masks, cutting_out, valid_pixels
 from devrf.scenes.resampling import as_pinhole
 from devrf.scenes.scene import Views
 from devrf.scenes.transforms import Transforms
-from devrf.scenes.validation import scene_error
+from devrf.scenes.validation import same_shape, scene_error
 
 log = logging.getLogger(__name__)
 
@@ -241,21 +241,18 @@ def load_views(
             f"its alpha is 0 everywhere, and that of all {len(files)} images of its set: nothing "
             "of them would be seen; save them without alpha, or with that of the subject",
         )
-    height, width = loaded.pixels.shape[1:3]
+    _check_shared(intrinsics, loaded.files, files)
     distorted = [
-        known.lens(loaded.width, loaded.height, file).scaled(
-            width / loaded.width, height / loaded.height
+        known.lens(width, height, file).scaled(columns / width, rows / height)
+        for known, file, (width, height), (columns, rows) in zip(
+            intrinsics, files, loaded.files, loaded.sizes, strict=True
         )
-        for known, file in zip(intrinsics, files, strict=True)
     ]
-    valid_mask = None
-    if masks == "ignore":
-        valid_mask = valid_pixels(
-            mask_files, (loaded.width, loaded.height), (width, height), sizes, distorted, files
-        )
+    ignored = mask_files if masks == "ignore" else []
+    valid_mask = valid_pixels(ignored, loaded.files, loaded.sizes, sizes, distorted, files)
     # Undistorted after the images are made smaller: a tenth of the work for the same picture.
-    pixels, lenses = as_pinhole(loaded.pixels, distorted, files)
-    cameras = pinholes(split.transforms.poses[used], lenses, width, height)
+    pixels, lenses = as_pinhole(loaded.pixels, distorted, files, loaded.sizes)
+    cameras = pinholes(split.transforms.poses[used], lenses, loaded.sizes)
     names = tuple(str(file.relative_to(root)) for file in files)
     return Views(
         pixels,
@@ -268,12 +265,46 @@ def load_views(
     )
 
 
-def pinholes(poses: Tensor, lenses: Sequence[Lens], width: int, height: int) -> Cameras:
-    """Cameras of N images of ``width`` × ``height`` pixels at poses (N, 3, 4), in float32."""
+def _check_shared(
+    cameras: Sequence[Intrinsics], sizes: Sequence[tuple[int, int]], names: Sequence[Path]
+) -> None:
+    """DevrfError if a camera that names no size is that of images of several sizes.
+
+    Its pixels are those of one of them; an angle alone holds for one image at several scales.
+    """
+    first: dict[int, int] = {}
+    for k, camera in enumerate(cameras):
+        j = first.setdefault(id(camera), k)
+        by_angle = camera.focal is None and camera.center == (None, None)
+        fits = same_shape(sizes[k], sizes[j]) if by_angle else sizes[k] == sizes[j]
+        if camera.size is None and not fits:
+            raise scene_error(
+                names[k],
+                f"{sizes[k][0]}x{sizes[k][1]} px, but {names[j]} has {sizes[j][0]}x{sizes[j][1]} "
+                "px, and their camera names no size; give each frame its own fl_x, cx, cy, w and h",
+            )
+
+
+def file_sizes(split: Split, views: Views) -> list[tuple[int, int]]:
+    """(width, height) of the file of each image of ``views``, those that the split uses."""
+
+    def size(k: int) -> tuple[int, int]:
+        return image_size(split.transforms.images[k], split.transforms.intrinsics[k].size)
+
+    used: list[int] = split.index.tolist()
+    if views.cameras.sizes is None:
+        return [size(used[0])] * len(used)
+    return [size(k) for k in used]
+
+
+def pinholes(poses: Tensor, lenses: Sequence[Lens], sizes: Sequence[tuple[int, int]]) -> Cameras:
+    """Cameras of N images of some (width, height) in pixels at poses (N, 3, 4), in float32."""
+    width, height = raster_of(sizes)
     return Cameras(
         poses.float(),
         torch.tensor([lens.focal for lens in lenses]),
         torch.tensor([lens.center for lens in lenses]),
         width,
         height,
+        torch.tensor(sizes) if len(set(sizes)) > 1 else None,
     )

@@ -17,8 +17,6 @@ from devrf.system.options import one_line
 MIN_SIDE = 8
 # Numbers become float32 tensors: what overflows there is as bad as infinity.
 LARGEST = 3e38
-# Sides are rounded when images are made smaller; beyond this they were cropped or turned.
-SAME_SHAPE = 0.05
 
 
 def scene_error(where: object, what: str) -> DevrfError:
@@ -39,8 +37,14 @@ def reduced_size(width: int, height: int, downscale: int, where: object) -> tupl
 
 
 def same_shape(size: tuple[float, float], other: tuple[float, float]) -> bool:
-    """Whether two (width, height) are those of one image at two scales, sides rounded."""
-    return abs(size[0] * other[1] / (size[1] * other[0]) - 1) <= SAME_SHAPE
+    """Whether two (width, height) are those of one image at two scales.
+
+    Sides of the smaller one may be rounded, by a pixel each: beyond this it was cropped or turned.
+    """
+    smaller, larger = sorted((size, other), key=math.prod)
+    least = max((few - 1) / many for few, many in zip(smaller, larger, strict=True))
+    most = min((few + 1) / many for few, many in zip(smaller, larger, strict=True))
+    return least <= most
 
 
 def checked_box(value: object) -> Box:

@@ -209,9 +209,9 @@ def seen_points(
     points are taken, evenly chosen. ``background`` is a grey level.
     """
     cameras = cameras[_every(len(cameras), CAMERAS)].to(renderer.device)
-    filled = len(_seen(renderer, cameras.of_height(FIRST), time, background)[0])
+    filled = len(_seen(renderer, cameras, FIRST, time, background)[0])
     rows = min(round(FIRST * (SPARE * count / max(filled, 1)) ** 0.5), LARGEST)
-    points, colors = _seen(renderer, cameras.of_height(rows), time, background)
+    points, colors = _seen(renderer, cameras, rows, time, background)
     chosen = _every(len(points), count)
     return points[chosen], colors[chosen]
 
@@ -223,13 +223,13 @@ def _every(count: int, max_count: int) -> Tensor:
 
 
 def _seen(
-    renderer: Renderer, cameras: Cameras, time: float, background: float
+    renderer: Renderer, cameras: Cameras, rows: int, time: float, background: float
 ) -> tuple[Tensor, Tensor]:
-    """As :func:`seen_points`, of all pixels of the cameras."""
+    """As :func:`seen_points`, of all pixels of images ``rows`` high."""
     points = []
     colors = []
     for camera in range(len(cameras)):
-        rays = cameras.image_rays(camera)
+        rays = cameras.single(camera).of_height(rows).image_rays(0)
         image = renderer.picture(rays, time, background)
         solid = (image.opacity > SOLID).nonzero()[:, 0]
         ends = points_at_depth(renderer.model.space, rays[solid], image.depth[solid])

@@ -148,7 +148,7 @@ def _named_cameras(viewpoints: Viewpoints) -> dict[str, Cameras]:
     """The cameras of the training images, each place of the dynamic ones once."""
     captures = {"static": viewpoints.static, "dynamic": viewpoints.dynamic}
     return {
-        f"{name}_{k}": cameras[[k]]
+        f"{name}_{k}": cameras.single(k)
         for name, cameras in captures.items()
         for k in range(len(cameras))
     }

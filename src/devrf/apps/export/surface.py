@@ -86,11 +86,10 @@ def isosurface(
 def entries(model: Renderable, box: Box, cameras: Cameras) -> Tensor:
     """Points (K, 3) in the fields' space at which rays of the cameras enter ``box``."""
     space = model.space
-    cameras = cameras.resized(ENTRIES, ENTRIES)
     near, far = model.depth_limits
     points = []
     for camera in range(len(cameras)):
-        rays = space.rays(cameras.image_rays(camera))
+        rays = space.rays(cameras.single(camera).resized(ENTRIES, ENTRIES).image_rays(0))
         entry, leave = box.crossing(rays, near, far)
         met = (entry < leave).nonzero()[:, 0]
         points.append(rays.at(met, entry[met]))

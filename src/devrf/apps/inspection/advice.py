@@ -160,6 +160,16 @@ def mean_share(masks: Iterable[Tensor]) -> float:
     return sum(shares) / len(shares)
 
 
+def masked_share(views: Views) -> float | None:
+    """The share of the images' pixels that masks leave out; None without masks."""
+    if views.valid_mask is None:
+        return None
+    masks = [image.valid_mask for image in views.singles()]
+    if all(mask is None for mask in masks):
+        return None
+    return mean_share(torch.zeros(1) if mask is None else ~mask for mask in masks)
+
+
 def _images(scene: Scene) -> Iterator[Advice]:
     """Problems of single images; sets may share files, and each is named once."""
     points = box_points(scene, scene.bounds.box, (9, 9, 9))
@@ -173,8 +183,9 @@ def _images(scene: Scene) -> Iterator[Advice]:
     def sees(views: Views, images: Tensor, targets: Tensor) -> Tensor:
         """(K,) bool: whether any of the ``targets`` is in the picture."""
         pixels, depth = project(views, images, targets)
-        size = pixels.new_tensor([views.width, views.height])
-        return ((depth > 0) & ((pixels >= 0) & (pixels <= size)).all(dim=2)).any(dim=1)
+        size = views.cameras.extents[images]
+        within = ((pixels >= 0) & (pixels <= size[:, None])).all(dim=2)
+        return ((depth > 0) & within).any(dim=1)
 
     def away(views: Views) -> list[bool]:
         middle = points[4, 4, 4:5]
@@ -265,12 +276,7 @@ def _alpha(scene: Scene) -> Iterator[Advice]:
 def _masks(scene: Scene) -> Iterator[Advice]:
     sets = image_sets(scene).items()
     # Of images with exposures of their own a half is not scored, and no mask says so.
-    masks = {
-        name: views.valid_mask
-        for name, views in sets
-        if views.valid_mask is not None and views.exposure_mask is None
-    }
-    shares = {name: mean_share(~mask for mask in of_set) for name, of_set in masks.items()}
+    shares = {n: masked_share(views) or 0.0 for n, views in sets if views.exposure_mask is None}
     if much := {name: share for name, share in shares.items() if share > MUCH_MASKED}:
         yield Advice(
             listed(list(much), 4),
@@ -323,9 +329,8 @@ def _times(scene: Scene) -> Iterator[Advice]:
 
 def _flow(scene: Scene) -> Iterator[Advice]:
     views = scene.dynamic.train
-    flow = scene.dynamic.train.flow
     longest = max(views.width, views.height)
-    if flow is None:
+    if views.flow is None:
         length = 0.0 if views.by_moving_camera else _frame_to_frame(views)
         if length > FAR * longest:
             yield Advice(
@@ -338,9 +343,11 @@ def _flow(scene: Scene) -> Iterator[Advice]:
     broken = []
     covered = []
     for k, _ in frame_pairs(views):
-        vectors = flow.vectors[k]
-        valid = flow.valid[k]
-        inside = views.pixels[k, ..., 3] > OPAQUE if views.has_alpha else torch.ones_like(valid)
+        view = views.single(k)
+        assert view.flow is not None
+        vectors = view.flow.vectors[0]
+        valid = view.flow.valid[0]
+        inside = view.pixels[0, ..., 3] > OPAQUE if views.has_alpha else torch.ones_like(valid)
         covered.append(float((valid & inside).sum()) / max(int(inside.sum()), 1))
         length = vectors[valid].norm(dim=-1)
         if not bool(torch.isfinite(length).all()):

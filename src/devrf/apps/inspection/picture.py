@@ -114,13 +114,11 @@ def _dynamic_sections(views: Views) -> list[Section]:
     if views.flow is None:
         return sections
     longest = flow_scale(views.flow)
-    vectors = views.flow.vectors
-    valid = views.flow.valid
-    images = {
-        k: (_smaller(flow_colors(vectors[k], valid[k], longest)), label[k])
-        for k, _ in frame_pairs(views)
-        if k in label
-    }
+    images: dict[int, Tile] = {}
+    for k, _ in frame_pairs(views):
+        if k in label and (of_image := views.single(k).flow) is not None:
+            colors = flow_colors(of_image.vectors[0], of_image.valid[0], longest)
+            images[k] = (_smaller(colors), label[k])
     flow: list[list[Tile]] = [[images.get(k) for k in row] for row in samples]
     # The first image of a view has no frame before it.
     flow[0][0] = (to_bytes(flow_wheel(300)).numpy(), f"rim: {longest:.3g} px or more")
@@ -157,10 +155,11 @@ def flow_scale(flow: OpticalFlow) -> float:
 
 def shown(views: Views, image: int) -> np.ndarray:
     """An image as RGB (H', W', 3) uint8; what its alpha or mask leaves out is chequered."""
-    pixels = views.pixels[image].cpu().float() / 255
+    views = views.single(image)
+    pixels = views.pixels[0].cpu().float() / 255
     opacity = pixels[..., 3:] if views.has_alpha else torch.ones(*pixels.shape[:2], 1)
     if views.valid_mask is not None:
-        opacity = opacity * views.valid_mask[image].cpu()[..., None]
+        opacity = opacity * views.valid_mask[0].cpu()[..., None]
     y, x = np.indices(pixels.shape[:2]) // max(1, views.width // 24)
     squares = torch.from_numpy(np.where((x + y) % 2, 0.91, 1.0)).float()[..., None]
     return _smaller(squares + opacity * (pixels[..., :3] - squares))
@@ -276,12 +275,11 @@ def box_edges(scene: Scene, box: Box) -> Tensor:
 
 def frusta(cameras: Cameras, depth: float) -> Tensor:
     """N cameras as pyramids ``depth`` high with a tick where up is: (10 · N, 2, 3), world units."""
-    w = cameras.width
-    h = cameras.height
     corners = cameras.center.new_tensor(
-        [[0, 0], [w, 0], [w, h], [0, h], [0.35 * w, 0], [0.5 * w, -0.2 * h], [0.65 * w, 0]]
+        [[0, 0], [1, 0], [1, 1], [0, 1], [0.35, 0], [0.5, -0.2], [0.65, 0]]
     )
-    x, y = ((corners - cameras.center[:, None]) / cameras.focal[:, None]).unbind(-1)
+    pixels = corners * cameras.extents[:, None]
+    x, y = ((pixels - cameras.center[:, None]) / cameras.focal[:, None]).unbind(-1)
     local = depth * torch.stack([x, -y, -torch.ones_like(x)], dim=-1)
     pose = cameras.camera_to_world
     ends = local @ pose[:, :, :3].transpose(1, 2) + pose[:, None, :, 3]

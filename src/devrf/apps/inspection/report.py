@@ -13,7 +13,15 @@ from rich.table import Table
 from rich.text import Text
 from torch import Tensor
 
-from devrf.apps.inspection.advice import OPAQUE, Advice, advice_on, image_sets, mean_share
+from devrf.apps.inspection.advice import (
+    OPAQUE,
+    Advice,
+    advice_on,
+    image_sets,
+    listed,
+    masked_share,
+    mean_share,
+)
 from devrf.apps.inspection.layout import box_middle, widest_gap
 from devrf.data.color_change import CHANGING, color_change, color_drift
 from devrf.geometry.clock import FrameClock
@@ -137,15 +145,16 @@ def _set_facts(name: str, views: Views, middle: Tensor) -> Row:
     low, high = map(float, views.cameras.focal.aminmax())
     alpha = masked = "no"
     if views.has_alpha:
-        inside = mean_share(image[..., 3] > OPAQUE for image in views.pixels)
+        inside = mean_share(image.pixels[0, ..., 3] > OPAQUE for image in views.singles())
         alpha = f"cover {_percent(inside)}"
-    if views.valid_mask is not None:
-        masked = f"leave out {_percent(mean_share(~mask for mask in views.valid_mask))}"
+    if (left_out := masked_share(views)) is not None:
+        masked = f"leave out {_percent(left_out)}"
+    sizes = sorted({views.cameras.size_of(k) for k in range(len(views))})
     return (
         name,
         str(len(views)),
         f"{len(set(views.view.tolist()))} x {len(distinct_times(views.times))}",
-        f"{views.width} x {views.height}",
+        listed([f"{width} x {height}" for width, height in sizes]),
         alpha,
         masked,
         f"{low:.0f} px" if high - low < 0.5 else f"{low:.0f} to {high:.0f} px",
@@ -163,17 +172,21 @@ def flow_facts(views: Views) -> str:
     covered = 0
     total = 0.0
     longest = 0.0
+    pixels = 0
     for k in images:  # one by one: all of a large scene's flow at once would be copied
-        valid = views.flow.valid[k]
-        length = views.flow.vectors[k][valid].norm(dim=-1)
+        view = views.single(k)
+        assert view.flow is not None
+        valid = view.flow.valid[0]
+        length = view.flow.vectors[0][valid].norm(dim=-1)
+        pixels += valid.numel()
         count += len(length)
         total += float(length.sum())
         longest = max(longest, float(length.max())) if len(length) else longest
         if views.has_alpha:
-            alpha = views.pixels[k, ..., 3] > OPAQUE
+            alpha = view.pixels[0, ..., 3] > OPAQUE
             inside += int(alpha.sum())
             covered += int((alpha & valid).sum())
-    share = _percent(count / max(len(images) * views.width * views.height, 1))
+    share = _percent(count / max(pixels, 1))
     in_alpha = f" ({_percent(covered / max(inside, 1))} of the alpha masks)" * views.has_alpha
     return (
         f"{len(images)} images, valid on {share} of the pixels{in_alpha}, "

@@ -85,7 +85,7 @@ def dynamic_frusta(scene: Scene, time: float) -> list[Frustum]:
     views = scene.dynamic.train
     images = ((views.times - time).abs() < scene.clock.TOLERANCE).nonzero()[:, 0].tolist()
     return [
-        Frustum(f"moving/{views.view[k]}", views.cameras[[k]], thumbnail(scene, views, k))
+        Frustum(f"moving/{views.view[k]}", views.cameras.single(k), thumbnail(scene, views, k))
         for k in (images[j] for j in evenly(len(images), MAX_FRUSTA))
     ]
 
@@ -95,7 +95,7 @@ def static_frusta(cameras: Cameras, scene: Scene | None) -> list[Frustum]:
     frusta = []
     for k in evenly(len(cameras), MAX_FRUSTA):
         image = None if scene is None else thumbnail(scene, scene.static.train, k)
-        frusta.append(Frustum(f"static/{k}", cameras[[k]], image))
+        frusta.append(Frustum(f"static/{k}", cameras.single(k), image))
     return frusta
 
 

@@ -66,7 +66,8 @@ def view_count(cameras: Cameras, points: Tensor) -> Tensor:
     for k in range(len(cameras)):
         pixel, depth = cameras.project_into(k, flat)
         x, y = pixel.unbind(-1)
-        seen += (depth > 0) & (x >= 0) & (x <= cameras.width) & (y >= 0) & (y <= cameras.height)
+        width, height = cameras.size_of(k)
+        seen += (depth > 0) & (x >= 0) & (x <= width) & (y >= 0) & (y <= height)
     return seen.view(points.shape[:-1])
 
 

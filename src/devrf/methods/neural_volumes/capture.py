@@ -57,17 +57,17 @@ def encoder_images(scene: Scene, settings: NeuralVolumesSettings) -> Tensor:
     )
     settings.check("encoder_views", wanted <= len(cameras), expected + "image of every frame")
     height, width = settings.encoder_size
-    scale = min(1.0, height / views.height, width / views.width)
-    rows = round(views.height * scale)
-    columns = round(views.width * scale)
-    top = (height - rows) // 2
-    left = (width - columns) // 2
     behind = round(255 * background_value(scene.background))
     images = torch.full((len(scene.clock), wanted, 3, height, width), behind, dtype=torch.uint8)
     for k in range(wanted):
         camera = cameras[k * (len(cameras) - 1) // max(wanted - 1, 1)]
         for place in (views.view == camera).nonzero()[:, 0].tolist():
             color = truth_image(views, place, scene.background).permute(2, 0, 1)
+            scale = min(1.0, height / color.shape[1], width / color.shape[2])
+            rows = round(color.shape[1] * scale)
+            columns = round(color.shape[2] * scale)
+            top = (height - rows) // 2
+            left = (width - columns) // 2
             if scale < 1:
                 color = nn.functional.interpolate(
                     color[None], (rows, columns), mode="bilinear", antialias=True

@@ -12,7 +12,6 @@ from pydantic.dataclasses import dataclass
 from devrf.geometry.offset import Offset
 from devrf.scenes.files import existing_folder, scene_folder
 from devrf.scenes.flow_files import FlowDirection, read_flow
-from devrf.scenes.images import image_size
 from devrf.scenes.layout import Layout, fewer, load_layout, one_capture, static_alone
 from devrf.scenes.names import Missing
 from devrf.scenes.reader import InwardReader, Time
@@ -22,6 +21,7 @@ from devrf.scenes.splits import (
     check_timed_alike,
     distinct_poses,
     every_nth,
+    file_sizes,
     in_motion,
     stand_still,
 )
@@ -127,7 +127,6 @@ class BlenderReader(InwardReader):
         if any(not known.distortion.none for known in split.transforms.intrinsics):
             log.warning("flow files in %s left out: they are of images before undistortion", folder)
             return None
-        used = int(split.index[0])
         first = split.times.min()
         last = split.times.max()
         expected = views.times > first + 1e-6 if direction == "bwd" else views.times < last - 1e-6
@@ -135,8 +134,8 @@ class BlenderReader(InwardReader):
             folder,
             split.index.tolist(),
             expected.tolist(),
-            image_size(split.transforms.images[used], split.transforms.intrinsics[used].size),
-            (views.width, views.height),
+            file_sizes(split, views),
+            views.cameras,
             direction,
         )
 

@@ -146,9 +146,8 @@ class ColmapReader(PosedReader, FixedViewsReader):
                 ", ".join(others),
             )
         world = normalised(model, FACING.get(self.space, "inward"))
-        camera = model.cameras[model.images[0].camera]
-        width = int(camera["w"])
-        height = int(camera["h"])
+        cameras = (model.cameras[k] for k in dict.fromkeys(i.camera for i in model.images))
+        width, height = max(((int(c["w"]), int(c["h"])) for c in cameras), key=max)
         factor = self.choose_factor(lambda factor: (width // factor, height // factor))
         source = images_of(model, folder, factor)
         layout, smaller = self._layout(folder, model, world.poses, source.path, factor)

@@ -20,13 +20,20 @@ from devrf.scenes.formats.llff_poses import (
     read_static_poses,
 )
 from devrf.scenes.image_folders import folder_size, image_folder, listed_images
-from devrf.scenes.images import image_size
 from devrf.scenes.layout import Layout, fewer, load_layout, static_alone, without_static_set
 from devrf.scenes.names import in_order
 from devrf.scenes.reader import FixedViewsReader, Time
 from devrf.scenes.scene import OpticalFlow, Scene, Views
 from devrf.scenes.space import forward_facing_scene
-from devrf.scenes.splits import Split, at_rest, at_times, evenly_spread, every_nth, in_motion
+from devrf.scenes.splits import (
+    Split,
+    at_rest,
+    at_times,
+    evenly_spread,
+    every_nth,
+    file_sizes,
+    in_motion,
+)
 from devrf.scenes.transforms import Transforms
 from devrf.scenes.validation import scene_error
 from devrf.scenes.view_folders import (
@@ -191,5 +198,4 @@ def _flow(
         log.info("no optical flow: no <frame>_%s.npz in %s and its like", direction, where)
         return None
     rows = {frame * len(folders) + view: path for (view, frame), path in sorted(files.items())}
-    source = image_size(folders[0].images[0], split.transforms.intrinsics[0].size)
-    return stacked_flow(rows, len(views), source, (views.width, views.height))
+    return stacked_flow(rows, file_sizes(split, views), views.cameras)

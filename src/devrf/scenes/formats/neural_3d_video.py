@@ -232,7 +232,7 @@ def _views(
     lenses = [posed.intrinsics[video].lens(width, height, posed.file) for video in chosen]
     return Views(
         pixels,
-        pinholes(posed.poses[chosen], lenses, width, height)[view],
+        pinholes(posed.poses[chosen], lenses, [(width, height)] * len(chosen))[view],
         times.repeat_interleave(len(chosen)),
         view,
         tuple(f"{videos.names[video]} frame {frame}" for frame in frames for video in chosen),
