@@ -23,7 +23,7 @@ from devrf.apps.video import VideoSettings, held_out_images, held_out_pictures, 
 from devrf.apps.video_file import write_pictures
 from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError
-from devrf.evaluation.held_out import HeldOutView, truth_image
+from devrf.evaluation.held_out import HeldOutView, score, truth_image
 from devrf.rendering.renderer import Renderer
 
 
@@ -142,6 +142,35 @@ def test_held_out_images_of_a_moving_camera_are_shown_at_their_own_times(moving,
         assert torch.equal(picture[18:, 28:52], to_bytes(color))
     # Each is rendered once.
     assert len({id(picture) for picture in shown}) == len(set(images))
+
+
+def test_pictures_of_two_sizes_have_their_own_within_a_video_of_one(moving, two_sizes, tmp_path):
+    views, renderer = two_sizes.dynamic.test, Renderer(moving)
+    film = VideoSettings(height=18)
+    shown = list(held_out_pictures(renderer, views, [0, 1], film, "white"))
+    assert [picture.shape for picture in shown] == [(36, 3 * 24 + 2 * 4, 3)] * 2
+    for image, picture in enumerate(shown):
+        truth = to_bytes(truth_image(views, image, "white"))
+        height, width = truth.shape[:2]
+        top, left = 18 + (18 - height) // 2, (24 - width) // 2
+        assert (width, height) == [(18, 18), (24, 16)][image]
+        assert torch.equal(picture[top : top + height, left : left + width], truth)
+        color, depth = still(renderer, views.cameras, (0.0, 1.0)[image], 1.0, image)
+        assert color.shape == depth.shape == (height, width, 3)
+        at = left + 28
+        assert torch.equal(picture[top : top + height, at : at + width], to_bytes(color))
+    sheet = [score(renderer, views, k, "white") for k in range(2)]
+    assert write_contact_sheet(tmp_path / "sheet.png", sheet).shape[0] == 30 + 2 * 306 - 6
+
+
+def test_a_video_of_cameras_of_several_sizes_has_the_commonest(two_sizes):
+    cameras = two_sizes.static.train.cameras[[0, 1, 3]]  # 18 x 18, twice 24 x 16
+    sized = VideoSettings().sized(cameras)
+    assert (sized.width, sized.height) == (600, 400) and sized.sizes is None
+    assert torch.equal(sized.camera_to_world, cameras.camera_to_world)
+    assert sized.focal[1].tolist() == (cameras.focal[1] * 25).tolist()
+    one = StillSettings(view=0).camera(Viewpoints.of(two_sizes))
+    assert (one.width, one.height) == (400, 400)
 
 
 def test_films_of_a_scene_at_rest_speak_of_no_time(learned, tiny_scene, monkeypatch):

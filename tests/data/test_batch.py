@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from devrf.data.batch import (
+    FramePool,
     PixelPool,
     all_pixels,
     background_color,
@@ -165,3 +166,16 @@ def test_what_is_wanted_but_does_not_count_is_left_out():
     valid_mask[1, 0, 1] = False
     pool = wanted_pixels(replace(shown, valid_mask=valid_mask), images, wanted)
     assert list(zip(pool.image.tolist(), pool.flat.tolist(), strict=True)) == [(1, 2), (0, 3)]
+
+
+def test_what_is_beside_an_image_is_never_drawn(two_sizes):
+    shown = two_sizes.static.train
+    pool = all_pixels(shown, torch.arange(2))
+    places = set(zip(pool.image.tolist(), pool.flat.tolist(), strict=True))
+    # Image 0 has 18 of 24 columns and 18 rows, image 1 16 of the rows.
+    first = {(0, 24 * row + column) for row in range(18) for column in range(18)}
+    assert places == first | {(1, number) for number in range(24 * 16)}
+    # The middle is that of the image: rows 4 to 13 and columns 4 to 13 of 18.
+    middle = FramePool.of(shown[torch.tensor([0])], centre=True).pool
+    inner = {24 * row + column for row in range(4, 14) for column in range(4, 14)}
+    assert set(middle.flat.tolist()) == inner

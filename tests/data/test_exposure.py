@@ -141,6 +141,19 @@ def test_a_held_out_image_that_shows_nothing_on_its_right_is_scored_on_its_left(
     assert torch.equal(made.valid_mask, left) and made.exposure_mask[0].any()
 
 
+def test_halves_are_those_of_each_image(film):
+    test = film.dynamic.test
+    sizes = torch.tensor([[test.width - 10, test.height]]).repeat(len(test), 1)
+    inside = (torch.arange(test.width) < test.width - 10).expand(test.pixels.shape[:3])
+    cameras = replace(test.cameras, sizes=sizes)
+    cut = replace(test, cameras=cameras, valid_mask=inside)
+    scene = replace(film, dynamic=replace(film.dynamic, test=cut))
+    made = with_equal_exposure(scene, "equal").dynamic.test
+    middle = (test.width - 10) // 2
+    assert made.exposure_mask[:, :, :middle].all() and made.valid_mask[:, :, middle:-10].all()
+    assert not (made.exposure_mask[:, :, middle:].any() or made.valid_mask[:, :, :middle].any())
+
+
 @pytest.mark.parametrize(
     ("change", "choice", "made"),
     [(0.2, "auto", False), (0.2, "equal", True), (1.0, "none", False), (1.0, "auto", True)],

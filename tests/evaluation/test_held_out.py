@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
@@ -109,3 +110,23 @@ def test_what_is_too_bright_does_not_tell_the_exposure():
     torch.testing.assert_close(exposed(prediction, truth, views, 0), truth)
     # An empty picture is not made as bright as the truth.
     assert float(exposed(1e-4 + 0 * truth, truth, views, 0).max()) < 1e-3
+
+
+def test_images_of_two_sizes_are_scored_each_at_its_own(moving, tiny_scene, two_sizes):
+    renderer = Renderer(moving)
+    suite = MetricSuite(("ms_ssim", "psnr_masked", "depth_error"))
+    views, whole = two_sizes.dynamic.test, tiny_scene.dynamic.test
+    for index, (width, height) in enumerate([(18, 18), (24, 16), (18, 18)]):
+        seen = score(renderer, views, index, "white", suite)
+        full = score(renderer, whole, index, "white", suite)
+        prediction, truth = (image[:height, :width] for image in (full.prediction, full.truth))
+        assert torch.equal(seen.truth, truth)
+        torch.testing.assert_close(seen.prediction, prediction, atol=1e-5, rtol=0)
+        assert seen.prediction.shape == seen.compared.shape == (height, width, 3)
+        assert seen.depth.shape == seen.opacity.shape == (height, width)
+        assert seen.psnr == pytest.approx(psnr(prediction, truth), abs=1e-3)
+        assert seen.ssim == pytest.approx(ssim(prediction, truth), abs=1e-5)
+        inside = whole.pixels[index, :height, :width, 3] > 127
+        masked = float((prediction - truth)[inside].square().mean())
+        assert seen.further["psnr_masked"] == pytest.approx(-10 * math.log10(masked), abs=1e-3)
+        assert (seen.further["depth_error"] is None) == (full.further["depth_error"] is None)

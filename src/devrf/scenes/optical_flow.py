@@ -169,15 +169,15 @@ def flow_between(views: Views, image: int, other: int, between: Estimator) -> tu
 
     Of images of two sizes it is that of the part at the top left that both have.
     """
-    sizes = [views.cameras.size_of(k) for k in (image, other)]
-    width = min(columns for columns, _ in sizes)
-    height = min(rows for _, rows in sizes)
-    now, then = (_on_white(views.pixels[k, :height, :width]) for k in (image, other))
+    whole = [views.single(k).pixels[0] for k in (image, other)]
+    height = min(pixels.shape[0] for pixels in whole)
+    width = min(pixels.shape[1] for pixels in whole)
+    now, then = (_on_white(pixels[:height, :width]) for pixels in whole)
     there = between(now, then)
     back = between(then, now)
     valid = consistent(there, back)
     if views.has_alpha:
-        valid &= views.pixels[image, :height, :width, 3].cpu() > ALPHA_THRESHOLD
+        valid &= whole[0][:height, :width, 3].cpu() > ALPHA_THRESHOLD
     return there, valid
 
 

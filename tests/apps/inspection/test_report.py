@@ -9,6 +9,7 @@ import pytest
 import torch
 from rich.console import Console
 
+from devrf.apps.inspection.advice import advice_on
 from devrf.apps.inspection.layout import box_points, common_up, widest_gap
 from devrf.apps.inspection.report import (
     as_text,
@@ -33,6 +34,15 @@ def test_the_sets_of_a_scene(tiny_scene):
     ]
     inside = float((tiny_scene.static.test.pixels[..., 3] > 127).float().mean())
     assert rows[1][4:6] == (f"cover {100 * inside:.0f} %", "no")
+
+
+def test_a_set_of_two_sizes_names_both_and_has_no_masks(two_sizes, tiny_scene):
+    row = image_facts(two_sizes)[0]
+    assert (row[3], row[5]) == ("18 x 18, 24 x 16", "no")
+    whole = tiny_scene.static.train.pixels[..., 3] > 127
+    left = [whole[k, :18, :18] if k % 2 == 0 else whole[k, :16] for k in range(8)]
+    assert row[4] == f"cover {100 * sum(float(m.float().mean()) for m in left) / 8:.0f} %"
+    assert not [a for a in advice_on(two_sizes) if "mask" in a.problem]
 
 
 @pytest.mark.parametrize(

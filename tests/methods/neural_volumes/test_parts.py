@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from devrf.errors import DevrfError
-from devrf.methods.neural_volumes.capture import cameras_of_every_frame
+from devrf.evaluation.held_out import truth_image
+from devrf.methods.neural_volumes.capture import cameras_of_every_frame, encoder_images
 from devrf.methods.neural_volumes.model import NeuralVolumes
 from devrf.methods.neural_volumes.networks import (
     AffineMixWarp,
@@ -187,3 +188,16 @@ def test_the_total_variation_of_log_opacity() -> None:
 def test_sizes_that_cannot_be_are_named(key: str, value: object) -> None:
     with pytest.raises(DevrfError, match=rf"ray_stage\.model\.settings\.{key}\b"):
         replace(NeuralVolumesSettings(), **{key: value})  # type: ignore[arg-type]
+
+
+def test_the_encoder_sees_each_image_whole_in_the_middle(two_sizes: Scene) -> None:
+    settings = NeuralVolumesSettings(encoder_views=2, encoder_size=(20, 26), encoder_channels=(2,))
+    images = encoder_images(two_sizes, settings)
+    train = two_sizes.dynamic.train
+    for place, (rows, columns) in ((0, (18, 18)), (1, (16, 24))):
+        assert int(train.frames[place]) == 0
+        top, left = (20 - rows) // 2, (26 - columns) // 2
+        shown = images[0, place, :, top : top + rows, left : left + columns].permute(1, 2, 0)
+        truth = 255 * truth_image(train, place, two_sizes.background)
+        assert truth.shape[:2] == (rows, columns)
+        assert torch.equal(shown, truth.round().to(torch.uint8))
