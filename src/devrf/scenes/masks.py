@@ -176,7 +176,8 @@ def valid_pixels(
     masks = np.zeros((len(sizes), height, width, 1), dtype=np.uint8)
     for mask, (columns, rows) in zip(masks, sizes, strict=True):
         mask[:rows, :columns] = WHITE
-    white = white_in_files([path for path in paths if path is not None])
+    there = [path for path in paths if path is not None]
+    white = white_in_files(there) if there else WHITE
 
     def fill(k: int) -> None:
         path = paths[k]
