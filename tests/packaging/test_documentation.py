@@ -37,7 +37,7 @@ TEST = re.compile(r"(tests/[\w/]+\.py)(?:::(\w+))?")
 LINK = re.compile(r"\]\((?!https?:)([^)#\s]+)")
 EQUATION = re.compile(r"\\\((.+?)\\\)|\\\[(.+?)\\\]", re.S)
 # `python -m devrf`, or the installed program: VENV/bin/devrf.
-ARGUMENT = r"'?[\w./]+=[^\s`]+"
+ARGUMENT = r"['\"]?\+{0,2}[\w./]+=[^\s`]+"
 COMMAND = re.compile(rf"(?:python -m |/bin/)devrf\"? ((?:-m )?{ARGUMENT}(?: {ARGUMENT})*)")
 COMMENT = re.compile(r'"""(.*?)"""|# ([^\n]*)', re.DOTALL)
 # In a comment: arguments alone, without what ends the sentence.

@@ -12,23 +12,25 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from itertools import product
 from pathlib import Path
 
 from hydra import initialize_config_dir
 from hydra._internal.utils import get_args_parser
+from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.types import Override
+from hydra.core.override_parser.types import Override, ValueType
 from hydra.errors import HydraException
 from hydra.types import RunMode
+from omegaconf.errors import OmegaConfBaseException
 
 from devrf.cli.config import APART, PATHS, config_folder, group_choices
-from devrf.cli.messages import in_quotes
 from devrf.cli.restore_config import of_named_run, parsed, told, value, values
 from devrf.cli.view import serves_page
 from devrf.errors import DevrfError
+from devrf.system.override import literal, without_reference
 from devrf.system.process import importing
 
 # Stages that DeVRF's protocol alone has.
@@ -53,7 +55,9 @@ def completed(arguments: Sequence[str]) -> list[str]:
     told.clear()
     known, _ = get_args_parser().parse_known_intermixed_args(arguments)
     flags = [word for word in arguments if word not in known.overrides]
-    texts = [quoted_path(SHORTHAND.get(w.lower(), w), known.multirun) for w in known.overrides]
+    texts = [SHORTHAND.get(word.lower(), word) for word in known.overrides]
+    in_sweep = known.multirun or _sweeps(texts, known.config_dir)
+    texts = [quoted_path(text, in_sweep) for text in texts]
     try:
         typed = parsed(texts)
     except HydraException:  # reported when Hydra parses them
@@ -91,21 +95,57 @@ def completed(arguments: Sequence[str]) -> list[str]:
 def quoted_path(argument: str, multirun: bool) -> str:
     """An argument as typed; if it names a file, as Hydra's grammar takes just that name.
 
-    In a multirun a comma separates paths, as it does other values.
+    In a multirun a comma separates paths, as it does other values; else it belongs to the name.
+
+    Raises:
+        DevrfError: it names a file that no config can hold.
     """
     found = KEY_VALUE.fullmatch(argument)
-    if not found or found[2] not in PATHS or "${" in argument:
+    if not found or found[2] not in PATHS:
         return argument
     start, _, text = found.groups()
+    if "${" in text:
+        if os.path.lexists(path := os.path.expanduser(text)):
+            without_reference(Path(path))
+        return argument
     paths = text.split(",") if multirun else [text]
     with suppress(HydraException):
         (override,) = parsed([argument])
         read = override.value()
-        if override.is_sweep_override() or read in (None, "", text):
+        is_one = override.value_type == ValueType.SIMPLE_CHOICE_SWEEP and not multirun
+        if (override.is_sweep_override() and not is_one) or read in (None, "", text):
             return argument
         # A folder's name may look like a number or a list.
         paths = [read if isinstance(read, str) else text]
-    return start + ",".join(in_quotes(os.path.expanduser(path)) for path in paths)
+    return start + ",".join(literal(os.path.expanduser(path)) for path in paths)
+
+
+def _sweeps(texts: Sequence[str], config_dir: str | None) -> bool:
+    """Whether a command without -m is a multirun, by an experiment; asked if a path has a comma."""
+    paths = {text for text in texts if (word := KEY_VALUE.fullmatch(text)) and word[2] in PATHS}
+    if not any("," in path for path in paths):
+        return False
+    with _config_loader() as loader, suppress(HydraException, OmegaConfBaseException):
+        others = [*(text for text in texts if text not in paths), *_searchpath(config_dir)]
+        config = loader.load_configuration(
+            "config", others, RunMode.MULTIRUN, validate_sweep_overrides=False
+        )
+        return bool(config.hydra.mode == RunMode.MULTIRUN)
+    return False
+
+
+@contextmanager
+def _config_loader() -> Iterator[ConfigLoader]:
+    """What composes configs, before Hydra itself has begun."""
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        yield GlobalHydra.instance().config_loader()
+
+
+def _searchpath(config_dir: str | None) -> list[str]:
+    """The override that has the effect of ``--config-dir``."""
+    if config_dir is None:
+        return []
+    return [f"hydra.searchpath=[{literal(f'file://{os.path.abspath(config_dir)}')}]"]
 
 
 def _says_how(override: Override) -> bool:
@@ -182,11 +222,9 @@ def _of_experiments(overrides: Sequence[Override], config_dir: str | None) -> li
     if not names:
         return [None]
     texts = [str(o.input_line) for o in overrides if o.key_or_group == "hydra.searchpath"]
-    if config_dir:
-        texts.append(f"hydra.searchpath=[{in_quotes(f'file://{os.path.abspath(config_dir)}')}]")
+    texts += _searchpath(config_dir)
     options: list[str | list[str] | None] = []
-    with initialize_config_dir(str(config_folder()), version_base="1.3"):
-        loader = GlobalHydra.instance().config_loader()
+    with _config_loader() as loader:
         for name in names:
             with suppress(HydraException):  # reported when Hydra composes it
                 words = [f"experiment={name}", *texts]

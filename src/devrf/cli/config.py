@@ -15,6 +15,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from devrf.apps.settings import ReportSettings
+from devrf.system.override import to_type
 
 PIPELINE = "pipeline"
 # Stages for which the run's scene need not be right.
@@ -118,16 +119,19 @@ def register_config() -> None:
 
 
 def command_line(*words: str) -> str:
-    """A command to type next; the present one's own folders of configs are named again."""
+    """A command of ``words`` to type next; the present one's own folders of configs come again.
+
+    Words with paths come from :func:`devrf.system.override.to_type`.
+    """
     options = list[str]()
     folders = list[str]()
     for source in HydraConfig.get().runtime.config_sources if HydraConfig.initialized() else ():
         if source.provider == "command-line":
-            options += ["--config-dir", source.path]
+            options += ["--config-dir", shlex.quote(source.path)]
         elif source.provider == "hydra.searchpath in command-line":
             folders.append(f"{source.schema}://{source.path}")
-    searched = [f"hydra.searchpath=[{','.join(folders)}]"] if folders else []
-    return shlex.join(["python", "-m", "devrf", *options, *searched, *words])
+    searched = [to_type("hydra.searchpath", folders)] if folders else []
+    return " ".join(["python", "-m", "devrf", *options, *searched, *words])
 
 
 def choices() -> dict[str, str | None]:

@@ -32,6 +32,7 @@ from devrf.evaluation.suite import MetricSuite
 from devrf.methods.base import Renderable
 from devrf.scenes.scene import CaptureName
 from devrf.system.files import write_json
+from devrf.system.override import to_type
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +45,8 @@ def evaluate(run: RunContext) -> list[Path]:
     """
     standing = unfinished(run)
     if standing is not None and run.config.ckpt is None:
-        raise DevrfError(f"{standing}, stage=evaluate ckpt=FILE scores that file as it stands")
+        given = to_type("ckpt", run.checkpoint())
+        raise DevrfError(f"{standing}, stage=evaluate {given} scores that file as it stands")
     loaded = run.load(scene=run.scene)
     model = loaded.model
     metadata = loaded.metadata

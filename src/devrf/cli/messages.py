@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf.errors import OmegaConfBaseException
 
@@ -18,6 +17,8 @@ from devrf.cli.config import group_choices, known_stages
 from devrf.cli.config_check import unknown_key
 from devrf.errors import DevrfError, did_you_mean
 from devrf.system.files import REFUSED
+from devrf.system.options import joined_lines
+from devrf.system.override import to_type
 
 # Read at import: the entry point sets the variable, so that Hydra raises its errors.
 FULL_ERRORS = os.environ.get("HYDRA_FULL_ERROR", "0") != "0"
@@ -84,6 +85,8 @@ def one_line(error: BaseException) -> str:
         text = f"{group}={option}: no such option{known}{more}{meant}"
     elif isinstance(error, OverrideParseException):
         text = _not_understood(str(error.override))
+    elif several := re.match(r"(?s)Ambiguous value for argument '(.*?)'\n1\. ", text):
+        text = _of_several(several[1])
     elif isinstance(error, OSError) and not isinstance(error, HydraException):
         text = f"{error.filename or 'output'}: {error.strerror}"
     elif unknown := re.match(r"Could not override '([^']+)'", text):
@@ -94,24 +97,32 @@ def one_line(error: BaseException) -> str:
         text = re.sub(r"(?m)^\s*(full_key:|object_type=|reference_type=).*$", "", text)
         if key := re.search(r"^\s*full_key: (\S+)$", str(error), re.MULTILINE):
             text = f"{key[1]}: {text}"
-    return "".join(sign if sign.isprintable() else "?" for sign in " ".join(text.split()))
+    shown = (sign if sign.isprintable() or sign.isspace() else "?" for sign in joined_lines(text))
+    return "".join(shown)
+
+
+def _of_several(argument: str) -> str:
+    """What to type instead of values with commas between them, which only a sweep has."""
+    key, _, value = argument.partition("=")
+    as_text, as_list = to_type(key, value), shlex.quote(f"{key}=[{value}]")
+    return (
+        f"{argument}: several values; write {as_text} as text, {as_list} as a list, or -m to sweep"
+    )
 
 
 def _not_understood(argument: str) -> str:
     """What to type instead of an argument that Hydra cannot read."""
     key, is_set, value = argument.partition("=")
+    if is_set and value[:1] == "[" and value[-1:] == "]":
+        listed = to_type(key, [item.strip() for item in value[1:-1].split(",")])
+        return f"{argument}: not understood; as a list of texts write {listed}"
     if is_set:
-        as_text = shlex.quote(f"{key}={in_quotes(value)}")
+        as_text = to_type(key, value)
         return f"{argument}: not understood; as text write {as_text}, else see that brackets close"
-    words = [f"data.root={shlex.quote(argument)}"] if Path(argument).is_dir() else []
+    words = [to_type("data.root", argument)] if Path(argument).is_dir() else []
     words += [
         f"{group}={argument}" for group, names in group_choices().items() if argument in names
     ]
     meant = f"; did you mean {' or '.join(words)}?" if words else ""
     meant = meant or did_you_mean(argument, known_stages(), "stage=")
     return f"{argument}: not understood{meant or '; write KEY=VALUE, or --help for what there is'}"
-
-
-def in_quotes(text: str) -> str:
-    """``text`` as Hydra's grammar takes it for text, whatever it holds."""
-    return QuotedString(text=text, quote=Quote.double).with_quotes()

@@ -27,6 +27,7 @@ from devrf.engine.ddp import ManualDDP
 from devrf.errors import DevrfError
 from devrf.scenes.export import export
 from devrf.system.files import write_json
+from devrf.system.override import literal, to_type
 from devrf.system.progress import duration
 
 log = logging.getLogger(__name__)
@@ -43,7 +44,7 @@ def fetch(run: RunContext) -> None:
     """Download the scene ``scene=…`` into ``fetch.into``, and say what to do with it."""
     settings: FetchSettings = instantiate(run.config.fetch)
     scene = published_scene(run.config.scene, settings.catalogue)
-    root = f"data.root={fetched(scene, settings, progress=sys.stderr.isatty()).path}"
+    root = to_type("data.root", fetched(scene, settings, progress=sys.stderr.isatty()).path)
     say_next(["stage=inspect", root], [*scene.collection.learn.split(), root])
 
 
@@ -51,8 +52,7 @@ def capture(run: RunContext) -> None:
     """Make a scene of the footage ``capture.…``, and report on it as ``stage=inspect`` does."""
     settings: CaptureSettings = instantiate(run.config.capture, _convert_="all")
     folder = scene_from_footage(settings)
-    words = [f"data.root={folder}"]
-    config = compose("config", completed(words))
+    config = compose("config", completed([f"data.root={literal(folder)}"]))
     log_told()
     captured = RunContext(config, run.folder)
     inspect(captured)
@@ -67,7 +67,7 @@ def capture(run: RunContext) -> None:
         seconds = seconds_to_learn(stage, moving, captured.datamodule, trainer)
     if seconds is not None:
         log.info("learning takes %s on this machine", duration(seconds))
-    say_next([*words, *change])
+    say_next([to_type("data.root", folder), *change])
 
 
 def prepare(run: RunContext) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import logging
 import re
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -31,9 +32,9 @@ from devrf.cli.config import (
     scene_folder_name,
 )
 from devrf.cli.config_check import RESERVED
-from devrf.cli.messages import in_quotes
 from devrf.errors import DevrfError
 from devrf.system.files import read_record
+from devrf.system.override import literal, to_type
 from devrf.system.process import importing
 
 log = logging.getLogger(__name__)
@@ -124,18 +125,9 @@ def root(key: str) -> str:
 
 
 def as_typed(command: Mapping[str, Any]) -> list[str]:
-    """It as it may be typed, for people."""
+    """It as it may be typed where no shell comes between."""
     said = {k: v if isinstance(v, str) else json.dumps(v) for k, v in command.items()}
     return [f"{key.lstrip('/')}={value}" for key, value in said.items()]
-
-
-def _literal(value: Any) -> str:
-    """A plain value in Hydra's grammar."""
-    if isinstance(value, list):
-        return f"[{','.join(map(_literal, value))}]"
-    if isinstance(value, str):
-        return in_quotes(value)
-    return str(value) if isinstance(value, float) else json.dumps(value)
 
 
 def parsed(overrides: Iterable[str]) -> list[Override]:
@@ -194,13 +186,14 @@ def of_named_run(typed: Sequence[Override], multirun: bool) -> list[str]:
     commands = [checked(path, metadata_of(path).command) for path in checkpoints]
     shared = {k: v for k, v in commands[0].items() if all(c.get(k, ...) == v for c in commands)}
     command = _beneath(typed, shared)
-    said = f"as it was learned, with {' '.join(as_typed(command))}"
+    words = [to_type(key.lstrip("/"), setting) for key, setting in command.items()]
+    said = f"as it was learned, with {' '.join(words)}"
     if {} in commands:
         said = "does not say how it was learned; what is typed and the defaults apply"
     if command or {} in commands:
         told.append(f"{', '.join(map(str, checkpoints))}: {said}")
     put = [
-        f"{key[1:]}={setting}" if key[0] == "/" else f"++{key}={_literal(setting)}"
+        f"{key[1:]}={setting}" if key[0] == "/" else f"++{key}={literal(setting)}"
         for key, setting in command.items()
     ]
     if multirun:
@@ -208,7 +201,7 @@ def of_named_run(typed: Sequence[Override], multirun: bool) -> list[str]:
         return put if values(typed, "hparams_search") else [*put, "hydra.sweeper.params=null"]
     put.append("hydra.mode=RUN")
     if folder is None and value(typed, "stage") in OF_A_CHECKPOINT:
-        put.append(f"hydra.run.dir={in_quotes(str(_folder_for(checkpoints[0])))}")
+        put.append(f"hydra.run.dir={literal(str(_folder_for(checkpoints[0])))}")
     return put
 
 
@@ -248,7 +241,7 @@ def _of_sweep(typed: Sequence[Override], folder: Path) -> list[str]:
             checked(record, {key: text})
         lines[key] = str(override.input_line)
     kept = [lines[key] for key in _beneath(typed, lines)]
-    told.append(f"{folder}: the sweep goes on, with {' '.join(kept)}")
+    told.append(f"{folder}: the sweep goes on, with {shlex.join(kept)}")
     return [*kept, "hydra.mode=MULTIRUN"]
 
 

@@ -42,6 +42,7 @@ from devrf.cli.context import RunContext
 from devrf.errors import DevrfError
 from devrf.system.files import read_record, write_json
 from devrf.system.folder_lock import PLACE
+from devrf.system.override import to_type
 
 log = logging.getLogger(__name__)
 
@@ -169,7 +170,7 @@ def unfinished(run: RunContext) -> str | None:
     if (at := read_description(path).get("progress")) is None:
         return None
     stands = f"iteration {at['iteration']} of {at['total']} of the {at['stage']} stage"
-    return f"{path}: {stands}; {command_line(f'hydra.run.dir={run.place}')} goes on"
+    return f"{path}: {stands}; {command_line(to_type('hydra.run.dir', run.place))} goes on"
 
 
 def done(run: RunContext, step: str) -> bool:

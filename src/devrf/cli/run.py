@@ -41,6 +41,7 @@ from devrf.kernels.ahead import compile_ahead
 from devrf.system.files import read_record
 from devrf.system.folder_lock import PLACE
 from devrf.system.memory import free_cache, shortage_in_words
+from devrf.system.override import to_type
 
 log = logging.getLogger(__name__)
 
@@ -165,7 +166,7 @@ def _ended(run: RunContext, steps: Names) -> float | None:
         log.info("results: %s (%s)", run.place, results)
         if (run.folder / "export" / PAGE).exists():
             log.info("the scene, for any browser: %s", run.place / "export" / PAGE)
-        further = [[f"hydra.run.dir={run.place}", *words.split()] for words in NEXT]
+        further = [[to_type("hydra.run.dir", run.place), *words.split()] for words in NEXT]
         if metrics.get("at_rest"):
             further[0].remove("still.time=0.35")
         say_next(*further, ["stage=report"])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import codecs
 import os
 import re
-import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
@@ -18,6 +17,7 @@ from pydantic import AfterValidator, BaseModel, Field, ValidationError
 from devrf.errors import DevrfError
 from devrf.scenes.validation import LARGEST, scene_error
 from devrf.system.options import abbreviated, first_error
+from devrf.system.override import to_type
 
 Numbers = npt.NDArray[np.float64]
 
@@ -89,8 +89,8 @@ def existing_folder(folder: Path) -> Path:
     if os.path.isfile(folder):
         if folder.suffix.lower() in ARCHIVES:
             raise scene_error(folder, "is an archive; unpack it, and set data.root to its folder")
-        parent = shlex.quote(f"data.root={folder.parent}")
-        raise scene_error(folder, f"is a file, expected the scene's folder; write {parent}")
+        parent = to_type("data.root", folder.parent)
+        raise scene_error(folder, "is a file, expected the scene's folder; write", parent)
     if not os.path.isdir(folder):  # unlike Path.is_dir it raises on nothing
         raise scene_error(folder, "no such folder; set data.root to the scene's folder")
     return folder

@@ -19,9 +19,9 @@ MIN_SIDE = 8
 LARGEST = 3e38
 
 
-def scene_error(where: object, what: str) -> DevrfError:
-    """The error ``where: what`` in one line."""
-    return DevrfError(one_line(where, what))
+def scene_error(where: object, what: str, typed: str = "") -> DevrfError:
+    """The error ``where: what`` in one line; it ends with what is to be ``typed``, if anything."""
+    return DevrfError(one_line(where, what, typed))
 
 
 def reduced_size(width: int, height: int, downscale: int, where: object) -> tuple[int, int]:

@@ -37,9 +37,14 @@ _brief = reprlib.Repr()
 _brief.maxlevel = 2
 
 
-def one_line(where: object, what: str) -> str:
-    """``where: what`` in one line that is not too long."""
-    return _shortened(" ".join(f"{where}: {what}".split()), LONGEST_MESSAGE)
+def one_line(where: object, what: str, typed: str = "") -> str:
+    """``where: what`` in one line that is not too long, then words to type, of any length."""
+    return f"{_shortened(joined_lines(f'{where}: {what}'), LONGEST_MESSAGE)} {typed}".rstrip()
+
+
+def joined_lines(text: str) -> str:
+    """Lines of text as one; spaces within a line stay, for names may have several in a row."""
+    return " ".join(filter(None, map(str.strip, text.splitlines())))
 
 
 def abbreviated(value: object) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -30,6 +29,7 @@ from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.offset import Offset
 from devrf.rendering.view import Viewable
+from devrf.system.override import to_type
 
 # Keyframes of a known path, and the seconds that it takes to go round.
 KEYFRAMES = 13
@@ -95,7 +95,7 @@ class PathPanel:
     ) -> None:
         """Put the panel on the page.
 
-        ``folder`` is the run's, and ``run`` the overrides that name it in a command; ``height`` the
+        ``folder`` is the run's, and ``run`` the words that name it in a command; ``height`` the
         rows of frames, for files that say so; ``presets`` are keyframes from the current ``time``
         in [0, 1]. ``fly`` shows a path from its beginning to its end; ``changed`` is called when a
         path appears in the scene, or vanishes. Positions in files have the scene's ``offset``.
@@ -188,8 +188,8 @@ class PathPanel:
     def _save(self, _: object) -> None:
         file = self._folder / "paths" / f"{check_name(self._name.value)}.json"
         write_path(file, self.path(), self._height, self._offset)
-        words = ["python", "-m", "devrf", "stage=render", *self._run, f"video.path={file}"]
-        set_value(self._command, shlex.join(words))
+        words = ["python", "-m", "devrf", "stage=render", *self._run, to_type("video.path", file)]
+        set_value(self._command, " ".join(words))
         self._command.visible = True
 
     def _load(self, _: object) -> None:

@@ -24,6 +24,7 @@ from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError
 from devrf.rendering.view import Viewable
 from devrf.scenes.scene import Scene
+from devrf.system.override import to_type
 
 log = logging.getLogger(__name__)
 
@@ -67,11 +68,11 @@ class Session:
         self._failures: set[str] = set()
         self.server = open_server(settings)
         self.controls = Controls(self.server, self.refresh)
-        learned = [] if ckpt is None else [f"ckpt={Path(ckpt).resolve()}"]
+        learned = [] if ckpt is None else [to_type("ckpt", Path(ckpt).resolve())]
         self.paths = PathPanel(
             self.server,
             folder,
-            [f"hydra.run.dir={folder}", *learned],
+            [to_type("hydra.run.dir", folder), *learned],
             settings.height,
             known_paths(viewpoints.static, lambda: self._model),
             time=lambda: self.controls.playback.time,

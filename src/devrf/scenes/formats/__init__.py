@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import os
-import shlex
 from dataclasses import dataclass, replace
 from importlib.metadata import entry_points
 from pathlib import Path
 
+from devrf.errors import DevrfError
 from devrf.scenes.files import entries, scene_folder
 from devrf.scenes.footage import VIDEOS
 from devrf.scenes.images import SUFFIXES
 from devrf.scenes.sparse_model import PARTS, model_folders
 from devrf.scenes.validation import scene_error
+from devrf.system.override import to_type
 
 
 @dataclass(frozen=True)
@@ -92,12 +93,12 @@ def _fitting(root: str | Path) -> tuple[Path, list[KnownLayout]]:
     """The scene's folder, and the layouts that it has, at least one."""
     file = Path(os.path.expanduser(root))
     if file.suffix.lower() in VIDEOS and os.path.isfile(file):
-        raise scene_error(file, _footage(file))
+        raise _footage(file, file)
     folder = scene_folder(root)
     fitting = _layouts(folder)
     if not fitting:
         model_folders(folder).check()
-        raise scene_error(folder, _of_no_layout(folder))
+        raise _of_no_layout(folder)
     return folder, fitting
 
 
@@ -114,20 +115,21 @@ def _fits(layout: KnownLayout, folder: Path) -> bool:
     return not layout.missing(folder)
 
 
-def _of_no_layout(folder: Path) -> str:
+def _of_no_layout(folder: Path) -> DevrfError:
     """What to do about a folder of no known layout: scenes, images or videos may be around it."""
     above = folder.absolute().parent
     inside = entries(folder)
     if _layouts(above):
-        return f"is a part of a scene; write {shlex.quote(f'data.root={above}')}"
+        return scene_error(folder, "is a part of a scene; write", to_type("data.root", above))
     for path in inside:
         if os.path.isdir(path) and _layouts(path):
-            return f"{path.name}/ in it is a scene; write {shlex.quote(f'data.root={path}')}"
+            word = to_type("data.root", path)
+            return scene_error(folder, f"{path.name}/ in it is a scene; write", word)
     for place in (folder, folder / "images"):
         if os.path.isdir(place) and any(p.suffix.lower() in SUFFIXES for p in entries(place)):
-            return _footage(place)
+            return _footage(folder, place)
     if videos := [path for path in inside if path.suffix.lower() in VIDEOS]:
-        return _footage(*videos)
+        return _footage(folder, *videos)
     # A layout is left out if another one lacks only some of the same files.
     missing = {layout.name: layout.missing(folder) for layout in LAYOUTS}
     lacks = [
@@ -135,15 +137,19 @@ def _of_no_layout(folder: Path) -> str:
         for name, files in missing.items()
         if not any({*fewer} < {*files} for fewer in missing.values())
     ]
-    return f"no known layout ({'; '.join(lacks)}); set data.root to the scene's folder"
+    return scene_error(
+        folder, f"no known layout ({'; '.join(lacks)}); set data.root to the scene's folder"
+    )
 
 
-def _footage(static: Path, *views: Path) -> str:
+def _footage(where: Path, static: Path, *views: Path) -> DevrfError:
     """What to type to make a scene of photographs or videos; the first one is taken at rest."""
     name = static.parent.name if static.name == "images" else static.stem
-    listed = [f"capture.views=[{','.join(map(str, views))}]"] if views else []
-    words = [f"capture.static={static}", *listed, f"capture.into=scenes/{name or 'mine'}"]
-    typed = " ".join(map(shlex.quote, words))
-    alone = ", or with capture.views=[…] in place of static if things move"
-    hint = alone if static.suffix.lower() in VIDEOS and not views else ""
-    return f"footage without camera poses; make a scene of it: stage=capture {typed}{hint}"
+    words = [to_type("capture.static", static)]
+    words += [to_type("capture.views", views)] if views else []
+    words.append(to_type("capture.into", Path("scenes", name or "mine")))
+    typed = f"stage=capture {' '.join(words)}"
+    if static.suffix.lower() in VIDEOS and not views:
+        moving = to_type("capture.views", [static])
+        typed += f", or with {moving} in place of capture.static if things move"
+    return scene_error(where, "footage without camera poses; make a scene of it:", typed)
