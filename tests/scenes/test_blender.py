@@ -17,6 +17,7 @@ import pytest
 import torch
 
 from devrf.data.priors import without_priors
+from devrf.errors import DevrfError
 from devrf.scenes.formats.blender import BlenderReader
 from devrf.scenes.space import dynamic_only
 
@@ -68,6 +69,59 @@ def test_camera_angle_becomes_a_focal_length_and_a_known_pixel(scene_folder):
     pixel, depth = cameras.project(torch.tensor([0]), torch.tensor([[0.0, 0.5, 0.0]]))
     assert pixel[0].tolist() == pytest.approx([16 + focal * 0.5 / 4, 12], abs=1e-4)
     assert float(depth) == pytest.approx(4, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("said", "focal"),
+    [
+        # 32×24 px: half a side by the tangent of half the angle.
+        ({"camera_angle_x": 0.8, "camera_angle_y": 0.5}, (37.8435, 46.9958)),
+        ({"camera_angle_y": 0.5}, (46.9958, 46.9958)),
+        ({"camera_angle_x": 0.8, "camera_angle_y": 0.5, "fl_x": 50, "fl_y": 40}, (50, 40)),
+        ({"camera_angle_y": 0.5, "fl_x": 50}, (50, 46.9958)),
+        ({"camera_angle_x": 0.8, "fl_y": 40}, (37.8435, 40)),
+        ({"camera_angle_y": 0.5, "w": 64, "h": 48}, (46.9958, 46.9958)),
+    ],
+)
+def test_either_angle_gives_the_focal_length_of_its_axis(scene_folder, said, focal):
+    def change(content):
+        del content["camera_angle_x"]
+        content.update(said)
+
+    scene_folder.edit(scene_folder.static / "transforms_train.json", change)
+    cameras = BlenderReader(scene_folder.root).read().static.train.cameras
+    assert cameras.focal.tolist() == [pytest.approx(focal, abs=1e-4)] * 6
+    assert cameras.center.tolist() == [[16, 12]] * 6
+
+
+def test_the_view_that_a_frame_states_replaces_the_files(scene_folder):
+    def change(content):
+        content.update(camera_angle_x=0.8, camera_angle_y=0.5)
+        first, second, third, *_ = content["frames"]
+        first.update(camera_angle_y=0.4)
+        second.update(fl_x=30.0)
+        third.update(camera_angle_x=0.6, camera_angle_y=0.4)
+
+    scene_folder.edit(scene_folder.static / "transforms_train.json", change)
+    focal = BlenderReader(scene_folder.root).read().static.train.cameras.focal
+    expected = [[59.1978, 59.1978], [30, 30], [51.7236, 59.1978], [37.8435, 46.9958]]
+    assert focal[:4].tolist() == [pytest.approx(one, abs=1e-4) for one in expected]
+
+
+def test_the_principal_point_of_a_crop_is_outside_the_image(scene_folder):
+    file = scene_folder.static / "transforms_train.json"
+    scene_folder.edit(file, lambda content: content.update(cx=-3.5, cy=0))
+    with pytest.raises(DevrfError, match="data.box: the images do not show where their axes meet"):
+        BlenderReader(scene_folder.root).read()
+    box = [[-1, -1, -1], [1, 1, 1]]
+    scene = BlenderReader(scene_folder.root, box=box, near=2.0, far=6.0).read()
+    assert scene.static.train.cameras.center.tolist() == [[-3.5, 0]] * 6
+    # What lies ahead of a camera falls beside its image.
+    pixel, _ = scene.static.train.cameras.project(torch.tensor([0]), torch.zeros(1, 3))
+    assert pixel[0].tolist() == pytest.approx([-3.5, 0], abs=1e-4)
+    scene_folder.edit(file, lambda content: content.update(cx=-33000))
+    with pytest.raises(DevrfError, match="cannot be one of 32x24 px"):
+        BlenderReader(scene_folder.root, box=box, near=2.0, far=6.0).read()
 
 
 def test_images_are_made_smaller_as_the_release_does_if_asked_to(scene_folder):
@@ -253,6 +307,7 @@ def pose(first: object) -> list[list[object]]:
     [
         (TRAIN, lambda c: c.pop("frames"), "frames: is missing"),
         (TRAIN, lambda c: c.pop("camera_angle_x"), '"camera_angle_x"'),
+        (TRAIN, lambda c: c.update(camera_angle_y=3.2), "camera_angle_y is 3.2, expected radians"),
         (
             TRAIN,
             in_first_frame("transform_matrix", pose(NAN)),

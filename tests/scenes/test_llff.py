@@ -208,7 +208,7 @@ def test_the_near_plane_of_a_video_by_hand():
     """Eleven cameras look along −z: one stray point, and a camera that has gone 1 forward."""
     poses = torch.eye(4, dtype=torch.float64)[:3].repeat(11, 1, 1)
     bounds = torch.tensor([[0.1, 9.0], *[[4.0, 9.0]] * 10], dtype=torch.float64)
-    intrinsics = (Intrinsics(None, (20.0, 20.0), (12.0, 8.0), (24, 16)),) * 11
+    intrinsics = (Intrinsics((20.0, 20.0), (12.0, 8.0), (24, 16)),) * 11
     side_by_side = PosedSet(Path("video"), poses, intrinsics, bounds)
     assert side_by_side.near_plane() == pytest.approx(3.0)
     moved = poses.clone()

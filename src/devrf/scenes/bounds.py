@@ -135,9 +135,11 @@ def seen_radius(cameras: Cameras, center: Tensor) -> float:
     """Radius of the sphere around ``center`` (3,) that the median camera sees whole.
 
     distance · sin(half of the smaller field of view); a principal point off the middle counts
-    with its nearer edge.
+    with its nearer edge. DevrfError if the median camera's is outside its image.
     """
     edge = torch.minimum(cameras.center, cameras.extents - cameras.center) / cameras.focal
+    if float(edge.amin(dim=1).median()) <= 0:
+        raise scene_error("data.box", f"the images do not show where their axes meet; {GIVE}")
     half_angle = torch.atan(edge.clamp(min=1e-3)).amin(dim=1)
     distance = (cameras.positions - center).norm(dim=1)
     return float((distance * half_angle.sin()).median())

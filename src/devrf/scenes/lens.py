@@ -83,13 +83,14 @@ class CameraKeys(BaseModel):
     """The keys of a camera, in a transforms file or in one of its frames.
 
     Attributes:
-        fl_x: focal length in pixels of an image of ``w`` × ``h``; or there is an angle.
-        fl_y: None: as ``fl_x``.
-        cx: principal point in pixels; None: the image's middle.
+        fl_x: focal length in pixels of an image of ``w`` × ``h``; None: that of the angle.
+        fl_y: as ``fl_x``; without an angle, too, pixels are square.
+        cx: principal point in pixels, outside a cropped image; None: the image's middle.
         cy: as ``cx``.
         w: width of the image that pixels are measured in; None: the file's.
         h: as ``w``.
         camera_angle_x: horizontal field of view in radians.
+        camera_angle_y: vertical field of view in radians.
         camera_model: one of :data:`CAMERA_MODELS`.
         is_fisheye: must be false.
         k1: with ``k2`` to ``k4``, radial distortion.
@@ -98,11 +99,12 @@ class CameraKeys(BaseModel):
 
     fl_x: Positive | None = None
     fl_y: Positive | None = None
-    cx: Positive | None = None
-    cy: Positive | None = None
+    cx: Number | None = None
+    cy: Number | None = None
     w: Positive | None = None
     h: Positive | None = None
     camera_angle_x: Number | None = None
+    camera_angle_y: Number | None = None
     camera_model: Annotated[Any, AfterValidator(_supported)] = "OPENCV"
     is_fisheye: Annotated[Any, AfterValidator(_no_fisheye)] = False
     k1: Number = 0.0
@@ -114,6 +116,8 @@ class CameraKeys(BaseModel):
 
 
 KEYS = set(CameraKeys.model_fields)
+FOCAL = {"fl_x", "fl_y"}
+ANGLES = {"camera_angle_x", "camera_angle_y"}
 
 
 @dataclass(frozen=True)
@@ -121,20 +125,20 @@ class Intrinsics:
     """A camera's intrinsics, for images of any size where an angle gives them.
 
     Attributes:
-        angle_x: horizontal field of view in radians, or None when ``focal`` is given.
-        focal: (fx, fy) in pixels, or None.
+        focal: (fx, fy) in pixels, None where an angle gives it, or the other one.
         center: (cx, cy) in pixels; None means the image's middle.
         size: (width, height) of the image that pixels are measured in; None: the file's.
         distortion: of the lens.
         skew: pixels; 0 where the sensor's axes are square to one another.
+        angles: fields of view in radians, horizontal and vertical; None: unknown.
     """
 
-    angle_x: float | None
-    focal: tuple[float, float] | None
+    focal: tuple[float | None, float | None]
     center: tuple[float | None, float | None]
     size: tuple[float, float] | None = None
     distortion: Distortion = Distortion()
     skew: float = 0.0
+    angles: tuple[float | None, float | None] = (None, None)
 
     def lens(self, width: int, height: int, where: object) -> Lens:
         """The lens in pixels of a file of ``width`` × ``height`` pixels.
@@ -148,15 +152,16 @@ class Intrinsics:
                 where,
                 f"{width}x{height} px, but its camera is one for {w:g}x{h:g} px; correct one",
             )
-        if self.focal is not None:
-            focal = self.focal
-        else:
-            assert self.angle_x is not None  # intrinsics_of asks for one of the two
-            square = w / 2 / math.tan(self.angle_x / 2)
-            focal = (square, square)
+        fx, fy = (
+            side / 2 / math.tan(angle / 2) if focal is None and angle is not None else focal
+            for focal, angle, side in zip(self.focal, self.angles, (w, h), strict=True)
+        )
+        square = fx or fy
+        assert square is not None  # intrinsics_of asks for one
         cx, cy = self.center
         center = (w / 2 if cx is None else cx, h / 2 if cy is None else cy)
-        lens = Lens(focal, center, self.distortion, self.skew).scaled(width / w, height / h)
+        lens = Lens((square, fy or square), center, self.distortion, self.skew)
+        lens = lens.scaled(width / w, height / h)
         if not lens.fits(width, height):
             fx, fy = lens.focal
             x, y = lens.center
@@ -171,24 +176,25 @@ class Intrinsics:
 def intrinsics_of(camera: CameraKeys, where: object) -> Intrinsics:
     """The intrinsics that the keys of a file, or of one of its frames, state.
 
-    DevrfError if ``where`` has no focal length, or an angle out of range.
+    A focal length counts before the angle of its axis. DevrfError if ``where`` has neither, or an
+    angle out of range.
     """
     c = camera
     distortion = Distortion((c.k1, c.k2, c.k3, c.k4), (c.p1, c.p2))
     size = None if c.w is None or c.h is None else (c.w, c.h)
-    if c.fl_x is not None:
-        focal = (c.fl_x, c.fl_x if c.fl_y is None else c.fl_y)
-        return Intrinsics(None, focal, (c.cx, c.cy), size, distortion)
-    angle = c.camera_angle_x
-    if angle is None:
+    focal = (c.fl_x, c.fl_y)
+    angles = (c.camera_angle_x, c.camera_angle_y)
+    if c.fl_x is None and angles == (None, None):
         raise scene_error(
             where, 'has no "camera_angle_x" (radians) and no "fl_x" (pixels); add one'
         )
-    if not _LEAST_ANGLE <= angle < math.pi:
-        raise scene_error(
-            where, f"camera_angle_x is {angle}, expected radians between 0 and pi; correct it"
-        )
-    return Intrinsics(angle, None, (c.cx, c.cy), size, distortion)
+    for axis, length, angle in zip("xy", focal, angles, strict=True):
+        if length is None and angle is not None and not _LEAST_ANGLE <= angle < math.pi:
+            key = f"camera_angle_{axis}"
+            raise scene_error(
+                where, f"{key} is {angle}, expected radians between 0 and pi; correct it"
+            )
+    return Intrinsics(focal, (c.cx, c.cy), size, distortion, angles=angles)
 
 
 def frame_intrinsics(shared: CameraKeys, frame: CameraKeys, where: object) -> Intrinsics | None:
@@ -196,8 +202,7 @@ def frame_intrinsics(shared: CameraKeys, frame: CameraKeys, where: object) -> In
     own = frame.model_dump(include=KEYS, exclude_unset=True)
     if not own:
         return None
-    merged = shared.model_dump(include=KEYS, exclude_unset=True) | own
-    if "camera_angle_x" in own and "fl_x" not in own:
-        # Its angle stands against focal lengths of other images.
-        merged = {key: value for key, value in merged.items() if key not in ("fl_x", "fl_y")}
+    # What a frame says of its view stands against what the file says of other images.
+    others = ANGLES if "fl_x" in own else FOCAL | ANGLES if own.keys() & ANGLES else set()
+    merged = shared.model_dump(include=KEYS - others, exclude_unset=True) | own
     return intrinsics_of(CameraKeys.model_construct(**merged), where)

@@ -192,7 +192,7 @@ def _intrinsics(file: Path, h: float, w: float, fx: float, *more: float) -> Intr
         raise scene_error(
             file, f"height {h:g}, width {w:g} or focal length {fx:g} is not above 0; correct it"
         )
-    return Intrinsics(None, (fx, fy), (cx, cy), (w, h))
+    return Intrinsics((fx, fy), (cx, cy), (w, h))
 
 
 def _posed_set(

@@ -134,7 +134,6 @@ def read_camera(folder: Path, item: str, world: World) -> tuple[Tensor, Intrinsi
     check_poses(pose[None], lambda _: f"{file}: orientation or position")
     focal = camera.focal_length
     intrinsics = Intrinsics(
-        None,
         (focal, focal * camera.pixel_aspect_ratio),
         camera.principal_point,
         camera.image_size,
