@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import signal
+import sys
 from pathlib import Path
 
 import pytest
@@ -210,6 +211,24 @@ def test_names_with_other_letters_where_the_locale_has_but_ascii(
     assert {path.name for path in tmp_path.iterdir()} == {"läufe", "szöne"}
     assert "szöne" in done.out
     assert "szöne" in (tmp_path / "läufe" / "run.log").read_text("utf-8")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="here all names are UTF-8")
+@pytest.mark.parametrize(
+    "typed", ["data.root={}", "hydra.run.dir={}", "stage=capture capture.views=[{}.mp4]"]
+)
+def test_a_name_that_is_not_utf8_ends_it_before_anything_is_written(
+    devrf, devrf_in, tmp_path, tiny, typed
+):
+    latin = "caf\udce9"  # b"caf\xe9" on the disk
+    said = "devrf: {}: its name is not UTF-8 text; rename it\n"
+    outcome = devrf(*typed.format(latin).split())
+    last = typed.format("caf\\xe9").split()[-1]
+    assert (outcome.status, outcome.err) == (2, said.format(last))
+    (tmp_path / latin).mkdir()
+    outcome = devrf_in(tmp_path / latin, *tiny)
+    assert (outcome.status, outcome.err) == (2, said.format(f"{tmp_path}/caf\\xe9"))
+    assert [path.name for path in tmp_path.rglob("*")] == [latin]
 
 
 def test_a_torchvision_for_another_torch_ends_only_what_needs_it(

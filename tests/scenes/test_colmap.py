@@ -267,6 +267,13 @@ def rewrite(root: Path, part: str, old: str, new: str) -> None:
 HALF = 0.5**0.5
 
 
+def test_the_name_of_an_image_is_utf8(folder, message_of):
+    file = folder / "sparse/0/images.txt"
+    file.write_bytes(file.read_bytes().replace(b"img_10", b"caf\xe9"))
+    said = r"the name of its image round/caf\xe9.png is not UTF-8 text; rename it"
+    assert said in message_of(folder)
+
+
 @pytest.mark.parametrize("suffix", [".txt", ".bin"])
 def test_cameras_poses_and_depths_by_hand(tmp_path, suffix):
     """Camera 7 at (1, 2, 3), turned by 90 degrees about its viewing axis z; two points."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 from functools import partial
 
 import pytest
@@ -11,7 +12,7 @@ import torch
 from devrf.scenes.formats.blender import BlenderReader
 from devrf.scenes.formats.llff import LlffReader
 from devrf.scenes.formats.nerfstudio import NerfstudioReader
-from devrf.scenes.image_folders import whole_factor
+from devrf.scenes.image_folders import listed_images, whole_factor
 
 
 def warnings_in(caplog) -> list[str]:
@@ -93,3 +94,27 @@ def test_the_folder_that_is_there_is_taken(llff_folder, caplog):
     # 96 x 64 pixels: made smaller at all they would have fewer than 64.
     assert (scene.static.train.width, scene.dynamic.train.width) == (96, 96)
     assert "images of 96x64 px, made smaller by 1 (data.downscale=up_to_4;" in caplog.text
+
+
+# Names that are not UTF-8
+
+LATIN = "caf\udce9"  # b"caf\xe9" on the disk
+linux = pytest.mark.skipif(sys.platform != "linux", reason="here all names are UTF-8")
+
+
+@linux
+def test_a_name_that_is_not_utf8_is_refused_where_it_is_used(
+    llff_folder, scene_folder, refusal, tmp_path
+):
+    said = r"caf\xe9{}: its name is not UTF-8 text; rename it"
+    images = llff_folder.static / "images_4"
+    (images / f"{LATIN}.txt").touch()
+    (llff_folder.root / LATIN).mkdir()
+    read = partial(LlffReader, llff_folder.root, downscale=4)
+    assert len(read().read().static.train) > 0  # what is not used may have any name
+    listed_images(images)[3].rename(images / f"{LATIN}.png")
+    assert refusal(LlffReader, llff_folder.root, downscale=4).endswith(said.format(".png"))
+    named = scene_folder.root / f"dynamic_{LATIN}views"
+    scene_folder.dynamic.rename(named)
+    assert refusal(BlenderReader, scene_folder.root).endswith(said.format("views"))
+    assert refusal(BlenderReader, tmp_path / LATIN).endswith(said.format(""))

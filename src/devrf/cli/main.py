@@ -19,6 +19,8 @@ from devrf.cli.restore_config import log_told, parsed
 from devrf.cli.run_folder import working_in
 from devrf.cli.sweep import naming_failures, record_failure
 from devrf.cli.view import serve_page, serves_page
+from devrf.system.files import utf8_path
+from devrf.system.override import without_reference
 from devrf.system.process import (
     Interrupted,
     end_at_once,
@@ -49,6 +51,9 @@ def entry() -> None:
     tune_for_cpu()
     try:
         with handle_signals(end_at_once), report_user_errors(), naming_failures():
+            without_reference(Path.cwd())
+            for word in sys.argv[1:]:
+                utf8_path(Path(word))
             sys.argv[1:] = completed(sys.argv[1:])
             main()
     # A KeyboardInterrupt is raised by another library's handler of Ctrl-C.

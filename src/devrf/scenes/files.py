@@ -16,6 +16,7 @@ from pydantic import AfterValidator, BaseModel, Field, ValidationError
 
 from devrf.errors import DevrfError
 from devrf.scenes.validation import LARGEST, scene_error
+from devrf.system.files import utf8_path
 from devrf.system.options import abbreviated, first_error
 from devrf.system.override import to_type
 
@@ -79,7 +80,7 @@ ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar")
 def scene_folder(root: str | Path) -> Path:
     """The folder that the user calls ``root``, with ``~`` filled in; else DevrfError."""
     try:
-        return existing_folder(Path(root).expanduser())
+        return existing_folder(utf8_path(Path(root).expanduser()))
     except RuntimeError as error:  # there is no user of that name
         raise scene_error("data.root", f"{root} is not a path ({error})") from None
 

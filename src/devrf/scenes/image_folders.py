@@ -19,6 +19,7 @@ from devrf.scenes.files import entries
 from devrf.scenes.images import SUFFIXES, image_size, unread
 from devrf.scenes.names import in_order
 from devrf.scenes.validation import scene_error
+from devrf.system.files import utf8_path
 
 log = logging.getLogger(__name__)
 
@@ -73,7 +74,7 @@ def listed_images(folder: Path, *, by_characters: bool = False) -> list[Path]:
     For the order and ``by_characters`` see :func:`~devrf.scenes.names.in_order`.
     """
     images = [
-        path
+        utf8_path(path)
         for path in entries(folder)
         if path.suffix.lower() in SUFFIXES and path.name[0] != "." and os.path.isfile(path)
     ]

@@ -199,7 +199,7 @@ def _opened(folder: Path) -> Any:
 
 
 def _of_reconstruction(folder: Path, model: Any) -> SparseModel:
-    images = [_image(image) for image in model.images.values() if image.has_pose]
+    images = [_image(folder, image) for image in model.images.values() if image.has_pose]
     if not images:
         raise scene_error(folder, "poses no image; run COLMAP's mapper again")
     ordered = tuple(sorted(images, key=lambda image: image.name))
@@ -234,12 +234,18 @@ def _camera(folder: Path, camera: Any) -> dict[str, float]:
     return {"fl_x": fx, "fl_y": fy, "w": camera.width, "h": camera.height, **parameters}
 
 
-def _image(image: Any) -> ModelImage:
+def _image(folder: Path, image: Any) -> ModelImage:
+    try:
+        name = str(image.name)
+    except UnicodeDecodeError as error:
+        name = error.object.decode(errors="backslashreplace")
+        what = f"the name of its image {name} is not UTF-8 text; rename it, and run COLMAP again"
+        raise scene_error(folder, what) from None
     pose = image.cam_from_world()
     x, y, z, w = pose.rotation.quat.tolist()
     shift = tuple(pose.translation.tolist())
     shown = np.array([point.point3D_id for point in image.get_observation_points2D()], np.int64)
-    return ModelImage(image.name, image.camera_id, (w, x, y, z), shift, shown)
+    return ModelImage(name, image.camera_id, (w, x, y, z), shift, shown)
 
 
 Corner = tuple[float, float, float]

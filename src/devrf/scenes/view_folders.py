@@ -19,12 +19,13 @@ from devrf.scenes.lens import Intrinsics
 from devrf.scenes.splits import Split
 from devrf.scenes.transforms import Transforms
 from devrf.scenes.validation import scene_error
+from devrf.system.files import utf8_path
 
 
 def dynamic_folders(root: Path) -> list[Path]:
     """The folders ``dynamic_<V>views`` of ``root``, in order of their names."""
     return [
-        path
+        utf8_path(path)
         for path in entries(root)
         if fnmatch.fnmatch(path.name, "dynamic_*views") and os.path.isdir(path)
     ]

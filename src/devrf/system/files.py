@@ -12,6 +12,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from devrf.errors import DevrfError
+
 # Bytes; the longest records, of footage of hours, have some ten million.
 LARGEST_RECORD = 64 * 2**20
 # Errors of a disk, its permissions, or a path that was given. A missing file may be a fault of the
@@ -21,6 +23,20 @@ REFUSED = {
     *(errno.ENOSPC, errno.EDQUOT, errno.EIO),
     *(errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ELOOP),
 }
+
+
+def utf8_path(path: Path) -> Path:
+    """``path`` itself; DevrfError if a name in it is not UTF-8 text.
+
+    Linux takes any bytes for a name. Records in JSON cannot hold them, and libraries that are given
+    them end the program.
+    """
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        shown = os.fsencode(path).decode(errors="backslashreplace")
+        raise DevrfError(f"{shown}: its name is not UTF-8 text; rename it") from None
+    return path
 
 
 def make_folder(folder: Path) -> None:

@@ -11,6 +11,7 @@ import shlex
 from pathlib import Path
 
 from devrf.errors import DevrfError
+from devrf.system.files import utf8_path
 
 # Text that the grammar takes for just that text: no number, no truth value, nothing to be closed.
 _PLAIN = re.compile(
@@ -51,6 +52,7 @@ def without_reference(path: Path) -> str:
 
     A reference can be escaped once, but a config is resolved more often than that.
     """
-    if "${" in str(path):
-        raise DevrfError(f"{path}: its name holds ${{, where a config puts another key; rename it")
-    return str(path)
+    text = str(utf8_path(path))
+    if "${" in text:
+        raise DevrfError(f"{text}: its name holds ${{, where a config puts another key; rename it")
+    return text

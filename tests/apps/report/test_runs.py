@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import tracemalloc
 
 import pytest
@@ -66,6 +67,14 @@ def test_damaged_records_are_skipped_with_a_line_that_says_where(runs, ran, cont
     assert len(found.skipped) == 2
     for line, name in zip(found.skipped, ("failure", "metrics"), strict=True):
         assert line.startswith(f"{runs / name / name}.json: skipped; it is damaged, or not as")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="here all names are UTF-8")
+def test_a_run_whose_name_is_not_utf8_is_skipped(runs, ran):
+    ran("good").rename(runs / "caf\udce9")  # b"caf\xe9" on the disk
+    found = collect(runs)
+    assert found.runs.empty
+    assert found.skipped == (rf"{runs}/caf\xe9: its name is not UTF-8 text; rename it",)
 
 
 def test_of_records_without_end_only_so_much_is_read_as_devrf_writes(runs, ran):

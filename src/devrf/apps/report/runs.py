@@ -14,7 +14,7 @@ import pandas as pd
 
 from devrf.apps.settings import REHEARSAL
 from devrf.errors import DevrfError
-from devrf.system.files import read_record
+from devrf.system.files import read_record, utf8_path
 
 # What every run has; further columns are what its file holds, by dotted name.
 COLUMNS = (
@@ -84,9 +84,12 @@ def collect(folder: Path) -> Collection:
             if not file.is_file():
                 continue
             try:
+                utf8_path(place)  # or no table could be printed
                 record = read(json.loads(read_record(file)))
             except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
                 skipped.append(f"{file}: skipped; it is damaged, or not as devrf writes it")
+            except DevrfError as error:
+                skipped.append(str(error))
             else:
                 records[status].append({**record, "folder": name, "path": place, "status": status})
     if rehearsals:
