@@ -230,6 +230,26 @@ def test_a_browser_draws_what_the_renderer_does(browser, scenes, tmp_path, space
     assert psnr(browser.picture(), truth) >= LEAST_IN_HASTE
 
 
+@pytest.mark.parametrize("rows", [72, 155])
+@pytest.mark.parametrize("parts", [1, 2])
+def test_an_enlarged_picture_has_no_line_at_its_edges(browser, file, rows, parts):
+    text = file.read_text("utf-8").replace("SETTLED = 120", "SETTLED = 1e9")
+    text = text.replace("BUDGET = 70", "BUDGET = 0").replace("MIN_ROWS = 72", f"MIN_ROWS = {rows}")
+    file.write_text(text, "utf-8")
+    browser.open(file.as_uri() + "#time=0.4", 500, 333)
+    moving = f"document.documentElement.dataset.rows === '{rows}'"
+    browser.wait(moving)
+    if parts == 2:
+        browser.run("document.documentElement.dataset.rows = ''")
+        browser.element("rest").click()
+        browser.wait(moving)
+    picture = browser.picture()
+    assert picture.shape == (333, 500, 3) and picture.std() > 0.05
+    # Around the robot everything is white; what the device has beyond the picture is black.
+    for edge in (picture[0], picture[-1], picture[:, 0], picture[:, -1]):
+        assert edge.min() > 0.99
+
+
 def test_a_served_page_runs_its_own_program_alone(browser, file, tiny_scene, tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = probe.getsockname()[1]

@@ -163,13 +163,16 @@ class Graphics {
   /** Draws rows of pictures side by side, counted from below, and shows them on all the canvas. */
   draw(program, parts, width, height, first, last) {
     const { gl, canvas } = this;
+    const scale = canvas.height / height;
+    // Where a picture is enlarged, its edges are mixed with the pixels beyond them.
+    const beyond = scale > 1 ? 1 : 0;
     parts.forEach((uniforms, k) => {
       const left = Math.round((k * width) / parts.length);
       const wide = Math.round(((k + 1) * width) / parts.length) - left;
-      this.paint(program, uniforms, [left, 0, wide, height], [left, first, wide, last - first]);
+      const drawn = [left, first, wide + beyond, last - first + beyond];
+      this.paint(program, uniforms, [left, 0, wide, height], drawn);
     });
     gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, null);
-    const scale = canvas.height / height;
     const [from, to] = [[0, first, width, last], [0, first * scale, canvas.width, last * scale]];
     const filter = scale > 1 ? gl.LINEAR : gl.NEAREST;
     gl.blitFramebuffer(...from, ...to, gl.COLOR_BUFFER_BIT, filter);
