@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 import socket
 import threading
 from collections.abc import Callable
@@ -17,6 +18,7 @@ from devrf.apps.keyframes import Keyframe, keyframes_of
 from devrf.apps.settings import ViewerSettings
 from devrf.apps.viewer.cameras import dynamic_frusta, from_browser, in_browser, static_frusta
 from devrf.apps.viewer.drawing import Drawing, Frame, RenderScheduler, Shot
+from devrf.cli.restore_config import parsed
 from devrf.errors import DevrfError
 from devrf.rendering.renderer import Renderer
 
@@ -301,7 +303,8 @@ def test_keyframes_are_collected_saved_loaded_and_flown_through(
     from devrf.checkpoints.checkpoint import Viewpoints
 
     settings = ViewerSettings(port=free_port(), height=48)
-    session = Session(settings, Viewpoints.of(tiny_scene), tiny_scene, tmp_path, "/a.ckpt")
+    run = tmp_path / "it's, a (1)"
+    session = Session(settings, Viewpoints.of(tiny_scene), tiny_scene, run, "/a,b.ckpt")
     try:
         session.present(Drawing(Renderer(learned[0].scene_model), 1.0))
         controls = session.controls
@@ -331,9 +334,11 @@ def test_keyframes_are_collected_saved_loaded_and_flown_through(
         assert [(k.time, k.seconds) for k in panel.keyframes] == [(0, 0), (0.5, 2), (1, 4)]
         assert panel.drawn
         panel._answer(panel._save)(event)
-        file, run = tmp_path / "paths" / "path.json", f"hydra.run.dir={tmp_path} ckpt=/a.ckpt"
-        command = f"python -m devrf stage=render {run} video.path={file}"
-        assert panel._command.value == command and panel._command.visible
+        file = run / "paths" / "path.json"
+        *program, stage, folder, given, path = shlex.split(panel._command.value)
+        assert program == ["python", "-m", "devrf"] and panel._command.visible
+        read = [override.value() for override in parsed([stage, folder, given, path])]
+        assert read == ["render", str(run), "/a,b.ckpt", str(file)]
         content = file.read_bytes()
         panel._take(())
         panel._upload = SimpleNamespace(value=SimpleNamespace(content=content, name="path.json"))

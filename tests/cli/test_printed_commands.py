@@ -23,7 +23,8 @@ TEXT = st.characters(exclude_categories=["Cs", "Cc"]) | st.sampled_from("\\\"'a1
 
 # As phones, people, recorders and other programs name files.
 NAMES = ["left (1)", "left, near", "it's", "a,b", "scene[1]", "x=y", "{a: 1}", 'a "b"', "#1; ls"]
-NAMES += ["München", "two  spaces", "at 1.00\u202fPM", "$HOME `ls`", "back\\", "2026", "null", "!x"]
+NAMES += ["München", "two  spaces", "at 1.00\u202fPM", "$HOME `ls`", "back\\", "2026", "null"]
+NAMES += ["!x", "חדר\u200e", "👩\u200d🚀"]
 
 
 @given(st.lists(st.text(TEXT, min_size=1).filter(str.strip), min_size=1, max_size=3))
@@ -157,7 +158,7 @@ def test_a_command_that_goes_on_names_the_present_run(devrf, tmp_path, name):
 
 
 def test_a_run_ends_with_commands_that_work(devrf, tiny_data, short, tmp_path):
-    root, run = "it's, a", "outputs/it's, a (1)"
+    root, run = "it's, a\u202f👩\u200d🚀", "outputs/it's, a (1)"
     assert devrf(*tiny_data, "stage=prepare", f"data.export={root}").status == 0
     quick = (*short, "evaluation.metrics=[]", "video.frames=1")
     done = devrf(f"data.root={root}", *quick, f"hydra.run.dir={run}")

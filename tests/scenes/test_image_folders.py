@@ -117,4 +117,12 @@ def test_a_name_that_is_not_utf8_is_refused_where_it_is_used(
     named = scene_folder.root / f"dynamic_{LATIN}views"
     scene_folder.dynamic.rename(named)
     assert refusal(BlenderReader, scene_folder.root).endswith(said.format("views"))
-    assert refusal(BlenderReader, tmp_path / LATIN).endswith(said.format(""))
+    (tmp_path / "link").symlink_to(scene_folder.root.rename(tmp_path / LATIN))
+    assert refusal(BlenderReader, tmp_path / "link").endswith(said.format(""))
+
+
+def test_a_scene_of_a_name_that_cannot_be_shown_is_refused(scene_folder, refusal):
+    shown = scene_folder.root.rename(scene_folder.root.with_name("at 1.00\u202fPM"))
+    assert BlenderReader(shown).read().name == "at 1.00\u202fPM"
+    root = shown.rename(shown.with_name("a\tb"))
+    assert "its name holds control characters; rename it" in refusal(BlenderReader, root)

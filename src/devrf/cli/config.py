@@ -27,8 +27,8 @@ OF_A_CHECKPOINT = ("evaluate", "render", "still", "view", "export")
 # Keys whose values are files or folders.
 PATHS = {
     *("data.root", "data.export", "data.flow_cache", "ckpt", "fetch.into", "export.into"),
-    *("capture.static", "capture.into", "capture.masks", "video.path"),
-    *("report.runs", "report.into", "evaluation.lpips_weights"),
+    *("capture.static", "capture.into", "capture.masks", "capture.alpha_masks", "video.path"),
+    *("report.runs", "report.into", "fetch.catalogue", "evaluation.lpips_weights"),
     *("hydra.run.dir", "hydra.sweep.dir"),
 }
 

@@ -17,7 +17,7 @@ from devrf.cli.config import group_choices, known_stages
 from devrf.cli.config_check import unknown_key
 from devrf.errors import DevrfError, did_you_mean
 from devrf.system.files import REFUSED
-from devrf.system.options import joined_lines
+from devrf.system.options import is_shown
 from devrf.system.override import to_type
 
 # Read at import: the entry point sets the variable, so that Hydra raises its errors.
@@ -97,8 +97,9 @@ def one_line(error: BaseException) -> str:
         text = re.sub(r"(?m)^\s*(full_key:|object_type=|reference_type=).*$", "", text)
         if key := re.search(r"^\s*full_key: (\S+)$", str(error), re.MULTILINE):
             text = f"{key[1]}: {text}"
-    shown = (sign if sign.isprintable() or sign.isspace() else "?" for sign in joined_lines(text))
-    return "".join(shown)
+    # Spaces within a line stay: names may have several in a row.
+    line = " ".join(filter(None, map(str.strip, text.splitlines())))
+    return "".join(sign if is_shown(sign) or sign == "\t" else "?" for sign in line)
 
 
 def _of_several(argument: str) -> str:

@@ -34,6 +34,7 @@ from devrf.cli.config import (
 from devrf.cli.config_check import RESERVED
 from devrf.errors import DevrfError
 from devrf.system.files import read_record
+from devrf.system.options import is_shown
 from devrf.system.override import literal, to_type
 from devrf.system.process import importing
 
@@ -110,7 +111,7 @@ def _is_plain(value: object, depth: int = 8) -> bool:
     if isinstance(value, list):
         return depth > 0 and all(_is_plain(item, depth - 1) for item in value)
     if isinstance(value, str):
-        return value.isprintable() and not CODE.search(value)
+        return is_shown(value) and not CODE.search(value)
     return value is None or isinstance(value, bool | int | float)
 
 

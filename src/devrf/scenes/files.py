@@ -17,7 +17,7 @@ from pydantic import AfterValidator, BaseModel, Field, ValidationError
 from devrf.errors import DevrfError
 from devrf.scenes.validation import LARGEST, scene_error
 from devrf.system.files import utf8_path
-from devrf.system.options import abbreviated, first_error
+from devrf.system.options import abbreviated, first_error, is_shown
 from devrf.system.override import to_type
 
 Numbers = npt.NDArray[np.float64]
@@ -78,11 +78,17 @@ ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar")
 
 
 def scene_folder(root: str | Path) -> Path:
-    """The folder that the user calls ``root``, with ``~`` filled in; else DevrfError."""
+    """The folder that the user calls ``root``, with ``~`` filled in; else DevrfError.
+
+    A scene has its folder's name in all records, so it has to be text that can be shown.
+    """
     try:
-        return existing_folder(utf8_path(Path(root).expanduser()))
+        folder = existing_folder(Path(root).expanduser())
     except RuntimeError as error:  # there is no user of that name
         raise scene_error("data.root", f"{root} is not a path ({error})") from None
+    if not is_shown(str(utf8_path(folder.resolve()))):
+        raise scene_error(abbreviated(str(folder)), "its name holds control characters; rename it")
+    return folder
 
 
 def existing_folder(folder: Path) -> Path:

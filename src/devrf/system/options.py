@@ -7,6 +7,7 @@ import reprlib
 from collections.abc import Sequence
 from inspect import signature
 from typing import Annotated, Any, ClassVar
+from unicodedata import category
 
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 from pydantic.dataclasses import dataclass
@@ -39,12 +40,13 @@ _brief.maxlevel = 2
 
 def one_line(where: object, what: str, typed: str = "") -> str:
     """``where: what`` in one line that is not too long, then words to type, of any length."""
-    return f"{_shortened(joined_lines(f'{where}: {what}'), LONGEST_MESSAGE)} {typed}".rstrip()
+    said = _shortened(" ".join(f"{where}: {what}".split()), LONGEST_MESSAGE)
+    return f"{said} {typed}" if typed else said
 
 
-def joined_lines(text: str) -> str:
-    """Lines of text as one; spaces within a line stay, for names may have several in a row."""
-    return " ".join(filter(None, map(str.strip, text.splitlines())))
+def is_shown(text: str) -> bool:
+    """Whether a terminal shows a text, in one line, and obeys nothing in it."""
+    return not any(category(sign) in ("Cc", "Cs", "Zl", "Zp") for sign in text)
 
 
 def abbreviated(value: object) -> str:

@@ -8,11 +8,13 @@ from typing import Annotated, Any, TypeVar
 from annotated_types import Ge, Gt, Le, Predicate
 from pydantic import TypeAdapter
 
+from devrf.system.options import is_shown
+
 Kind = TypeVar("Kind")
 # How many; a factor; text that a terminal shows as it is.
 Count = Annotated[int, Ge(0), Le(2**53)]
 Share = Annotated[float, Gt(0), Le(1)]
-Line = Annotated[str, Predicate(str.isprintable)]
+Line = Annotated[str, Predicate(is_shown)]
 
 
 def built(kind: type[Kind], data: Any) -> Kind:
