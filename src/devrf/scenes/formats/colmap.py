@@ -58,8 +58,12 @@ def images_of(model: SparseModel, root: Path, factor: int) -> ImageFolder:
     finder = ImageFinder(root)
 
     def absent(folder: Path) -> int:
-        places = (inside(root, folder, image.name, model.folder) for image in model.images)
-        return sum(finder.find(place) is None for place in places)
+        places = [inside(root, folder, image.name, model.folder) for image in model.images]
+        found = [finder.find(place) for place in places]
+        return sum(
+            image is None or image.name.lower() != place.name.lower()
+            for image, place in zip(found, places, strict=True)
+        )
 
     lacks = absent(source.path)
     if lacks <= absent(full):
