@@ -137,3 +137,21 @@ def test_points_beyond_the_fold_are_not_upright():
     x = torch.tensor([0.5, fold - 0.01, fold + 0.01, 3.0])
     points = torch.stack([x, torch.zeros(4)], dim=-1)
     assert lens.upright(points).tolist() == [True, True, False, False]
+
+
+def test_images_of_several_sizes_are_scaled_with_their_raster():
+    pose = torch.eye(3, 4)[None].repeat(3, 1, 1)
+    focal, center = torch.full((3, 2), 110.0), torch.tensor([[48.0, 36], [36, 48], [36, 48]])
+    sizes = torch.tensor([[96, 72], [72, 96], [72, 96]])
+    cameras = Cameras(pose, focal, center, 96, 96, sizes)
+    large = cameras.of_height(400)
+    assert large.sizes.tolist() == [[400, 300], [300, 400], [300, 400]]
+    assert (large.single(0).width, large.single(0).height) == (400, 300)
+    assert cameras.extents.tolist() == sizes.tolist() and cameras[[1]].size_of(0) == (72, 96)
+    one = cameras.of_commonest_size()
+    assert (one.width, one.height, one.sizes) == (72, 96, None)
+    assert one.center.tolist() == [[36, 48]] * 3
+    same = Cameras(pose, focal, center, 96, 96)
+    assert same.joined(cameras).sizes.tolist() == [[96, 96]] * 3 + sizes.tolist()
+    with pytest.raises(ValueError, match="not of the raster"):
+        Cameras(pose, focal, center, 96, 90, sizes).check()

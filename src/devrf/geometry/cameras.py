@@ -215,7 +215,12 @@ class Cameras:
     def resized(self, width: int, height: int) -> Cameras:
         """The same cameras on another raster (each axis scaled by its own factor)."""
         scale = self.focal.new_tensor([width / self.width, height / self.height])
-        sizes = None if self.sizes is None else (self.sizes * scale).long().clamp(min=1)
+        sizes = self.sizes
+        if sizes is not None:
+            old, new = (
+                sizes.new_tensor(pair) for pair in ([self.width, self.height], [width, height])
+            )
+            sizes = (sizes * new // old).clamp(min=1)
         return replace(
             self,
             focal=self.focal * scale,
