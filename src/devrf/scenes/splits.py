@@ -275,7 +275,7 @@ def _check_shared(
     first: dict[int, int] = {}
     for k, camera in enumerate(cameras):
         j = first.setdefault(id(camera), k)
-        by_angle = camera.focal is None and camera.center == (None, None)
+        by_angle = camera.focal == (None, None) and camera.center == (None, None)
         fits = same_shape(sizes[k], sizes[j]) if by_angle else sizes[k] == sizes[j]
         if camera.size is None and not fits:
             raise scene_error(
