@@ -42,6 +42,24 @@ def test_box_of_the_usual_synthetic_cameras(ring_cameras):
     assert box.high == pytest.approx((half,) * 3, abs=1e-5)
 
 
+def test_the_box_of_crops_beside_their_axes_is_what_they_show(ring_cameras):
+    """Cameras that look 40 degrees aside, and crops of what the middle is in."""
+    ahead = ring_cameras(9, width=80, height=80, angle=1.2)
+    turn = math.radians(40)
+    rotation = torch.eye(3)
+    rotation[0, 0] = rotation[2, 2] = math.cos(turn)
+    rotation[0, 2], rotation[2, 0] = -math.sin(turn), math.sin(turn)
+    poses = ahead.camera_to_world.clone()
+    poses[:, :, :3] = poses[:, :, :3] @ rotation
+    focal = float(ahead.focal[0, 0])
+    center = torch.tensor([[40 + focal * math.tan(turn), 40.0]] * 9)
+    box = box_from_cameras(replace(ahead, camera_to_world=poses, center=center))
+    # The left edge is nearest to the middle, 40 px from it and that much further from the axis.
+    half = 4 * math.sin(math.atan(math.tan(turn) + 40 / focal) - turn)
+    assert box.high == pytest.approx((half,) * 3, abs=1e-4)
+    assert box.low == pytest.approx((-half,) * 3, abs=1e-4)
+
+
 def test_depth_range_holds_the_sphere_around_the_box(ring_cameras, cube):
     near, far = depth_range(ring_cameras(4, width=8, height=8, angle=0.7), cube)
     assert near == pytest.approx(4 - math.sqrt(3), abs=1e-5)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -135,18 +137,44 @@ def seen_radius(cameras: Cameras, center: Tensor) -> float:
     """Radius of the sphere around ``center`` (3,) that the median camera sees whole.
 
     distance · sin(half of the smaller field of view); a principal point off the middle counts
-    with its nearer edge. DevrfError if the median camera's is outside its image.
+    with its nearer edge.
     """
     edge = torch.minimum(cameras.center, cameras.extents - cameras.center) / cameras.focal
-    if float(edge.amin(dim=1).median()) <= 0:
-        raise scene_error("data.box", f"the images do not show where their axes meet; {GIVE}")
     half_angle = torch.atan(edge.clamp(min=1e-3)).amin(dim=1)
     distance = (cameras.positions - center).norm(dim=1)
     return float((distance * half_angle.sin()).median())
 
 
+def _turned_to_crops(cameras: Cameras) -> Cameras:
+    """The cameras; where an image is a crop beside its axis, one that looks at the crop's middle.
+
+    Its image has the same middle, and its nearest edge lies as many degrees from it.
+    """
+    beside = ((cameras.center <= 0) | (cameras.center >= cameras.extents)).any(dim=1)
+    if not bool(beside.any()):
+        return cameras
+    every = torch.arange(len(cameras))
+    middle = cameras.extents / 2
+    ahead = cameras.rays(every, middle).directions
+    right = normalize(torch.linalg.cross(ahead, cameras.camera_to_world[:, :, 1]), dim=1)
+    axes = [right, torch.linalg.cross(right, ahead), -ahead, cameras.positions]
+    # The cosines with rays through the middles of the four edges.
+    shares = middle.new_tensor([[0, 1], [2, 1], [1, 0], [1, 2]])
+    edges = (cameras.rays(every, middle * share).directions for share in shares)
+    cosine = torch.stack([(edge * ahead).sum(dim=1) for edge in edges]).amax(dim=0)
+    focal = middle.amin(dim=1) / torch.tan(torch.acos(cosine.clamp(-1, 1)))
+    poses = torch.where(beside[:, None, None], torch.stack(axes, dim=2), cameras.camera_to_world)
+    return replace(
+        cameras,
+        camera_to_world=poses,
+        focal=torch.where(beside[:, None], focal[:, None], cameras.focal),
+        center=torch.where(beside[:, None], middle, cameras.center),
+    )
+
+
 def box_from_cameras(cameras: Cameras) -> Box:
     """The cube around the point all cameras look at whose half edge is what they see of it."""
+    cameras = _turned_to_crops(cameras)
     center = axes_meet(cameras)
     radius = seen_radius(cameras, center)
     return resolved_box(center - radius, center + radius)

@@ -13,7 +13,7 @@ import unicodedata
 from collections.abc import Callable, Iterable, Sequence
 from decimal import Decimal
 from functools import cache
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Literal, TypeVar
 
 from devrf.scenes.files import entries, from_elsewhere, inside
@@ -56,7 +56,7 @@ def in_order(
     if differing:
         way = "characters" if by_characters else "numbers"
         pair = (as_text[k] for k in differing[0][:: 1 if by_characters else -1])
-        first, second = (PurePosixPath(name(item)).name for item in pair)
+        first, second = (name(item) for item in pair)
         log.info("%s: names are in the order of their %s: %s before %s", where, way, first, second)
     return as_text if by_characters else [as_text[k] for k in order]
 
