@@ -166,3 +166,15 @@ def test_another_folder_in_its_place_is_left_alone(devrf, web, tmp_path, publish
     assert outcome.status == 2
     assert "scenes/fox: there is something else, without fetched.json" in outcome.err
     assert not web.asked
+
+
+@pytest.mark.parametrize("name", [".fox.fetch", ".fox.fetch/files", "fox"])
+def test_nothing_is_fetched_through_a_link(devrf, web, tmp_path, published, name):
+    (tmp_path / "scenes" / name).parent.mkdir(parents=True)
+    (tmp_path / "scenes" / name).symlink_to(tmp_path / "else")
+    if name != "fox":
+        (tmp_path / "else").mkdir()
+    outcome = devrf(*published, "scene=fox")
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert f"scenes/{name}: " in outcome.err and not web.asked
+    assert not (tmp_path / "else").exists() or not list((tmp_path / "else").iterdir())

@@ -51,6 +51,19 @@ def test_outputs_are_reported_by_default_and_no_scene_is_read(devrf, tmp_path, f
     assert outcome.out.endswith("report written to outputs/report/report.md\n")
 
 
+@pytest.mark.parametrize("name", ["report", "report/figures", "report/report.md"])
+def test_a_report_is_not_written_through_a_link(devrf, tmp_path, finished, name):
+    (tmp_path / "else").mkdir()
+    (finished / name).parent.mkdir(exist_ok=True)
+    (finished / name).symlink_to(tmp_path / "else")
+    before = everything_in(tmp_path)
+    said = f"devrf: mine/{name}: a link or a pipe; remove it: devrf writes there\n"
+    for where in ((), ("hydra.run.dir=other",)):
+        outcome = devrf("stage=report", "report.runs=mine", *where)
+        assert (outcome.status, outcome.err) == (2, said)
+        assert everything_in(tmp_path) <= {*before, "other"}
+
+
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [

@@ -307,6 +307,8 @@ WRITTEN += [
     "export",
     "export/points",
     "paths",
+    "notes",
+    "tensorboard/hparams.yaml",
 ]
 
 
@@ -373,6 +375,26 @@ def test_nothing_of_a_sweep_is_written_through_a_link(devrf, tmp_path, tiny):
     outcome = devrf("-m", *tiny, "seed=1,2", "stage=inspect", "hydra.sweep.dir=sweep")
     assert outcome.status == 2 and "a link or a pipe" in outcome.err
     assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize("name", ["multirun.yaml", "optimization_results.yaml", "report/figures"])
+def test_a_link_at_the_top_of_a_sweep_is_refused(devrf, tmp_path, tiny, name):
+    (tmp_path / "sweep" / name).parent.mkdir(parents=True)
+    (tmp_path / "sweep" / name).symlink_to(tmp_path / "x")
+    outcome = devrf("-m", *tiny, "seed=1,2", "stage=inspect", "hydra.sweep.dir=sweep")
+    said = f"devrf: sweep/{name}: a link or a pipe; remove it: devrf writes there\n"
+    assert (outcome.status, outcome.err) == (2, said)
+    assert not (tmp_path / "x").exists() and len(list((tmp_path / "sweep").iterdir())) == 1
+
+
+def test_outputs_on_another_disk_and_a_linked_checkpoint_are_used(devrf, run, tmp_path):
+    (run / "checkpoints" / "deformation.ckpt").rename(tmp_path / "other.ckpt")
+    (run / "checkpoints" / "deformation.ckpt").symlink_to(tmp_path / "other.ckpt")
+    (tmp_path / "disk").mkdir()
+    run.rename(tmp_path / "disk" / "run")
+    (tmp_path / "outputs").symlink_to(tmp_path / "disk")
+    assert devrf("stage=still", "still.height=20", "hydra.run.dir=outputs/run").status == 0
+    assert list((tmp_path / "disk" / "run" / "images").glob("still*.png"))
 
 
 def test_a_pipe_is_no_checkpoint(devrf, run):

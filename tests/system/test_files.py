@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from devrf.system.files import atomic_write, free_disk, write_json
+from devrf.errors import DevrfError
+from devrf.system.files import atomic_write, free_disk, refuse_links, write_json
 
 
 def test_a_finished_file_stands_under_its_name_alone(tmp_path: Path) -> None:
@@ -63,3 +64,16 @@ def test_json_takes_the_place_of_what_was_there(tmp_path: Path) -> None:
 
 def test_a_disk_is_that_of_the_first_folder_that_exists(tmp_path: Path) -> None:
     assert free_disk(tmp_path) == pytest.approx(free_disk(tmp_path / "not" / "yet"), rel=0.05)
+
+
+def test_links_to_what_is_in_the_folder_are_as_wandb_leaves_them(tmp_path: Path) -> None:
+    (tmp_path / "run" / "wandb" / "run-1").mkdir(parents=True)
+    (tmp_path / "run" / "wandb" / "latest-run").symlink_to("run-1")
+    refuse_links(tmp_path / "run")
+    (tmp_path / "linked").symlink_to(tmp_path / "run")
+    refuse_links(tmp_path / "linked")
+    with pytest.raises(DevrfError, match="linked: a link or a pipe"):
+        refuse_links(tmp_path / "linked", itself=True)
+    (tmp_path / "run" / "wandb" / "run_id").symlink_to(tmp_path / "run-1")
+    with pytest.raises(DevrfError, match="run_id: a link or a pipe"):
+        refuse_links(tmp_path / "run")

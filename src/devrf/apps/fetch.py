@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import os
 import shutil
 import tomllib
 import zipfile
@@ -20,7 +21,7 @@ from rich.filesize import decimal
 from rich.progress import track
 
 from devrf.errors import DevrfError, did_you_mean
-from devrf.system.files import make_folder, read_record, write_json
+from devrf.system.files import make_folder, read_record, refuse_links, write_json
 
 log = logging.getLogger(__name__)
 
@@ -164,7 +165,7 @@ class Fetched:
 def fetched_before(scene: PublishedScene, into: Path) -> Fetched | None:
     """The scene, if it is in its place already; DevrfError if something else is there."""
     path = into / scene.name
-    if not path.exists():
+    if not os.path.lexists(path):
         return None
     try:
         record = json.loads(read_record(path / RECORD))
@@ -210,6 +211,7 @@ def fetch_scene(scene: PublishedScene, into: Path, sha256: str | None, progress:
     """
     expected = sha256.lower() if sha256 else scene.collection.sha256.get(scene.name)
     work = into / f".{scene.name}.fetch"
+    refuse_links(work, itself=True)
     make_folder(work)
     files = _download(scene, work / "files", progress)
     digest = _digest(files)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 import shutil
-import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,16 +18,19 @@ from omegaconf.errors import OmegaConfBaseException
 from devrf.cli.config import in_sweep
 from devrf.cli.messages import is_user_error, report_user_errors
 from devrf.errors import DevrfError
-from devrf.system.files import close_logs, holds_at_most, make_folder, remove_if_only
+from devrf.system.files import (
+    close_logs,
+    holds_at_most,
+    make_folder,
+    refuse_links,
+    remove_if_only,
+)
 from devrf.system.folder_lock import PLACE, lock_folder, release_folder
 
 log = logging.getLogger(__name__)
 
 # Made in the folder before the config is checked.
 AT_FIRST = {".hydra", PLACE}
-# What is written by names that are known, and might lead elsewhere; all that is in the first four.
-WRITTEN = [".hydra", PLACE, "logs", "export", "run.log", "checkpoints", "images", "videos", "paths"]
-WRITTEN += ["metrics.json", "frames.csv"]
 # Why a sweep's job failed.
 FAILURE = "failure.json"
 # Stages that leave .hydra alone: they look at other runs, or are none.
@@ -57,8 +59,10 @@ class FolderLock(Callback):
         except OmegaConfBaseException:
             return  # Hydra will report what is wrong with the config
         with report_user_errors():
+            # Where a report is written by default is a name in the folder of the runs.
+            named = config.stage == "report" and folder == Path(str(config.report.runs)) / "report"
+            refuse_links(folder, itself=named)
             make_folder(folder)  # as Hydra does next, with a traceback where it cannot
-            refuse_links(folder)
             if config.stage in UNRECORDED:
                 with read_write(config.hydra):
                     config.hydra.output_subdir = None
@@ -75,7 +79,7 @@ class FolderLock(Callback):
                     f"hydra/launcher: no {' and no '.join(missing)} here; type the command where "
                     "SLURM takes jobs, or leave hydra/launcher out"
                 )
-            for place in (folder, *folder.glob("*/")):
+            for place in (folder, *folder.glob("[!.]*/")):
                 refuse_links(place)
             lock_folder(folder, "hydra.sweep.dir")
         FolderLock.sweep = folder
@@ -106,20 +110,6 @@ def working_in(folder: Path, config: DictConfig) -> Iterator[None]:
         raise
     finally:
         release_folder(folder)
-
-
-def refuse_links(folder: Path) -> None:
-    """Refuse a run's folder in which names that are written to are no files or folders of its own.
-
-    Raises:
-        DevrfError: one is a link, or a pipe.
-    """
-    places = [folder / name for name in WRITTEN]
-    inside = (path for place in places[:4] if place.is_dir() for path in place.iterdir())
-    for path in [*places, *inside]:
-        mode = path.lstat().st_mode if os.path.lexists(path) else stat.S_IFREG
-        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-            raise DevrfError(f"{path}: a link or a pipe; remove it: devrf writes there")
 
 
 def _is_worker(config: DictConfig) -> bool:

@@ -52,6 +52,29 @@ def make_folder(folder: Path) -> None:
         raise PermissionError(errno.EACCES, "no folder can be made there", error.filename) from None
 
 
+def refuse_links(folder: Path, *, itself: bool = False) -> None:
+    """Refuse a folder in which what is written would go elsewhere.
+
+    No link or pipe may be at its top; in the folders there, links may lead to what is below it, as
+    wandb's do. In ``checkpoints``, and further down, what is written replaces a name. The folder
+    may be a link, unless ``itself``, or lie below one; it need not be there yet.
+
+    Raises:
+        DevrfError: naming the first link or pipe.
+    """
+    whole = os.path.realpath(folder)
+    top = [*os.scandir(folder)] if folder.is_dir() else []
+    folders = [p for p in top if p.is_dir(follow_symlinks=False) and p.name != "checkpoints"]
+    found = [str(folder)] if itself and folder.is_symlink() else []
+    for entry in [*top, *(entry for place in folders for entry in os.scandir(place))]:
+        real = entry.is_file(follow_symlinks=False) or entry.is_dir(follow_symlinks=False)
+        inside = entry.is_symlink() and os.path.realpath(entry).startswith(whole + os.sep)
+        if not real and not (inside and entry not in top):
+            found.append(entry.path)
+    if found:
+        raise DevrfError(f"{found[0]}: a link or a pipe; remove it: devrf writes there")
+
+
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
     """A path to write to that becomes ``path`` when the block ends well, and vanishes otherwise.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from importlib.util import find_spec
 from pathlib import Path
 
 import cv2
@@ -21,9 +22,10 @@ from devrf.apps.capture.images import (
     still_masks,
     write_frames,
 )
-from devrf.apps.capture.pipeline import kept
+from devrf.apps.capture.pipeline import kept, scene_from_footage
 from devrf.apps.capture.structure import checked_model, pairs
 from devrf.apps.capture.survey import BLURRED, check_sharp, moved, sharpest, sharpness, survey
+from devrf.apps.settings import CaptureSettings
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
@@ -39,6 +41,18 @@ def test_a_damaged_record_of_a_step_is_one_line(tmp_path, text):
         DevrfError, match=r"survey\.json: damaged; remove it, and it is made again$"
     ):
         kept(tmp_path / "survey.json", "videos", dict)
+
+
+@pytest.mark.skipif(find_spec("pycolmap") is None, reason="needs devrf[capture]")
+@pytest.mark.parametrize("name", ["images", "images/static", "capture/masks", "transforms.json"])
+def test_nothing_of_a_capture_is_written_through_a_link(tmp_path, name):
+    into = tmp_path / "scene"
+    (into / "capture").mkdir(parents=True)
+    (into / name).parent.mkdir(exist_ok=True)
+    (into / name).symlink_to(tmp_path / "else")
+    with pytest.raises(DevrfError, match=f"scene/{name}: a link or a pipe; remove it"):
+        scene_from_footage(CaptureSettings(static="a.mp4", into=into))
+    assert not (tmp_path / "else").exists()
 
 
 # Survey.

@@ -36,7 +36,7 @@ from devrf.scenes.sparse_model import (
     normalised,
 )
 from devrf.scenes.splits import every_nth
-from devrf.system.files import make_folder, read_record, write_json
+from devrf.system.files import make_folder, read_record, refuse_links, write_json
 from devrf.system.plain_data import built
 from devrf.system.progress import followed
 
@@ -167,6 +167,7 @@ def _folders(settings: CaptureSettings) -> tuple[Path, Path]:
             f"{into}: is there already, and not from stage=capture; give capture.into another "
             "folder"
         )
+    refuse_links(into)
     return into, work
 
 

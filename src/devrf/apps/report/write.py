@@ -19,7 +19,7 @@ from devrf.apps.report.text import latex, markdown, plain
 from devrf.apps.settings import ReportSettings
 from devrf.apps.video_file import fitted_font, write_pictures
 from devrf.errors import DevrfError
-from devrf.system.files import write_text
+from devrf.system.files import refuse_links, write_text
 
 # Pictures a second of the videos that show rows side by side.
 FPS = 10
@@ -32,7 +32,8 @@ def write_report(settings: ReportSettings) -> str:
         The tables for a terminal, and where the report is.
 
     Raises:
-        DevrfError: no such folder, or nothing below it that a run left; nothing is written.
+        DevrfError: no such folder, or nothing below it that a run left, or a link where the report
+            is written; nothing is written.
     """
     collection = collect(Path(settings.runs))
     folder = settings.folder
@@ -42,6 +43,7 @@ def write_report(settings: ReportSettings) -> str:
             f"report.runs: no finished run below {settings.runs}{why}; give the folder of runs "
             "that were scored (stage=pipeline or stage=evaluate)"
         )
+    refuse_links(folder, itself=settings.into is None)
     table = tabulate(collection, settings.published)
     figures = _write_plots(table, folder)
     videos = _write_videos(table, folder)
