@@ -8,13 +8,16 @@ import gzip
 import io
 import json
 import math
+import os
 import re
 import shutil
 import socket
+import struct
 import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -525,3 +528,107 @@ def test_the_server_gives_page_and_pictures_to_its_own_page_alone(tiny_scene, tm
         assert answer("/", Origin="http://elsewhere.example")[0] == 403
     finally:
         served.close()
+
+
+@pytest.fixture
+def port(tmp_path) -> Iterator[int]:
+    """Where a server serves a page, a picture, and a folder with links and a pipe."""
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    pictures = tmp_path / "export" / "pictures"
+    (pictures / "static_0").mkdir(parents=True)
+    (tmp_path / "export" / "scene.html").write_text("<p>a page</p>")
+    Image.new("RGB", (8, 6)).save(pictures / "static_0" / "0.jpg")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "7.jpg").write_text("a secret")
+    (pictures / "static_0" / "7.jpg").symlink_to(tmp_path / "other" / "7.jpg")
+    (pictures / "leak").symlink_to(tmp_path / "other")
+    (pictures / "static_0" / "notes.txt").write_text("a secret")
+    os.mkfifo(pictures / "static_0" / "8.jpg")
+    served = PageServer(ViewerSettings(port=port), tmp_path / "export")
+    yield port
+    served.close()
+
+
+def answered(port: int, request: str) -> bytes:
+    """What a server answers."""
+    with socket.create_connection(("127.0.0.1", port), timeout=20) as client:
+        client.sendall(request.encode("latin-1"))
+        return b"".join(iter(lambda: client.recv(2**16), b""))
+
+
+@pytest.mark.parametrize("method", ["GET", "HEAD"])
+def test_the_server_gives_page_and_pictures_alone(port, method):
+    def status(path: str, **headers: str) -> bytes:
+        lines = {"Host": f"127.0.0.1:{port}", **headers}
+        text = "".join(f"{name.replace('_', '-')}: {value}\r\n" for name, value in lines.items())
+        answer = answered(port, f"{method} {path} HTTP/1.0\r\n{text}\r\n")
+        assert b"a secret" not in answer
+        for header in (
+            b"Cross-Origin-Resource-Policy: same-origin",
+            b"X-Content-Type-Options: nosniff",
+            b"frame-ancestors 'none'; form-action 'none'; base-uri 'none'",
+        ):
+            assert header in answer
+        return answer[9:12]
+
+    assert status("/") == b"302"
+    assert status("/scene.html?pictures") == status("/pictures/static_0/0.jpg") == b"200"
+    assert status("/scene.html", Sec_Fetch_Site="same-origin") == b"200"
+    assert status("/scene.html", Host=f"localhost:{port}") == b"200"
+    assert status("/scene.html", Host="[::1]") == b"200"
+    for path in (
+        *("/pictures/static_0/7.jpg", "/pictures/leak/7.jpg", "/pictures/static_0/8.jpg"),
+        *("/pictures/static_0/notes.txt", "/pictures/static_0", "/pictures/", "/%00", "//[", "*"),
+        *("http://[", f"/pictures/{'a' * 5000}/0.jpg", "/scene.html/", "/./scene.html"),
+    ):
+        assert status(path) == b"404", path
+    for refused in (
+        *({"Origin": origin} for origin in ("http://[", "null", "", "http://elsewhere.example")),
+        *({"Host": host} for host in ("[", "", "\xff", "[evil.com]", "127.0.0.1@evil.com", "²")),
+        {"Sec_Fetch_Site": "cross-site"},
+    ):
+        assert status("/scene.html", **refused) == b"403", refused
+
+
+def test_clients_that_are_slow_or_go_away_hold_nothing_and_are_not_told(port, monkeypatch, capfd):
+    monkeypatch.setattr("devrf.apps.viewer.page.PATIENCE", 1.0)
+    slow = [socket.create_connection(("127.0.0.1", port), timeout=20) for _ in range(150)]
+    for client in slow:
+        with suppress(OSError):  # ended: there are too many
+            client.sendall(b"GET /sc")
+    began = time.monotonic()
+    request = f"GET /scene.html HTTP/1.0\r\nHost: 127.0.0.1:{port}\r\n\r\n"
+    assert b"<p>a page</p>" in answered(port, request)
+    assert time.monotonic() - began < 5
+    while time.monotonic() - began < 3:  # a byte at a time
+        with suppress(OSError):
+            slow[-1].sendall(b"e")
+        time.sleep(0.1)
+    with suppress(ConnectionError):
+        assert slow[-1].recv(1) == b""
+    for client in slow:
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # reset
+        client.close()
+    assert b"<p>a page</p>" in answered(port, request)
+    assert capfd.readouterr().err == ""
+
+
+def test_another_page_shows_neither_pictures_nor_the_page(browser, port, tmp_path):
+    picture = f"http://127.0.0.1:{port}/pictures/static_0/0.jpg"
+    tried = "window.ended = 0; for (const kind of ['onload', 'onerror'])"
+    other = tmp_path / "other.html"
+    other.write_text(
+        f"<img src='{picture}'><iframe src='http://127.0.0.1:{port}/scene.html'></iframe>"
+        f"<script>{tried} document.images[0][kind] = () => window.ended += 1</script>"
+    )
+    browser.open(f"http://127.0.0.1:{port}/")
+    assert "a page" in browser.run("return document.body.innerText")
+    browser.run(f"window.own = new Image(); own.src = '{picture}'")
+    browser.wait("own.naturalWidth === 8")
+    browser.open(other.as_uri())
+    browser.wait("window.ended === 1")
+    assert browser.run("return document.images[0].naturalWidth") == 0
+    browser.driver.switch_to.frame(0)
+    assert "a page" not in browser.run("return document.body.innerText")
+    browser.driver.switch_to.default_content()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Callable, Collection
+from contextlib import suppress
+from ipaddress import ip_address
 from urllib.parse import urlsplit
 
 
@@ -18,18 +20,24 @@ def refusal(header: Callable[[str, str], str], names: Collection[str]) -> str | 
 
     ``header(name, default)`` gives a header of the request.
 
-    A page from elsewhere that the same browser shows gives its own address in ``Origin``. One whose
-    name was made to lead to this machine (DNS rebinding) gives that name in ``Host``: an IP address
-    or one of the machine's own ``names`` cannot be made so.
+    A page from elsewhere that the same browser shows gives its own address in ``Origin``, or its
+    browser says ``Sec-Fetch-Site: cross-site``. One whose name was made to lead to this machine
+    (DNS rebinding) gives that name in ``Host``: an IP address or one of the machine's own ``names``
+    cannot be made so.
     """
     host = header("Host", "").lower()
-    try:
+    name = host
+    with suppress(ValueError):
         name = urlsplit(f"//{host}").hostname or ""
-    except ValueError:
-        name = host
-    is_address = ":" in name or name.replace(".", "").isdigit()
-    if name not in names and not is_address:
+    if name not in names and not _is_address(name):
         return f"devrf: this machine is not {name!r}; open the page by its IP address\n"
-    if urlsplit(header("Origin", f"//{host}")).netloc.lower() != host:
-        return "devrf: another page's request\n"
+    origin = header("Origin", f"http://{host}").lower().partition("://")[2]
+    if origin != host or header("Sec-Fetch-Site", "") == "cross-site":
+        return "devrf: another page's request; type the address of this one\n"
     return None
+
+
+def _is_address(name: str) -> bool:
+    with suppress(ValueError):
+        return bool(ip_address(name))
+    return False

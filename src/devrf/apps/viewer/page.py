@@ -9,14 +9,18 @@ from __future__ import annotations
 import base64
 import hashlib
 import logging
+import re
+import socket
+import sys
 import threading
+import time
+from contextlib import suppress
 from functools import cache, partial
 from http import HTTPStatus
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from pathlib import Path
-from typing import BinaryIO
-from urllib.parse import urlsplit
+from typing import Any, BinaryIO
 
 from devrf.apps.settings import ViewerSettings
 from devrf.apps.viewer.guard import own_names, refusal
@@ -28,6 +32,12 @@ PAGE = "scene.html"
 PICTURES = "pictures"
 # Bytes of a page in which it says what it shows.
 START = 2000
+# What is served.
+SERVED = re.compile(r"/(scene\.html|pictures/\w{1,80}/\d{1,9}\.jpg)", re.ASCII)
+# Seconds in which a request has to come, and in which a client has to take 64 KB of the answer.
+PATIENCE = 10.0
+# Connections on which a request is waited for.
+WAITING = 64
 
 
 def is_current(run: Path) -> bool:
@@ -58,7 +68,8 @@ def _policy() -> str:
     """What a browser lets a page do: a file from somebody else runs no program but devrf's own."""
     program = hashlib.sha256(f"\n{_source('scene.js')}\n".encode()).digest()
     own = f"script-src 'sha256-{base64.b64encode(program).decode()}'"
-    return f"default-src 'none'; img-src 'self' data:; style-src 'unsafe-inline'; {own}"
+    alone = "frame-ancestors 'none'; form-action 'none'; base-uri 'none'"
+    return f"default-src 'none'; img-src 'self' data:; style-src 'unsafe-inline'; {own}; {alone}"
 
 
 class PageServer:
@@ -73,9 +84,8 @@ class PageServer:
         settings.check_free()
         self.settings = settings
         self._stop = threading.Event()
-        handler = partial(_Handler, directory=str(folder), names=own_names(settings.host))
-        self._server = ThreadingHTTPServer((settings.host, settings.port), handler)
-        self._server.daemon_threads = True
+        handler = partial(_Handler, directory=str(folder.resolve()), names=own_names(settings.host))
+        self._server = _Server((settings.host, settings.port), handler)
         threading.Thread(target=self._server.serve_forever, daemon=True).start()
 
     def serve(self) -> None:
@@ -94,34 +104,73 @@ class PageServer:
         self._server.server_close()
 
 
-class _Handler(SimpleHTTPRequestHandler):
-    """Answers requests for the files of the folder, from this machine's own pages."""
+class _Server(ThreadingHTTPServer):
+    """Ends connections on which no request has come in time, or that are too many, oldest first."""
 
-    def __init__(self, *request: object, names: frozenset[str], directory: str) -> None:
+    daemon_threads = True
+    request_queue_size = WAITING
+
+    def __init__(self, *address_and_handler: Any) -> None:
+        self.waiting: dict[Any, float] = {}
+        super().__init__(*address_and_handler)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        self.waiting[request] = time.monotonic()
+        super().process_request(request, client_address)
+
+    def service_actions(self) -> None:  # twice a second, and after each new connection
+        waiting = [*self.waiting.items()]
+        for number, (request, began) in enumerate(reversed(waiting)):
+            if number >= WAITING or time.monotonic() - began > PATIENCE:
+                with suppress(KeyError, OSError):  # answered just now, or its client has gone away
+                    del self.waiting[request]
+                    request.shutdown(socket.SHUT_RDWR)
+
+    def shutdown_request(self, request: Any) -> None:
+        self.waiting.pop(request, None)
+        super().shutdown_request(request)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Say nothing of a client that has gone away, or is too slow."""
+        if not isinstance(sys.exc_info()[1], OSError):
+            super().handle_error(request, client_address)
+
+
+class _Handler(SimpleHTTPRequestHandler):
+    """Answers requests for the page and its pictures, from this machine's own pages."""
+
+    timeout = PATIENCE
+    server: _Server
+
+    def __init__(self, *request: Any, names: frozenset[str], directory: str) -> None:
         self.names = names
-        super().__init__(*request, directory=directory)  # type: ignore[arg-type]
+        super().__init__(*request, directory=directory)
 
     def send_head(self) -> BinaryIO | None:
+        self.server.waiting.pop(self.request, None)
+        path = self.path.partition("?")[0]
+        file = Path(self.directory + path)
         why = refusal(self.headers.get, self.names)
         if why is not None:
             self.send_error(HTTPStatus.FORBIDDEN, explain=why.strip())
-        elif urlsplit(self.path).path == "/":  # tells the page that pictures are to be had
+        elif path == "/":  # tells the page that pictures are to be had
             self.send_response(HTTPStatus.FOUND)
             self.send_header("Location", f"/{PAGE}?{PICTURES}")
             self.send_header("Content-Length", "0")
             self.end_headers()
-        else:
+        elif SERVED.fullmatch(path) and file.is_file() and file.resolve() == file:  # no link, pipe
             del self.headers["If-Modified-Since"]  # by another run's page at the same address
             return super().send_head()
+        else:
+            self.send_error(HTTPStatus.NOT_FOUND)
         return None
 
     def end_headers(self) -> None:
         self.send_header("Cache-Control", "no-store")
         self.send_header("Content-Security-Policy", _policy())
+        self.send_header("Cross-Origin-Resource-Policy", "same-origin")
+        self.send_header("X-Content-Type-Options", "nosniff")
         super().end_headers()
-
-    def list_directory(self, path: object) -> None:
-        self.send_error(HTTPStatus.NOT_FOUND)
 
     def log_message(self, format: str, *arguments: object) -> None:
         """Say nothing: requests are no news."""
