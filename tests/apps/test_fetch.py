@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+import io
+import os
 import shutil
+import threading
+import time
 import zipfile
+from collections.abc import Iterator
+from contextlib import suppress
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -14,6 +22,7 @@ from devrf.apps.fetch import (
     PublishedScene,
     _unpacked,
     catalogue,
+    fetch_scene,
     published_scene,
 )
 from devrf.cli.config import config_folder
@@ -48,12 +57,32 @@ def test_a_misspelt_name_is_answered_with_the_closest():
         "not TOML",
         "[[collection]]\npage='https://a'\nlicence=''\ndata='inward'\nlearn=''\nurl='https://a'\n"
         "scenes.'../a'=''",
+        "collection=5",
+        "a=" + "[" * 100_000,
+        "#" * (2**20 + 1),
+        *(
+            f"[[collection]]\npage='https://a'\nlicence=\"{licence}\"\ndata='inward'\n"
+            f"learn='{learn}'\nurl='https://a'\nscenes.a=''"
+            for licence, learn in (("\\u001b[2J", ""), ("", "a=1; rm -r x"))
+        ),
     ],
 )
 def test_another_catalogue_has_the_same_form(tmp_path, text):
     (tmp_path / "mine.toml").write_text(text)
     with pytest.raises(DevrfError, match="fetch.catalogue: .* cannot be read"):
         catalogue(tmp_path / "mine.toml")
+
+
+def test_a_pipe_is_no_catalogue(tmp_path):
+    os.mkfifo(tmp_path / "mine.toml")
+    with pytest.raises(DevrfError, match="cannot be read"):
+        catalogue(tmp_path / "mine.toml")
+
+
+def test_words_of_an_address_are_replaced_and_nothing_else_is_read():
+    text = "https://a/{scene}/{file}?{scene.__class__}{0}{file"
+    downloads = published("lego", url=text, files=["b.png"]).downloads
+    assert downloads == {"b.png": "https://a/lego/b.png?{scene.__class__}{0}{file"}
 
 
 FILES = {
@@ -64,16 +93,21 @@ FILES = {
 }
 
 
+def published(name: str, **entries: Any) -> PublishedScene:
+    """A scene of a collection with some entries."""
+    words = {"page": "https://a", "licence": "", "data": "inward", "learn": "", "url": "https://a"}
+    return PublishedScene(name, "", Collection(**{**words, **entries}, scenes={name: ""}))
+
+
 def lego(folder: str | None = "lego") -> PublishedScene:
     """A scene that is published in an archive."""
-    words = {"page": "https://a", "licence": "", "data": "inward", "learn": "", "url": "https://a"}
-    return PublishedScene("lego", "", Collection(**words, folder=folder, scenes={"lego": ""}))
+    return published("lego", folder=folder)
 
 
 def written(work: Path, files: dict[str, bytes]) -> Path:
     """An archive of files where a download leaves it."""
     archive = work / "files" / "archive"
-    archive.parent.mkdir()
+    archive.parent.mkdir(parents=True)
     with zipfile.ZipFile(archive, "w") as packed:
         for name, content in files.items():
             packed.writestr(name, content)
@@ -91,9 +125,23 @@ def test_the_scene_alone_is_unpacked_and_nothing_leaves_its_folder(tmp_path):
     assert [path.parent.name for path in tmp_path.parent.rglob("x.txt")] == ["lego"]
 
 
+def damaged(compression: int) -> bytes:
+    """An archive in which what is packed is altered."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", compression) as packed:
+        packed.writestr("a.json", bytes(range(256)) * 9)
+    packed_at = 30 + len("a.json")
+    return content.getvalue()[:packed_at] + b"\xff" * 40 + content.getvalue()[packed_at + 40 :]
+
+
 @pytest.mark.parametrize(
     ("content", "said"),
-    [(b"<html>not an archive</html>", "cannot be unpacked"), (None, "holds no hotdog with")],
+    [
+        (b"<html>not an archive</html>", "cannot be unpacked"),
+        (damaged(zipfile.ZIP_LZMA), "cannot be unpacked"),
+        (damaged(zipfile.ZIP_BZIP2), "cannot be unpacked"),
+        (None, "holds no hotdog with"),
+    ],
 )
 def test_another_file_than_expected_is_refused(tmp_path, content, said):
     archive = written(tmp_path, FILES)
@@ -115,6 +163,52 @@ def test_an_archive_that_expands_beyond_what_scenes_do_is_removed(tmp_path):
     ):
         _unpacked(lego(), tmp_path / "work")
     assert not list(tmp_path.iterdir())
+
+
+def test_an_archive_of_many_empty_files_is_removed(tmp_path):
+    written(tmp_path / "work", {f"lego/{k}": b"" for k in range(20_000)})
+    with pytest.raises(DevrfError, match=r"MB would unpack to 81\.9 MB"):
+        _unpacked(lego(), tmp_path / "work")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture
+def trickle() -> Iterator[str]:
+    """The address of a server that sends a part at once, then a byte now and then, without end."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:  # noqa: N802
+            assert self.headers["Accept-Encoding"] == "identity"
+            self.send_response(200)
+            self.end_headers()
+            with suppress(OSError):
+                self.wfile.write(bytes(2000))
+                while True:
+                    self.wfile.write(b"x")
+                    time.sleep(0.05)
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        server.daemon_threads = True
+        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
+@pytest.mark.parametrize(
+    ("limit", "said"),
+    [({"PERIOD": 0.4}, "it comes too slowly"), ({"LARGEST": 1000}, "more than 1.0 kB came")],
+)
+def test_a_download_without_end_is_ended(tmp_path, monkeypatch, trickle, limit, said):
+    for name, value in limit.items():
+        monkeypatch.setattr(f"devrf.apps.fetch.{name}", value)
+    scene = published("lego", url=f"{trickle}/lego.zip")
+    began = time.monotonic()
+    with pytest.raises(DevrfError, match=rf"lego\.zip: cannot be fetched \({said}\)"):
+        fetch_scene(scene, tmp_path, None, progress=False)
+    assert time.monotonic() - began < 20 and not (tmp_path / "lego").exists()
 
 
 def test_a_file_in_an_archive_that_holds_more_than_is_said_is_not_unpacked(tmp_path):

@@ -3,25 +3,31 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import logging
 import os
 import shutil
+import time
 import tomllib
 import zipfile
-import zlib
+from collections.abc import Callable
+from concurrent.futures import Future, wait
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from threading import Thread
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 from rich.console import Console
 from rich.filesize import decimal
 from rich.progress import track
 
 from devrf.errors import DevrfError, did_you_mean
 from devrf.system.files import make_folder, read_record, refuse_links, write_json
+from devrf.system.plain_data import Line, built
 
 log = logging.getLogger(__name__)
 
@@ -49,6 +55,12 @@ ARCHIVE = "archive"
 # bytes may expand by more.
 MOST_EXPANSION = 20
 SMALL = 2**26
+# Bytes at most of what is downloaded for a scene, and of what it unpacks to; of a catalogue.
+LARGEST = 2**34
+LARGEST_CATALOGUE = 2**20
+# Seconds that a scene may take, and bytes that have to come in each PERIOD of seconds.
+LONGEST = 6 * 3600
+PERIOD, LEAST = 60, 2**18
 # The file by which a scene's folder is known, by the layout that reads it.
 MARKERS = {
     "inward": "transforms_train.json",
@@ -57,7 +69,7 @@ MARKERS = {
     "nerfies": "dataset.json",
 }
 
-Address = Annotated[str, Field(pattern=r"^https?://")]
+Address = Annotated[str, Field(pattern=r"^https?://[!-~]+$")]
 # Names become paths: they begin with a letter or digit, and lead nowhere else.
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][\w-]*$")]
 FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][\w-]*(\.\w+)?(/[A-Za-z0-9][\w.-]*)*$")]
@@ -82,14 +94,18 @@ class Collection(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     page: Address
-    licence: str
+    licence: Line
     data: Literal["inward", "nerfstudio", "forward", "nerfies"]
-    learn: str
+    learn: Annotated[str, Field(pattern=r"^[\w.=,/\[\] -]*$")]
     url: Address
     files: list[FileName] = []
     folder: str | None = None
-    scenes: dict[Name, str]
+    scenes: dict[Name, Line]
     sha256: dict[str, Digest] = {}
+
+    def filled(self, text: str, scene: str, file: str = "{file}") -> str:
+        """A text of this with the names of a scene and a file in their places."""
+        return text.replace("{scene}", scene).replace("{file}", file)
 
 
 @dataclass(frozen=True)
@@ -109,8 +125,9 @@ class PublishedScene:
     @property
     def downloads(self) -> dict[str, str]:
         """The address of each file to fetch, by its name."""
-        files = self.collection.files or [ARCHIVE]
-        return {file: self.collection.url.format(scene=self.name, file=file) for file in files}
+        source = self.collection
+        files = source.files or [ARCHIVE]
+        return {file: source.filled(source.url, self.name, file) for file in files}
 
     @property
     def is_archive(self) -> bool:
@@ -122,14 +139,15 @@ def catalogue(file: str | Path | None = None) -> list[PublishedScene]:
     """The scenes of a catalogue (None: devrf's own); DevrfError if it cannot be read."""
     path = OWN if file is None else Path(file).expanduser()
     try:
-        listed = tomllib.loads(path.read_text())
-        collections = [Collection.model_validate(table) for table in listed.get("collection", [])]
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, ValidationError) as error:
+        if not path.is_file() or path.stat().st_size > LARGEST_CATALOGUE:
+            raise ValueError("no file, or a larger one than a catalogue's")
+        listed = built(dict[str, list[Collection]], tomllib.loads(path.read_text()))
+    except (OSError, ValueError, RecursionError) as error:
         why = " ".join(str(error).split())
         raise DevrfError(f"fetch.catalogue: {path} cannot be read ({why[:200]})") from None
     return [
         PublishedScene(name, about, collection)
-        for collection in collections
+        for collection in listed.get("collection", [])
         for name, about in collection.scenes.items()
     ]
 
@@ -227,7 +245,7 @@ def fetch_scene(scene: PublishedScene, into: Path, sha256: str | None, progress:
         {
             "scene": scene.name,
             "page": scene.collection.page,
-            "url": scene.collection.url.format(scene=scene.name, file="{file}"),
+            "url": scene.collection.filled(scene.collection.url, scene.name),
             "licence": scene.collection.licence,
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
             "files": len(files),
@@ -254,24 +272,67 @@ def _download(scene: PublishedScene, folder: Path, progress: bool) -> dict[str, 
         retry_if_failed=1,
     )
     # Some servers refuse the name that Python gives itself.
-    get = pooch.HTTPDownloader(
-        progressbar=progress and scene.is_archive, headers={"User-Agent": "devrf"}
-    )
+    headers = {"User-Agent": "devrf", "Accept-Encoding": "identity"}
+    get = pooch.HTTPDownloader(progressbar=progress and scene.is_archive, headers=headers)
+
+    def get_bounded(url: str, path: str, files: object) -> None:
+        with _Bounded(io.FileIO(path, "wb")) as file:
+            file.came = came
+            get(url, file, files)
+
+    came = [0]
+    until = time.monotonic() + LONGEST
     fetched = {}
     console = Console(stderr=True)
     hidden = scene.is_archive or not progress
     for name in track(scene.downloads, scene.name, console=console, disable=hidden):
         try:
-            fetched[name] = Path(files.fetch(name, downloader=get))
-        except OSError as error:
-            if error.errno is not None:  # the disk's
+            fetch = partial(files.fetch, name, downloader=get_bounded)
+            fetched[name] = Path(_in_time(fetch, came, until))
+        except (OSError, ValueError) as error:
+            if getattr(error, "errno", None) is not None:  # the disk's
                 raise
             url = scene.downloads[name]
             raise DevrfError(
                 f"{url}: cannot be fetched ({error}); see that the network works, and that its "
                 f"page {scene.collection.page} names no other address"
             ) from None
+    for path in folder.absolute().rglob("*"):  # of a download that was killed
+        if path.is_file() and path not in fetched.values():
+            path.unlink()
     return fetched
+
+
+class _Bounded(io.BufferedWriter):
+    """A file of a scene of which so many bytes ``came``, a list of one number, in all files."""
+
+    came: list[int]
+
+    def write(self, part: Any) -> int:
+        self.came[0] += len(part)
+        if self.came[0] > LARGEST:
+            raise ValueError(f"more than {decimal(LARGEST)} came")
+        return super().write(part)
+
+
+def _in_time(fetch: Callable[[], str], came: list[int], until: float) -> str:
+    """What ``fetch`` returns; it is left alone where fewer bytes ``came`` than have to."""
+    result: Future[str] = Future()
+
+    def run() -> None:
+        try:
+            result.set_result(fetch())
+        except Exception as error:
+            result.set_exception(error)
+
+    # Nothing else ends a wait for bytes that come one by one.
+    Thread(target=run, daemon=True).start()
+    before = came[0]
+    while not wait([result], PERIOD).done:
+        if came[0] < before + LEAST or time.monotonic() > until:
+            raise TimeoutError("it comes too slowly")
+        before = came[0]
+    return result.result()
 
 
 def _digest(files: dict[str, Path]) -> str:
@@ -286,7 +347,7 @@ def _digest(files: dict[str, Path]) -> str:
 
 
 def _check_size(packed: zipfile.ZipFile, archive: Path, work: Path) -> None:
-    """Check that an archive holds no more than images and camera files of its size may hold.
+    """Check that an archive holds no more than a scene, and than images and cameras of its size.
 
     Python unpacks no more of a file than the archive says that it holds.
 
@@ -294,12 +355,14 @@ def _check_size(packed: zipfile.ZipFile, archive: Path, work: Path) -> None:
         DevrfError: it would expand far beyond that; ``work`` is removed, and the archive with it.
     """
     size = archive.stat().st_size
-    unpacked_size = sum(file.file_size for file in packed.infolist())
-    if unpacked_size > max(MOST_EXPANSION * size, SMALL):
+    # A file takes 4 kB of a disk at least.
+    unpacked_size = sum(max(file.file_size, 2**12) for file in packed.infolist())
+    if unpacked_size > min(max(MOST_EXPANSION * size, SMALL), LARGEST):
         shutil.rmtree(work, ignore_errors=True)
         raise DevrfError(
             f"{archive}: {decimal(size)} would unpack to {decimal(unpacked_size)}, more than "
-            f"{MOST_EXPANSION} times as much; it was removed: ask who published it"
+            f"{MOST_EXPANSION} times as much, or {decimal(LARGEST)}; it was removed: ask who "
+            "published it"
         )
 
 
@@ -312,12 +375,15 @@ def _unpacked(scene: PublishedScene, work: Path) -> Path:
         with zipfile.ZipFile(archive) as packed:
             _check_size(packed, archive, work)
             packed.extractall(place)  # names that lead elsewhere are written below it, too
-    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
+    except Exception as error:  # of any kind, where an archive is damaged
+        if getattr(error, "errno", None) is not None or isinstance(error, DevrfError):
+            raise  # the disk's, or that of the size
         raise DevrfError(
             f"{archive}: cannot be unpacked ({error}); remove it, and the same command fetches it "
             "again"
         ) from None
-    folder = scene.collection.folder and scene.collection.folder.format(scene=scene.name)
+    source = scene.collection
+    folder = source.folder and source.filled(source.folder, scene.name)
     marker = MARKERS[scene.collection.data]
     folders = [
         path.parent
