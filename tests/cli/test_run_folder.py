@@ -51,6 +51,16 @@ def test_the_second_process_is_refused_until_the_first_is_killed(
     assert os.listdir(tmp_path / "run" / ".devrf") == ["lock"]
 
 
+def test_files_that_a_killed_process_had_begun_are_removed(devrf, tiny, tmp_path):
+    begun = [".partial-metrics.json", "checkpoints/.partial-canonical.ckpt", "logs/a/.partial-x"]
+    for name in (*begun, "export/.partial-scene.glb", "notes/.partial-mine"):
+        (tmp_path / "run" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "run" / name).write_text("half")
+    assert devrf("stage=inspect", *tiny, "hydra.run.dir=run").status == 0
+    left = [str(path.relative_to(tmp_path)) for path in tmp_path.rglob(".partial-*")]
+    assert left == ["run/notes/.partial-mine"]
+
+
 def test_a_sweep_and_its_jobs_have_their_folders_to_themselves(devrf, hanging, tiny, tmp_path):
     sweep = ("stage=canonical", "hydra.sweep.dir=sweep", "seed=0,1")
     first = hanging("-m", "hydra.sweep.dir=sweep", "seed=0,1")

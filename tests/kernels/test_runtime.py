@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -61,6 +62,34 @@ def test_memory_too_short_for_warp_is_one_line():
     done = subprocess.run([sys.executable, "-c", SHORT], capture_output=True, text=True)
     assert done.stdout.startswith("kernels: Warp cannot be loaded (") and done.stderr == ""
     assert done.stdout.endswith("; free memory, or give kernels=torch\n")
+
+
+# Where kernels are kept, and whether others may write there.
+CACHE = """
+import tempfile, torch, warp
+from pathlib import Path
+from devrf.kernels.runtime import others_may_write, take
+assert take(torch.empty(0))
+folder = Path(warp.config.kernel_cache_dir)
+assert folder.is_dir()
+print(folder.parent == Path(tempfile.gettempdir()), others_may_write(folder))
+"""
+
+
+@pytest.mark.parametrize(("mode", "private"), [(0o700, False), (0o755, False), (0o777, True)])
+def test_kernels_are_not_kept_where_others_may_write(tmp_path, mode, private):
+    own = tmp_path / "own"
+    (own / "devrf-kernels-of-a-killed-run").mkdir(parents=True)
+    (tmp_path / "cache").mkdir()
+    (tmp_path / "cache").chmod(mode)
+    tmp_path.chmod(0o755)
+    places = {"WARP_CACHE_PATH": str(tmp_path / "cache"), "TMPDIR": str(own)}
+    done = subprocess.run(
+        [sys.executable, "-c", CACHE], capture_output=True, text=True, env={**os.environ, **places}
+    )
+    assert done.stdout == f"{private} False\n"
+    assert ("others may write there" in done.stderr) is private
+    assert list(own.iterdir()) == ([] if private else [own / "devrf-kernels-of-a-killed-run"])
 
 
 def scene(rng: torch.Generator, count: int = 500) -> tuple[Rays, Medium]:

@@ -6,7 +6,6 @@ import math
 import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import imageio.v3 as iio
@@ -21,6 +20,7 @@ from devrf.geometry.cameras import Cameras
 from devrf.rendering.view import Viewable
 from devrf.scenes.bounds import nearest_point
 from devrf.scenes.scene import Scene, Views
+from devrf.system.folder_lock import private_folder
 from devrf.system.progress import followed
 
 # The most frusta of a capture.
@@ -94,8 +94,8 @@ def write_thumbnails(folder: Path, scene: Scene, viewpoints: Viewpoints) -> None
     """
     cameras = list(_shown(viewpoints))
     folder.parent.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(prefix=".pictures-", dir=folder.parent) as partial:
-        whole = Path(partial) / folder.name
+    with private_folder(folder.parent, ".pictures-") as partial:
+        whole = partial / folder.name
         for kind, k, times in followed(cameras, len(cameras), "pictures of the cameras"):
             own = whole / f"{kind}_{k}"
             own.mkdir(parents=True)

@@ -31,6 +31,8 @@ log = logging.getLogger(__name__)
 
 # Made in the folder before the config is checked.
 AT_FIRST = {".hydra", PLACE}
+# Where a killed process may have left files that it had begun.
+BEGUN = (".", "checkpoints", "images", "videos", "logs/*", "export", "export/*", "paths")
 # Why a sweep's job failed.
 FAILURE = "failure.json"
 # Stages that leave .hydra alone: they look at other runs, or are none.
@@ -100,6 +102,8 @@ def working_in(folder: Path, config: DictConfig) -> Iterator[None]:
     leads = not _is_worker(config)
     if leads and config.stage not in UNRECORDED:
         lock_folder(folder, "hydra.sweep.dir" if in_sweep() else "hydra.run.dir")
+        for path in (path for place in BEGUN for path in folder.glob(f"{place}/.partial-*")):
+            path.unlink(missing_ok=True)
     was_new = leads and not in_sweep() and holds_at_most(folder, AT_FIRST)
     try:
         yield

@@ -1,20 +1,24 @@
 """Where the kernels run, and how they are launched.
 
 NVIDIA Warp compiles a kernel's Python source when it is first launched, and keeps the result on
-disk, in ``WARP_CACHE_PATH`` or the user's cache folder. A kernel has a thread for each ray, sample
-or voxel. On a CPU Warp runs these one after another; so each of torch's threads takes a part,
-but of what is added to grids.
+disk, in ``WARP_CACHE_PATH`` or the user's cache folder, if nobody else may write there. A kernel
+has a thread for each ray, sample or voxel. On a CPU Warp runs these one after another; so each of
+torch's threads takes a part, but of what is added to grids.
 """
 
 from __future__ import annotations
 
+import atexit
+import logging
 import os
+import stat
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import cache, wraps
 from itertools import pairwise
+from pathlib import Path
 from threading import RLock, local
 from typing import Any, Literal
 
@@ -23,6 +27,9 @@ import warp as wp
 from torch import Tensor
 
 from devrf.errors import DevrfError
+from devrf.system.folder_lock import private_folder
+
+log = logging.getLogger(__name__)
 
 # What computes the hot operations: Warp's kernels or their definitions in PyTorch; auto: Warp's
 # kernels where they run.
@@ -217,14 +224,37 @@ def _begin() -> None:
         try:
             wp.init()
         except OSError:
-            wp.config.kernel_cache_dir = tempfile.mkdtemp(prefix="devrf-kernels-")
+            wp.config.kernel_cache_dir = _own_folder()
             wp.init()
         except RuntimeError as error:
             why = error.__cause__ or error
             instead = "free memory, or give kernels=torch"
             raise DevrfError(f"kernels: Warp cannot be loaded ({why}); {instead}") from error
-    if not os.access(wp.config.kernel_cache_dir, os.W_OK):
-        wp.config.kernel_cache_dir = tempfile.mkdtemp(prefix="devrf-kernels-")
+    folder = Path(wp.config.kernel_cache_dir)
+    if not os.access(folder, os.W_OK):
+        wp.config.kernel_cache_dir = _own_folder()
+    elif others_may_write(folder):
+        log.warning("%s: others may write there; kernels are compiled for this run alone", folder)
+        wp.config.kernel_cache_dir = _own_folder()
+
+
+def others_may_write(folder: Path) -> bool:
+    """Whether other users may write to a folder, or put another in its place."""
+    for path in (folder, *folder.parents):
+        info = path.stat()
+        # Many systems give each user a group of the same number.
+        others = stat.S_IWOTH | (0 if info.st_gid == info.st_uid else stat.S_IWGRP)
+        if info.st_mode & others and (path == folder or not info.st_mode & stat.S_ISVTX):
+            return True
+    return folder.stat().st_uid != os.getuid()
+
+
+def _own_folder() -> str:
+    """A folder that ends with this process."""
+    until_the_end = ExitStack()
+    atexit.register(until_the_end.close)
+    place = Path(tempfile.gettempdir())
+    return str(until_the_end.enter_context(private_folder(place, "devrf-kernels-")))
 
 
 @contextmanager

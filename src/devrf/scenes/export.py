@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -26,6 +24,7 @@ from devrf.scenes.formats.llff_poses import BOUND_FACTOR
 from devrf.scenes.scene import Capture, Scene, Views
 from devrf.scenes.validation import scene_error
 from devrf.system.files import write_json
+from devrf.system.folder_lock import private_folder
 
 _WRITE_HINT = "give data.export another folder"
 
@@ -39,16 +38,15 @@ def whole_folder(folder: Path) -> Iterator[Path]:
     folder = folder.expanduser().absolute()
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
         raise scene_error(folder, f"is there already and not an empty folder; {_WRITE_HINT}")
-    partial = folder.with_name(f".{folder.name}.partial-{os.getpid()}")
     try:
-        partial.mkdir(parents=True)
-        yield partial
-        partial.rename(folder)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with private_folder(folder.parent, f".{folder.name}.partial-") as around:
+            partial = around / folder.name
+            partial.mkdir()
+            yield partial
+            partial.rename(folder)
     except OSError as error:
         raise scene_error(folder, f"cannot be written ({error}); {_WRITE_HINT}") from error
-    finally:
-        # After the renaming there is nothing left to remove.
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def time_major(views: Views) -> Views:

@@ -1,4 +1,4 @@
-"""A folder in which one process works at a time.
+"""Folders in which one process works at a time, and those that it has for itself.
 
 The lock is the system's on an open file, so it ends with its process. A file beside it tells other
 processes which one that is.
@@ -6,10 +6,15 @@ processes which one that is.
 
 from __future__ import annotations
 
+import glob
 import logging
 import os
+import shutil
 import socket
-from contextlib import suppress
+import stat
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 
@@ -69,4 +74,28 @@ def release_folder(folder: Path) -> None:
     lock = _held.pop(folder.resolve(), None)
     if lock is not None:
         (folder / PLACE / OWNER).unlink(missing_ok=True)
+        lock.release()
+
+
+@contextmanager
+def private_folder(place: Path, prefix: str) -> Iterator[Path]:
+    """A new folder in ``place`` for this process alone, which is removed at the end.
+
+    What killed processes of this user have left by that ``prefix`` is removed first.
+    """
+    for left in place.glob(f"{glob.escape(prefix)}*"):
+        with suppress(OSError, NotImplementedError):  # in use, or no locks there
+            info = left.lstat()
+            if stat.S_ISDIR(info.st_mode) and info.st_uid == os.getuid():
+                with FileLock(left / LOCK, timeout=0):
+                    shutil.rmtree(left)
+    made = Path(tempfile.mkdtemp(prefix=".devrf-", dir=place))
+    lock = FileLock(made / LOCK, timeout=0)
+    with suppress(OSError, NotImplementedError):
+        lock.acquire()
+    folder = made.rename(place / f"{prefix}{made.name[7:]}")  # others see it when it is locked
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
         lock.release()
