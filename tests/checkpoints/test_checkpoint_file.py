@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import random
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from devrf.checkpoints.checkpoint_file import (
     read_description,
     write_checkpoint_file,
 )
-from devrf.checkpoints.file_metadata import digest_of
+from devrf.checkpoints.file_metadata import digest_of, latest_checkpoint
 from devrf.errors import DevrfError
 from devrf.system.memory import own_memory
 
@@ -150,3 +151,29 @@ def test_a_failed_write_leaves_the_file_of_before(path, monkeypatch):
     assert (caught.value.errno, caught.value.filename) == (28, str(path))
     assert path.read_bytes() == before
     assert [p.name for p in path.parent.iterdir()] == ["some.ckpt"]
+
+
+def test_the_latest_checkpoint_is_told_by_what_files_hold(tmp_path):
+    folder = tmp_path / "checkpoints"
+
+    def write(name: str, stages: int, iteration: int | None = None) -> None:
+        records = {str(k): {} for k in range(stages)}
+        progress = None if iteration is None else {"iteration": iteration}
+        metadata = {"records": records, "training_config": {}}
+        write_checkpoint_file(folder / name, {"devrf": metadata, "progress": progress})
+        os.utime(folder / name, (1e9 - stages, 1e9 - (iteration or 0)))  # the latest is the oldest
+
+    assert latest_checkpoint(tmp_path) is None
+    files = [
+        ("a-progress-99.ckpt", 1, 99),
+        ("a-progress-100.ckpt", 1, 100),
+        ("a.ckpt", 1, None),
+        ("b-progress-5.ckpt", 2, 5),
+        ("b.ckpt", 2, None),
+    ]
+    for name, stages, iteration in files:
+        write(name, stages, iteration)
+        assert latest_checkpoint(tmp_path) == folder / name
+    for content in ({"devrf": []}, {}, {"devrf": {"records": 7}, "progress": {"iteration": "x"}}):
+        write_checkpoint_file(folder / "c.ckpt", content)
+        assert latest_checkpoint(tmp_path) == folder / "b.ckpt"

@@ -17,6 +17,8 @@ import trimesh
 
 from devrf.apps.keyframes import CameraPath, Keyframe, write_path
 from devrf.checkpoints.checkpoint import load_checkpoint
+from devrf.checkpoints.checkpoint_file import read_checkpoint_file, write_checkpoint_file
+from devrf.checkpoints.file_metadata import latest_checkpoint
 from devrf.cli.restore_config import parsed
 from devrf.cli.view import serves_page
 
@@ -219,9 +221,13 @@ def test_a_page_is_that_of_the_last_checkpoint(trained, tmp_path):
     assert serves_page(typed, run)
     assert not serves_page([*typed, *parsed(["viewer.renderer=server"])], run)
     assert not serves_page([*typed, *parsed(["data=flower"])], run)
-    os.utime(run / "checkpoints" / "canonical.ckpt")  # learned since
-    assert not serves_page(typed, run)
-    os.utime(run / "checkpoints" / "deformation.ckpt")
+    rest = run / "checkpoints" / "canonical.ckpt"
+    os.utime(rest)  # as a copy of the folder may do
+    assert serves_page(typed, run) and latest_checkpoint(run).name == "deformation.ckpt"
+    content = read_checkpoint_file(rest)
+    write_checkpoint_file(rest, {**content, "again": 1})  # learned since
+    assert not serves_page(typed, run) and latest_checkpoint(run) == rest
+    write_checkpoint_file(rest, content)
     assert serves_page(typed, run)
     progress = run / "checkpoints" / "deformation-progress-3.ckpt"
     (run / "checkpoints" / "deformation.ckpt").rename(progress)  # it does not say how far it is

@@ -17,7 +17,8 @@ import lightning
 import torch
 
 import devrf
-from devrf.checkpoints.checkpoint import GIVEN_REST, OWN_REST, CheckpointMetadata
+from devrf.checkpoints.checkpoint import GIVEN_REST, CheckpointMetadata
+from devrf.checkpoints.file_metadata import OWN_REST
 from devrf.evaluation.held_out import HeldOutView
 from devrf.evaluation.objective import TRAINING, VALIDATION
 from devrf.geometry.clock import FrameClock

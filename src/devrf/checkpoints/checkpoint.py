@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from devrf.checkpoints.checkpoint_file import (
     read_description,
     write_checkpoint_file,
 )
+from devrf.checkpoints.file_metadata import latest_checkpoint
 from devrf.checkpoints.progress import Progress
 from devrf.checkpoints.stored_class import StoredClass, stored_class
 from devrf.errors import DevrfError
@@ -32,9 +32,7 @@ from devrf.system.plain_data import Line, built
 
 # The stage's attribute that holds the model: what its entries of a state begin with.
 MODEL = "scene_model."
-# Keys of a training config for the digest of the canonical checkpoint that is built on: the run's
-# own, or a given one.
-OWN_REST = "checkpoints/canonical.ckpt"
+# As OWN_REST, of a checkpoint that was given.
 GIVEN_REST = "ckpt"
 # A whole number in a model's config (layers, units, samples of a ray) is at most this.
 LARGEST = 2**14
@@ -298,15 +296,6 @@ def metadata_of(path: Path) -> CheckpointMetadata:
         DevrfError: the file is not devrf's, or has no metadata.
     """
     return metadata_in(path, read_description(path))
-
-
-def latest_checkpoint(run: Path) -> Path | None:
-    """The checkpoint or progress file of the latest stage in a run's folder; None without one."""
-    latest: list[tuple[int, int, Path]] = []
-    for path in (run / "checkpoints").glob("*.ckpt"):
-        with suppress(DevrfError, OSError):
-            latest.append((len(metadata_of(path).records), path.stat().st_mtime_ns, path))
-    return max(latest)[2] if latest else None
 
 
 def learned_with(run: Path, chosen: str | Path | None = None) -> dict[str, Any]:

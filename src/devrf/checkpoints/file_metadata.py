@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import json
+import math
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from safetensors import SafetensorError, safe_open
 
 from devrf.errors import DevrfError
 
 FORMAT = "5"
+# Key of a training config for the digest of the run's canonical checkpoint that is built on.
+OWN_REST = "checkpoints/canonical.ckpt"
 # Bytes of a header at most: usual are 20,000. In memory each may become 50.
 HEADER = 2**23
 
@@ -44,3 +49,28 @@ def file_metadata(path: Path) -> dict[str, str]:
             "the version that wrote it, or train again"
         )
     return metadata
+
+
+def latest_checkpoint(run: Path) -> Path | None:
+    """The checkpoint of the latest stage in a run's folder, else its furthest progress file.
+
+    By what the files hold: a copy of the folder has other times. What is built on another canonical
+    field than the run's is passed over. None without one.
+    """
+    latest: list[tuple[int, float, Path]] = []
+    for path in (run / "checkpoints").glob("*.ckpt"):
+        with suppress(DevrfError, OSError, LookupError, TypeError, ValueError, RecursionError):
+            content = _entries(json.loads(file_metadata(path)["nested"]))
+            metadata = _entries(content["devrf"])
+            rest = _entries(metadata["training_config"]).get(OWN_REST)
+            if rest and (run / OWN_REST).is_file() and rest != digest_of(run / OWN_REST):
+                continue
+            progress = content.get("progress")
+            at = float(_entries(progress)["iteration"]) if progress else math.inf
+            latest.append((len(_entries(metadata["records"])), at, path))
+    return max(latest)[2] if latest else None
+
+
+def _entries(node: Any) -> dict[str, Any]:
+    """The entries of a dict as devrf.checkpoints.checkpoint_file writes it into JSON."""
+    return dict(node["dict"])

@@ -19,14 +19,13 @@ from devrf.apps.fitting import SIZE
 from devrf.apps.rehearsal import LONGEST, RehearsedStage, for_rehearsal
 from devrf.apps.trackers import Tracker, trackers
 from devrf.checkpoints.checkpoint import (
-    OWN_REST,
     LoadedCheckpoint,
     Viewpoints,
     learned_with,
     load_checkpoint,
     metadata_of,
 )
-from devrf.checkpoints.file_metadata import digest_of
+from devrf.checkpoints.file_metadata import OWN_REST, digest_of
 from devrf.checkpoints.progress import progress_files
 from devrf.cli.config import PIPELINE, scene_name
 from devrf.cli.restore_config import present_command

@@ -22,6 +22,7 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
+from devrf.checkpoints.file_metadata import latest_checkpoint
 from devrf.cli.config import (
     OF_A_CHECKPOINT,
     PATHS,
@@ -178,7 +179,7 @@ def of_named_run(typed: Sequence[Override], multirun: bool) -> list[str]:
     if not checkpoints and (folder is None or multirun):
         return []
     with importing():  # it loads torch
-        from devrf.checkpoints.checkpoint import latest_checkpoint, metadata_of
+        from devrf.checkpoints.checkpoint import metadata_of
 
     if not checkpoints and (last := latest_checkpoint(Path(str(folder)))):
         checkpoints = [last]
@@ -262,7 +263,7 @@ def _folder_for(checkpoint: Path) -> Path:
     Into the folder of its run if it is the last of it, else into a folder below that has the
     checkpoint's name; of a file that stands alone, into ``outputs/<scene>/<name>``.
     """
-    from devrf.checkpoints.checkpoint import latest_checkpoint, metadata_of
+    from devrf.checkpoints.checkpoint import metadata_of
 
     run = Path("outputs") / scene_folder_name(metadata_of(checkpoint).scene)
     if checkpoint.parent.name == "checkpoints":

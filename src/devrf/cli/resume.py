@@ -29,12 +29,11 @@ from pydantic import TypeAdapter
 import devrf
 from devrf.checkpoints.checkpoint import (
     GIVEN_REST,
-    OWN_REST,
     CheckpointMetadata,
     metadata_in,
 )
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file, read_description
-from devrf.checkpoints.file_metadata import digest_of
+from devrf.checkpoints.file_metadata import OWN_REST, digest_of
 from devrf.checkpoints.progress import progress_files
 from devrf.cli.config import command_line, leaves
 from devrf.cli.config_check import REFERENCE

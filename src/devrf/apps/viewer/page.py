@@ -24,7 +24,7 @@ from typing import Any, BinaryIO
 
 from devrf.apps.settings import ViewerSettings
 from devrf.apps.viewer.guard import own_names, refusal
-from devrf.checkpoints.file_metadata import digest_of
+from devrf.checkpoints.file_metadata import digest_of, latest_checkpoint
 
 log = logging.getLogger(__name__)
 
@@ -47,13 +47,12 @@ def is_current(run: Path) -> bool:
     """
     folder = run / "export"
     try:
-        found = [(path.stat().st_mtime_ns, path) for path in run.glob("checkpoints/*.ckpt")]
-        newest = max(found)[1]
+        newest = latest_checkpoint(run)
         page = (folder / PAGE).read_bytes()
-        digest = digest_of(newest)
-    except (OSError, ValueError):  # none is there, or another process has just removed it
+        digest = "" if newest is None or "-progress-" in newest.name else digest_of(newest)
+    except OSError:  # none is there, or another process has just removed it
         return False
-    whole = digest != "" and (folder / PICTURES).is_dir() and "-progress-" not in newest.name
+    whole = digest != "" and (folder / PICTURES).is_dir()
     programs = _source("scene.js").encode(), _source("scene.glsl").encode()
     return whole and digest.encode() in page[:START] and all(text in page for text in programs)
 
