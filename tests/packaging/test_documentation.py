@@ -140,6 +140,22 @@ def test_workflows_fit_githubs_schema(tmp_path):
     assert done.returncode == 1 and "'runs-on' is a required property" in done.stdout
 
 
+def test_workflows_run_actions_by_their_commits_and_few_may_write():
+    for file in SCRIPTS:
+        if file.suffix != ".yml":
+            continue
+        assert re.findall(r"uses: (.*)", file.read_text()) == re.findall(
+            r"uses: ([\w/-]+@[0-9a-f]{40} # v[\d.]+)\n", file.read_text()
+        )
+        workflow = yaml.safe_load(file.read_text())
+        assert workflow["permissions"] == {"contents": "read"}
+        for job in workflow["jobs"].values():
+            for step in job["steps"]:
+                if step.get("uses", "").startswith("actions/checkout@"):
+                    assert step["with"]["persist-credentials"] is False
+                    assert "permissions" not in job  # what is checked out is run
+
+
 def test_options_that_comments_name_exist():
     groups = {**group_choices(), "stage": known_stages()}
     words = [word for text in in_comments() for word in text.split()]
