@@ -53,14 +53,11 @@ def make_folder(folder: Path) -> None:
 
 
 def refuse_links(folder: Path, *, itself: bool = False) -> None:
-    """Refuse a folder in which what is written would go elsewhere.
+    """Refuse, by a DevrfError, a folder in which what is written would go elsewhere.
 
     No link or pipe may be at its top; in the folders there, links may lead to what is below it, as
     wandb's do. In ``checkpoints``, and further down, what is written replaces a name. The folder
     may be a link, unless ``itself``, or lie below one; it need not be there yet.
-
-    Raises:
-        DevrfError: naming the first link or pipe.
     """
     whole = os.path.realpath(folder)
     top = [*os.scandir(folder)] if folder.is_dir() else []

@@ -5,7 +5,6 @@ from __future__ import annotations
 import socket
 from collections.abc import Callable, Collection
 from contextlib import suppress
-from ipaddress import ip_address
 from urllib.parse import urlsplit
 
 
@@ -29,15 +28,10 @@ def refusal(header: Callable[[str, str], str], names: Collection[str]) -> str | 
     name = host
     with suppress(ValueError):
         name = urlsplit(f"//{host}").hostname or ""
-    if name not in names and not _is_address(name):
+    is_address = ":" in name or name.replace(".", "").isdecimal()
+    if name not in names and not is_address:
         return f"devrf: this machine is not {name!r}; open the page by its IP address\n"
     origin = header("Origin", f"http://{host}").lower().partition("://")[2]
     if origin != host or header("Sec-Fetch-Site", "") == "cross-site":
         return "devrf: another page's request; type the address of this one\n"
     return None
-
-
-def _is_address(name: str) -> bool:
-    with suppress(ValueError):
-        return bool(ip_address(name))
-    return False

@@ -118,16 +118,11 @@ class _Server(ThreadingHTTPServer):
         super().process_request(request, client_address)
 
     def service_actions(self) -> None:  # twice a second, and after each new connection
-        waiting = [*self.waiting.items()]
-        for number, (request, began) in enumerate(reversed(waiting)):
-            if number >= WAITING or time.monotonic() - began > PATIENCE:
+        for request, began in [*self.waiting.items()]:
+            if len(self.waiting) > WAITING or time.monotonic() - began > PATIENCE:
                 with suppress(KeyError, OSError):  # answered just now, or its client has gone away
                     del self.waiting[request]
                     request.shutdown(socket.SHUT_RDWR)
-
-    def shutdown_request(self, request: Any) -> None:
-        self.waiting.pop(request, None)
-        super().shutdown_request(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Say nothing of a client that has gone away, or is too slow."""
