@@ -5,10 +5,10 @@ Readers have positions in double precision. Where cameras are far away for how f
 a scene is computed with in the capture's world − offset:
 
 - The offset is found once, from the first camera file that is read, and holds for all files of a
-  scene (``offset`` of :class:`devrf.scenes.transforms.Transforms`). It is subtracted there, before
-  poses are compared with one another or become float32.
+  scene (:class:`devrf.scenes.transforms.TransformsFiles`). It is subtracted there, before poses are
+  compared with one another or become float32.
 - What options or files say in the capture's world, a box, has it subtracted where it is used
-  (:meth:`devrf.scenes.reader.InwardReader.scene`). Distances need nothing.
+  (:meth:`devrf.scenes.reader.InwardReader.placed`). Distances need nothing.
 - The scene keeps it, and checkpoints do, beside the cameras.
 - It is added to all positions that leave the program, and subtracted from those that come in:
   written scenes, exported geometry, camera paths, links to a page.

@@ -29,17 +29,12 @@ class ImageFolder:
     """The folder to read images from, and what is left to do.
 
     Attributes:
-        path: the folder; the flow of its images lies in a folder of its name with ``_flow``.
+        path: the folder.
         downscale: integer factor ≥ 1 by which its images are yet to be made smaller.
     """
 
     path: Path
     downscale: int
-
-    @property
-    def flow(self) -> Path:
-        """Where backward flow of these images would lie, in pixels of these images."""
-        return self.path.with_name(f"{self.path.name}_flow")
 
 
 def image_folder(

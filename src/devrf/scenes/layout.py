@@ -12,11 +12,11 @@ from torch import Tensor
 
 from devrf.geometry.offset import Offset
 from devrf.scenes.images import Size, image_size
-from devrf.scenes.masks import Masks
 from devrf.scenes.scene import Capture, Views
 from devrf.scenes.splits import (
     Split,
     at_one_moment,
+    at_rest,
     at_times,
     distinct_times,
     evenly_spread,
@@ -26,10 +26,13 @@ from devrf.scenes.splits import (
     one_moment,
     standing,
 )
-from devrf.scenes.transforms import Transforms
+from devrf.scenes.transforms import SceneBounds, Transforms
 from devrf.scenes.validation import scene_error
 
 log = logging.getLogger(__name__)
+
+# The images of a capture to learn from, and those held out.
+Pair = tuple[Transforms, Transforms]
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,8 @@ class Layout:
         dynamic_train: images of the scene in motion; ``static_train`` itself if it is at rest.
         dynamic_test: held-out images of the scene in motion.
         validation: images as those of ``dynamic_test``, by which settings are chosen, or None.
+        thinned: whether times were left out, so that frames have lost their neighbours.
+        alpha_weighted: as for :func:`devrf.scenes.images.load_images`.
     """
 
     static_train: Split
@@ -49,11 +54,18 @@ class Layout:
     dynamic_train: Split
     dynamic_test: Split
     validation: Split | None = None
+    thinned: bool = False
+    alpha_weighted: bool = True
 
     @property
     def offset(self) -> Offset:
         """What is subtracted from positions: one offset for all files of the scene."""
         return self.static_train.transforms.offset
+
+    @property
+    def bounds(self) -> SceneBounds | None:
+        """Where the scene is, if its files say so."""
+        return self.static_train.transforms.bounds
 
     @property
     def moves(self) -> bool:
@@ -113,6 +125,16 @@ def static_alone(train: Transforms, test: Transforms, why: str) -> Layout:
     return Layout(train_set, test_set, train_set, test_set)
 
 
+def two_captures(static: Pair, dynamic: Pair) -> Layout:
+    """The layout of a scene that was recorded at rest and in motion; each to train and to test."""
+    return Layout(
+        static_train=at_rest(static[0]),
+        static_test=at_rest(static[1]),
+        dynamic_train=in_motion(dynamic[0]),
+        dynamic_test=in_motion(dynamic[1]),
+    )
+
+
 def one_capture(train: Transforms, test: Transforms, static_until: float) -> Layout:
     """The layout of one capture: at rest without times, or with one, else without a static set."""
     if one_moment(train, test):
@@ -146,8 +168,8 @@ def without_static_set(train: Split, test: Split, static_until: float) -> Layout
     return Layout(early, early_test, train, test)
 
 
-def fewer(layout: Layout, train_views: int | None, frames: int | None) -> tuple[Layout, bool]:
-    """The layout with fewer dynamic views and times, and whether times were left out.
+def fewer(layout: Layout, train_views: int | None, frames: int | None) -> Layout:
+    """The layout with fewer dynamic views and times.
 
     It keeps the first ``train_views`` dynamic views and ``frames`` times, evenly spread, first and
     last included; None: all. DevrfError if the dynamic images have one time only, or fewer views;
@@ -161,7 +183,7 @@ def fewer(layout: Layout, train_views: int | None, frames: int | None) -> tuple[
                     f"{count} was asked for, but all images of "
                     f"{layout.static_train.transforms.file} show one moment; leave it null",
                 )
-        return layout, False
+        return layout
     train = first_views(layout.dynamic_train, train_views)
     if len(distinct_times(train.used_times)) < 2:
         raise scene_error(
@@ -169,57 +191,42 @@ def fewer(layout: Layout, train_views: int | None, frames: int | None) -> tuple[
         )
     times = None if frames is None else evenly_spread(train.used_times, frames)
     if times is None:
-        return replace(layout, dynamic_train=train), False
+        return replace(layout, dynamic_train=train)
 
     def held_out(split: Split) -> Split:
         thinned = at_times(split, times)
         # Held-out times (D-NeRF's) need not be among the training times: then all stay.
         return thinned if len(thinned.index) else split
 
-    thinner = replace(
+    return replace(
         layout,
         dynamic_train=at_times(train, times),
         dynamic_test=held_out(layout.dynamic_test),
         validation=None if layout.validation is None else held_out(layout.validation),
+        thinned=True,
     )
-    return thinner, True
 
 
-def load_layout(
-    layout: Layout,
-    root: Path,
-    downscale: int,
-    masks: Masks = "none",
-    dynamic_downscale: int | None = None,
-    *,
-    alpha_weighted: bool = True,
-) -> tuple[Capture, Capture]:
+def load_layout(layout: Layout, root: Path, downscale: int) -> tuple[Capture, Capture]:
     """The static and the dynamic capture, images read from below the scene's folder ``root``.
 
-    Images are made smaller by ``downscale``, the dynamic ones by ``dynamic_downscale`` where they
-    are not of the size of the static ones; ``masks`` and ``alpha_weighted`` are as for
-    :func:`devrf.scenes.splits.load_views`.
+    Images are made smaller by ``downscale``, those of transforms with a factor of their own by it.
     """
-
-    def load(split: Split, by: int) -> Views:
-        return load_views(split, root, by, masks, alpha_weighted=alpha_weighted)
-
-    moving = downscale if dynamic_downscale is None else dynamic_downscale
     loaded: list[tuple[Split, Views]] = []
-    for split, by in (
-        (layout.static_train, downscale),
-        (layout.static_test, downscale),
-        (layout.dynamic_train, moving),
-        (layout.dynamic_test, moving),
-    ):
+
+    def load(split: Split) -> Views:
         # Without a static set the captures share files: read them once.
-        twin = next((v for s, v in loaded if _same_images(s, split)), None)
-        loaded.append((split, twin or load(split, by)))
-    static_train, static_test, dynamic_train, dynamic_test = (views for _, views in loaded)
-    validation = None
+        views = next((v for s, v in loaded if _same_images(s, split)), None)
+        if views is None:
+            views = load_views(split, root, downscale, alpha_weighted=layout.alpha_weighted)
+            loaded.append((split, views))
+        return views
+
+    static = Capture(load(layout.static_train), load(layout.static_test))
+    dynamic = Capture(load(layout.dynamic_train), load(layout.dynamic_test))
     if layout.validation is not None:
-        validation = load(layout.validation, moving)
-    return Capture(static_train, static_test), Capture(dynamic_train, dynamic_test, validation)
+        dynamic = replace(dynamic, validation=load(layout.validation))
+    return static, dynamic
 
 
 def _same_images(a: Split, b: Split) -> bool:

@@ -13,12 +13,14 @@ from pydantic.dataclasses import dataclass
 
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
-from devrf.geometry.offset import NO_OFFSET, Offset
-from devrf.scenes.files import Number
+from devrf.scenes.files import Number, scene_folder
+from devrf.scenes.flow_files import FlowDirection
 from devrf.scenes.image_folders import Downscale, SizeAt, whole_factor
+from devrf.scenes.layout import Layout, load_layout
 from devrf.scenes.names import Missing
 from devrf.scenes.scene import Background, Capture, OpticalFlow, Scene, Views
 from devrf.scenes.space import SpaceChoice, centred, forward_facing_scene, inward_space
+from devrf.scenes.splits import Split
 from devrf.scenes.transforms import SceneBounds
 from devrf.scenes.validation import LARGEST, checked_box, scene_error
 from devrf.system.options import Count, Options, Several
@@ -118,7 +120,56 @@ class SceneReader(Options, ABC):
 
 
 @dataclass(frozen=True)
-class FixedViewsReader(SceneReader):
+class LayoutReader(SceneReader):
+    """Reads what lists images and their poses: a :class:`~devrf.scenes.layout.Layout`.
+
+    Attributes:
+        has_flow_files: whether there is a place for flow files, which :meth:`flow_of` reads.
+    """
+
+    has_flow_files: ClassVar[bool] = False
+
+    @abstractmethod
+    def layout(self, folder: Path) -> Layout:
+        """The splits of the scene in ``folder``, no image read but its header."""
+
+    @abstractmethod
+    def placed(self, folder: Path, layout: Layout, static: Capture, dynamic: Capture) -> Scene:
+        """The scene of the captures that were read from ``folder``, its bounds found."""
+
+    def flow_of(self, split: Split, views: Views, direction: FlowDirection) -> OpticalFlow | None:
+        """The flow in the files of a split's images, which are ``views``; None: there are none."""
+        return None
+
+    def read(self) -> Scene:
+        """See :meth:`SceneReader.read`."""
+        folder = scene_folder(self.root)
+        layout = self.layout(folder)
+        factor = layout.static_train.transforms.downscale or self.choose_factor(layout.size_at)
+        static, dynamic = load_layout(layout, folder, factor)
+        if self.wants_flow_files:
+            flow = self._flow(layout, dynamic.train, "bwd")
+            if flow is not None:  # else the captures may share images
+                dynamic = replace(dynamic, train=replace(dynamic.train, flow=flow))
+        return self.placed(folder, layout, static, dynamic)
+
+    def forward_flow(self, views: Views) -> OpticalFlow | None:
+        """See :meth:`SceneReader.forward_flow`."""
+        if not self.has_flow_files:
+            return None
+        return self._flow(self.layout(scene_folder(self.root)), views, "fwd")
+
+    def _flow(self, layout: Layout, views: Views, direction: FlowDirection) -> OpticalFlow | None:
+        if not self.has_flow_files or not layout.moves:
+            return None
+        if layout.thinned:
+            log.info("flow files dropped: data.frames=%s leaves out neighbours", self.frames)
+            return None
+        return self.flow_of(layout.dynamic_train, views, direction)
+
+
+@dataclass(frozen=True)
+class FixedViewsReader(LayoutReader):
     """Options of layouts with folders ``dynamic_<V>views/view1`` … of fixed cameras.
 
     Images come from ``images_<downscale>`` where it is there; else larger ones are made smaller.
@@ -140,7 +191,7 @@ class FixedViewsReader(SceneReader):
 
 
 @dataclass(frozen=True)
-class InwardReader(SceneReader):
+class InwardReader(LayoutReader):
     """Options of scenes that cameras look in at.
 
     Attributes:
@@ -164,13 +215,12 @@ class InwardReader(SceneReader):
     missing: Missing = "error"
     space: SpaceChoice = "auto"
 
-    def scene(
-        self, folder: Path, static: Capture, dynamic: Capture, offset: Offset = NO_OFFSET
-    ) -> Scene:
-        """The scene of two captures that were read from ``folder``, its bounds found.
+    def placed(self, folder: Path, layout: Layout, static: Capture, dynamic: Capture) -> Scene:
+        """See :meth:`LayoutReader.placed`.
 
-        ``offset`` is subtracted from their positions already, and here from the box.
+        The layout's offset is subtracted from positions already, and here from the box.
         """
+        offset = layout.offset
         name = self.name_of(folder)
         box = self.box
         if any(offset):
@@ -204,32 +254,29 @@ class PosedReader(InwardReader):
             the scene from one side: then the world is that of their average pose, ``near`` is
             the near plane, and the scene is a forward-facing one. Stated bounds say what ``auto``
             is, and ``near``, ``far`` and ``box`` where they are None.
+        stater: who states them, in words.
     """
+
+    stater: ClassVar[str]
 
     _: KW_ONLY
     space: SpaceChoice | Literal["ndc"] = "auto"  # type: ignore[assignment]
 
-    def placed(
-        self,
-        folder: Path,
-        static: Capture,
-        dynamic: Capture,
-        stated: SceneBounds | None,
-        source: str,
-        offset: Offset = NO_OFFSET,
-    ) -> Scene:
-        """The scene of two captures, which for a scene always at rest are one.
+    def stated(self, layout: Layout, static: Capture) -> SceneBounds | None:
+        """Where the scene is, if that is known."""
+        return layout.bounds
 
-        ``stated`` says where it is, if that is known, and ``source``, in words, who states it;
-        ``offset`` is subtracted from their positions already.
-        DevrfError if neither options nor cameras do.
+    def placed(self, folder: Path, layout: Layout, static: Capture, dynamic: Capture) -> Scene:
+        """See :meth:`LayoutReader.placed`; captures of a scene always at rest are one.
+
+        DevrfError if neither options nor cameras say where it is.
         """
-        reader = _with_bounds(self, stated)
+        reader = _with_bounds(self, self.stated(layout, static))
         if reader.space != "ndc":
-            scene = reader.scene(folder, static, dynamic, offset)
-            reason = scene.bounds.reason if reader.space == self.space else source
+            scene = InwardReader.placed(reader, folder, layout, static, dynamic)
+            reason = scene.bounds.reason if reader.space == self.space else self.stater
             box_is_stated = self.box is None and reader.box is not None
-            box_source = source if box_is_stated else scene.bounds.box_source
+            box_source = self.stater if box_is_stated else scene.bounds.box_source
             bounds = replace(scene.bounds, reason=reason, box_source=box_source)
             return replace(scene, bounds=bounds)
         name = self.name_of(folder)

@@ -15,7 +15,7 @@ from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
 from devrf.scenes.images import image_size, load_images, raster_of
 from devrf.scenes.lens import Intrinsics, Lens
-from devrf.scenes.masks import Masks, cutting_out, valid_pixels
+from devrf.scenes.masks import cutting_out, valid_pixels
 from devrf.scenes.resampling import as_pinhole
 from devrf.scenes.scene import Views
 from devrf.scenes.transforms import Transforms
@@ -24,16 +24,37 @@ from devrf.scenes.validation import same_shape, scene_error
 log = logging.getLogger(__name__)
 
 
-def every_nth(count: int, holdout: int, start: int | None = None) -> tuple[list[int], list[int]]:
-    """The positions to learn from and those to hold out, of ``count`` ≥ 2 images.
+def every_nth(
+    count: int, holdout: int, start: int | None = None, *, where: object = "images"
+) -> tuple[list[int], list[int]]:
+    """The positions to learn from and those to hold out, of ``count`` images.
 
     Every ``holdout``-th (≥ 2) is held out, or the last one if there are fewer. ``start`` is the
     first that is held out: 0 for images at rest, as LLFF's scenes are scored; None:
-    ``holdout`` − 1, since a sequence begins at rest.
+    ``holdout`` − 1, since a sequence begins at rest. DevrfError that names ``where`` the images
+    are listed, if there are fewer than two.
     """
+    if count < 2:
+        number = "one image" if count else "no image"
+        raise scene_error(where, f"lists {number}; add more, one of them to hold out")
     start = holdout - 1 if start is None else start
     held_out = list(range(start, count, holdout)) or [count - 1]
     return sorted(set(range(count)) - set(held_out)), held_out
+
+
+def parted(
+    train: Sequence[int], test: Sequence[int], holdout: int, where: object
+) -> tuple[list[int], list[int]]:
+    """The positions to learn from and to hold out: if none are listed to ``test``, every n-th.
+
+    DevrfError that names ``where`` they are listed, if there are none to learn from, or one alone.
+    """
+    if test and not train:
+        raise scene_error(where, "all images are held out; list some to learn from")
+    if test:
+        return list(train), list(test)
+    learned, held_out = every_nth(len(train), holdout, where=where)
+    return [train[k] for k in learned], [train[k] for k in held_out]
 
 
 # Two poses are those of one camera if no entry differs by more than this, relative to its distance.
@@ -215,26 +236,25 @@ def load_views(
     split: Split,
     root: Path,
     downscale: int,
-    masks: Masks = "none",
     *,
     alpha_weighted: bool = True,
 ) -> Views:
-    """Read the used images of a split, made smaller by ``downscale``; their cameras are pinholes.
+    """Read the used images of a split, made smaller; their cameras are pinholes.
 
     Images of a lens with distortion are undistorted, and masks with them. ``root`` is the scene's
-    folder, ``masks`` what the masks that the file lists are taken for, ``alpha_weighted`` as for
-    :func:`devrf.scenes.images.load_images`. DevrfError if an image, a mask or a lens is wrong, or
-    they do not go together.
+    folder; ``downscale`` counts if the images have no factor of their own; ``alpha_weighted`` is as
+    for :func:`devrf.scenes.images.load_images`. DevrfError if an image, a mask or a lens is wrong,
+    or they do not go together.
     """
     used = split.index
-    files = [split.transforms.images[i] for i in used.tolist()]
-    intrinsics = [split.transforms.intrinsics[i] for i in used.tolist()]
+    transforms = split.transforms[used.tolist()]
+    files = transforms.images
+    intrinsics = transforms.intrinsics
     sizes = [known.size for known in intrinsics]
-    mask_files = (
-        [split.transforms.masks[i] for i in used.tolist()] if split.transforms.masks else []
-    )
-    finish = cutting_out(mask_files, sizes, files) if masks == "alpha" else None
-    loaded = load_images(files, downscale, sizes, finish, alpha_weighted=alpha_weighted)
+    masks = transforms.masks or ()
+    finish = cutting_out(masks, sizes, files) if transforms.cut_out else None
+    by = transforms.downscale or downscale
+    loaded = load_images(files, by, sizes, finish, alpha_weighted=alpha_weighted)
     if loaded.pixels.shape[3] == 4 and not bool(loaded.pixels[..., 3].any()):
         raise scene_error(
             files[0],
@@ -248,11 +268,11 @@ def load_views(
             intrinsics, files, loaded.files, loaded.sizes, strict=True
         )
     ]
-    ignored = mask_files if masks == "ignore" else []
+    ignored = () if transforms.cut_out else masks
     valid_mask = valid_pixels(ignored, loaded.files, loaded.sizes, sizes, distorted, files)
     # Undistorted after the images are made smaller: a tenth of the work for the same picture.
     pixels, lenses = as_pinhole(loaded.pixels, distorted, files, loaded.sizes)
-    cameras = pinholes(split.transforms.poses[used], lenses, loaded.sizes)
+    cameras = pinholes(transforms.poses, lenses, loaded.sizes)
     names = tuple(str(file.relative_to(root)) for file in files)
     return Views(
         pixels,

@@ -21,6 +21,7 @@ from torch import Tensor
 from devrf.geometry.offset import NO_OFFSET, Offset, offset_of, subtracted
 from devrf.scenes.files import Name, Number, Positive, Vector3, Vector4, inside, read_json
 from devrf.scenes.lens import CameraKeys, Intrinsics, frame_intrinsics, intrinsics_of
+from devrf.scenes.masks import Masks
 from devrf.scenes.names import ImageFinder, Missing, in_order, present_images
 from devrf.scenes.validation import check_poses, scene_error
 
@@ -118,6 +119,8 @@ class Transforms:
         times: N times in [0, 1], or None when the file gives none.
         masks: N existing files inside the scene's folder, None for an image without one; None if
             they were not asked for.
+        cut_out: whether what masks leave out is background; else it is ignored.
+        downscale: by what the images are yet to be made smaller; None: as those of the scene.
         skipped: how many images of the file are absent, and left out.
         bounds: where the scene is, if the file says so, in the world of the file.
         unread_times: keys of frames that say something of time, but are not read.
@@ -130,6 +133,8 @@ class Transforms:
     poses: Tensor
     times: tuple[float, ...] | None
     masks: tuple[Path | None, ...] | None = None
+    cut_out: bool = False
+    downscale: int | None = None
     skipped: int = 0
     bounds: SceneBounds | None = None
     unread_times: tuple[str, ...] = ()
@@ -147,85 +152,94 @@ class Transforms:
         )
 
 
-def read_transforms(
-    file: Path,
-    root: Path,
-    *,
-    masked: bool = False,
-    missing: Missing = "error",
-    times_by_order: bool = False,
-    offset: Offset | None = None,
-) -> tuple[TransformsFile, Transforms]:
-    """What a transforms file below ``root``, the scene's folder, says, and its posed images.
+class TransformsFiles:
+    """The transforms files of one scene: all are read in one way, with the offset of the first."""
 
-    ``masked``: whether ``mask_path`` is followed, too; ``missing``: as for
-    :func:`devrf.scenes.names.present_images`; ``times_by_order``: times are spread evenly over the
-    images in the order of their names, whatever the file says of times; ``offset``: that of the
-    scene's other files, None for the first one.
+    def __init__(self, root: Path, missing: Missing, masks: Masks = "none") -> None:
+        """Say how they are read.
 
-    Raises:
-        DevrfError: the file or an image is missing, a value is wrong (NaN, a time outside [0, 1], a
-            negative focal length …), a pose is no rigid transform, or only some frames have a time.
-    """
-    listing = read_json(file, TransformsFile, "every capture needs its posed images")
-    images = present_images([frame.file_path for frame in listing.frames], file, root, missing)
-    frames = [listing.frames[index] for index in images]
-    where = [f"{file}: frames[{index}]" for index in images]
-    times = [frame.time for frame in frames]
-    if times_by_order:
-        names = in_order((frame.file_path for frame in frames), name=str, where=file)
-        moments = {name: k / max(len(names) - 1, 1) for k, name in enumerate(names)}
-        times = [moments[frame.file_path] for frame in frames]
-    known = [t for t in times if t is not None]
-    if known and len(known) < len(times):
-        raise scene_error(
-            where[times.index(None)],
-            'has no "time" although others have; give every frame its time, or none',
+        Args:
+            root: the scene's folder.
+            missing: as for :func:`devrf.scenes.names.present_images`.
+            masks: what the images of ``mask_path`` are taken for; ``none``: it is not followed.
+        """
+        self._root = root
+        self._missing = missing
+        self._masks = masks
+        self._finder = ImageFinder(root)
+        self._offset: Offset | None = None
+
+    def read(
+        self, file: Path, *, times_by_order: bool = False
+    ) -> tuple[TransformsFile, Transforms]:
+        """What a file says, and its posed images.
+
+        ``times_by_order``: times are spread evenly over the images in the order of their names,
+        whatever the file says of times.
+
+        Raises:
+            DevrfError: the file or an image is missing, a value is wrong (NaN, a time outside
+                [0, 1], a negative focal length …), a pose is no rigid transform, or only some
+                frames have a time.
+        """
+        listing = _listing(file)
+        names = [frame.file_path for frame in listing.frames]
+        images = present_images(names, file, self._root, self._missing)
+        frames = [listing.frames[index] for index in images]
+        where = [f"{file}: frames[{index}]" for index in images]
+        times = [frame.time for frame in frames]
+        if times_by_order:
+            names = in_order((frame.file_path for frame in frames), name=str, where=file)
+            moments = {name: k / max(len(names) - 1, 1) for k, name in enumerate(names)}
+            times = [moments[frame.file_path] for frame in frames]
+        known = [t for t in times if t is not None]
+        if known and len(known) < len(times):
+            raise scene_error(
+                where[times.index(None)],
+                'has no "time" although others have; give every frame its time, or none',
+            )
+        poses = torch.tensor([frame.transform_matrix[:3] for frame in frames], dtype=torch.float64)
+        check_poses(poses, lambda index: f"{where[index]}: transform_matrix")
+        self._offset = offset_of(poses) if self._offset is None else self._offset
+        lenses = [frame_intrinsics(listing, f, at) for f, at in zip(frames, where, strict=True)]
+        shared = cache(lambda: intrinsics_of(listing, file))  # asked for only where it is needed
+        masked = self._masks != "none"
+        transforms = Transforms(
+            file,
+            tuple(own or shared() for own in lenses),
+            tuple(images.values()),
+            subtracted(poses, self._offset).float(),
+            tuple(known) or None,
+            tuple(self._mask(frame.mask_path, file) for frame in frames) if masked else None,
+            cut_out=self._masks == "alpha",
+            skipped=len(listing.frames) - len(frames),
+            bounds=listing.scene_bounds,
+            unread_times=tuple(
+                key
+                for key in ("timestep_index", "timestamp")
+                if any(getattr(frame, key) is not None for frame in frames)
+            ),
+            offset=self._offset,
         )
-    poses = torch.tensor([frame.transform_matrix[:3] for frame in frames], dtype=torch.float64)
-    check_poses(poses, lambda index: f"{where[index]}: transform_matrix")
-    offset = offset_of(poses) if offset is None else offset
-    lenses = [frame_intrinsics(listing, f, at) for f, at in zip(frames, where, strict=True)]
-    shared = cache(lambda: intrinsics_of(listing, file))  # asked for only where it is needed
-    transforms = Transforms(
-        file,
-        tuple(own or shared() for own in lenses),
-        tuple(images.values()),
-        subtracted(poses, offset).float(),
-        tuple(known) or None,
-        _masks(frames, file, root) if masked else None,
-        skipped=len(listing.frames) - len(frames),
-        bounds=listing.scene_bounds,
-        unread_times=tuple(
-            key
-            for key in ("timestep_index", "timestamp")
-            if any(getattr(frame, key) is not None for frame in frames)
-        ),
-        offset=offset,
-    )
-    return listing, transforms
+        return listing, transforms
 
+    def find(self, name: str, file: Path) -> Path | None:
+        """The image that ``name`` in a file means; None: there is none."""
+        return self._finder.find(inside(self._root, file.parent, name, file))
 
-def any_image(file: Path, root: Path) -> bool:
-    """Whether any image is there that a transforms file below ``root`` lists, if there is one."""
-    if not os.path.isfile(file):
-        return False
-    listing = read_json(file, TransformsFile, "every capture needs its posed images")
-    finder = ImageFinder(root)
-    places = (inside(root, file.parent, frame.file_path, file) for frame in listing.frames)
-    return any(finder.find(place) is not None for place in places)
+    def any_image(self, file: Path) -> bool:
+        """Whether any image is there that a file lists, if there is one."""
+        if not os.path.isfile(file):
+            return False
+        return any(self.find(frame.file_path, file) for frame in _listing(file).frames)
 
-
-def _masks(frames: Sequence[Frame], file: Path, root: Path) -> tuple[Path | None, ...]:
-    finder = ImageFinder(root)
-
-    def mask(name: str | None) -> Path | None:
-        if name is None:
-            return None
-        place = inside(root, file.parent, name, file)
-        found = finder.find(place)
-        if found is None:
+    def _mask(self, name: str | None, file: Path) -> Path | None:
+        mask = None if name is None else self.find(name, file)
+        if name is not None and mask is None:
+            place = inside(self._root, file.parent, name, file)
             raise scene_error(place, "no such mask; correct mask_path, or set data.masks=none")
-        return found
+        return mask
 
-    return tuple(mask(frame.mask_path) for frame in frames)
+
+def _listing(file: Path) -> TransformsFile:
+    return read_json(file, TransformsFile, "every capture needs its posed images")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
+import logging
 import os
 import re
 from collections.abc import Callable, Sequence
@@ -13,13 +14,17 @@ import torch
 from torch import Tensor
 
 from devrf.scenes.files import entries
-from devrf.scenes.flow_files import FlowDirection, warn_of_missing
+from devrf.scenes.flow_files import FlowDirection, stacked_flow, warn_of_missing
 from devrf.scenes.image_folders import ImageFolder, image_folder, listed_images
+from devrf.scenes.layout import Layout, Pair
 from devrf.scenes.lens import Intrinsics
-from devrf.scenes.splits import Split
+from devrf.scenes.scene import OpticalFlow, Views
+from devrf.scenes.splits import Split, at_rest, file_sizes
 from devrf.scenes.transforms import Transforms
 from devrf.scenes.validation import scene_error
 from devrf.system.files import utf8_path
+
+log = logging.getLogger(__name__)
 
 
 def dynamic_folders(root: Path) -> list[Path]:
@@ -31,25 +36,21 @@ def dynamic_folders(root: Path) -> list[Path]:
     ]
 
 
-def chosen_dynamic(root: Path, chosen: str | None) -> Path:
-    """The one of :func:`dynamic_folders` called ``chosen``, or (None) the only one.
+def chosen_dynamic(root: Path, chosen: str | None) -> Path | None:
+    """The one of :func:`dynamic_folders` called ``chosen``, or (None) the only one, if there is.
 
-    DevrfError if there is none, none of that name, or several to choose from.
+    DevrfError if there is none of that name, or there are several to choose from.
     """
     folders = dynamic_folders(root)
     names = ", ".join(folder.name for folder in folders)
-    if chosen is not None:
-        named = [folder for folder in folders if folder.name == chosen]
-        if not named:
-            raise scene_error(
-                root, f"no folder {chosen!r} (found: {names or 'none'}); correct data.dynamic"
-            )
-        return named[0]
-    if not folders:
-        raise scene_error(root, "no folder dynamic_<V>views; add the capture of the moving scene")
-    if len(folders) > 1:
+    named = [folder for folder in folders if chosen in (None, folder.name)]
+    if chosen is not None and not named:
+        raise scene_error(
+            root, f"no folder {chosen!r} (found: {names or 'none'}); correct data.dynamic"
+        )
+    if len(named) > 1:
         raise scene_error(root, f"several captures ({names}); choose one with data.dynamic=NAME")
-    return folders[0]
+    return named[0] if named else None
 
 
 _VIEW = re.compile(r"view(\d{1,6})")
@@ -119,43 +120,49 @@ def held_out_view(count: int, test_view: int) -> int:
     return test_view - 1 if test_view > 0 else count + test_view
 
 
-def fixed_views(
-    views: list[ViewFolder], posed_by: Path, poses: Tensor, lenses: Sequence[Intrinsics], test: int
-) -> tuple[Split, Split]:
-    """What fixed cameras saw, to learn from and held out: all at the first frame, then at the next.
+def with_fixed_views(
+    static: Pair,
+    views: list[ViewFolder],
+    posed_by: Path,
+    poses: Tensor,
+    lenses: Sequence[Intrinsics],
+    test: int,
+) -> Layout:
+    """The layout of a scene that was seen at rest, and in motion by V fixed cameras.
 
-    The V ``views`` have ``poses`` (V, 3, 4), camera-to-world, and ``lenses``, both from the file
-    ``posed_by``; ``test`` is the position of the held-out one.
+    Their images are all at the first frame, then all at the next. The ``views`` have ``poses``
+    (V, 3, 4), camera-to-world, and ``lenses``, both from the file ``posed_by``; ``test`` is the
+    position of the held-out one.
     """
     frames = len(views[0].images)
 
-    def of(chosen: list[int]) -> Split:
+    def seen(chosen: list[int]) -> Split:
         shots = [(t, v) for t in range(frames) for v in chosen]
         cameras = [v for _, v in shots]
-        times = tuple(t / (frames - 1) for t, _ in shots)
         transforms = Transforms(
             posed_by,
             tuple(lenses[v] for v in cameras),
             tuple(views[v].images[t] for t, v in shots),
             poses[cameras].float(),
-            times,
+            tuple(t / (frames - 1) for t, _ in shots),
+            downscale=views[0].downscale,
         )
         number = torch.arange(len(chosen)).repeat(frames)
-        return Split(transforms, torch.tensor(times), number, True, torch.arange(len(shots)))
+        times = torch.tensor(transforms.times)
+        return Split(transforms, times, number, True, torch.arange(len(shots)))
 
-    return of([v for v in range(len(views)) if v != test]), of([test])
+    learned = seen([v for v in range(len(views)) if v != test])
+    return Layout(at_rest(static[0]), at_rest(static[1]), learned, seen([test]))
 
 
-def flow_files(
-    views: list[ViewFolder], direction: FlowDirection = "bwd"
-) -> dict[tuple[int, int], Path]:
-    """The file that holds the backward flow of (view, frame); frame 0 has none.
+def flow_of_views(split: Split, views: Views, direction: FlowDirection) -> OpticalFlow | None:
+    """The flow in ``<folder>_flow`` beside the folders of images by fixed cameras; None: no file.
 
-    Forward flow is in ``<frame>_fwd.npz``, and the last frame has none.
-
-    ``<frame>_bwd.npz`` may name a frame in three ways: by its image's name (``0007`` for
-    ``0007.png``), by the last number in it (``7`` for ``img_0007.png``), or by its position,
-    counted from 0. The way that finds the most files holds for all views; of equal ones the first.
+    Backward flow is in ``<frame>_bwd.npz``, and frame 0 has none; forward flow in
+    ``<frame>_fwd.npz``, and the last frame has none. The name may tell the frame in three ways: by
+    its image's name (``0007`` for ``0007.png``), by the last number in it (``7`` for
+    ``img_0007.png``), or by its position, counted from 0. The way that finds the most files holds
+    for all views; of equal ones the first.
     """
     suffix = f"_{direction}.npz"
     ways: tuple[Callable[[int, Path], str | int | None], ...] = (
@@ -163,21 +170,29 @@ def flow_files(
         lambda position, image: _last_number(image.stem),
         lambda position, image: position,
     )
-    frames = len(views[0].images)
+    images = [split.transforms.images[k] for k in split.index.tolist()]
+    folders = {
+        image.parent: image.parent.with_name(f"{image.parent.name}_flow") for image in images
+    }
+    named = {folder: _named(flow, suffix) for folder, flow in folders.items()}
+    frames = len(images) // len(folders)
+    without = 0 if direction == "bwd" else frames - 1
     shots = [
-        (v, k, view.images[k], files)
-        for v, view in enumerate(views)
-        for files in [_named(view.flow, suffix)]
-        for k in (range(1, frames) if direction == "bwd" else range(frames - 1))
+        (row, row // len(folders), image, named[image.parent])
+        for row, image in enumerate(images)
+        if row // len(folders) != without
     ]
     candidates = [
-        {(v, k): files[name] for v, k, image, files in shots if (name := way(k, image)) in files}
+        {row: files[name] for row, t, image, files in shots if (name := way(t, image)) in files}
         for way in ways
     ]
     best = max(candidates, key=len)
-    if best:
-        warn_of_missing(len(best), len(shots), views[0].flow)
-    return best
+    first = folders[images[0].parent]
+    if not best:
+        log.info("no optical flow: no <frame>%s in %s and its like", suffix, first)
+        return None
+    warn_of_missing(len(best), len(shots), first)
+    return stacked_flow(best, file_sizes(split, views), views.cameras)
 
 
 def _named(folder: Path, suffix: str) -> dict[str | int | None, Path]:

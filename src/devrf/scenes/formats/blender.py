@@ -6,31 +6,31 @@ import logging
 import os
 from dataclasses import KW_ONLY, replace
 from pathlib import Path
+from typing import ClassVar
 
 from pydantic.dataclasses import dataclass
 
-from devrf.geometry.offset import Offset
-from devrf.scenes.files import existing_folder, scene_folder
+from devrf.scenes.files import existing_folder
 from devrf.scenes.flow_files import FlowDirection, read_flow
-from devrf.scenes.layout import Layout, fewer, load_layout, one_capture, static_alone
-from devrf.scenes.names import Missing
+from devrf.scenes.layout import Layout, Pair, fewer, one_capture, static_alone, two_captures
 from devrf.scenes.reader import InwardReader, Time
-from devrf.scenes.scene import OpticalFlow, Scene, Views
+from devrf.scenes.scene import OpticalFlow, Views
 from devrf.scenes.splits import (
-    at_rest,
+    Split,
     check_timed_alike,
     distinct_poses,
     every_nth,
     file_sizes,
-    in_motion,
+    one_moment,
     stand_still,
 )
-from devrf.scenes.transforms import Transforms, any_image, read_transforms
+from devrf.scenes.transforms import Transforms, TransformsFiles
 from devrf.scenes.view_folders import chosen_dynamic, dynamic_folders
 from devrf.system.options import Count
 
 log = logging.getLogger(__name__)
 
+VAL = "transforms_val.json"
 # The scene of D-NeRF's whose test images show it otherwise than those that are learned from.
 SCORED_ON_VAL = "lego"
 # One training image in so many is held out where no held-out image is there.
@@ -56,107 +56,76 @@ class BlenderReader(InwardReader):
             DeVRF's authors average each channel by itself.
     """
 
+    has_flow_files: ClassVar[bool] = True
+
     _: KW_ONLY
     dynamic: str | None = None
     train_views: Count | None = None
     static_until: Time = 1.0
     alpha_weighted: bool = True
 
-    def read(self) -> Scene:
-        """See :meth:`devrf.scenes.reader.SceneReader.read`."""
-        folder = scene_folder(self.root)
-        layout, thinned, flow_folder = self._layout(folder)
-        factor = self.choose_factor(layout.size_at)
-        static, dynamic = load_layout(layout, folder, factor, alpha_weighted=self.alpha_weighted)
-        if layout.moves and self.wants_flow_files:
-            flow = self._flow(dynamic.train, layout, thinned, flow_folder, "bwd")
-            dynamic = replace(dynamic, train=replace(dynamic.train, flow=flow))
-        return self.scene(folder, static, dynamic, layout.offset)
-
-    def forward_flow(self, views: Views) -> OpticalFlow | None:
-        """See :meth:`devrf.scenes.reader.SceneReader.forward_flow`."""
-        layout, thinned, flow_folder = self._layout(scene_folder(self.root))
-        return self._flow(views, layout, thinned, flow_folder, "fwd") if layout.moves else None
-
-    def _layout(self, root: Path) -> tuple[Layout, bool, Path]:
-        """The splits, whether times were left out, and the folder where flow files would lie."""
-        static = root / "static"
-        flow_folder = root / "train_flow"
-        if not os.path.isdir(static) and not dynamic_folders(root):
-            train, test = _train_and_test(root, root, self.missing)
-            layout = one_capture(train, test, self.static_until)
-            val = root / "transforms_val.json"
-            if layout.moves and root.name == SCORED_ON_VAL and os.path.isfile(val):
-                log.info("%s: scored on its val split: its test split shows another scene", root)
-                _, test = read_transforms(val, root, missing=self.missing, offset=train.offset)
+    def layout(self, folder: Path) -> Layout:
+        """See :meth:`devrf.scenes.reader.LayoutReader.layout`."""
+        files = TransformsFiles(folder, self.missing)
+        static = folder / "static"
+        if not os.path.isdir(static) and not dynamic_folders(folder):
+            train, test = _train_and_test(files, folder)
+            val = folder / VAL
+            if folder.name == SCORED_ON_VAL and not one_moment(train, test) and os.path.isfile(val):
+                log.info("%s: scored on its val split: its test split shows another scene", folder)
+                _, test = files.read(val)
                 check_timed_alike(train, test)
-                layout = one_capture(train, test, self.static_until)
-        elif self.dynamic is None and not dynamic_folders(root):
-            train, test = _train_and_test(static, root, self.missing)
+            layout = one_capture(train, test, self.static_until)
+        elif (moving := chosen_dynamic(folder, self.dynamic)) is None:
+            train, test = _train_and_test(files, static)
             layout = static_alone(train, test, "there is no folder dynamic_<V>views")
         else:
-            moving = chosen_dynamic(root, self.dynamic)
-            train, test = _train_and_test(existing_folder(static), root, self.missing)
-            moving_train, moving_test = _train_and_test(moving, root, self.missing, train.offset)
-            layout = Layout(
-                static_train=at_rest(train),
-                static_test=at_rest(test),
-                dynamic_train=in_motion(moving_train),
-                dynamic_test=in_motion(moving_test),
-            )
-            flow_folder = moving / "train_flow"
+            resting = _train_and_test(files, existing_folder(static))
+            layout = two_captures(resting, _train_and_test(files, moving))
         test_file = layout.dynamic_test.transforms.file
-        val = test_file.with_name("transforms_val.json")
+        val = test_file.with_name(VAL)
         if self.validation and val != test_file and os.path.isfile(val):
-            _, validation = read_transforms(val, root, missing=self.missing, offset=layout.offset)
+            _, validation = files.read(val)
             check_timed_alike(layout.dynamic_train.transforms, validation)
             layout = layout.with_validation(validation)
-        return *fewer(layout, self.train_views, self.frames), flow_folder
+        layout = replace(layout, alpha_weighted=self.alpha_weighted)
+        return fewer(layout, self.train_views, self.frames)
 
-    def _flow(
-        self, views: Views, layout: Layout, thinned: bool, folder: Path, direction: FlowDirection
-    ) -> OpticalFlow | None:
-        """The flow files of the dynamic training views, if they are of these images."""
-        split = layout.dynamic_train
-        if thinned:
-            log.info("flow files dropped: data.frames=%s leaves out neighbours", self.frames)
-            return None
+    def flow_of(self, split: Split, views: Views, direction: FlowDirection) -> OpticalFlow | None:
+        """See :meth:`devrf.scenes.reader.LayoutReader.flow_of`."""
+        folder = split.transforms.file.with_name("train_flow")
         if split.transforms.skipped:
             log.info("flow files dropped: they are numbered by images of which some are left out")
             return None
         if any(not known.distortion.none for known in split.transforms.intrinsics):
             log.warning("flow files in %s left out: they are of images before undistortion", folder)
             return None
-        first = split.times.min()
-        last = split.times.max()
-        expected = views.times > first + 1e-6 if direction == "bwd" else views.times < last - 1e-6
+        end = split.times.min() if direction == "bwd" else split.times.max()
         return read_flow(
             folder,
             split.index.tolist(),
-            expected.tolist(),
+            ((views.times - end).abs() > 1e-6).tolist(),
             file_sizes(split, views),
             views.cameras,
             direction,
         )
 
 
-def _train_and_test(
-    folder: Path, root: Path, missing: Missing, offset: Offset | None = None
-) -> tuple[Transforms, Transforms]:
-    """The images of a capture to learn from, and those held out; ``offset``: another capture's."""
+def _train_and_test(files: TransformsFiles, folder: Path) -> Pair:
+    """The images of the capture in a folder to learn from, and those held out."""
     file = folder / "transforms_train.json"
-    _, train = read_transforms(file, root, missing=missing, offset=offset)
-    test, val = (folder / f"transforms_{split}.json" for split in ("test", "val"))
-    held_out = next((listing for listing in (test, val) if any_image(listing, root)), None)
+    _, train = files.read(file)
+    listings = (folder / "transforms_test.json", folder / VAL)
+    held_out = next(filter(files.any_image, listings), None)
     parts = None if held_out else _held_out_of(train)
     if parts is None:
-        _, tested = read_transforms(held_out or test, root, missing=missing, offset=train.offset)
+        _, tested = files.read(held_out or listings[0])
         check_timed_alike(train, tested)
         return train, tested
     learned, scored = parts
     log.warning(
         "%s: no image of it is there; %d of the %d of %s are held out in their place",
-        test,
+        listings[0],
         len(scored),
         len(train.images),
         file.name,

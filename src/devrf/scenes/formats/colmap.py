@@ -6,33 +6,26 @@ import logging
 import os
 from dataclasses import KW_ONLY
 from pathlib import Path, PurePosixPath
+from typing import ClassVar
 
 from pydantic.dataclasses import dataclass
-from torch import Tensor
 
-from devrf.scenes.files import inside, scene_folder
+from devrf.scenes.files import inside
 from devrf.scenes.image_folders import Downscale, ImageFolder, image_folder
 from devrf.scenes.images import SUFFIXES
-from devrf.scenes.layout import Layout, fewer, load_layout, static_alone
+from devrf.scenes.layout import Layout, fewer, static_alone
 from devrf.scenes.names import ImageFinder, present_images
 from devrf.scenes.reader import EstimatedFlow, FixedViewsReader, PosedReader
-from devrf.scenes.scene import Scene
-from devrf.scenes.sparse_model import (
-    Facing,
-    SparseModel,
-    World,
-    normalised,
-    scene_model,
-)
-from devrf.scenes.splits import at_rest, every_nth
+from devrf.scenes.scene import Capture
+from devrf.scenes.sparse_model import Facing, SparseModel, normalised, scene_model
+from devrf.scenes.splits import every_nth
 from devrf.scenes.transforms import SceneBounds, Transforms
 from devrf.scenes.validation import scene_error
 from devrf.scenes.view_folders import (
     chosen_dynamic,
-    dynamic_folders,
-    fixed_views,
     held_out_view,
     view_folders,
+    with_fixed_views,
 )
 
 log = logging.getLogger(__name__)
@@ -134,13 +127,14 @@ class ColmapReader(PosedReader, FixedViewsReader):
             ``world`` instead of ``contracted``.
     """
 
+    stater: ClassVar[str] = "the sparse model"
+
     _: KW_ONLY
     downscale: Downscale = "auto"
     flow: EstimatedFlow = "auto"
 
-    def read(self) -> Scene:
-        """See :meth:`devrf.scenes.reader.SceneReader.read`."""
-        folder = scene_folder(self.root)
+    def layout(self, folder: Path) -> Layout:
+        """See :meth:`devrf.scenes.reader.LayoutReader.layout`."""
         model, others = scene_model(folder)
         if others:
             log.info(
@@ -154,59 +148,48 @@ class ColmapReader(PosedReader, FixedViewsReader):
         width, height = max(((int(c["w"]), int(c["h"])) for c in cameras), key=max)
         factor = self.choose_factor(lambda factor: (width // factor, height // factor))
         source = images_of(model, folder, factor)
-        layout, smaller = self._layout(folder, model, world.poses, source.path, factor)
-        layout, _ = fewer(layout, self.train_views, self.frames)
-        static, dynamic = load_layout(layout, folder, source.downscale, dynamic_downscale=smaller)
-        bounds = _bounds(world, static.train.cut_out)
-        return self.placed(folder, static, dynamic, bounds, "the sparse model")
-
-    def _layout(
-        self, folder: Path, model: SparseModel, poses: Tensor, source: Path, factor: int
-    ) -> tuple[Layout, int | None]:
-        """The splits, and by what the images of fixed views are yet to be made smaller."""
         lenses = model.intrinsics
         names = [image.name for image in model.images]
         listing = model.folder / "images"
-        present = present_images(names, listing, folder, self.missing, relative_to=source)
-        warn_of_unposed(len(present), source)
-        if len(present) < 2:
-            raise scene_error(model.folder, "poses one image, expected one more to hold out")
+        present = present_images(names, listing, folder, self.missing, relative_to=source.path)
+        warn_of_unposed(len(present), source.path)
         positions = list(present)
         images = Transforms(
             model.folder,
             tuple(lenses[k] for k in positions),
             tuple(present.values()),
-            poses[positions].float(),
+            world.poses[positions].float(),
             None,
+            downscale=source.downscale,
+            bounds=SceneBounds(space=world.space, near=world.near, far=world.far, box=world.box),
         )
-        train, test = every_nth(len(positions), self.holdout, 0)
-        if self.dynamic is None and not dynamic_folders(folder):
-            why = "there is no folder dynamic_<V>views"
-            return static_alone(images[train], images[test], why), None
+        train, test = every_nth(len(positions), self.holdout, 0, where=model.folder)
         moving = chosen_dynamic(folder, self.dynamic)
-        views = view_folders(moving, factor)
-        posed = fixed_cameras(model, moving, len(views))
-        test_view = held_out_view(len(views), self.test_view)
-        moving_train, moving_test = fixed_views(
-            views, model.folder, poses[posed], tuple(lenses[k] for k in posed), test_view
-        )
-        # What the held-out camera saw of the scene at rest is held out, too.
-        unseen = {k for k, position in enumerate(positions) if position == posed[test_view]}
-        train = [k for k in train if k not in unseen]
-        test = sorted({*test, *unseen})
-        layout = Layout(
-            static_train=at_rest(images[train]),
-            static_test=at_rest(images[test]),
-            dynamic_train=moving_train,
-            dynamic_test=moving_test,
-        )
-        return layout, views[0].downscale
+        if moving is None:
+            why = "there is no folder dynamic_<V>views"
+            layout = static_alone(images[train], images[test], why)
+        else:
+            views = view_folders(moving, factor)
+            posed = fixed_cameras(model, moving, len(views))
+            test_view = held_out_view(len(views), self.test_view)
+            # What the held-out camera saw of the scene at rest is held out, too.
+            unseen = {k for k, position in enumerate(positions) if position == posed[test_view]}
+            train = [k for k in train if k not in unseen]
+            test = sorted({*test, *unseen})
+            layout = with_fixed_views(
+                (images[train], images[test]),
+                views,
+                posed_by=model.folder,
+                poses=world.poses[posed],
+                lenses=[lenses[k] for k in posed],
+                test=test_view,
+            )
+        return fewer(layout, self.train_views, self.frames)
 
-
-def _bounds(world: World, cut_out: bool) -> SceneBounds:
-    """What the sparse points say of where the scene is."""
-    if world.space == "ndc":
-        return SceneBounds(space="ndc", near=world.near)
-    if cut_out:  # then nothing is around it, whatever points lie there
-        return SceneBounds(space="world", box=world.box)
-    return SceneBounds(space="contracted", near=world.near, far=world.far, box=world.box)
+    def stated(self, layout: Layout, static: Capture) -> SceneBounds | None:
+        """What the sparse points say of where the scene is."""
+        known = layout.bounds
+        if known and known.space == "contracted" and static.train.cut_out:
+            # Nothing is around it, whatever points lie there.
+            return SceneBounds(space="world", box=known.box)
+        return known

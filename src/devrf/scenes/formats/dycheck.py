@@ -16,7 +16,7 @@ from devrf.scenes.files import Ids, Number, inside, read_json
 from devrf.scenes.formats.nerfies import ItemsReader, Listed
 from devrf.scenes.image_folders import Downscale, ImageFolder
 from devrf.scenes.names import ImageFinder
-from devrf.scenes.splits import every_nth
+from devrf.scenes.splits import parted
 from devrf.scenes.validation import scene_error
 from devrf.system.options import abbreviated
 
@@ -63,17 +63,13 @@ class DycheckReader(ItemsReader):
                 folder / VAL,
                 f"lists {abbreviated(both[0])}, as {TRAIN} does; list it in one of them",
             )
-        least = 1 if held_out else 2
-        count = len(learned)
-        if count < least:
-            raise scene_error(
-                folder / TRAIN, f"lists {count} images, expected at least {least}; add some"
-            )
-        if held_out:
-            items = [*learned, *held_out]
-            return items, list(range(count)), list(range(count, len(items)))
-        log.info("%s lists no image: one of %d training images is held out", VAL, self.holdout)
-        return list(learned), *every_nth(count, self.holdout)
+        if not held_out:
+            log.info("%s lists no image: one of %d training images is held out", VAL, self.holdout)
+        items = [*learned, *held_out]
+        positions = range(len(items))
+        first = len(learned)
+        file = folder / TRAIN
+        return items, *parted(positions[:first], positions[first:], self.holdout, file)
 
     def moments(self, folder: Path, ids: Sequence[str]) -> Sequence[float]:
         """The times in both splits."""

@@ -6,11 +6,12 @@ import logging
 import os
 from dataclasses import KW_ONLY, replace
 from pathlib import Path
+from typing import ClassVar
 
 from pydantic.dataclasses import dataclass
 
-from devrf.scenes.files import Positive, existing_folder, scene_folder
-from devrf.scenes.flow_files import FlowDirection, stacked_flow
+from devrf.scenes.files import Positive, existing_folder
+from devrf.scenes.flow_files import FlowDirection
 from devrf.scenes.formats.llff_poses import (
     POSES,
     PRECOMPUTED,
@@ -19,31 +20,22 @@ from devrf.scenes.formats.llff_poses import (
     read_precomputed_poses,
     read_static_poses,
 )
-from devrf.scenes.image_folders import folder_size, image_folder, listed_images
-from devrf.scenes.layout import Layout, fewer, load_layout, static_alone, without_static_set
+from devrf.scenes.image_folders import ImageFolder, folder_size, image_folder, listed_images
+from devrf.scenes.layout import Layout, fewer, static_alone, without_static_set
 from devrf.scenes.names import in_order
 from devrf.scenes.reader import FixedViewsReader, Time
-from devrf.scenes.scene import OpticalFlow, Scene, Views
+from devrf.scenes.scene import Capture, OpticalFlow, Scene, Views
 from devrf.scenes.space import forward_facing_scene
-from devrf.scenes.splits import (
-    Split,
-    at_rest,
-    at_times,
-    evenly_spread,
-    every_nth,
-    file_sizes,
-    in_motion,
-)
-from devrf.scenes.transforms import Transforms
+from devrf.scenes.splits import Split, at_times, evenly_spread, every_nth, in_motion
+from devrf.scenes.transforms import SceneBounds, Transforms
 from devrf.scenes.validation import scene_error
 from devrf.scenes.view_folders import (
-    ViewFolder,
     chosen_dynamic,
     dynamic_folders,
-    fixed_views,
-    flow_files,
+    flow_of_views,
     held_out_view,
     view_folders,
+    with_fixed_views,
 )
 
 log = logging.getLogger(__name__)
@@ -68,79 +60,64 @@ class LlffReader(FixedViewsReader):
         static_until: in a video, the latest time of an image that counts as static.
     """
 
+    has_flow_files: ClassVar[bool] = True
+
     _: KW_ONLY
     near: Positive | None = None
     monocular: bool | None = None
     static_until: Time = 1.0
 
-    def read(self) -> Scene:
-        """See :meth:`devrf.scenes.reader.SceneReader.read`."""
-        folder = scene_folder(self.root)
-        layout, downscale, views, near = self._layout(folder)
-        layout, thinned = fewer(layout, self.train_views, self.frames)
-        smaller = views[0].downscale if views else None
-        static, dynamic = load_layout(layout, folder, downscale, dynamic_downscale=smaller)
-        if views and self.wants_flow_files and thinned:
-            log.info("flow files dropped: data.frames=%s leaves out neighbours", self.frames)
-        elif views and self.wants_flow_files:
-            flow = _flow(dynamic.train, layout.dynamic_train, views, "bwd")
-            dynamic = replace(dynamic, train=replace(dynamic.train, flow=flow))
-        name = self.name_of(folder)
-        return forward_facing_scene(name, static, dynamic, self.near or near, self.background)
-
-    def forward_flow(self, views: Views) -> OpticalFlow | None:
-        """See :meth:`devrf.scenes.reader.SceneReader.forward_flow`."""
-        layout, _, folders, _ = self._layout(scene_folder(self.root))
-        layout, thinned = fewer(layout, self.train_views, self.frames)
-        if not folders or thinned:
-            return None
-        return _flow(views, layout.dynamic_train, folders, "fwd")
-
-    def _layout(self, folder: Path) -> tuple[Layout, int, list[ViewFolder], float]:
-        """The splits, by what static images are made smaller, the fixed views learned from, near.
-
-        The last is the distance of the near plane unless :attr:`near` says it.
-        """
+    def layout(self, folder: Path) -> Layout:
+        """See :meth:`devrf.scenes.reader.LayoutReader.layout`."""
         static = static_folder(folder)
-        moving = bool(dynamic_folders(folder)) or self.dynamic
+        moving = chosen_dynamic(folder, self.dynamic)
         if moving and self.monocular:
             raise scene_error(
                 "data.monocular", f"{folder} has fixed views, so it is no video; leave it null"
             )
         factor = self.choose_factor(folder_size(static))
-        source = image_folder(static, factor)
         # The cameras of fixed views are in LLFF's own unit, and the static ones have to be, too.
-        posed = _read_cameras(static, with_strays=bool(moving))
-        images = _posed_images(posed, source.path)
+        posed = _read_cameras(static, with_strays=moving is not None)
+        images = _posed_images(posed, image_folder(static, factor))
         video = self.monocular
         if video is None:
-            video = not moving and os.path.isfile(static / PRECOMPUTED)
-        near = posed.near_plane() if video else 1.0
+            video = moving is None and os.path.isfile(static / PRECOMPUTED)
         if video:
-            return self._video(images), source.downscale, [], near
-        train, test = (images[part] for part in every_nth(len(images.images), self.holdout, 0))
-        if not moving:
-            return static_alone(train, test, "there are no times"), source.downscale, [], near
-        folder = chosen_dynamic(folder, self.dynamic)
-        views = view_folders(folder, factor)
-        cameras = read_dynamic_poses(folder)
-        count = len(views)
-        if len(cameras) < count:
-            raise scene_error(
-                cameras.file,
-                f"has {len(cameras)} cameras, but there are {count} folders view1 …; add some",
+            near = SceneBounds(space="ndc", near=posed.near_plane())
+            layout = self._video(replace(images, bounds=near))
+            return fewer(layout, self.train_views, self.frames)
+        learned, held_out = every_nth(len(posed), self.holdout, 0, where=posed.file)
+        train, test = images[learned], images[held_out]
+        if moving is None:
+            layout = static_alone(train, test, "there are no times")
+        else:
+            views = view_folders(moving, factor)
+            cameras = read_dynamic_poses(moving)
+            count = len(views)
+            if len(cameras) < count:
+                raise scene_error(
+                    cameras.file,
+                    f"has {len(cameras)} cameras, but there are {count} folders view1 …; add some",
+                )
+            layout = with_fixed_views(
+                (train, test),
+                views,
+                posed_by=cameras.file,
+                poses=cameras.poses[-count:],
+                lenses=cameras.intrinsics[-count:],
+                test=held_out_view(count, self.test_view),
             )
-        unseen = held_out_view(count, self.test_view)
-        moving_train, moving_test = fixed_views(
-            views, cameras.file, cameras.poses[-count:], cameras.intrinsics[-count:], unseen
-        )
-        layout = Layout(
-            static_train=at_rest(train),
-            static_test=at_rest(test),
-            dynamic_train=moving_train,
-            dynamic_test=moving_test,
-        )
-        return layout, source.downscale, views[:unseen] + views[unseen + 1 :], near
+        return fewer(layout, self.train_views, self.frames)
+
+    def placed(self, folder: Path, layout: Layout, static: Capture, dynamic: Capture) -> Scene:
+        """See :meth:`devrf.scenes.reader.LayoutReader.placed`."""
+        near = self.near or (layout.bounds and layout.bounds.near) or 1.0
+        name = self.name_of(folder)
+        return forward_facing_scene(name, static, dynamic, near, self.background)
+
+    def flow_of(self, split: Split, views: Views, direction: FlowDirection) -> OpticalFlow | None:
+        """See :meth:`devrf.scenes.reader.LayoutReader.flow_of`."""
+        return flow_of_views(split, views, direction) if split.fixed else None
 
     def _video(self, images: Transforms) -> Layout:
         """The splits of images by one moving camera, in the order of their times."""
@@ -174,28 +151,14 @@ def _read_cameras(folder: Path, *, with_strays: bool) -> PosedSet:
     return read(folder).normalised(with_strays=with_strays)
 
 
-def _posed_images(posed: PosedSet, source: Path) -> Transforms:
+def _posed_images(posed: PosedSet, source: ImageFolder) -> Transforms:
     """All images in ``source`` with their cameras."""
-    images = listed_images(source, by_characters=True)
+    images = tuple(listed_images(source.path, by_characters=True))
     if len(images) != len(posed):
         raise scene_error(
             posed.file,
-            f"has {len(posed)} cameras, but {source} has {len(images)} images; remove some",
+            f"has {len(posed)} cameras, but {source.path} has {len(images)} images; remove some",
         )
-    if len(images) < 2:
-        raise scene_error(source, "holds one image, expected at least one more to hold out")
-    return Transforms(posed.file, posed.intrinsics, tuple(images), posed.poses.float(), None)
-
-
-def _flow(
-    views: Views, split: Split, folders: list[ViewFolder], direction: FlowDirection
-) -> OpticalFlow | None:
-    """The flow in the folders of the first views, as many as the split has."""
-    folders = folders[: int(views.view.max()) + 1]
-    files = flow_files(folders, direction)
-    if not files:
-        where = folders[0].flow
-        log.info("no optical flow: no <frame>_%s.npz in %s and its like", direction, where)
-        return None
-    rows = {frame * len(folders) + view: path for (view, frame), path in sorted(files.items())}
-    return stacked_flow(rows, file_sizes(split, views), views.cameras)
+    poses = posed.poses.float()
+    by = source.downscale
+    return Transforms(posed.file, posed.intrinsics, images, poses, None, downscale=by)

@@ -15,7 +15,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from devrf.geometry.cameras import Distortion
-from devrf.geometry.offset import Offset, offset_of, subtracted
+from devrf.geometry.offset import offset_of, subtracted
 from devrf.scenes.bounds import FALLBACK_BOUND_SCALE, axes_do_meet, box_of_frusta
 from devrf.scenes.files import (
     Ids,
@@ -25,22 +25,15 @@ from devrf.scenes.files import (
     Vector3,
     inside,
     read_json,
-    scene_folder,
 )
-from devrf.scenes.image_folders import (
-    Downscale,
-    ImageFolder,
-    folder_size,
-    image_folder,
-)
-from devrf.scenes.layout import fewer, load_layout, one_capture
+from devrf.scenes.image_folders import Downscale, ImageFolder, folder_size, image_folder
+from devrf.scenes.layout import Layout, fewer, one_capture
 from devrf.scenes.lens import Intrinsics
-from devrf.scenes.masks import Masks
 from devrf.scenes.names import present_images
 from devrf.scenes.reader import EstimatedFlow, InwardReader, Time
 from devrf.scenes.scene import Capture, Scene
-from devrf.scenes.splits import every_nth
-from devrf.scenes.transforms import Transforms
+from devrf.scenes.splits import parted
+from devrf.scenes.transforms import SceneBounds, Transforms
 from devrf.scenes.validation import FARTHEST, check_poses, scene_error
 from devrf.system.options import Several, abbreviated
 
@@ -63,32 +56,6 @@ class World(BaseModel):
     scale: Length
     near: Length
     far: Length
-
-
-def placed(
-    reader: InwardReader,
-    folder: Path,
-    world: World,
-    static: Capture,
-    dynamic: Capture,
-    offset: Offset,
-) -> Scene:
-    """The scene of two captures; near and far are from the options, or else from the world."""
-    near = world.near if reader.near is None else reader.near
-    far = world.far if reader.far is None else reader.far
-    options = replace(reader, near=near, far=far)
-    cameras = static.train.cameras
-    wide = reader.box is None and not static.train.cut_out and 0 <= near < far
-    if not wide or (reader.space != "world" and axes_do_meet(cameras)):
-        return options.scene(folder, static, dynamic, offset)
-    # Without alpha masks the backdrop is to be learned too.
-    frusta_box = box_of_frusta(cameras, near, far).moved(offset)
-    scale = FALLBACK_BOUND_SCALE if reader.bound_scale == "auto" else reader.bound_scale
-    options = replace(options, box=frusta_box, space="world", bound_scale=scale)
-    scene = options.scene(folder, static, dynamic, offset)
-    why = "data.space=world" if reader.space == "world" else "the cameras look in one direction"
-    bounds = replace(scene.bounds, reason=why, box_source="all that the cameras see up to far")
-    return replace(scene, bounds=bounds)
 
 
 class Camera(BaseModel):
@@ -182,9 +149,8 @@ class ItemsReader(InwardReader):
         """The masks of images; what they leave out is ignored. None: no masks."""
         return None
 
-    def read(self) -> Scene:
-        """See :meth:`devrf.scenes.reader.SceneReader.read`."""
-        folder = scene_folder(self.root)
+    def layout(self, folder: Path) -> Layout:
+        """See :meth:`devrf.scenes.reader.LayoutReader.layout`."""
         items, *split = self.listed(folder)
         listing = folder / self.listing
         world = read_json(
@@ -205,23 +171,41 @@ class ItemsReader(InwardReader):
         poses = torch.stack([pose for pose, _ in cameras])
         offset = offset_of(poses)
         moments = self.moments(folder, ids)
-        masks = self.masks_of(folder, ids, images)
         first = min(moments)
-        span = (max(moments) - min(moments)) or 1.0
+        span = (max(moments) - first) or 1.0
         posed = Transforms(
             listing,
             tuple(intrinsics for _, intrinsics in cameras),
             tuple(present.values()),
             subtracted(poses, offset).float(),
             tuple((moment - first) / span for moment in moments),
-            masks,
+            self.masks_of(folder, ids, images),
+            downscale=images.downscale,
+            bounds=SceneBounds(space="contracted", near=world.near, far=world.far),
             offset=offset,
         )
         layout = one_capture(posed[train], posed[test], self.static_until)
-        layout, _ = fewer(layout, None, self.frames)
-        ignored: Masks = "none" if masks is None else "ignore"
-        static, dynamic = load_layout(layout, folder, images.downscale, ignored)
-        return placed(self, folder, world, static, dynamic, offset)
+        return fewer(layout, None, self.frames)
+
+    def placed(self, folder: Path, layout: Layout, static: Capture, dynamic: Capture) -> Scene:
+        """See :meth:`devrf.scenes.reader.LayoutReader.placed`."""
+        stated = layout.bounds
+        assert stated and stated.near and stated.far  # those of scene.json
+        near = stated.near if self.near is None else self.near
+        far = stated.far if self.far is None else self.far
+        options = replace(self, near=near, far=far)
+        cameras = static.train.cameras
+        wide = self.box is None and not static.train.cut_out and 0 <= near < far
+        if not wide or (self.space != "world" and axes_do_meet(cameras)):
+            return InwardReader.placed(options, folder, layout, static, dynamic)
+        # Without alpha masks the backdrop is to be learned too.
+        frusta_box = box_of_frusta(cameras, near, far).moved(layout.offset)
+        scale = FALLBACK_BOUND_SCALE if self.bound_scale == "auto" else self.bound_scale
+        options = replace(options, box=frusta_box, space="world", bound_scale=scale)
+        scene = InwardReader.placed(options, folder, layout, static, dynamic)
+        why = "data.space=world" if self.space == "world" else "the cameras look in one direction"
+        bounds = replace(scene.bounds, reason=why, box_source="all that the cameras see up to far")
+        return replace(scene, bounds=bounds)
 
 
 class _Dataset(BaseModel):
@@ -271,23 +255,12 @@ class NerfiesReader(ItemsReader):
             raise scene_error(
                 file, f'{abbreviated(unknown[0])} is in train_ids or val_ids, but not in "ids"'
             )
-        if not val:
-            chosen = [position[item] for item in train or items]
-            if len(chosen) < 2:
-                raise scene_error(
-                    file, f"lists {len(chosen)} images to learn from, none in val_ids; add some"
-                )
-            learn, held_out = every_nth(len(chosen), self.holdout)
-            return items, [chosen[i] for i in learn], [chosen[i] for i in held_out]
         both = set(train) & set(val)
         if both:
             log.warning("%s: %d images of val_ids are in train_ids too; held out", file, len(both))
         learned = [position[item] for item in train or items if item not in set(val)]
-        if not learned:
-            raise scene_error(
-                file, "all images are held out by val_ids; list some in train_ids only"
-            )
-        return items, learned, [position[item] for item in val]
+        held_out = [position[item] for item in val]
+        return items, *parted(learned, held_out, self.holdout, file)
 
     def moments(self, folder: Path, ids: Sequence[str]) -> Sequence[float]:
         """The times in ``metadata.json``: all ``time_id``, or else all ``warp_id``."""

@@ -6,22 +6,18 @@ import logging
 import os
 from dataclasses import KW_ONLY, replace
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
-from devrf.geometry.offset import Offset
-from devrf.scenes.files import inside, scene_folder
 from devrf.scenes.image_folders import Downscale
-from devrf.scenes.layout import Layout, fewer, load_layout, one_capture, static_alone
+from devrf.scenes.layout import Layout, fewer, one_capture, static_alone, two_captures
 from devrf.scenes.masks import Masks
-from devrf.scenes.names import ImageFinder
 from devrf.scenes.reader import EstimatedFlow, PosedReader, Time
-from devrf.scenes.scene import Scene
-from devrf.scenes.splits import at_rest, distinct_poses, every_nth, in_motion, one_moment
-from devrf.scenes.transforms import TIME_TOLERANCE, Transforms, read_transforms
+from devrf.scenes.splits import distinct_poses, every_nth, one_moment
+from devrf.scenes.transforms import TIME_TOLERANCE, Transforms, TransformsFiles
 from devrf.scenes.validation import scene_error
 from devrf.system.options import Count, Several, abbreviated
 
@@ -60,6 +56,8 @@ class NerfstudioReader(PosedReader):
             itself (``scene_bounds``) what ``auto`` is.
     """
 
+    stater: ClassVar[str] = f"scene_bounds in {FILE}"
+
     _: KW_ONLY
     downscale: Downscale = "auto"
     flow: EstimatedFlow = "auto"
@@ -69,100 +67,67 @@ class NerfstudioReader(PosedReader):
     static_until: Time | None = None
     masks: Masks = "ignore"
 
-    def read(self) -> Scene:
-        """See :meth:`devrf.scenes.reader.SceneReader.read`."""
-        folder = scene_folder(self.root)
-        layout = _layout(folder, self)
-        layout, _ = fewer(layout, self.train_views, self.frames)
-        factor = self.choose_factor(layout.size_at)
-        static, dynamic = load_layout(layout, folder, factor, self.masks)
-        bounds = layout.static_train.transforms.bounds
-        stater = f"scene_bounds in {FILE}"
-        return self.placed(folder, static, dynamic, bounds, stater, layout.offset)
+    def layout(self, folder: Path) -> Layout:
+        """See :meth:`devrf.scenes.reader.LayoutReader.layout`."""
+        files = TransformsFiles(folder, self.missing, self.masks)
+        if os.path.isfile(folder / FILE):
+            train, test, validation = self._splits(files, folder / FILE)
+            layout = _one_file(train, test, self.static_until)
+            if layout.static_train.transforms is not layout.dynamic_train.transforms:
+                validation = validation[_seen_moving(validation)]
+        else:
+            still = folder / "static" / FILE
+            moving = folder / "dynamic" / FILE
+            train, test, validation = replace(self, times="file")._splits(files, still)
+            if os.path.isfile(moving):
+                resting = (train, test)
+                train, test, validation = self._splits(files, moving)
+                if train.times is None:
+                    raise scene_error(
+                        moving, 'its frames have no "time"; give every frame its time in [0, 1]'
+                    )
+                layout = two_captures(resting, (train, test))
+            else:
+                layout = static_alone(train, test, f"there is no dynamic/{FILE}")
+        layout = layout.with_validation(validation)
+        return fewer(layout, self.train_views, self.frames)
 
+    def _splits(
+        self, files: TransformsFiles, file: Path
+    ) -> tuple[Transforms, Transforms, Transforms]:
+        """The images of a file to learn from, to test on, and in its validation list, if wanted."""
+        listing, transforms = files.read(file, times_by_order=self.times == "order")
+        position = {image: k for k, image in enumerate(transforms.images)}
 
-def _layout(root: Path, options: NerfstudioReader) -> Layout:
-    if os.path.isfile(root / FILE):
-        train, test, validation = _splits(root / FILE, root, options)
-        layout = _one_file(train, test, options.static_until)
-        if layout.static_train.transforms is not layout.dynamic_train.transforms:
-            validation = validation[_seen_moving(validation)]
-        return layout.with_validation(validation)
-    still = root / "static" / FILE
-    moving = root / "dynamic" / FILE
-    train, test, validation = _splits(still, root, replace(options, times="file"))
-    if not os.path.isfile(moving):
-        layout = static_alone(train, test, f"there is no dynamic/{FILE}")
-        return layout.with_validation(validation)
-    static_train = at_rest(train)
-    static_test = at_rest(test)
-    train, test, validation = _splits(moving, root, options, train.offset)
-    if train.times is None:
-        raise scene_error(moving, 'its frames have no "time"; give every frame its time in [0, 1]')
-    layout = Layout(
-        static_train=static_train,
-        static_test=static_test,
-        dynamic_train=in_motion(train),
-        dynamic_test=in_motion(test),
-    )
-    return layout.with_validation(validation)
+        def listed(key: str) -> set[int]:
+            """Positions of the images that it lists."""
+            positions = set[int]()
+            for name in getattr(listing, key) or ():
+                image = files.find(name, file)
+                if image in position:
+                    positions.add(position[image])
+                elif image is not None or not transforms.skipped:
+                    what = f"{key} lists {abbreviated(name)}, which is in no frame; correct it"
+                    raise scene_error(file, what)
+            return positions
 
-
-def _splits(
-    file: Path, root: Path, options: NerfstudioReader, offset: Offset | None = None
-) -> tuple[Transforms, Transforms, Transforms]:
-    """The images of a file to learn from, to test on, and in its validation list, if asked for.
-
-    ``offset`` is that of the scene's other file, if it has been read.
-    """
-    listing, transforms = read_transforms(
-        file,
-        root,
-        masked=options.masks != "none",
-        missing=options.missing,
-        times_by_order=options.times == "order",
-        offset=offset,
-    )
-    count = len(transforms.images)
-    if count == 1:
-        raise scene_error(file, "lists one image; add more, one of them to hold out")
-    listed = {
-        split: _listed(getattr(listing, f"{split}_filenames"), split, transforms, root)
-        for split in ("train", "val", "test")
-    }
-    test = listed["test"] or listed["val"]
-    elsewhere = set(listed["val"] + listed["test"])
-    train = listed["train"] or [i for i in range(count) if i not in elsewhere]
-    if listed["train"] and not test:
-        test = sorted(set(range(count)) - set(train))
-    elif not test:
-        train, test = every_nth(count, options.holdout)
-    if not train or not test or set(train) & set(test):
-        raise scene_error(
-            file,
-            f"{len(train)} images to learn from, {len(test)} held out, "
-            f"{len(set(train) & set(test))} of them both; correct train_filenames, test_filenames",
-        )
-    validation = listed["val"] if options.validation else []
-    return transforms[train], transforms[test], transforms[validation]
-
-
-def _listed(names: list[str] | None, split: str, transforms: Transforms, root: Path) -> list[int]:
-    """Positions in the file, ascending, of the images that it lists for a split."""
-    position = {image: i for i, image in enumerate(transforms.images)}
-    positions = list[int]()
-    finder = ImageFinder(root)
-    for name in names or []:
-        image = finder.find(inside(root, transforms.file.parent, name, transforms.file))
-        if image is None and transforms.skipped:
-            continue
-        if image not in position:
+        everyone = set(range(len(transforms.images)))
+        train = listed("train_filenames")
+        val = listed("val_filenames")
+        test = listed("test_filenames") or val
+        if train or test:
+            test = test or everyone - train
+            train = train or everyone - val - test
+        else:
+            train, test = map(set, every_nth(len(everyone), self.holdout, where=file))
+        if not train or not test or train & test:
             raise scene_error(
-                transforms.file,
-                f"{split}_filenames lists {abbreviated(name)}, which is in no frame; correct it",
+                file,
+                f"{len(train)} images to learn from, {len(test)} held out, {len(train & test)} of "
+                "them both; correct train_filenames, test_filenames",
             )
-        positions.append(position[image])
-    return sorted(set(positions))
+        validation = val if self.validation else ()
+        return transforms[sorted(train)], transforms[sorted(test)], transforms[sorted(validation)]
 
 
 def _one_file(train: Transforms, test: Transforms, static_until: float | None) -> Layout:
@@ -191,12 +156,7 @@ def _one_file(train: Transforms, test: Transforms, static_until: float | None) -
         still_test = still[:1]
         rest_test = train
     log.info("%d images at time 0 are the static set of %d", len(still), len(times))
-    return Layout(
-        at_rest(train[still]),
-        at_rest(rest_test[still_test]),
-        in_motion(train[moving]),
-        in_motion(test[moving_test]),
-    )
+    return two_captures((train[still], rest_test[still_test]), (train[moving], test[moving_test]))
 
 
 def _seen_moving(transforms: Transforms) -> list[int]:
