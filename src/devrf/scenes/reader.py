@@ -62,6 +62,7 @@ class SceneReader(Options, ABC):
         downscale: integer factor ≥ 1 by which images and flow are made smaller; ``auto``, ``cpu``,
             ``gpu``, ``up_to_<factor>``: see :func:`~devrf.scenes.image_folders.whole_factor`.
         factor: by what images were made smaller; known once they have been read.
+        has_flow_files: whether the layout has a place for flow files.
         background: what is behind the alpha masks of RGBA images; RGB images are used as they are.
         flow: ``auto`` reads the scene's backward flow where it has files of it, ``files`` insists
             on them, ``dis`` and ``raft`` estimate it, ``none`` does without.
@@ -89,6 +90,7 @@ class SceneReader(Options, ABC):
     validation: bool = False
 
     factor: ClassVar[int] = 1
+    has_flow_files: ClassVar[bool] = False
 
     def choose_factor(self, size_at: SizeAt) -> int:
         """The factor by which images of such sizes are made smaller; sets :attr:`factor`."""
@@ -111,34 +113,32 @@ class SceneReader(Options, ABC):
 
     @property
     def wants_flow_files(self) -> bool:
-        """Whether flow is to be read from files."""
-        return self.flow in ("auto", "files")
+        """Whether flow is to be read from files, and there is a place for them."""
+        return self.has_flow_files and self.flow in ("auto", "files")
 
-    def name_of(self, folder: Path) -> str:
+    @property
+    def scene_name(self) -> str:
         """The scene's name, its folder's where none was given."""
-        return self.name or folder.resolve().name
+        return self.name or scene_folder(self.root).resolve().name
 
 
 @dataclass(frozen=True)
 class LayoutReader(SceneReader):
-    """Reads what lists images and their poses: a :class:`~devrf.scenes.layout.Layout`.
-
-    Attributes:
-        has_flow_files: whether there is a place for flow files, which :meth:`flow_of` reads.
-    """
-
-    has_flow_files: ClassVar[bool] = False
+    """Reads what lists images and their poses: a :class:`~devrf.scenes.layout.Layout`."""
 
     @abstractmethod
     def layout(self, folder: Path) -> Layout:
         """The splits of the scene in ``folder``, no image read but its header."""
 
     @abstractmethod
-    def placed(self, folder: Path, layout: Layout, static: Capture, dynamic: Capture) -> Scene:
-        """The scene of the captures that were read from ``folder``, its bounds found."""
+    def placed(self, layout: Layout, static: Capture, dynamic: Capture) -> Scene:
+        """The scene of the captures that were read, its bounds found."""
 
     def flow_of(self, split: Split, views: Views, direction: FlowDirection) -> OpticalFlow | None:
-        """The flow in the files of a split's images, which are ``views``; None: there are none."""
+        """The flow in the files of a split's images, which are ``views``; None: there are none.
+
+        It is asked for only where :attr:`has_flow_files`.
+        """
         return None
 
     def read(self) -> Scene:
@@ -151,16 +151,14 @@ class LayoutReader(SceneReader):
             flow = self._flow(layout, dynamic.train, "bwd")
             if flow is not None:  # else the captures may share images
                 dynamic = replace(dynamic, train=replace(dynamic.train, flow=flow))
-        return self.placed(folder, layout, static, dynamic)
+        return self.placed(layout, static, dynamic)
 
     def forward_flow(self, views: Views) -> OpticalFlow | None:
         """See :meth:`SceneReader.forward_flow`."""
-        if not self.has_flow_files:
-            return None
         return self._flow(self.layout(scene_folder(self.root)), views, "fwd")
 
     def _flow(self, layout: Layout, views: Views, direction: FlowDirection) -> OpticalFlow | None:
-        if not self.has_flow_files or not layout.moves:
+        if not layout.moves:
             return None
         if layout.thinned:
             log.info("flow files dropped: data.frames=%s leaves out neighbours", self.frames)
@@ -215,13 +213,13 @@ class InwardReader(LayoutReader):
     missing: Missing = "error"
     space: SpaceChoice = "auto"
 
-    def placed(self, folder: Path, layout: Layout, static: Capture, dynamic: Capture) -> Scene:
+    def placed(self, layout: Layout, static: Capture, dynamic: Capture) -> Scene:
         """See :meth:`LayoutReader.placed`.
 
         The layout's offset is subtracted from positions already, and here from the box.
         """
         offset = layout.offset
-        name = self.name_of(folder)
+        name = self.scene_name
         box = self.box
         if any(offset):
             log.info(
@@ -266,20 +264,20 @@ class PosedReader(InwardReader):
         """Where the scene is, if that is known."""
         return layout.bounds
 
-    def placed(self, folder: Path, layout: Layout, static: Capture, dynamic: Capture) -> Scene:
+    def placed(self, layout: Layout, static: Capture, dynamic: Capture) -> Scene:
         """See :meth:`LayoutReader.placed`; captures of a scene always at rest are one.
 
         DevrfError if neither options nor cameras say where it is.
         """
         reader = _with_bounds(self, self.stated(layout, static))
         if reader.space != "ndc":
-            scene = InwardReader.placed(reader, folder, layout, static, dynamic)
+            scene = InwardReader.placed(reader, layout, static, dynamic)
             reason = scene.bounds.reason if reader.space == self.space else self.stater
             box_is_stated = self.box is None and reader.box is not None
             box_source = self.stater if box_is_stated else scene.bounds.box_source
             bounds = replace(scene.bounds, reason=reason, box_source=box_source)
             return replace(scene, bounds=bounds)
-        name = self.name_of(folder)
+        name = self.scene_name
         static, dynamic = centred(static, dynamic)
         if reader.near is None or reader.near <= 0:
             apart = float(static.train.cameras.positions.norm(dim=1).max())

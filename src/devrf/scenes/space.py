@@ -162,7 +162,7 @@ def dynamic_only(scene: Scene) -> Scene:
     """
     views = scene.dynamic.train
     held_out = scene.dynamic.test
-    at_rest = Capture(train=_earliest(views), test=_earliest(held_out))
+    at_rest = Capture(train=earliest(views), test=earliest(held_out))
     if isinstance(scene.space, NormalizedDevice):
         bounds = forward_bounds([views], scene.space, "all that the dynamic cameras see")
         return replace(scene, static=at_rest, bounds=bounds)
@@ -173,5 +173,6 @@ def dynamic_only(scene: Scene) -> Scene:
     return replace(scene, static=at_rest, bounds=bounds, space=space)
 
 
-def _earliest(views: Views) -> Views:
+def earliest(views: Views) -> Views:
+    """Those of the views that were taken first."""
     return views[(views.times == views.times.min()).nonzero()[:, 0]]

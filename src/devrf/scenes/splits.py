@@ -24,36 +24,37 @@ from devrf.scenes.validation import same_shape, scene_error
 log = logging.getLogger(__name__)
 
 
-def every_nth(
-    count: int, holdout: int, start: int | None = None, *, where: object = "images"
-) -> tuple[list[int], list[int]]:
-    """The positions to learn from and those to hold out, of ``count`` images.
+def every_nth(count: int, holdout: int, start: int | None = None) -> tuple[list[int], list[int]]:
+    """The positions to learn from and those to hold out, of ``count`` ≥ 2 images.
 
     Every ``holdout``-th (≥ 2) is held out, or the last one if there are fewer. ``start`` is the
     first that is held out: 0 for images at rest, as LLFF's scenes are scored; None:
-    ``holdout`` − 1, since a sequence begins at rest. DevrfError that names ``where`` the images
-    are listed, if there are fewer than two.
+    ``holdout`` − 1, since a sequence begins at rest.
     """
-    if count < 2:
-        number = "one image" if count else "no image"
-        raise scene_error(where, f"lists {number}; add more, one of them to hold out")
     start = holdout - 1 if start is None else start
     held_out = list(range(start, count, holdout)) or [count - 1]
     return sorted(set(range(count)) - set(held_out)), held_out
 
 
 def parted(
-    train: Sequence[int], test: Sequence[int], holdout: int, where: object
+    train: Sequence[int],
+    test: Sequence[int],
+    holdout: int,
+    where: object,
+    start: int | None = None,
 ) -> tuple[list[int], list[int]]:
-    """The positions to learn from and to hold out: if none are listed to ``test``, every n-th.
+    """The positions to learn from and to hold out; without ``test``, some of ``train`` are.
 
-    DevrfError that names ``where`` they are listed, if there are none to learn from, or one alone.
+    These are then as :func:`every_nth` says. DevrfError if ``where`` lists too few of them.
     """
     if test and not train:
         raise scene_error(where, "all images are held out; list some to learn from")
     if test:
         return list(train), list(test)
-    learned, held_out = every_nth(len(train), holdout, where=where)
+    if len(train) < 2:
+        number = "one image" if train else "no image"
+        raise scene_error(where, f"lists {number}; add more, one of them to hold out")
+    learned, held_out = every_nth(len(train), holdout, start)
     return [train[k] for k in learned], [train[k] for k in held_out]
 
 

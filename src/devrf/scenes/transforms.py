@@ -120,7 +120,7 @@ class Transforms:
         masks: N existing files inside the scene's folder, None for an image without one; None if
             they were not asked for.
         cut_out: whether what masks leave out is background; else it is ignored.
-        downscale: by what the images are yet to be made smaller; None: as those of the scene.
+        downscale: by what the images are yet to be made smaller; None: that is not chosen yet.
         skipped: how many images of the file are absent, and left out.
         bounds: where the scene is, if the file says so, in the world of the file.
         unread_times: keys of frames that say something of time, but are not read.

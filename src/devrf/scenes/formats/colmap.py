@@ -18,7 +18,7 @@ from devrf.scenes.names import ImageFinder, present_images
 from devrf.scenes.reader import EstimatedFlow, FixedViewsReader, PosedReader
 from devrf.scenes.scene import Capture
 from devrf.scenes.sparse_model import Facing, SparseModel, normalised, scene_model
-from devrf.scenes.splits import every_nth
+from devrf.scenes.splits import parted
 from devrf.scenes.transforms import SceneBounds, Transforms
 from devrf.scenes.validation import scene_error
 from devrf.scenes.view_folders import (
@@ -163,7 +163,7 @@ class ColmapReader(PosedReader, FixedViewsReader):
             downscale=source.downscale,
             bounds=SceneBounds(space=world.space, near=world.near, far=world.far, box=world.box),
         )
-        train, test = every_nth(len(positions), self.holdout, 0, where=model.folder)
+        train, test = parted(range(len(positions)), (), self.holdout, model.folder, start=0)
         moving = chosen_dynamic(folder, self.dynamic)
         if moving is None:
             why = "there is no folder dynamic_<V>views"

@@ -26,7 +26,7 @@ from devrf.scenes.names import in_order
 from devrf.scenes.reader import FixedViewsReader, Time
 from devrf.scenes.scene import Capture, OpticalFlow, Scene, Views
 from devrf.scenes.space import forward_facing_scene
-from devrf.scenes.splits import Split, at_times, evenly_spread, every_nth, in_motion
+from devrf.scenes.splits import Split, at_times, evenly_spread, every_nth, in_motion, parted
 from devrf.scenes.transforms import SceneBounds, Transforms
 from devrf.scenes.validation import scene_error
 from devrf.scenes.view_folders import (
@@ -86,8 +86,8 @@ class LlffReader(FixedViewsReader):
             near = SceneBounds(space="ndc", near=posed.near_plane())
             layout = self._video(replace(images, bounds=near))
             return fewer(layout, self.train_views, self.frames)
-        learned, held_out = every_nth(len(posed), self.holdout, 0, where=posed.file)
-        train, test = images[learned], images[held_out]
+        parts = parted(range(len(posed)), (), self.holdout, posed.file, start=0)
+        train, test = (images[part] for part in parts)
         if moving is None:
             layout = static_alone(train, test, "there are no times")
         else:
@@ -109,11 +109,10 @@ class LlffReader(FixedViewsReader):
             )
         return fewer(layout, self.train_views, self.frames)
 
-    def placed(self, folder: Path, layout: Layout, static: Capture, dynamic: Capture) -> Scene:
+    def placed(self, layout: Layout, static: Capture, dynamic: Capture) -> Scene:
         """See :meth:`devrf.scenes.reader.LayoutReader.placed`."""
         near = self.near or (layout.bounds and layout.bounds.near) or 1.0
-        name = self.name_of(folder)
-        return forward_facing_scene(name, static, dynamic, near, self.background)
+        return forward_facing_scene(self.scene_name, static, dynamic, near, self.background)
 
     def flow_of(self, split: Split, views: Views, direction: FlowDirection) -> OpticalFlow | None:
         """See :meth:`devrf.scenes.reader.LayoutReader.flow_of`."""

@@ -187,7 +187,7 @@ class ItemsReader(InwardReader):
         layout = one_capture(posed[train], posed[test], self.static_until)
         return fewer(layout, None, self.frames)
 
-    def placed(self, folder: Path, layout: Layout, static: Capture, dynamic: Capture) -> Scene:
+    def placed(self, layout: Layout, static: Capture, dynamic: Capture) -> Scene:
         """See :meth:`devrf.scenes.reader.LayoutReader.placed`."""
         stated = layout.bounds
         assert stated and stated.near and stated.far  # those of scene.json
@@ -197,12 +197,12 @@ class ItemsReader(InwardReader):
         cameras = static.train.cameras
         wide = self.box is None and not static.train.cut_out and 0 <= near < far
         if not wide or (self.space != "world" and axes_do_meet(cameras)):
-            return InwardReader.placed(options, folder, layout, static, dynamic)
+            return InwardReader.placed(options, layout, static, dynamic)
         # Without alpha masks the backdrop is to be learned too.
         frusta_box = box_of_frusta(cameras, near, far).moved(layout.offset)
         scale = FALLBACK_BOUND_SCALE if self.bound_scale == "auto" else self.bound_scale
         options = replace(options, box=frusta_box, space="world", bound_scale=scale)
-        scene = InwardReader.placed(options, folder, layout, static, dynamic)
+        scene = InwardReader.placed(options, layout, static, dynamic)
         why = "data.space=world" if self.space == "world" else "the cameras look in one direction"
         bounds = replace(scene.bounds, reason=why, box_source="all that the cameras see up to far")
         return replace(scene, bounds=bounds)

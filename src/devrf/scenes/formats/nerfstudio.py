@@ -16,7 +16,7 @@ from devrf.scenes.image_folders import Downscale
 from devrf.scenes.layout import Layout, fewer, one_capture, static_alone, two_captures
 from devrf.scenes.masks import Masks
 from devrf.scenes.reader import EstimatedFlow, PosedReader, Time
-from devrf.scenes.splits import distinct_poses, every_nth, one_moment
+from devrf.scenes.splits import distinct_poses, one_moment, parted
 from devrf.scenes.transforms import TIME_TOLERANCE, Transforms, TransformsFiles
 from devrf.scenes.validation import scene_error
 from devrf.system.options import Count, Several, abbreviated
@@ -119,7 +119,7 @@ class NerfstudioReader(PosedReader):
             test = test or everyone - train
             train = train or everyone - val - test
         else:
-            train, test = map(set, every_nth(len(everyone), self.holdout, where=file))
+            train, test = map(set, parted(sorted(everyone), (), self.holdout, file))
         if not train or not test or train & test:
             raise scene_error(
                 file,

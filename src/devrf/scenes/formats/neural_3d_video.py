@@ -25,7 +25,7 @@ from devrf.scenes.names import in_order
 from devrf.scenes.reader import EstimatedFlow, SceneReader
 from devrf.scenes.resampling import shrink_pixels
 from devrf.scenes.scene import Capture, Scene, Views
-from devrf.scenes.space import forward_facing_scene
+from devrf.scenes.space import earliest, forward_facing_scene
 from devrf.scenes.splits import pinholes
 from devrf.scenes.validation import check_memory, reduced_size, scene_error
 from devrf.system.options import Count, Several, Whole
@@ -181,8 +181,8 @@ class Neural3DVideoReader(SceneReader):
             train=_views(videos, posed, train, frames, times, factor),
             test=_views(videos, posed, [test], frames, times, factor),
         )
-        still = Capture(train=_first_frame(moving.train), test=_first_frame(moving.test))
-        return forward_facing_scene(self.name_of(folder), still, moving, self.near, self.background)
+        still = moving.mapped(earliest)
+        return forward_facing_scene(self.scene_name, still, moving, self.near, self.background)
 
     def _split(self, videos: CameraVideos) -> tuple[int, list[int]]:
         """Positions of the held-out video and of those to learn from."""
@@ -210,10 +210,6 @@ class Neural3DVideoReader(SceneReader):
         count = total if self.frames is None else min(self.frames, total)
         frames = torch.linspace(0, total - 1, count, dtype=torch.float64).round().long()
         return frames.tolist(), (frames / (total - 1)).float()
-
-
-def _first_frame(views: Views) -> Views:
-    return views[(views.times == 0).nonzero()[:, 0]]
 
 
 def _views(
