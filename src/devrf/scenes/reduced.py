@@ -11,7 +11,7 @@ from torch import Tensor
 
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.scenes.resampling import shrink_flow, shrink_pixels
-from devrf.scenes.scene import OpticalFlow, Scene, Views
+from devrf.scenes.scene import OpticalFlow, Scene, Views, both_mapped
 from devrf.scenes.validation import MIN_SIDE
 
 
@@ -20,21 +20,15 @@ def reduced(scene: Scene, longest: int) -> Scene:
 
     Sides keep their proportion, but are no shorter than what a reader takes.
     """
-    smaller: dict[int, Views] = {}
-
-    def of(views: Views) -> Views:
-        # A film's images are both captures: they stay one.
-        if id(views) not in smaller:
-            smaller[id(views)] = _reduced_views(views, longest)
-        return smaller[id(views)]
-
     space = scene.space
     if isinstance(space, NormalizedDevice):
         width, height = _size(space.width, space.height, longest)
         focal = (space.focal[0] * width / space.width, space.focal[1] * height / space.height)
         space = replace(space, width=width, height=height, focal=focal)
-    static = scene.static.mapped(of)
-    return replace(scene, static=static, dynamic=scene.dynamic.mapped(of), space=space)
+    static, dynamic = both_mapped(
+        scene.static, scene.dynamic, lambda views: _reduced_views(views, longest)
+    )
+    return replace(scene, static=static, dynamic=dynamic, space=space)
 
 
 def _size(width: int, height: int, longest: int) -> tuple[int, int]:

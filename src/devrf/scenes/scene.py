@@ -179,6 +179,20 @@ class Capture:
         return Capture(change(self.train), change(self.test), validation)
 
 
+def both_mapped(
+    static: Capture, dynamic: Capture, change: Callable[[Views], Views]
+) -> tuple[Capture, Capture]:
+    """Both captures with ``change`` made to all views, once to those that they share."""
+    changed: dict[int, Views] = {}
+
+    def once(views: Views) -> Views:
+        if id(views) not in changed:
+            changed[id(views)] = change(views)
+        return changed[id(views)]
+
+    return static.mapped(once), dynamic.mapped(once)
+
+
 @dataclass(frozen=True)
 class Bounds:
     """Where the scene is, in the space that its fields live in (world units, or NDC).
@@ -243,16 +257,13 @@ class Scene:
 
     def __post_init__(self) -> None:
         clock = self.clock
-        numbered = dict[int, Views]()
-
-        def with_frames(views: Views) -> Views:
-            # A moving camera's images may be both captures: they stay one.
-            if id(views) not in numbered:
-                numbered[id(views)] = replace(views, frames=clock.frames_of(views.times))
-            return numbered[id(views)]
-
-        for name in ("static", "dynamic"):
-            object.__setattr__(self, name, getattr(self, name).mapped(with_frames))
+        static, dynamic = both_mapped(
+            self.static,
+            self.dynamic,
+            lambda views: replace(views, frames=clock.frames_of(views.times)),
+        )
+        object.__setattr__(self, "static", static)
+        object.__setattr__(self, "dynamic", dynamic)
 
     @property
     def is_film(self) -> bool:

@@ -21,7 +21,7 @@ from devrf.scenes.bounds import (
     inward_bounds,
     reference_space,
 )
-from devrf.scenes.scene import Background, Bounds, Capture, Scene, Views
+from devrf.scenes.scene import Background, Bounds, Capture, Scene, Views, both_mapped
 from devrf.scenes.silhouettes import motion_box
 from devrf.scenes.validation import scene_error
 
@@ -142,15 +142,12 @@ def centred(static: Capture, dynamic: Capture) -> tuple[Capture, Capture]:
     """Both captures in a world in which the static cameras' average pose is the identity."""
     both = (static.train, static.test)
     frame = average_pose(torch.cat([v.cameras.camera_to_world.double() for v in both]))
-    moved: dict[int, Views] = {}
 
     def in_frame(views: Views) -> Views:
-        if id(views) not in moved:  # captures that share images go on sharing them
-            poses = relative_to(frame, views.cameras.camera_to_world.double()).float()
-            moved[id(views)] = replace(views, cameras=replace(views.cameras, camera_to_world=poses))
-        return moved[id(views)]
+        poses = relative_to(frame, views.cameras.camera_to_world.double()).float()
+        return replace(views, cameras=replace(views.cameras, camera_to_world=poses))
 
-    return static.mapped(in_frame), dynamic.mapped(in_frame)
+    return both_mapped(static, dynamic, in_frame)
 
 
 def dynamic_only(scene: Scene) -> Scene:
