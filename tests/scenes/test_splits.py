@@ -11,11 +11,12 @@ import pytest
 import torch
 
 from devrf.data.flow import with_flow
+from devrf.errors import DevrfError
 from devrf.scenes.formats.blender import BlenderReader
 from devrf.scenes.formats.llff import LlffReader
 from devrf.scenes.formats.nerfstudio import NerfstudioReader
 from devrf.scenes.scene import Scene
-from devrf.scenes.splits import SAME_POSE, distinct_poses
+from devrf.scenes.splits import SAME_POSE, distinct_poses, parted
 
 
 def test_poses_are_told_apart_up_to_rounding():
@@ -98,3 +99,16 @@ def test_nerfstudio_without_times(tmp_path, balls):
     assert_at_rest(NerfstudioReader(tmp_path / "one").read(), 8, 1)
     balls.write(tmp_path / "two/static", None)
     assert_at_rest(NerfstudioReader(tmp_path / "two").read(), 8, 1)
+
+
+def test_what_no_list_holds_out_is_parted():
+    assert parted([4, 5, 6], [7], 2, "list.json") == ([4, 5, 6], [7])
+    assert parted([4, 5, 6], [], 2, "list.json") == ([4, 6], [5])
+    assert parted([4, 5, 6], [], 2, "list.json", start=0) == ([5], [4, 6])
+    for train, test, what in (
+        ([], [7], "all images are held out; list some to learn from"),
+        ([4], [], "lists one image; add more, one of them to hold out"),
+        ([], [], "lists no image; add more, one of them to hold out"),
+    ):
+        with pytest.raises(DevrfError, match=f"list.json: {what}"):
+            parted(train, test, 2, "list.json")

@@ -175,15 +175,18 @@ def flow_of_views(split: Split, views: Views, direction: FlowDirection) -> Optic
         image.parent: image.parent.with_name(f"{image.parent.name}_flow") for image in images
     }
     named = {folder: _named(flow, suffix) for folder, flow in folders.items()}
-    frames = len(images) // len(folders)
-    without = 0 if direction == "bwd" else frames - 1
+    count = len(folders)
+    length = len(images) // count
+    frames = range(1, length) if direction == "bwd" else range(length - 1)
     shots = [
-        (row, row // len(folders), image, named[image.parent])
-        for row, image in enumerate(images)
-        if row // len(folders) != without
+        (t, t * count + view, images[t * count + view]) for view in range(count) for t in frames
     ]
     candidates = [
-        {row: files[name] for row, t, image, files in shots if (name := way(t, image)) in files}
+        {
+            row: named[image.parent][name]
+            for t, row, image in shots
+            if (name := way(t, image)) in named[image.parent]
+        }
         for way in ways
     ]
     best = max(candidates, key=len)
