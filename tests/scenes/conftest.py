@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
 from collections.abc import Callable
@@ -270,6 +271,14 @@ def write_layout(
         for name, pixels in zip(names, views.pixels, strict=True):
             iio.imwrite(root / "images" / name, pixels.numpy())
 
+    def colmap_binary(root: Path) -> None:
+        colmap(root)
+        model = root / "sparse/0"
+        library = importlib.import_module("pycolmap")
+        library.Reconstruction(model).write_binary(model)
+        for file in model.glob("*.txt"):
+            file.unlink()
+
     def videos(root: Path) -> None:
         train, test = tiny_toy.dynamic.train, tiny_toy.dynamic.test
         shots = {"cam00.mp4": test.pixels}
@@ -284,6 +293,7 @@ def write_layout(
         "forward": partial(export, tiny_toy),
         **{name: partial(write_scene, name, tiny_scene) for name in LISTED},
         "colmap": colmap,
+        "colmap_binary": colmap_binary,
         "neural_3d_video": videos,
     }
     return lambda choice, root: writers[choice](root)

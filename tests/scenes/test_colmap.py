@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import logging
 import shutil
+import struct
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -272,6 +273,29 @@ def test_the_name_of_an_image_is_utf8(folder, message_of):
     file.write_bytes(file.read_bytes().replace(b"img_10", b"caf\xe9"))
     said = r"the name of its image round/caf\xe9.png is not UTF-8 text; rename it"
     assert said in message_of(folder)
+
+
+@pytest.mark.parametrize("number", [2**31, 2**62])
+@pytest.mark.parametrize(
+    ("part", "place", "form"),
+    [
+        *[(part, 0, "<Q") for part in ("frames", "images", "points3D")],
+        ("frames", 72, "<I"),  # images of the first one
+        ("images", 8 + 64 + len(NAMES[0]) + 1, "<Q"),  # what the first one shows
+        ("points3D", 51, "<Q"),  # the images that show the first one
+    ],
+)
+def test_counts_that_a_binary_model_cannot_hold_are_refused_before_they_are_believed(
+    folder, message_of, part, place, form, number
+):
+    model = folder / "sparse/0"
+    importlib.import_module("pycolmap").Reconstruction(model).write_binary(model)
+    assert len(ColmapReader(folder, downscale=1).read().static.train) == 14
+    data = bytearray((model / f"{part}.bin").read_bytes())
+    struct.pack_into(form, data, place, min(number, 2 ** (8 * struct.calcsize(form)) - 1))
+    (model / f"{part}.bin").write_bytes(data)
+    said = f"{model}: not a readable COLMAP model ({part}.bin counts more than it holds)"
+    assert message_of(folder).startswith(said)
 
 
 @pytest.mark.parametrize("suffix", [".txt", ".bin"])

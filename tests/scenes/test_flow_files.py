@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 import zipfile
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from devrf.errors import DevrfError
-from devrf.scenes.flow_files import read_flow_file
+from devrf.scenes.flow_files import load_flow, read_flow_file
 from devrf.scenes.resampling import area_average, shrink_flow
 
 
@@ -66,3 +67,25 @@ def test_wrong_arrays_are_named(tmp_path):
     write_flow(path, np.ones((6, 4, 2)), np.ones((4, 6)))
     with pytest.raises(DevrfError, match="001_bwd.npz"):
         read_flow_file(path, width=6, height=4)
+
+
+def test_packed_arrays_larger_than_an_image_are_not_unpacked(tmp_path):
+    path = tmp_path / "001_bwd.npz"
+    with (
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("flow.npy", "w", force_zip64=True) as member,
+    ):
+        np.lib.format.write_array_header_1_0(
+            member, {"descr": "<f4", "fortran_order": False, "shape": (2**14, 2**11, 2)}
+        )
+        for _ in range(2**6):
+            member.write(bytes(2**22))
+    assert path.stat().st_size < 2**19
+    tracemalloc.start()
+    try:
+        with pytest.raises(DevrfError, match=r"flow.npy is larger than numbers of shape \(4, 6, 2"):
+            read_flow_file(path, width=6, height=4)
+        assert tracemalloc.get_traced_memory()[1] < 2**22
+        assert load_flow(path, "key", (1, 4, 6)) is None
+    finally:
+        tracemalloc.stop()

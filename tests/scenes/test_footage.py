@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import struct
 import subprocess
 from pathlib import Path
+from zlib import crc32
 
 import imageio_ffmpeg
 import numpy as np
@@ -167,3 +169,17 @@ def test_a_cover_picture_is_no_film(film, tmp_path, frames):
     ffmpeg(*cover, *streams, "-disposition:v:0", "attached_pic", tmp_path / "cover.mp4")
     shown = [number(picture) for _, picture in pictures(tmp_path / "cover.mp4")]
     assert shown == list(range(FRAMES))
+
+
+def test_sizes_that_no_frame_has_are_refused_before_any_is_decoded(film, tmp_path):
+    wide = film("wide.mkv", "-vf", "scale=20000:16", "-c:v", "ffv1")
+    Image.new("RGB", (8, 8)).save(tmp_path / "photos.png")
+    header = b"IHDR" + struct.pack(">II", 2**15, 2**15) + bytes([8, 2, 0, 0, 0])
+    data = (tmp_path / "photos.png").read_bytes()
+    (tmp_path / "photos").mkdir()
+    photo = tmp_path / "photos" / "0.png"
+    photo.write_bytes(data[:12] + header + struct.pack(">I", crc32(header)) + data[33:])
+    with pytest.raises(DevrfError, match="wide.mkv: states 20000x16 px, expected sides of 1 to"):
+        next(pictures(wide))
+    with pytest.raises(DevrfError, match=r"0.png: not a readable image \(Image size \(1073741824"):
+        next(pictures(photo.parent))

@@ -288,3 +288,11 @@ def test_a_fixed_camera_that_looks_elsewhere(llff_folder, message_of):
 )
 def test_wrong_options(llff_folder, options, said, message_of):
     assert said in message_of(llff_folder.root, **options)
+
+
+def test_arrays_larger_than_their_file_take_no_memory(llff_folder, message_of):
+    header = {"descr": "<f8", "fortran_order": False, "shape": (2**30, 17)}
+    with (llff_folder.root / STATIC).open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, header)
+    message = message_of(llff_folder.root)
+    assert f"{STATIC}: not a readable npy file (mmap length is greater than" in message

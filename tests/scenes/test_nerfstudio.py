@@ -258,3 +258,9 @@ def parts(scene: Scene) -> list[Views]:
 def test_wrong_values(moving, change, said, message_of, balls):
     balls.edit(moving, change)
     assert said in message_of(moving)
+
+
+def test_a_file_of_numbers_without_end_is_not_read(tmp_path, message_of):
+    with (tmp_path / "transforms.json").open("wb") as file:
+        file.truncate(2**33)  # of zeros, which take no room on the disk
+    assert message_of(tmp_path) == f"{tmp_path}/transforms.json: larger than 64 MiB; write it again"

@@ -16,7 +16,7 @@ from pydantic import AfterValidator, BaseModel, Field, ValidationError
 
 from devrf.errors import DevrfError
 from devrf.scenes.validation import LARGEST, scene_error
-from devrf.system.files import utf8_path
+from devrf.system.files import read_record, utf8_path
 from devrf.system.options import abbreviated, first_error, is_shown
 from devrf.system.override import to_type
 
@@ -174,7 +174,7 @@ def read_json(file: Path, kind: type[Content], purpose: str) -> Content:
     """
     try:
         # Some editors begin a file with a byte order mark.
-        data = existing_file(file, purpose).read_bytes().removeprefix(codecs.BOM_UTF8)
+        data = read_record(existing_file(file, purpose)).removeprefix(codecs.BOM_UTF8)
         return kind.model_validate_json(data)
     except OSError as error:
         raise scene_error(file, f"cannot be read ({error.strerror}); {purpose}") from None
@@ -182,6 +182,8 @@ def read_json(file: Path, kind: type[Content], purpose: str) -> Content:
         if remedy := _stands_in(file):
             raise scene_error(file, f"not JSON; {remedy}") from None
         raise first_error(error, f"{file}: ") from None
+    except ValueError as error:  # its size
+        raise scene_error(file, f"{error}; write it again") from None
 
 
 def read_numbers(path: Path, expected: str) -> Numbers:
@@ -190,8 +192,9 @@ def read_numbers(path: Path, expected: str) -> Numbers:
     DevrfError if there is no such file, it is damaged, or holds no numbers, or NaN or infinity.
     """
     existing_file(path, f"expected {expected}")
-    with decoding(path, "npy file", "write it again"), path.open("rb") as stream:
-        values: npt.NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
+    with decoding(path, "npy file", "write it again"):
+        # Mapped: an array that is larger than its file is refused before it takes memory.
+        values: npt.NDArray[Any] = np.lib.format.open_memmap(path, mode="r")
     if values.dtype.kind not in "fiu":
         raise scene_error(path, f"holds values of type {values.dtype}, expected {expected}")
     # NaN compares false.

@@ -9,7 +9,7 @@ import os
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +31,9 @@ REMEDY = "compute the flow again, or set data.flow=none"
 FlowDirection = Literal["bwd", "fwd"]
 # Bytes a pixel of vectors and mask once they are read.
 _BYTES = 9
+# Bytes of the widest numbers, and what an array may have before them.
+_WIDEST = 16
+_HEADER = 2**16
 
 
 def read_flow_file(
@@ -47,10 +50,9 @@ def read_flow_file(
     Raises:
         DevrfError: not an npz, an array is missing, or an array is of another size.
     """
-    with decoding(path, "npz", REMEDY), np.load(path, allow_pickle=False) as archive:
-        # A member that is no array comes as bytes.
-        arrays = {n: np.asarray(archive[n]) for n in ("flow", "mask") if n in archive}
-    for name, shape in (("flow", (height, width, 2)), ("mask", (height, width))):
+    shapes = {"flow": (height, width, 2), "mask": (height, width)}
+    arrays = _arrays(path, shapes, REMEDY)
+    for name, shape in shapes.items():
         array = arrays.get(name, np.empty(0, "O"))
         if array.shape != shape or array.dtype.kind not in "bfiu":
             raise scene_error(
@@ -63,6 +65,20 @@ def read_flow_file(
     # NaN compares false.
     valid = (arrays["mask"] > 0.5) & (np.abs(vectors) <= width + height).all(axis=-1)
     return np.where(valid[..., None], vectors, np.float32(0)), valid
+
+
+def _arrays(path: Path, shapes: Mapping[str, tuple[int, ...]], remedy: str) -> dict[str, Any]:
+    """The arrays of an npz file that are called as ``shapes``, none of them much larger than that.
+
+    What is packed may be a thousand times as large as its file. DevrfError if it is no npz.
+    """
+    with decoding(path, "npz", remedy), np.load(path, allow_pickle=False) as archive:
+        for member in archive.zip.infolist():
+            shape = shapes.get(member.filename.removesuffix(".npy"))
+            if shape is not None and member.file_size > _WIDEST * math.prod(shape) + _HEADER:
+                raise ValueError(f"{member.filename} is larger than numbers of shape {shape}")
+        # A member that is no array comes as bytes.
+        return {name: np.asarray(archive[name]) for name in shapes if name in archive}
 
 
 def read_flow(
@@ -173,17 +189,21 @@ def load_flow(path: Path, key: str, shape: tuple[int, int, int]) -> OpticalFlow 
     if not os.path.isfile(path):
         return None
     try:
-        with decoding(path, "npz", "it is written again"), np.load(path) as stored:
-            stored_key = str(stored["key"])
-            vectors = stored["vectors"]
-            valid = stored["valid"]
+        shapes = {"key": (len(key),), "vectors": (*shape, 2), "valid": shape}
+        stored = _arrays(path, shapes, "it is written again")
+        with decoding(path, "npz", "it is written again"):
+            vectors, valid = (torch.from_numpy(stored[name]) for name in ("vectors", "valid"))
+            fits = str(stored["key"]) == key and (vectors.shape, valid.shape) == (
+                (*shape, 2),
+                shape,
+            )
     except DevrfError as error:
         log.warning("the flow is estimated again: %s", error)
         return None
-    if stored_key != key or vectors.shape != (*shape, 2) or not np.isfinite(vectors).all():
+    if not fits or not bool(vectors.isfinite().all()):
         log.info("%s holds the flow of other images or of another method", path)
         return None
-    return OpticalFlow(torch.from_numpy(vectors), torch.from_numpy(valid))
+    return OpticalFlow(vectors.float(), valid.bool())
 
 
 def save_flow(path: Path, key: str, flow: OpticalFlow) -> None:

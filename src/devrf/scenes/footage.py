@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from devrf.scenes.files import existing_file
 from devrf.scenes.image_folders import listed_images
+from devrf.scenes.images import open_image
 from devrf.scenes.validation import scene_error
 
 log = logging.getLogger(__name__)
@@ -34,6 +35,8 @@ Size = tuple[int, int]
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mts", ".m2ts", ".3gp")
 
 _REMEDY = "convert it, for example to H.264 in an mp4 file"
+# Pixels of a frame's longer side.
+_LARGEST = 2**14
 # A film that has fewer of its frames, and ends before this share of its duration, was cut off.
 _WHOLE = 0.95
 # Lines of FFmpeg's log: a frame, numbered from 0, and its time in microseconds; how long the file
@@ -94,7 +97,10 @@ def film_header(path: Path) -> FilmHeader:
         height = round(height * aspect)
     elif aspect > 0:
         width = round(width * aspect)
-    return FilmHeader((width, height), frames, rate)
+    if not 0 < min(width, height) <= max(width, height) <= _LARGEST:
+        raise scene_error(path, f"states {width}x{height} px, expected sides of 1 to {_LARGEST}")
+    # A frame takes some bytes, whatever the header says.
+    return FilmHeader((width, height), min(frames, path.stat().st_size // 8), rate)
 
 
 def frame_count(path: Path) -> int:
@@ -232,6 +238,7 @@ def _ffmpeg(
 
 
 def _photograph(file: Path) -> Picture:
+    open_image(file).close()  # OpenCV would decode much larger ones than Pillow opens
     image = cv2.imread(str(file), cv2.IMREAD_COLOR)
     if image is None:
         raise scene_error(file, "not a readable image; convert it to PNG or JPEG")

@@ -84,7 +84,7 @@ def unread(folder: Path) -> str:
     return f"; {', '.join(sorted(kinds))} files are there, which are not read: convert them to PNG"
 
 
-def _open(path: Path) -> Image.Image:
+def open_image(path: Path) -> Image.Image:
     """The image at ``path``, its header read, nothing decoded yet."""
     with decoding(path, "image", "replace the file, or make it smaller"):
         return Image.open(path, formats=FORMATS)
@@ -96,7 +96,7 @@ def read_header(path: Path, camera: Size | None = None) -> Header:
     ``camera`` is the (width, height) of the images that its camera is for; None: unknown.
     DevrfError if it is no image with 8 bits a channel, or one that Pillow takes for too large.
     """
-    with _open(path) as image:
+    with open_image(path) as image:
         if image.mode in DEEP_MODES:
             raise scene_error(path, f"expected 8 bits a channel, not mode {image.mode}; convert it")
         alpha = "A" in image.mode or "a" in image.mode or "transparency" in image.info
@@ -147,7 +147,7 @@ def decode(path: Path, header: Header, mode: str) -> npt.NDArray[np.uint8]:
 
     DevrfError if it is damaged, or not what it claimed to be.
     """
-    with _open(path) as image, decoding(path, "image", "replace the file"):
+    with open_image(path) as image, decoding(path, "image", "replace the file"):
         converted: Image.Image = image.convert(mode)
         if header.turn in TURNS:
             converted = converted.transpose(TURNS[header.turn])

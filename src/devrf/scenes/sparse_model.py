@@ -30,6 +30,9 @@ from devrf.system.options import abbreviated
 
 # The files of a model, binary or as text.
 PARTS = ("cameras", "images", "points3D")
+# Records of binary files that end with a list: their bytes before it but for a name, of its length,
+# and of an entry.
+LISTS = {"frames": (64, 4, 16), "images": (64, 8, 24), "points3D": (43, 8, 8)}
 # Parameters of each camera model that can be read, in COLMAP's order; further ones have to be 0.
 PARAMETERS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -195,11 +198,35 @@ def _opened(folder: Path) -> Any:
     library: Any = importlib.import_module("pycolmap")
     library.logging.minloglevel = 3
     with decoding(folder, "COLMAP model", "run COLMAP's mapper again"):
+        if all(os.path.isfile(folder / f"{part}.bin") for part in PARTS):
+            _check_counts(folder)
         return library.Reconstruction(folder)
 
 
+def _check_counts(folder: Path) -> None:
+    """ValueError if a binary file counts more than it holds: COLMAP would read on behind its end.
+
+    It notices that by itself in the files that are not looked at.
+    """
+    for part, (fixed, width, entry) in LISTS.items():
+        if not (file := folder / f"{part}.bin").is_file():
+            continue
+        data = file.read_bytes()
+        count, at = int.from_bytes(data[:8], "little"), 8
+        while count > 0 and at < len(data):
+            at += fixed
+            if part == "images":
+                at = data.find(b"\0", at) + 1 or len(data)  # after its name
+            at += width + entry * int.from_bytes(data[at : at + width], "little")
+            count -= 1
+        if count > 0 or at > len(data):
+            raise ValueError(f"{file.name} counts more than it holds")
+
+
 def _of_reconstruction(folder: Path, model: Any) -> SparseModel:
-    images = [_image(folder, image) for image in model.images.values() if image.has_pose]
+    with decoding(folder, "COLMAP model", "run COLMAP's mapper again"):  # numbers may be too large
+        images = [_image(folder, image) for image in model.images.values() if image.has_pose]
+        numbers = np.array(sorted(model.point3D_ids()), np.int64)
     if not images:
         raise scene_error(folder, "poses no image; run COLMAP's mapper again")
     ordered = tuple(sorted(images, key=lambda image: image.name))
@@ -212,7 +239,6 @@ def _of_reconstruction(folder: Path, model: Any) -> SparseModel:
             )
     used = sorted({image.camera for image in images})
     cameras = {number: _camera(folder, model.cameras[number]) for number in used}
-    numbers = np.array(sorted(model.point3D_ids()), np.int64)
     points = np.array([model.point3D(n).xyz for n in numbers.tolist()], np.float64)
     return SparseModel(folder, cameras, ordered, points.reshape(-1, 3), numbers)
 

@@ -122,15 +122,15 @@ def write_json(path: Path, values: dict[str, Any]) -> None:
 
 
 def read_record(path: Path) -> bytes:
-    """What devrf wrote.
+    """The content of a file of JSON or CSV.
 
     Raises:
-        ValueError: the file is larger than that, and so damaged.
+        ValueError: it is larger than devrf writes, or a scene needs.
     """
     with path.open("rb") as file:
         content = file.read(LARGEST_RECORD + 1)
     if len(content) > LARGEST_RECORD:
-        raise ValueError(f"{path}: of more than {LARGEST_RECORD} bytes")
+        raise ValueError(f"larger than {LARGEST_RECORD // 2**20} MiB")
     return content
 
 
