@@ -24,6 +24,7 @@ from devrf.evaluation.objective import TRAINING, VALIDATION
 from devrf.geometry.clock import FrameClock
 from devrf.scenes.scene import Scene
 from devrf.system.files import atomic_write
+from devrf.system.printed import csv_cell
 
 # Held-out images of the dynamic capture at times that a training view has, and at others.
 OF_TIMES = ("training_times", "novel_times")
@@ -126,7 +127,11 @@ def write_frames(path: Path, captures: Mapping[str, Sequence[HeldOutView]]) -> N
         table = csv.DictWriter(file, [*columns], lineterminator="\n")
         table.writeheader()
         for row in rows:
-            table.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
+            table.writerow({k: _cell(v) for k, v in row.items()})
+
+
+def _cell(value: str | float | None) -> str | float | None:
+    return f"{value:.6g}" if isinstance(value, float) else value and csv_cell(str(value))
 
 
 def frame_rows(

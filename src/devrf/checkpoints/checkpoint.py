@@ -29,6 +29,7 @@ from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Background, Scene
 from devrf.system.memory import OutOfMemoryError, is_oom
 from devrf.system.plain_data import Line, built
+from devrf.system.printed import shown
 
 # The stage's attribute that holds the model: what its entries of a state begin with.
 MODEL = "scene_model."
@@ -239,10 +240,9 @@ def unfit(path: Path, error: Exception) -> DevrfError:
     if isinstance(error, ValidationError):
         issue = error.errors()[0]
         why = ": ".join([*map(str, issue["loc"]), issue["msg"]])
-    line = "".join(sign for sign in " ".join(why.split()) if sign.isprintable())
     return DevrfError(
-        f"{path}: its parts do not fit together ({line[:120]}); take a copy that is whole, or "
-        "train again (resume=false)"
+        f"{path}: its parts do not fit together ({shown(why)[:120]}); take a copy that is whole, "
+        "or train again (resume=false)"
     )
 
 

@@ -17,8 +17,8 @@ from devrf.cli.config import group_choices, known_stages
 from devrf.cli.config_check import unknown_key
 from devrf.errors import DevrfError, did_you_mean
 from devrf.system.files import REFUSED
-from devrf.system.options import is_shown
 from devrf.system.override import to_type
+from devrf.system.printed import shown
 
 # Read at import: the entry point sets the variable, so that Hydra raises its errors.
 FULL_ERRORS = os.environ.get("HYDRA_FULL_ERROR", "0") != "0"
@@ -98,8 +98,7 @@ def one_line(error: BaseException) -> str:
         if key := re.search(r"^\s*full_key: (\S+)$", str(error), re.MULTILINE):
             text = f"{key[1]}: {text}"
     # Spaces within a line stay: names may have several in a row.
-    line = " ".join(filter(None, map(str.strip, text.splitlines())))
-    return "".join(sign if is_shown(sign) or sign == "\t" else "?" for sign in line)
+    return shown(" ".join(filter(None, map(str.strip, text.splitlines()))))
 
 
 def _of_several(argument: str) -> str:

@@ -35,8 +35,8 @@ from devrf.cli.config import (
 from devrf.cli.config_check import RESERVED
 from devrf.errors import DevrfError
 from devrf.system.files import read_record
-from devrf.system.options import is_shown
 from devrf.system.override import literal, to_type
+from devrf.system.printed import is_shown
 from devrf.system.process import importing
 
 log = logging.getLogger(__name__)

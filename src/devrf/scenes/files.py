@@ -17,8 +17,9 @@ from pydantic import AfterValidator, BaseModel, Field, ValidationError
 from devrf.errors import DevrfError
 from devrf.scenes.validation import LARGEST, scene_error
 from devrf.system.files import read_record, utf8_path
-from devrf.system.options import abbreviated, first_error, is_shown
+from devrf.system.options import abbreviated, first_error
 from devrf.system.override import to_type
+from devrf.system.printed import is_shown
 
 Numbers = npt.NDArray[np.float64]
 

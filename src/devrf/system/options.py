@@ -7,13 +7,13 @@ import reprlib
 from collections.abc import Sequence
 from inspect import signature
 from typing import Annotated, Any, ClassVar
-from unicodedata import category
 
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 from pydantic.dataclasses import dataclass
 from pydantic_core import ArgsKwargs
 
 from devrf.errors import DevrfError
+from devrf.system.printed import shown
 
 # Types of settings: how many, how many that make a grid or a series, shares, and factors.
 Whole = Annotated[int, Field(strict=True, ge=0)]
@@ -40,13 +40,8 @@ _brief.maxlevel = 2
 
 def one_line(where: object, what: str, typed: str = "") -> str:
     """``where: what`` in one line that is not too long, then words to type, of any length."""
-    said = _shortened(" ".join(f"{where}: {what}".split()), LONGEST_MESSAGE)
+    said = _shortened(shown(" ".join(f"{where}: {what}".split())), LONGEST_MESSAGE)
     return f"{said} {typed}" if typed else said
-
-
-def is_shown(text: str) -> bool:
-    """Whether a terminal shows a text, in one line, and obeys nothing in it."""
-    return not any(category(sign) in ("Cc", "Cs", "Zl", "Zp") for sign in text)
 
 
 def abbreviated(value: object) -> str:

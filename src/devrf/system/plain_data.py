@@ -8,7 +8,7 @@ from typing import Annotated, Any, TypeVar
 from annotated_types import Ge, Gt, Le, Predicate
 from pydantic import TypeAdapter
 
-from devrf.system.options import is_shown
+from devrf.system.printed import is_shown
 
 Kind = TypeVar("Kind")
 # How many; a factor; text that a terminal shows as it is.

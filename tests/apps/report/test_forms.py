@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from devrf.apps.report.text import latex, latex_escaped, markdown, markdown_escaped, plain
+from devrf.apps.report.text import latex, markdown, plain
 
 FULL = "Ours w/ c2f, tv, cycle, flow"
 METRICS = ["PSNR ↑", "SSIM ↑", "LPIPS ↓", "GPU (GB) ↓", "Time ↓"]
@@ -70,18 +70,6 @@ def test_failures_are_listed_with_their_reason(pig_and_robot, failed, runs):
     assert f"## Skipped\n\n- {runs}/9_robot/metrics.json: skipped; it is damaged" in text
     assert f"failed: {first}\nfailed: {second}\n" in plain(found)
     assert f"% failed: {first}\n% failed: {second}\n" in latex(found)
-
-
-@pytest.mark.parametrize(
-    ("escaped", "text", "expected"),
-    [
-        (markdown_escaped, "pig_toy _a_ a|b <`[", r"pig_toy \_a\_ a\|b \<\`\["),
-        (latex_escaped, "pig_toy 100 % & $x^2$", r"pig\_toy 100 \% \& \$x\textasciicircum{}2\$"),
-        (latex_escaped, "2×9 ± 1 ↑ <|", r"2$\times$9 $\pm$ 1 $\uparrow$ \textless{}\textbar{}"),
-    ],
-)
-def test_nothing_in_a_text_is_taken_for_markup(escaped, text, expected):
-    assert escaped(text) == expected
 
 
 def test_latex_has_the_scenes_side_by_side(pig_and_robot):

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import math
 import sys
 import tracemalloc
 
 import pytest
 
-from devrf.apps.report.runs import collect, metric_over_time
+from devrf.apps.report.runs import SKIPPED, collect, metric_over_time
+from devrf.apps.report.write import write_report
+from devrf.apps.settings import ReportSettings
 
 
 def one(folder):
@@ -69,6 +72,56 @@ def test_damaged_records_are_skipped_with_a_line_that_says_where(runs, ran, cont
         assert line.startswith(f"{runs / name / name}.json: skipped; it is damaged, or not as")
 
 
+HUGE = {f"k{k}": k for k in range(200_000)}
+STRANGE = {
+    "scene": [["a"], {"a": 1}, 5, None, "", "x" * 10**6],
+    "method": [None],
+    "protocol": [[], None],
+    "at_rest": ["x"],
+    "static": [[], 1],
+    "dynamic": [[], {"psnr": "x"}, {"psnr": []}],
+    "run": [[], {"overrides": 5}, {"git": 5}, {"device": [1]}, {"image_size": [1]}],
+    "run.git": [5],
+    "further": ["x" * 10**6, HUGE, {"a" * 10**6: 1}],
+}
+STRANGE["run"] += [{"settings": {"ray_stage.model.settings.sampling": []}}, {"checkpoint": [1]}]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [(k, v) for k, values in STRANGE.items() for v in values]
+)
+def test_records_that_no_run_writes_are_skipped(runs, ran, key, value):
+    ran("good")
+    file = ran("strange") / "metrics.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), key: value}))
+    found = collect(runs)
+    assert list(found.runs["folder"]) == ["good"]
+    assert found.skipped == (SKIPPED % file,)
+
+
+@pytest.mark.parametrize(
+    "further",
+    [
+        {"dynamic": {"psnr": 10**400, "ssim": -1e308, "lpips": math.nan, "seconds": "x"}},
+        {"static": {"psnr": 1e308, "seconds": 1e300}, "run": {"seed": "x", "choices": []}},
+        {
+            "run": {
+                "choices": {"experiment": [1], "ablation": {"a": []}},
+                "settings": {"priors": []},
+            }
+        },
+        {"row": 1, "label": [1], "PSNR": "x", "path": 5, "status": {}, "budget": 3, "views": "q"},
+        {"scene": "$x^{$", "run": {"train_views": [1], "frames": {"a": 2}, "overrides": None}},
+        {"scene": "x" * 255, "run": {"settings": {"schedule.seconds": 1e300, "k": "v" * 9999}}},
+    ],
+)
+def test_other_values_are_reported_as_far_as_they_are_known(runs, ran, further):
+    ran("good", curve=[(0.0, 20.0)])
+    file = ran("other", curve=[(0.0, 1e308), (1.0, 20.0)]) / "metrics.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), **further}))
+    assert "skipped" not in write_report(ReportSettings(runs))
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="here all names are UTF-8")
 def test_a_run_whose_name_is_not_utf8_is_skipped(runs, ran):
     ran("good").rename(runs / "caf\udce9")  # b"caf\xe9" on the disk
@@ -90,9 +143,13 @@ def test_of_records_without_end_only_so_much_is_read_as_devrf_writes(runs, ran):
         tracemalloc.stop()
 
 
-def test_curves_are_over_the_dynamic_images_views_of_a_time_averaged(ran):
+def test_curves_are_over_the_dynamic_images_views_of_a_time_averaged(ran, caplog):
     folder = ran("a", curve=[(1.0, 20.0), (0.0, 30.0), (0.0, 32.0)])
     assert metric_over_time(folder, "psnr").to_dict() == {0.0: 31.0, 1.0: 20.0}
-    assert metric_over_time(folder, "ssim").empty and metric_over_time(folder, "nothing").empty
+    assert metric_over_time(folder, "ssim").empty
     (folder / "frames.csv").write_bytes(b"capture,time,psnr\ndynamic,x,3\n")
+    assert metric_over_time(folder, "psnr").empty and caplog.messages == [
+        SKIPPED % (folder / "frames.csv")
+    ]
+    (folder / "frames.csv").write_text(f"capture,time,psnr\ndynamic,0,{10**400}\n")
     assert metric_over_time(folder, "psnr").empty and metric_over_time(ran("b"), "psnr").empty

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 import subprocess
 import sys
 
@@ -10,10 +11,11 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from devrf.apps.report.runs import collect
+from devrf.apps.report.runs import SKIPPED, collect
 from devrf.apps.report.write import write_report
 from devrf.apps.settings import ReportSettings
 from devrf.errors import DevrfError
+from devrf.system.printed import is_shown
 
 
 def files(folder):
@@ -105,3 +107,35 @@ def test_each_row_is_a_tile_beside_the_truth_at_the_same_time(runs, ran):
         tiles = [picture[46, 24], picture[46, 76], picture[46, 128]]
         for found, wanted in zip(tiles, (TRUTH, first, blue), strict=True):
             assert np.abs(found.astype(int) - wanted).max() < 24
+
+
+@pytest.mark.parametrize("damage", ["cut", "junk", "list of files"])
+def test_a_film_that_cannot_be_read_is_left_out(runs, ran, damage, caplog):
+    for k, name in enumerate(("a", "b", "c")):
+        film(ran(name, ablation=("base", "c2f", "full")[k]), [TRUTH])
+    broken = runs / "b" / "videos" / "held_out.mp4"
+    data = broken.read_bytes()
+    listed = b"ffconcat version 1.0\nfile ../../a/videos/held_out.mp4\n"
+    broken.write_bytes({"cut": data[: len(data) // 2], "junk": b"x"}.get(damage, listed))
+    write_report(ReportSettings(runs))
+    assert caplog.messages == [SKIPPED % broken]
+    assert iio.imread(runs / "report" / "videos" / "side_by_side_robot.mp4").shape[0] == 1
+
+
+def test_nothing_that_runs_are_called_is_obeyed(runs, ran, failed):
+    """By terminals, spreadsheets, and what reads Markdown or LaTeX."""
+    evil = "\x1b]0;x\x07\u202e\u2028<script>$x^{$[a](javascript:1)|\\input{/etc/passwd}"
+    for k, name in enumerate(("=cmd|' 'A1", "@SUM(1)")):
+        ran(name, f"=1+{k}{evil}", method=f"-x{k}{evil}", curve=[(0.0, 20.0)], overrides=["+a=1"])
+    failed("-2+3", f"{evil}\r\n# no heading")
+    written = write_report(ReportSettings(runs))
+    text, table, tex = (
+        (runs / "report" / f"report.{kind}").read_text("utf-8") for kind in ("md", "csv", "tex")
+    )
+    for shown in (written, text, table, tex):
+        assert all(map(is_shown, shown.split("\n")))
+    assert not re.search(r"(?<!\\)(<script|\[a|\|\\input)|^# no", text, re.MULTILINE)
+    assert r"\input{/etc" not in tex.split("\n%")[1]
+    cells = [cell for row in csv.reader(table.splitlines()) for cell in row]
+    assert "'=cmd|' 'A1" in cells and "'+a=1" in cells
+    assert not [cell for cell in cells if cell[:1] in ("=", "+", "-", "@")]

@@ -13,7 +13,7 @@ from typing import Any
 
 import pandas as pd
 
-from devrf.apps.report.runs import DEFAULT_METHOD, number
+from devrf.apps.report.runs import DEFAULT_METHOD, SETTINGS, number
 
 METHODS = {
     DEFAULT_METHOD: "Ours",
@@ -45,7 +45,6 @@ ABLATIONS = {
     "without_last_level": "Ours w/o last level",
 }
 CHOICES = "run.choices."
-SETTINGS = "run.settings."
 IGNORED = {"objective", "seed", "stage", "method"}
 # Without an experiment a run has the config of this one.
 DEFAULT_EXPERIMENT = "quickstart"
@@ -172,7 +171,8 @@ def _methods(runs: pd.DataFrame) -> list[str]:
 
 
 def _options(runs: pd.DataFrame, group: str) -> pd.Series:
-    return runs.get(CHOICES + group, pd.Series(None, runs.index, dtype=object)).fillna("")
+    options = runs.get(CHOICES + group, pd.Series(None, runs.index, dtype=object))
+    return options.map(lambda option: option if isinstance(option, str) else "")
 
 
 def _names(runs: pd.DataFrame) -> dict[str, pd.Series]:

@@ -44,6 +44,7 @@ STYLE: dict[Any, Any] = {
     "axes.spines.right": False,
     "axes.grid": True,
     "axes.formatter.useoffset": False,
+    "text.parse_math": False,  # a name may hold $
     "grid.color": "#e6e6e6",
     "axes.axisbelow": True,
     "legend.frameon": False,
@@ -87,7 +88,7 @@ def plots(table: Table) -> list[Plot]:
 
 def file_name(text: str) -> str:
     """Text as the name of a file, without what a file system or a link may refuse."""
-    return re.sub(r"[^\w.-]+", "_", text)
+    return re.sub(r"[^\w.-]+", "_", text).encode()[:200].decode(errors="ignore")
 
 
 @mpl.rc_context(STYLE)

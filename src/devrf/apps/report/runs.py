@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import pandas as pd
+from annotated_types import Len
 
 from devrf.apps.settings import REHEARSAL
 from devrf.errors import DevrfError
 from devrf.system.files import read_record, utf8_path
+from devrf.system.plain_data import built
+from devrf.system.printed import shown
+
+log = logging.getLogger(__name__)
 
 # What every run has; further columns are what its file holds, by dotted name.
 COLUMNS = (
@@ -38,6 +44,32 @@ COLUMNS = (
     "run.date",
     "path",
 )
+SKIPPED = "%s: skipped; it is damaged, or not as devrf writes it"
+# The most values of a record, letters of a name, letters of a text or items of a list; the largest
+# number.
+MOST = 1000
+LONGEST_NAME = 255
+LONGEST = 10_000
+LARGEST = 1e9
+_Name = Annotated[str, Len(1, LONGEST_NAME)]
+_Text = Annotated[str, Len(0, LONGEST)]
+_Plain = _Text | bool | int | float | Annotated[list[Any], Len(0, LONGEST)] | None
+SETTINGS = "run.settings."
+SAMPLING = "ray_stage.model.settings.sampling"
+SECTIONS = ("static", "dynamic", "run", "choices")
+# What values are that are used, by their dotted names.
+KINDS: dict[str, Any] = {
+    **dict.fromkeys(("scene", "method", "protocol"), _Name),
+    **{
+        f"run.{key}": _Text | None for key in "device git devrf fingerprint date checkpoint".split()
+    },
+    **dict.fromkeys(("run.lpips_network", f"{SETTINGS}{SAMPLING}"), _Text | None),
+    **{"dynamic.psnr": int | float | None, "at_rest": bool, "error": _Text, "mistake": bool},
+    **{
+        "run.overrides": list[_Text] | None,
+        "run.image_size": Annotated[list[int], Len(2, 2)] | None,
+    },
+}
 DEFAULT_METHOD = "devrf"
 DEFAULT_PROTOCOL = "two_stage"
 
@@ -85,13 +117,14 @@ def collect(folder: Path) -> Collection:
                 continue
             try:
                 utf8_path(place)  # or no table could be printed
-                record = read(json.loads(read_record(file)))
+                record = read(_flat(json.loads(read_record(file))))
             except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
-                skipped.append(f"{file}: skipped; it is damaged, or not as devrf writes it")
+                skipped.append(shown(SKIPPED % file))
             except DevrfError as error:
                 skipped.append(str(error))
             else:
-                records[status].append({**record, "folder": name, "path": place, "status": status})
+                record |= {"folder": shown(name), "path": place, "status": status}
+                records[status].append(record)
     if rehearsals:
         skipped.append(f"{rehearsals} of the folders hold a rehearsal, which is no run")
     runs = _frame(records["finished"])
@@ -100,9 +133,9 @@ def collect(folder: Path) -> Collection:
 
 
 def number(value: Any) -> float:
-    """A recorded value as a number; NaN where it is none, or not finite."""
+    """A recorded value as a number; NaN where it is none, not finite, or like none of a run."""
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    return float(value) if is_number and math.isfinite(value) else math.nan
+    return float(value) if is_number and abs(value) < LARGEST else math.nan
 
 
 def metric_over_time(path: Path, metric: str) -> pd.Series:
@@ -110,14 +143,16 @@ def metric_over_time(path: Path, metric: str) -> pd.Series:
 
     Empty where the run has no such values.
     """
-    try:
-        file = path / "frames.csv"
-        text = read_record(file) if file.is_file() else b""  # a pipe would be waited for
-        frames = pd.read_csv(io.BytesIO(text))
-        frames = frames[frames["capture"] == "dynamic"].dropna(subset=metric)
-        return frames.astype({"time": float, metric: float}).groupby("time")[metric].mean()
-    except (OSError, ValueError, KeyError):
-        return pd.Series(dtype=float)
+    file = path / "frames.csv"
+    if file.is_file():  # a pipe would be waited for
+        try:
+            frames = pd.read_csv(io.BytesIO(read_record(file)), usecols=["capture", "time", metric])
+            frames = frames[frames["capture"] == "dynamic"].dropna(subset=metric)
+            frames = frames.astype({"time": float, metric: float})
+            return frames[frames[metric].abs() < LARGEST].groupby("time")[metric].mean()
+        except (OSError, ValueError, KeyError, OverflowError):
+            log.warning(SKIPPED, file)
+    return pd.Series(dtype=float)
 
 
 def _natural(name: str) -> tuple[int, int, str]:
@@ -126,30 +161,53 @@ def _natural(name: str) -> tuple[int, int, str]:
     return (0, int(head), name) if head.isdecimal() else (1, 0, name)
 
 
+def _flat(record: dict[str, Any], above: str = "") -> dict[str, Any]:
+    """The values of a record by dotted names, their texts as a terminal may have them.
+
+    Raises:
+        ValueError: they are not as in a record, too many or too long.
+    """
+    values: dict[str, Any] = {}
+    for key, value in record.items():
+        name = shown(above + key)
+        if isinstance(value, dict):
+            values |= _flat(value, f"{name}.")
+        else:
+            value = built(KINDS.get(name, _Plain), value)
+            values[name] = [*map(_shown, value)] if isinstance(value, list) else _shown(value)
+        if name in values.keys() & SECTIONS or len(name) > LONGEST_NAME or len(values) > MOST:
+            raise ValueError(name)
+    return values
+
+
+def _shown(value: Any) -> Any:
+    return shown(value) if isinstance(value, str) else value
+
+
 def _finished(metrics: dict[str, Any]) -> dict[str, Any]:
     at_rest = metrics.get("at_rest", False)
-    static = metrics.get("static", {})
     # Other protocols may have no stage of their own for the static capture.
-    stages = [] if at_rest else [metrics.get("dynamic", {})]
-    if at_rest or static.get("seconds") is not None or metrics["protocol"] == DEFAULT_PROTOCOL:
-        stages.append(static)
-    frame = pd.DataFrame(stages, columns=["seconds", "peak_gpu_gb"], dtype=object).map(number)
-    seconds = frame["seconds"].sum(skipna=False)
-    memory = frame["peak_gpu_gb"].max(skipna=False)
+    stages = [] if at_rest else ["dynamic"]
+    own = metrics.get("static.seconds") is not None or metrics["protocol"] == DEFAULT_PROTOCOL
+    stages += ["static"] * (at_rest or own)
+    seconds, memory = (
+        [number(metrics.get(f"{stage}.{key}")) for stage in stages]
+        for key in ("seconds", "peak_gpu_gb")
+    )
     head = {key: metrics[key] for key in ("scene", "method")}
-    return metrics | head | {"at_rest": at_rest, "train_seconds": seconds, "peak_gpu_gb": memory}
+    # NaN unless all are known.
+    took = {"train_seconds": sum(seconds), "peak_gpu_gb": max(memory) + 0 * sum(memory)}
+    return metrics | head | {"at_rest": at_rest} | took
 
 
 def _failed(failure: dict[str, Any]) -> dict[str, Any]:
-    setup = {key: failure[key] for key in ("choices", "overrides", "seed")}
-    error = " ".join(failure["error"].split())
-    head = {"scene": failure["scene"], "error": error, "mistake": failure["mistake"]}
-    return {**head, "run": setup}
+    setup = {f"run.{key}": failure[key] for key in failure if key.startswith("choices.")}
+    setup |= {f"run.{key}": failure[key] for key in ("overrides", "seed")}
+    return {key: failure[key] for key in ("scene", "error", "mistake")} | setup
 
 
 def _frame(records: list[dict[str, Any]]) -> pd.DataFrame:
-    flat = [pd.json_normalize(record).to_dict("records")[0] for record in records]
-    names = dict.fromkeys([*COLUMNS, *(name for record in flat for name in record)])
+    names = dict.fromkeys([*COLUMNS, *(name for record in records for name in record)])
     # Values are objects, so that numbers are written as they were read.
-    frame = pd.DataFrame(flat, columns=list(names), dtype=object)
-    return frame.assign(**{"run.overrides": [row.get("run.overrides") or [] for row in flat]})
+    frame = pd.DataFrame(records, columns=list(names), dtype=object)
+    return frame.assign(**{"run.overrides": [row.get("run.overrides") or [] for row in records]})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -10,6 +9,7 @@ import pandas as pd
 
 from devrf.apps.report.runs import Collection
 from devrf.apps.report.table import Block, Column, Table, published
+from devrf.system import printed
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Style:
     heading: str = "{}"
 
 
-def printed(table: Table, blocks: Sequence[Block], style: Style) -> pd.DataFrame:
+def cells_of(table: Table, blocks: Sequence[Block], style: Style) -> pd.DataFrame:
     """Blocks side by side as text: measured rows, then published ones below a line of their own.
 
     Columns have two levels: the label, and the protocol where it differs, below an empty title;
@@ -86,12 +86,7 @@ def reasons(collection: Collection) -> list[str]:
     return lines
 
 
-def markdown_escaped(text: str) -> str:
-    """Text in which nothing is taken for Markdown."""
-    return re.sub(r"([\\`*<>|\[\]])|((?<!\w)_|_(?!\w))", r"\\\1\2", text)
-
-
-MARKDOWN = Style(markdown_escaped, ("{}", "**{}**", "<ins>{}</ins>", "*{}*"), "*{}*")
+MARKDOWN = Style(printed.markdown, ("{}", "**{}**", "<ins>{}</ins>", "*{}*"), "*{}*")
 PLAIN = Style(str, ("{} ", "{}¹", "{}²", "{}³"))
 
 
@@ -105,18 +100,19 @@ def markdown(
     parts = [
         "# Runs compared",
         f"{count} finished run{'s' * (count != 1)} below `{collection.folder}`{failed}.",
-        f"{markdown_escaped(caption(table))} **Best**, <ins>second</ins>, *third*.",
+        f"{printed.markdown(caption(table))} **Best**, <ins>second</ins>, *third*.",
     ]
     if table.shows_published:
-        parts.append(f"† {markdown_escaped(published().credit)}")
+        parts.append(f"† {printed.markdown(published().credit)}")
     for block in table.blocks:
-        frame = printed(table, [block], MARKDOWN).droplevel(0, axis=1)
+        frame = cells_of(table, [block], MARKDOWN).droplevel(0, axis=1)
         left = len(frame.columns) - len(table.columns)
         align = ["left"] * left + ["right"] * len(table.columns)
         cells = frame.to_markdown(index=False, disable_numparse=True, colalign=align)
-        parts += [f"## {markdown_escaped(block.title)}", cells]
+        parts += [f"## {printed.markdown(block.title)}", cells]
     if len(table.gains):
-        cells = table.gains.map(markdown_escaped).to_markdown(index=False, disable_numparse=True)
+        gains = table.gains.map(printed.markdown).rename(columns=printed.markdown)
+        cells = gains.to_markdown(index=False, disable_numparse=True)
         parts += ["## Gains over all scenes", cells]
     for heading, lines in (
         ("", table.notes),
@@ -124,12 +120,12 @@ def markdown(
         ("## Skipped", collection.skipped),
     ):
         if lines:
-            parts += [heading, "\n".join(f"- {markdown_escaped(line)}" for line in lines)]
+            parts += [heading, "\n".join(f"- {printed.markdown(line)}" for line in lines)]
     if figures:
         parts.append("## Plots")
-        parts += [f"![{markdown_escaped(shows)}](<{link}>)" for shows, link in figures.items()]
+        parts += [f"![{printed.markdown(shows)}](<{link}>)" for shows, link in figures.items()]
     if videos:
-        links = [f"- [{markdown_escaped(shows)}](<{link}>)" for shows, link in videos.items()]
+        links = [f"- [{printed.markdown(shows)}](<{link}>)" for shows, link in videos.items()]
         parts += ["## Videos", "\n".join(links)]
     return "\n\n".join(filter(None, parts)) + "\n"
 
@@ -144,7 +140,7 @@ def plain(table: Table) -> str:
 
 
 def _plain_block(table: Table, block: Block) -> str:
-    frame = printed(table, [block], PLAIN).droplevel(0, axis=1)
+    frame = cells_of(table, [block], PLAIN).droplevel(0, axis=1)
     count = len(table.columns)
     heads = frame.iloc[:, :-count]
     cells = frame.iloc[:, -count:]
@@ -163,22 +159,8 @@ HEAD = r"""% Made by devrf; read it with \input. Needs no package. For marks in 
 \providecommand{\devrfsecond}[1]{\underline{#1}}
 \providecommand{\devrfthird}[1]{\textit{#1}}
 """
-# pandas' own escapes leave the symbols below the first two lines as they are.
-SPECIAL = str.maketrans(
-    {character: rf"\{character}" for character in "&%$#_{}"}
-    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
-    | {"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': "''", "–": "--"}
-    | {"±": r"$\pm$", "×": r"$\times$", "↑": r"$\uparrow$", "↓": r"$\downarrow$", "†": r"$\dagger$"}
-)
-
-
-def latex_escaped(text: str) -> str:
-    """Text in which nothing is taken for a command."""
-    return text.translate(SPECIAL)
-
-
 STYLE = Style(
-    latex_escaped,
+    printed.latex,
     ("{}", r"\devrfbest{{{}}}", r"\devrfsecond{{{}}}", r"\devrfthird{{{}}}"),
     r"\textit{{{}}}",
 )
@@ -191,7 +173,7 @@ def latex(table: Table) -> str:
     parts = [HEAD]
     for start in range(0, len(table.blocks), SIDE_BY_SIDE):
         blocks = table.blocks[start : start + SIDE_BY_SIDE]
-        parts.append(_tables(table, blocks, latex_escaped(words)))
+        parts.append(_tables(table, blocks, printed.latex(words)))
         words = "Continued."
     lines = [*table.notes, *(f"failed: {why}" for why in reasons(table.collection))]
     parts.append("".join(f"% {' '.join(line.split())}\n" for line in lines))
@@ -199,7 +181,7 @@ def latex(table: Table) -> str:
 
 
 def _tables(table: Table, blocks: Sequence[Block], words: str) -> str:
-    frame = printed(table, blocks, STYLE)
+    frame = cells_of(table, blocks, STYLE)
     count = len(table.columns)
     left = len(frame.columns) - count * len(blocks)
     above = [rf"\multicolumn{{{count}}}{{c|}}{{{STYLE.escape(block.title)}}}" for block in blocks]

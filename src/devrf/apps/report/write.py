@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -13,13 +14,16 @@ from PIL import Image, ImageDraw
 
 from devrf.apps.figures import write_figure
 from devrf.apps.report.plots import file_name, plots
-from devrf.apps.report.runs import collect
+from devrf.apps.report.runs import SKIPPED, collect
 from devrf.apps.report.table import Table, tabulate
 from devrf.apps.report.text import latex, markdown, plain
 from devrf.apps.settings import ReportSettings
 from devrf.apps.video_file import fitted_font, write_pictures
 from devrf.errors import DevrfError
 from devrf.system.files import refuse_links, write_text
+from devrf.system.printed import csv_cell
+
+log = logging.getLogger(__name__)
 
 # Pictures a second of the videos that show rows side by side.
 FPS = 10
@@ -55,20 +59,23 @@ def write_report(settings: ReportSettings) -> str:
 
 def csv(table: Table) -> str:
     """A row for each run and failure, with all of ``metrics.json`` by dotted name."""
-    runs = table.collection.runs.drop(columns="path").copy()  # in one piece
+    runs = table.collection.runs.drop(
+        columns=["path", "row"], errors="ignore"
+    ).copy()  # in one piece
     runs.insert(3, "row", table.runs["label"])
     failures = table.collection.failures.drop(columns="path")
     rows = pd.concat([runs, failures], ignore_index=True)
-    return str(rows.map(_csv_cell).to_csv(index=False, lineterminator="\n"))
+    rows = rows.map(_csv_cell).rename(columns=csv_cell)
+    return str(rows.to_csv(index=False, lineterminator="\n"))
 
 
 def _csv_cell(value: object) -> str:
     """Text as it was recorded: a column of integers stays one where some are unknown."""
     if isinstance(value, list):
-        return " ".join(map(str, value))
+        return csv_cell(" ".join(map(str, value)))
     if isinstance(value, bool):
         return str(value).lower()
-    return "" if pd.isna(value) else str(value)
+    return "" if pd.isna(value) else csv_cell(str(value))
 
 
 def _write_plots(table: Table, folder: Path) -> dict[str, str]:
@@ -109,25 +116,36 @@ def scene_video(table: Table, scene: str) -> Iterator[np.ndarray] | None:
     row's, and as many frames as the shortest video. None where fewer than two rows have a video.
     """
     runs = table.runs[table.runs["scene"] == scene]
-    videos = dict[str, Path]()
+    videos = dict[str, tuple[Path, int]]()
     for label, folder in zip(runs["label"], runs["path"], strict=True):
         path = Path(folder) / "videos" / "held_out.mp4"
-        if path.is_file():
-            videos.setdefault(label, path)
+        if label not in videos and path.is_file() and (count := _frame_count(path)):
+            videos[label] = path, count
     return _pictures(videos) if len(videos) > 1 else None
 
 
-def _pictures(paths: Mapping[str, Path]) -> Iterator[np.ndarray]:
-    counts = [sum(1 for _ in iio.imiter(path)) for path in paths.values()]
-    times = np.linspace(0, 1, min(counts))
+def _frame_count(path: Path) -> int:
+    """How many frames can be read of a video; a line in the log if there is none."""
+    try:
+        with path.open("rb") as file:
+            if file.read(8)[4:] != b"ftyp":  # FFmpeg would follow what a list of files says
+                raise ValueError
+        return sum(1 for _ in iio.imiter(path))
+    except Exception:  # what decoders raise depends on the damage
+        log.warning(SKIPPED, path)
+        return 0
+
+
+def _pictures(films: Mapping[str, tuple[Path, int]]) -> Iterator[np.ndarray]:
+    times = np.linspace(0, 1, min(count for _, count in films.values()))
     videos = (
         _frames_at([round(time * (count - 1)) for time in times], path)
-        for path, count in zip(paths.values(), counts, strict=True)
+        for path, count in films.values()
     )
     for frames in zip(*videos, strict=True):
         truth = _column(frames[0], TRUTH)
         shown = (_column(frame, RENDERED).resize(truth.size) for frame in frames)
-        yield _page({"truth": truth, **dict(zip(paths, shown, strict=True))})
+        yield _page({"truth": truth, **dict(zip(films, shown, strict=True))})
 
 
 def _frames_at(places: Iterable[int], path: Path) -> Iterator[np.ndarray]:

@@ -51,6 +51,7 @@ from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.volume_rendering import deformed_occupancy, medium
 from devrf.ops.trilinear import shape_of
 from devrf.rendering.occupancy import Occupancy, dilate
+from devrf.system.printed import shown
 
 # Displacements are rounded to this share of a cell, residual colours to this share of a logit:
 # noise takes space.
@@ -89,7 +90,7 @@ def page(model: Renderable, viewpoints: Viewpoints, name: str, checkpoint: str) 
     description = _description(model, viewpoints) | {"name": name, "shapes": sizes}
     folder = files("devrf.apps.web")
     texts = {
-        "title": html.escape(f"{name} · devrf"),
+        "title": html.escape(shown(f"{name} · devrf")),
         "checkpoint": checkpoint,
         "shader": folder.joinpath("scene.glsl").read_text("utf-8"),
         "script": folder.joinpath("scene.js").read_text("utf-8"),
