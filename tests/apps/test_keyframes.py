@@ -143,6 +143,8 @@ SCALED = [2 * value for value in MATRIX[:12]] + MATRIX[12:]
     [
         (b"{", "p: not valid JSON"),
         (content(fps=24), "p: holds no camera path"),
+        *[(content(keyframes=[frame()], fps=x), "p: fps: ") for x in (1e-300, 0, -1, 1e30)],
+        (content(keyframes=[frame(aspect=1e30)]), "p: keyframes[0].aspect: "),
         (content(keyframes=[frame(fov=190)]), "p: keyframes[0].fov: "),
         (content(keyframes=[frame(matrix=SCALED)]), "p: keyframes[0].matrix: is no rigid"),
         (content(keyframes=[frame(), frame()]), "p: keyframes[1].seconds: "),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import imageio.v3 as iio
@@ -224,6 +225,11 @@ def test_the_camera_that_is_meant(tiny_scene):
         (StillSettings, {"view": -1}, "still.view: "),
         (StillSettings, {"height": 0}, "still.height: "),
         (VideoSettings, {"height": 15}, "video.height: "),
+        (StillSettings, {"height": 10**9}, "still.height: "),
+        (VideoSettings, {"height": 10**9}, "video.height: "),
+        *[(VideoSettings, {"fps": x}, "video.fps: ") for x in (1e-300, 0, -1, 1e300, math.nan)],
+        *[(VideoSettings, {"orbit_turns": x}, "video.orbit_turns: ") for x in (1e300, math.inf)],
+        (VideoSettings, {"orbit_elevation": 1e30}, "video.orbit_elevation: "),
         (VideoSettings, {"max_seconds": 0}, "video.max_seconds: "),
         (VideoSettings, {"time": 1.5}, "video.time: "),
     ],

@@ -11,6 +11,8 @@ import os
 import random
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,9 @@ from lightning import Callback, Trainer
 from lightning.pytorch.callbacks import LambdaCallback
 from torch import Tensor
 
+from devrf.apps.export.geometry import ExportSettings
+from devrf.apps.export.scene import export_scene
+from devrf.apps.web.pack import drawable, page
 from devrf.callbacks import DivergenceGuard, Previews, TrainingRecord
 from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, load_checkpoint, save_checkpoint
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file, write_checkpoint_file
@@ -33,7 +38,7 @@ from devrf.rendering.renderer import Renderer
 from devrf.system.memory import own_memory
 
 INPUTS = int(os.environ.get("DEVRF_FUZZ_INPUTS", "100"))
-NUMBERS = [0, -1, 1, 0.5, 5e-324, 1e9, 1e300, 2**63, math.nan, math.inf, True]
+NUMBERS = [0, -1, 1, 0.5, 5e-324, 1e9, 1e30, 1e300, 2**63, math.nan, math.inf, True]
 OTHERS = [None, "", "a", "../x", "\x1b[2J\n", [], [0], [[0] * 4] * 4, {}, {"": 1}]
 TENSORS = [torch.zeros(()), torch.zeros(0), torch.ones(3), torch.ones(1, 1, 1, 1)]
 LEFT_OUT = object()
@@ -48,7 +53,8 @@ def other_tensors(tensor: Tensor) -> Iterator[Tensor]:
         yield from (tensor[:0], tensor[:1], tensor.repeat_interleave(3, dim=0))
         yield tensor.transpose(0, -1)
     if tensor.is_floating_point():
-        yield from (torch.full_like(tensor, value) for value in (math.nan, math.inf, -6e4))
+        largest = torch.finfo(tensor.dtype).max
+        yield from (torch.full_like(tensor, v) for v in (math.nan, math.inf, largest, -6e4))
 
 
 def changes(value: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:
@@ -100,23 +106,53 @@ def try_all(path: Path, keys: tuple[str, ...], use: Callable[[], object], count:
     return refused
 
 
-@pytest.mark.filterwarnings("ignore")
-def test_a_checkpoint_is_shown_or_refused(rest, datamodule, trainer, tmp_path):
+@pytest.fixture
+def motion(rest, datamodule, trainer, tmp_path) -> Path:
+    """The checkpoint of a scene that moves."""
     schedule, learner = DeformationSchedule(levels=(Level(4, 2),), rays=64), trainer(max_epochs=1)
     learner.fit(DeformationStage(rest, schedule), datamodule=datamodule)
-    path = tmp_path / "deformation.ckpt"
-    save_checkpoint(learner, path)
+    save_checkpoint(learner, tmp_path / "deformation.ckpt")
+    return tmp_path / "deformation.ckpt"
 
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_checkpoint_is_shown_or_refused(motion, tmp_path):
     def show() -> None:
-        stored = load_checkpoint(path)
+        stored = load_checkpoint(motion)
         if stored.viewpoints is not None:
             camera = stored.viewpoints.held_out.of_height(12)
             for moment in (0.0, 0.3, 1.0):
                 Renderer(stored.model).view(camera, index=0, time=moment, background=1.0)
             stored.model.forward_map(0.7)(torch.zeros(2, 3))
+            if drawable(stored.model):
+                page(stored.model, stored.viewpoints, "a", "b")
+            mesh = ExportSettings(side=8, faces=20, times=[0, 0.7])
+            with suppress(DevrfError):  # there may be no surface
+                export_scene(stored.model, stored.viewpoints, mesh, tmp_path / "export")
 
     count = INPUTS * 3 // 4
-    assert try_all(path, ("devrf", "state_dict", "viewpoints"), show, count) > count // 4
+    assert try_all(motion, ("devrf", "state_dict", "viewpoints"), show, count) > count // 4
+
+
+PLACES: list[Place] = [
+    ("state_dict", "scene_model.deformation.frames.to_canonical", "kept"),
+    ("state_dict", "scene_model.canonical.decoder.output.bias"),
+    ("viewpoints", "static", "camera_to_world"),
+    ("viewpoints", "held_out", "center"),
+    ("viewpoints", "clock", "times", 1),
+    ("viewpoints", "offset", 0),
+]
+
+
+def test_numbers_that_nothing_can_be_computed_with_are_one_line(motion):
+    content = read_checkpoint_file(motion)
+    for place in PLACES:
+        part = reduce(lambda whole, key: whole[key], place, content)
+        for value in (math.nan, math.inf, -math.inf, 1e30):
+            other = part.float() * 0 + value if isinstance(part, Tensor) else value
+            write_checkpoint_file(motion, changed(content, place, other))
+            with pytest.raises(DevrfError, match="its parts do not fit together"):
+                load_checkpoint(motion)
 
 
 @pytest.mark.filterwarnings("ignore")

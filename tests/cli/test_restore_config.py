@@ -185,6 +185,9 @@ def nested(depth: int) -> object:
 
 
 HOSTILE = {
+    "a list without end": ({}, {"data.test_times": [0] * 2000}),
+    "keys without end": ({}, {f"data.k{k}": 0 for k in range(2000)}),
+    "a text without end": ({}, {"data.root": "a b " * 10**5}),
     "a word that is put together": (
         {},
         {"aa": "_tar", "bb": "get_", "canonical": TEXT},
@@ -218,6 +221,19 @@ def test_a_checkpoint_holds_names_of_options_and_plain_values(run, learned_by, c
     for named in (f"hydra.run.dir={run}", f"ckpt={evil}"):
         with pytest.raises(DevrfError, match=f"^{evil}: "):
             completed(["stage=still", named])
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        [f"data.test_times={[0] * 2000}"],
+        [f"+data.k{k}=0" for k in range(2000)],
+        [f"data.root='{'a b ' * 10**5}'"],
+    ],
+)
+def test_a_command_without_end_is_not_parsed(words):
+    with pytest.raises(DevrfError, match="^the command: more than 1000 values"):
+        completed(words)
 
 
 @pytest.mark.parametrize("name", ["a word that is put together", "a path as a choice", "a part"])

@@ -19,11 +19,12 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, Validati
 from torch import Tensor
 
 from devrf.apps.camera_paths import NAMES
-from devrf.apps.video import MAX_FRAMES
+from devrf.apps.video import MAX_FRAMES, Rate
+from devrf.checkpoints.checkpoint import ASPECT
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.offset import NO_OFFSET, Offset, added, subtracted
-from devrf.scenes.files import Number, Positive, read_json
+from devrf.scenes.files import Number, read_json
 from devrf.scenes.validation import in_reach, is_rotation, scene_error
 from devrf.system.files import write_json
 from devrf.system.options import first_error
@@ -188,7 +189,7 @@ Time = Annotated[Number, Field(ge=0, le=1)]
 class _PathCamera(BaseModel):
     matrix: Matrix = Field(alias="camera_to_world")
     fov: Annotated[Number, Field(gt=0, lt=180)]
-    aspect: Positive = 1.0
+    aspect: Annotated[Number, Field(ge=1 / ASPECT, le=ASPECT)] = 1.0
     render_time: Time | None = None
 
 
@@ -202,7 +203,7 @@ class _PathFile(BaseModel):
     keyframes: Annotated[list[_PathKeyframe], BeforeValidator(_with_seconds)] = []
     camera_path: list[_PathCamera] = []
     camera_type: Literal["perspective"] = "perspective"
-    fps: Positive = 24.0
+    fps: Rate = 24.0
 
 
 def read_path(file: Path, offset: Offset = NO_OFFSET) -> CameraPath:

@@ -7,10 +7,11 @@ from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
 from textwrap import wrap
-from typing import ClassVar, Literal, NamedTuple
+from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import pydantic.dataclasses
 import torch
+from annotated_types import Ge, Le
 from torch import Tensor
 
 from devrf.apps.images import (
@@ -32,12 +33,14 @@ from devrf.metrics.image import psnr
 from devrf.rendering.renderer import Renderer
 from devrf.rendering.view import Viewable
 from devrf.scenes.scene import Background, Views
-from devrf.system.options import Count, Options, Share
+from devrf.system.options import Options, Share
 
 log = logging.getLogger(__name__)
 
 # Pictures of small images are rendered at this height, in pixels, unless another is asked for.
 READABLE = 400
+# The most rows of a picture that may be asked for.
+MAX_ROWS = 8192
 # The least and the largest height of images in contact sheets; others are resized.
 MIN_HEIGHT = 300
 MAX_HEIGHT = 640
@@ -53,7 +56,7 @@ class StillSettings(Options):
 
     view: Literal["held_out"] | int = "held_out"
     time: Share = 0.5
-    height: Count | None = None
+    height: Annotated[int, Ge(1), Le(MAX_ROWS)] | None = None
     half: bool = True
 
     def name(self, moves: bool) -> str:

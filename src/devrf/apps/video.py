@@ -9,13 +9,12 @@ from itertools import groupby
 from typing import Annotated, ClassVar
 
 import torch
-from annotated_types import Ge, Gt, Le
-from pydantic import FiniteFloat
+from annotated_types import Ge, Le
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from devrf.apps.images import centred, image_grid, scaled
-from devrf.apps.still import DEPTH, READABLE, sized, still
+from devrf.apps.still import DEPTH, MAX_ROWS, READABLE, sized, still
 from devrf.evaluation.held_out import background_value, truth_image
 from devrf.geometry.cameras import Cameras
 from devrf.rendering.renderer import Renderer
@@ -24,6 +23,8 @@ from devrf.system.options import Options, Positive, Share
 
 # More frames than this are a mistake: an hour at 25 a second.
 MAX_FRAMES = 90_000
+# Frames a second that FFmpeg takes.
+Rate = Annotated[float, Ge(0.01), Le(1000)]
 # H.264 has blocks of so many pixels.
 MIN_HEIGHT = 16
 # To render within max_seconds, images get lower, down to LOW rows; then frames get fewer.
@@ -38,10 +39,10 @@ class VideoSettings(Options):
     key: ClassVar[str] = "video"
 
     frames: Annotated[int, Ge(1), Le(MAX_FRAMES)] = 120
-    fps: Annotated[float, Gt(0), Le(1000)] = 24
-    orbit_turns: FiniteFloat = 1.0
-    orbit_elevation: FiniteFloat | None = None
-    height: Annotated[int, Ge(MIN_HEIGHT)] | None = None
+    fps: Rate = 24
+    orbit_turns: Annotated[float, Ge(-1000), Le(1000)] = 1.0
+    orbit_elevation: Annotated[float, Ge(-90), Le(90)] | None = None
+    height: Annotated[int, Ge(MIN_HEIGHT), Le(MAX_ROWS)] | None = None
     max_seconds: Positive | None = None
     half: bool = True
     path: str | None = None

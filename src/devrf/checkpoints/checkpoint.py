@@ -27,6 +27,7 @@ from devrf.geometry.clock import FrameClock
 from devrf.geometry.offset import NO_OFFSET, Offset
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Background, Scene
+from devrf.scenes.validation import check_poses
 from devrf.system.memory import OutOfMemoryError, is_oom
 from devrf.system.plain_data import Line, built
 from devrf.system.printed import shown
@@ -37,6 +38,8 @@ MODEL = "scene_model."
 GIVEN_REST = "ckpt"
 # A whole number in a model's config (layers, units, samples of a ray) is at most this.
 LARGEST = 2**14
+# Numbers of a file are at most this: their squares, too, are float32.
+FARTHEST = 1e12
 # What is raised where parts of a file contradict each other.
 UNFIT: tuple[type[Exception], ...] = (
     DevrfError,
@@ -138,6 +141,7 @@ class Viewpoints:
             raise ValueError("no camera")
         for camera in cameras.values():
             camera.check()
+            check_poses(camera.camera_to_world, lambda index: f"camera {index}")
             sizes = {(camera.width, camera.height), *map(tuple, camera.extents.tolist())}
             for sides in map(sorted, sizes):
                 if not 0 < sides[0] <= sides[1] <= min(SIDE, ASPECT * sides[0]):
@@ -217,6 +221,7 @@ def load_checkpoint(
         check_scene(path, metadata, scene)
     model_class = _model_class(path, metadata)
     try:
+        _check_numbers((metadata.model, data["state_dict"], data.get("viewpoints")))
         state = {k.removeprefix(MODEL): v for k, v in data["state_dict"].items() if MODEL in k}
         model = _outlined(model_class, metadata.model, state).to(device)
         model.load_stored_state(state)
@@ -263,6 +268,21 @@ def _outlined(model_class: Any, description: Mapping[str, Any], state: Mapping[s
     if values > stored + UNSTORED:
         raise ValueError("more values than are stored")
     return model_class.from_config(config)
+
+
+def _check_numbers(parts: Any) -> None:
+    """ValueError if a number in nested data is not finite, or too large to be computed with.
+
+    Settings may be infinite: how far away something may be.
+    """
+    for value in _leaves(parts):
+        if isinstance(value, torch.Tensor) and value.is_floating_point() and value.numel():
+            low, high = map(float, value.aminmax())
+            valid = -FARTHEST <= low and high <= FARTHEST  # NaN compares false
+        else:
+            valid = not isinstance(value, float) or abs(value) <= FARTHEST or math.isinf(value)
+        if not valid:
+            raise ValueError("a number that is not finite, or too large")
 
 
 def _leaves(value: Any) -> Iterator[Any]:

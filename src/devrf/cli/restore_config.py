@@ -59,6 +59,8 @@ CODE = re.compile(rf"\$\{{|^\?\?\?$|{'|'.join(RESERVED)}")
 # What reading a damaged record raises.
 UNREADABLE = (yaml.YAMLError, HydraException, LookupError, TypeError, ValueError, RecursionError)
 
+# Keys of a command, and items of its lists, at most.
+MOST = 1000
 # Options by /group, values by key.
 Command = dict[str, Any]
 
@@ -91,6 +93,7 @@ def checked(path: Path, command: Mapping[str, Any]) -> Command:
     Raises:
         DevrfError: something else is among them.
     """
+    _check_length(path, command.values())
     for key, value in command.items():
         if not _is_known(key, value):
             said = f"{key}={value}"[:80]
@@ -137,8 +140,17 @@ def parsed(overrides: Iterable[str]) -> list[Override]:
 
     Raises:
         HydraException: one is not understood.
+        DevrfError: there are too many values for the parser, which would take minutes.
     """
-    return list(OverridesParser.create().parse_overrides(list(overrides)))
+    words = list(overrides)
+    _check_length("the command", words)
+    return list(OverridesParser.create().parse_overrides(words))
+
+
+def _check_length(where: object, words: Iterable[object]) -> None:
+    texts = [*map(str, words)]
+    if sum(1 + text.count(",") for text in texts) > MOST or sum(map(len, texts)) > 100 * MOST:
+        raise DevrfError(f"{where}: more than {MOST} values; give fewer, or shorter ones")
 
 
 def values(overrides: Sequence[Override], key: str) -> list[str]:

@@ -53,7 +53,7 @@ class Cameras:
             raise ValueError(f"cameras of the shapes {shapes}")
         single = all(tensor.dtype == torch.float32 for tensor in tensors)
         finite = single and all(bool(tensor.isfinite().all()) for tensor in tensors)
-        if not finite or not bool((self.focal > 0).all()):
+        if not finite or not bool((self.focal > 1e-3).all()):
             raise ValueError("a camera that is not finite, or sees nothing")
         if self.sizes is not None:
             raster = torch.tensor([self.width, self.height])

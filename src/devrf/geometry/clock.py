@@ -45,6 +45,8 @@ class FrameClock:
             raise ValueError("a frame clock begins at time 0")
         if not all(b - a > self.TOLERANCE for a, b in pairwise(self.times)):
             raise ValueError("a frame clock needs distinct ascending times")
+        if self.times[-1] > 1 + self.TOLERANCE:
+            raise ValueError("a frame clock ends at time 1")
 
     def __len__(self) -> int:
         return len(self.times)

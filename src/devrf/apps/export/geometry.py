@@ -11,7 +11,6 @@ from typing import Annotated, ClassVar, Literal, cast
 import pydantic.dataclasses
 import torch
 from annotated_types import Ge, Gt, Le, Lt, MinLen
-from pydantic import FiniteFloat
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -26,7 +25,7 @@ from devrf.system.options import Count, Options, Share
 
 Format = Literal["gltf", "html", "ply", "obj", "splats", "usd"]
 Up = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
-PositiveFinite = Annotated[FiniteFloat, Gt(0)]
+Factor = Annotated[float, Ge(1e-9), Le(1e9)]
 
 
 @pydantic.dataclasses.dataclass(frozen=True)
@@ -41,14 +40,14 @@ class ExportSettings(Options):
     side: Annotated[int, Ge(2), Le(1024)] | None = None
     faces: Annotated[int, Ge(4)] = 20_000
     pieces: Share = 0.01
-    reach: PositiveFinite = 10.0
+    reach: Factor = 10.0
     colors: Literal["normal", "mean"] = "mean"
     points: Count = 20_000
     times: Annotated[Sequence[float], MinLen(1)] | None = None
-    fps: PositiveFinite | None = None
-    seconds: PositiveFinite = 3.0
+    fps: Annotated[float, Gt(0), Le(1000)] | None = None
+    seconds: Annotated[float, Ge(0.01), Le(3600)] = 3.0
     up: Up = "auto"
-    metres: PositiveFinite = 1.0
+    metres: Factor = 1.0
     into: str | Path | None = None
 
     def __post_init__(self) -> None:

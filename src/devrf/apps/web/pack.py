@@ -177,7 +177,8 @@ def _seen(
         mask = first.mask | second.mask
         near = Occupancy(mask, first.box).points_near(motion.shape, motion.box)
         before, after = (motion.to_canonical[n].to(near.device).float() for n in (k, k + 1))
-        change = float(((after - before).norm(dim=-1) * near).amax())
+        # What moves by more than this comes from where nothing is.
+        change = min(float(((after - before).norm(dim=-1) * near).amax()), first.box.diagonal)
         steps = math.ceil(change / (2 * cell))
         for time in torch.linspace(times[k], times[k + 1], steps + 1)[1:-1].tolist():
             mask |= occupied(motion.warp_at(time)).mask
