@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import copy
 import gzip
+import html
 import io
 import json
 import math
@@ -42,6 +43,7 @@ from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
+from devrf.system.printed import shown
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 DRIVER = shutil.which("chromedriver")
@@ -418,6 +420,17 @@ def test_without_webgl_and_after_a_lost_context_there_is_a_line(browser, file):
 
 
 # Without a browser
+
+
+@pytest.mark.parametrize("name", ["{{data}}", "{{x}}", "</script><script>alert(1)", "a\x1b\u202eb"])
+def test_a_scene_may_be_called_as_a_part_of_the_page(moving, tiny_scene, name):
+    plain, text = (page(moving, Viewpoints.of(tiny_scene), n, "0123abcd") for n in ("plain", name))
+    described = re.search(r'id="description">(.*)</script>', text)[1]
+    assert json.loads(described)["name"] == name and text.count("</script>") == plain.count(
+        "</script>"
+    )
+    title = re.search("<title>(.*)</title>", text)[1]
+    assert html.unescape(title) == f"{shown(name)} · devrf"
 
 
 def test_all_data_are_in_the_file_and_as_large_as_their_textures(moving, tiny_scene):

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
+import math
 import shutil
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,9 +25,17 @@ from devrf.apps.capture.images import (
     still_masks,
     write_frames,
 )
-from devrf.apps.capture.pipeline import kept, scene_from_footage
-from devrf.apps.capture.structure import checked_model, pairs
-from devrf.apps.capture.survey import BLURRED, check_sharp, moved, sharpest, sharpness, survey
+from devrf.apps.capture.pipeline import _model, kept, scene_from_footage
+from devrf.apps.capture.structure import MODELS, checked_model, pairs
+from devrf.apps.capture.survey import (
+    BLURRED,
+    Survey,
+    check_sharp,
+    moved,
+    sharpest,
+    sharpness,
+    survey,
+)
 from devrf.apps.settings import CaptureSettings
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
@@ -40,7 +51,44 @@ def test_a_damaged_record_of_a_step_is_one_line(tmp_path, text):
     with pytest.raises(
         DevrfError, match=r"survey\.json: damaged; remove it, and it is made again$"
     ):
-        kept(tmp_path / "survey.json", "videos", dict)
+        kept(tmp_path / "survey.json", "videos", dict[str, Any], dict)
+
+
+SEEN = {"size": [64, 48], "times": [0.0, 0.1], "sharpness": [1.0, 1.0], "motion": [0.0, 1.0]}
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("size", [0, -1]),
+        ("size", "large"),
+        *[("times", x) for x in ([], [0.0], [0.0, math.nan], [1.0, 0.0], [0, 10**400], {}, None)],
+        *[("sharpness", x) for x in ([1.0], [math.inf, 1.0], ["x", "y"])],
+        ("motion", [0.0] * 10_000),
+    ],
+)
+def test_a_record_of_a_step_that_holds_something_else_is_one_line(tmp_path, key, value):
+    file = tmp_path / "survey.json"
+    assert kept(file, "videos", Survey, lambda: SEEN) == kept(file, "videos", Survey, dict)
+    record = json.loads(file.read_text())
+    for result in ({**SEEN, key: value}, [value], value):
+        file.write_text(json.dumps({**record, "result": result}))
+        with pytest.raises(DevrfError, match=r"survey\.json: damaged; remove it"):
+            kept(file, "videos", Survey, dict)
+
+
+@pytest.mark.parametrize("name", ["../../../elsewhere", "/etc", "a/../..", "", "a\0b"])
+def test_a_model_is_in_the_folder_of_models(tmp_path, monkeypatch, name):
+    work, film = tmp_path / "capture", tmp_path / "a.mp4"
+    film.touch()
+    monkeypatch.setattr("devrf.apps.capture.pipeline.reconstruct", lambda *_: work / MODELS / "0")
+    arguments = (tmp_path, work, Chosen(film, "static", (0,)), [], CaptureSettings())
+    with pytest.raises(DevrfError, match="0: not a readable COLMAP model"):
+        _model(*arguments)
+    record = json.loads((work / "structure.json").read_text())
+    (work / "structure.json").write_text(json.dumps({**record, "result": {"model": name}}))
+    with pytest.raises(DevrfError, match="(leads outside the scene's folder|is not a path)"):
+        _model(*arguments)
 
 
 @pytest.mark.skipif(find_spec("pycolmap") is None, reason="needs devrf[capture]")

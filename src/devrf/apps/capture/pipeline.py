@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from devrf.apps.capture.alignment import Timeline, timeline
 from devrf.apps.capture.images import (
@@ -24,6 +24,7 @@ from devrf.apps.capture.survey import Survey, check_sharp, sharpest, survey
 from devrf.apps.settings import CaptureSettings
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
+from devrf.scenes.files import inside
 from devrf.scenes.footage import frame_count, is_folder, pictures
 from devrf.scenes.formats.nerfstudio import FILE
 from devrf.scenes.sparse_model import (
@@ -37,7 +38,7 @@ from devrf.scenes.sparse_model import (
 )
 from devrf.scenes.splits import every_nth
 from devrf.system.files import make_folder, read_record, refuse_links, write_json
-from devrf.system.plain_data import built
+from devrf.system.plain_data import Kind, built
 from devrf.system.progress import followed
 
 log = logging.getLogger(__name__)
@@ -124,8 +125,10 @@ def scene_from_footage(settings: CaptureSettings) -> Path:
     return into
 
 
-def kept(file: Path, source: Any, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """What ``make`` returns; read from the JSON ``file`` if that was made from the same source.
+def kept(file: Path, source: Any, kind: type[Kind], make: Callable[[], dict[str, Any]]) -> Kind:
+    """The ``kind`` that ``make`` returns the entries of.
+
+    It is read from the JSON ``file`` if that was made from the same source.
 
     Raises:
         DevrfError: the file is damaged.
@@ -134,15 +137,16 @@ def kept(file: Path, source: Any, make: Callable[[], dict[str, Any]]) -> dict[st
     if file.is_file():
         try:
             stored = json.loads(read_record(file))
-            same, found = stored["key"] == key, dict(stored["result"])
-        except (ValueError, LookupError, TypeError, RecursionError):
+            same, result = stored["key"] == key, stored["result"]
+            if same:
+                found = built(kind, result)
+                log.info("%s: found before", file.stem)
+                return found
+        except (ValueError, LookupError, TypeError, RecursionError, OverflowError):
             raise DevrfError(f"{file}: damaged; remove it, and it is made again") from None
-        if same:
-            log.info("%s: found before", file.stem)
-            return found
     result = make()
     write_json(file, {"key": key, "result": result})
-    return result
+    return built(kind, result)
 
 
 def _digest(source: Any) -> str:
@@ -183,7 +187,7 @@ def _surveyed(path: Path, work: Path) -> Survey:
         return asdict(survey(path, frames))
 
     slug = f"{path.stem}-{_digest(str(path.resolve()))[:6]}"
-    return built(Survey, kept(work / f"survey-{slug}.json", _stamp(path), make))
+    return kept(work / f"survey-{slug}.json", _stamp(path), Survey, make)
 
 
 def _write_images(
@@ -213,7 +217,7 @@ def _write_images(
 
     if not images.is_dir():
         file.unlink(missing_ok=True)
-    kept(file, [source, size], make)
+    kept(file, [source, size], dict[str, Any], make)
 
 
 def _model(
@@ -230,8 +234,9 @@ def _model(
         model = reconstruct(into / IMAGES, work, moving, list(first), settings)
         return {"model": model.relative_to(work / MODELS).as_posix()}
 
-    result = kept(work / "structure.json", [images, options, settings.size], make)
-    return checked_model(work / MODELS / result["model"], moving, first)
+    file = work / "structure.json"
+    name = kept(file, [images, options, settings.size], dict[Literal["model"], str], make)["model"]
+    return checked_model(inside(work / MODELS, work / MODELS, name, file), moving, first)
 
 
 def _around_motion(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -50,6 +51,13 @@ class Survey:
     times: tuple[float, ...]
     sharpness: tuple[float, ...]
     motion: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        rising = all(a < b < math.inf for a, b in pairwise((-1.0, *self.times)))
+        finite = all(map(math.isfinite, (*self.sharpness, *self.motion)))
+        alike = 0 < len(self.times) == len(self.sharpness) == len(self.motion)
+        if not (rising and finite and alike and min(self.size) > 0):
+            raise ValueError("no survey")
 
     @property
     def rate(self) -> float:

@@ -26,6 +26,7 @@ import gzip
 import html
 import json
 import math
+import re
 from collections.abc import Callable, Iterator
 from functools import partial
 from importlib.resources import files
@@ -99,9 +100,8 @@ def page(model: Renderable, viewpoints: Viewpoints, name: str, checkpoint: str) 
         "data": "\n".join(elements),
     }
     text = folder.joinpath("scene.html").read_text("utf-8")
-    for word, filling in texts.items():
-        text = text.replace(f"{{{{{word}}}}}", filling)
-    return text
+    # In one pass: a scene's name may look like a word.
+    return re.sub(r"\{\{(\w+)\}\}", lambda word: texts[word[1]], text)
 
 
 def _element(part: str, values: Tensor) -> str:
