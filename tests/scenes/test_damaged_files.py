@@ -1,6 +1,7 @@
-"""Scenes with one damaged file: each is read, or refused in one clear line.
+"""Files with one damage: each is read, or refused in one clear line.
 
-Sixty inputs in all, or as many as DEVRF_FUZZ_INPUTS says, shared out among the layouts.
+Sixty inputs in all, or as many as DEVRF_FUZZ_INPUTS says, shared out among the layouts,
+records of runs, and the catalogue of scenes.
 """
 
 from __future__ import annotations
@@ -18,9 +19,15 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.strategies import DrawFn
 
+from devrf.apps.fetch import OWN, catalogue
+from devrf.apps.report.runs import collect
+from devrf.apps.report.table import tabulate
+from devrf.apps.report.text import latex, markdown, plain
+from devrf.apps.report.write import csv
 from devrf.data.recorded import READERS
 from devrf.errors import DevrfError
 from devrf.scenes.scene import Scene
+from devrf.system.printed import is_shown
 
 NUMBERS = [0, -1, 0.5, 5e-324, 1e9, 1e38, 1e300, 2**63, float("nan"), float("inf")]
 TEXTS = ["", "a", "..", "/", "../../secret", "/etc/passwd", "a\0b", "\ud800", "\x1b[2J\r\n"]
@@ -162,3 +169,59 @@ def test_a_damaged_file_is_read_or_refused(layout, write_layout, tmp_path):
     each()
     # Damage that no reader notices would test nothing.
     assert len(refused) >= INPUTS * share // 1000
+
+
+RECORD = {
+    **{"scene": "robot", "method": "devrf", "protocol": "two_stage", "at_rest": False},
+    "static": {"psnr": 33.0, "seconds": 10.0, "peak_gpu_gb": None},
+    "dynamic": {"psnr": 29.0, "ssim": 0.9, "novel_times": {"psnr": 28.0, "images": 3}},
+    "run": {
+        **{"device": "cpu", "git": "0123456789", "overrides": ["a=1"], "seed": 0, "frames": 3},
+        **{"image_size": [96, 96], "checkpoint": "ab", "date": "2026", "train_views": 4},
+        "choices": {"ablation": "full", "experiment": "paper", "data": "robot"},
+        "settings": {"loss.terms": [1, "x"], "schedule.seconds": 60, "priors": "none"},
+    },
+    **{"overrides": [], "seed": 0, "choices": {"a": "b"}, "error": "x: y", "mistake": True},
+}
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_damaged_record_is_reported_or_skipped(tmp_path):
+    whole = json.dumps(RECORD).encode()
+    for name in ("good", "changed"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "metrics.json").write_bytes(whole)
+    skipped = list[str]()
+    edited = st.builds(json.loads, st.just(whole)).flatmap(edited_json)
+
+    @settings(max_examples=max(3, INPUTS * 2 // 100), suppress_health_check=list(HealthCheck))
+    @given(
+        st.sampled_from(["metrics.json", "failure.json"]),
+        st.one_of(edited.map(str.encode), damaged_bytes(whole)),
+    )
+    def each(file: str, content: bytes) -> None:
+        (tmp_path / "changed" / file).write_bytes(content)
+        collection = collect(tmp_path)
+        table = tabulate(collection)
+        for text in (plain(table), markdown(table, {}), latex(table), csv(table)):
+            assert all(map(is_shown, text.split("\n")))
+        skipped.extend(collection.skipped)
+        remove(tmp_path / "changed" / file)
+
+    each()
+    assert INPUTS < 1000 or skipped
+
+
+def test_a_damaged_catalogue_is_read_or_refused(tmp_path):
+    file = tmp_path / "catalogue.toml"
+
+    @settings(max_examples=max(3, INPUTS * 10 // 100), suppress_health_check=list(HealthCheck))
+    @given(damaged_bytes(OWN.read_bytes()))
+    def each(content: bytes) -> None:
+        file.write_bytes(content)
+        try:
+            catalogue(file)
+        except DevrfError as error:
+            assert str(error).startswith(f"fetch.catalogue: {file} cannot be read (")
+
+    each()
