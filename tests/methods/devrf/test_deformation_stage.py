@@ -128,6 +128,25 @@ def test_each_level_has_its_rates_and_its_factor_of_all_terms_but_render(rest, d
     assert rates[1] == pytest.approx(falls)
 
 
+def test_the_elastic_term_counts_more_while_a_visit_at_the_coarsest_level_begins(
+    rest, datamodule, trainer
+):
+    schedule = DeformationSchedule((Level(4, 2), Level(6, 1)), rays=16)
+    loss = {"render": 1.0, "elastic": 0.5}
+    elastic = {"elastic": Elastic(initial_factor=16.0)}
+    stage = DeformationStage(rest, schedule, loss=loss, extensions=elastic, iterations_per_step=1)
+    weights = {0: [], 1: []}
+
+    def note(trainer: Trainer, stage: DeformationStage, *_: Any) -> None:
+        weights[stage.phase.level].append(stage.weights["elastic"])
+
+    watch = LambdaCallback(on_train_batch_end=note)
+    trainer(watch, max_epochs=1).fit(stage, datamodule=datamodule)
+    # Frame 1 has four iterations, frame 2 two; within each 16 falls towards 1.
+    assert weights[0] == pytest.approx([8.0, 4.0, 2.0, 1.0, 8.0, 2.0])
+    assert set(weights[1]) == {0.5}
+
+
 def test_the_flow_of_a_moving_camera_neither_starts_nor_teaches_a_frame(
     rest, tiny_scene, serve, trainer
 ):

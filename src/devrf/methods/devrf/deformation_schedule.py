@@ -82,8 +82,11 @@ class DeformationPhase(Phase):
 
     def learning_rate_at(self, iteration: int) -> float:
         """Factor of the learning rate in the visit (docs/method.md#motion-learning-rate)."""
-        share = (iteration - self.start) / (self.stop - self.start)
-        return self.learning_rate_factor * math.pow(self.lr_final_factor, share)
+        return self.learning_rate_factor * math.pow(self.lr_final_factor, self.share(iteration))
+
+    def share(self, iteration: int) -> float:
+        """What share of the visit is over, from 0 to below 1."""
+        return (iteration - self.start) / (self.stop - self.start)
 
 
 @pydantic.dataclasses.dataclass(frozen=True)

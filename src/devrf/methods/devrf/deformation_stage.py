@@ -65,7 +65,7 @@ class DeformationStage(Stage):
         schedule: levels, iterations and rays.
         motion: learning rate and how batches are drawn.
         motion_loss: the loss terms, and their weights at each level.
-        weights: of the loss terms that count at the present level.
+        weights: of the loss terms that count at the present iteration.
         active: the frame that is trained; None before the first, and after the last.
     """
 
@@ -319,9 +319,12 @@ class DeformationStage(Stage):
         frame.occupancy.refill(possible_occupancy(model.occupancy, warp))
 
     def prepare(self) -> None:
-        """Update the frame's occupancy every ``occupancy_every`` iterations."""
-        assert self.phase is not None
-        if self.is_due(self.motion.occupancy_every, self.phase.start):
+        """Weigh the terms; update the frame's occupancy every ``occupancy_every`` iterations."""
+        phase = self.phase
+        assert phase is not None
+        share = phase.share(self.iterations_done)
+        self.weights = self.motion_loss.weights_at(phase.level, share)
+        if self.is_due(self.motion.occupancy_every, phase.start):
             with span("sampling"):
                 self._update_occupancy()
 

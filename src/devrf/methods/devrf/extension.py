@@ -47,8 +47,8 @@ class Extension:
     def begin_level(self, stage: DeformationStage, level: int) -> None:
         """Memory of the active frame is ready; give the optimiser what is learned of it."""
 
-    def weight_factor(self, term: str, level: int) -> float:
-        """Factor of the weight of any loss term at ``level``."""
+    def weight_factor(self, term: str, level: int, share: float) -> float:
+        """Factor of the weight of any loss term at ``level``, a ``share`` of a visit being over."""
         return 1.0
 
     def initialise(self, stage: DeformationStage, phase: DeformationPhase) -> None:

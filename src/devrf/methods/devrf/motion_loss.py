@@ -61,17 +61,18 @@ class MotionLoss:
         """Let a term count no more; whether it did."""
         return bool(self._weights.pop(term, 0.0))
 
-    def weights_at(self, level: int) -> dict[str, float]:
-        """The weights of the terms that count at ``level``."""
+    def weights_at(self, level: int, share: float = 0.0) -> dict[str, float]:
+        """The weights of the terms that count at ``level``, a ``share`` of a visit being over."""
         weights = {
-            name: weight * self._factor(name, level) for name, weight in self._weights.items()
+            name: weight * self._factor(name, level, share)
+            for name, weight in self._weights.items()
         }
         return {name: weight for name, weight in weights.items() if weight}
 
-    def _factor(self, term: str, level: int) -> float:
+    def _factor(self, term: str, level: int, share: float) -> float:
         scaled = term in self._scaled_by_level
         of_level = self._schedule.levels[level].other_terms if scaled else 1.0
-        factors = (extension.weight_factor(term, level) for extension in self._extensions)
+        factors = (extension.weight_factor(term, level, share) for extension in self._extensions)
         return math.prod(factors, start=of_level)
 
     def smoothing(self, level: int, shape: tuple[int, int, int]) -> float:

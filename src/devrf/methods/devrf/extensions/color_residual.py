@@ -181,7 +181,7 @@ class ColorResidual(Extension):
                 weight = total_variation_weight(self._tv, longest, stage.schedule.rays)
                 stage.optimizer.replace(number, residuals, smoothing=weight)
 
-    def weight_factor(self, term: str, level: int) -> float:
+    def weight_factor(self, term: str, level: int, share: float) -> float:
         """Where a texture may slide over the surface, some terms tell less."""
         return 1.0 if self._first is None or level < self._first else self._scale.get(term, 1.0)
 

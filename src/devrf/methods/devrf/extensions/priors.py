@@ -5,12 +5,14 @@ See docs/method.md#elastic and docs/method.md#bending.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_max_pool3d, max_pool3d
 
+from devrf.errors import expect
 from devrf.geometry.box import Box
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.extension import Extension
@@ -150,8 +152,21 @@ class MotionPrior(Extension):
 class Elastic(MotionPrior):
     """Resists stretching; parts may tear off one another (docs/method.md#elastic)."""
 
-    def __init__(self) -> None:
+    def __init__(self, initial_factor: float = 1.0) -> None:
+        """Say how much more it counts at the start of a visit at the coarsest level.
+
+        Args:
+            initial_factor: of its weight; it goes to 1 at the visit's end, exponentially.
+        """
         super().__init__("elastic", elastic_energy)
+        key = "schedule.extensions.elastic.initial_factor"
+        expect(0 < initial_factor < math.inf, key, "a number above 0", initial_factor)
+        self._initial_factor = initial_factor
+
+    def weight_factor(self, term: str, level: int, share: float) -> float:
+        """Stiff while a visit at the coarsest level finds where things are, soft at its end."""
+        stiff = term == self.name and level == 0
+        return self._initial_factor ** (1 - share) if stiff else 1.0
 
 
 class Bending(MotionPrior):
