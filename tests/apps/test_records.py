@@ -88,13 +88,13 @@ def test_validation_scores_are_no_test_scores():
 def test_frames_read_back(tmp_path):
     path = tmp_path / "run" / "frames.csv"
     rest = [view("r, 0", 0.0, 20.0, depth_error=0.5, flow_error=None)]
-    moving = [view("m", 0.5, 21.0, depth_error=None, flow_error=1.5)]
+    moving = [view("=m()", 0.5, 21.0, depth_error=None, flow_error=1.5)]
     write_frames(path, {"static": rest, "dynamic": moving})
     with path.open(newline="") as file:
         assert list(csv.reader(file)) == [
             ["capture", "name", "time", *METRICS],
             ["static", "r, 0", "0", "20", "0.5", "9", "0.5", ""],
-            ["dynamic", "m", "0.5", "21", "0.5", "9", "", "1.5"],
+            ["dynamic", "'=m()", "0.5", "21", "0.5", "9", "", "1.5"],
         ]
 
 

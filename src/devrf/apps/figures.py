@@ -9,14 +9,10 @@ from matplotlib.figure import Figure
 
 from devrf.system.files import atomic_write
 
-# Pixels of the longer side.
-LONGEST = 20_000
-
 
 def write_figure(path: Path, figure: Figure) -> None:
     """Write a figure in the format of the path's suffix; letters that its font lacks are boxes."""
     with atomic_write(path) as partial, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=r"Glyph \d+ .* missing from")
-        # A side of 2**16 pixels is too long for matplotlib.
-        dpi = min(figure.dpi, LONGEST / max(figure.get_size_inches()))
-        figure.savefig(partial, dpi=dpi)
+        # For matplotlib a side of 2**16 pixels is too long.
+        figure.savefig(partial, dpi=min(figure.dpi, 20_000 / max(figure.get_size_inches())))

@@ -127,11 +127,8 @@ def write_frames(path: Path, captures: Mapping[str, Sequence[HeldOutView]]) -> N
         table = csv.DictWriter(file, [*columns], lineterminator="\n")
         table.writeheader()
         for row in rows:
-            table.writerow({k: _cell(v) for k, v in row.items()})
-
-
-def _cell(value: str | float | None) -> str | float | None:
-    return f"{value:.6g}" if isinstance(value, float) else value and csv_cell(str(value))
+            cells = {k: csv_cell(v) if isinstance(v, str) else v for k, v in row.items()}
+            table.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in cells.items()})
 
 
 def frame_rows(

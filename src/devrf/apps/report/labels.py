@@ -13,7 +13,7 @@ from typing import Any
 
 import pandas as pd
 
-from devrf.apps.report.runs import DEFAULT_METHOD, SETTINGS, number
+from devrf.apps.report.runs import DEFAULT_METHOD, number
 
 METHODS = {
     DEFAULT_METHOD: "Ours",
@@ -45,6 +45,7 @@ ABLATIONS = {
     "without_last_level": "Ours w/o last level",
 }
 CHOICES = "run.choices."
+SETTINGS = "run.settings."
 IGNORED = {"objective", "seed", "stage", "method"}
 # Without an experiment a run has the config of this one.
 DEFAULT_EXPERIMENT = "quickstart"

@@ -54,22 +54,15 @@ LARGEST = 1e9
 _Name = Annotated[str, Len(1, LONGEST_NAME)]
 _Text = Annotated[str, Len(0, LONGEST)]
 _Plain = _Text | bool | int | float | Annotated[list[Any], Len(0, LONGEST)] | None
-SETTINGS = "run.settings."
-SAMPLING = "ray_stage.model.settings.sampling"
 SECTIONS = ("static", "dynamic", "run", "choices")
+SAMPLING = "run.settings.ray_stage.model.settings.sampling"
 # What values are that are used, by their dotted names.
-KINDS: dict[str, Any] = {
-    **dict.fromkeys(("scene", "method", "protocol"), _Name),
-    **{
-        f"run.{key}": _Text | None for key in "device git devrf fingerprint date checkpoint".split()
-    },
-    **dict.fromkeys(("run.lpips_network", f"{SETTINGS}{SAMPLING}"), _Text | None),
-    **{"dynamic.psnr": int | float | None, "at_rest": bool, "error": _Text, "mistake": bool},
-    **{
-        "run.overrides": list[_Text] | None,
-        "run.image_size": Annotated[list[int], Len(2, 2)] | None,
-    },
-}
+KINDS: dict[str, Any] = dict.fromkeys(("scene", "method", "protocol"), _Name)
+for key in "device git devrf fingerprint date checkpoint lpips_network".split():
+    KINDS[f"run.{key}"] = _Text | None
+KINDS |= {SAMPLING: _Text | None, "run.overrides": list[_Text] | None, "error": _Text}
+KINDS |= {"run.image_size": Annotated[list[int], Len(2, 2)] | None}
+KINDS |= {"dynamic.psnr": int | float | None, "at_rest": bool, "mistake": bool}
 DEFAULT_METHOD = "devrf"
 DEFAULT_PROTOCOL = "two_stage"
 

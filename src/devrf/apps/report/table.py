@@ -13,7 +13,7 @@ from typing import Any
 import pandas as pd
 
 from devrf.apps.report.labels import labelled
-from devrf.apps.report.runs import SAMPLING, SETTINGS, Collection, number
+from devrf.apps.report.runs import SAMPLING, Collection, number
 from devrf.apps.settings import PublishedScenes
 
 UNKNOWN = "–"
@@ -326,7 +326,7 @@ def _scored_again(runs: pd.DataFrame) -> pd.Series:
 def _sampled(runs: pd.DataFrame) -> list[str]:
     """How the methods that choose their samples took them, a sentence for each way."""
     absent = pd.Series(None, runs.index, dtype=object)
-    kind = runs.get(f"{SETTINGS}{SAMPLING}", absent)
+    kind = runs.get(SAMPLING, absent)
     hull = runs.get("run.settings.ray_stage.model.settings.hull", absent)
     # A hull of alpha masks counts with samples by occupancy only; Neural Volumes' always are.
     carved = hull.eq(True) & kind.fillna("occupancy").eq("occupancy")

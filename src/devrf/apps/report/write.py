@@ -59,9 +59,7 @@ def write_report(settings: ReportSettings) -> str:
 
 def csv(table: Table) -> str:
     """A row for each run and failure, with all of ``metrics.json`` by dotted name."""
-    runs = table.collection.runs.drop(
-        columns=["path", "row"], errors="ignore"
-    ).copy()  # in one piece
+    runs = table.collection.runs.drop(columns=["path", "row"], errors="ignore").copy()
     runs.insert(3, "row", table.runs["label"])
     failures = table.collection.failures.drop(columns="path")
     rows = pd.concat([runs, failures], ignore_index=True)
