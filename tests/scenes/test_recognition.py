@@ -124,3 +124,19 @@ def test_a_wrong_reader_is_answered_with_the_right_one(tmp_path: Path) -> None:
 
     with pytest.raises(DevrfError, match="nowhere: no such folder"):
         recognise(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize(
+    ("file", "said"),
+    [
+        ("IMG_1.HEIC", "; .heic files are there, which are not read: convert them to PNG"),
+        ("images/1.avif", "; .avif files are there, which are not read: convert them to PNG"),
+        ("scene.zip", "/scene.zip: is an archive; unpack it, and set data.root to its folder"),
+    ],
+)
+def test_a_folder_of_what_is_not_read(tmp_path, file, said):
+    (tmp_path / file).parent.mkdir(exist_ok=True)
+    (tmp_path / file).touch()
+    with pytest.raises(DevrfError) as caught:
+        recognise(tmp_path)
+    assert str(caught.value).endswith(said)

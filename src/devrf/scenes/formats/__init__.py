@@ -8,9 +8,9 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 from devrf.errors import DevrfError
-from devrf.scenes.files import entries, scene_folder
+from devrf.scenes.files import ARCHIVES, entries, scene_folder
 from devrf.scenes.footage import VIDEOS
-from devrf.scenes.images import SUFFIXES
+from devrf.scenes.images import SUFFIXES, unread
 from devrf.scenes.sparse_model import PARTS, model_folders
 from devrf.scenes.validation import scene_error
 from devrf.system.override import to_type
@@ -130,6 +130,11 @@ def _of_no_layout(folder: Path) -> DevrfError:
             return _footage(folder, place)
     if videos := [path for path in inside if path.suffix.lower() in VIDEOS]:
         return _footage(folder, *videos)
+    for place in (folder, folder / "images"):
+        if os.path.isdir(place) and (kinds := unread(place)):
+            return scene_error(place, f"no known layout, and no images that are read{kinds}")
+    if packed := [path for path in inside if path.suffix.lower() in ARCHIVES]:
+        return scene_error(packed[0], "is an archive; unpack it, and set data.root to its folder")
     # A layout is left out if another one lacks only some of the same files.
     missing = {layout.name: layout.missing(folder) for layout in LAYOUTS}
     lacks = [
