@@ -46,9 +46,9 @@ def nearest_point(origins: Tensor, axes: Tensor, parallel: float) -> Tensor | No
     return point
 
 
-# Poses of another convention are taken for it where cameras, read in that way, look at one point
-# with this cosine in the median, and as they are with less: none of these false alarms came with
-# simulated cameras that look past their subject by up to 25 degrees.
+# Poses are taken for those of another convention where cameras look at one point if they are read
+# in that way, with this cosine in the median, and with less as they are. Simulated cameras that
+# look past their subject by up to 25 degrees raised no false alarm.
 AT_ONE_POINT = 0.9
 AT_LESS = 0.97
 AT_NOTHING = 0.5
