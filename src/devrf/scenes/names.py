@@ -70,11 +70,15 @@ def _by_number(stem: str, *, decimal: bool) -> list[str | int | Decimal]:
 
 
 class ImageFinder:
-    """Finds the images below a scene's folder that lists name; each folder is read once."""
+    """Finds the images below a scene's folder that lists name; each folder is read once.
+
+    Attributes:
+        root: the scene's folder, which no name may leave.
+    """
 
     def __init__(self, root: Path) -> None:
         """Of the scene in ``root``."""
-        self._root = root
+        self.root = root
         self._names_in = cache(_names_in)
 
     def find(self, place: Path) -> Path | None:
@@ -83,8 +87,8 @@ class ImageFinder:
         A name that is there as it is written comes first, then one with a suffix appended, then one
         with another image suffix; of each, the same spelling before others.
         """
-        folder = self._root
-        for part in place.relative_to(self._root).parts[:-1]:
+        folder = self.root
+        for part in place.relative_to(self.root).parts[:-1]:
             same = self._names_in(folder).get(_spelling(part), [])
             if not same:
                 return None
@@ -121,7 +125,7 @@ Missing = Literal["error", "skip"]
 def present_images(
     names: Sequence[str],
     file: Path,
-    root: Path,
+    finder: ImageFinder,
     missing: Missing,
     relative_to: Path | None = None,
 ) -> dict[int, Path]:
@@ -130,15 +134,15 @@ def present_images(
     Args:
         names: of N images, with or without their suffix; see :class:`ImageFinder`.
         file: the file that lists them.
-        root: the scene's folder, which no name may leave.
+        finder: of the scene.
         missing: whether absent images are an error, or left out with one warning.
         relative_to: the folder that names begin in; None: the file's.
 
     Raises:
         DevrfError: an image is absent and must not be, or all are.
     """
+    root = finder.root
     places = [inside(root, relative_to or file.parent, name, file) for name in names]
-    finder = ImageFinder(root)
     found = [finder.find(place) for place in places]
     present = {k: image for k, image in enumerate(found) if image is not None}
     absent = [place for k, place in enumerate(places) if k not in present]

@@ -163,10 +163,10 @@ class TransformsFiles:
             missing: as for :func:`devrf.scenes.names.present_images`.
             masks: what the images of ``mask_path`` are taken for; ``none``: it is not followed.
         """
-        self._root = root
         self._missing = missing
         self._masks = masks
         self._finder = ImageFinder(root)
+        self._listing = cache(_listing)
         self._offset: Offset | None = None
 
     def read(
@@ -182,9 +182,9 @@ class TransformsFiles:
                 [0, 1], a negative focal length …), a pose is no rigid transform, or only some
                 frames have a time.
         """
-        listing = _listing(file)
+        listing = self._listing(file)
         names = [frame.file_path for frame in listing.frames]
-        images = present_images(names, file, self._root, self._missing)
+        images = present_images(names, file, self._finder, self._missing)
         frames = [listing.frames[index] for index in images]
         where = [f"{file}: frames[{index}]" for index in images]
         times = [frame.time for frame in frames]
@@ -225,18 +225,18 @@ class TransformsFiles:
 
     def find(self, name: str, file: Path) -> Path | None:
         """The image that ``name`` in a file means; None: there is none."""
-        return self._finder.find(inside(self._root, file.parent, name, file))
+        return self._finder.find(inside(self._finder.root, file.parent, name, file))
 
     def any_image(self, file: Path) -> bool:
         """Whether any image is there that a file lists, if there is one."""
         if not os.path.isfile(file):
             return False
-        return any(self.find(frame.file_path, file) for frame in _listing(file).frames)
+        return any(self.find(frame.file_path, file) for frame in self._listing(file).frames)
 
     def _mask(self, name: str | None, file: Path) -> Path | None:
         mask = None if name is None else self.find(name, file)
         if name is not None and mask is None:
-            place = inside(self._root, file.parent, name, file)
+            place = inside(self._finder.root, file.parent, name, file)
             raise scene_error(place, "no such mask; correct mask_path, or set data.masks=none")
         return mask
 

@@ -151,7 +151,8 @@ class ColmapReader(PosedReader, FixedViewsReader):
         lenses = model.intrinsics
         names = [image.name for image in model.images]
         listing = model.folder / "images"
-        present = present_images(names, listing, folder, self.missing, relative_to=source.path)
+        finder = ImageFinder(folder)
+        present = present_images(names, listing, finder, self.missing, relative_to=source.path)
         warn_of_unposed(len(present), source.path)
         positions = list(present)
         images = Transforms(

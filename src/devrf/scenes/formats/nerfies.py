@@ -29,7 +29,7 @@ from devrf.scenes.files import (
 from devrf.scenes.image_folders import Downscale, ImageFolder, folder_size, image_folder
 from devrf.scenes.layout import Layout, fewer, one_capture
 from devrf.scenes.lens import Intrinsics
-from devrf.scenes.names import present_images
+from devrf.scenes.names import ImageFinder, present_images
 from devrf.scenes.reader import EstimatedFlow, InwardReader, Time
 from devrf.scenes.scene import Capture, Scene
 from devrf.scenes.splits import parted
@@ -159,7 +159,7 @@ class ItemsReader(InwardReader):
         factor = self.choose_factor(folder_size(folder / "rgb", full="1x", reduced="{}x"))
         images = image_folder(folder / "rgb", factor, full="1x", reduced="{}x")
         files = [f"rgb/{images.path.name}/{item}" for item in items]
-        present = present_images(files, listing, folder, self.missing)
+        present = present_images(files, listing, ImageFinder(folder), self.missing)
         ids = [items[position] for position in present]
         place = {position: k for k, position in enumerate(present)}
         train, test = ([place[p] for p in part if p in place] for part in split)
