@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from devrf.apps.settings import CaptureSettings
-from devrf.apps.video_file import write_pictures
 from devrf.geometry.cameras import Cameras
+from devrf.pictures.video_file import write_pictures
 from devrf.scenes.procedural.filming import Filming
 from devrf.scenes.procedural.recipe import ProceduralForwardScene, ProceduralScene
 from devrf.scenes.procedural.surroundings import REACH, STEPS

@@ -121,7 +121,7 @@ def measured(folder: Path) -> dict[str, float]:
         trainer.fit(stage, datamodule=run.datamodule)
         seconds = time.perf_counter() - began
         hook.remove()
-        count = stage.iterations_done
+        count = stage.position.iterations_done
         result[stage.name] = 1000 * (seconds - clock.spent) / count
         result[f"{stage.name}, optimiser"] = 1000 * clock.spent / count
 

@@ -23,7 +23,7 @@ from devrf.callbacks import LearningRateDecay
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.cli.context import RunContext
 from devrf.cli.messages import report_user_errors
-from devrf.engine.phase import Phase
+from devrf.engine.schedule import Phase
 from devrf.engine.stage import Stage
 from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_schedule import CanonicalPhase
@@ -120,8 +120,8 @@ def one_phase_of_each_resolution(stage: Stage) -> dict[str, Phase]:
     """The middle one of a stage's phases at each resolution by its name, coarse to fine."""
     phases_by_name: dict[str, list[Phase]] = {}
     start = 0
-    while start < stage.total_iterations:
-        phase = stage.phase_at(start)
+    while start < stage.timeline.total:
+        phase = stage.timeline.phase(start)
         name = phase.kind
         if isinstance(phase, CanonicalPhase):
             name += f" {phase.voxels}"
@@ -132,7 +132,7 @@ def one_phase_of_each_resolution(stage: Stage) -> dict[str, Phase]:
 
 def give_fields(stage: Stage, learned: DeVRFModel) -> None:
     """Give a stage learned fields, as at the end of its last phase."""
-    last = stage.phase_at(stage.total_iterations)
+    last = stage.timeline.phase(stage.timeline.total)
     model = stage.scene_model
     assert isinstance(model, DeVRFModel)
     model.canonical = learned.canonical
@@ -148,13 +148,13 @@ def give_fields(stage: Stage, learned: DeVRFModel) -> None:
 
 def measure_phase(stage: Stage, phase: Phase, views: Any, seconds: float) -> Row:
     """Time and memory of an iteration of ``phase``; then, under a profiler, its time by part."""
-    stage.iteration = phase.start
+    stage.position.iteration = phase.start
     stage.enter(phase)
     count = min(stage.iterations_per_step, phase.stop - phase.start)
 
     def step() -> None:
         if stage.iteration + count > phase.stop:
-            stage.iteration = phase.start
+            stage.position.iteration = phase.start
         stage.training_step(views, 0)
         if stage.abort_reason is not None:
             raise DevrfError(stage.abort_reason)
@@ -174,7 +174,7 @@ def measure_phase(stage: Stage, phase: Phase, views: Any, seconds: float) -> Row
     if cuda:
         row["gb"] = torch.cuda.max_memory_allocated(stage.device) / 1e9
     row |= {part: ms / count for part, ms in parts(step, cuda=cuda).items()}
-    stage.iteration = phase.start  # of the phase that was entered
+    stage.position.iteration = phase.start  # of the phase that was entered
     return row
 
 

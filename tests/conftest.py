@@ -44,7 +44,6 @@ from lightning import Callback, Trainer
 from omegaconf import DictConfig
 from scipy.spatial.transform import Rotation
 
-from devrf.apps.video_file import write_pictures
 from devrf.callbacks import GridUpscaling, LearningRateDecay
 from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, LoadedCheckpoint
 from devrf.cli.config import config_folder
@@ -62,6 +61,7 @@ from devrf.methods.devrf.extensions.color_residual import ResidualField
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import CanonicalRates
 from devrf.methods.devrf.volume_rendering import render
+from devrf.pictures.video_file import write_pictures
 from devrf.rendering.output import RenderedImage
 from devrf.scenes.lens import Lens
 from devrf.scenes.procedural import ProceduralForwardScene, ProceduralScene
@@ -453,15 +453,17 @@ def four_frames(four_frame_scene: Scene) -> SceneDataModule:
 def quiet_trainer(*callbacks: Callback, **options: Any) -> Trainer:
     """A trainer on the CPU with the two callbacks that a schedule needs, and no files."""
     warnings.filterwarnings("ignore", module="lightning")
+    quiet: dict[str, Any] = {
+        "logger": False,
+        "enable_checkpointing": False,
+        "enable_progress_bar": False,
+        "enable_model_summary": False,
+        "limit_val_batches": 0,
+        "num_sanity_val_steps": 0,
+    }
+    schedule = [GridUpscaling(), LearningRateDecay()]
     return Trainer(
-        accelerator="cpu",
-        devices=1,
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        callbacks=[GridUpscaling(), LearningRateDecay(), *callbacks],
-        **options,
+        accelerator="cpu", devices=1, callbacks=[*schedule, *callbacks], **{**quiet, **options}
     )
 
 

@@ -30,14 +30,14 @@ def scene() -> SmallScene:
 
 def test_a_stage_that_a_signal_stops_goes_on_to_equal_bits(scene, monkeypatch):
     assert resume(scene, "canonical").endswith("equal bits")
-    usual = Stage._reseed
+    usual = Stage.on_train_start
 
     def other(self: Stage) -> None:
         usual(self)
         if self.trainer.ckpt_path:
             self.generator.manual_seed(5)
 
-    monkeypatch.setattr(Stage, "_reseed", other)
+    monkeypatch.setattr(Stage, "on_train_start", other)
     with pytest.raises(DevrfError, match="came to other fields"):
         resume(scene, "canonical")
 

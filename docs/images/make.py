@@ -21,12 +21,12 @@ from PIL import Image
 from torch import Tensor
 
 from devrf.apps.camera_paths import orbit
-from devrf.apps.images import image_grid, scaled, to_bytes
 from devrf.apps.still import still
 from devrf.apps.video import VideoSettings
 from devrf.checkpoints.checkpoint import load_checkpoint
 from devrf.geometry.cameras import Cameras
-from devrf.methods.base import Renderable
+from devrf.pictures.images import image_grid, scaled, to_bytes
+from devrf.rendering.renderable import Renderable
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.procedural.filming import Filming, extent
 

@@ -209,7 +209,7 @@ def resume(scene: SmallScene, name: str) -> str:
     scene.learn(uninterrupted, EXACT)
 
     def interrupt(*_: Any) -> None:
-        if 0 <= first.iteration - first.total_iterations // 2 < first.iterations_per_step:
+        if 0 <= first.iteration - first.timeline.total // 2 < first.iterations_per_step:
             os.kill(os.getpid(), signal.SIGTERM)
 
     with tempfile.TemporaryDirectory() as folder:
@@ -218,8 +218,8 @@ def resume(scene: SmallScene, name: str) -> str:
             sender = LambdaCallback(on_train_batch_start=interrupt)
             scene.learn(first, EXACT, saving, stop, sender)
         files = progress_files(Path(folder), name)
-        stopped = f"stopped at iteration {first.iteration} of {first.total_iterations}"
-        interrupted = stop.number is not None and 0 < first.iteration < first.total_iterations
+        stopped = f"stopped at iteration {first.iteration} of {first.timeline.total}"
+        interrupted = stop.number is not None and 0 < first.iteration < first.timeline.total
         require(interrupted and bool(files), f"{stopped}, {len(files)} progress files")
         scene.learn(second, EXACT, resumed_from=str(files[0]))
     require(second.iteration == uninterrupted.iteration, f"ended at iteration {second.iteration}")

@@ -10,7 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from devrf.apps.images import (
+from devrf.apps.still import StillSettings, still
+from devrf.apps.video import VideoSettings, held_out_images, held_out_pictures, path_pictures
+from devrf.checkpoints.checkpoint import Viewpoints
+from devrf.errors import DevrfError
+from devrf.evaluation.held_out import HeldOutView, score, truth_image
+from devrf.pictures.held_out import write_contact_sheet
+from devrf.pictures.images import (
     UNKNOWN,
     depth_colors,
     evenly,
@@ -19,12 +25,7 @@ from devrf.apps.images import (
     short_name,
     to_bytes,
 )
-from devrf.apps.still import StillSettings, still, write_contact_sheet
-from devrf.apps.video import VideoSettings, held_out_images, held_out_pictures, path_pictures
-from devrf.apps.video_file import write_pictures
-from devrf.checkpoints.checkpoint import Viewpoints
-from devrf.errors import DevrfError
-from devrf.evaluation.held_out import HeldOutView, score, truth_image
+from devrf.pictures.video_file import write_pictures
 from devrf.rendering.renderer import Renderer
 
 

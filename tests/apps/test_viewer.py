@@ -13,13 +13,13 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from devrf.apps.images import to_bytes
 from devrf.apps.keyframes import Keyframe, keyframes_of
 from devrf.apps.settings import ViewerSettings
 from devrf.apps.viewer.cameras import dynamic_frusta, from_browser, in_browser, static_frusta
 from devrf.apps.viewer.drawing import Drawing, Frame, RenderScheduler, Shot
 from devrf.cli.restore_config import parsed
 from devrf.errors import DevrfError
+from devrf.pictures.images import to_bytes
 from devrf.rendering.renderer import Renderer
 
 

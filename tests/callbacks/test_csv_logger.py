@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from devrf.callbacks import csv_logger as module
-from devrf.callbacks.csv_logger import ResumableCSVLogger
+from devrf.loggers import csv_logger as module
+from devrf.loggers.csv_logger import ResumableCSVLogger
 
 
 def table(path: Path) -> list[dict[str, str]]:

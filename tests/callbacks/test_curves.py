@@ -15,9 +15,9 @@ from lightning import Callback, Trainer
 from lightning.pytorch.loggers import Logger
 from torch import Tensor
 
-from devrf.apps.trackers import Row
 from devrf.callbacks import Meter, Previews, TrainingCurve
 from devrf.data.datamodule import SceneDataModule
+from devrf.loggers.trackers import Row
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 
 
@@ -58,7 +58,7 @@ def learn(
     def fit(logger: Logger, *callbacks: Callback) -> CanonicalStage:
         torch.manual_seed(3)
         stage: CanonicalStage = canonical()
-        made = trainer(*callbacks, max_epochs=1, log_every_n_steps=4)
+        made = trainer(*callbacks, max_epochs=1, log_every_n_steps=4, limit_val_batches=1)
         made.loggers = [logger]
         made.fit(stage, datamodule=datamodule)
         return stage
@@ -84,7 +84,7 @@ def test_previews_come_as_often_as_asked_for_and_look_right(learn, datamodule):
 
 def test_the_curve_of_a_stage_has_every_step(learn, tmp_path, monkeypatch):
     drawn: list[Any] = []
-    module = "devrf.apps.report.plots"
+    module = "devrf.callbacks.training_curve"
     original = importlib.import_module(module).write_training_curve
     monkeypatch.setattr(
         f"{module}.write_training_curve", lambda *a: drawn.append(a[1:]) or original(*a)
@@ -113,8 +113,8 @@ def test_a_curve_goes_on_after_a_break_and_a_rollback(learn, tmp_path):
     assert second.state_dict() == first.state_dict() and len(first.state_dict()["points"]) == 12
     # Iteration 12 once more, after it was rolled back to 10.
     for iteration in (11, 12):
-        stage.iteration = iteration
-        error = {"render": torch.tensor(10.0**-iteration)}
+        stage.position.iterations_done = iteration
+        error = {"psnr": torch.tensor(10.0 * iteration)}
         second.on_train_batch_end(stage.trainer, stage, error, None, 0)
     points = second.state_dict()["points"]
     assert [iteration for iteration, _ in points] == list(range(1, 13))

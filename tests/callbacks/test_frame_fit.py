@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from devrf.callbacks.frame_fit import FrameFit, complaint, in_ranges, lost
-from devrf.engine.phase import Phase
+from devrf.engine.provenance import Provenance
+from devrf.engine.schedule import Phase
 from devrf.engine.stage import Stage
 
 TRAINER: Any = SimpleNamespace(is_global_zero=True)
@@ -21,11 +22,10 @@ class Visiting(Stage):
 
     def __init__(self) -> None:
         self.__dict__["phase"] = None
-        self.__dict__["record"] = {"seconds": 1.0}
+        self.__dict__["provenance"] = Provenance(record={"seconds": 1.0})
         self.__dict__["name"] = "deformation"
 
-    total_iterations = resolution = learning_rate_factor = phase_at = enter = draw = None
-    loss = restore = None
+    iterate = timeline_of = resolution = enter = restore = None
 
 
 Visiting.__abstractmethods__ = frozenset()
@@ -50,7 +50,11 @@ def test_a_frame_is_measured_by_the_mean_error_of_its_last_visit(caplog):
     assert fit.psnr == {1: pytest.approx(26.9897), 2: pytest.approx(30), 3: pytest.approx(20)}
     with caplog.at_level(logging.WARNING):
         fit.on_train_end(TRAINER, stage)
-    assert stage.record == {"seconds": 1.0, "lost_frames": 1, "frame_psnr": [26.99, 30.0, 20.0]}
+    assert stage.provenance.record == {
+        "seconds": 1.0,
+        "lost_frames": 1,
+        "frame_psnr": [26.99, 30.0, 20.0],
+    }
     said = "frame 3 fits worse than the rest: 20.0 dB, the others 28.5"
     assert caplog.messages == [f"deformation: {said}"]
 
@@ -77,7 +81,7 @@ def test_times_that_are_learned_at_once_have_no_figures():
     fit, stage = FrameFit(), Visiting()
     visit(fit, stage, 0, None, 0.1)
     fit.on_train_end(TRAINER, stage)
-    assert fit.psnr == {} and stage.record == {"seconds": 1.0}
+    assert fit.psnr == {} and stage.provenance.record == {"seconds": 1.0}
 
 
 def test_lost_frames_are_four_decibels_below_the_median():

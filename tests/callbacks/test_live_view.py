@@ -46,7 +46,7 @@ class Page:
 @pytest.fixture
 def fitted(fit, canonical, tiny_scene, monkeypatch):
     """``fitted(share)``: learns the tiny scene at rest with a page beside; callback, page, s."""
-    from devrf.callbacks import live_view
+    from devrf.apps.viewer import live_view
 
     def learn(share: float):
         monkeypatch.setattr(live_view, "PAUSE", 0.0)
@@ -78,8 +78,8 @@ def test_pictures_take_their_share_alone(fitted):
 @pytest.fixture
 def session(tiny_scene, tmp_path, monkeypatch):
     """A real page, which nothing but its share keeps from rendering."""
+    from devrf.apps.viewer import live_view
     from devrf.apps.viewer.session import Session
-    from devrf.callbacks import live_view
 
     monkeypatch.setattr(live_view, "PAUSE", 0.0)
     with socket.create_server(("127.0.0.1", 0)) as probe:
@@ -136,12 +136,12 @@ HOSTILE = (
 
 @pytest.mark.filterwarnings("ignore:.*does not match annotation")
 def test_no_tab_of_a_browser_ends_learning(fit, canonical, session, tab, caplog):
-    from devrf.callbacks.live_view import LiveView
+    from devrf.apps.viewer.live_view import LiveView
 
     for said in (*HOSTILE, {}):
         tab(**said)
     stage = fit(canonical(iterations=40, upsample_at=()), LiveView(session, 1.0))
-    assert stage.iteration == stage.total_iterations and session.frames > len(HOSTILE)
+    assert stage.iteration == stage.timeline.total and session.frames > len(HOSTILE)
     assert not caplog.records
     assert len(session.scheduler._requests) == 5  # of those that have an area and a pose
 
@@ -150,7 +150,7 @@ def test_no_tab_of_a_browser_ends_learning(fit, canonical, session, tab, caplog)
 def test_no_error_of_the_viewer_ends_learning(
     fit, canonical, session, tab, caplog, monkeypatch, error
 ):
-    from devrf.callbacks import live_view
+    from devrf.apps.viewer import live_view
 
     tab()
     render = Drawing.draw
@@ -163,6 +163,6 @@ def test_no_error_of_the_viewer_ends_learning(
 
     monkeypatch.setattr(Drawing, "draw", fails_now_and_then)
     stage = fit(canonical(iterations=20, upsample_at=()), live_view.LiveView(session, 1.0))
-    assert stage.iteration == stage.total_iterations and session.frames > 4
+    assert stage.iteration == stage.timeline.total and session.frames > 4
     kind = type(error).__name__
     assert caplog.messages == [f"viewer: {kind}: {error}; it goes on, and says this once"]

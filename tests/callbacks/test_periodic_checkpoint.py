@@ -13,7 +13,7 @@ import pytest
 from lightning import Callback, Trainer
 from lightning.pytorch.callbacks import LambdaCallback
 
-from devrf.callbacks import Meter, PeriodicCheckpoint, StopOnSignal
+from devrf.callbacks import PeriodicCheckpoint, StopOnSignal
 from devrf.callbacks import periodic_checkpoint as module
 from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_stage import CanonicalStage
@@ -43,15 +43,6 @@ def test_the_last_two_are_kept_and_none_is_written_before_its_time(learn, tmp_pa
     # The stage's last iteration is its checkpoint's.
     assert names(tmp_path) == [f"canonical-progress-{n}.ckpt" for n in left]
     assert saving.saved == (left[-1] if left else None)
-
-
-@pytest.mark.parametrize(("seconds", "written"), [(0, True), (1000, False)])
-def test_the_row_of_the_curves_that_waits_is_written_first(learn, tmp_path, seconds, written):
-    meter, seen = Meter(), []
-    look = at(3, lambda: seen.append("static/loss" in meter.row))
-    learn(meter, PeriodicCheckpoint(tmp_path, seconds, share=1.0), look, every=3)
-    # It is due at iteration 3, and waits for the next one's at iteration 6.
-    assert seen == [written] and "static/loss" in meter.row
 
 
 def test_a_full_disk_does_not_end_the_training(learn, tmp_path, monkeypatch, caplog):

@@ -7,6 +7,7 @@ import re
 from dataclasses import replace
 from functools import partial
 from itertools import count
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,8 +16,9 @@ from lightning import Callback, Trainer
 from lightning.pytorch.callbacks import LambdaCallback
 from torch.optim import Optimizer
 
+from devrf.apps.trial import seconds_to_learn
 from devrf.callbacks import Meter, Progress, TrainingRecord
-from devrf.callbacks.trial import seconds_to_learn
+from devrf.engine.schedule import cost
 from devrf.errors import DevrfError
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
@@ -79,33 +81,33 @@ def test_without_a_callback_of_the_schedule_a_stage_says_what_is_missing(
 
 def test_the_record_says_what_training_took(fit, canonical):
     stage = fit(canonical(), TrainingRecord())
-    assert stage.record["iterations"] == 12
-    assert stage.record["peak_gpu_gb"] is None and stage.record["peak_reserved_gb"] is None
-    seconds, speed = stage.record["seconds"], stage.record["iterations_per_second"]
+    record = stage.provenance.record
+    assert record["iterations"] == 12
+    assert record["peak_gpu_gb"] is None and record["peak_reserved_gb"] is None
+    seconds, speed = record["seconds"], record["iterations_per_second"]
     assert 0 < seconds < 60 and 12 / speed == pytest.approx(seconds, abs=0.01)
-    assert stage.metadata().records["canonical"] == stage.record
+    assert stage.metadata().records["canonical"] == record
 
 
 def test_progress_and_curves_name_the_frame_of_a_visit(rest, four_frames, trainer, caplog):
     caplog.set_level(logging.INFO, logger="devrf")
     schedule = replace(DEFORMATION, levels=(Level(6, 5),))
     stage = DeformationStage(rest, schedule, iterations_per_step=100)
-    meter = Meter()
-    trainer(Progress(line_every_seconds=0.0), meter, max_epochs=1).fit(
-        stage, datamodule=four_frames
-    )
+    fitted = trainer(Progress(line_every_seconds=0.0), Meter(), max_epochs=1)
+    fitted.fit(stage, datamodule=four_frames)
     lines = [line for line in caplog.messages if line.startswith("dynamic ")]
     first, *_, last = (line.split("  ") for line in lines)
     assert first[-2] == "frame 1" and re.fullmatch(r"about \d+ (s|min) left", first[-1])
     assert last[-1] == "frame 3"  # nothing is left
     assert " dB" in lines[-1]
-    assert meter.row["dynamic/frame"] == 3
+    assert fitted.callback_metrics["dynamic/frame"] == 3
 
 
 def test_the_time_left_knows_that_finer_levels_take_longer(fit, canonical, caplog, monkeypatch):
     stage = canonical(upsample_at=(2, 3, 4))
     # Sides of 6 for two iterations, of 12 for the last eight.
-    assert (stage.cost(0, 2), stage.cost(4, 12)) == pytest.approx((2 * 6, 8 * 12))
+    costs = (cost(stage.timeline, 0, 2), cost(stage.timeline, 4, 12))
+    assert costs == pytest.approx((2 * 6, 8 * 12))
     # Every iteration takes a second so far: each of the last eight will take two.
     clock = SimpleNamespace(perf_counter=map(float, count()).__next__)
     monkeypatch.setattr("devrf.callbacks.progress.time", clock)
@@ -122,7 +124,7 @@ def test_how_long_learning_takes_is_told_from_its_first_seconds(datamodule, monk
     )
     stage = CanonicalStage(schedule, Architecture(width=16), iterations_per_step=5)
     seconds = count(step=10)
-    monkeypatch.setattr("devrf.callbacks.trial.time.perf_counter", lambda: float(next(seconds)))
+    monkeypatch.setattr("devrf.apps.trial.time.perf_counter", lambda: float(next(seconds)))
     moving = DeformationSchedule(levels=(Level(4, 2),), rays=32)
     plain = {"enable_checkpointing": False, "enable_progress_bar": False, "max_epochs": 1}
     taken = seconds_to_learn(
@@ -134,3 +136,20 @@ def test_how_long_learning_takes_is_told_from_its_first_seconds(datamodule, monk
     assert taken == pytest.approx(
         (20 * 12.699 + 20 * 16 + 6 * 16 / 2) / (5 * 12.699 / 10), rel=1e-3
     )
+
+
+def test_a_callback_of_ones_own_sets_the_rates_as_the_page_shows(canonical, datamodule, trainer):
+    page = (Path(__file__).parents[2] / "docs" / "extending.md").read_text()
+    section = page.split("{ #schedule-callbacks }")[1]
+    names: dict[str, Any] = {}
+    exec(section.split("```python\n")[1].split("```")[0], names)
+    rates = []
+    watch = LambdaCallback(
+        on_train_batch_end=lambda trainer, stage, *_: rates.append(
+            stage.optimizer.param_groups[0]["lr"] / stage.optimizer.param_groups[0]["base_lr"]
+        )
+    )
+    stage = canonical(iterations=20, upsample_at=(), decay_iterations=10**6)
+    fitted = trainer(names["RampedDecay"](), watch, max_epochs=1)
+    fitted.fit(stage, datamodule=datamodule)
+    assert rates == pytest.approx([1.0] * 19 + [0.5], abs=1e-4)

@@ -24,7 +24,7 @@ import hashlib, json, os, signal
 from pathlib import Path
 import torch
 from lightning import Callback
-from devrf.callbacks import Meter, TrainingCurve
+from devrf.callbacks import TrainingCurve
 from devrf.errors import DevrfError
 
 
@@ -37,7 +37,7 @@ class Witness(Callback):
     def on_fit_end(self, trainer, stage):
         tensors = {k: v for k, v in stage.state_dict().items() if isinstance(v, torch.Tensor)}
         seen = {k: hashlib.sha256(v.numpy().tobytes()).hexdigest() for k, v in tensors.items()}
-        (metrics,) = (meter.row for meter in trainer.callbacks if isinstance(meter, Meter))
+        metrics = {name: float(value) for name, value in trainer.callback_metrics.items()}
         path = self.folder / f"{stage.capture}-{trainer.global_rank}.json"
         words = {"fields": seen, "metrics": metrics, "seed": stage.generator.initial_seed()}
         path.write_text(json.dumps(words))

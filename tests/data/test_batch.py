@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from devrf.data.batch import (
+    BackgroundColor,
     FramePool,
     PixelPool,
     all_pixels,
-    background_color,
     concatenated,
     gather_batch,
     pixel_positions,
@@ -117,9 +117,11 @@ def test_batches_become_one(rng: torch.Generator) -> None:
 
 
 def test_backgrounds(rng: torch.Generator) -> None:
-    assert background_color("white", 5, rng).tolist() == [1, 1, 1]
-    assert background_color("black", 5, rng).tolist() == [0, 0, 0]
-    drawn = background_color("random", 5, rng)
+    image = torch.zeros(5, dtype=torch.long)
+    white = BackgroundColor("white")
+    assert white(image, rng).tolist() == [1, 1, 1] and white(image, rng) is white(image, rng)
+    assert BackgroundColor("black")(image, rng).tolist() == [0, 0, 0]
+    drawn = BackgroundColor("random")(image, rng)
     assert drawn.shape == (5, 3) and len(drawn.unique(dim=0)) == 5
 
 

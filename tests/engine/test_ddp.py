@@ -131,7 +131,7 @@ def test_each_process_and_step_draws_pixels_of_its_own(canonical, datamodule, tr
         torch.manual_seed(seed)
         stage = canonical()
         monkeypatch.setattr(CanonicalStage, "global_rank", number)
-        stage.iterations_done = iteration
+        stage.position.iterations_done = iteration
         stage.trainer = trainer()
         stage.trainer.datamodule = SimpleNamespace(scene=datamodule.scene)
         stage.setup("fit")

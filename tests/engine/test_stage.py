@@ -70,19 +70,19 @@ def test_means_over_iterations() -> None:
     assert mean_terms([], processes=1) == {}
 
 
-def test_each_of_several_processes_draws_its_share(monkeypatch):
-    monkeypatch.setattr(CanonicalStage, "processes", 4)
+def test_each_of_several_processes_draws_its_share():
     stage = canonical()
-    assert [stage.rays_to_draw(64), stage.rays_to_draw(64, most=40)] == [16, 10]
-    stage.batch_share = 0.5
-    assert [stage.rays_to_draw(64), stage.rays_to_draw(1)] == [8, 1]
+    stage.batch_size.processes = 4
+    assert [stage.batch_size.rays(64), stage.batch_size.rays(64, most=40)] == [16, 10]
+    stage.batch_size.share = 0.5
+    assert [stage.batch_size.rays(64), stage.batch_size.rays(1)] == [8, 1]
 
 
 def test_when_memory_runs_out_batches_are_halved(fit, memory_for, caplog):
     calls = memory_for(32)
     with caplog.at_level(logging.WARNING, logger="devrf"):
         stage = fit(canonical())
-    assert stage.batch_share == 0.5 and stage.iterations_done == 4
+    assert stage.batch_size.share == 0.5 and stage.position.iterations_done == 4
     assert calls == [64, 32, 32, 32, 32]
     (said,) = caplog.messages
     assert "out of memory (2.5 GiB more asked" in said and said.endswith("from now on")
@@ -100,7 +100,7 @@ def test_memory_that_runs_out_in_the_backward_pass_leaves_no_gradient(fit, monke
 
     monkeypatch.setattr(stage, "manual_backward", backward)
     fit(stage)
-    assert before == [True] * 5 and stage.batch_share == 0.5
+    assert before == [True] * 5 and stage.batch_size.share == 0.5
 
 
 def test_a_frame_that_does_not_fit_in_half_either_ends_the_stage_saved(
@@ -123,25 +123,21 @@ def test_a_resumed_stage_draws_half_batches_too(fit, memory_for, tmp_path):
     calls = memory_for(64)
     again = canonical()
     fit(again, ckpt_path=tmp_path / "canonical-progress-2.ckpt")
-    assert again.batch_share == 0.5 and set(calls) == {32}
+    assert again.batch_size.share == 0.5 and set(calls) == {32}
 
 
-def test_one_of_several_processes_ends_with_an_error(fit, memory_for, monkeypatch):
+def test_one_of_several_processes_ends_with_an_error(fit, memory_for):
+    class OneOfTwo(CanonicalStage):
+        def setup(self, stage: str) -> None:
+            super().setup(stage)
+            self.batch_size.processes = 2
+
     memory_for(0)
-    monkeypatch.setattr(CanonicalStage, "processes", 2)
     with pytest.raises(DevrfError, match="one of 2 processes is out of memory"):
-        fit(canonical())
+        fit(OneOfTwo(SCHEDULE, SMALL, iterations_per_step=2))
 
 
-@pytest.mark.parametrize(
-    ("leap", "renewed"),
-    [
-        (0, [4, 12, 20, 28, 30]),
-        (2, [6, 12, 21, 30]),  # of 0, 3, 6, …
-        (-1, [4, 12, 20, 28, 30]),  # each but the first twice
-    ],
-)
-def test_what_is_due_comes_once_however_far_an_iteration_goes(fit, leap, renewed):
+def test_what_is_due_comes_at_multiples_after_its_start(fit):
     found = []
 
     class Watched(CanonicalStage):
@@ -149,12 +145,24 @@ def test_what_is_due_comes_once_however_far_an_iteration_goes(fit, leap, renewed
             found.append(self.iteration)
             super().update_occupancy()
 
-    class Leap(Callback):
-        def on_before_optimizer_step(self, trainer: Any, stage: Any, optimizer: Any) -> None:
-            if leap > 0 or stage.iterations_done % 2:
-                stage.iteration += leap
-
     schedule = CanonicalSchedule(0, 12, True, 30, 12, (), rays=16, occupancy_every=8)
-    stage = fit(Watched(schedule, SMALL, iterations_per_step=5), Leap())
-    assert found == renewed
-    assert stage.iterations_done == {0: 30, 2: 10, -1: 59}[leap]
+    fit(Watched(schedule, SMALL, iterations_per_step=5))
+    assert found == [4, 12, 20, 28, 30]
+
+
+def test_a_scaled_schedule_goes_on_at_the_same_place(fit):
+    """In half its iterations from iteration 6 of 12 on: 3 are over, 3 are left; grids as before."""
+    schedule = CanonicalSchedule(0, 12, True, 12, 12, (4, 8), rays=16)
+    seen = []
+
+    class Scale(Callback):
+        def on_train_batch_end(self, trainer: Any, stage: Any, *_: Any) -> None:
+            if stage.iteration == 6 and stage.position.schedule_scale == 1:
+                stage.scale_schedule(0.5)
+                assert stage.iteration == 3
+            seen.append(stage.resolution)
+
+    stage = fit(CanonicalStage(schedule, SMALL, iterations_per_step=1), Scale())
+    assert stage.position.iterations_done == 6 + 3 and stage.timeline.total == 6
+    assert stage.configured_timeline.total == 12 and stage.is_complete
+    assert seen == sorted(seen) and len(set(seen)) == 3

@@ -11,7 +11,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from devrf.evaluation.held_out import exposed, score, score_all, truth_image
+from devrf.evaluation.held_out import exposed, score, truth_image
+from devrf.evaluation.scoring import score_held_out
 from devrf.evaluation.suite import MetricSuite
 from devrf.metrics.image import psnr, ssim
 from devrf.rendering.renderer import Renderer
@@ -74,14 +75,14 @@ def test_static_views_are_scored_at_rest_whatever_their_time(moving, tiny_scene)
 
 def test_scoring_says_how_far_it_is(learned, tiny_scene, caplog, monkeypatch):
     monkeypatch.setattr(
-        "devrf.evaluation.held_out.followed", partial(followed, line_every_seconds=0.0)
+        "devrf.evaluation.scoring.followed", partial(followed, line_every_seconds=0.0)
     )
     caplog.set_level(logging.INFO, logger="devrf")
     views = tiny_scene.dynamic.test
-    scored = score_all(learned[0].scene_model, views, "white", MetricSuite(), "held-out images")
+    scored = score_held_out(learned[0].scene_model, {"dynamic": views}, "white")["dynamic"]
     assert [view.name for view in scored] == list(views.names) and len(views) > 2
-    said = [line.split(", ")[0] for line in caplog.messages]
-    assert said == [f"held-out images: {k} of {len(views)}" for k in range(1, len(views))]
+    said = [line.rpartition(", ")[0] for line in caplog.messages]
+    assert said == [f"held-out images, dynamic: {k} of {len(views)}" for k in range(1, len(views))]
 
 
 def test_half_an_image_tells_its_exposure(learned, tiny_scene):

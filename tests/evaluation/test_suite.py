@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,7 +10,8 @@ import pytest
 import torch
 
 from devrf.errors import DevrfError
-from devrf.evaluation.held_out import score, score_all
+from devrf.evaluation.held_out import score
+from devrf.evaluation.scoring import score_held_out
 from devrf.evaluation.suite import MEASURES, Evaluation, flow_error
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
@@ -123,11 +123,11 @@ def test_every_metric_of_a_learned_scene(learned, tiny_scene, alex):
 
 def test_scores_at_rest_serve_the_same_views_in_motion(moving, tiny_scene) -> None:
     held_out = tiny_scene.dynamic.test
-    scored = partial(score_all, moving, held_out, "white", None, "held-out images")
-    at_rest = scored(time=0.0)
-    known = [view.scores for view in scored(at_rest=at_rest)]
-    assert known == [view.scores for view in scored()]
-    assert [view["rest_pose_psnr"] for view in known] == [view.psnr for view in at_rest]
+    alone = score_held_out(moving, {"dynamic": held_out}, "white")["dynamic"]
+    both = score_held_out(moving, {"static": held_out, "dynamic": held_out}, "white")
+    known = [view.scores for view in both["dynamic"]]
+    assert known == [view.scores for view in alone]
+    assert [view["rest_pose_psnr"] for view in known] == [view.psnr for view in both["static"]]
     assert any(view["psnr"] != view["rest_pose_psnr"] for view in known)
 
 

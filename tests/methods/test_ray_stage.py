@@ -63,7 +63,7 @@ def test_a_fixed_share_of_a_joint_batch_is_static(
     share: float, static: int, ray_stage: Make, fit: Fit, tiny_scene: Scene
 ) -> None:
     stage = fit(ray_stage(DNeRF(TINY), static_share=share))
-    image = stage.draw().image
+    image = stage.draw()[0]
     assert len(image) == 32 and int((image < len(tiny_scene.static.train)).sum()) == static
 
 
@@ -74,16 +74,16 @@ def test_the_curriculum_adds_frames(
     views = stage.training_views("dynamic")
     assert views.frames is not None
     for iteration, frames in ((0, 3), (4, 4)):
-        stage.iteration = iteration
-        image = stage.draw().image
+        stage.position.iteration = iteration
+        image = stage.draw()[0]
         assert len(views.frames[image].unique()) == frames
 
 
 def test_the_first_batches_may_see_the_centre_half_alone(ray_stage: Make, fit: Fit) -> None:
     stage = fit(ray_stage(DNeRF(TINY), centre_crop=2, rays=2000))  # of 24×18 pixels
     for iteration, rows, columns in ((1, (4, 13), (6, 17)), (2, (0, 17), (0, 23))):
-        stage.iteration = iteration
-        flat = stage.draw().flat
+        stage.position.iteration = iteration
+        flat = stage.draw()[1]
         assert (int(flat.min()) // 24, int(flat.max()) // 24) == rows
         assert (int((flat % 24).min()), int((flat % 24).max())) == columns
 
@@ -93,7 +93,7 @@ def test_a_batch_may_have_few_times(
     step: str, times: int, ray_stage: Make, fit: Fit, four_frames: SceneDataModule
 ) -> None:
     stage = fit(ray_stage(DNeRF(TINY), step, times_per_batch=times, rays=60), data=four_frames)
-    image = stage.draw().image
+    image = stage.draw()[0]
     if step == "joint":
         static = len(stage.training_views("static"))
         assert (image[:30] < static).all()
@@ -111,8 +111,8 @@ def test_a_part_of_a_batch_has_fewer_times(
     frames = stage.training_views("dynamic").frames
     assert frames is not None and stage.useful_share == 1 / 2
     for share, times in ((1.0, 2), (1 / 2, 1), (1 / 8, 1)):
-        stage.batch_share = share
-        image = stage.draw().image
+        stage.batch_size.share = share
+        image = stage.draw()[0]
         assert len(image) == 64 * share and len(frames[image].unique()) == times
 
 
@@ -122,7 +122,7 @@ def test_a_batch_may_have_fewer_rays_where_no_masks_tell_what_is_empty(
     sizes = []
     for hull in (True, False):
         stage = fit(ray_stage(DNeRF(replace(TINY, hull=hull)), rays_without_hull=7))
-        sizes.append(len(stage.draw().image))
+        sizes.append(len(stage.draw()[0]))
     assert sizes == [32, 7]
 
 
@@ -131,7 +131,7 @@ def test_steps_may_be_smaller_where_no_masks_tell_what_is_empty(ray_stage: Make,
         rates = {"learning_rate": 2e-3, "learning_rate_without_hull": 5e-4}
         stage = fit(ray_stage(DNeRF(replace(TINY, hull=hull)), **rates))
         assert {group["base_lr"] for group in stage.optimizer.param_groups} == {rate}
-        assert stage.learning_rate_factor(0) == 1
+        assert stage.timeline.learning_rate_factor(0) == 1
 
 
 def test_a_method_may_learn_before_random_colours_where_all_images_have_masks(
@@ -145,23 +145,23 @@ def test_a_method_may_learn_before_random_colours_where_all_images_have_masks(
     shapes = []
     for model, scene in ((DNeRF, tiny_scene), (Varied, tiny_scene), (Varied, half)):
         stage = fit(ray_stage(model(TINY)), data=serve(scene))
-        shapes.append(tuple(stage.draw().background.shape))
+        shapes.append(tuple(stage.background(stage.draw()[0], stage.generator).shape))
     assert shapes == [(3,), (32, 3), (3,)]
 
 
 def test_rates_decay_exponentially_or_as_half_a_cosine_after_a_warm_up(ray_stage: Make) -> None:
     rates = {"iterations": 101, "learning_rate": 1e-2, "final_learning_rate": 1e-4}
     plain = ray_stage(DNeRF(TINY), **rates)
-    factors = [plain.learning_rate_factor(n) for n in (0, 50, 100)]
+    factors = [plain.timeline.learning_rate_factor(n) for n in (0, 50, 100)]
     assert factors == pytest.approx([1, 0.1, 0.01])
     rates |= {"final_learning_rate": 0.0, "decay": "cosine"}
     cosine = ray_stage(DNeRF(TINY), **rates)
-    factors = [cosine.learning_rate_factor(n) for n in (0, 50, 100)]
+    factors = [cosine.timeline.learning_rate_factor(n) for n in (0, 50, 100)]
     assert factors == pytest.approx([1, 0.5, 0])
     warm = ray_stage(DNeRF(TINY), warmup=9 / 101, **rates)  # nine iterations below the decay's rate
     for n in (0, 4, 9, 50):
-        expected = cosine.learning_rate_factor(n) * min(1, (n + 1) / 10)
-        assert warm.learning_rate_factor(n) == pytest.approx(expected)
+        expected = cosine.timeline.learning_rate_factor(n) * min(1, (n + 1) / 10)
+        assert warm.timeline.learning_rate_factor(n) == pytest.approx(expected)
     with pytest.raises(DevrfError, match="final_learning_rate: expected more than 0, or decay"):
         ray_stage(DNeRF(TINY), final_learning_rate=0.0)
 

@@ -12,8 +12,8 @@ import pytest
 import torch
 from PIL import Image
 
-from devrf.apps.video_file import write_pictures
 from devrf.geometry.cameras import Cameras
+from devrf.pictures.video_file import write_pictures
 from devrf.scenes.formats import recognise
 from devrf.scenes.formats.neural_3d_video import Neural3DVideoReader
 

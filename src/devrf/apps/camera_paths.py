@@ -11,14 +11,14 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from devrf.apps.images import evenly
 from devrf.apps.video import VideoSettings
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.poses import average_pose
 from devrf.geometry.space import Space
+from devrf.pictures.images import evenly
+from devrf.rendering.renderable import Renderable
 from devrf.rendering.renderer import Renderer, points_at_depth
-from devrf.rendering.view import Viewable
 
 # Cameras stand all around if the widest gap between two, seen from above, is at most WIDEST_GAP, or
 # UNEVEN times the gap of evenly spaced ones.
@@ -234,7 +234,7 @@ def default_way(space: Space, closed: bool = False) -> str:
     return "orbit" if space.is_linear or closed else "captured"
 
 
-def looked_at(model: Viewable, cameras: Cameras, ahead: Callable[[], float]) -> Tensor:
+def looked_at(model: Renderable, cameras: Cameras, ahead: Callable[[], float]) -> Tensor:
     """What captured cameras look at (3,), world units: the middle of the scene.
 
     In a forward-facing scene it is the point ``ahead`` of the middle of the cameras, so far away.

@@ -13,11 +13,11 @@ import torch
 from torch import Tensor
 
 from devrf.apps.camera_paths import looked_at
-from devrf.apps.images import evenly, scaled, to_bytes
 from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.evaluation.held_out import truth_image
 from devrf.geometry.cameras import Cameras
-from devrf.rendering.view import Viewable
+from devrf.pictures.images import evenly, scaled, to_bytes
+from devrf.rendering.renderable import Renderable
 from devrf.scenes.bounds import nearest_point
 from devrf.scenes.scene import Scene, Views
 from devrf.system.folder_lock import private_folder
@@ -61,7 +61,7 @@ def thumbnail(scene: Scene, views: Views, index: int) -> Tensor:
     return to_bytes(scaled(image, min(len(image), ROWS)))
 
 
-def described(model: Viewable, viewpoints: Viewpoints) -> Iterator[dict[str, Any]]:
+def described(model: Renderable, viewpoints: Viewpoints) -> Iterator[dict[str, Any]]:
     """The captured cameras in plain numbers, for a page: first those that saw the scene move.
 
     Of each its ``name``, that of its pictures' folder; ``pose``, camera to world, 12 numbers, row

@@ -6,7 +6,6 @@ import csv
 import math
 import platform
 import subprocess
-import sys
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -24,6 +23,7 @@ from devrf.evaluation.objective import TRAINING, VALIDATION
 from devrf.geometry.clock import FrameClock
 from devrf.scenes.scene import Scene
 from devrf.system.files import atomic_write
+from devrf.system.memory import peak_host_memory
 from devrf.system.printed import csv_cell
 
 # Held-out images of the dynamic capture at times that a training view has, and at others.
@@ -234,17 +234,6 @@ def git_revision(root: Path | None = None) -> str | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return result.stdout.strip() or None
-
-
-def peak_host_memory() -> float | None:
-    """The peak memory of this process so far, GiB; None where the system does not tell."""
-    if sys.platform == "win32":
-        return None
-    import resource
-
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    unit = 1 if sys.platform == "darwin" else 2**10
-    return round(peak * unit / 2**30, 3)
 
 
 def in_words(values: Mapping[str, Any]) -> str:

@@ -11,11 +11,11 @@ import torch
 from rich.console import Group, RenderableType
 from torch import Tensor
 
-from devrf.apps.images import evenly
 from devrf.apps.inspection.report import titled_table
 from devrf.evaluation.held_out import background_value, score
-from devrf.methods.base import Renderable
 from devrf.metrics.image import psnr
+from devrf.pictures.images import evenly
+from devrf.rendering.renderable import Renderable
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.reduced import reduced
 from devrf.scenes.scene import Capture, CaptureName, Scene

@@ -13,10 +13,10 @@ from annotated_types import Ge, Le
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
-from devrf.apps.images import centred, image_grid, scaled
 from devrf.apps.still import DEPTH, MAX_ROWS, READABLE, sized, still
 from devrf.evaluation.held_out import background_value, truth_image
 from devrf.geometry.cameras import Cameras
+from devrf.pictures.images import centred, image_grid, scaled
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Background, Views
 from devrf.system.options import Options, Positive, Share

@@ -12,7 +12,7 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 from torch import Tensor
 
-from devrf.engine.phase import Phase
+from devrf.engine.schedule import Phase
 from devrf.engine.stage import Stage
 from devrf.errors import DevrfError
 from devrf.system.plain_data import built
@@ -25,27 +25,33 @@ SNAPSHOT_EVERY = 1000
 # The fewest iterations, as carried out, between checks that allow a judgement of opacity.
 MIN_ITERATIONS = 20
 # An expected opacity (or transparency) below this is too small to judge by.
-FAINT = 0.02
+MIN_EXPECTED = 0.02
 # Shares of the expected opacity: seen before, and as good as gone.
-THERE = 0.1
-GONE = 0.01
+MIN_SEEN = 0.1
+MAX_GONE = 0.01
 # Shares of the expected transparency. Much light passes beside the field whatever happens.
-CLEAR = 0.8
-BLOCKED = 0.5
+MIN_CLEAR = 0.8
+MAX_CLEAR_LEFT = 0.5
 
 
-def emptied(opacity: float, highest: float, expected: float) -> bool:
+def collapsed_to_empty(opacity: float, highest: float, expected: float) -> bool:
     """Whether what should be seen was there and is gone.
 
     All are mean opacities of rays: ``opacity`` now, the highest so far, and what it should be.
     """
-    return expected > FAINT and highest > THERE * expected and opacity < GONE * expected
+    return (
+        expected > MIN_EXPECTED and highest > MIN_SEEN * expected and opacity < MAX_GONE * expected
+    )
 
 
-def filled(opacity: float, lowest: float, expected: float) -> bool:
+def collapsed_to_opaque(opacity: float, lowest: float, expected: float) -> bool:
     """Whether light that should pass did so, and no longer does; ``lowest``: the lowest so far."""
     clear = 1 - expected
-    return clear > FAINT and 1 - lowest > CLEAR * clear and 1 - opacity < BLOCKED * clear
+    return (
+        clear > MIN_EXPECTED
+        and 1 - lowest > MIN_CLEAR * clear
+        and 1 - opacity < MAX_CLEAR_LEFT * clear
+    )
 
 
 class Snapshot(NamedTuple):
@@ -89,7 +95,6 @@ class DivergenceGuard(Callback):
         self._steps: list[tuple[int, dict[str, Tensor]]] = []
         self._good: Snapshot | None = None
         self._checked = 0
-        self._done_by_then = 0
         # Of the opacity, since grids of this kind are learned.
         self._kind = ""
         self._range = [1.0, 0.0]
@@ -134,9 +139,9 @@ class DivergenceGuard(Callback):
         done = pl_module.iteration
         if outputs:
             self._steps.append((done, outputs))
-        ends = done >= min(pl_module.phase.stop, pl_module.total_iterations)
-        due = done - self._checked >= self.every_iterations
-        if ends or (due and pl_module.iterations_done - self._done_by_then >= self._fewest):
+        ends = done >= min(pl_module.phase.stop, pl_module.timeline.total)
+        since = pl_module.position.iterations_done - self._checked
+        if ends or since >= self.every_iterations:
             self.check(pl_module)
 
     def check(self, stage: Stage) -> None:
@@ -144,7 +149,7 @@ class DivergenceGuard(Callback):
         if not self._steps:
             return
         iterations = [done for done, _ in self._steps]
-        since = stage.iterations_done - self._done_by_then
+        since = stage.position.iterations_done - self._checked
         *steps, fields = _read(stage, [means for _, means in self._steps])
         self._steps = []
         self._count_from(stage)
@@ -157,19 +162,13 @@ class DivergenceGuard(Callback):
             self._snapshot(stage)
 
     def _count_from(self, stage: Stage) -> None:
-        self._checked = stage.iteration
-        self._done_by_then = stage.iterations_done
-
-    @property
-    def _fewest(self) -> int:
-        """Iterations, as carried out, between checks: a budget of time strides over the others."""
-        return min(MIN_ITERATIONS, self.every_iterations)
+        self._checked = stage.position.iterations_done
 
     def _snapshot(self, stage: Stage) -> None:
         assert stage.phase is not None
         self._good = None  # its memory is free before the next takes as much
         values = tuple(value.detach().clone() for value in _trained(stage))
-        self._good = Snapshot(stage.phase, stage.iteration, stage.iterations_done, values)
+        self._good = Snapshot(stage.phase, stage.iteration, stage.position.iterations_done, values)
 
     def _collapsed(self, stage: Stage, steps: Sequence[dict[str, float]], since: int) -> str | None:
         """In words, that everything has become empty or opaque."""
@@ -181,24 +180,30 @@ class DivergenceGuard(Callback):
         where = f"{stage.describe(stage.iteration)} ({BACKGROUND})"
         if since >= MIN_ITERATIONS:
             self._range = [min(lowest, opacity), max(highest, opacity)]
-            if covered is not None and filled(opacity, lowest, covered):
+            if covered is not None and collapsed_to_opaque(opacity, lowest, covered):
                 return f"everything has become opaque by {where}"
             # Without alpha masks, what moves may have left the picture.
-            judged = covered is not None or stage.name == "canonical"
-            if judged and emptied(opacity, highest, highest if covered is None else covered):
+            judged = covered is not None or stage.capture == "static"
+            if judged and collapsed_to_empty(
+                opacity, highest, highest if covered is None else covered
+            ):
                 return f"everything has become empty by {where}"
-        if stage.iteration >= stage.total_iterations and opacity < GONE * (covered or THERE):
+        if stage.iteration >= stage.timeline.total and opacity < MAX_GONE * (covered or MIN_SEEN):
             log.warning("%s: nothing is to be seen at the end (%s)", stage.name, BACKGROUND)
         return None
 
     @torch.no_grad()
     def _rollback(self, stage: Stage, good: Snapshot, wrong: str) -> None:
         """Restore the last good state; the second time, end there."""
-        again = stage.num_rollbacks > 0
+        again = stage.position.num_rollbacks > 0
         scale = stage.lr_scale
         for value, stored in zip(_trained(stage), good.values, strict=True):
             value.copy_(stored)
-        stage.rollback(good.iteration, good.iterations_done, self.rate_factor)
+        stage.position.roll_back(good.iteration, good.iterations_done, self.rate_factor)
+        stage.optimizer.forget()
+        stage.values_replaced()
+        stage.position.seed_generator(stage.generator, stage.global_rank)
+        stage.trainer.should_stop = False
         self._count_from(stage)
         if again:
             stage.abort(

@@ -13,8 +13,7 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 from torch import Tensor
 
-from devrf.callbacks.curves import batch_error
-from devrf.engine.phase import Phase
+from devrf.engine.schedule import Phase
 from devrf.engine.stage import Stage
 
 log = logging.getLogger(__name__)
@@ -65,7 +64,7 @@ class FrameFit(Callback):
         """Add the step's error to those of the frame's visit."""
         assert isinstance(pl_module, Stage)
         phase = pl_module.phase
-        error = batch_error(outputs or {})
+        error = (outputs or {}).get("render")
         if phase is None or phase.frame is None or error is None:
             return
         if phase != self._visit:
@@ -81,7 +80,7 @@ class FrameFit(Callback):
         if not psnr:
             return
         frames = lost(psnr)
-        pl_module.record |= {
+        pl_module.provenance.record |= {
             "lost_frames": len(frames),
             "frame_psnr": [round(value, 2) for _, value in sorted(psnr.items())],
         }

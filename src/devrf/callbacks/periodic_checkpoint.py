@@ -74,7 +74,7 @@ class PeriodicCheckpoint(Callback):
     def left_at(self, stage: Stage) -> str:
         """Where a stage has ended, and whether it can go on from there, in words."""
         done = stage.iteration
-        total = stage.total_iterations
+        total = stage.timeline.total
         where = f"iteration {done} of {total} of the {stage.name} stage"
         if done < total and done != (self.saved or 0):
             last = "there is none" if self.saved is None else f"the last is of {self.saved}"
@@ -101,18 +101,19 @@ class PeriodicCheckpoint(Callback):
         due = time.monotonic() >= self._due
         if trainer.world_size > 1:  # what one process is asked, all must do
             stopping, due = self._agreed(trainer.is_global_zero, pl_module.device)
-        if pl_module.iteration >= pl_module.total_iterations:
+        if pl_module.is_complete:
             return  # the stage is done: its checkpoint is next
         if stopping or due:
             self._write(trainer, pl_module)
         if stopping:
             self._asked = False
             trainer.should_stop = True
+            trainer.limit_val_batches = 0  # Lightning would validate once more
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Write a file where something else has ended the stage before its schedule."""
         assert isinstance(pl_module, Stage)
-        if self.saved != pl_module.iteration < pl_module.total_iterations:
+        if not pl_module.is_complete and self.saved != pl_module.iteration:
             self._write(trainer, pl_module)
 
     def _agreed(self, leads: bool, device: torch.device) -> tuple[bool, bool]:

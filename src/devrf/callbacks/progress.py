@@ -13,7 +13,7 @@ from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 from torch import Tensor
 
-from devrf.callbacks.curves import batch_psnr
+from devrf.engine.schedule import share_done
 from devrf.engine.stage import Stage
 from devrf.system.progress import time_left
 
@@ -29,13 +29,14 @@ class Progress(Callback):
     """Shows a bar on a terminal, else a line every ``line_every_seconds``.
 
     The time left comes from the pace so far and from what the phases to come cost
-    (:meth:`~devrf.engine.stage.Stage.cost`).
+    (:func:`~devrf.engine.schedule.cost`).
     """
 
     def __init__(self, line_every_seconds: float = 15.0) -> None:
         self.line_every_seconds = line_every_seconds
         self._bar: Bar | None = None
-        self._shown = (0.0, 0)
+        # Seconds, iterations carried out, and the share of the schedule that was over.
+        self._shown = (0.0, 0, 0.0)
         self._pace = 0.0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -43,7 +44,7 @@ class Progress(Callback):
         assert isinstance(pl_module, Stage)
         if not trainer.is_global_zero:
             return
-        self._shown = (time.perf_counter(), pl_module.iteration)
+        self._shown = self._now(pl_module)
         self._pace = 0.0
         console = Console()
         if console.is_terminal:
@@ -56,10 +57,10 @@ class Progress(Callback):
             )
             self._bar.add_task(
                 type(pl_module).__name__,
-                total=pl_module.cost(0, pl_module.total_iterations),
-                completed=int(pl_module.cost(0, pl_module.iteration)),
+                total=1.0,
                 state="",
             )
+            self._bar.update(self._bar.task_ids[0], completed=self._shown[2])
             self._bar.start()
 
     def on_train_batch_end(
@@ -67,23 +68,25 @@ class Progress(Callback):
     ) -> None:
         """Update the bar or write a line, if it is due."""
         assert isinstance(pl_module, Stage)
-        now = time.perf_counter()
-        since = now - self._shown[0]
-        done = pl_module.iteration
+        before = self._shown
+        since = time.perf_counter() - before[0]
         if since < (self.line_every_seconds if self._bar is None else BAR_EVERY_SECONDS):
             return
-        before = self._shown[1]
-        total = pl_module.total_iterations
-        speed = (done - before) / since
-        pace = pl_module.cost(before, done) / since
-        self._shown = (now, done)
+        self._shown = now = self._now(pl_module)
+        speed = (now[1] - before[1]) / since
+        pace = (now[2] - before[2]) / since
         if self._bar is None:
             self._pace = pace if self._pace == 0 else self._pace + LATEST * (pace - self._pace)
             log.info("%s", in_one_line(outputs or {}, pl_module, speed, self._pace))
         else:
-            state = f"{done}/{total}  {describe(outputs or {}, pl_module, speed)}"
-            completed = pl_module.cost(0, done)
-            self._bar.update(self._bar.task_ids[0], completed=completed, state=state)
+            total = pl_module.timeline.total
+            at = f"{pl_module.iteration}/{total}  {describe(outputs or {}, pl_module, speed)}"
+            self._bar.update(self._bar.task_ids[0], completed=now[2], state=at)
+
+    @staticmethod
+    def _now(stage: Stage) -> tuple[float, int, float]:
+        done = stage.position.iterations_done
+        return time.perf_counter(), done, share_done(stage.timeline, stage.iteration)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Close the bar."""
@@ -104,17 +107,18 @@ class Progress(Callback):
 def in_one_line(means: Mapping[str, Tensor], stage: Stage, speed: float, pace: float) -> str:
     """Where a stage is, what :func:`describe` says, and the time left.
 
-    ``speed`` is in iterations a second, ``pace`` in their cost, which levels to come have more of.
+    ``speed`` is in iterations a second, ``pace`` in shares of the whole schedule's duration.
     """
     done = stage.iteration
-    total = stage.total_iterations
-    left = f"  {time_left(stage.cost(done, total) / pace)}" if 0 < pace and done < total else ""
-    return f"{stage.capture} {done}/{total}  {describe(means, stage, speed)}{left}"
+    total = stage.timeline.total
+    left = 1 - share_done(stage.timeline, done)
+    ends = f"  {time_left(left / pace)}" if pace > 0 and left > 0 else ""
+    return f"{stage.capture} {done}/{total}  {describe(means, stage, speed)}{ends}"
 
 
 def describe(means: Mapping[str, Tensor], stage: Stage, speed: float) -> str:
     """PSNR of the last batches, iterations a second, resolution, and the frame if any."""
-    psnr = batch_psnr(means)
+    psnr = means.get("psnr")
     parts = [] if psnr is None else [f"{float(psnr):.1f} dB"]
     parts.append(f"{speed:.0f} it/s" if speed >= 10 else f"{speed:.2g} it/s")
     if stage.resolution:

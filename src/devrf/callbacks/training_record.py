@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from lightning import Callback, LightningModule, Trainer
 
-from devrf.callbacks.curves import Previews
 from devrf.engine.stage import Stage
 from devrf.system.device import wait
 from devrf.system.plain_data import built
@@ -22,15 +21,28 @@ class TrainingRecord(Callback):
         self._seconds_before = 0.0
         self._peaks_before: tuple[float, float] | None = None
         self._device: torch.device | None = None
-        self._previews: list[Previews] = []
+        # Of validations: the seconds that they took, and when the present one began.
+        self._validating = 0.0
+        self._began = 0.0
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Note the stage, and what its clock leaves out."""
-        callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
-        self._previews = [other for other in callbacks if isinstance(other, Previews)]
+        """Note the stage."""
+        if stage != "fit":
+            return
         assert isinstance(pl_module, Stage)
         self._stage = pl_module
         self._device = trainer.strategy.root_device
+        self._validating = 0.0
+
+    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Stop the clock."""
+        wait(pl_module.device)
+        self._began = time.perf_counter()
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start it again."""
+        wait(pl_module.device)
+        self._validating += time.perf_counter() - self._began
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the memory's high-water mark; the clock runs since the stage's own setup."""
@@ -48,7 +60,7 @@ class TrainingRecord(Callback):
         self._peaks_before = None if peaks is None else built(tuple[float, float], peaks)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Fill the record: wall-clock seconds without previews, memory in GiB (None on a CPU).
+        """Fill the record: wall-clock seconds without validation, memory in GiB (None on a CPU).
 
         ``peak_gpu_gb`` is what tensors took, ``peak_reserved_gb`` what torch's allocator held, with
         its caches.
@@ -56,23 +68,23 @@ class TrainingRecord(Callback):
         assert isinstance(pl_module, Stage)
         wait(pl_module.device)
         seconds = self.seconds
-        done = pl_module.iterations_done
+        done = pl_module.position.iterations_done
         allocated, reserved = self._peaks() or (None, None)
-        pl_module.record = {
+        pl_module.provenance.record = {
             "seconds": round(seconds, 2),
             "iterations": done,
             "iterations_per_second": round(done / seconds, 2),
             "peak_gpu_gb": allocated,
             "peak_reserved_gb": reserved,
-            "num_rollbacks": pl_module.num_rollbacks,
+            "num_rollbacks": pl_module.position.num_rollbacks,
         }
 
     @property
     def seconds(self) -> float:
-        """Wall clock of the stage so far, in all runs, its setup included, previews not."""
+        """Wall clock of the stage so far, in all runs, its setup included, validation not."""
         assert self._stage is not None
-        looking = sum(previews.seconds for previews in self._previews)
-        return self._seconds_before + time.perf_counter() - self._stage.began - looking
+        since = time.perf_counter() - self._stage.began
+        return self._seconds_before + since - self._validating
 
     def _peaks(self) -> tuple[float, float] | None:
         """GiB allocated and reserved at the peaks so far."""

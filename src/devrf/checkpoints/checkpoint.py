@@ -20,7 +20,6 @@ from devrf.checkpoints.checkpoint_file import (
 )
 from devrf.checkpoints.file_metadata import latest_checkpoint
 from devrf.checkpoints.progress import Progress
-from devrf.checkpoints.stored_class import StoredClass, stored_class
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
@@ -31,6 +30,7 @@ from devrf.scenes.validation import check_poses
 from devrf.system.memory import OutOfMemoryError, is_oom
 from devrf.system.plain_data import Line, built
 from devrf.system.printed import shown
+from devrf.system.stored_class import StoredClass, stored_class
 
 # The stage's attribute that holds the model: what its entries of a state begin with.
 MODEL = "scene_model."
@@ -162,7 +162,7 @@ class LoadedCheckpoint:
 
     Attributes:
         metadata: which scene, and how it was learned.
-        model: a :class:`~devrf.methods.base.Renderable`.
+        model: a :class:`~devrf.rendering.renderable.Renderable`.
         viewpoints: where the scene was seen from; None where the file does not say.
     """
 

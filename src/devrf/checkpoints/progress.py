@@ -15,11 +15,11 @@ import numpy as np
 import torch
 from typing_extensions import TypedDict
 
-from devrf.system.plain_data import Count, Line, Share
+from devrf.system.plain_data import Count, Factor, Line, Share
 
 
 class Progress(TypedDict):
-    """Where a stage was left: its name, its schedule's length, and attributes of it by name.
+    """Where a stage was left: name, length of its schedule, position and size of batches.
 
     ``phase`` is the first iteration of the present phase; ``phase_state`` is what of it does not
     follow from schedule and model, and ``random`` is what :func:`rng_state` gives.
@@ -32,6 +32,8 @@ class Progress(TypedDict):
     seed: Count
     num_rollbacks: Count
     lr_scale: Share
+    schedule_scale: Factor
+    ended_early: bool
     batch_share: Share
     largest_share: Share
     phase: Count | None

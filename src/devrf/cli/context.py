@@ -17,7 +17,6 @@ from omegaconf import DictConfig, OmegaConf
 
 from devrf.apps.fitting import SIZE
 from devrf.apps.rehearsal import LONGEST, RehearsedStage, for_rehearsal
-from devrf.apps.trackers import Tracker, trackers
 from devrf.checkpoints.checkpoint import (
     LoadedCheckpoint,
     Viewpoints,
@@ -35,6 +34,7 @@ from devrf.engine.stage import Stage
 from devrf.errors import DevrfError, expect
 from devrf.evaluation.objective import VALIDATION
 from devrf.evaluation.suite import Evaluation
+from devrf.loggers.trackers import Tracker, trackers
 from devrf.methods.protocol import Protocol
 from devrf.scenes.scene import Scene
 

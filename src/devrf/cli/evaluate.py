@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from pathlib import Path
 
 from devrf.apps.records import (
@@ -19,18 +18,16 @@ from devrf.apps.records import (
     write_frames,
 )
 from devrf.apps.settings import REHEARSAL
-from devrf.apps.still import write_contact_sheet
 from devrf.checkpoints.file_metadata import digest_of
 from devrf.cli.config import choices
 from devrf.cli.context import RunContext
 from devrf.cli.restore_config import as_typed
 from devrf.cli.resume import unfinished
 from devrf.errors import DevrfError
-from devrf.evaluation.held_out import HeldOutView, score_all
 from devrf.evaluation.objective import VALIDATION
-from devrf.evaluation.suite import MetricSuite
-from devrf.methods.base import Renderable
-from devrf.scenes.scene import CaptureName
+from devrf.evaluation.scoring import score_held_out
+from devrf.pictures.held_out import write_contact_sheet
+from devrf.scenes.scene import Views
 from devrf.system.files import write_json
 from devrf.system.override import to_type
 
@@ -54,21 +51,24 @@ def evaluate(run: RunContext) -> list[Path]:
     suite = run.evaluation.suite(run.device)
     # The stage that learns the scene at rest.
     rest = next((step.name for step in run.protocol.steps if step.capture == "static"), None)
-    frames: dict[str, list[HeldOutView]] = {"static": _score(run, model, "static", suite)}
+    sets: dict[str, Views] = {"static": scene.static.test}
     if model.moves and metadata.stage != rest:
-        # A film without a static set has the same images in both captures.
-        shared = scene.dynamic.test is scene.static.test
-        at_rest = frames["static"] if shared else ()
-        frames["dynamic"] = _score(run, model, "dynamic", suite, at_rest)
-    size = round(run.checkpoint(metadata.stage).stat().st_size / 1e6, 3)
-    sections = scores_by_section(frames, scene.clock, metadata, rest, size)
-    if run.datamodule.validation and {*frames} == {*scene.captures}:
-        views = scene.dynamic.validation
-        if views is None:
+        sets["dynamic"] = scene.dynamic.test
+    if run.datamodule.validation and {*sets} == {*scene.captures}:
+        if scene.dynamic.validation is None:
             log.info("%s: no validation split; the test views decide the objective", scene.name)
         else:
-            scored = score_all(model, views, scene.background, suite, "validation images")
-            sections[VALIDATION] = {**mean_scores(scored), "images": len(scored)}
+            sets[VALIDATION] = scene.dynamic.validation
+    frames = score_held_out(model, sets, scene.background, suite)
+    validated = frames.pop(VALIDATION, [])
+    for capture, scored in frames.items():
+        sheet = write_contact_sheet(run.folder / "images" / f"{capture}.png", scored)
+        for tracker in run.trackers:
+            tracker.show_image(f"held_out/{capture}", sheet)
+    size = round(run.checkpoint(metadata.stage).stat().st_size / 1e6, 3)
+    sections = scores_by_section(frames, scene.clock, metadata, rest, size)
+    if validated:
+        sections[VALIDATION] = {**mean_scores(validated), "images": len(validated)}
     write_frames(run.folder / "frames.csv", frames)
     protocol = metadata.protocol or run.protocol.name
     head = {"scene": scene.name, "method": model.name, "protocol": protocol}
@@ -97,25 +97,3 @@ def evaluate(run: RunContext) -> list[Path]:
         tracker.show_table("frames", frame_rows(frames))
     written = (metrics, "frames.csv", *(f"images/{capture}.png" for capture in frames))
     return [run.folder / name for name in written]
-
-
-def _score(
-    run: RunContext,
-    model: Renderable,
-    capture: CaptureName,
-    suite: MetricSuite,
-    at_rest: Sequence[HeldOutView] = (),
-) -> list[HeldOutView]:
-    """Score a capture's held-out views; the static ones show the rest state at any time.
-
-    ``at_rest``: scores of the same images at rest, where there are any.
-    """
-    views = run.scene.capture(capture).test
-    background = run.scene.background
-    name = f"held-out images, {capture}"
-    time = 0.0 if capture == "static" else None
-    scored = score_all(model, views, background, suite, name, time=time, at_rest=at_rest)
-    sheet = write_contact_sheet(run.folder / "images" / f"{capture}.png", scored)
-    for tracker in run.trackers:
-        tracker.show_image(f"held_out/{capture}", sheet)
-    return scored

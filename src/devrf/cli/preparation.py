@@ -17,7 +17,7 @@ from devrf.apps.inspection.advice import image_sets
 from devrf.apps.inspection.report import inspection_text, show
 from devrf.apps.needs import needs_table
 from devrf.apps.settings import CaptureSettings
-from devrf.callbacks.trial import seconds_to_learn
+from devrf.apps.trial import seconds_to_learn
 from devrf.cli.complete import completed
 from devrf.cli.config import command_line
 from devrf.cli.context import RunContext
@@ -96,6 +96,14 @@ def inspect(run: RunContext) -> None:
     path = run.folder / "images" / "inspect.png"
     write_inspection_picture(path, run.scene)
     log.info("picture written to %s", path)
+
+
+def report(run: RunContext) -> None:
+    """``stage=report``: tables and plots of the runs below ``report.runs``; needs no scene."""
+    # pandas and matplotlib are slow to import.
+    from devrf.apps.report.write import write_report
+
+    log.info("%s", write_report(instantiate(run.config.report)))
 
 
 def selfcheck(run: RunContext) -> None:

@@ -16,7 +16,6 @@ from devrf.apps.settings import ViewerSettings
 from devrf.apps.still import StillSettings, write_still
 from devrf.apps.still import still as rendered
 from devrf.apps.video import VideoSettings
-from devrf.apps.video_file import write_pictures
 from devrf.apps.viewer.page import PAGE, PICTURES, PageServer, is_current
 from devrf.apps.web.pack import drawable, page
 from devrf.checkpoints.checkpoint import Viewpoints, check_scene, metadata_of
@@ -27,7 +26,8 @@ from devrf.cli.resume import unfinished
 from devrf.cli.view import serve
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
-from devrf.methods.base import Renderable
+from devrf.pictures.video_file import write_pictures
+from devrf.rendering.renderable import Renderable
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
 from devrf.system.files import write_text

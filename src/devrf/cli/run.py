@@ -25,12 +25,11 @@ from devrf.cli.context import RunContext
 from devrf.cli.evaluate import evaluate
 from devrf.cli.memory import compare
 from devrf.cli.messages import as_own_errors
-from devrf.cli.preparation import capture, fetch, inspect, prepare, say_next, selfcheck
+from devrf.cli.preparation import capture, fetch, inspect, prepare, report, say_next, selfcheck
 from devrf.cli.rehearse import begin_anew, conclude
 from devrf.cli.render import export, render, still, view, write_scene_page
 from devrf.cli.resume import done, note_done, unfinished
 from devrf.cli.run_folder import archive_previous
-from devrf.cli.sweep import report
 from devrf.cli.train import learn
 from devrf.engine.ddp import ManualDDP
 from devrf.engine.workers import launch_workers

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hydra.experimental.callback import Callback
 from hydra.utils import instantiate
@@ -24,23 +24,12 @@ from devrf.system.files import remove_if_only, write_json
 from devrf.system.folder_lock import PLACE, release_folder
 from devrf.system.process import forget_peak_memory
 
-if TYPE_CHECKING:
-    from devrf.cli.context import RunContext
-
 log = logging.getLogger(__name__)
 
 # The exit status of a sweep with failed jobs.
 JOBS_FAILED = 3
 # What the sweep's folder holds before Hydra starts the first job.
 OF_SWEEP = {"multirun.yaml", PLACE}
-
-
-def report(run: RunContext) -> None:
-    """``stage=report``: tables and plots of the runs below ``report.runs``; needs no scene."""
-    # Hydra imports this module with every command; pandas and matplotlib are slow to import.
-    from devrf.apps.report.write import write_report
-
-    log.info("%s", write_report(instantiate(run.config.report)))
 
 
 @contextmanager

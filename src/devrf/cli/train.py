@@ -9,17 +9,18 @@ from typing import Any
 
 from hydra.utils import instantiate
 from lightning import Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint
 from omegaconf import OmegaConf
 
 from devrf.apps.records import in_words
 from devrf.apps.rehearsal import RehearsedStage
 from devrf.callbacks import PeriodicCheckpoint, StopOnSignal, TrainingRecord
-from devrf.callbacks.csv_logger import ResumableCSVLogger
 from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, save_checkpoint
 from devrf.cli.context import RunContext
 from devrf.cli.resume import ResumePoint, beginning, remove_progress
 from devrf.engine.stage import Stage, fit
 from devrf.errors import DevrfError
+from devrf.loggers.csv_logger import ResumableCSVLogger
 from devrf.system.files import atomic_write
 from devrf.system.process import Interrupted
 
@@ -48,25 +49,26 @@ def learn(run: RunContext, name: str) -> None:
             needed = f"stage={name} needs a checkpoint of the {below} stage"
             raise DevrfError(f"ckpt: {needed}, not of the {before.stage} stage")
         stage = build(rest=rest)
-        stage.earlier_configs = {**before.earlier_configs, below: before.training_config}
-    stage.protocol = run.protocol.name
+        stage.provenance.earlier_configs = {**before.earlier_configs, below: before.training_config}
+    stage.provenance.protocol = run.protocol.name
     stage.time_share = run.protocol.time_share(name, run.stages_with_images)
-    stage.command = run.command
+    stage.provenance.command = run.command
     _fit(run, stage, begin)
 
 
 def _fit(run: RunContext, stage: Stage, begin: ResumePoint) -> None:
     if run.leads:
         _ = run.scene  # errors in it come before a logger writes files
-    stage.training_config = begin.training_config
+    stage.provenance.training_config = begin.training_config
     # The clock stops before curves are drawn.
-    callbacks = [TrainingRecord(), *instantiate(run.config.callbacks).values()]
+    configured = instantiate(run.config.callbacks) or {}
+    callbacks = [TrainingRecord(), *filter(None, configured.values())]
     saving = next((hook for hook in callbacks if isinstance(hook, PeriodicCheckpoint)), None)
     if saving is None:  # no periodic files, but still one at a signal
         saving = PeriodicCheckpoint(run.folder / "checkpoints", every_seconds=math.inf)
         callbacks.append(saving)
     if run.config.viewer.training and run.leads:
-        from devrf.callbacks.live_view import LiveView  # an extra
+        from devrf.apps.viewer.live_view import LiveView  # an extra
 
         callbacks.append(LiveView(run.page, run.config.viewer.share))
     with StopOnSignal(saving) as stop:
@@ -75,6 +77,7 @@ def _fit(run: RunContext, stage: Stage, begin: ResumePoint) -> None:
             callbacks=[*callbacks, stop],
             logger=run.logger,
             default_root_dir=str(run.folder),
+            enable_checkpointing=any(isinstance(hook, ModelCheckpoint) for hook in callbacks),
         )
         trainer.strategy.checkpoint_io = ChecksummedCheckpointIO()
         if isinstance(run.logger, ResumableCSVLogger):
@@ -82,7 +85,7 @@ def _fit(run: RunContext, stage: Stage, begin: ResumePoint) -> None:
         fit(trainer, stage, run.datamodule, begin.progress)
         strategy = trainer.strategy
         stopping = strategy.reduce_boolean_decision(stop.number is not None, all=False)
-        finished = stage.iteration >= stage.total_iterations
+        finished = stage.is_complete
         if run.leads and finished and not run.is_trial:
             _keep(run, trainer, stage)
         strategy.barrier("the checkpoint is written")
@@ -90,10 +93,10 @@ def _fit(run: RunContext, stage: Stage, begin: ResumePoint) -> None:
         _, settings = run.whole_stages[stage.name]
         run.rehearsed[stage.name] = RehearsedStage(
             capture=stage.capture,
-            iterations=stage.iterations_done,
+            iterations=stage.position.iterations_done,
             whole=stage.iterations_of(settings, run.scene),
             events={name: count for name, count in stage.events.items() if count},
-            planned=dict(stage.planned_events),
+            planned=dict(stage.timeline.planned_events),
         )
     where = saving.left_at(stage)
     if stopping:
@@ -103,7 +106,7 @@ def _fit(run: RunContext, stage: Stage, begin: ResumePoint) -> None:
         run.tried[stage.name] = stage.result()
         if run.leads:
             tried = stage.iteration
-            total = stage.total_iterations
+            total = stage.timeline.total
             log.info("%s: a trial, %d of %d iterations; nothing is kept", stage.name, tried, total)
     elif not finished:
         asked = run.config.trainer
@@ -116,7 +119,7 @@ def _keep(run: RunContext, trainer: Trainer, stage: Stage) -> None:
     """Write the stage's checkpoint, and the config that it was learned with."""
     path = run.own_checkpoint(stage.name)
     # Goes into the checkpoint, so without the time of writing it.
-    stage.record["wall_seconds"] = run.step_seconds
+    stage.provenance.record["wall_seconds"] = run.step_seconds
     try:
         save_checkpoint(trainer, path)
         with atomic_write(path.with_name("config.yaml")) as partial:
@@ -125,4 +128,4 @@ def _keep(run: RunContext, trainer: Trainer, stage: Stage) -> None:
         again = "make it possible to write there, and run the same command again"
         raise DevrfError(f"{error.filename or path}: {error.strerror}; {again}") from error
     remove_progress(path.parent, stage.name)
-    log.info("%s: %s; written to %s", stage.name, in_words(stage.record), path)
+    log.info("%s: %s; written to %s", stage.name, in_words(stage.provenance.record), path)

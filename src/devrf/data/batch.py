@@ -151,21 +151,6 @@ class FramePool:
 
 
 @dataclass(frozen=True)
-class Pixels:
-    """R pixels to make a batch of.
-
-    Attributes:
-        image: (R,) int64, the image of each among the views.
-        flat: (R,) int64, its row-major number in the image.
-        background: (3,) or (R, 3) RGB in [0, 1] that colours are composited on.
-    """
-
-    image: Tensor
-    flat: Tensor
-    background: Tensor
-
-
-@dataclass(frozen=True)
 class RayBatch:
     """R rays with the truth at their pixels.
 
@@ -239,18 +224,26 @@ def gather_batch(
     )
 
 
-def background_color(name: str, rays: int, generator: torch.Generator) -> Tensor:
-    """The background (3,) to learn on, or (R, 3) where it is random.
+class BackgroundColor:
+    """Colours that images are composited on while a stage learns."""
 
-    Args:
-        name: ``white``, ``black`` or ``random``.
-        rays: R, the rays of the batch.
-        generator: of the random colours; the background is on its device.
-    """
-    device = generator.device
-    if name == "random":
-        return torch.rand(rays, 3, device=device, generator=generator)
-    return torch.full((3,), 0.0 if name == "black" else 1.0, device=device)
+    def __init__(self, name: str) -> None:
+        """``name``: ``white``, ``black`` or ``random``."""
+        self.name = name
+        self._plain: Tensor | None = None
+
+    def __call__(self, image: Tensor, generator: torch.Generator) -> Tensor:
+        """The colour (3,) behind the pixels of ``image`` (R,), always the same tensor.
+
+        Random colours are (R, 3), drawn with ``generator``.
+        """
+        device = generator.device
+        if self.name == "random":
+            return torch.rand(len(image), 3, device=device, generator=generator)
+        if self._plain is None or self._plain.device != image.device:
+            value = 0.0 if self.name == "black" else 1.0
+            self._plain = torch.full((3,), value, device=image.device)
+        return self._plain
 
 
 def concatenated(batches: Sequence[RayBatch]) -> RayBatch:

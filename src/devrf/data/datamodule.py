@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from itertools import repeat
 from typing import Any
 
@@ -77,6 +77,12 @@ class SceneDataModule(LightningDataModule, ABC):
     def test_dataloader(self) -> Iterable[int]:
         """The positions of the held-out images, one at a time."""
         return range(len(self.scene.capture(self._stage.scored_capture).test))
+
+    def val_dataloader(self) -> Sequence[int]:
+        """The positions of the validation views, or held-out ones: the middle one first."""
+        capture = self.scene.capture(self._stage.scored_capture)
+        count = len(capture.test if capture.validation is None else capture.validation)
+        return sorted(range(count), key=lambda index: abs(index - count // 2))
 
     def transfer_batch_to_device(
         self, batch: Any, device: torch.device, dataloader_idx: int

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -12,9 +11,7 @@ from devrf.evaluation.suite import MetricInput, MetricSuite
 from devrf.metrics.image import psnr, psnr_masked, ssim, ssim_masked, ssim_within
 from devrf.rendering.output import RenderedImage
 from devrf.rendering.renderer import Renderer, points_at_depth
-from devrf.rendering.view import Viewable
 from devrf.scenes.scene import Background, Views
-from devrf.system.progress import followed
 
 
 @dataclass(frozen=True)
@@ -109,29 +106,6 @@ def score(
         depth=rendered.depth.cpu().view(truth.shape[:2]),
         opacity=opacity,
     )
-
-
-def score_all(
-    model: Viewable,
-    views: Views,
-    background: Background,
-    suite: MetricSuite,
-    name: str,
-    *,
-    time: float | None = None,
-    at_rest: Sequence[HeldOutView] = (),
-) -> list[HeldOutView]:
-    """:func:`score` of each of the held-out ``views``; progress is shown under ``name``.
-
-    ``at_rest`` has the same views of the scene at rest where they were scored before.
-    """
-    renderer = Renderer(model)
-    known: Sequence[float | None] = [view.psnr for view in at_rest] or [None] * len(views)
-    scored = (
-        score(renderer, views, index, background, suite, time=time, rest_pose_psnr=rest_pose_psnr)
-        for index, rest_pose_psnr in enumerate(known)
-    )
-    return list(followed(scored, len(views), name))
 
 
 def compare(prediction: Tensor, truth: Tensor, valid_mask: Tensor | None) -> Tensor:

@@ -1,117 +1,25 @@
-"""What every method is: a scene that can be rendered, and, of most, a module that learns from rays.
+"""A method that learns from rays: what :class:`~devrf.methods.ray_stage.RayStage` trains.
 
-:class:`RayTrainable` methods are learned by ``methods.ray_stage``; DeVRF has stages of its own
-(``methods.devrf``), and is :class:`Renderable` alone. Everything that shows a learned scene
-(videos, stills, evaluation) asks for :meth:`Renderable.at`; exports also for
-:meth:`Renderable.surface` and :meth:`Renderable.forward_map`, which a method may have.
+DeVRF has stages of its own (``methods.devrf``), and is a
+:class:`~devrf.rendering.renderable.Renderable` alone.
 """
 
 from __future__ import annotations
 
 import fnmatch
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from abc import abstractmethod
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from devrf.checkpoints.stored_class import StoredClass
 from devrf.data.batch import RayBatch
 from devrf.errors import DevrfError
-from devrf.geometry.box import Box
-from devrf.geometry.space import Space
 from devrf.methods.protocol import ProtocolStage
 from devrf.rendering.output import RenderOutput
-from devrf.rendering.view import SurfaceField, View
+from devrf.rendering.renderable import Renderable
 from devrf.scenes.scene import Scene, Views
-
-
-class Renderable(StoredClass, nn.Module, ABC):
-    """A scene, learned by some method, to be rendered from any view at any time.
-
-    Attributes:
-        name: the method's name: what ``method=`` chooses, and tables say.
-        box: what holds the scene, in the space of the fields.
-        space: the space that the fields live in: world units, or NDC.
-        depth_limits: distances along a ray before and behind which nothing is sampled, in the
-            space of the fields.
-    """
-
-    name: ClassVar[str]
-    box: Box
-    space: Space
-    depth_limits: tuple[float, float]
-
-    @abstractmethod
-    def config(self) -> dict[str, Any]:
-        """Plain data from which :meth:`from_config` builds a module that takes this one's state.
-
-        A checkpoint holds it, beside the class.
-        """
-
-    @classmethod
-    def from_config(cls, config: Mapping[str, Any]) -> Renderable:
-        """The module that :meth:`config` described, with other values in it."""
-        return cls(**config)
-
-    @abstractmethod
-    def at(self, time: float, *, half: bool = False) -> View:
-        """The scene at ``time`` in [0, 1], ready to be looked at from anywhere.
-
-        Args:
-            time: in [0, 1].
-            half: let networks work in half precision where device and method can.
-        """
-
-    def surface(self) -> SurfaceField | None:
-        """The scene at rest as a field of which a surface can be taken; None: there is none.
-
-        Of a method that has not this and :meth:`forward_map`, nor :meth:`surface_at`, exports take
-        what :meth:`at` shows.
-        """
-        return None
-
-    def surface_at(self, time: float) -> SurfaceField | None:
-        """The scene at ``time`` as a field of which a surface can be taken; None: there is none.
-
-        Of a method whose surface is not carried through time by :meth:`forward_map`.
-        """
-        return None
-
-    def forward_map(self, time: float) -> Callable[[Tensor], Tensor] | None:
-        """q → x(q, t): where canonical points (M, 3) are at ``time``, both in the fields' space.
-
-        The identity at time 0. None: the method knows only the way back, from x to q, or none.
-        """
-        return None
-
-    @property
-    def device(self) -> torch.device:
-        """Where the parameters are."""
-        return next(self.parameters()).device
-
-    @property
-    def moves(self) -> bool:
-        """Whether it has learned to move: False for a rest state alone."""
-        return True
-
-    @property
-    def size(self) -> int:
-        """How many numbers are learned."""
-        return sum(parameter.numel() for parameter in self.parameters())
-
-    def stored_state(self) -> dict[str, Any]:
-        """The state for a finished checkpoint: tensors and plain data, as small as can be."""
-        return self.state_dict()
-
-    def load_stored_state(self, state: Mapping[str, Any]) -> None:
-        """Take what :meth:`stored_state` gave, or a full state.
-
-        Raises:
-            RuntimeError | KeyError | ValueError | TypeError: it does not fit.
-        """
-        self.load_state_dict(dict(state))
 
 
 class RayTrainable(Renderable):
@@ -154,7 +62,7 @@ class RayTrainable(Renderable):
             DevrfError: the scene lacks what the method needs.
         """
 
-    def learn_from(self, views: Sequence[Views], terms: Collection[str]) -> None:
+    def prepare_priors(self, views: Sequence[Views], terms: Collection[str]) -> None:
         """Look at the images whose rays will be rendered; called when a stage begins or goes on.
 
         Args:
@@ -162,7 +70,7 @@ class RayTrainable(Renderable):
             terms: the loss terms that count.
         """
 
-    def further_pixels(
+    def extra_pixels(
         self, generator: torch.Generator, share: float
     ) -> tuple[Tensor, Tensor] | None:
         """Pixels that the next batch has beside those drawn from all images; None: none.
@@ -172,7 +80,7 @@ class RayTrainable(Renderable):
             share: the part of the schedule's batches that this process draws.
 
         Returns:
-            image (K,), numbered as for :meth:`learn_from`, and row-major number (K,), int64.
+            image (K,), numbered as for :meth:`prepare_priors`, and row-major number (K,), int64.
         """
         return None
 
@@ -226,7 +134,7 @@ class RayTrainable(Renderable):
             for parameter in parameters:
                 parameter.requires_grad_(name not in frozen)
 
-    def follow(self, step: ProtocolStage) -> None:
+    def begin_stage(self, step: ProtocolStage) -> None:
         """Called when a stage of a protocol begins: keeps its frozen parts as they are."""
         self.freeze(step.frozen)
 

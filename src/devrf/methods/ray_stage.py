@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from functools import cached_property
+from dataclasses import field, replace
 from typing import Annotated, Any, ClassVar, Literal
 
 import torch
@@ -16,11 +15,11 @@ from torch import Tensor
 from warp import Kernel
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
-from devrf.data.batch import FramePool, Pixels, RayBatch, concatenated, gather_batch
+from devrf.data.batch import BackgroundColor, FramePool, RayBatch, concatenated, gather_batch
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.grid_adam import GridAdam
-from devrf.engine.phase import Phase
-from devrf.engine.stage import Stage
+from devrf.engine.schedule import Phase
+from devrf.engine.stage import Stage, Terms
 from devrf.errors import expect
 from devrf.kernels.ahead import grid_kernels
 from devrf.methods.base import RayTrainable
@@ -95,6 +94,72 @@ class RaySchedule(Options):
             centre_crop=math.ceil(self.centre_crop * factor),
         )
 
+    def learning_rate_factor(self, iteration: int) -> float:
+        """At iteration n of N, with ρ = final / initial and x = n / (N − 1), after a warm-up.
+
+        ρ^x, or ρ + (1 − ρ) (1 + cos πx) / 2.
+        """
+        last = max(self.iterations - 1, 1)
+        done = min(iteration, last) / last
+        ratio = self.final_learning_rate / self.learning_rate
+        warmth = min(1.0, (iteration + 1) / (self.warmup * self.iterations + 1))
+        if self.decay == "cosine":
+            return warmth * (ratio + (1 - ratio) * (1 + math.cos(math.pi * done)) / 2)
+        return float(warmth * ratio**done)
+
+
+@dataclass(frozen=True)
+class RayTimeline:
+    """The schedule of a stage that learns a method (:class:`~devrf.engine.schedule.Schedule`).
+
+    Attributes:
+        schedule: of this stage alone.
+        growths: iterations at which the method's grids grow, ascending.
+        milestones: iterations of what happens once, by name.
+    """
+
+    schedule: RaySchedule
+    growths: tuple[int, ...] = ()
+    milestones: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def total(self) -> int:
+        """Iterations of the stage."""
+        return self.schedule.iterations
+
+    @property
+    def planned_events(self) -> Mapping[str, int]:
+        """Growths of grids, curricula, and what the method itself does in time."""
+        grown = {GROWN: len(self._edges) - 2} if len(self._edges) > 2 else {}
+        reached = [name for name, at in self.milestones.items() if at < self.total]
+        return {**grown, **dict.fromkeys(reached, 1)}
+
+    @property
+    def _edges(self) -> list[int]:
+        """The phases' ends."""
+        return [0, *(n for n in self.growths if 0 < n < self.total), self.total]
+
+    def phase(self, iteration: int) -> Phase:
+        """A phase lasts until the method's grids grow; all else stays as it is."""
+        edges = self._edges
+        number = min(bisect_right(edges, iteration), len(edges) - 1)
+        return Phase(kind="rays", start=edges[number - 1], stop=edges[number])
+
+    def learning_rate_factor(self, iteration: int) -> float:
+        """The schedule's."""
+        return self.schedule.learning_rate_factor(iteration)
+
+    def scaled(self, factor: float) -> RayTimeline:
+        """As many phases in ``factor`` times the iterations, one each at least."""
+        edges = [0]
+        for edge in self._edges[1:]:
+            edges.append(max(round(edge * factor), edges[-1] + 1))
+        return RayTimeline(
+            replace(self.schedule.scaled(factor), iterations=edges[-1]),
+            growths=tuple(edges[1:-1]),
+            milestones={name: round(at * factor) for name, at in self.milestones.items()},
+        )
+
 
 class RayStage(Stage):
     """Learns a :class:`~devrf.methods.base.RayTrainable` from random rays of all its images.
@@ -106,6 +171,7 @@ class RayStage(Stage):
     rate_keys = "ray_stage.schedule.learning_rate or the weights of ray_stage.loss"
     memory_keys = ("ray_stage.schedule.rays",)
     scene_model: RayTrainable
+    schedule: RayTimeline
 
     def __init__(
         self,
@@ -130,13 +196,14 @@ class RayStage(Stage):
         self.name = step.name
         self.capture = step.capture
         self.step_of_protocol = step
-        self.schedule = schedule
+        of_stage = replace(schedule, iterations=step.share_of(schedule.iterations))
+        self.schedule = RayTimeline(of_stage)
         self.static_share = static_share
         self.scene_model = model
         self._ready = rest is not None
         if rest is not None:
             self.scene_model = rest.model
-            self.earlier_records = rest.metadata.records
+            self.provenance.earlier_records = rest.metadata.records
         self.keeps_batches = self.scene_model.keeps_batches
         if schedule.times_per_batch is not None:
             self.useful_share = 1 / schedule.times_per_batch
@@ -144,7 +211,6 @@ class RayStage(Stage):
         self.pools: list[FramePool] = []
         self._centres: list[FramePool] = []
         self._rays = schedule.rays
-        self._random_background = False
 
     @classmethod
     def kernels(cls, settings: Mapping[str, Any]) -> Sequence[Kernel]:
@@ -188,58 +254,19 @@ class RayStage(Stage):
             "model": model.rehearsed(factor),
         }
 
-    @property
-    def planned_events(self) -> Mapping[str, int]:
-        """Growths of grids, curricula, and what the method itself does in time."""
-        total = self.total_iterations
-        grown = sum(0 < iteration < total for iteration in self.scene_model.growths(total))
-        reached = [name for name, at in self._milestones.items() if at < total]
-        return {**({GROWN: grown} if grown else {}), **dict.fromkeys(reached, 1)}
-
-    @cached_property
-    def _milestones(self) -> dict[str, int]:
-        """The iterations of what happens once, beside growths of grids; known once it learns."""
-        schedule = self.schedule
-        total = self.total_iterations
-        milestones = dict(self.scene_model.milestones(total))
-        if schedule.curriculum:
-            milestones["all frames shown"] = math.ceil(schedule.curriculum * total)
-        if schedule.centre_crop:
-            milestones["whole images shown"] = schedule.centre_crop
-        if schedule.warmup:
-            milestones["rate grown"] = math.ceil(schedule.warmup * total)
-        return milestones
+    def timeline_of(self, schedule: RayTimeline) -> RayTimeline:
+        """The schedule itself."""
+        return schedule
 
     @property
-    def total_iterations(self) -> int:
-        """The stage's share of the schedule."""
-        return self.step_of_protocol.share_of(self.schedule.iterations)
+    def settings(self) -> RaySchedule:
+        """The schedule's settings."""
+        return self.schedule.schedule
 
     @property
     def resolution(self) -> tuple[int, ...]:
         """Present shape of the method's grid, if it has one."""
         return self.scene_model.resolution
-
-    def phase_at(self, iteration: int) -> Phase:
-        """A phase lasts until the method's grids grow; all else stays as it is."""
-        last = self.total_iterations
-        edges = sorted({0, last, *(n for n in self.scene_model.growths(last) if 0 < n < last)})
-        place = min(bisect_right(edges, iteration), len(edges) - 1)
-        return Phase(kind="rays", start=edges[place - 1], stop=edges[place])
-
-    def learning_rate_factor(self, iteration: int) -> float:
-        """At iteration n of N, with ρ = final / initial and x = n / (N − 1), after a warm-up.
-
-        ρ^x, or ρ + (1 − ρ) (1 + cos πx) / 2.
-        """
-        schedule = self.schedule
-        last = max(self.total_iterations - 1, 1)
-        done = min(iteration, last) / last
-        ratio = schedule.final_learning_rate / schedule.learning_rate
-        warmth = min(1.0, (iteration + 1) / (schedule.warmup * self.total_iterations + 1))
-        if schedule.decay == "cosine":
-            return warmth * (ratio + (1 - ratio) * (1 + math.cos(math.pi * done)) / 2)
-        return float(warmth * ratio**done)
 
     def setup(self, stage: str) -> None:
         """Give the model what it needs of the scene, and make the optimiser."""
@@ -253,26 +280,54 @@ class RayStage(Stage):
             alone = self.capture == "dynamic" and self.step_of_protocol.builds_on is None
             self.scene_model.setup(dynamic_only(self.scene) if alone else self.scene)
             self._ready = True
-        self.scene_model.follow(self.step_of_protocol)
+        self.scene_model.begin_stage(self.step_of_protocol)
         if hasattr(self, "optimizer"):
             return
-        schedule = self.schedule
-        highest = schedule.learning_rate
+        self.schedule = self._with_method()
+        settings = self.settings
+        highest = settings.learning_rate
         if not self.scene_model.has_hull:
-            highest = schedule.learning_rate_without_hull or highest
+            highest = settings.learning_rate_without_hull or highest
         groups = self.scene_model.param_groups()
         for group in groups:
             rate = highest * group.pop("rate", 1.0)
             group.update(lr=rate, base_lr=rate)
-        first, second = schedule.betas
-        self.optimizer = GridAdam(groups, betas=(first, second), eps=schedule.eps)
+        first, second = settings.betas
+        self.optimizer = GridAdam(groups, betas=(first, second), eps=settings.eps)
+
+    def _with_method(self) -> RayTimeline:
+        """The schedule with what the method itself does in the course of the stage."""
+        settings = self.settings
+        total = settings.iterations
+        milestones = dict(self.scene_model.milestones(total))
+        if settings.curriculum:
+            milestones["all frames shown"] = math.ceil(settings.curriculum * total)
+        if settings.centre_crop:
+            milestones["whole images shown"] = settings.centre_crop
+        if settings.warmup:
+            milestones["rate grown"] = math.ceil(settings.warmup * total)
+        growths = tuple(sorted({*self.scene_model.growths(total)}))
+        return RayTimeline(settings, growths, milestones)
+
+    def iterate(self, views: Views | tuple[Views, ...]) -> Terms:
+        """Learn the method from one batch."""
+        with span("batch"):
+            image, flat = self.draw()
+            background = self.background(image, self.generator)
+            batch = self._gather(views, image, flat, background)
+        output = self.scene_model(batch)
+        with span("losses"):
+            values = self.scene_model.loss_terms(output, batch, self.weights)
+            loss, terms = weighted_sum(values, self.weights)
+            terms |= visibility(output.transmittance, batch.alpha)
+        self.step(loss)
+        return {"loss": loss.detach(), **terms}
 
     def enter(self, phase: Phase) -> None:
         """Let grids grow; when the stage begins or goes on, gather the pixels to draw from."""
-        growths = self.scene_model.growths(self.total_iterations)
         self.events[GROWN] += self.phase is not None
         self.phase = phase
-        self.scene_model.grow(sum(iteration <= phase.start for iteration in growths))
+        self.scene_model.grow(sum(iteration <= phase.start for iteration in self.schedule.growths))
         for index, group in enumerate(self.scene_model.param_groups()):
             present = self.optimizer.param_groups[index]["params"]
             parameters = group.pop("params")
@@ -281,100 +336,90 @@ class RayStage(Stage):
                 self.optimizer.replace(index, parameters, **group)
         if self.pools:
             return
-        fewer = self.schedule.rays_without_hull
+        fewer = self.settings.rays_without_hull
         if fewer is not None and not self.scene_model.has_hull:
             self._rays = fewer
         views = [self.training_views(images) for images in self.images]
-        masked = all(view_set.has_alpha for view_set in views)
-        self._random_background = masked and self.scene_model.random_background
+        if self.scene_model.random_background and all(view_set.has_alpha for view_set in views):
+            self.background = BackgroundColor("random")
         self.pools = [FramePool.of(view_set) for view_set in views]
-        if self.schedule.centre_crop:
+        if self.settings.centre_crop:
             self._centres = [FramePool.of(view_set, centre=True) for view_set in views]
-        self.scene_model.learn_from(views, self.weights)
+        self.scene_model.prepare_priors(views, self.weights)
 
     def prepare(self) -> None:
-        """Let the model follow the schedule."""
-        self.scene_model.on_iteration(self.iteration, self.total_iterations)
-        for name, at in self._milestones.items():
-            self.events[name] += self.previous_iteration < at <= self.iteration
+        """Let the model follow the schedule, whose configured iterations it knows."""
+        total = self.schedule.total
+        whole = self.configured_timeline.total
+        iteration = self.position.iteration
+        self.scene_model.on_iteration(iteration * whole // total, whole)
+        for name, at in self.schedule.milestones.items():
+            self.events[name] = int(iteration >= at)
 
-    def draw(self) -> Pixels:
-        """Random pixels: of the static images first, where both captures are learned from.
+    def draw(self) -> tuple[Tensor, Tensor]:
+        """Random pixels: their images (R,), numbered through, and places there (R,), int64.
 
-        Images are numbered through, the static ones first. Last are those the model asks for.
+        Those of static images come first, where both captures are learned from; last are those
+        the model asks for.
         """
-        schedule = self.schedule
-        rays = self.rays_to_draw(self._rays)
-        pools = self._centres if self.iteration < schedule.centre_crop else self.pools
+        rays = self.batch_size.rays(self._rays)
+        cropped = self.position.iteration < self.settings.centre_crop
+        pools = self._centres if cropped else self.pools
         static = round(rays * self.static_share)
         counts = [static, rays - static] if len(pools) > 1 else [rays]
-        with span("batch"):
-            images: list[Tensor] = []
-            flats: list[Tensor] = []
-            offset = 0
-            times_left = self._times_to_draw
-            for pool, count in zip(pools, counts, strict=True):
-                frames = self._shown_frames(pool)
-                image, flat = pool.draw(count, frames, self.generator, times=times_left)
-                images.append(image + offset)
-                flats.append(flat)
-                offset += pool.images
-                times_left = None if times_left is None else max(1, times_left - pool.frames)
-            further = self.scene_model.further_pixels(self.generator, self.share)
-            if further is not None:
-                image, flat = further
-                images.append(image)
-                flats.append(flat)
-            image = torch.cat(images)
-            return Pixels(image, flat=torch.cat(flats), background=self.background(image))
+        images: list[Tensor] = []
+        flats: list[Tensor] = []
+        offset = 0
+        times_left = self._times_to_draw
+        for pool, count in zip(pools, counts, strict=True):
+            frames = self._shown_frames(pool)
+            image, flat = pool.draw(count, frames, self.generator, times=times_left)
+            images.append(image + offset)
+            flats.append(flat)
+            offset += pool.images
+            times_left = None if times_left is None else max(1, times_left - pool.frames)
+        extra = self.scene_model.extra_pixels(self.generator, self.batch_size.of_process)
+        if extra is not None:
+            image, flat = extra
+            images.append(image)
+            flats.append(flat)
+        return torch.cat(images), torch.cat(flats)
 
     @property
     def _times_to_draw(self) -> int | None:
         """How many times a batch may have: fewer of them where it is a part of the schedule's."""
-        whole = self.schedule.times_per_batch
-        return None if whole is None else max(1, round(whole * self.batch_share))
-
-    @property
-    def background_name(self) -> str:
-        """``random`` where the method learns so and all images have masks; else the scene's."""
-        return "random" if self._random_background else super().background_name
+        whole = self.settings.times_per_batch
+        return None if whole is None else max(1, round(whole * self.batch_size.share))
 
     def _shown_frames(self, pool: FramePool) -> int:
         """How many frames the curriculum shows by now."""
-        share = self.schedule.curriculum * self.total_iterations
-        if self.iteration >= share:
+        share = self.settings.curriculum * self.schedule.total
+        iteration = self.position.iteration
+        if iteration >= share:
             return pool.frames
-        return min(pool.frames, max(3, int(pool.frames * self.iteration / share)))
+        return min(pool.frames, max(3, int(pool.frames * iteration / share)))
 
-    def loss(
-        self, views: Views | tuple[Views, ...], pixels: Pixels
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Render a batch and weigh the method's loss terms."""
-        with span("batch"):
-            batch = self._gather(views, pixels)
-        output = self.scene_model(batch)
-        with span("losses"):
-            values = self.scene_model.loss_terms(output, batch, self.weights)
-            total, terms = weighted_sum(values, self.weights)
-            return total, terms | visibility(output.transmittance, batch.alpha)
-
-    def _gather(self, views: Views | tuple[Views, ...], pixels: Pixels) -> RayBatch:
+    def _gather(
+        self,
+        views: Views | tuple[Views, ...],
+        image: Tensor,
+        flat: Tensor,
+        background: Tensor,
+    ) -> RayBatch:
         """The batch of pixels, in the order of their images' captures."""
-        background = pixels.background
         batches: list[RayBatch] = []
         offset = 0
         for view_set in views if isinstance(views, tuple) else (views,):
-            in_capture = (pixels.image >= offset) & (pixels.image < offset + len(view_set))
+            in_capture = (image >= offset) & (image < offset + len(view_set))
             index = in_capture.nonzero()[:, 0]
-            image = pixels.image[index]
             batch = gather_batch(
                 view_set,
-                image=image - offset,
-                flat=pixels.flat[index],
+                image=image[index] - offset,
+                flat=flat[index],
                 background=background if background.dim() == 1 else background[index],
                 space=self.scene_model.space,
             )
-            batches.append(replace(batch, image=image))
+            batches.append(replace(batch, image=image[index]))
             offset += len(view_set)
         return batches[0] if len(batches) == 1 else concatenated(batches)
 

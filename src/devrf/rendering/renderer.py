@@ -19,7 +19,8 @@ from devrf.geometry.cameras import Cameras
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import Space, WorldSpace
 from devrf.rendering.output import RenderedImage
-from devrf.rendering.view import MovingView, Viewable
+from devrf.rendering.renderable import Renderable
+from devrf.rendering.view import MovingView
 from devrf.system.memory import free_cache, is_oom
 
 log = logging.getLogger(__name__)
@@ -41,7 +42,7 @@ class Renderer:
         at: time in [0, 1] → the :class:`~devrf.rendering.view.View` of that time, cached.
     """
 
-    def __init__(self, model: Viewable, *, times: int = 4, half: bool = False) -> None:
+    def __init__(self, model: Renderable, *, times: int = 4, half: bool = False) -> None:
         """Prepare to render a scene, which is not to be moved to another device afterwards.
 
         ``times`` are cached; ``half`` runs networks in half precision, on a CUDA device only.

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import Protocol, runtime_checkable
 
-import torch
 from torch import Tensor
 
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.rays import Rays
-from devrf.geometry.space import Space
 from devrf.rendering.output import RenderedImage
 
 
@@ -48,33 +46,6 @@ class MovingView(View, Protocol):
             (R, 2) the mean over each ray of (pixel at ``time``) − (pixel now), weighted by the
             rendering weights; and (R,) the sum of these weights.
         """
-
-
-class Viewable(Protocol):
-    """A scene that can be rendered: a :class:`~devrf.methods.base.Renderable`."""
-
-    @property
-    def box(self) -> Box:
-        """The scene's bounds, in the space of its fields."""
-
-    @property
-    def space(self) -> Space:
-        """The space of its fields."""
-
-    @property
-    def depth_limits(self) -> tuple[float, float]:
-        """Distances before and behind which nothing is sampled, in the space of its fields."""
-
-    @property
-    def device(self) -> torch.device:
-        """The device of its tensors."""
-
-    @property
-    def moves(self) -> bool:
-        """Whether it has learned to move: False for a rest state alone."""
-
-    def at(self, time: float, *, half: bool = False) -> View:
-        """The scene at ``time`` in [0, 1]; ``half``: in half precision where that is possible."""
 
 
 class SurfaceField(Protocol):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import re
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -146,3 +147,14 @@ def gib(count: float) -> str:
     """Bytes as a number of GiB with two significant digits or more: 21.3, 1.2, 0.034."""
     value = count / 2**30
     return f"{value:.1f}" if value >= 1 else f"{value:.2g}"
+
+
+def peak_host_memory() -> float | None:
+    """The peak memory of this process so far, GiB; None where the system does not tell."""
+    if sys.platform == "win32":
+        return None
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    unit = 1 if sys.platform == "darwin" else 2**10
+    return round(peak * unit / 2**30, 3)

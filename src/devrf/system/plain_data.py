@@ -14,6 +14,7 @@ Kind = TypeVar("Kind")
 # How many; a factor; text that a terminal shows as it is.
 Count = Annotated[int, Ge(0), Le(2**53)]
 Share = Annotated[float, Gt(0), Le(1)]
+Factor = Annotated[float, Gt(0), Le(1e6)]
 Line = Annotated[str, Predicate(is_shown)]
 
 

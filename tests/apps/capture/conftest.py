@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from devrf.apps.capture.survey import Survey
-from devrf.apps.video_file import write_pictures
+from devrf.pictures.video_file import write_pictures
 
 
 @pytest.fixture

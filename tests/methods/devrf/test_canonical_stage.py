@@ -9,7 +9,6 @@ import pytest
 import torch
 from lightning import Callback, Trainer
 from lightning.pytorch.callbacks import LambdaCallback
-from torch.optim import Optimizer
 
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
@@ -99,7 +98,7 @@ def test_coarse_and_few_pixels_make_a_coarse_grid_and_small_batches(fit):
         stages[0].scene_model.canonical.base_voxels
     )
     pixels = len(stages[1].pool)
-    drawn = [len(stage.draw().image) for stage in stages]
+    drawn = [len(stage.draw()[0]) for stage in stages]
     assert drawn == [4096, max(64, round(2 * pixels / 60))]
 
 
@@ -151,20 +150,17 @@ def test_a_search_that_finds_nothing_says_what_to_check(datamodule, trainer):
         trainer(max_epochs=1).fit(CanonicalStage(schedule, SMALL), datamodule=datamodule)
 
 
-def test_a_search_that_a_budget_has_cut_short_leaves_all_to_the_radiance_field(
-    datamodule, trainer, caplog
-):
-    def skip(trainer: Trainer, stage: CanonicalStage, optimizer: Optimizer) -> None:
-        stage.iteration = stage.phase.stop - 1  # as a TimeBudget's stride does
-
-    caplog.set_level("INFO")
+def test_a_shorter_search_begins_less_faintly(datamodule, trainer):
     stage = CanonicalStage(SEARCHED, SMALL)
-    watch = LambdaCallback(on_before_optimizer_step=skip)
+
+    def shorten(trainer: Trainer, stage: CanonicalStage, *_: Any) -> None:
+        if stage.position.schedule_scale == 1:
+            stage.scale_schedule(0.5)
+            assert stage.scene_model.canonical.alpha_init == 2 * SMALL.search_alpha_init
+
+    watch = LambdaCallback(on_train_batch_end=shorten)
     trainer(watch, max_epochs=1).fit(stage, datamodule=datamodule)
-    assert stage.iterations_done == 2 and stage.iteration == stage.total_iterations
-    assert "nothing is found yet, for want of time" in caplog.text
-    # All that three cameras see.
-    assert stage.scene_model.occupancy.share > 0.3
+    assert stage.position.iterations_done < SEARCHED.total and stage.is_complete
 
 
 def test_afterwards_what_is_not_occupied_is_empty(learned):

@@ -53,12 +53,14 @@ def test_a_visit_shows_its_pixels_as_often_as_said(rest, fit, views: Any):
         def draw(self) -> Any:
             pixels = super().draw()
             assert self.phase is not None
-            drawn.append((self.phase.stop - self.phase.start, len(pixels.image)))
+            drawn.append((self.phase.stop - self.phase.start, len(pixels[0])))
             return pixels
 
     schedule = DeformationSchedule(levels=(Level(4, 6),), rays=1500)
     stage = fit(Watched(rest, schedule, MotionSettings(views=views, epochs=5.0)))
-    pixels = 2 * stage.views.height * stage.views.width  # of two views; the first visit has 12
+    pixels = (
+        2 * stage.context.views.height * stage.context.views.width
+    )  # of two views; the first visit has 12
     assert set(drawn) == {(12, round(5 * pixels / 12)), (6, min(1500, round(5 * pixels / 6)))}
 
 
@@ -68,7 +70,7 @@ def test_a_whole_schedule_sees_the_motion_better_than_the_rest_pose(
     schedule = DeformationSchedule(levels=(Level(4, 30), Level(8, 15)), rays=128)
     stage = DeformationStage(rest, schedule, FAST)
     trainer(max_epochs=1).fit(stage, datamodule=datamodule)
-    assert stage.iteration == stage.total_iterations == 135
+    assert stage.iteration == stage.timeline.total == 135
     assert stage.resolution == stage.scene_model.canonical.box.grid_shape(8**3)
     for frames in (stage.field.to_canonical, stage.field.to_time):
         assert not frames[0].any()
@@ -115,7 +117,7 @@ def test_each_level_has_its_rates_and_its_factor_of_all_terms_but_render(rest, d
 
     def note(trainer: Trainer, stage: DeformationStage, *_: Any) -> None:
         level, group = stage.phase.level, stage.optimizer.param_groups[0]
-        weights[level], smoothing[level] = stage.weights, group["smoothing"]
+        weights[level], smoothing[level] = stage.context.weights, group["smoothing"]
         rates[level].append(group["lr"])
 
     watch = LambdaCallback(on_train_batch_end=note)
@@ -138,7 +140,7 @@ def test_the_elastic_term_counts_more_while_a_visit_at_the_coarsest_level_begins
     weights = {0: [], 1: []}
 
     def note(trainer: Trainer, stage: DeformationStage, *_: Any) -> None:
-        weights[stage.phase.level].append(stage.weights["elastic"])
+        weights[stage.phase.level].append(stage.context.weights["elastic"])
 
     watch = LambdaCallback(on_train_batch_end=note)
     trainer(watch, max_epochs=1).fit(stage, datamodule=datamodule)
@@ -160,7 +162,7 @@ def test_the_flow_of_a_moving_camera_neither_starts_nor_teaches_a_frame(
         stage = DeformationStage(rest, SHORT, motion, iterations_per_step=1, extensions=tracks)
         trainer(max_steps=1).fit(stage, datamodule=module)
         assert (stage.field.to_time[1].abs().amax() > 1e-3) is not moving
-        assert ("flow" in stage.weights) is not moving
+        assert ("flow" in stage.context.weights) is not moving
 
 
 def test_state_and_model_hold_what_an_active_frame_has_learned(rest, datamodule, trainer):
@@ -232,4 +234,4 @@ def test_a_frame_has_a_copy_of_the_frame_before_it(rest, four_frames, trainer):
     watch = LambdaCallback(on_train_batch_start=look)
     trainer(watch, max_epochs=1).fit(stage, datamodule=four_frames)
     assert visited == [(0, 1), (0, 2), (0, 3), (1, 1), (1, 2), (1, 3)]
-    assert stage.iteration == stage.total_iterations == 8 + 4
+    assert stage.iteration == stage.timeline.total == 8 + 4

@@ -226,12 +226,12 @@ SCHEDULES = {
 
 
 def test_events_of_the_papers_schedule():
-    assert SCHEDULES["inward"].events == {
+    assert SCHEDULES["inward"].planned_events == {
         "geometry searched": 1,
         "grids grown": 4,
         "occupancy renewed": 5 + 20,  # at 500, 1500, … of the search, and of the radiance field
     }
-    assert SCHEDULES["forward"].events == {
+    assert SCHEDULES["forward"].planned_events == {
         "grids grown": 4,
         "occupancy renewed": 20,
         "view dependence begun": 1,
@@ -247,9 +247,9 @@ def test_a_scaled_schedule_has_the_same_events_in_the_same_order(name, factor):
     schedule = SCHEDULES[name]
     scaled = schedule.scaled(factor)
     assert scaled.total == pytest.approx(factor * schedule.total, abs=1)
-    assert scaled.events.keys() == schedule.events.keys()
-    for event, count in schedule.events.items():
-        assert scaled.events[event] == pytest.approx(count, rel=0.1)
+    assert scaled.planned_events.keys() == schedule.planned_events.keys()
+    for event, count in schedule.planned_events.items():
+        assert scaled.planned_events[event] == pytest.approx(count, rel=0.1)
     phases, shorter = (in_order(s.phase, s.total) for s in (schedule, scaled))
     assert [(p.kind, p.voxels) for p in shorter] == [(p.kind, p.voxels) for p in phases]
     for phase, short in zip(phases, shorter, strict=True):

@@ -85,10 +85,10 @@ def test_pixels_that_move_are_those_of_fixed_cameras_with_long_flow(tiny_scene: 
 def test_smaller_batches_have_fewer_pixels_that_move(tiny: NSFFSettings, tiny_scene: Scene) -> None:
     model = NSFF(tiny)
     model.setup(tiny_scene)
-    model.learn_from([tiny_scene.dynamic.train], model.losses)
+    model.prepare_priors([tiny_scene.dynamic.train], model.losses)
     model.on_iteration(0, 100)
     for share, count in ((1.0, 4), (0.5, 2), (1 / 64, 1)):
-        further = model.further_pixels(torch.Generator(), share)
+        further = model.extra_pixels(torch.Generator(), share)
         assert further is not None and len(further[0]) == count
 
 
@@ -96,7 +96,7 @@ def missing(caplog: pytest.LogCaptureFixture, model: NSFF, views: Views, scene: 
     """What a model says that images do not have, and the terms that are left."""
     model.setup(scene)
     with caplog.at_level(logging.INFO):
-        model.learn_from([views], model.losses)
+        model.prepare_priors([views], model.losses)
     (record,) = caplog.records
     return record.getMessage().rpartition(": ")[2]
 

@@ -18,8 +18,8 @@ from devrf.errors import DevrfError, expect
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.offset import NO_OFFSET, Offset
-from devrf.methods.base import Renderable
 from devrf.metrics.geometric import SOLID
+from devrf.rendering.renderable import Renderable
 from devrf.rendering.renderer import Renderer, points_at_depth
 from devrf.system.options import Count, Options, Share
 

@@ -16,7 +16,7 @@ from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
 from devrf.geometry.cameras import Cameras
-from devrf.methods.base import Renderable
+from devrf.rendering.renderable import Renderable
 from devrf.rendering.renderer import Renderer
 from devrf.system.progress import followed
 

@@ -10,8 +10,8 @@ import numpy as np
 from torch import Tensor
 
 from devrf.apps.export.geometry import MovingMesh
-from devrf.apps.images import to_bytes
 from devrf.geometry.offset import NO_OFFSET, Offset
+from devrf.pictures.images import to_bytes
 from devrf.system.files import atomic_write, write_json
 
 FRAME = "world: the axes and the unit of the capture"

@@ -14,7 +14,7 @@ from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import Space
-from devrf.methods.base import Renderable
+from devrf.rendering.renderable import Renderable
 from devrf.rendering.view import SurfaceField
 
 # Points at which a field is evaluated at once.

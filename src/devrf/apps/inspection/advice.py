@@ -9,10 +9,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from devrf.apps.images import evenly
 from devrf.apps.inspection.layout import box_middle, box_points, widest_gap
 from devrf.errors import DevrfError
 from devrf.geometry.clock import FrameClock
+from devrf.pictures.images import evenly
 from devrf.scenes.bounds import box_from_cameras
 from devrf.scenes.optical_flow import estimator, flow_between, frame_pairs
 from devrf.scenes.scene import Scene, Views

@@ -16,11 +16,11 @@ from matplotlib.patheffects import withStroke
 from PIL import Image
 from torch import Tensor
 
-from devrf.apps.figures import write_figure
-from devrf.apps.images import evenly, flow_colors, flow_wheel, short_name, to_bytes
 from devrf.apps.inspection.layout import box_middle, box_points, common_up, horizontal_axes
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
+from devrf.pictures.figures import write_figure
+from devrf.pictures.images import evenly, flow_colors, flow_wheel, short_name, to_bytes
 from devrf.scenes.optical_flow import frame_pairs
 from devrf.scenes.scene import OpticalFlow, Scene, Views
 

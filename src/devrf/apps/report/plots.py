@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
 from itertools import pairwise
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import matplotlib as mpl
 import pandas as pd
@@ -16,10 +14,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
 
-from devrf.apps.figures import write_figure
 from devrf.apps.report.labels import METHODS
 from devrf.apps.report.runs import DEFAULT_METHOD, metric_over_time
 from devrf.apps.report.table import LPIPS, PSNR, SSIM, TIME, Block, Table
+from devrf.pictures.figures import STYLE
 
 # The palette of Okabe and Ito, distinguishable with colour-blindness; then each time the colour
 # furthest in CIELAB from those before, from white and from grey. Other dashes every eight colours.
@@ -36,23 +34,6 @@ LEGEND_LINE = 0.19
 MOST_COLUMNS = 8
 PUBLISHED = ", published"
 GREY = "#9a9a9a"
-STYLE: dict[Any, Any] = {
-    "figure.dpi": 160,
-    "font.size": 9,
-    "axes.titlesize": 10,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.formatter.useoffset": False,
-    "text.parse_math": False,  # a name may hold $
-    "grid.color": "#e6e6e6",
-    "axes.axisbelow": True,
-    "legend.frameon": False,
-    "legend.fontsize": 8,
-    "legend.handlelength": 2.6,  # of two dashes
-    "lines.linewidth": 1.6,
-    "lines.markersize": 4,
-}
 # Markers of the methods, and how the names of their variants end.
 NAMES = ("DeVRF", *list(METHODS.values())[1:])
 MARKERS = dict(zip(NAMES, "s^vDPXo*", strict=True))
@@ -279,50 +260,3 @@ def _legend(figure: Figure) -> None:
             figure.set_figheight(figure.get_figheight() + (lines - 1) * LEGEND_LINE)
             return
         legend.remove()
-
-
-BATCHES = "#9ec9e6"
-MEAN = "#0072b2"
-PREVIEWS = "#d55e00"
-# The running mean is over this share of the curve.
-WINDOW = 1 / 25
-# More labels of grids would overlap.
-MOST_GRIDS = 8
-
-
-@mpl.rc_context(STYLE)
-def write_training_curve(
-    path: Path,
-    stage: str,
-    batches: Sequence[tuple[int, float]],
-    previews: Sequence[tuple[int, float]] = (),
-    grids: Sequence[tuple[int, str]] = (),
-    frames: Sequence[float] = (),
-) -> None:
-    """Plot (iteration, PSNR in dB) of at least one training batch, and write it as a PNG.
-
-    ``previews`` are the same of a held-out view; at iterations of ``grids`` the grid took that
-    size. ``frames`` is the training PSNR of frames 1, 2, … in their last visit: a second plot.
-    """
-    panels = 2 if frames else 1
-    figure = Figure(figsize=(8.0, 4.2 * panels), dpi=120, layout="constrained")
-    axes = figure.subplots(panels, squeeze=False)[0, 0]
-    curve = pd.Series(dict(batches), dtype=float)
-    mean = curve.rolling(max(1, round(WINDOW * len(curve))), min_periods=1).mean()
-    axes.plot(curve.index, curve, color=BATCHES, linewidth=0.9, label="batches")
-    axes.plot(mean.index, mean, color=MEAN, linewidth=1.8, label="running mean")
-    if previews:
-        iterations, psnr = zip(*previews, strict=True)
-        axes.plot(iterations, psnr, "o", color=PREVIEWS, label="held-out preview")
-    if 1 < len(grids) <= MOST_GRIDS:
-        for iteration, shape in grids:
-            axes.axvline(iteration, color="0.75", linewidth=0.8, linestyle=":")
-            axes.text(iteration, 1, f" {shape}", transform=axes.get_xaxis_transform(), color="0.4")
-    axes.set(xlabel="iteration", ylabel="PSNR (dB)")
-    axes.set_title(f"{stage}: PSNR of the training batches", loc="left", pad=20)
-    if frames:
-        figure.axes[1].plot(range(1, len(frames) + 1), frames, ".-", color=MEAN)
-        figure.axes[1].set(xlabel="frame", ylabel="PSNR (dB)")
-        figure.axes[1].set_title("the last visit of each frame", loc="left")
-    axes.legend(loc="lower right", ncols=3)
-    write_figure(path, figure)

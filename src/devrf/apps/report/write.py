@@ -12,14 +12,14 @@ import numpy as np
 import pandas as pd
 from PIL import Image, ImageDraw
 
-from devrf.apps.figures import write_figure
 from devrf.apps.report.plots import file_name, plots
 from devrf.apps.report.runs import SKIPPED, collect
 from devrf.apps.report.table import Table, tabulate
 from devrf.apps.report.text import latex, markdown, plain
 from devrf.apps.settings import ReportSettings
-from devrf.apps.video_file import fitted_font, write_pictures
 from devrf.errors import DevrfError
+from devrf.pictures.figures import write_figure
+from devrf.pictures.video_file import fitted_font, write_pictures
 from devrf.system.files import refuse_links, write_text
 from devrf.system.printed import csv_cell
 

@@ -14,10 +14,10 @@ from kornia.geometry.conversions import (
 from torch import Tensor
 
 from devrf.apps.captured_cameras import MAX_FRUSTA, frustum_depth, thumbnail
-from devrf.apps.images import evenly
 from devrf.apps.keyframes import Keyframe, keyframes_of
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
+from devrf.pictures.images import evenly
 from devrf.scenes.scene import Scene
 from devrf.scenes.validation import in_reach
 

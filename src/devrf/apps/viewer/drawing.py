@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from devrf.apps.images import depth_colors, flow_colors, to_bytes
 from devrf.apps.keyframes import Keyframe, cameras_of
 from devrf.apps.settings import ViewerSettings
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.metrics.geometric import SOLID
+from devrf.pictures.images import depth_colors, flow_colors, to_bytes
 from devrf.rendering.output import RenderedImage
 from devrf.rendering.renderer import Renderer, points_at_depth
 from devrf.rendering.view import MovingView

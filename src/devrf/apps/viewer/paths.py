@@ -28,7 +28,7 @@ from devrf.apps.viewer.controls import choice_of, number_of, set_value
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.offset import Offset
-from devrf.rendering.view import Viewable
+from devrf.rendering.renderable import Renderable
 from devrf.system.override import to_type
 
 # Keyframes of a known path, and the seconds that it takes to go round.
@@ -43,7 +43,7 @@ Preset = Callable[[float], tuple[Keyframe, ...]]
 Act = Callable[[viser.GuiEvent[Any]], None]
 
 
-def known_paths(cameras: Cameras, model: Callable[[], Viewable]) -> dict[str, Preset]:
+def known_paths(cameras: Cameras, model: Callable[[], Renderable]) -> dict[str, Preset]:
     """The paths that ``video.path`` names, with the time, from the static ``cameras``."""
     once = VideoSettings(frames=KEYFRAMES)
     longer = VideoSettings(frames=3 * KEYFRAMES)

@@ -22,7 +22,7 @@ from devrf.apps.viewer.paths import PathPanel, known_paths
 from devrf.apps.viewer.server import open_server, quiet
 from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError
-from devrf.rendering.view import Viewable
+from devrf.rendering.renderable import Renderable
 from devrf.scenes.scene import Scene
 from devrf.system.override import to_type
 
@@ -155,7 +155,7 @@ class Session:
             self.scheduler.ask(client.client_id, shot)
 
     @property
-    def _model(self) -> Viewable:
+    def _model(self) -> Renderable:
         assert self.scheduler is not None
         return self.scheduler.drawing.renderer.model
 

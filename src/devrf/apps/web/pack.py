@@ -45,13 +45,13 @@ from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
 from devrf.geometry.contraction import ContractedSpace
 from devrf.geometry.ndc import NormalizedDevice
-from devrf.methods.base import Renderable
 from devrf.methods.devrf.canonical_field import ColorDecoder
 from devrf.methods.devrf.deformation_field import DeformationField, GridWarp
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.volume_rendering import deformed_occupancy, medium
 from devrf.ops.trilinear import shape_of
 from devrf.rendering.occupancy import Occupancy, dilate
+from devrf.rendering.renderable import Renderable
 from devrf.system.printed import shown
 
 # Displacements are rounded to this share of a cell, residual colours to this share of a logit:

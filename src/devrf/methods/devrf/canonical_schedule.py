@@ -11,7 +11,7 @@ from typing import Annotated, ClassVar
 import pydantic.dataclasses
 from annotated_types import Ge, Gt, Le
 
-from devrf.engine.phase import Phase
+from devrf.engine.schedule import Phase
 from devrf.errors import DevrfError, expect
 from devrf.geometry.space import Space
 from devrf.system.options import Count, NotNegative, Options, Several, Whole
@@ -152,7 +152,7 @@ class CanonicalSchedule(Options):
         )
 
     @property
-    def events(self) -> dict[str, int]:
+    def planned_events(self) -> dict[str, int]:
         """What the schedule brings about, and how often, as :attr:`Stage.events` counts it."""
         lengths = (self.search_iterations, self.iterations)
         every = self.occupancy_every

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 from warp import Kernel
 
-from devrf.data.batch import PixelPool, Pixels, gather_batch
+from devrf.data.batch import PixelPool, gather_batch
 from devrf.engine.grid_adam import GridAdam
-from devrf.engine.stage import Stage
+from devrf.engine.stage import Stage, Terms
 from devrf.errors import DevrfError
 from devrf.kernels.ahead import grid_kernels, march_kernels
 from devrf.methods.devrf.architecture import Architecture, fitted_to, resolved_voxels
@@ -27,11 +27,12 @@ from devrf.methods.devrf.canonical_schedule import (
     CanonicalPhase,
     CanonicalSchedule,
 )
-from devrf.methods.devrf.extensions.depth_crop import crop_to_visible
+from devrf.methods.devrf.depth_crop import crop_to_visible
 from devrf.methods.devrf.free_space import possibly_occupied, searched_box, view_count_weight
 from devrf.methods.devrf.losses import (
     PHOTOMETRIC_TERMS,
     Prediction,
+    Weighted,
     apart_from_total_variation,
     batch_loss,
     total_variation_weight,
@@ -50,15 +51,15 @@ from devrf.methods.devrf.volume_rendering import render
 from devrf.methods.weighted_loss import counted_weights
 from devrf.ops.photometric import distortion
 from devrf.rendering.occupancy import Occupancy, bounding_box, dilate
+from devrf.rendering.output import VoxelOutput
 from devrf.rendering.sampling import RenderSettings
 from devrf.scenes.scene import CaptureName, ImagesName, Scene, Views
 from devrf.system.profiling import span
 
 log = logging.getLogger(__name__)
 
-# Where fewer of the iterations were made, a field in which nothing is to be seen is not due to
-# wrong settings.
-LEAST_DONE = 1 / 4
+# The opacity that a shorter search begins with, at most.
+MOST_OPAQUE = 1e-2
 # What a rehearsal has at most: iterations, rays, units of a layer, voxels along an edge.
 REHEARSED_ITERATIONS = 600
 REHEARSED_RAYS = 256
@@ -67,18 +68,38 @@ REHEARSED_SIDE = 48
 REHEARSED_SEARCH_SIDE = 40
 
 
+@dataclass(frozen=True)
+class Objective:
+    """What a kind of phase learns by: the geometry search, or the radiance field.
+
+    Attributes:
+        weights: of the loss terms, by name.
+        tv: ω of the total variation.
+        alpha_threshold: samples of less opacity have no colour.
+        occupancy_threshold: cells of less opacity are empty where the occupancy is renewed.
+        searches: whether the whole box is looked at: all pixels are drawn, Adam steps in every
+            voxel, and the rate of a voxel goes with the number of views that see it.
+    """
+
+    weights: Mapping[str, float]
+    tv: float
+    alpha_threshold: float
+    occupancy_threshold: float
+    searches: bool
+
+
 class CanonicalStage(Stage):
     """Learns the canonical field from the static views (docs/method.md#canonical-stage).
 
     Attributes:
         scene_model: the canonical field and its occupancy.
         schedule: resolutions and iterations.
-        weights: of the loss terms, by the kind of the phase.
-        tv: ω of the total variation, by the kind of the phase.
+        objectives: what is learned by, by the kind of the phase.
         pool: the pixels that batches are drawn from.
     """
 
     scene_model: DeVRFModel
+    schedule: CanonicalSchedule
     phase: CanonicalPhase | None
     name = "canonical"
     capture: CaptureName = "static"
@@ -114,13 +135,27 @@ class CanonicalStage(Stage):
         self.rates = rates or CanonicalRates()
         self.sampling = sampling or Sampling()
         self.decoder_precision = decoder_precision
-        self.weights: dict[str, dict[str, float]] = {}
-        self.tv: dict[str, float] = {}
-        for kind, loss in (("search", search_loss), ("fine", fine_loss)):
-            key = f"loss.{kind}"
-            weights, self.tv[kind] = apart_from_total_variation(loss, key)
-            self.weights[kind] = counted_weights(weights, PHOTOMETRIC_TERMS, key)
+        self.objectives = {
+            kind: self._objective(kind, loss)
+            for kind, loss in (("search", search_loss), ("fine", fine_loss))
+        }
         self.pool: PixelPool | None = None
+
+    def _objective(self, kind: str, loss: Mapping[str, float]) -> Objective:
+        """The objective of a kind of phase, whose ``loss`` is weights with that of ``tv``."""
+        sampling = self.sampling
+        searches = kind == "search"
+        key = f"loss.{kind}"
+        weights, tv = apart_from_total_variation(loss, key)
+        # The search begins far fainter than what counts as occupied at its end.
+        faint = sampling.search_alpha_threshold
+        return Objective(
+            weights=counted_weights(weights, PHOTOMETRIC_TERMS, key),
+            tv=tv,
+            alpha_threshold=faint if searches else sampling.alpha_threshold,
+            occupancy_threshold=faint if searches else sampling.occupancy_threshold,
+            searches=searches,
+        )
 
     @classmethod
     def kernels(cls, settings: Mapping[str, Any]) -> Sequence[Kernel]:
@@ -158,20 +193,20 @@ class CanonicalStage(Stage):
                 architecture,
                 width=min(architecture.width, REHEARSED_WIDTH),
                 planes=planes and min(planes, REHEARSED_SIDE),
-                search_alpha_init=min(faint / factor, 1e-2),
+                search_alpha_init=min(faint / factor, MOST_OPAQUE),
             ),
             "iterations_per_step": min(settings["iterations_per_step"], 10),
         }
 
-    @property
-    def planned_events(self) -> Mapping[str, int]:
-        """Of the schedule."""
-        return self.schedule.events
+    def timeline_of(self, schedule: CanonicalSchedule) -> CanonicalSchedule:
+        """The schedule itself, of search and radiance field."""
+        return schedule
 
     @property
-    def total_iterations(self) -> int:
-        """Iterations of search and radiance field together."""
-        return self.schedule.total
+    def objective(self) -> Objective:
+        """The objective of the present phase."""
+        assert self.phase is not None
+        return self.objectives[self.phase.kind]
 
     @property
     def images(self) -> tuple[ImagesName, ...]:
@@ -188,13 +223,48 @@ class CanonicalStage(Stage):
         """Present shape of the density and feature grids."""
         return self.scene_model.canonical.density.shape
 
-    def phase_at(self, iteration: int) -> CanonicalPhase:
-        """The schedule's phase."""
-        return self.schedule.phase(iteration)
+    def iterate(self, views: Views) -> Terms:
+        """Learn the scene at rest from one batch (docs/method.md#canonical-stage)."""
+        model = self.scene_model
+        with span("batch"):
+            image, flat = self.draw()
+            background = self.background(image, self.generator)
+            batch = gather_batch(views, image, flat, background, space=model.space)
+        output = render(
+            batch.rays,
+            model.canonical,
+            model.occupancy,
+            model.settings,
+            batch.background,
+            precision=self.decoder_dtype,
+        )
+        with span("losses"):
+            prediction = Prediction(output=output, batch=batch)
+            loss, terms = batch_loss(prediction, PHOTOMETRIC_TERMS, self.objective.weights)
+            if not model.space.is_linear:
+                loss, terms = self._with_distortion(loss, terms, output)
+        self.step(loss)
+        return {"loss": loss.detach(), **terms}
 
-    def learning_rate_factor(self, iteration: int) -> float:
-        """The schedule's exponential decay."""
-        return self.schedule.learning_rate_factor(iteration)
+    def draw(self) -> tuple[Tensor, Tensor]:
+        """Random pixels: the image of each (R,) and its row-major number there (R,), int64."""
+        assert self.pool is not None
+        schedule = self.schedule
+        most = None
+        if schedule.epochs is not None and not self.objective.searches:
+            most = rays_for_epochs(schedule.epochs, len(self.pool), schedule.iterations)
+        return self.pool.draw(self.batch_size.rays(schedule.rays, most), self.generator)
+
+    def _with_distortion(self, loss: Tensor, terms: Terms, output: VoxelOutput) -> Weighted:
+        """In unbounded space surfaces are drawn together; distances are in half edges."""
+        model = self.scene_model
+        half_edge = sum(model.space.inner(model.box).size) / 6
+        samples = output.samples
+        distance = samples.distance / half_edge
+        spread = distortion(samples.weight, distance, samples.ray, len(output.color))
+        if self.schedule.learns_directions(self.position.iteration):
+            loss = loss + self.schedule.unbounded_distortion * spread
+        return loss, {**terms, "distortion": spread.detach()}
 
     def setup(self, stage: str) -> None:
         """Build the field of the first phase in the scene's box."""
@@ -208,7 +278,9 @@ class CanonicalStage(Stage):
         self.schedule = schedule
         self.architecture = architecture
         if schedule.side != side:
-            log.info("schedule.canonical.side: %g is %.4g here", side, schedule.side)
+            log.info(
+                "schedule.canonical.side: %g is changed to %.4g for this scene", side, schedule.side
+            )
         views = self.scene.training_views(self.images[0])
         if schedule.first_frames and self.scene.moves and views is self.scene.static.train:
             log.info(
@@ -216,7 +288,8 @@ class CanonicalStage(Stage):
                 "static ones in size or masks, or are by one camera that moves"
             )
         first = schedule.phase(0)
-        carve = schedule.visual_hull_init or first.kind != "search"
+        searches = self.objectives[first.kind].searches
+        carve = schedule.visual_hull_init or not searches
         box = searched_box(self.scene, carve=carve)
         possible = possibly_occupied(
             self.scene,
@@ -228,7 +301,7 @@ class CanonicalStage(Stage):
             device=self.trainer.strategy.root_device,  # the stage is moved there later
         )
         occupancy = Occupancy(possible, box)
-        if first.kind == "search":
+        if searches:
             canonical = self.architecture.search_field(box, first.voxels)
         else:
             canonical = self._radiance_field(occupancy, first)
@@ -252,12 +325,9 @@ class CanonicalStage(Stage):
 
     def render_settings(self, phase: CanonicalPhase) -> RenderSettings:
         """How rays are sampled in a phase."""
-        sampling = self.sampling
-        searching = phase.kind == "search"
-        threshold = sampling.search_alpha_threshold if searching else sampling.alpha_threshold
         return RenderSettings(
-            step=sampling.step,
-            alpha_threshold=threshold,
+            step=self.sampling.step,
+            alpha_threshold=self.objectives[phase.kind].alpha_threshold,
             near=self.scene.bounds.near,
             far=self.scene.bounds.far,
         )
@@ -282,19 +352,18 @@ class CanonicalStage(Stage):
 
     def _choose_pixels(self) -> None:
         """Those whose rays meet occupied space; in the search, all."""
-        assert self.phase is not None
-        occupancy = None if self.phase.kind == "search" else self.scene_model.occupancy
+        occupancy = None if self.objective.searches else self.scene_model.occupancy
         self.pool = static_pool(self.views, self.scene_model, occupancy)
         if not len(self.pool):
             raise DevrfError(
-                f"the field has become empty by iteration {self.iteration}: check data.background, "
-                "data.box and data.near, or lower schedule.rates.density"
+                f"the field has become empty by iteration {self.position.iteration}: check "
+                "data.background, data.box and data.near, or lower schedule.rates.density"
             )
 
     def _grow(self, phase: CanonicalPhase) -> None:
         """Give up what no camera sees, and give the field the resolution of ``phase``."""
         field = self.scene_model.canonical
-        self._forget_hidden()
+        self._clear_unobserved()
         if self.schedule.crop:
             assert self.pool is not None
             crop_to_visible(self.scene_model, self.scene, self.views, self.pool)
@@ -309,8 +378,7 @@ class CanonicalStage(Stage):
         search = self.scene_model.canonical
         occupancy = self.scene_model.occupancy
         opaque = search.voxel_alpha(self.sampling.step) > self.sampling.occupancy_threshold
-        found = opaque & occupancy.mask
-        occupancy.replace(dilate(occupancy.mask if self._is_too_early(found) else found, 1))
+        occupancy.replace(dilate(opaque & occupancy.mask, 1))
         self.scene_model.canonical = self._radiance_field(occupancy, phase).to(self.device)
 
     def _radiance_field(self, occupancy: Occupancy, phase: CanonicalPhase) -> CanonicalField:
@@ -344,37 +412,23 @@ class CanonicalStage(Stage):
     @torch.no_grad()
     def update_occupancy(self) -> None:
         """Find the occupancy at rest on the field's own grid, within the one before."""
-        assert self.phase is not None
-        sampling = self.sampling
-        field = self.scene_model.canonical
-        threshold = sampling.occupancy_threshold
-        if self.phase.kind == "search":
-            # The search begins far fainter than what counts as occupied at its end.
-            threshold = sampling.search_alpha_threshold
-        elif not self.scene_model.space.is_linear:
+        objective = self.objective
+        threshold = objective.occupancy_threshold
+        if not (objective.searches or self.scene_model.space.is_linear):
             # Fog in unbounded space clears until it is not coloured, and no further.
-            threshold = max(threshold, sampling.alpha_threshold)
-        self._keep_occupied(field.voxel_alpha(sampling.step) > threshold)
+            threshold = max(threshold, objective.alpha_threshold)
+        opacity = self.scene_model.canonical.voxel_alpha(self.sampling.step)
+        self._keep_occupied(opacity > threshold)
 
     def _keep_occupied(self, where: Tensor) -> None:
         """Keep of the occupancy what is within a voxel of ``where`` (X, Y, Z)."""
         occupancy = self.scene_model.occupancy
         field = self.scene_model.canonical
         before = occupancy.on(field.density.shape, field.box)
-        kept = dilate(where, 1) & before
-        occupancy.replace(before if self._is_too_early(kept) else kept, field.box)
-
-    def _is_too_early(self, occupied: Tensor) -> bool:
-        """Whether nothing is ``occupied`` as a budget of time has left most iterations out."""
-        few = self.iterations_done < LEAST_DONE * self.iteration
-        early = few and not bool(occupied.any())
-        if early:
-            where = self.describe(self.iteration)
-            log.info("%s: nothing is found yet, for want of time; all is kept", where)
-        return early
+        occupancy.replace(dilate(where, 1) & before, field.box)
 
     @torch.no_grad()
-    def _forget_hidden(self) -> None:
+    def _clear_unobserved(self) -> None:
         """In contracted space, occupy only what this phase's rays have reached.
 
         A voxel that no ray has reached had no gradient: Adam's second moment of it is still zero.
@@ -385,15 +439,14 @@ class CanonicalStage(Stage):
 
     def setup_optimizer(self) -> None:
         """Give the optimiser the present grids (docs/method.md#optimiser)."""
-        assert self.phase is not None
-        searching = self.phase.kind == "search"
+        objective = self.objective
         field = self.scene_model.canonical
         shape = field.density.shape
         side = max(shape if field.planes is None else shape[:2])
-        smoothing = total_variation_weight(self.tv[self.phase.kind], side, self.schedule.rays)
+        smoothing = total_variation_weight(objective.tv, side, self.schedule.rays)
         along_z = 1.0 if field.planes is None else shape[2] / side
         per_voxel_lr = None
-        if searching:
+        if objective.searches:
             points = field.box.grid_points(shape, field.density.values)
             seen = view_count_weight(self.views.cameras, self.scene.space.to_world(points))
             per_voxel_lr = seen[..., None]
@@ -402,10 +455,10 @@ class CanonicalStage(Stage):
                 group,
                 list(grid.parameters()),
                 per_voxel_lr=per_voxel_lr if grid is field.density else None,
-                skip_zero=not searching,
+                skip_zero=not objective.searches,
                 smoothing=smoothing,
                 along_z=along_z,
-                touched_only=not self.schedule.smooths_all(self.iteration),
+                touched_only=not self.schedule.smooths_all(self.position.iteration),
             )
         self._look_for_gradients()
         decoder = list(field.decoder.parameters())
@@ -431,13 +484,14 @@ class CanonicalStage(Stage):
         schedule = self.schedule
         groups = self.optimizer.param_groups[:2]
         every = schedule.occupancy_every
-        begin = schedule.search_iterations if self.iteration >= schedule.search_iterations else 0
-        renews = every is not None and self.is_due(every, begin - every // 2)
+        iteration = self.position.iteration
+        begin = schedule.search_iterations if iteration >= schedule.search_iterations else 0
+        renews = every is not None and self.position.is_due(every, begin - every // 2)
         if renews:
             self.update_occupancy()
             self._choose_pixels()
             self.events[RENEWED] += 1
-        touched_only = not schedule.smooths_all(self.iteration)
+        touched_only = not schedule.smooths_all(iteration)
         smooths_less = touched_only and not groups[0]["touched_only"]
         changed = renews or touched_only != groups[0]["touched_only"]
         self.events[SMOOTHED_LESS] += smooths_less
@@ -445,67 +499,37 @@ class CanonicalStage(Stage):
             group["touched_only"] = touched_only
         if changed:
             self._look_for_gradients()
-        learns = schedule.learns_directions(self.iteration)
+        learns = schedule.learns_directions(iteration)
         begun = self.scene_model.canonical.learn_directions(learns)
         self.events[DIRECTIONS] += begun
-
-    def draw(self) -> Pixels:
-        """Random pixels of all images."""
-        assert self.pool is not None and self.phase is not None
-        schedule = self.schedule
-        most = None
-        if schedule.epochs is not None and self.phase.kind == "fine":
-            most = rays_for_epochs(schedule.epochs, len(self.pool), schedule.iterations)
-        rays = self.rays_to_draw(schedule.rays, most)
-        with span("batch"):
-            image, flat = self.pool.draw(rays, self.generator)
-            return Pixels(image=image, flat=flat, background=self.background(image))
-
-    def loss(self, views: Views, pixels: Pixels) -> tuple[Tensor, dict[str, Tensor]]:
-        """Render a batch of pixels and compare it with the images."""
-        assert self.phase is not None
-        model = self.scene_model
-        with span("batch"):
-            batch = gather_batch(
-                views, pixels.image, pixels.flat, pixels.background, space=model.space
-            )
-        output = render(
-            batch.rays,
-            model.canonical,
-            model.occupancy,
-            model.settings,
-            batch.background,
-            precision=self.decoder_dtype,
-        )
-        with span("losses"):
-            prediction = Prediction(output=output, batch=batch)
-            total, terms = batch_loss(prediction, PHOTOMETRIC_TERMS, self.weights[self.phase.kind])
-            if model.space.is_linear:
-                return total, terms
-            # In unbounded space surfaces are drawn together; distances are in half edges.
-            half_edge = sum(model.space.inner(model.box).size) / 6
-            distance = output.samples.distance / half_edge
-            spread = distortion(
-                output.samples.weight, distance, output.samples.ray, len(output.color)
-            )
-            if self.schedule.learns_directions(self.iteration):
-                total = total + self.schedule.unbounded_distortion * spread
-            return total, {**terms, "distortion": spread.detach()}
 
     @torch.no_grad()
     def on_train_end(self) -> None:
         """Empty what was never occupied, so that no deformed sample meets leftover fog."""
-        if self.iteration < self.total_iterations:
+        if not self.is_complete:
             return
         self.scene_model.canonical.learn_directions(True)
-        self._forget_hidden()
+        self._clear_unobserved()
         self.update_occupancy()
         self.scene_model.canonical.clear(~self.scene_model.occupancy.mask, alpha=1e-6)
         super().on_train_end()
 
-    def resize_to(self, state: dict[str, Tensor]) -> None:
+    def scale_schedule(self, factor: float) -> None:
+        """Begin a shorter search less faintly.
+
+        How long a search takes to see anything goes with the reciprocal of the opacity that it
+        begins with: gradients are as faint, and far below Adam's epsilon.
+        """
+        super().scale_schedule(factor)
+        if self.objectives[self.schedule.phase(self.position.iteration).kind].searches:
+            faint = self.architecture.search_alpha_init
+            self.scene_model.canonical.alpha_init = min(faint / min(factor, 1.0), MOST_OPAQUE)
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Take a radiance field in place of the search's, if that is what was stored."""
-        fine = any(key.startswith("scene_model.canonical.decoder.") for key in state)
+        super().on_load_checkpoint(checkpoint)
+        stored = checkpoint["state_dict"]
+        fine = any(key.startswith("scene_model.canonical.decoder.") for key in stored)
         if fine and self.schedule.search_iterations:
             box = self.scene_model.canonical.box
             self.scene_model.canonical = self.architecture.radiance_field(box, 8, 8)

@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar
 import pydantic.dataclasses
 from annotated_types import MinLen
 
-from devrf.engine.phase import Phase
+from devrf.engine.schedule import Phase
 from devrf.errors import DevrfError
 from devrf.system.options import Count, NotNegative, Options, Positive, Several
 
@@ -225,6 +225,41 @@ class DeformationSchedule(Options):
             init_from_previous=level == 0 and place > 1,
             step=-1 if row.backwards else 1,
         )
+
+
+@dataclass(frozen=True)
+class Visits:
+    """The schedule of a scene of T frames (:class:`~devrf.engine.schedule.Schedule`).
+
+    Attributes:
+        schedule: levels and iterations.
+        frames: T, frame 0 included.
+    """
+
+    schedule: DeformationSchedule
+    frames: int
+
+    @property
+    def total(self) -> int:
+        """Iterations of all levels and frames."""
+        return self.schedule.total(self.frames)
+
+    @property
+    def planned_events(self) -> Mapping[str, int]:
+        """Number of levels, growths and visits."""
+        return self.schedule.events(self.frames)
+
+    def phase(self, iteration: int) -> DeformationPhase:
+        """The visit of an iteration."""
+        return self.schedule.phase(iteration, self.frames)
+
+    def learning_rate_factor(self, iteration: int) -> float:
+        """Factor of the iteration's level, and within its visit."""
+        return self.phase(iteration).learning_rate_at(iteration)
+
+    def scaled(self, factor: float) -> Visits:
+        """As many visits in ``factor`` times the iterations."""
+        return replace(self, schedule=self.schedule.scaled(factor))
 
 
 def converged(losses: Sequence[float], min_rel_improvement: float) -> bool:

@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
-from devrf.data.batch import Pixels, gather_batch
+from devrf.data.batch import gather_batch
 from devrf.data.flow import previous_images
 from devrf.engine.grid_adam import GridAdam
-from devrf.engine.stage import Stage
+from devrf.engine.stage import Stage, Terms
 from devrf.errors import DevrfError
 from devrf.methods.devrf.active_frame import ActiveFrame
 from devrf.methods.devrf.deformation_field import DeformationField
@@ -25,9 +25,10 @@ from devrf.methods.devrf.deformation_schedule import (
     VISITS,
     DeformationPhase,
     DeformationSchedule,
+    Visits,
     converged,
 )
-from devrf.methods.devrf.extension import Extension
+from devrf.methods.devrf.extension import Extension, MotionContext
 from devrf.methods.devrf.frame_store import FrameField
 from devrf.methods.devrf.losses import FlowMean, MotionPrediction, batch_loss
 from devrf.methods.devrf.model import DeVRFModel
@@ -65,11 +66,12 @@ class DeformationStage(Stage):
         schedule: levels, iterations and rays.
         motion: learning rate and how batches are drawn.
         motion_loss: the loss terms, and their weights at each level.
-        weights: of the loss terms that count at the present iteration.
-        active: the frame that is trained; None before the first, and after the last.
+        context: what extensions work with, the active frame among it.
     """
 
     scene_model: DeVRFModel
+    schedule: DeformationSchedule
+    context: MotionContext
     phase: DeformationPhase | None
     name = "deformation"
     capture: CaptureName = "dynamic"
@@ -105,7 +107,6 @@ class DeformationStage(Stage):
         self.decoder_precision = decoder_precision
         self.extensions = tuple((extensions or {}).values())
         self.motion_loss = MotionLoss(loss, self.extensions, self.schedule)
-        self.weights = self.motion_loss.weights_at(0)
         canonical = rest.model
         self.scene_model = DeVRFModel(
             canonical.architecture,
@@ -114,12 +115,11 @@ class DeformationStage(Stage):
             canonical.settings,
             space=canonical.space,
         ).requires_grad_(False)
-        self.earlier_records = rest.metadata.records
+        self.provenance.earlier_records = rest.metadata.records
         placeholder = torch.zeros(2, 2, 2, 3, requires_grad=True)
         self.optimizer = GridAdam(
             [{"params": [placeholder], "lr": self.motion.learning_rate, "name": "motion"}]
         )
-        self.active: ActiveFrame | None = None
         # The state holds what the active frame has learned.
         self.register_state_dict_pre_hook(  # type: ignore[no-untyped-call]
             lambda *_: self._write_back()
@@ -159,57 +159,52 @@ class DeformationStage(Stage):
         }
 
     @property
-    def planned_events(self) -> Mapping[str, int]:
-        """Of the schedule."""
-        return self.schedule.events(len(self.field.clock))
-
-    @property
     def field(self) -> DeformationField:
         """The deformation field; what the active frame learns may not be written back yet."""
         assert self.scene_model.deformation is not None, "the stage has not been set up"
         return self.scene_model.deformation
 
-    @property
-    def views(self) -> Views:
-        """The dynamic training views, on the stage's device."""
-        return self.training_views("dynamic")
-
     @cached_property
     def previous_images(self) -> Tensor:
         """(N,) for each image the same view's image one frame earlier; itself without one."""
-        return previous_images(self.views)
+        return previous_images(self.context.views)
 
     @property
-    def total_iterations(self) -> int:
-        """Iterations of all levels and frames."""
-        return self.schedule.total(len(self.field.clock))
+    def active(self) -> ActiveFrame | None:
+        """The frame that is trained; None before the first, and after the last."""
+        return self.context.active if hasattr(self, "context") else None
+
+    def timeline_of(self, schedule: DeformationSchedule) -> Visits:
+        """The visits to the scene's frames."""
+        return Visits(schedule, len(self.field.clock))
 
     @property
     def resolution(self) -> tuple[int, ...]:
         """Present shape of the motion grids."""
         return self.field.shape
 
-    def phase_at(self, iteration: int) -> DeformationPhase:
-        """The schedule's visit."""
-        return self.schedule.phase(iteration, len(self.field.clock))
-
-    def learning_rate_factor(self, iteration: int) -> float:
-        """Of the iteration's level, and of its visit."""
-        return self.phase_at(iteration).learning_rate_at(iteration)
-
     def setup(self, stage: str) -> None:
         """Build a field of no motion at the coarsest resolution; refuse a scene without motion."""
         super().setup(stage)
         device = self.trainer.strategy.root_device
-        self.decoder_dtype = decoder_dtype(self.decoder_precision, device)
         if not self.scene.moves:
             raise DevrfError(f"{self.scene.name}: is at rest; the canonical stage is all it takes")
         if self.scene.dynamic.train.by_moving_camera and self.motion_loss.leave_out("flow"):
             log.info("the camera moves, and so does all that it sees: the flow loss is left out")
+        self.context = MotionContext(
+            model=self.scene_model,
+            datamodule=self.trainer.datamodule,  # type: ignore[attr-defined]
+            schedule=self.schedule,
+            optimizer=self.optimizer,
+            generator=self.generator,
+            background=self.background,
+            batch_size=self.batch_size,
+            precision=decoder_dtype(self.decoder_precision, device),
+        )
         if self.scene_model.deformation is None:
             self._build_field()
             for extension in self.extensions:
-                extension.setup(self)
+                extension.setup(self.context)
         scale = self.field.box.longest if self.motion.unit == "box" else 1.0
         self.optimizer.param_groups[0]["base_lr"] = self.motion.learning_rate * scale
 
@@ -229,6 +224,84 @@ class DeformationStage(Stage):
             half=self.motion.stored_half(device),
         )
 
+    def iterate(self, views: Views) -> Terms:
+        """Learn the present frame from one batch (docs/method.md#deformation-stage)."""
+        frame = self.active
+        assert frame is not None
+        model = self.scene_model
+        field = self.field
+        with span("batch"):
+            image, flat = self.draw()
+            background = self.background(image, self.generator)
+            batch = gather_batch(views, image, flat, background, space=model.space)
+        output = render(
+            batch.rays,
+            model.canonical,
+            frame.occupancy,
+            model.settings,
+            batch.background,
+            warp=field.warp_by(frame.backward),
+            precision=self.context.precision,
+            color_change=self._color_change(frame),
+        )
+        # Before frame 1 nothing has moved.
+        unwarp_previous = field.warp_by(frame.before) if frame.number > 1 else field.warp_by()
+        with span("losses"):
+            prediction = MotionPrediction(
+                output=output,
+                batch=batch,
+                unwarp=field.warp_by(frame.forward),
+                unwarp_previous=unwarp_previous,
+                cameras=views.cameras,
+                previous_image=self.previous_images,
+                forward_slice=frame.forward,
+                box=field.box,
+                space=model.space,
+                flow_mean=self.flow_mean,
+            )
+            loss, terms = batch_loss(prediction, self.motion_loss.terms, self.context.weights)
+        self.step(loss)
+        return {"loss": loss.detach(), **terms}
+
+    def draw(self) -> tuple[Tensor, Tensor]:
+        """Random pixels of the frame, of its views in turn or of all.
+
+        The image of each (R,), and its row-major number there (R,), int64.
+        """
+        frame = self.active
+        phase = self.phase
+        assert frame is not None and phase is not None
+        most = None
+        if self.motion.epochs is not None:
+            pixels = sum(len(pool) for pool in frame.pools)
+            most = rays_for_epochs(self.motion.epochs, pixels, phase.stop - phase.start)
+        pool = frame.pools[self.position.iterations_done % len(frame.pools)]
+        return pool.draw(self.batch_size.rays(self.schedule.rays, most), self.generator)
+
+    def _color_change(self, frame: ActiveFrame) -> ColorChange | None:
+        """The addition to the colours' logits by an extension; None: nothing."""
+        changes = (extension.color_change(frame) for extension in self.extensions)
+        return next((change for change in changes if change is not None), None)
+
+    def prepare(self) -> None:
+        """Weigh the terms; update the frame's occupancy every ``occupancy_every`` iterations."""
+        phase = self.phase
+        assert phase is not None
+        share = phase.share(self.position.iteration)
+        self.context.weights = self.motion_loss.weights_at(phase.level, share)
+        every = max(1, round(self.motion.occupancy_every * self.position.schedule_scale))
+        if self.position.is_due(every, phase.start):
+            with span("sampling"):
+                self._update_occupancy()
+
+    def converged(self, loss: Tensor) -> bool:
+        """Whether the frame's loss has stopped falling, if the schedule asks for that."""
+        gain = self.motion.min_rel_improvement
+        if gain is None:
+            return False
+        self._losses.append(float(loss))
+        return converged(self._losses, gain)
+
     def enter(self, phase: DeformationPhase) -> None:
         """Go to the phase's frame: grow the grids if a level begins, fresh Adam if asked for."""
         previous = self.phase
@@ -243,11 +316,11 @@ class DeformationStage(Stage):
         if phase.init_from_previous:
             self.field.frames.copy_previous(phase.frame)
         for extension in self.extensions:
-            extension.initialise(self, phase)
+            extension.initialise(self.context, phase)
         frame = self._activate(phase)
         self._update_occupancy()
         frame.pools = frame_pools(
-            self.views,
+            self.context.views,
             frame.number,
             self.scene_model,
             frame.occupancy,
@@ -257,37 +330,51 @@ class DeformationStage(Stage):
 
     def _free(self) -> None:
         """Free the memory of the active frame, and that of all that refers to it."""
-        self.active = None
+        self.context.active = None
         for group in range(len(self.optimizer.param_groups)):
             self.optimizer.replace(group, [])
 
     def _activate(self, phase: DeformationPhase) -> ActiveFrame:
         """Check out the phase's frame."""
-        if self.active is None:
-            self.active = self._allocate(phase)
+        frame = self.active
+        if frame is None:
+            frame = self._allocate(phase)
         elif self.motion.adam_state != "carried" or phase.level == 0:
             self.optimizer.forget()
-        self.active.check_out(phase.frame)
+        frame.check_out(phase.frame)
         self._losses = []
         side = f"schedule.deformation.levels.{phase.level + 1}.side"
         self.memory_keys = (side, "schedule.deformation.rays")
-        return self.active
+        return frame
 
     def _allocate(self, phase: DeformationPhase) -> ActiveFrame:
         """Make memory for a frame at the fields' resolutions, and let Adam learn it."""
         self._free()
+        context = self.context
         level = phase.level
         further: dict[str, FrameField] = {}
         for extension in self.extensions:
-            further |= extension.frame_fields(self, level)
+            further |= extension.frame_fields(context, level)
         frame = ActiveFrame.of(self.field.frames, self.scene_model.occupancy, further)
-        self.active = frame
-        self.weights = self.motion_loss.weights_at(level)
+        context.active = frame
+        context.weights = self.motion_loss.weights_at(level)
         smoothing = self.motion_loss.smoothing(level, self.field.shape)
         self.optimizer.replace(0, frame.slices, smoothing=smoothing)
         for extension in self.extensions:
-            extension.begin_level(self, level)
+            extension.begin_level(context, level)
         return frame
+
+    def _update_occupancy(self) -> None:
+        """Find the occupancy of the active frame under its present displacements."""
+        frame = self.active
+        assert frame is not None
+        warp = self.field.warp_by(frame.backward)
+        frame.occupancy.refill(possible_occupancy(self.scene_model.occupancy, warp))
+
+    def values_replaced(self) -> None:
+        """Find the frame's occupancy anew, and judge its losses afresh."""
+        self._losses = []
+        self._update_occupancy()
 
     def _write_back(self) -> None:
         """Copy what was learned of the active frame into the fields; learning may go on."""
@@ -307,105 +394,17 @@ class DeformationStage(Stage):
     def on_train_end(self) -> None:
         """Write the last frame back."""
         self._write_back()
-        self.active = None
+        self.context.active = None
         super().on_train_end()
-
-    def _update_occupancy(self) -> None:
-        """Find the occupancy of the active frame under its present displacements."""
-        model = self.scene_model
-        frame = self.active
-        assert frame is not None
-        warp = self.field.warp_by(frame.backward)
-        frame.occupancy.refill(possible_occupancy(model.occupancy, warp))
-
-    def prepare(self) -> None:
-        """Weigh the terms; update the frame's occupancy every ``occupancy_every`` iterations."""
-        phase = self.phase
-        assert phase is not None
-        share = phase.share(self.iterations_done)
-        self.weights = self.motion_loss.weights_at(phase.level, share)
-        if self.is_due(self.motion.occupancy_every, phase.start):
-            with span("sampling"):
-                self._update_occupancy()
-
-    def draw(self) -> Pixels:
-        """Random pixels of the frame, of its views in turn or of all."""
-        frame = self.active
-        phase = self.phase
-        assert frame is not None and phase is not None
-        most = None
-        if self.motion.epochs is not None:
-            pixels = sum(len(pool) for pool in frame.pools)
-            most = rays_for_epochs(self.motion.epochs, pixels, phase.stop - phase.start)
-        rays = self.rays_to_draw(self.schedule.rays, most)
-        pool = frame.pools[self.iterations_done % len(frame.pools)]
-        with span("batch"):
-            image, flat = pool.draw(rays, self.generator)
-            return Pixels(image=image, flat=flat, background=self.background(image))
-
-    def loss(self, views: Views, pixels: Pixels) -> tuple[Tensor, dict[str, Tensor]]:
-        """Render a batch of the frame through its warp; compare images and motion."""
-        model = self.scene_model
-        field = self.field
-        frame = self.active
-        assert frame is not None
-        with span("batch"):
-            batch = gather_batch(
-                views, pixels.image, pixels.flat, pixels.background, space=model.space
-            )
-        output = render(
-            batch.rays,
-            model.canonical,
-            frame.occupancy,
-            model.settings,
-            batch.background,
-            warp=field.warp_by(frame.backward),
-            precision=self.decoder_dtype,
-            color_change=self._color_change(frame),
-        )
-        # Before frame 1 nothing has moved.
-        unwarp_previous = field.warp_by(frame.before) if frame.number > 1 else field.warp_by()
-        with span("losses"):
-            prediction = MotionPrediction(
-                output=output,
-                batch=batch,
-                unwarp=field.warp_by(frame.forward),
-                unwarp_previous=unwarp_previous,
-                cameras=views.cameras,
-                previous_image=self.previous_images,
-                forward_slice=frame.forward,
-                box=field.box,
-                space=model.space,
-                flow_mean=self.flow_mean,
-            )
-            return batch_loss(prediction, self.motion_loss.terms, self.weights)
-
-    def _color_change(self, frame: ActiveFrame) -> ColorChange | None:
-        """What an extension adds to the colours' logits; None: nothing."""
-        changes = (extension.color_change(frame) for extension in self.extensions)
-        return next((change for change in changes if change is not None), None)
-
-    def converged(self, loss: Tensor) -> bool:
-        """Whether the frame's loss has stopped falling, if the schedule asks for that."""
-        gain = self.motion.min_rel_improvement
-        if gain is None:
-            return False
-        self._losses.append(float(loss))
-        return converged(self._losses, gain)
-
-    def rollback(self, iteration: int, iterations_done: int, lr_scale: float) -> None:
-        """Go on from an earlier iteration of the present frame, with an occupancy found anew."""
-        super().rollback(iteration, iterations_done, lr_scale)
-        self._losses = []
-        self._update_occupancy()
 
     def phase_state(self) -> dict[str, Any]:
         """The state of the active frame, and its losses so far."""
         assert self.active is not None
         exact = self.motion.stored_half(self.device)
-        return {"frame": self.active.state(self.views, exact=exact), "losses": [*self._losses]}
+        views = self.context.views
+        return {"frame": self.active.state(views, exact=exact), "losses": [*self._losses]}
 
     def restore(self, phase: DeformationPhase, state: dict[str, Any]) -> None:
         """Go on with the frame of ``phase``, the field being loaded."""
-        self._activate(phase).load_state(state["frame"], self.views)
+        self._activate(phase).load_state(state["frame"], self.context.views)
         self._losses = [float(loss) for loss in state["losses"]]

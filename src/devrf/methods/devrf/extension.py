@@ -3,16 +3,62 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
 
+import torch
+
+from devrf.data.batch import BackgroundColor
+from devrf.data.datamodule import SceneDataModule
+from devrf.engine.batch_size import BatchSize
+from devrf.engine.grid_adam import GridAdam
 from devrf.methods.devrf.active_frame import ActiveFrame
-from devrf.methods.devrf.deformation_schedule import DeformationPhase
+from devrf.methods.devrf.deformation_field import DeformationField
+from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
 from devrf.methods.devrf.frame_store import FrameField
 from devrf.methods.devrf.losses import MotionTerm
+from devrf.methods.devrf.model import DeVRFModel
 from devrf.rendering.output import ColorChange
+from devrf.scenes.scene import Views
 
-if TYPE_CHECKING:
-    from devrf.methods.devrf.deformation_stage import DeformationStage
+
+@dataclass
+class MotionContext:
+    """What an extension works with while the motion is learned.
+
+    Attributes:
+        model: the scene; its deformation has been built.
+        datamodule: serves the scene.
+        schedule: levels and frames.
+        optimizer: learns the active frame; extensions add groups.
+        generator: of all random numbers.
+        background: the colours behind the images' pixels.
+        batch_size: how many rays are drawn.
+        precision: of the colour network.
+        weights: of the loss terms that count at the present iteration.
+        active: the frame that is trained; None before the first, and after the last.
+    """
+
+    model: DeVRFModel
+    datamodule: SceneDataModule
+    schedule: DeformationSchedule
+    optimizer: GridAdam
+    generator: torch.Generator
+    background: BackgroundColor
+    batch_size: BatchSize
+    precision: torch.dtype
+    weights: Mapping[str, float] = field(default_factory=dict)
+    active: ActiveFrame | None = None
+
+    @property
+    def views(self) -> Views:
+        """The dynamic training views, on the device of the model."""
+        return self.datamodule.training_views("dynamic", self.model.device)
+
+    @property
+    def field(self) -> DeformationField:
+        """The deformation field; what the active frame learns may not be written back yet."""
+        assert self.model.deformation is not None
+        return self.model.deformation
 
 
 class Extension:
@@ -37,21 +83,21 @@ class Extension:
         """The loss terms that :meth:`weight_factor` may change."""
         return ()
 
-    def setup(self, stage: DeformationStage) -> None:
+    def setup(self, context: MotionContext) -> None:
         """Add fields to the model and groups to the optimiser, before learning starts."""
 
-    def frame_fields(self, stage: DeformationStage, level: int) -> Mapping[str, FrameField]:
+    def frame_fields(self, context: MotionContext, level: int) -> Mapping[str, FrameField]:
         """Fields whose frames are learned at ``level`` as the displacements are, by name."""
         return {}
 
-    def begin_level(self, stage: DeformationStage, level: int) -> None:
+    def begin_level(self, context: MotionContext, level: int) -> None:
         """Memory of the active frame is ready; give the optimiser what is learned of it."""
 
     def weight_factor(self, term: str, level: int, share: float) -> float:
         """Factor of the weight of any loss term at ``level``, a ``share`` of a visit being over."""
         return 1.0
 
-    def initialise(self, stage: DeformationStage, phase: DeformationPhase) -> None:
+    def initialise(self, context: MotionContext, phase: DeformationPhase) -> None:
         """Give the phase's frame its first values, in the fields, before a visit."""
 
     def color_change(self, frame: ActiveFrame) -> ColorChange | None:

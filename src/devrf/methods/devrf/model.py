@@ -10,12 +10,10 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from devrf.checkpoints.stored_class import StoredClass, class_path, stored_class
 from devrf.checkpoints.stored_grids import pack, unpack
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.space import WORLD, Space, space_config, space_from
-from devrf.methods.base import Renderable
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField, ColorDecoder
 from devrf.methods.devrf.deformation_field import DeformationField, GridWarp
@@ -26,8 +24,10 @@ from devrf.methods.devrf.volume_rendering import deformed_occupancy
 from devrf.ops.trilinear import shape_of
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import ColorChange
+from devrf.rendering.renderable import Renderable
 from devrf.rendering.sampling import RenderSettings
 from devrf.system.plain_data import built
+from devrf.system.stored_class import StoredClass, class_path, stored_class
 
 # Samples of a ray, at most, before empty space is skipped.
 SAMPLES = 2**14

@@ -16,7 +16,7 @@ from devrf.geometry.space import WorldSpace
 from devrf.kernels.march import march
 from devrf.ops.march import Medium, Path
 from devrf.rendering.occupancy import Occupancy
-from devrf.rendering.view import Viewable
+from devrf.rendering.renderable import Renderable
 from devrf.scenes.scene import Views
 
 # One ray is followed for a block of so many pixels a side: at least, and at most.
@@ -33,7 +33,7 @@ MIN_RAYS = 64
 
 @torch.no_grad()
 def rays_hit_occupied(
-    cameras: Cameras, images: Tensor, model: Viewable, occupancy: Occupancy
+    cameras: Cameras, images: Tensor, model: Renderable, occupancy: Occupancy
 ) -> Tensor:
     """Mask (K, H·W): the pixels of images whose rays pass near anything occupied.
 
@@ -83,7 +83,7 @@ def rays_that_hit(rays: Rays, path: Path) -> Tensor:
     return samples.transmittance < 0.5
 
 
-def block_size(cameras: Cameras, model: Viewable, occupancy: Occupancy) -> int:
+def block_size(cameras: Cameras, model: Renderable, occupancy: Occupancy) -> int:
     """Pixels a side of a block all of whose rays are within a cell of its middle one.
 
     A ray that passes near anything stands for its neighbours. Only at the silhouette of the box, if
@@ -97,7 +97,7 @@ def block_size(cameras: Cameras, model: Viewable, occupancy: Occupancy) -> int:
     return max(BLOCK, min(int(math.sqrt(2) * occupancy.cell / pixel), MOST_BLOCK))
 
 
-def static_pool(views: Views, model: Viewable, occupancy: Occupancy | None) -> PixelPool:
+def static_pool(views: Views, model: Renderable, occupancy: Occupancy | None) -> PixelPool:
     """The static training images' pixels: all, or those that hit something in ``occupancy``."""
     device = model.device
     images = torch.arange(len(views), device=device)
@@ -111,7 +111,7 @@ def static_pool(views: Views, model: Viewable, occupancy: Occupancy | None) -> P
 def frame_pools(
     views: Views,
     frame: int,
-    model: Viewable,
+    model: Renderable,
     occupancy: Occupancy,
     *,
     occupied_only: bool,

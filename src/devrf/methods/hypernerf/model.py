@@ -114,9 +114,9 @@ class HyperNeRF(Nerfies):
         if self.settings.slicing == "plane":
             self.slicing = TimeCodes(times, self.settings.ambient).to(self.device)
 
-    def follow(self, step: ProtocolStage) -> None:
+    def begin_stage(self, step: ProtocolStage) -> None:
         """Static images alone do not open ambient space."""
-        super().follow(step)
+        super().begin_stage(step)
         self._shut = step.capture == "static"
 
     def milestones(self, total: int) -> dict[str, int]:

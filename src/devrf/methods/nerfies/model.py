@@ -136,9 +136,9 @@ class Nerfies(DeformableField):
         super().set_times(times)
         self.codes = TimeCodes(times, self.settings.code).to(self.device)
 
-    def follow(self, step: ProtocolStage) -> None:
+    def begin_stage(self, step: ProtocolStage) -> None:
         """What is learned from the static images alone is the canonical state."""
-        super().follow(step)
+        super().begin_stage(step)
         self.rest_is_canonical |= step.capture == "static"
 
     def milestones(self, total: int) -> dict[str, int]:

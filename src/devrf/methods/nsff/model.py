@@ -106,7 +106,7 @@ class NSFF(NeuralField):
         """N₀."""
         return self.settings.warmup.steps(len(self.clock))
 
-    def learn_from(self, views: Sequence[Views], terms: Collection[str]) -> None:
+    def prepare_priors(self, views: Sequence[Views], terms: Collection[str]) -> None:
         """Look for priors; the log names missing ones, whose terms are left out."""
         self._images = ImagePriors(views, self.space)
         missing = missing_terms(self._images, terms, additive=self.fields.additive)
@@ -120,7 +120,7 @@ class NSFF(NeuralField):
             listed = ", ".join(f"{name} ({why})" for name, why in missing.items())
             log.info("nsff: zero, for what this scene and blend do not have: %s", listed)
 
-    def further_pixels(
+    def extra_pixels(
         self, generator: torch.Generator, share: float
     ) -> tuple[Tensor, Tensor] | None:
         """In the first N₀ iterations, pixels that move."""

@@ -116,7 +116,7 @@ def test_auto_learns_colours_that_drift_early_and_others_late(
     groups = [group["name"] for group in stage.optimizer.param_groups]
     assert groups[1:] == [NAME] * (first is not None)
     (extension,) = stage.extensions
-    learned = [NAME in extension.frame_fields(stage, level) for level in (0, 1)]
+    learned = [NAME in extension.frame_fields(stage.context, level) for level in (0, 1)]
     assert learned == [first is not None and level >= first for level in (0, 1)]
     # Where colours drift, terms count less from the level on that learns them.
     factors = [0.25, 0.5] if first == 0 else [1.0, 2.0]

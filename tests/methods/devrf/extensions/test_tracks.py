@@ -171,6 +171,10 @@ def test_flow_starts_the_frames_of_the_first_level(tiny_scene):
     schedule = DeformationSchedule((Level(5, 4), Level(6, 4)))
     phases = [schedule.phase(at, 4) for at in (0, 8, 16)]
     assert [(phase.level, phase.frame) for phase in phases] == [(0, 1), (0, 2), (1, 1)]
-    stage: Any = SimpleNamespace(scene=tiny_scene)
-    assert [StartAlongFlow("flow").changes(stage, phase) for phase in phases] == [True, True, False]
-    assert not any(StartAlongFlow("previous").changes(stage, phase) for phase in phases)
+    context: Any = SimpleNamespace(views=tiny_scene.dynamic.train)
+    assert [StartAlongFlow("flow").changes(context, phase) for phase in phases] == [
+        True,
+        True,
+        False,
+    ]
+    assert not any(StartAlongFlow("previous").changes(context, phase) for phase in phases)

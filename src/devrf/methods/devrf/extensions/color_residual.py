@@ -18,8 +18,7 @@ from devrf.geometry.clock import FrameClock
 from devrf.kernels.look_up import look_up
 from devrf.methods.devrf.active_frame import ActiveFrame
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
-from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.methods.devrf.extension import Extension
+from devrf.methods.devrf.extension import Extension, MotionContext
 from devrf.methods.devrf.frame_store import FrameField
 from devrf.methods.devrf.losses import MotionPrediction, MotionTerm, total_variation_weight
 from devrf.methods.devrf.model import ColorField
@@ -135,18 +134,18 @@ class ColorResidual(Extension):
         """Those that ``loss_scale_if_color_drift`` names."""
         return self._scale_if_drift
 
-    def setup(self, stage: DeformationStage) -> None:
+    def setup(self, context: MotionContext) -> None:
         """Build the residuals, zero, and their empty parameter group, if they are learned."""
-        first, drifting = self._decide(stage.scene.dynamic.train)
+        first, drifting = self._decide(context.datamodule.scene.dynamic.train)
         if first is None:
             return
         self._scale = self._scale_if_drift if drifting else {}
         # The ablation without levels has one.
-        self._first = min(first, len(stage.schedule.levels)) - 1
-        model = stage.scene_model
+        self._first = min(first, len(context.schedule.levels)) - 1
+        model = context.model
         rate = self._learning_rate
-        model.color_residual = ResidualField(model.box, stage.field.clock, voxels=self._side**3)
-        stage.optimizer.add_param_group({"params": [], "lr": rate, "base_lr": rate, "name": NAME})
+        model.color_residual = ResidualField(model.box, context.field.clock, voxels=self._side**3)
+        context.optimizer.add_param_group({"params": [], "lr": rate, "base_lr": rate, "name": NAME})
 
     def _decide(self, views: Views) -> tuple[int | None, bool]:
         """From which level residuals are learned, None: never; whether colours are to drift."""
@@ -160,34 +159,36 @@ class ColorResidual(Extension):
         log.info("colours %s: their change is %s", how, learned)
         return first, drifting
 
-    def frame_fields(self, stage: DeformationStage, level: int) -> Mapping[str, FrameField]:
+    def frame_fields(self, context: MotionContext, level: int) -> Mapping[str, FrameField]:
         """The residuals, if ``level`` learns them."""
-        field = stage.scene_model.color_residual
+        field = context.model.color_residual
         learned = self._first is not None and level >= self._first
         return {NAME: field} if learned and field is not None else {}
 
-    def begin_level(self, stage: DeformationStage, level: int) -> None:
+    def begin_level(self, context: MotionContext, level: int) -> None:
         """Let the optimiser learn the active frame's residuals (X, Y, Z, 3).
 
         Within a visit their rate falls as that of the displacements does; from level to level it
         does not.
         """
-        assert stage.active is not None
-        residuals = [grid for name, grid in stage.active.further.items() if name == NAME]
-        for number, group in enumerate(stage.optimizer.param_groups):
+        assert context.active is not None
+        residuals = [grid for name, grid in context.active.further.items() if name == NAME]
+        for number, group in enumerate(context.optimizer.param_groups):
             if group["name"] == NAME:
-                group["base_lr"] = self._learning_rate / stage.schedule.learning_rate_factor(level)
+                group["base_lr"] = self._learning_rate / context.schedule.learning_rate_factor(
+                    level
+                )
                 longest = max([2, *(max(grid.shape) for grid in residuals)])
-                weight = total_variation_weight(self._tv, longest, stage.schedule.rays)
-                stage.optimizer.replace(number, residuals, smoothing=weight)
+                weight = total_variation_weight(self._tv, longest, context.schedule.rays)
+                context.optimizer.replace(number, residuals, smoothing=weight)
 
     def weight_factor(self, term: str, level: int, share: float) -> float:
         """Where a texture may slide over the surface, some terms tell less."""
         return 1.0 if self._first is None or level < self._first else self._scale.get(term, 1.0)
 
-    def initialise(self, stage: DeformationStage, phase: DeformationPhase) -> None:
+    def initialise(self, context: MotionContext, phase: DeformationPhase) -> None:
         """At the first level that learns it, start a frame from the one visited before it."""
-        field = stage.scene_model.color_residual
+        field = context.model.color_residual
         before = phase.frame - phase.step
         if isinstance(field, ResidualField) and phase.level == self._first:
             if before < len(field.clock):  # backwards, the last frame is the first

@@ -14,8 +14,7 @@ from devrf.errors import expect
 from devrf.geometry.box import Box
 from devrf.kernels.look_up import look_up
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
-from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.methods.devrf.extension import Extension
+from devrf.methods.devrf.extension import Extension, MotionContext
 from devrf.methods.devrf.frame_store import Directions
 from devrf.methods.devrf.pixel_pools import images_of
 from devrf.methods.devrf.volume_rendering import possible_occupancy, render
@@ -48,34 +47,34 @@ class StartFromBest(Extension):
         self._levels = levels
         self._rays = rays
 
-    def initialise(self, stage: DeformationStage, phase: DeformationPhase) -> None:
+    def initialise(self, context: MotionContext, phase: DeformationPhase) -> None:
         """Give the frame the displacements of the best candidate."""
         if phase.level >= self._levels:
             return
-        found = candidates(stage, phase)
+        found = candidates(context, phase)
         if len(found) < 2:
             return
-        errors = self._errors(stage, phase.frame, list(found.values()))
+        errors = self._errors(context, phase.frame, list(found.values()))
         best = min(zip(errors, found, strict=True))[1]
         log.debug("%s frame %d: %s", phase.kind, phase.frame, dict(zip(found, errors, strict=True)))
-        field = stage.field
+        field = context.field
         field.frames.write(phase.frame, found[best])
         # Each process has looked at pixels of its own.
         broadcast([field.to_canonical[phase.frame], field.to_time[phase.frame]])
 
     @torch.no_grad()
-    def _errors(self, stage: DeformationStage, frame: int, starts: list[Directions]) -> list[float]:
+    def _errors(self, context: MotionContext, frame: int, starts: list[Directions]) -> list[float]:
         """Mean squared colour error of each start, on the same pixels of all the frame's images."""
-        views = stage.views
-        model = stage.scene_model
+        views = context.views
+        model = context.model
         pool = all_pixels(views, images_of(views, frame))
-        rays = max(1, round(stage.batch_share * self._rays))
-        image, flat = pool.draw(rays, stage.generator)
-        background = stage.background(image)
+        rays = max(1, round(context.batch_size.share * self._rays))
+        image, flat = pool.draw(rays, context.generator)
+        background = context.background(image, context.generator)
         batch = gather_batch(views, image, flat, background, space=model.space)
         errors = []
         for backward, _ in starts:
-            warp = stage.field.warp_by(backward)
+            warp = context.field.warp_by(backward)
             output = render(
                 batch.rays,
                 model.canonical,
@@ -83,16 +82,16 @@ class StartFromBest(Extension):
                 model.settings,
                 batch.background,
                 warp=warp,
-                precision=stage.decoder_dtype,
+                precision=context.precision,
             )
             errors.append(float(color_error(output.color, batch.color)))
         return errors
 
 
 @torch.no_grad()
-def candidates(stage: DeformationStage, phase: DeformationPhase) -> dict[str, Directions]:
+def candidates(context: MotionContext, phase: DeformationPhase) -> dict[str, Directions]:
     """What a visit may start from, by name; the frame's own displacements are the first."""
-    field = stage.field
+    field = context.field
     like = field.frames.here.new_empty(*field.shape, 3)
 
     def read(number: int) -> Directions:

@@ -14,8 +14,7 @@ from torch.nn.functional import adaptive_max_pool3d, max_pool3d
 
 from devrf.errors import expect
 from devrf.geometry.box import Box
-from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.methods.devrf.extension import Extension
+from devrf.methods.devrf.extension import Extension, MotionContext
 from devrf.methods.devrf.losses import MotionPrediction, MotionTerm
 from devrf.rendering.occupancy import Occupancy
 
@@ -137,11 +136,11 @@ class MotionPrior(Extension):
         """The energy, under its name."""
         return {self.name: self._term}
 
-    def begin_level(self, stage: DeformationStage, level: int) -> None:
+    def begin_level(self, context: MotionContext, level: int) -> None:
         """Find the cells of the level's grids that are occupied at rest."""
-        if self.name in stage.weights:
-            field = stage.field
-            occupancy = stage.scene_model.occupancy
+        if self.name in context.weights:
+            field = context.field
+            occupancy = context.model.occupancy
             self._occupied = occupied_cells(occupancy, field.box, field.shape)
 
     def _term(self, prediction: MotionPrediction) -> Tensor:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from devrf.data.batch import PixelPool, all_pixels, gather_batch
+from devrf.data.flow import previous_images
 from devrf.engine.ddp import broadcast
 from devrf.engine.grid_adam import GridAdam
 from devrf.geometry.cameras import Cameras
@@ -18,8 +19,7 @@ from devrf.geometry.space import WORLD, Space
 from devrf.kernels.look_up import look_up
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
-from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.methods.devrf.extension import Extension
+from devrf.methods.devrf.extension import Extension, MotionContext
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.pixel_pools import images_of
 from devrf.methods.devrf.volume_rendering import render
@@ -56,36 +56,36 @@ class StartAlongFlow(Extension):
         self._init_from = init_from
         self._tracks: FlowTracks | None = None
 
-    def begin_level(self, stage: DeformationStage, level: int) -> None:
+    def begin_level(self, context: MotionContext, level: int) -> None:
         """Forget what the level before has seen."""
         self._tracks = None
 
-    def changes(self, stage: DeformationStage, phase: DeformationPhase) -> bool:
+    def changes(self, context: MotionContext, phase: DeformationPhase) -> bool:
         """Whether a phase starts along the flow: at the coarsest level, where there is one."""
-        recorded = stage.scene.dynamic.train
+        recorded = context.views
         # What a moving camera sees moves with it.
         known = recorded.flow is not None and not recorded.by_moving_camera
         asked = self._init_from != "previous" and known
         return asked and phase.level == 0
 
-    def initialise(self, stage: DeformationStage, phase: DeformationPhase) -> None:
+    def initialise(self, context: MotionContext, phase: DeformationPhase) -> None:
         """Fit the frame's displacements to where its pixels are followed back to."""
-        if not self.changes(stage, phase):
+        if not self.changes(context, phase):
             return
-        views = stage.views
-        model = stage.scene_model
+        views = context.views
+        model = context.model
         frame = phase.frame
         if self._tracks is None:
             by_color = self._init_from == "tracks"
-            self._tracks = FlowTracks(model, views, stage.previous_images, by_color=by_color)
+            self._tracks = FlowTracks(model, views, previous_images(views), by_color=by_color)
         pool = all_pixels(views, images_of(views, frame))
-        # As much less as batches are smaller for want of time or memory.
-        most = max(1, round(stage.batch_share * MOST_TRACKS))
-        steps = max(1, round(stage.batch_share * FIT_STEPS))
-        tracks = self._tracks.follow(frame, pool, stage.generator, most=most)
-        start_from_tracks(stage.field, frame, tracks, views.cameras, model.space, steps)
+        # Scaled with the batch share.
+        most = max(1, round(context.batch_size.share * MOST_TRACKS))
+        steps = max(1, round(context.batch_size.share * FIT_STEPS))
+        tracks = self._tracks.follow(frame, pool, context.generator, most=most)
+        start_from_tracks(context.field, frame, tracks, views.cameras, model.space, steps)
         # Each process has followed pixels of its own.
-        broadcast([stage.field.to_canonical[frame], stage.field.to_time[frame]])
+        broadcast([context.field.to_canonical[frame], context.field.to_time[frame]])
 
 
 @dataclass(frozen=True)

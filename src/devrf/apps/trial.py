@@ -10,6 +10,7 @@ from lightning import LightningModule, Trainer
 
 from devrf.callbacks.schedule import GridUpscaling, LearningRateDecay
 from devrf.data.datamodule import SceneDataModule
+from devrf.engine.schedule import cost
 from devrf.engine.stage import Stage
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
@@ -20,7 +21,7 @@ class Trial(GridUpscaling):
 
     Attributes:
         most_seconds: after which it ends; the first step, which warms up, does not count.
-        pace: the cost of iterations in a second (:meth:`~devrf.engine.stage.Stage.cost`).
+        pace: the cost of iterations in a second (:func:`~devrf.engine.schedule.cost`).
     """
 
     def __init__(self, most_seconds: float = 10.0) -> None:
@@ -37,7 +38,7 @@ class Trial(GridUpscaling):
         done = pl_module.iteration
         began, first = self._began = self._began or (now, done)
         if done > first:
-            self.pace = pl_module.cost(first, done) / (now - began)
+            self.pace = cost(pl_module.timeline, first, done) / (now - began)
             trainer.should_stop = now - began >= self.most_seconds
 
 
@@ -55,7 +56,8 @@ def seconds_to_learn(
     assert isinstance(stage, CanonicalStage)
     trial = Trial()
     trainer(callbacks=[trial, LearningRateDecay()], logger=False).fit(stage, datamodule=datamodule)
-    end = stage.total_iterations
+    end = stage.timeline.total
     frames = len(datamodule.scene.clock)
     batches = moving.total(frames) * moving.rays / stage.schedule.rays if frames > 1 else 0
-    return (stage.cost(0, end) + batches * stage.phase_at(end).cost) / trial.pace
+    moving_cost = batches * stage.timeline.phase(end).cost
+    return (cost(stage.timeline, 0, end) + moving_cost) / trial.pace

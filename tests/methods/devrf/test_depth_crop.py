@@ -7,12 +7,12 @@ import torch
 
 from devrf.data.batch import all_pixels, gather_batch
 from devrf.geometry.box import Box
+from devrf.methods.devrf import depth_crop
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField, SigmoidColor
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
-from devrf.methods.devrf.extensions import depth_crop
-from devrf.methods.devrf.extensions.depth_crop import (
+from devrf.methods.devrf.depth_crop import (
     crop,
     crop_to_visible,
     visible_depths,

@@ -13,7 +13,7 @@ from kornia.color import ColorMap, apply_colormap, hsv_to_rgb
 from PIL import Image, ImageDraw
 from torch import Tensor
 
-from devrf.apps.video_file import fitted_font, font
+from devrf.pictures.video_file import fitted_font, font
 from devrf.system.files import atomic_write
 
 # Grey level of invalid flow; valid flow is white or coloured.

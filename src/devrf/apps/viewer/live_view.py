@@ -10,6 +10,7 @@ from lightning import Callback, LightningModule, Trainer
 from devrf.apps.viewer.drawing import Drawing
 from devrf.apps.viewer.session import Session
 from devrf.callbacks.progress import in_one_line
+from devrf.engine.schedule import share_done
 from devrf.engine.stage import Stage
 from devrf.evaluation.held_out import background_value
 from devrf.rendering.renderer import Renderer
@@ -40,7 +41,8 @@ class LiveView(Callback):
         assert isinstance(pl_module, Stage)
         self.seconds = 0.0
         self._began = time.perf_counter()
-        self._first = pl_module.iteration
+        self._first = pl_module.position.iterations_done
+        self._share = share_done(pl_module.timeline, pl_module.iteration)
         with self.session.surviving():
             background = background_value(pl_module.scene.background)
             self.session.present(Drawing(_renderer(pl_module), background))
@@ -59,9 +61,9 @@ class LiveView(Callback):
         controls = self.session.controls
         with self.session.surviving():
             seconds = now - self._began
-            done = pl_module.iteration
-            pace = pl_module.cost(self._first, done) / seconds
-            line = in_one_line(outputs or {}, pl_module, (done - self._first) / seconds, pace)
+            speed = (pl_module.position.iterations_done - self._first) / seconds
+            share = share_done(pl_module.timeline, pl_module.iteration)
+            line = in_one_line(outputs or {}, pl_module, speed, (share - self._share) / seconds)
             controls.tell(f"**{pl_module.name}**: {line}")
         if self.seconds > self.share * (now - self._began):
             return
@@ -79,7 +81,7 @@ class LiveView(Callback):
         """Say that the stage has ended."""
         assert isinstance(pl_module, Stage)
         done = pl_module.iteration
-        total = pl_module.total_iterations
+        total = pl_module.timeline.total
         with self.session.surviving():
             self.session.controls.tell(
                 f"**{pl_module.name}** has ended after {done} of {total} iterations. The picture "

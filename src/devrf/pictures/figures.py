@@ -1,13 +1,32 @@
-"""Figures as files."""
+"""Figures: their style, and as files."""
 
 from __future__ import annotations
 
 import warnings
 from pathlib import Path
+from typing import Any
 
 from matplotlib.figure import Figure
 
 from devrf.system.files import atomic_write
+
+STYLE: dict[Any, Any] = {
+    "figure.dpi": 160,
+    "font.size": 9,
+    "axes.titlesize": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.formatter.useoffset": False,
+    "text.parse_math": False,  # a name may hold $
+    "grid.color": "#e6e6e6",
+    "axes.axisbelow": True,
+    "legend.frameon": False,
+    "legend.fontsize": 8,
+    "legend.handlelength": 2.6,  # of two dashes
+    "lines.linewidth": 1.6,
+    "lines.markersize": 4,
+}
 
 
 def write_figure(path: Path, figure: Figure) -> None:

@@ -12,8 +12,8 @@ from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 from tabulate import tabulate
 from torch import Tensor
 
-from devrf.apps.images import to_bytes
 from devrf.errors import DevrfError
+from devrf.pictures.images import to_bytes
 
 if TYPE_CHECKING:
     from wandb.sdk.wandb_run import Run

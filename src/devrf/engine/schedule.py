@@ -1,0 +1,121 @@
+"""What schedules of all stages have in common: a pure map from an iteration to a phase."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol, Self
+
+
+@dataclass(frozen=True, kw_only=True)
+class Phase:
+    """A range of iterations in which the same tensors are learned.
+
+    Between two phases grids grow, or another frame becomes active.
+
+    Attributes:
+        kind: what is learned, in a word or two: ``search``, ``fine``, ``level 2``.
+        start: first iteration.
+        stop: one past the last iteration.
+        frame: the frame that is learned; None where all times are learned at once.
+    """
+
+    kind: str
+    start: int
+    stop: int
+    frame: int | None = None
+
+    @property
+    def cost(self) -> float:
+        """Estimated duration of an iteration, in a unit that the stage's phases share."""
+        return 1.0
+
+
+class Schedule(Protocol):
+    """A stage's schedule for its scene."""
+
+    @property
+    def total(self) -> int:
+        """Number of iterations."""
+        ...
+
+    @property
+    def planned_events(self) -> Mapping[str, int]:
+        """Number of times that each event takes place, by the names of :attr:`Stage.events`."""
+        ...
+
+    def phase(self, iteration: int) -> Phase:
+        """The phase of an iteration; the last one from the end on."""
+        ...
+
+    def learning_rate_factor(self, iteration: int) -> float:
+        """Factor of the base learning rates at an iteration."""
+        ...
+
+    def scaled(self, factor: float) -> Self:
+        """The schedule in ``factor`` times its iterations: as many phases, in their order."""
+        ...
+
+
+class Scheduled(Protocol):
+    """What the callbacks of the schedule need of a stage (docs/extending.md#schedule-callbacks).
+
+    Attributes:
+        phase: the phase whose tensors are ready; None before the first.
+        iteration: the next iteration.
+        lr_scale: factor of all learning rates, below 1 after a rollback.
+        has_scheduled_rates: whether a callback sets the learning rates.
+    """
+
+    phase: Any
+    has_scheduled_rates: bool
+
+    @property
+    def iteration(self) -> int: ...  # noqa: D102 - above
+
+    @property
+    def lr_scale(self) -> float: ...  # noqa: D102 - above
+
+    @property
+    def timeline(self) -> Schedule:
+        """The schedule."""
+        ...
+
+    def enter(self, phase: Any) -> None:
+        """Make grids and optimiser ready for a phase."""
+        ...
+
+
+def phases(schedule: Schedule) -> list[Phase]:
+    """All phases, in their order."""
+    found: list[Phase] = []
+    while not found or found[-1].stop < schedule.total:
+        found.append(schedule.phase(found[-1].stop if found else 0))
+    return found
+
+
+def cost(schedule: Schedule, first: int, last: int) -> float:
+    """Estimated duration of iterations ``first`` to ``last``, in the unit of the phases' costs."""
+    total = 0.0
+    while first < last:
+        phase = schedule.phase(first)
+        stop = min(phase.stop, last)
+        total += (stop - first) * phase.cost
+        first = stop
+    return total
+
+
+def share_done(schedule: Schedule, iteration: int) -> float:
+    """Estimated share of the whole duration that is over before an iteration, 0 to 1."""
+    return cost(schedule, 0, iteration) / cost(schedule, 0, schedule.total)
+
+
+def same_place(iteration: int, before: Schedule, after: Schedule) -> int:
+    """The iteration of a rescaled schedule at the same share of the same phase."""
+    old = phases(before)
+    number = next((k for k, phase in enumerate(old) if iteration < phase.stop), len(old))
+    if number == len(old):
+        return after.total
+    phase = phases(after)[number]
+    share = (iteration - old[number].start) / (old[number].stop - old[number].start)
+    return phase.start + int(share * (phase.stop - phase.start))
