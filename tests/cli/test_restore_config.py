@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -296,6 +297,16 @@ def test_the_record_of_a_sweep_does_not_unfold(tmp_path):
         (tmp_path / "multirun.yaml").write_text(text)
         with pytest.raises(DevrfError, match="not the record of a sweep"):
             completed(["stage=inspect", f"hydra.sweep.dir={tmp_path}"])
+
+
+def test_the_record_of_a_sweep_is_no_longer_than_a_command(tmp_path):
+    """A quarter of a minute is what YAML takes for 500 kB of empty lists."""
+    text = f"hydra: {{overrides: {{task: [seed=1]}}, a: [{'[],' * 200_000}]}}"
+    (tmp_path / "multirun.yaml").write_text(text)
+    began = time.perf_counter()
+    with pytest.raises(DevrfError, match="not the record of a sweep"):
+        completed(["stage=inspect", f"hydra.sweep.dir={tmp_path}"])
+    assert time.perf_counter() - began < 5
 
 
 def test_a_sweep_goes_on_with_all_kinds_of_values(tmp_path, monkeypatch):

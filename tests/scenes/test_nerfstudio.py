@@ -263,4 +263,4 @@ def test_wrong_values(moving, change, said, message_of, balls):
 def test_a_file_of_numbers_without_end_is_not_read(tmp_path, message_of):
     with (tmp_path / "transforms.json").open("wb") as file:
         file.truncate(2**33)  # of zeros, which take no room on the disk
-    assert message_of(tmp_path) == f"{tmp_path}/transforms.json: larger than 64 MiB; write it again"
+    assert message_of(tmp_path) == f"{tmp_path}/transforms.json: larger than 16 MiB; write it again"

@@ -262,7 +262,7 @@ def _of_sweep(typed: Sequence[Override], folder: Path) -> list[str]:
 def _recorded(record: Path) -> list[Override]:
     """The overrides of a sweep, from its ``multirun.yaml``."""
     with suppress(*UNREADABLE):
-        text = read_record(record).decode()
+        text = read_record(record, 200 * MOST).decode()  # YAML takes ten seconds for this
         # Hydra writes no aliases, which may unfold without end.
         if not any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
             return parsed(yaml.safe_load(text)["hydra"]["overrides"]["task"])

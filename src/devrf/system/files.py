@@ -14,8 +14,9 @@ from typing import Any
 
 from devrf.errors import DevrfError
 
-# Bytes; the longest records, of footage of hours, have some ten million.
-LARGEST_RECORD = 64 * 2**20
+# Bytes; the longest records, of footage of two hours, have some ten million. In memory each may
+# become 50.
+LARGEST_RECORD = 2**24
 # Errors of a disk, its permissions, or a path that was given. A missing file may be a fault of the
 # program instead.
 REFUSED = {
@@ -121,16 +122,16 @@ def write_json(path: Path, values: dict[str, Any]) -> None:
     write_text(path, json.dumps(values, indent=2) + "\n")
 
 
-def read_record(path: Path) -> bytes:
-    """The content of a file of JSON or CSV.
+def read_record(path: Path, most: int = LARGEST_RECORD) -> bytes:
+    """The content of a file of JSON, CSV or YAML.
 
     Raises:
-        ValueError: it is larger than devrf writes, or a scene needs.
+        ValueError: it has more than so many bytes: than devrf writes, or a scene needs.
     """
     with path.open("rb") as file:
-        content = file.read(LARGEST_RECORD + 1)
-    if len(content) > LARGEST_RECORD:
-        raise ValueError(f"larger than {LARGEST_RECORD // 2**20} MiB")
+        content = file.read(most + 1)
+    if len(content) > most:
+        raise ValueError(f"larger than {most / 2**20:.3g} MiB")
     return content
 
 

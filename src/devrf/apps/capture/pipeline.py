@@ -37,7 +37,7 @@ from devrf.scenes.sparse_model import (
     normalised,
 )
 from devrf.scenes.splits import every_nth
-from devrf.system.files import make_folder, read_record, refuse_links, write_json
+from devrf.system.files import make_folder, read_record, refuse_links, write_json, write_text
 from devrf.system.plain_data import Kind, built
 from devrf.system.progress import followed
 
@@ -145,7 +145,7 @@ def kept(file: Path, source: Any, kind: type[Kind], make: Callable[[], dict[str,
         except (ValueError, LookupError, TypeError, RecursionError, OverflowError):
             raise DevrfError(f"{file}: damaged; remove it, and it is made again") from None
     result = make()
-    write_json(file, {"key": key, "result": result})
+    write_text(file, json.dumps({"key": key, "result": result}))
     return built(kind, result)
 
 

@@ -7,6 +7,7 @@ import json
 import logging
 import math
 import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -63,6 +64,8 @@ for key in "device git devrf fingerprint date checkpoint lpips_network".split():
 KINDS |= {SAMPLING: _Text | None, "run.overrides": list[_Text] | None, "error": _Text}
 KINDS |= {"run.image_size": Annotated[list[int], Len(2, 2)] | None}
 KINDS |= {"dynamic.psnr": int | float | None, "at_rest": bool, "mistake": bool}
+# The first line of a table: to take many columns of one name apart would take pandas hours.
+HEADER = re.compile(rb'[^"\r\n]{1,1000}\r?\n')
 DEFAULT_METHOD = "devrf"
 DEFAULT_PROTOCOL = "two_stage"
 
@@ -139,7 +142,10 @@ def metric_over_time(path: Path, metric: str) -> pd.Series:
     file = path / "frames.csv"
     if file.is_file():  # a pipe would be waited for
         try:
-            frames = pd.read_csv(io.BytesIO(read_record(file)), usecols=["capture", "time", metric])
+            table = read_record(file)
+            if not HEADER.match(table):
+                raise ValueError("no names of columns")
+            frames = pd.read_csv(io.BytesIO(table), usecols=["capture", "time", metric])
             frames = frames[frames["capture"] == "dynamic"].dropna(subset=metric)
             frames = frames.astype({"time": float, metric: float})
             return frames[frames[metric].abs() < LARGEST].groupby("time")[metric].mean()
