@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -296,3 +297,6 @@ def test_arrays_larger_than_their_file_take_no_memory(llff_folder, message_of):
         np.lib.format.write_array_header_1_0(file, header)
     message = message_of(llff_folder.root)
     assert f"{STATIC}: not a readable npy file (mmap length is greater than" in message
+    os.truncate(llff_folder.root / STATIC, 2**25)  # in memory each byte of it would become 18
+    message = message_of(llff_folder.root)
+    assert f"{STATIC}: not a readable npy file (more than the cameras of a capture" in message

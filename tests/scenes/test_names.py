@@ -120,6 +120,13 @@ def test_what_leads_outside_is_refused(scene_folder, refusal, outside):
     assert "leads outside the scene's folder" in refusal(BlenderReader, scene_folder.root)
 
 
+@pytest.mark.parametrize("name", ["/a" * 100_000, "a" * 10_000, "../" + "9" * 5000])
+def test_names_that_no_file_can_have_are_not_looked_for(scene_folder, refusal, name):
+    """Of a path of another machine every tail is looked for, but of none that is too long."""
+    _listed_as(scene_folder, lambda _: name)
+    assert "is not a path; correct it" in refusal(BlenderReader, scene_folder.root)
+
+
 def test_the_same_spelling_comes_first(scene_folder):
     """r_000.png and R_000.PNG may both be there."""
     iio.imwrite(scene_folder.static / "train/R_000.PNG", np.zeros((24, 32, 4), np.uint8))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -140,6 +141,16 @@ def test_what_is_held_out_is_not_learned_from(folder, caplog):
     assert not set(scene.dynamic.train.names) & set(scene.dynamic.test.names)
     folder.write("dataset.json", {"train_ids": IDS[:2], "val_ids": IDS[2:4]})
     assert len(NerfiesReader(folder.root, downscale=1).read().dynamic.train) == 2
+
+
+def test_long_lists_of_absent_images_are_gone_through_once(folder, message_of):
+    train, val = ([f"{part}{k}" for k in range(30_000)] for part in "ab")
+    folder.write("dataset.json", {"train_ids": train, "val_ids": val})
+    began = time.perf_counter()
+    assert "60000 of the 60000 images" in message_of(folder.root)
+    assert time.perf_counter() - began < 20
+    folder.write("dataset.json", {"ids": [str(k) for k in range(100_001)]})
+    assert "ids: expected at most 100000 items" in message_of(folder.root)
 
 
 CAMERA = "camera/000004.json"

@@ -16,7 +16,7 @@ from pydantic import AfterValidator, BaseModel, Field, ValidationError
 
 from devrf.errors import DevrfError
 from devrf.scenes.validation import LARGEST, scene_error
-from devrf.system.files import read_record, utf8_path
+from devrf.system.files import LARGEST_RECORD, read_record, utf8_path
 from devrf.system.options import abbreviated, first_error
 from devrf.system.override import to_type
 from devrf.system.printed import is_shown
@@ -38,9 +38,17 @@ def _distinct(ids: list[str]) -> list[str]:
     return ids
 
 
-Ids = Annotated[list[Name], Field(fail_fast=True), AfterValidator(_distinct)]
+# Images that a file may list: each takes a tenth of a millisecond to be found, or not.
+MOST_IMAGES = 100_000
+Ids = Annotated[
+    list[Name], Field(fail_fast=True, max_length=MOST_IMAGES), AfterValidator(_distinct)
+]
 
 Content = TypeVar("Content", bound=BaseModel)
+
+# Letters of a path, and folders of another machine's that are looked for here, at most.
+LONGEST_PATH = 4096
+MOST_FOLDERS = 32
 
 
 @contextmanager
@@ -129,7 +137,7 @@ def inside(root: Path, folder: Path, name: str, file: Path) -> Path:
     the folder is there. Whether there is such a file is not looked up. DevrfError if the name leads
     outside, or no file can have it.
     """
-    if "\0" in name:
+    if "\0" in name or len(name) > LONGEST_PATH:
         raise scene_error(file, f"{abbreviated(name)} is not a path; correct it")
     path = name.replace("\\", "/")
     if from_elsewhere(root, name):
@@ -158,7 +166,7 @@ def from_elsewhere(root: Path, name: str) -> bool:
 
 def _tail(root: Path, folder: Path, path: str) -> str | None:
     """Where the longest tail of an absolute path leads from ``folder``, or else from ``root``."""
-    parts = PurePosixPath(path).parts[1:]
+    parts = PurePosixPath(path).parts[1:][-MOST_FOLDERS:]
     for above in (folder, root):
         for start in range(len(parts)):
             place = above.joinpath(*parts[start:])
@@ -194,6 +202,8 @@ def read_numbers(path: Path, expected: str) -> Numbers:
     """
     existing_file(path, f"expected {expected}")
     with decoding(path, "npy file", "write it again"):
+        if path.stat().st_size > LARGEST_RECORD:
+            raise ValueError("more than the cameras of a capture")
         # Mapped: an array that is larger than its file is refused before it takes memory.
         values: npt.NDArray[Any] = np.lib.format.open_memmap(path, mode="r")
     if values.dtype.kind not in "fiu":

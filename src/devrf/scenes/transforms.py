@@ -19,7 +19,16 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from torch import Tensor
 
 from devrf.geometry.offset import NO_OFFSET, Offset, offset_of, subtracted
-from devrf.scenes.files import Name, Number, Positive, Vector3, Vector4, inside, read_json
+from devrf.scenes.files import (
+    MOST_IMAGES,
+    Name,
+    Number,
+    Positive,
+    Vector3,
+    Vector4,
+    inside,
+    read_json,
+)
 from devrf.scenes.lens import CameraKeys, Intrinsics, frame_intrinsics, intrinsics_of
 from devrf.scenes.masks import Masks
 from devrf.scenes.names import ImageFinder, Missing, in_order, present_images
@@ -68,7 +77,7 @@ class Frame(CameraKeys):
     timestamp: Any = None
 
 
-FileNames = Annotated[list[Name], Field(fail_fast=True)]
+FileNames = Annotated[list[Name], Field(fail_fast=True, max_length=MOST_IMAGES)]
 
 
 class SceneBounds(BaseModel):
@@ -100,7 +109,7 @@ class TransformsFile(CameraKeys):
         scene_bounds: where the scene is, if devrf has written the file.
     """
 
-    frames: Annotated[list[Frame], Field(fail_fast=True, min_length=1)]
+    frames: Annotated[list[Frame], Field(fail_fast=True, min_length=1, max_length=MOST_IMAGES)]
     train_filenames: FileNames | None = None
     val_filenames: FileNames | None = None
     test_filenames: FileNames | None = None

@@ -255,10 +255,10 @@ class NerfiesReader(ItemsReader):
             raise scene_error(
                 file, f'{abbreviated(unknown[0])} is in train_ids or val_ids, but not in "ids"'
             )
-        both = set(train) & set(val)
-        if both:
+        scored = set(val)
+        if both := scored.intersection(train):
             log.warning("%s: %d images of val_ids are in train_ids too; held out", file, len(both))
-        learned = [position[item] for item in train or items if item not in set(val)]
+        learned = [position[item] for item in train or items if item not in scored]
         held_out = [position[item] for item in val]
         return items, *parted(learned, held_out, self.holdout, file)
 

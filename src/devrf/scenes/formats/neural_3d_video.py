@@ -7,6 +7,7 @@ import math
 import os
 import re
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
@@ -67,9 +68,10 @@ def camera_videos(folder: Path) -> CameraVideos:
     ]
     ordered = in_order(places, name=lambda path: path.name, where=folder, by_characters=True)
     named = {path: int(path.stem[len("cam") :]) for path in ordered}
-    filmed = [number for path, number in named.items() if path.suffix]
+    filmed = {number for path, number in named.items() if path.suffix}
     numbers = {p: number for p, number in named.items() if p.suffix or number not in filmed}
-    twice = [path for path, number in numbers.items() if [*numbers.values()].count(number) > 1]
+    times = Counter(numbers.values())
+    twice = [path for path, number in numbers.items() if times[number] > 1]
     if twice:
         raise scene_error(twice[1], f"has the number of {twice[0].name}, too; remove one of them")
     if len(numbers) < 2:
