@@ -15,13 +15,14 @@ from safetensors.torch import load_file, save_file
 from devrf.checkpoints import checkpoint_file as module
 from devrf.checkpoints.checkpoint_file import (
     DTYPES,
+    UNKNOWN,
     _digest,
     _header,
     read_checkpoint_file,
     read_description,
     write_checkpoint_file,
 )
-from devrf.checkpoints.file_metadata import digest_of, latest_checkpoint
+from devrf.checkpoints.file_metadata import FORMAT, digest_of, latest_checkpoint
 from devrf.errors import DevrfError
 from devrf.system.memory import own_memory
 
@@ -128,6 +129,15 @@ def test_files_of_others_are_refused(tmp_path):
     assert "not a devrf" in refusal(path, len(header).to_bytes(8, "little") + header + bytes(40))
 
 
+@pytest.mark.parametrize("dtype", [torch.uint16, torch.complex64, torch.float8_e4m3fn])
+def test_tensors_of_types_that_devrf_does_not_store_are_refused(path, dtype):
+    metadata = {"devrf": FORMAT, "sha256": UNKNOWN, "nested": "{}"}
+    save_file({"grid": torch.zeros(3).to(dtype)}, path, metadata=metadata)
+    assert "damaged" in refusal(path)
+    save_file({}, path, metadata=metadata | {"devrf": "5" * 10_000})
+    assert len(refusal(path)) < 1000
+
+
 def test_a_long_header_does_not_fill_memory(path):
     """Three million lists in 9 MB would take 0.4 GB, and those that 100 MB hold 4 GB."""
     nested = f'{{"dict": [["devrf", [{",".join(["[]"] * 3_000_000)}]]]}}'
@@ -174,6 +184,7 @@ def test_the_latest_checkpoint_is_told_by_what_files_hold(tmp_path):
     for name, stages, iteration in files:
         write(name, stages, iteration)
         assert latest_checkpoint(tmp_path) == folder / name
-    for content in ({"devrf": []}, {}, {"devrf": {"records": 7}, "progress": {"iteration": "x"}}):
+    broken = {"devrf": {"records": 7, "training_config": {}}, "progress": {"iteration": 10**400}}
+    for content in ({"devrf": []}, {}, broken):
         write_checkpoint_file(folder / "c.ckpt", content)
         assert latest_checkpoint(tmp_path) == folder / "b.ckpt"

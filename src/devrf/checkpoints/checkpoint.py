@@ -347,6 +347,6 @@ def _model_class(path: Path, metadata: CheckpointMetadata) -> Any:
         return stored_class(metadata.model.get("class"), StoredClass)
     except LookupError as error:
         raise DevrfError(
-            f"{path}: was learned by {error.args[0]!r}, which is not known here; install or import "
-            "the method first"
+            f"{path}: was learned by {error.args[0][:200]!r}, which is not known here; install "
+            "or import the method first"
         ) from None

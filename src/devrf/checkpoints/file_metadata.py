@@ -15,6 +15,8 @@ from devrf.errors import DevrfError
 FORMAT = "5"
 # Key of a training config for the digest of the run's canonical checkpoint that is built on.
 OWN_REST = "checkpoints/canonical.ckpt"
+# What nested data raise that are not as devrf writes them.
+UNREADABLE = (LookupError, TypeError, ValueError, ArithmeticError, RecursionError)
 # Bytes of a header at most: usual are 20,000. In memory each may become 50.
 HEADER = 2**23
 
@@ -45,8 +47,8 @@ def file_metadata(path: Path) -> dict[str, str]:
         )
     if metadata["devrf"] != FORMAT:
         raise DevrfError(
-            f"{path}: has format {metadata['devrf']}, this version of devrf reads {FORMAT}; use "
-            "the version that wrote it, or train again"
+            f"{path}: has format {metadata['devrf'][:9]}, this version of devrf reads {FORMAT}; "
+            "use the version that wrote it, or train again"
         )
     return metadata
 
@@ -59,7 +61,7 @@ def latest_checkpoint(run: Path) -> Path | None:
     """
     latest: list[tuple[int, float, Path]] = []
     for path in (run / "checkpoints").glob("*.ckpt"):
-        with suppress(DevrfError, OSError, LookupError, TypeError, ValueError, RecursionError):
+        with suppress(DevrfError, OSError, *UNREADABLE):
             content = _entries(json.loads(file_metadata(path)["nested"]))
             metadata = _entries(content["devrf"])
             rest = _entries(metadata["training_config"]).get(OWN_REST)

@@ -41,7 +41,7 @@ def stored_class(path: object, kind: type[Kind]) -> type[Kind]:
     module = str(path).rpartition(".")[0]
     plugins = {point.module for point in entry_points(group=METHODS)}
     if module.startswith(f"{METHODS}.") or module in plugins:
-        with suppress(ImportError, ValueError):
+        with suppress(ImportError, ValueError, RecursionError):  # of a module in a thousand others
             import_module(module)
     known = _known.get(str(path))
     if known is None or not issubclass(known, kind):
