@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+import os
 import shutil
 import struct
 from collections.abc import Callable
@@ -22,6 +23,7 @@ from devrf.geometry.offset import added
 from devrf.scenes.formats.colmap import ColmapReader
 from devrf.scenes.lens import Lens
 from devrf.scenes.sparse_model import normalised, read_model, scene_model
+from devrf.system.memory import own_memory
 
 # Not square, the principal point off the middle.
 WIDTH, HEIGHT, COUNT = 80, 60, 17
@@ -296,6 +298,16 @@ def test_counts_that_a_binary_model_cannot_hold_are_refused_before_they_are_beli
     (model / f"{part}.bin").write_bytes(data)
     said = f"{model}: not a readable COLMAP model ({part}.bin counts more than it holds)"
     assert message_of(folder).startswith(said)
+
+
+def test_zeros_behind_a_binary_model_take_no_memory(folder):
+    model = folder / "sparse/0"
+    importlib.import_module("pycolmap").Reconstruction(model).write_binary(model)
+    for part in ("images", "points3D"):
+        os.truncate(model / f"{part}.bin", 2**34)  # of zeros, which take no room on the disk
+    before = own_memory()
+    assert len(ColmapReader(folder, downscale=1).read().static.train) == 14
+    assert own_memory() - before < 300e6
 
 
 @pytest.mark.parametrize("suffix", [".txt", ".bin"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import mmap
 import os
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -211,7 +212,8 @@ def _check_counts(folder: Path) -> None:
     for part, (fixed, width, entry) in LISTS.items():
         if not (file := folder / f"{part}.bin").is_file():
             continue
-        data = file.read_bytes()
+        with file.open("rb") as stream:  # mapped: it may be larger than memory, of zeros
+            data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
         count, at = int.from_bytes(data[:8], "little"), 8
         while count > 0 and at < len(data):
             at += fixed
