@@ -149,11 +149,14 @@ def test_what_is_no_film_is_one_line(film, tmp_path, frames):
     film("one.mp4", *H264, "-frames:v", "1")
     ffmpeg("-i", film("small.mp4", *H264, "-s", "48x32"), "-c", "copy", tmp_path / "small.ts")
     ffmpeg("-i", film("large.mp4", *H264), "-c", "copy", tmp_path / "joined.ts")
+    # FFmpeg would show the film as often as the list says.
+    (tmp_path / "list.mp4").write_text("ffconcat version 1.0\n" + "file large.mp4\n" * 1000)
     with (tmp_path / "joined.ts").open("ab") as joined:
         joined.write((tmp_path / "small.ts").read_bytes())
     for name, said in (
         ("empty.mp4", "not a readable video; convert it"),
         ("sound.m4a", "not a readable video; convert it"),
+        ("list.mp4", "not a readable video; convert it"),
         ("one.mp4", "a video of 1 frame, expected at least 2"),
         ("joined.ts", "has not the size or colours of those before it"),
         ("nowhere.mp4", "no such file"),

@@ -34,6 +34,8 @@ Size = tuple[int, int]
 # Suffixes of videos; FFmpeg tells what they are by their content.
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mts", ".m2ts", ".3gp")
 
+# What else FFmpeg reads are lists of other files, of any number, and what nobody films in.
+_FORMATS = "mov,matroska,avi,mpeg,mpegts,mpegvideo,m4v,h264,hevc,asf,flv,ogg,mxf,dv,gif"
 _REMEDY = "convert it, for example to H.264 in an mp4 file"
 # Pixels of a frame's longer side.
 _LARGEST = 2**14
@@ -74,6 +76,7 @@ def film_header(path: Path) -> FilmHeader:
     existing_file(path, "give a video that is there")
     # FFmpeg and OpenCV would print on stderr what is said here in a line.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", f"format_whitelist;{_FORMATS}")
     level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
     video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     cv2.utils.logging.setLogLevel(level)
@@ -217,7 +220,8 @@ def _ffmpeg(
     except RuntimeError as error:
         raise scene_error(path, f"cannot be read without FFmpeg ({error})") from None
     # Half a frame at the end of what is there is left out, and so are cover pictures (V).
-    command += ["-fflags", "+discardcorrupt", "-i", f"file:{path}", "-map", "0:V:0"]
+    command += ["-format_whitelist", _FORMATS, "-fflags", "+discardcorrupt"]
+    command += ["-i", f"file:{path}", "-map", "0:V:0"]
     command += ["-vf", filters, "-fps_mode", "passthrough"]
     command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "pipe:1"]
     with TemporaryDirectory() as folder:
