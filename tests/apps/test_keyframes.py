@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import time
 
 import pytest
 import torch
@@ -153,6 +154,14 @@ SCALED = [2 * value for value in MATRIX[:12]] + MATRIX[12:]
 def test_what_is_no_path_is_refused_in_one_line(data, expected):
     with pytest.raises(DevrfError, match=f"^{re.escape(expected)}"):
         path_from(data, "p")
+
+
+def test_a_long_path_is_read_in_seconds():
+    """A minute, were each matrix looked at by itself."""
+    data = content(keyframes=[frame(seconds=k) for k in range(60_000)])
+    began = time.perf_counter()
+    assert len(path_from(data, "p").keyframes) == 60_000
+    assert time.perf_counter() - began < 10
 
 
 def test_a_path_is_saved_in_its_folder_alone():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import shutil
+import time
 from pathlib import Path
 
 import pytest
@@ -25,6 +26,16 @@ def test_poses_are_told_apart_up_to_rounding():
     drawn = [(0, 0), (1, 0), (0, 1), (0, 9), (1, -1), (2, 0), (0, 9)]
     poses = torch.stack([cameras[k] + 0.6 * SAME_POSE * step for k, step in drawn])
     assert distinct_poses(poses).tolist() == [0, 1, 0, 2, 1, 3, 2]
+
+
+def test_poses_across_a_line_are_told_apart_in_seconds():
+    """Along one line all are the same: half a minute, were that line the one that is used."""
+    numbers = torch.randn((10_000, 12), generator=torch.Generator().manual_seed(0)).double()
+    line = torch.arange(2, 14).double().sqrt()
+    across = numbers - (numbers @ line)[:, None] * line / (line @ line)
+    began = time.perf_counter()
+    assert distinct_poses(across.view(-1, 3, 4)).tolist() == list(range(10_000))
+    assert time.perf_counter() - began < 10
 
 
 def assert_at_rest(scene: Scene, train: int, test: int) -> None:

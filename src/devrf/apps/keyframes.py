@@ -15,7 +15,7 @@ from kornia.geometry.conversions import (
     quaternion_to_rotation_matrix,
     rotation_matrix_to_quaternion,
 )
-from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 from torch import Tensor
 
 from devrf.apps.camera_paths import NAMES
@@ -25,7 +25,7 @@ from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.offset import NO_OFFSET, Offset, added, subtracted
 from devrf.scenes.files import Number, read_json
-from devrf.scenes.validation import in_reach, is_rotation, scene_error
+from devrf.scenes.validation import check_poses, scene_error
 from devrf.system.files import write_json
 from devrf.system.options import first_error
 
@@ -162,18 +162,6 @@ def _quaternions(rotations: Tensor) -> Tensor:
     return torch.cat([wxyz[:1], wxyz[1:] * signs[:, None]])
 
 
-def _pose(numbers: list[float]) -> Tensor:
-    """The camera (3, 4) in 16 numbers, row by row."""
-    return torch.tensor(numbers, dtype=torch.float64).view(4, 4)[:3]
-
-
-def _rigid(numbers: list[float]) -> list[float]:
-    pose = _pose(numbers)
-    if not bool(is_rotation(pose[:, :3])) or not bool(in_reach(pose[:, 3])):
-        raise ValueError("is no rigid transform; give a rotation and a translation")
-    return numbers
-
-
 def _with_seconds(keyframes: Any) -> Any:
     """devrf's own keyframes; without seconds they are nerfstudio's, which are not used."""
     has_seconds = isinstance(keyframes, list) and all(
@@ -182,7 +170,7 @@ def _with_seconds(keyframes: Any) -> Any:
     return keyframes if has_seconds else []
 
 
-Matrix = Annotated[list[Number], Field(min_length=16, max_length=16), AfterValidator(_rigid)]
+Matrix = Annotated[list[Number], Field(min_length=16, max_length=16)]
 Time = Annotated[Number, Field(ge=0, le=1)]
 
 
@@ -266,19 +254,24 @@ def write_path(file: Path, path: CameraPath, height: int, offset: Offset = NO_OF
 
 
 def _path(content: _PathFile, where: object, offset: Offset) -> CameraPath:
-    cameras = content.camera_path
-    last = max(len(content.camera_path) - 1, 1)
-
-    def placed(matrix: list[float]) -> Tensor:
-        return subtracted(_pose(matrix), offset).float()
-
+    place, cameras = "keyframes[{}].matrix", list[_PathCamera](content.keyframes)
+    if not cameras:
+        place, cameras = "camera_path[{}].camera_to_world", content.camera_path
+    last = max(len(cameras) - 1, 1)
+    numbers = torch.tensor([camera.matrix for camera in cameras], dtype=torch.float64)
+    poses = numbers.view(-1, 4, 4)[:, :3]
+    check_poses(poses, lambda k: f"{where}: {place.format(k)}")
     keyframes = [
-        Keyframe(placed(keyframe.matrix), keyframe.fov, keyframe.render_time, keyframe.seconds)
-        for keyframe in content.keyframes
+        Keyframe(
+            pose,
+            camera.fov,
+            k / last if camera.render_time is None else camera.render_time,
+            camera.seconds if isinstance(camera, _PathKeyframe) else k / content.fps,
+        )
+        for k, (camera, pose) in enumerate(
+            zip(cameras, subtracted(poses, offset).float(), strict=True)
+        )
     ]
-    for k, camera in enumerate(cameras if not keyframes else ()):
-        time = k / last if camera.render_time is None else camera.render_time
-        keyframes.append(Keyframe(placed(camera.matrix), camera.fov, time, k / content.fps))
     if not keyframes:
         raise scene_error(
             where, "holds no camera path; expected keyframes with seconds, or camera_path"
@@ -289,7 +282,7 @@ def _path(content: _PathFile, where: object, offset: Offset) -> CameraPath:
                 f"{where}: keyframes[{k}].seconds",
                 f"expected more than {before.seconds:g}, as before it, not {after.seconds:g}",
             )
-    return CameraPath(tuple(keyframes), (content.keyframes or cameras)[0].aspect, content.fps)
+    return CameraPath(tuple(keyframes), cameras[0].aspect, content.fps)
 
 
 def check_name(name: str) -> str:

@@ -39,7 +39,7 @@ def _distinct(ids: list[str]) -> list[str]:
 
 
 # Images that a file may list: each takes a tenth of a millisecond to be found, or not.
-MOST_IMAGES = 100_000
+MOST_IMAGES = 50_000
 Ids = Annotated[
     list[Name], Field(fail_fast=True, max_length=MOST_IMAGES), AfterValidator(_distinct)
 ]

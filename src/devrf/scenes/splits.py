@@ -94,19 +94,22 @@ def distinct_poses(poses: Tensor) -> Tensor:
     """(N,) int64: which of the distinct poses each of (N, 3, 4) is, in order of appearance."""
     near = SAME_POSE * (1 + float(poses[:, :, 3].norm(dim=1).median()))
     entries = poses.flatten(1).double().numpy()
-    # Poses that are near each other are so along any line, too: only few have to be compared.
-    line = np.sqrt(np.arange(2.0, 2 + entries.shape[1]))
+    # Poses that are near each other are so along any line, too: only few have to be compared. The
+    # line is another one each time: a file could have all its poses across one that it knows.
+    line = np.random.default_rng().normal(size=entries.shape[1])
     along = entries @ line
-    reach = near * line.sum()
+    reach = near * np.abs(line).sum()
     order = along.argsort()
     ends = np.searchsorted(along[order], [along - reach, along + reach])
     numbers = np.full(len(entries), -1)
+    count = 0
     for row, (start, stop) in enumerate(ends.T):
         if numbers[row] < 0:
             rows = order[start:stop]
-            same = (numbers[rows] < 0) & (np.abs(entries[rows] - entries[row]).max(axis=1) <= near)
-            same |= rows == row
-            numbers[rows[same]] = numbers.max() + 1
+            for column in entries.T:  # few are left after the first ones
+                rows = rows[np.abs(column[rows] - column[row]) <= near]
+            numbers[rows[numbers[rows] < 0]] = numbers[row] = count
+            count += 1
     return torch.from_numpy(numbers)
 
 
