@@ -36,8 +36,9 @@ FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 UNREAD = frozenset(
     ".heic .heif .avif .jxl .jp2 .exr .hdr .tga .ppm .gif .dng .cr2 .cr3 .nef .arw".split()
 )
-# Pillow warns of images that it reads, and refuses those of twice that size.
-warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
+# Pillow warns of large images that it reads, and refuses those of twice that size; of damaged ones
+# it warns, too, and what it cannot read is said in one line.
+warnings.filterwarnings("ignore", module=r"PIL\.")
 # 16-bit and float greys have no fixed white; the rest converts to 8 bits without a choice.
 DEEP_MODES = ("I", "F", "I;16", "I;16B", "I;16L", "I;16N")
 # How the stored image becomes the one to be seen, by its EXIF orientation; 1 is as it is.
