@@ -35,7 +35,7 @@ from torch.profiler import profile
 from devrf import selfcheck
 from devrf.cli.context import RunContext
 from devrf.evaluation.held_out import background_value
-from devrf.kernels.look_up import look_up
+from devrf.kernels.trilinear import interpolate
 from devrf.rendering.renderer import Renderer
 from devrf.system.device import wait
 from devrf.system.files import write_json
@@ -126,9 +126,11 @@ def tests(into: Path) -> Iterator[Row]:
 def kernel_rows(into: Path) -> Iterator[Row]:
     """Each kernel at the paper's size beside its definition; first, seconds until one has run."""
     began = time.perf_counter()
-    look_up(torch.zeros(2, 2, 2, 1, device=DEVICE), torch.zeros(1, 3, device=DEVICE), kernels.BOX)
+    interpolate(
+        torch.zeros(2, 2, 2, 1, device=DEVICE), torch.zeros(1, 3, device=DEVICE), kernels.BOX
+    )
     wait(DEVICE)
-    yield {"seconds until the first look-up has run, compiled": time.perf_counter() - began}
+    yield {"seconds until the first interpolation has run, compiled": time.perf_counter() - began}
     yield from kernels.rows(DEVICE) if GPU else kernels.rows(DEVICE, side=8, rays=8, points=8)
 
 

@@ -20,10 +20,10 @@ from torch.utils.benchmark import Timer
 
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
-from devrf.kernels import adam, look_up, march
+from devrf.kernels import adam, march, trilinear
 from devrf.ops import adam as adam_definition
 from devrf.ops import march as march_definition
-from devrf.ops import trilinear
+from devrf.ops import trilinear as trilinear_definition
 from devrf.ops.adam import AdamRule
 from devrf.ops.march import Medium
 from devrf.ops.march import Path as RayPath
@@ -54,21 +54,21 @@ def rows(
 def rows_of_a_grid(
     grid: Tensor, points: int, draw: Callable[..., Tensor]
 ) -> Iterator[dict[str, Any]]:
-    """Look-ups of as many points in a grid, a step of Adam on it, its total variation."""
+    """Interpolation of a grid at as many points, a step of Adam on it, its total variation."""
     channels = grid.shape[-1]
     places = draw(points, 3) / 3
     factor = draw(points, channels)
     touched = points * FLOAT * (3 + 9 * channels)
     yield compared(
-        f"look-up, {channels} channels",
-        lambda ours: ours.look_up(grid, places, BOX),
-        (look_up, trilinear),
+        f"interpolation, {channels} channels",
+        lambda ours: ours.interpolate(grid, places, BOX),
+        (trilinear, trilinear_definition),
         touched,
     )
     yield compared(
-        f"look-up, {channels} channels, forward and backward",
-        lambda ours: gradients(ours.look_up, grid, places, factor),
-        (look_up, trilinear),
+        f"interpolation, {channels} channels, forward and backward",
+        lambda ours: gradients(ours.interpolate, grid, places, factor),
+        (trilinear, trilinear_definition),
         3 * touched,
     )
     moments = [draw(*grid.shape), draw(*grid.shape), draw(*grid.shape).square()]
@@ -138,7 +138,7 @@ def microseconds(work: Callable[[Any], Any], module: Any) -> float:
 def gradients(
     look: Callable[..., Tensor], grid: Tensor, places: Tensor, factor: Tensor
 ) -> list[Tensor]:
-    """Of a look-up: the gradients in the grid and in the points."""
+    """Of interpolation: the gradients in the grid and in the points."""
     given = [grid.detach().requires_grad_(), places.detach().requires_grad_()]
     return list(torch.autograd.grad(look(*given, BOX), given, factor))
 

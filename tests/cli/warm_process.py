@@ -44,7 +44,7 @@ import devrf.cli.run
 from devrf.__main__ import entry
 from devrf.checkpoints import checkpoint_file
 from devrf.engine.grid_adam import GridAdam
-from devrf.kernels.runtime import take
+from devrf.kernels.runtime import is_supported
 
 
 class Fuse:
@@ -132,7 +132,7 @@ def hang(context: Any) -> None:
 def main() -> None:
     """Fork for each command that is asked for."""
     torch.set_num_threads(1)
-    assert take(torch.empty(0))  # loads Warp
+    assert is_supported(torch.empty(0))  # loads Warp
     Plugins.instance()
     gc.freeze()  # what is there stays shared with the children
     gc.enable()

@@ -7,8 +7,8 @@ import torch
 from devrf.geometry.box import Box
 from devrf.kernels.adam import adam_kernel, adam_step
 from devrf.kernels.ahead import compile_ahead, grid_kernels
-from devrf.kernels.look_up import add_kernel, look_up, look_up_kernel, slope_kernel
 from devrf.kernels.march import march_kernel
+from devrf.kernels.trilinear import add_kernel, interpolate, interpolate_kernel, slope_kernel
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.dnerf.model import DNeRF
@@ -24,13 +24,13 @@ CHANNELS = 5  # no other test's
 
 def test_what_was_compiled_ahead_is_not_compiled_again() -> None:
     compile_ahead(grid_kernels({CHANNELS}), torch.device("cpu")).join()
-    made = (look_up_kernel, slope_kernel, add_kernel, adam_kernel)
+    made = (interpolate_kernel, slope_kernel, add_kernel, adam_kernel)
     modules = [make(CHANNELS).module for make in made]
     built = [set(module.execs) for module in modules]
     assert all(built)
     grid = torch.ones(2, 2, 2, CHANNELS, requires_grad=True)
     points = torch.full((1, 3), 0.5, requires_grad=True)
-    look_up(grid, points, Box((0.0,) * 3, (1.0,) * 3)).sum().backward()
+    interpolate(grid, points, Box((0.0,) * 3, (1.0,) * 3)).sum().backward()
     assert grid.grad.sum() == CHANNELS and not points.grad.any()
     with torch.no_grad():
         adam_step(grid, grid.grad, torch.zeros_like(grid), torch.zeros_like(grid), AdamRule(0.1, 1))
@@ -40,9 +40,9 @@ def test_what_was_compiled_ahead_is_not_compiled_again() -> None:
 def test_methods_with_grids_say_which_kernels_they_take() -> None:
     proposals = KPlanesSettings(sampling="proposals", channels=7, proposal_channels=2, resolution=4)
     planes = RayStage.kernels({"model": KPlanes(proposals)})
-    assert {look_up_kernel(7), look_up_kernel(2), adam_kernel(7)} <= set(planes)
+    assert {interpolate_kernel(7), interpolate_kernel(2), adam_kernel(7)} <= set(planes)
     voxels = RayStage.kernels({"model": TiNeuVox(TiNeuVoxSettings(side=8, channels=9))})
-    assert look_up_kernel(9) in voxels and march_kernel(False) not in voxels
+    assert interpolate_kernel(9) in voxels and march_kernel(False) not in voxels
     assert RayStage.kernels({"model": DNeRF()}) == []
     stage = CanonicalStage.kernels({"architecture": Architecture(channels=11)})
-    assert {march_kernel(False), look_up_kernel(3), look_up_kernel(11)} <= set(stage)
+    assert {march_kernel(False), interpolate_kernel(3), interpolate_kernel(11)} <= set(stage)

@@ -13,7 +13,7 @@ import torch
 import warp as wp
 
 import devrf.kernels
-from devrf.kernels.runtime import take
+from devrf.kernels.runtime import is_supported
 
 # Densities, displacements, features.
 CHANNELS = (1, 3, 12)
@@ -46,7 +46,7 @@ def every_kernel() -> dict[str, wp.Kernel]:
 @pytest.fixture(scope="module")
 def together() -> wp.Module:
     """All kernels in one module: the compiler reads Warp's own functions once, not for each."""
-    assert take(torch.zeros(1))  # starts Warp
+    assert is_supported(torch.zeros(1))  # starts Warp
     module = wp.get_module("devrf_kernels_together")
     module.made = [
         wp.Kernel(kernel.func, key=name.replace(".", "_"), module=module, options=kernel.options)
@@ -56,8 +56,8 @@ def together() -> wp.Module:
 
 
 def test_all_are_found() -> None:
-    look_ups = ("look_up_kernel", "slope_kernel", "add_kernel")
-    names = {f"look_up.{one}_{n}" for one in look_ups for n in CHANNELS}
+    trilinear = ("interpolate_kernel", "slope_kernel", "add_kernel")
+    names = {f"trilinear.{one}_{n}" for one in trilinear for n in CHANNELS}
     steps = ("adam_kernel", "total_variation_kernel")
     names |= {f"adam.{one}_{n}" for one in steps for n in CHANNELS}
     names |= {f"march.march_kernel_{n}" for n in SPACES}

@@ -15,9 +15,9 @@ from torch import Tensor
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 from devrf.kernels.adam import GRAIN_OF_VOXELS, adam_step, add_total_variation_gradient
-from devrf.kernels.look_up import look_up
 from devrf.kernels.march import march
-from devrf.kernels.runtime import GRAIN_OF_RAYS, choose, take
+from devrf.kernels.runtime import GRAIN_OF_RAYS, choose, is_supported
+from devrf.kernels.trilinear import interpolate
 from devrf.ops import adam, trilinear
 from devrf.ops import march as definition
 from devrf.ops.adam import AdamRule
@@ -47,11 +47,11 @@ def threads() -> Iterator[Callable[[int], None]]:
 SHORT = """
 import resource, sys, torch
 from devrf.errors import DevrfError
-from devrf.kernels.runtime import take
+from devrf.kernels.runtime import is_supported
 pages = int(open("/proc/self/statm").read().split()[0])
 resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + 20 * 2**20,) * 2)
 try:
-    take(torch.empty(0))
+    is_supported(torch.empty(0))
 except DevrfError as error:
     print(error)
 """
@@ -68,8 +68,8 @@ def test_memory_too_short_for_warp_is_one_line():
 CACHE = """
 import tempfile, torch, warp
 from pathlib import Path
-from devrf.kernels.runtime import others_may_write, take
-assert take(torch.empty(0))
+from devrf.kernels.runtime import others_may_write, is_supported
+assert is_supported(torch.empty(0))
 folder = Path(warp.config.kernel_cache_dir)
 assert folder.is_dir()
 print(folder.parent == Path(tempfile.gettempdir()), others_may_write(folder))
@@ -111,24 +111,24 @@ def scene(rng: torch.Generator, count: int = 500) -> tuple[Rays, Medium]:
 
 
 def test_kernels_take_single_precision_where_they_run() -> None:
-    assert take(torch.zeros(1)) and take(torch.zeros(0, 3))
+    assert is_supported(torch.zeros(1)) and is_supported(torch.zeros(0, 3))
     for other in (torch.float64, torch.float16, torch.bfloat16, torch.int32):
-        assert not take(torch.zeros(1, dtype=other))
-    assert not take(torch.zeros(1, device="meta"))
+        assert not is_supported(torch.zeros(1, dtype=other))
+    assert not is_supported(torch.zeros(1, device="meta"))
 
 
 def test_kernels_can_be_left_out(in_torch: None) -> None:
-    assert not take(torch.zeros(1))
+    assert not is_supported(torch.zeros(1))
     choose("auto")
-    assert take(torch.zeros(1))
+    assert is_supported(torch.zeros(1))
 
 
 def everything(given: tuple[Rays, Medium], points: Tensor, grid: Tensor) -> list[Any]:
     """What all functions of the kernels give."""
     rays, medium = given
     samples = march(rays, medium)
-    looked_up = look_up(grid, points, BOX)
-    return [*vars(samples).values(), looked_up, *optimised(grid)]
+    interpolated = interpolate(grid, points, BOX)
+    return [*vars(samples).values(), interpolated, *optimised(grid)]
 
 
 def optimised(grid: Tensor) -> list[Tensor]:
@@ -148,8 +148,8 @@ def by_definition(given: tuple[Rays, Medium], points: Tensor, grid: Tensor) -> l
     smoothed = torch.zeros_like(grid)
     adam.add_total_variation_gradient(grid, smoothed, 0.5)
     samples = definition.march(rays, medium)
-    looked_up = trilinear.look_up(grid, points, BOX)
-    return [*vars(samples).values(), looked_up, smoothed, *stepped]
+    interpolated = trilinear.interpolate(grid, points, BOX)
+    return [*vars(samples).values(), interpolated, smoothed, *stepped]
 
 
 def test_without_kernels_everything_is_the_definition_to_the_bit(
@@ -167,11 +167,11 @@ def test_without_kernels_everything_is_the_definition_to_the_bit(
 
 def test_doubles_are_taken_by_the_definition(rng: torch.Generator) -> None:
     grid, points = torch.randn(6, 7, 5, 3, generator=rng), torch.randn(50, 3, generator=rng)
-    double = look_up(grid.double(), points.double(), BOX)
-    assert torch.equal(double, trilinear.look_up(grid.double(), points.double(), BOX))
+    double = interpolate(grid.double(), points.double(), BOX)
+    assert torch.equal(double, trilinear.interpolate(grid.double(), points.double(), BOX))
     # As every definition it can be differentiated twice.
     places = points[:4].double().requires_grad_()
-    values = (look_up(grid.double(), places, BOX) ** 2).sum()
+    values = (interpolate(grid.double(), places, BOX) ** 2).sum()
     (slope,) = torch.autograd.grad(values, places, create_graph=True)
     slope.sum().backward()
     assert places.grad.abs().max() > 0
@@ -187,10 +187,10 @@ def with_gradients(given: tuple[Rays, Medium], points: Tensor, grid: Tensor) -> 
         leaf.requires_grad_()
     samples = march(rays, medium)
     loss = (samples.canonical**2).sum() + (samples.weight**2).sum()
-    loss = loss + (samples.transmittance**2).sum() + (look_up(grid, points, BOX) ** 2).sum()
+    loss = loss + (samples.transmittance**2).sum() + (interpolate(grid, points, BOX) ** 2).sum()
     loss.backward()
     # Once more, added to the gradients that are there.
-    (march(rays, medium).weight.sum() + look_up(grid, points, BOX).sum()).backward()
+    (march(rays, medium).weight.sum() + interpolate(grid, points, BOX).sum()).backward()
     results += [leaf.grad for leaf in leaves]
     for leaf in leaves:
         leaf.requires_grad_(False)

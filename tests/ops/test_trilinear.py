@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.autograd import gradcheck
 
 from devrf.geometry.box import Box
-from devrf.ops.trilinear import look_up
+from devrf.ops.trilinear import interpolate
 
 UNIT = Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
 
@@ -32,7 +32,7 @@ def corner_grid() -> Tensor:
     ],
 )
 def test_interpolates_between_eight_corners(at: tuple[float, float, float], value: float) -> None:
-    found = look_up(corner_grid(), torch.tensor([at]), UNIT).item()
+    found = interpolate(corner_grid(), torch.tensor([at]), UNIT).item()
     assert found == pytest.approx(value, rel=1e-6)
 
 
@@ -40,7 +40,7 @@ def test_is_exact_at_every_grid_point_of_a_grid_with_unequal_sides(rng: torch.Ge
     grid = torch.randn(3, 4, 5, 2, generator=rng)
     points = torch.cartesian_prod(torch.arange(3.0), torch.arange(4.0), torch.arange(5.0))
     box = Box((0.0, 0.0, 0.0), (2.0, 3.0, 4.0))
-    assert torch.equal(look_up(grid, points, box), grid.reshape(-1, 2))
+    assert torch.equal(interpolate(grid, points, box), grid.reshape(-1, 2))
 
 
 def test_the_grid_lies_on_the_box() -> None:
@@ -50,14 +50,14 @@ def test_the_grid_lies_on_the_box() -> None:
     grid = torch.stack(torch.meshgrid(*map(torch.arange, shape), indexing="ij"), dim=-1).float()
     points = torch.tensor([box.low, box.middle, box.high])
     expected = torch.tensor([[0.0, 0.0, 0.0], [3.0, 79.5, 16.0], [6.0, 159.0, 32.0]])
-    torch.testing.assert_close(look_up(grid, points, box), expected)
+    torch.testing.assert_close(interpolate(grid, points, box), expected)
 
 
 def test_outside_the_border_goes_on(rng: torch.Generator) -> None:
     grid = torch.randn(3, 3, 3, 1, generator=rng)
     points = torch.tensor([[-5.0, 1.0, 1.0], [9.0, 1.0, 1.0], [1.0, -0.01, 7.0]])
     expected = torch.stack([grid[0, 1, 1], grid[2, 1, 1], grid[1, 0, 2]])
-    torch.testing.assert_close(look_up(grid, points, Box((0.0,) * 3, (2.0,) * 3)), expected)
+    torch.testing.assert_close(interpolate(grid, points, Box((0.0,) * 3, (2.0,) * 3)), expected)
 
 
 def test_gradients_of_values_and_positions(rng: torch.Generator) -> None:
@@ -70,14 +70,14 @@ def test_gradients_of_values_and_positions(rng: torch.Generator) -> None:
     )
     box = Box((0.0, 0.0, 0.0), (2.0, 6.0, 1.0))
     points = (points.detach() * torch.tensor([1.0, 2.0, 0.5])).requires_grad_()
-    assert gradcheck(lambda grid, points: look_up(grid, points, box), (grid, points))
+    assert gradcheck(lambda grid, points: interpolate(grid, points, box), (grid, points))
 
 
 @pytest.mark.parametrize("channels", [1, 4])
 def test_no_points_is_no_values_and_no_gradient(channels: int) -> None:
     grid = torch.ones(2, 3, 2, channels, requires_grad=True)
     points = torch.zeros(0, 3, requires_grad=True)
-    out = look_up(grid, points, UNIT)
+    out = interpolate(grid, points, UNIT)
     assert out.shape == (0, channels)
     out.sum().backward()
     assert grid.grad is not None and not grid.grad.any()

@@ -1,13 +1,13 @@
 """The hot operations as kernels that Warp compiles for the CPU and for CUDA: one source for both.
 
-Each module defines kernels, and the functions that launch them. Where Warp does not run
-(:func:`devrf.kernels.runtime.take`) these functions call their definition in :mod:`devrf.ops`,
-against which every kernel is tested.
+Each module defines kernels, and the functions that launch them. On tensors that kernels do not
+support (:func:`devrf.kernels.runtime.is_supported`) these functions call their definition in
+:mod:`devrf.ops`, against which every kernel is tested.
 
 | module | functions |
 |---|---|
 | ``march`` | ``march``: samples, warped and composited |
-| ``look_up`` | ``look_up``: values of a grid between its points |
+| ``trilinear`` | ``interpolate``: values of a grid between its points |
 | ``adam`` | ``adam_step``, ``add_total_variation_gradient``: a step of the optimiser |
 | ``grid`` | what the kernels share: where grids are, and which cell a point is in |
 | ``runtime`` | where kernels run, and how they are launched |

@@ -7,7 +7,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from devrf.kernels.runtime import launch, made_once, row_type, take
+from devrf.kernels.runtime import cached_kernel, is_supported, launch, row_type
 from devrf.ops import adam as definition
 from devrf.ops.adam import AdamRule
 
@@ -30,7 +30,7 @@ def adam_step(
     Outside the voxels ``rows`` (K,), int32, if they are given, the gradient is zero and so is not
     read; with ``skip_zero``.
     """
-    if not take(values):
+    if not is_supported(values):
         definition.adam_step(values, gradient, mean, square, rule)
         return
     # A voxel of a grid, or one number.
@@ -58,7 +58,7 @@ def add_total_variation_gradient(
     touched_only: bool = False,
 ) -> None:
     """As :func:`devrf.ops.adam.add_total_variation_gradient`; both tensors are contiguous."""
-    if not take(grid):
+    if not is_supported(grid):
         definition.add_total_variation_gradient(
             grid, gradient, weight, along_z=along_z, touched_only=touched_only
         )
@@ -70,7 +70,7 @@ def add_total_variation_gradient(
     launch(kernel, x * y * z, inputs, grid.device, grain=GRAIN_OF_VOXELS)
 
 
-@made_once
+@cached_kernel
 def adam_kernel(channels: int) -> wp.Kernel:
     """A step on voxels of so many numbers."""
     numbers = row_type(channels)
@@ -128,7 +128,7 @@ def adam_kernel(channels: int) -> wp.Kernel:
     return adam_step
 
 
-@made_once
+@cached_kernel
 def total_variation_kernel(channels: int) -> wp.Kernel:
     """The gradient of the total variation, in voxels of so many numbers."""
     numbers = row_type(channels)

@@ -10,8 +10,8 @@ from threading import Thread
 import torch
 import warp as wp
 
-from devrf.kernels import adam, look_up, march
-from devrf.kernels.runtime import compiling, take
+from devrf.kernels import adam, march, trilinear
+from devrf.kernels.runtime import compiling, is_supported
 
 log = logging.getLogger(__name__)
 
@@ -24,7 +24,7 @@ THREADS = {"cpu": 1, "cuda": 256}
 def march_kernels() -> list[wp.Kernel]:
     """What marches along rays, and their adjoints."""
     kernels = [march.enter_kernel, march.march_kernel(False), march.keep_significant_kernel]
-    kernels += [march.adjoint_kernel, look_up.add_kernel(1), adam.total_variation_kernel(1)]
+    kernels += [march.adjoint_kernel, trilinear.add_kernel(1), adam.total_variation_kernel(1)]
     # The last is for contracted space.
     return [*kernels, adam.adam_kernel(1), march.march_kernel(True)]
 
@@ -33,8 +33,8 @@ def grid_kernels(channels: Collection[int]) -> list[wp.Kernel]:
     """What looks up, and steps, grids of these numbers of channels."""
     kernels: list[wp.Kernel] = []
     for count in sorted({*channels}):
-        kernels += [look_up.look_up_kernel(count), look_up.slope_kernel(count)]
-        kernels += [look_up.add_kernel(count), adam.total_variation_kernel(count)]
+        kernels += [trilinear.interpolate_kernel(count), trilinear.slope_kernel(count)]
+        kernels += [trilinear.add_kernel(count), adam.total_variation_kernel(count)]
         kernels.append(adam.adam_kernel(count))
     return kernels
 
@@ -44,7 +44,7 @@ def compile_ahead(kernels: Sequence[wp.Kernel], device: torch.device) -> Thread:
 
     One line says so if that takes long; nothing is done where PyTorch takes their place.
     """
-    wanted = kernels if take(torch.empty(0, device=device)) else ()
+    wanted = kernels if is_supported(torch.empty(0, device=device)) else ()
     thread = Thread(target=_compile, args=(wanted, device), daemon=True)
     thread.start()
     return thread

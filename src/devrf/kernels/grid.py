@@ -37,16 +37,16 @@ class Grid:
 
 
 @lru_cache(maxsize=256)
-def grid_over(box: Box, shape: Shape, every: int = 1) -> Grid:
-    """The grid of ``shape`` (X, Y, Z) over ``box``, or every ``every``-th of its points."""
-    points = [(count - 1) // every + 1 for count in shape]
+def grid_over(box: Box, shape: Shape, stride: int = 1) -> Grid:
+    """The grid of ``shape`` (X, Y, Z) over ``box``, or every ``stride``-th of its points."""
+    points = [(count - 1) // stride + 1 for count in shape]
     grid = Grid()
     grid.low, grid.high = wp.vec3(*box.low), wp.vec3(*box.high)
     grid.scale = wp.vec3(*((n - 1) / edge for n, edge in zip(points, box.size, strict=True)))
     grid.x, grid.y, grid.z = points
-    grid.next_x = every * shape[1] * shape[2]
-    grid.next_y = every * shape[2]
-    grid.next_z = every if points[2] > 1 else 0
+    grid.next_x = stride * shape[1] * shape[2]
+    grid.next_y = stride * shape[2]
+    grid.next_z = stride if points[2] > 1 else 0
     return grid
 
 
@@ -85,7 +85,7 @@ def inside(grid: Grid, point: wp.vec3):
 
 
 @wp.func
-def interpolate(values: wp.array(dtype=Any), grid: Grid, row: int, f: wp.vec3):
+def interpolate_cell(values: wp.array(dtype=Any), grid: Grid, row: int, f: wp.vec3):
     """Σ over a cell's corners of weight · value: trilinear, at the place ``f`` in the cell."""
     total = values[row] * ((1.0 - f[0]) * (1.0 - f[1]) * (1.0 - f[2]))
     total += values[row + grid.next_y] * ((1.0 - f[0]) * f[1] * (1.0 - f[2]))
@@ -102,7 +102,7 @@ def interpolate(values: wp.array(dtype=Any), grid: Grid, row: int, f: wp.vec3):
 
 @wp.func
 def slope(values: wp.array(dtype=Any), factor: Any, grid: Grid, row: int, f: wp.vec3):
-    """∂/∂ position of the scalar product of :func:`interpolate`'s value and ``factor``.
+    """∂/∂ position of the scalar product of :func:`interpolate_cell`'s value and ``factor``.
 
     Per unit of length, at the place ``f`` in the cell.
     """

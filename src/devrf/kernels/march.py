@@ -17,9 +17,16 @@ from torch.autograd.function import once_differentiable
 
 from devrf.geometry.contraction import INFINITY, ContractedRays, ContractedSpace
 from devrf.geometry.rays import PARALLEL, Rays
-from devrf.kernels.grid import Grid, cell, coordinates, grid_over, inside, interpolate, slope
-from devrf.kernels.look_up import add_to_grid
-from devrf.kernels.runtime import GRAIN_OF_RAYS, launch, made_once, room, row_type, take
+from devrf.kernels.grid import Grid, cell, coordinates, grid_over, inside, interpolate_cell, slope
+from devrf.kernels.runtime import (
+    GRAIN_OF_RAYS,
+    cached_kernel,
+    empty_structs,
+    is_supported,
+    launch,
+    row_type,
+)
+from devrf.kernels.trilinear import add_to_grid
 from devrf.ops import march as definition
 from devrf.ops.compositing import LEAST_MASS
 from devrf.ops.march import EXIT, STOP, Medium, Samples
@@ -38,7 +45,7 @@ def march(rays: Rays, medium: Medium) -> Samples:
 
     A leaf of densities that has a gradient is added to there.
     """
-    if not take(rays.origins):
+    if not is_supported(rays.origins):
         return definition.march(rays, medium)
     kept = medium.density.grad if medium.density.is_leaf else None
     results = _March.apply(  # type: ignore[no-untyped-call]
@@ -59,7 +66,7 @@ class _March(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         device = density.device
         geometry = _geometry(rays, medium)
-        lines = room(Ray, len(rays), device)
+        lines = empty_structs(Ray, len(rays), device)
         counts = torch.empty(len(rays), dtype=torch.int32, device=device)
         # Straight rays have no course; their origins stand in for it.
         course = rays.course if isinstance(rays, ContractedRays) else rays.origins
@@ -69,7 +76,7 @@ class _March(torch.autograd.Function):
 
         # Room for all of a ray's samples; how many are visible is known afterwards.
         visible_start, length = _starts(counts)
-        visible = room(VisibleSample, length, device)
+        visible = empty_structs(VisibleSample, length, device)
         visible_count = torch.empty_like(counts)
         significant_count = torch.empty_like(counts)
         transmittance = torch.empty(len(rays), device=device)
@@ -317,7 +324,7 @@ def warped(geometry: Geometry, displacements: wp.array(dtype=wp.vec3), point: wp
         if wp.min(inside(geometry.motion, point)) == 0.0:
             return point
     row, fraction = cell(geometry.motion, point)
-    return point + interpolate(displacements, geometry.motion, row, fraction)
+    return point + interpolate_cell(displacements, geometry.motion, row, fraction)
 
 
 @wp.func
@@ -392,7 +399,7 @@ def enter_kernel(
     counts[number] = ray.count
 
 
-@made_once
+@cached_kernel
 def march_kernel(contracted: bool) -> wp.Kernel:
     """The march in straight or in contracted space; one for both takes a third longer."""
     place = place_of if contracted else straight_place
@@ -438,7 +445,7 @@ def march_kernel(contracted: bool) -> wp.Kernel:
                 point = position(geometry, ray, distance)
                 canonical = warped(geometry, displacements, point)
                 row, fraction = cell(geometry.density, canonical)
-                raw = interpolate(density, geometry.density, row, fraction)[0]
+                raw = interpolate_cell(density, geometry.density, row, fraction)[0]
                 if raw >= geometry.faintest:
                     sample = VisibleSample()
                     sample.distance = distance
@@ -523,7 +530,7 @@ def adjoint_kernel(
 ):
     """From gradients of what the march gives to those of raw densities and displacements.
 
-    ∂L/∂v and ∂L/∂Δ of visible samples, and where these have been looked up, lie without gaps.
+    ∂L/∂v and ∂L/∂Δ of visible samples, and their positions, lie without gaps.
 
     Back to front ∂L/∂τ_i = ∂L/∂w_i T_i exp(−τ_i) − Σ_{j>i} ∂L/∂w_j w_j − ∂L/∂T_end T_end.
     """

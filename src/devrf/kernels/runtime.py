@@ -57,8 +57,8 @@ def choose(kernels: Kernels, *, deterministic: bool = False) -> None:
     wp.config.deterministic = modes.RUN_TO_RUN if deterministic else modes.NOT_GUARANTEED
 
 
-def take(tensor: Tensor) -> bool:
-    """Whether kernels take ``tensor``: single precision, on a CPU or one of NVIDIA's GPUs."""
+def is_supported(tensor: Tensor) -> bool:
+    """Whether kernels run on ``tensor``: single precision, on a CPU or one of NVIDIA's GPUs."""
     here = tensor.is_cpu or (tensor.is_cuda and torch.version.hip is None)
     wanted = _chosen == "auto" and here and tensor.dtype == torch.float32
     if wanted:
@@ -141,14 +141,14 @@ def array(tensor: Tensor, kind: Any = None) -> wp.array:
     return made
 
 
-def room(kind: Any, count: int, device: torch.device) -> wp.array:
+def empty_structs(kind: Any, count: int, device: torch.device) -> wp.array:
     """Memory for ``count`` of a Warp struct of four-byte numbers, from torch's allocator."""
     floats = wp.types.type_size_in_bytes(kind) // 4
     return array(torch.empty(count, floats, device=device), kind)
 
 
-def made_once(factory: Callable[[int], wp.Kernel]) -> Callable[[int], wp.Kernel]:
-    """The kernels of a ``factory``, for a number of channels or a space, each made once."""
+def cached_kernel(factory: Callable[[int], wp.Kernel]) -> Callable[[int], wp.Kernel]:
+    """A ``factory`` of kernels, for a number of channels or a space, that makes each once."""
     made = cache(factory)
 
     @wraps(factory)

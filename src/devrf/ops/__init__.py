@@ -6,7 +6,7 @@ compute where those do not run.
 | module | functions |
 |---|---|
 | ``march`` | ``march``: samples, warped and composited |
-| ``trilinear`` | ``look_up``: values of a grid between its points; ``resample`` |
+| ``trilinear`` | ``interpolate``: values of a grid between its points; ``resample`` |
 | ``compositing`` | ``composite``: weights; ``sum_by_ray``; ``mean_distance``: depths |
 | ``color_network`` | ``decode``: features and directions → RGB |
 | ``photometric`` | the terms that compare rays with images |

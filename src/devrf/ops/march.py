@@ -14,7 +14,7 @@ from torch.nn.functional import softplus
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 from devrf.ops.compositing import composite, mean_distance, transmittances
-from devrf.ops.trilinear import look_up
+from devrf.ops.trilinear import interpolate
 
 # A ray ends where its transmittance is less: what is behind cannot be seen.
 STOP = 1e-4
@@ -129,7 +129,7 @@ def march(rays: Rays, medium: Medium) -> Samples:
     occupied = (medium.path.surroundings.at(points) == 0).nonzero()[:, 0]
     ray, distance, points = ray[occupied], distance[occupied], points[occupied]
     canonical = warped(points, medium)
-    raw = look_up(medium.density, canonical, medium.path.box)[:, 0]
+    raw = interpolate(medium.density, canonical, medium.path.box)[:, 0]
     tau = softplus(raw + medium.shift) * medium.delta
 
     with torch.no_grad():
@@ -163,7 +163,7 @@ def warped(points: Tensor, medium: Medium) -> Tensor:
     """q = x + Δ(x) (M, 3) of ``points`` x (M, 3)."""
     if medium.displacement is None or medium.motion_box is None:
         return points
-    move = look_up(medium.displacement, points, medium.motion_box)
+    move = interpolate(medium.displacement, points, medium.motion_box)
     if medium.still_outside:
         move = torch.where(medium.motion_box.contains(points)[:, None], move, 0.0)
     return points + move

@@ -12,7 +12,7 @@ from devrf.geometry.box import Box
 Shape = tuple[int, int, int]
 
 
-def look_up(grid: Tensor, points: Tensor, box: Box, every: int = 1) -> Tensor:
+def interpolate(grid: Tensor, points: Tensor, box: Box, stride: int = 1) -> Tensor:
     """Values of a grid between its points; outside the box they are those of the border.
 
     ``Σ_{i,j,k ∈ {0,1}} w_i(x) w_j(y) w_k(z) · grid[⌊(x, y, z)⌋ + (i, j, k)]`` with linear weights.
@@ -22,13 +22,13 @@ def look_up(grid: Tensor, points: Tensor, box: Box, every: int = 1) -> Tensor:
             all z.
         points: (M, 3) in the box's units.
         box: where the grid's outer points lie.
-        every: look at every so many-th of the grid's points alone, along each axis, of which
-            there are one more than a multiple.
+        stride: use every stride-th of the grid's points along each axis; X, Y, Z are one more than
+            a multiple of it.
 
     Returns:
         (M, C), differentiable in ``grid`` and ``points``.
     """
-    grid = grid[::every, ::every, ::every]
+    grid = grid[::stride, ::stride, ::stride]
     shape = shape_of(grid)
     last = torch.tensor(shape, device=points.device) - 1
     at = box.to_grid(points, shape)
@@ -52,7 +52,7 @@ def resample(values: Tensor, shape: Shape) -> Tensor:
     resized = torch.nn.functional.interpolate(
         channels_first, size=shape, mode="trilinear", align_corners=True
     )
-    # Not contiguous(): of a single channel it keeps a stray stride, and look-ups become slow.
+    # Not contiguous(): of a single channel it keeps a stray stride, and interpolation becomes slow.
     return resized[0].permute(1, 2, 3, 0).clone(memory_format=torch.contiguous_format)
 
 

@@ -15,7 +15,7 @@ from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import WORLD
-from devrf.kernels.look_up import look_up
+from devrf.kernels.trilinear import interpolate
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.deformation_field import DeformationField, GridWarp
@@ -151,7 +151,7 @@ def test_a_picture_is_the_same_as_a_batch(cube: Box, rng: torch.Generator, time:
     occupancy = Occupancy(torch.rand(9, 9, 9, generator=rng) < 0.1, cube)
     residual = draw(3, 4, 3, 3)
     how = RenderSettings(step=0.5, alpha_threshold=0.02, near=0.2, far=9.0)
-    color_change = partial(look_up, residual, box=cube)
+    color_change = partial(interpolate, residual, box=cube)
     view = DeVRFView(field, occupancy, how, motion, WORLD, time, color_change)
     d = torch.nn.functional.normalize(0.3 * draw(200, 3) + torch.tensor([1.0, 0.0, 0.0]), dim=1)
     rays = Rays(0.3 * draw(200, 3) - torch.tensor([3.0, 0.0, 0.0]), d, d)

@@ -12,7 +12,7 @@ from typing_extensions import TypedDict
 
 from devrf.checkpoints.stored_grids import StoredShape
 from devrf.geometry.box import Box
-from devrf.kernels.look_up import look_up
+from devrf.kernels.trilinear import interpolate
 from devrf.ops.color_network import ColorNetwork, decode
 from devrf.ops.trilinear import resample, shape_of
 from devrf.system.plain_data import built
@@ -49,7 +49,7 @@ class VoxelGrid(StoredShape):
 
     def forward(self, points: Tensor, box: Box) -> Tensor:
         """Values (M, C) at ``points`` (M, 3), trilinear; outside ``box`` they are the border's."""
-        return look_up(self.values, points, box)
+        return interpolate(self.values, points, box)
 
     @torch.no_grad()
     def resize(self, shape: tuple[int, int, int]) -> None:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
-from devrf.kernels.look_up import look_up
+from devrf.kernels.trilinear import interpolate
 from devrf.methods.devrf.frame_store import FrameField, FrameStore
 from devrf.ops.trilinear import Shape
 
@@ -50,7 +50,7 @@ class GridWarp:
         """The points (M, 3) moved, (M, 3); differentiable in the slices and the points."""
         if not self.slices:
             return points
-        moves = [look_up(frame, points, self.box) for frame in self.slices]
+        moves = [interpolate(frame, points, self.box) for frame in self.slices]
         move = moves[0] if len(moves) == 1 else moves[0].lerp(moves[1], self.weight)
         if self.still_outside:
             move = torch.where(self.box.contains(points)[:, None], move, 0.0)

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn.functional import mse_loss
 
 from devrf.geometry.box import Box, constant
-from devrf.kernels.look_up import look_up
+from devrf.kernels.trilinear import interpolate
 from devrf.methods.kplanes.settings import Pairing
 
 # Axes of the planes of space: xy, xz, yz.
@@ -107,7 +107,7 @@ def _values(grid: Tensor, share: Tensor) -> Tensor:
     at = torch.stack([row + starts[:, None], column, torch.zeros_like(row)], dim=2)
     # Lengths are points of the grid. Along z it has one, and the same values.
     box = Box((0.0, 0.0, -1.0), (len(SPACE) * rows - 1.0, columns - 1.0, 1.0))
-    return look_up(grid, at.view(-1, 3), box).view(len(SPACE), -1, channels)
+    return interpolate(grid, at.view(-1, 3), box).view(len(SPACE), -1, channels)
 
 
 def _step(values: Tensor, axis: int) -> Tensor:

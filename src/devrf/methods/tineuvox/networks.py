@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from devrf.checkpoints.stored_grids import StoredShape
 from devrf.geometry.box import Box
-from devrf.kernels.look_up import look_up
+from devrf.kernels.trilinear import interpolate
 from devrf.methods.nerf.networks import ColorBranch, SinusoidalEncoding, linear_by_ray
 from devrf.methods.tineuvox.settings import TiNeuVoxSettings
 from devrf.ops.trilinear import Shape, resample, shape_of
@@ -44,7 +44,7 @@ class MultiDistanceGrid(StoredShape):
 
         The grid is over ``box``; outside they are those of its border.
         """
-        return torch.cat([look_up(self.values, points, box, n) for n in self.strides], dim=1)
+        return torch.cat([interpolate(self.values, points, box, n) for n in self.strides], dim=1)
 
     def fitting(self, box: Box, side: float) -> Shape:
         """The least shape of about ``side``³ points over ``box`` that all strides fit into."""

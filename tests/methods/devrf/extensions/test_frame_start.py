@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from devrf.geometry.box import Box
-from devrf.kernels.look_up import look_up
+from devrf.kernels.trilinear import interpolate
 from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule, Level
 from devrf.methods.devrf.extensions import frame_start
 from devrf.methods.devrf.extensions.frame_start import (
@@ -93,8 +93,8 @@ def test_both_directions_stay_each_others_inverse(cube: Box):
     backward, forward = carried(first, turn(0.2) - turn(0.1), cube)
     assert torch.allclose(forward, turn(0.2), atol=1e-6)
     inner = points[4:11, 4:11, 4:11].reshape(-1, 3)
-    there = inner + look_up(forward, inner, cube)
-    back = there + look_up(backward, there, cube)
+    there = inner + interpolate(forward, inner, cube)
+    back = there + interpolate(backward, there, cube)
     assert (back - inner).norm(dim=1).amax() < 2e-3
 
 

@@ -15,7 +15,7 @@ from devrf.data.color_change import CHANGING, color_drift
 from devrf.errors import expect
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
-from devrf.kernels.look_up import look_up
+from devrf.kernels.trilinear import interpolate
 from devrf.methods.devrf.active_frame import ActiveFrame
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
 from devrf.methods.devrf.extension import Extension, MotionContext
@@ -59,7 +59,7 @@ class ResidualField(ColorField, StoredShape):
         grid = self.values[moment.before]
         if moment.weight:
             grid = grid.lerp(self.values[moment.after], moment.weight)
-        return partial(look_up, grid, box=self.box)
+        return partial(interpolate, grid, box=self.box)
 
     @torch.no_grad()
     def copy(self, source: int, frame: int) -> None:
@@ -198,7 +198,7 @@ class ColorResidual(Extension):
         """q → A_t(q), as learned so far."""
         if NAME not in frame.further:
             return None
-        return partial(look_up, frame.further[NAME], box=frame.fields[NAME].box)
+        return partial(interpolate, frame.further[NAME], box=frame.fields[NAME].box)
 
 
 def squared_residual(prediction: MotionPrediction) -> Tensor:

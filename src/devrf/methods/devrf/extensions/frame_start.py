@@ -12,7 +12,7 @@ from devrf.data.batch import all_pixels, gather_batch
 from devrf.engine.ddp import broadcast
 from devrf.errors import expect
 from devrf.geometry.box import Box
-from devrf.kernels.look_up import look_up
+from devrf.kernels.trilinear import interpolate
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
 from devrf.methods.devrf.extension import Extension, MotionContext
 from devrf.methods.devrf.frame_store import Directions
@@ -131,10 +131,10 @@ def carried(start: Directions, way: Tensor, box: Box) -> Directions:
     points = box.grid_points((shape[0], shape[1], shape[2]), backward).view(-1, 3)
     was = points
     for _ in range(ROUNDS):
-        canonical = was + look_up(backward, was, box)
-        step = look_up(way, canonical, box)
+        canonical = was + interpolate(backward, was, box)
+        step = interpolate(way, canonical, box)
         was = points - step
-    return (look_up(backward, was, box) - step).view(shape), forward + way
+    return (interpolate(backward, was, box) - step).view(shape), forward + way
 
 
 def smoothed(grid: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from devrf.engine.ddp import broadcast
 from devrf.engine.grid_adam import GridAdam
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import WORLD, Space
-from devrf.kernels.look_up import look_up
+from devrf.kernels.trilinear import interpolate
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
 from devrf.methods.devrf.extension import Extension, MotionContext
@@ -269,20 +269,20 @@ def start_from_tracks(
     points = tracks.canonical
 
     def misses(start: Tensor) -> Residual:
-        there = points + look_up(forward + start, points, field.box)
+        there = points + interpolate(forward + start, points, field.box)
         missed, slopes = _projected(tracks, there, cameras, space, small)
-        missed -= _moved(slopes, look_up(start, points, field.box))
-        return lambda change: missed + _moved(slopes, look_up(change, points, field.box))
+        missed -= _moved(slopes, interpolate(start, points, field.box))
+        return lambda change: missed + _moved(slopes, interpolate(change, points, field.box))
 
     _, slopes = _projected(tracks, points, cameras, space, small)
     # Pixels to a unit of length, along the axis that moves pixels most.
     scale = float(slopes.norm(dim=1).mean(dim=0).amax())
     forward += _fit(misses, forward, scale, steps)
-    arrived = points + look_up(forward, points, field.box)
-    lost = arrived + look_up(backward, arrived, field.box) - points
+    arrived = points + interpolate(forward, points, field.box)
+    lost = arrived + interpolate(backward, arrived, field.box) - points
 
     def errs(_: Tensor) -> Residual:
-        return lambda change: (lost + look_up(change, arrived, field.box)) * scale
+        return lambda change: (lost + interpolate(change, arrived, field.box)) * scale
 
     backward += _fit(errs, backward, scale, steps)
     field.frames.write(frame, (backward, forward))

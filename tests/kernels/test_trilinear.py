@@ -1,4 +1,4 @@
-"""Look-ups by kernels, and their gradients, against their definition in double precision."""
+"""Interpolation by kernels, and their gradients, against their definition in double precision."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from devrf.geometry.box import Box
-from devrf.kernels.look_up import add_to_grid, look_up
+from devrf.kernels.trilinear import add_to_grid, interpolate
 from devrf.ops import trilinear
 
 BOX = Box((-1.1, 0.3, -0.7), (0.9, 2.2, 1.3))
@@ -40,8 +40,8 @@ def test_values_and_gradients_are_those_of_the_definition(
     factor = torch.randn(1000, channels, generator=rng)
     exact_grid = grid.detach().double().requires_grad_()
     exact_points = points.detach().double().requires_grad_()
-    values = look_up(grid, points, BOX)
-    exact = trilinear.look_up(exact_grid, exact_points, BOX)
+    values = interpolate(grid, points, BOX)
+    exact = trilinear.interpolate(exact_grid, exact_points, BOX)
     assert values.shape == (1000, channels)
     torch.testing.assert_close(values.double(), exact, atol=1e-5, rtol=0)
     (values * factor).sum().backward()
@@ -52,7 +52,7 @@ def test_values_and_gradients_are_those_of_the_definition(
     assert outside.any() and points.grad[outside].eq(0).any(dim=1).all()
 
 
-@pytest.mark.parametrize("look", [look_up, trilinear.look_up])
+@pytest.mark.parametrize("look", [interpolate, trilinear.interpolate])
 def test_every_second_point_is_a_grid_of_its_own(
     look: Callable[..., Tensor], rng: torch.Generator
 ) -> None:
@@ -61,8 +61,8 @@ def test_every_second_point_is_a_grid_of_its_own(
     factor = torch.randn(500, 3, generator=rng)
     alone = grid.detach()[::2, ::2, ::2].contiguous().requires_grad_()
     beside = points.detach().clone().requires_grad_()
-    (look(grid, points, BOX, every=2) * factor).sum().backward()
-    (look_up(alone, beside, BOX) * factor).sum().backward()
+    (look(grid, points, BOX, stride=2) * factor).sum().backward()
+    (interpolate(alone, beside, BOX) * factor).sum().backward()
     torch.testing.assert_close(grid.grad[::2, ::2, ::2], alone.grad)
     torch.testing.assert_close(points.grad, beside.grad)
     # The points between have no part in it; what a grid has from elsewhere stays.
@@ -77,7 +77,7 @@ def test_every_second_point_is_a_grid_of_its_own(
     torch.testing.assert_close(grid.grad, expected)
 
 
-@pytest.mark.parametrize("look", [look_up, trilinear.look_up])
+@pytest.mark.parametrize("look", [interpolate, trilinear.interpolate])
 def test_a_plane_is_the_same_for_all_z(look: Callable[..., Tensor]) -> None:
     plane = torch.tensor([[0.0, 2.0], [4.0, 6.0]])[:, :, None, None].requires_grad_()
     box = Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
@@ -97,10 +97,10 @@ def test_it_is_exact_at_grid_points_and_goes_on_beyond_the_border(
     grid = torch.randn(3, 4, 5, channels, generator=rng)
     box = Box((0.0, 0.0, 0.0), (2.0, 3.0, 4.0))
     places = torch.cartesian_prod(torch.arange(3.0), torch.arange(4.0), torch.arange(5.0))
-    assert torch.equal(look_up(grid, places, box), grid.reshape(-1, channels))
+    assert torch.equal(interpolate(grid, places, box), grid.reshape(-1, channels))
     beyond = torch.tensor([[-5.0, 1.0, 1.0], [9.0, 1.0, 1.0], [1.0, -0.01, 7.0], [1e9, 1e9, -1e9]])
     expected = torch.stack([grid[0, 1, 1], grid[2, 1, 1], grid[1, 0, 4], grid[2, 3, 0]])
-    assert torch.equal(look_up(grid, beyond, box), expected)
+    assert torch.equal(interpolate(grid, beyond, box), expected)
 
 
 @pytest.mark.parametrize("channels", CHANNELS)
@@ -108,8 +108,8 @@ def test_it_is_exact_at_grid_points_and_goes_on_beyond_the_border(
 def test_no_point_and_one_point(channels: int, count: int, rng: torch.Generator) -> None:
     grid = torch.randn(*SHAPE, channels, generator=rng).requires_grad_()
     points = points_around(count, rng).requires_grad_()
-    values = look_up(grid, points, BOX)
-    torch.testing.assert_close(values, trilinear.look_up(grid, points, BOX))
+    values = interpolate(grid, points, BOX)
+    torch.testing.assert_close(values, trilinear.interpolate(grid, points, BOX))
     assert values.shape == (count, channels)
     values.sum().backward()
     assert points.grad.shape == (count, 3)
@@ -119,10 +119,10 @@ def test_no_point_and_one_point(channels: int, count: int, rng: torch.Generator)
 
 def test_only_what_needs_a_gradient_gets_one(rng: torch.Generator) -> None:
     grid, points = torch.randn(*SHAPE, 3, generator=rng), points_around(5, rng)
-    assert not look_up(grid, points, BOX).requires_grad
-    look_up(grid, points.requires_grad_(), BOX).sum().backward()
+    assert not interpolate(grid, points, BOX).requires_grad
+    interpolate(grid, points.requires_grad_(), BOX).sum().backward()
     assert points.grad is not None and grid.grad is None
-    look_up(grid.requires_grad_(), points.detach(), BOX).sum().backward()
+    interpolate(grid.requires_grad_(), points.detach(), BOX).sum().backward()
     assert grid.grad is not None
 
 
@@ -130,25 +130,25 @@ def test_points_may_lie_in_memory_axis_by_axis(rng: torch.Generator) -> None:
     grid, points = torch.randn(*SHAPE, 3, generator=rng), points_around(50, rng)
     scattered = points.t().contiguous().t().requires_grad_()
     assert not scattered.is_contiguous()
-    values = look_up(grid, scattered, BOX)
-    assert torch.equal(values, look_up(grid, points, BOX))
+    values = interpolate(grid, scattered, BOX)
+    assert torch.equal(values, interpolate(grid, points, BOX))
     # So may gradients.
     factor = torch.randn(3, 50, generator=rng).t()
     (values * factor).sum().backward()
     together = points.clone().requires_grad_()
-    (look_up(grid, together, BOX) * factor).sum().backward()
+    (interpolate(grid, together, BOX) * factor).sum().backward()
     assert torch.equal(scattered.grad, together.grad)
 
 
 def test_a_gradient_that_a_grid_has_is_added_to(rng: torch.Generator) -> None:
     grid, points = torch.randn(*SHAPE, 3, generator=rng).requires_grad_(), points_around(50, rng)
-    look_up(grid, points, BOX).sum().backward()
+    interpolate(grid, points, BOX).sum().backward()
     first, place = grid.grad.clone(), grid.grad
     other = points_around(70, rng)
-    (2 * look_up(grid, other, BOX)).sum().backward()
+    (2 * interpolate(grid, other, BOX)).sum().backward()
     assert grid.grad is place
     fresh = grid.detach().clone().requires_grad_()
-    (2 * look_up(fresh, other, BOX)).sum().backward()
+    (2 * interpolate(fresh, other, BOX)).sum().backward()
     torch.testing.assert_close(grid.grad, first + fresh.grad)
     assert fresh.grad.sum().item() == pytest.approx(2 * 70 * 3, rel=1e-4)
 
@@ -160,9 +160,9 @@ def test_where_a_gradient_is_kept_no_other_tensor_of_the_grids_size_is_made(
     usual = torch.zeros_like
     monkeypatch.setattr(torch, "zeros_like", lambda one: made.append(one.shape) or usual(one))
     grid, points = torch.randn(*SHAPE, 3, generator=rng).requires_grad_(), points_around(50, rng)
-    look_up(grid, points, BOX).sum().backward()
+    interpolate(grid, points, BOX).sum().backward()
     assert made == [grid.shape]
-    look_up(grid, points, BOX).sum().backward()
+    interpolate(grid, points, BOX).sum().backward()
     assert made == [grid.shape]
 
 
@@ -172,9 +172,9 @@ def test_the_gradient_of_a_grid_that_is_computed_reaches_what_it_is_computed_of(
     small = torch.randn(*SHAPE, 3, generator=rng).requires_grad_()
     points = points_around(50, rng)
     for _ in range(2):  # the second time there is a gradient
-        look_up(2 * small, points, BOX).sum().backward()
+        interpolate(2 * small, points, BOX).sum().backward()
     alone = small.detach().clone().requires_grad_()
-    look_up(alone, points, BOX).sum().backward()
+    interpolate(alone, points, BOX).sum().backward()
     torch.testing.assert_close(small.grad, 4 * alone.grad)
 
 
@@ -185,19 +185,19 @@ def test_the_adjoint_adds_to_the_corners(channels: int, rng: torch.Generator) ->
     grid = start.clone()
     add_to_grid(grid, points, values, BOX)
     exact = torch.zeros(*SHAPE, channels, dtype=torch.float64, requires_grad=True)
-    (trilinear.look_up(exact, points.double(), BOX) * values).sum().backward()
+    (trilinear.interpolate(exact, points.double(), BOX) * values).sum().backward()
     torch.testing.assert_close((grid - start).double(), exact.grad, atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("look_up", [look_up, trilinear.look_up])
+@pytest.mark.parametrize("interpolate", [interpolate, trilinear.interpolate])
 def test_a_box_first_met_in_inference_mode_can_be_trained_in(
-    look_up: Callable[..., torch.Tensor],
+    interpolate: Callable[..., torch.Tensor],
 ) -> None:
     grid, box = torch.zeros(2, 3, 9, 1), Box((0.0, 0.0, 0.0), (1.0, 1.0, 8.0))
     grid[1] = 1.0
     grid[:, :, -1] += 5.0
     with torch.inference_mode():
-        look_up(grid, torch.ones(1, 3), box)
+        interpolate(grid, torch.ones(1, 3), box)
     points = torch.tensor([[0.5, 0.5, 7.5]], requires_grad=True)
-    look_up(grid, points, box).sum().backward()
+    interpolate(grid, points, box).sum().backward()
     assert points.grad.tolist() == [[1.0, 0.0, 5.0]]

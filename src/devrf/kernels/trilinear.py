@@ -1,4 +1,4 @@
-"""Look-ups: the values of a grid between its points (docs/method.md#notation)."""
+"""Trilinear interpolation of a grid, and its adjoints (docs/method.md#notation)."""
 
 from typing import Any
 
@@ -8,13 +8,13 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from devrf.geometry.box import Box
-from devrf.kernels.grid import Grid, cell, grid_over, inside, interpolate, slope
-from devrf.kernels.runtime import launch, made_once, row_type, take
-from devrf.ops import trilinear
+from devrf.kernels.grid import Grid, cell, grid_over, inside, interpolate_cell, slope
+from devrf.kernels.runtime import cached_kernel, is_supported, launch, row_type
+from devrf.ops import trilinear as definition
 from devrf.ops.trilinear import shape_of
 
 
-def look_up(grid: Tensor, points: Tensor, box: Box, every: int = 1) -> Tensor:
+def interpolate(grid: Tensor, points: Tensor, box: Box, stride: int = 1) -> Tensor:
     """Trilinear values of a grid over a box; outside they are those of the border.
 
     Args:
@@ -23,31 +23,31 @@ def look_up(grid: Tensor, points: Tensor, box: Box, every: int = 1) -> Tensor:
             grid's size.
         points: (M, 3) in the box's units.
         box: where the grid's outer points lie.
-        every: look at every so many-th of the grid's points alone, along each axis, of which
-            there are one more than a multiple.
+        stride: use every stride-th of the grid's points along each axis; X, Y, Z are one more than
+            a multiple of it.
 
     Returns:
         (M, C), differentiable once in ``grid`` and ``points``.
     """
-    if not take(points):
-        return trilinear.look_up(grid, points, box, every)
+    if not is_supported(points):
+        return definition.interpolate(grid, points, box, stride)
     kept = grid.grad if grid.is_leaf else None
-    values: Tensor = _LookUp.apply(grid, points, box, every, kept)  # type: ignore[no-untyped-call]
+    values: Tensor = _Interpolate.apply(grid, points, box, stride, kept)  # type: ignore[no-untyped-call]
     return values
 
 
-class _LookUp(torch.autograd.Function):
+class _Interpolate(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, grid: Tensor, points: Tensor, box: Box, every: int, kept: Tensor | None
+        ctx: Any, grid: Tensor, points: Tensor, box: Box, stride: int, kept: Tensor | None
     ) -> Tensor:
         grid = grid.contiguous()
         points = points.contiguous()
         ctx.save_for_backward(grid, points)
-        ctx.box, ctx.every, ctx.kept = box, every, kept
+        ctx.box, ctx.stride, ctx.kept = box, stride, kept
         values = grid.new_empty(len(points), grid.shape[-1])
-        inputs = [grid_over(box, shape_of(grid), every), points, grid, values]
-        launch(look_up_kernel(grid.shape[-1]), len(points), inputs, points.device)
+        inputs = [grid_over(box, shape_of(grid), stride), points, grid, values]
+        launch(interpolate_kernel(grid.shape[-1]), len(points), inputs, points.device)
         return values
 
     @staticmethod
@@ -59,17 +59,17 @@ class _LookUp(torch.autograd.Function):
         if ctx.needs_input_grad[0]:
             of_grid = torch.zeros_like(grid) if ctx.kept is None else None
             into = ctx.kept if of_grid is None else of_grid
-            add_to_grid(into, points, gradient, ctx.box, ctx.every)
+            add_to_grid(into, points, gradient, ctx.box, ctx.stride)
         if ctx.needs_input_grad[1]:
             of_points = torch.empty_like(points)
-            place = grid_over(ctx.box, shape_of(grid), ctx.every)
+            place = grid_over(ctx.box, shape_of(grid), ctx.stride)
             inputs = [place, points, grid, gradient, of_points]
             launch(slope_kernel(grid.shape[-1]), len(points), inputs, points.device)
         return of_grid, of_points, None, None, None
 
 
-def add_to_grid(grid: Tensor, points: Tensor, values: Tensor, box: Box, every: int = 1) -> None:
-    """The adjoint of a look-up: add weight · ``values`` (M, C) to the corners around ``points``.
+def add_to_grid(grid: Tensor, points: Tensor, values: Tensor, box: Box, stride: int = 1) -> None:
+    """Add weight · ``values`` (M, C) to the corners around ``points``: interpolation's adjoint.
 
     On a GPU by atomic additions, on a CPU in one thread, in the order of the points. Two threads,
     each with planes of its own, took twice as long: one that guesses wrongly whose plane it is
@@ -80,19 +80,19 @@ def add_to_grid(grid: Tensor, points: Tensor, values: Tensor, box: Box, every: i
         points: (M, 3) in the box's units.
         values: (M, C).
         box: where the grid's outer points lie.
-        every: as of a look-up.
+        stride: as of :func:`interpolate`.
     """
-    inputs = [grid_over(box, shape_of(grid), every), points, values, grid]
+    inputs = [grid_over(box, shape_of(grid), stride), points, values, grid]
     launch(add_kernel(grid.shape[-1]), len(points), inputs, points.device, grain=None)
 
 
-@made_once
-def look_up_kernel(channels: int) -> wp.Kernel:
-    """The look-up in grids of so many channels: Warp chooses slowly among kernels of one name."""
+@cached_kernel
+def interpolate_kernel(channels: int) -> wp.Kernel:
+    """Interpolation of grids of so many channels: Warp is slow to choose among overloads."""
     row_of = row_type(channels)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def look_up(
+    def interpolate(
         first: int,
         grid: Grid,
         points: wp.array(dtype=wp.vec3),
@@ -101,14 +101,14 @@ def look_up_kernel(channels: int) -> wp.Kernel:
     ):
         sample = first + wp.tid()
         row, fraction = cell(grid, points[sample])
-        result[sample] = interpolate(values, grid, row, fraction)
+        result[sample] = interpolate_cell(values, grid, row, fraction)
 
-    return look_up
+    return interpolate
 
 
-@made_once
+@cached_kernel
 def slope_kernel(channels: int) -> wp.Kernel:
-    """The look-up's adjoint in the points."""
+    """The adjoint of interpolation in the points."""
     row_of = row_type(channels)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -120,7 +120,7 @@ def slope_kernel(channels: int) -> wp.Kernel:
         gradient: wp.array(dtype=row_of),
         result: wp.array(dtype=wp.vec3),
     ):
-        """From the gradient of looked-up values to that of the points."""
+        """The gradient of the points from that of the interpolated values."""
         sample = first + wp.tid()
         point = points[sample]
         row, fraction = cell(grid, point)
@@ -130,9 +130,9 @@ def slope_kernel(channels: int) -> wp.Kernel:
     return slopes
 
 
-@made_once
+@cached_kernel
 def add_kernel(channels: int) -> wp.Kernel:
-    """The look-up's adjoint in the grid."""
+    """The adjoint of interpolation in the grid."""
     row_of = row_type(channels)
 
     @wp.kernel(module="unique", enable_backward=False)
