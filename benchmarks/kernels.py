@@ -25,8 +25,7 @@ from devrf.ops import adam as adam_definition
 from devrf.ops import march as march_definition
 from devrf.ops import trilinear as trilinear_definition
 from devrf.ops.adam import AdamRule
-from devrf.ops.march import Medium
-from devrf.ops.march import Path as RayPath
+from devrf.ops.march import MarchInputs, MarchRange
 from devrf.rendering.occupancy import Occupancy, dilate
 
 BOX = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
@@ -91,17 +90,17 @@ def rows_of_a_march(
     side: int, rays: int, draw: Callable[..., Tensor], *, moves: bool
 ) -> Iterator[dict[str, Any]]:
     """A march through a foggy ball, and with its adjoint."""
-    seen, medium = ball(side, rays, draw, moves=moves)
+    seen, inputs = ball(side, rays, draw, moves=moves)
     name = "march, warped" if moves else "march"
     yield compared(
         name,
-        lambda ours: follow(ours, seen, medium, backward=False),
+        lambda ours: follow(ours, seen, inputs, backward=False),
         (march, march_definition),
         None,
     )
     yield compared(
         f"{name}, forward and backward",
-        lambda ours: follow(ours, seen, medium, backward=True),
+        lambda ours: follow(ours, seen, inputs, backward=True),
         (march, march_definition),
         None,
     )
@@ -158,19 +157,21 @@ def smoothed(module: Any, grid: Tensor, gradient: Tensor) -> Tensor:
     return added
 
 
-def ball(side: int, rays: int, draw: Callable[..., Tensor], *, moves: bool) -> tuple[Rays, Medium]:
+def ball(
+    side: int, rays: int, draw: Callable[..., Tensor], *, moves: bool
+) -> tuple[Rays, MarchInputs]:
     """Rays at a foggy ball of radius 1/2, and that ball, bent if it ``moves``."""
     axis = torch.linspace(-1, 1, side, device=draw(0).device)
     radius = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij")).norm(dim=0)
     density = (60 * (0.5 - radius) + 0.3 * draw(side, side, side))[..., None]
     occupancy = Occupancy(dilate(radius < 0.55, 3), BOX)
     step = 1 / side
-    path = RayPath(BOX, occupancy.surroundings, step=step, near=0.1, far=10.0)
+    limits = MarchRange(BOX, occupancy.distances, step=step, near=0.1, far=10.0)
     bends = interpolate(0.05 * draw(1, 3, 6, 6, 6), (side,) * 3, mode="trilinear")
     origins = 3 * normalize(draw(rays, 3), dim=1)
     directions = normalize(0.35 * draw(rays, 3) - origins, dim=1)
-    return Rays(origins, directions, directions), Medium(
-        path,
+    return Rays(origins, directions, directions), MarchInputs(
+        limits,
         density=density,
         shift=-4.0,
         delta=0.5,
@@ -180,20 +181,20 @@ def ball(side: int, rays: int, draw: Callable[..., Tensor], *, moves: bool) -> t
     )
 
 
-def follow(module: Any, rays: Rays, medium: Medium, *, backward: bool) -> list[Tensor]:
+def follow(module: Any, rays: Rays, inputs: MarchInputs, *, backward: bool) -> list[Tensor]:
     """What rays meet in all; with ``backward`` the gradients in densities and displacements."""
-    density = medium.density.detach().requires_grad_(backward)
-    moves = medium.displacement
+    density = inputs.density.detach().requires_grad_(backward)
+    moves = inputs.displacement
     if moves is not None:
         moves = moves.detach().requires_grad_(backward)
-    given = Medium(
-        medium.path,
+    given = MarchInputs(
+        inputs.range,
         density=density,
-        shift=medium.shift,
-        delta=medium.delta,
-        threshold=medium.threshold,
+        shift=inputs.shift,
+        delta=inputs.delta,
+        threshold=inputs.threshold,
         displacement=moves,
-        motion_box=medium.motion_box,
+        motion_box=inputs.motion_box,
     )
     samples = module.march(rays, given)
     depth = torch.zeros_like(samples.transmittance)

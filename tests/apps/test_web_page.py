@@ -148,9 +148,9 @@ def in_motion(rest: DeVRFModel, seed: int) -> DeVRFModel:
     """A model at rest, of which at the times 0.4 and 1 points have moved by up to 5 %."""
     model = copy.deepcopy(rest)
     box = model.space.inner(model.box)
-    still_outside = not model.space.is_linear
+    zero_outside_box = not model.space.is_linear
     clock = FrameClock((0.0, 0.4, 1.0))
-    motion = DeformationField(box, clock, voxels=5**3, still_outside=still_outside)
+    motion = DeformationField(box, clock, voxels=5**3, zero_outside_box=zero_outside_box)
     shape = motion.to_canonical[1:].shape
     generator = torch.Generator().manual_seed(seed)
     size = torch.tensor(box.size)

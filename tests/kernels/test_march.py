@@ -15,7 +15,7 @@ from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.rays import Rays
 from devrf.kernels.march import march
 from devrf.ops import march as definition
-from devrf.ops.march import STOP, Medium, Path, Samples, Surroundings
+from devrf.ops.march import STOP, MarchInputs, MarchRange, OccupancyDistances, Samples
 from devrf.ops.trilinear import shape_of
 from devrf.rendering.occupancy import Occupancy
 
@@ -32,7 +32,7 @@ class Setting:
     """Rays in a space, and how it is sampled."""
 
     rays: Rays
-    path: Path
+    range: MarchRange
     motion_box: Box
 
 
@@ -59,26 +59,26 @@ def setting(space: str, count: int, rng: torch.Generator, share: float = 0.4) ->
         rays, box = CONTRACTED.rays(directed(1.5 * draw(count, 3), draw(count, 3))), CONTRACTED.box
         motion, limits = CONTRACTED.inner(), (0.06, 0.1, math.inf)
     occupancy = Occupancy(torch.rand(9, 8, 7, generator=rng) < share, box)
-    return Setting(rays, Path(box, occupancy.surroundings, *limits), motion)
+    return Setting(rays, MarchRange(box, occupancy.distances, *limits), motion)
 
 
-def medium(
-    given: Setting, rng: torch.Generator, *, moves: bool = True, still_outside: bool = False
-) -> Medium:
+def inputs(
+    given: Setting, rng: torch.Generator, *, moves: bool = True, zero_outside_box: bool = False
+) -> MarchInputs:
     """Random densities and displacements; some rays end in front of what is behind."""
-    return Medium(
-        given.path,
+    return MarchInputs(
+        given.range,
         density=5 * torch.randn(6, 7, 5, 1, generator=rng),
         shift=-1.5,
         delta=0.4,
         threshold=0.01,
         displacement=0.15 * torch.randn(4, 3, 5, 3, generator=rng) if moves else None,
         motion_box=given.motion_box if moves else None,
-        still_outside=still_outside,
+        zero_outside_box=zero_outside_box,
     )
 
 
-def exact(something: Medium, learned: bool = False) -> Medium:
+def exact(something: MarchInputs, learned: bool = False) -> MarchInputs:
     """The same in double precision."""
     density, displacement = something.density.detach().double(), something.displacement
     if displacement is not None:
@@ -90,18 +90,18 @@ def doubled(rays: Rays) -> Rays:
     return rays.to(torch.float64)
 
 
-def clear_rays(rays: Rays, path: Path, moving: Medium | None = None) -> Rays:
+def clear_rays(rays: Rays, limits: MarchRange, moving: MarchInputs | None = None) -> Rays:
     """The rays none of whose samples is where rounding decides what it is.
 
     That is between two cells of the occupancy, on the faces of what moves, and, for what has moved,
     on a plane of the densities' grid, where slopes jump.
     """
-    ray, _, points = definition.samples_in_box(doubled(rays), path)
-    at = path.surroundings.box.to_grid(points, shape_of(path.surroundings.distances))
+    ray, _, points = definition.samples_in_box(doubled(rays), limits)
+    at = limits.distances.box.to_grid(points, shape_of(limits.distances.cells))
     unclear = ((at - at.floor() - 0.5).abs() < CLEAR).any(dim=1)
     if moving is not None and moving.displacement is not None:
         canonical = definition.warped(points, exact(moving))
-        at = path.box.to_grid(canonical, shape_of(moving.density))
+        at = limits.box.to_grid(canonical, shape_of(moving.density))
         unclear |= ((at - at.round()).abs() < CLEAR).any(dim=1) & (canonical != points).any(dim=1)
         at = moving.motion_box.to_grid(points, shape_of(moving.displacement))
         last = torch.tensor(shape_of(moving.displacement)) - 1
@@ -141,13 +141,13 @@ def random_loss(samples: Samples, seed: int = 3) -> Tensor:
 
 
 @pytest.mark.parametrize("space", SPACES)
-@pytest.mark.parametrize("still_outside", [False, True])
+@pytest.mark.parametrize("zero_outside_box", [False, True])
 def test_samples_and_gradients_are_those_of_the_definition(
-    space: str, still_outside: bool, rng: torch.Generator
+    space: str, zero_outside_box: bool, rng: torch.Generator
 ) -> None:
     given = setting(space, 400, rng)
-    moving = medium(given, rng, still_outside=still_outside)
-    rays = clear_rays(given.rays, given.path, moving)
+    moving = inputs(given, rng, zero_outside_box=zero_outside_box)
+    rays = clear_rays(given.rays, given.range, moving)
     moving.density.requires_grad_()
     moving.displacement.requires_grad_()
     truth = exact(moving, learned=True)
@@ -158,7 +158,7 @@ def test_samples_and_gradients_are_those_of_the_definition(
     assert (left == 1).any() and (left < STOP).any() and ((left > 0.1) & (left < 0.9)).any()
     inside = moving.motion_box.contains(theirs.points)
     assert inside.any() and not inside.all()
-    assert torch.equal(ours.canonical[~inside], ours.points[~inside]) == still_outside
+    assert torch.equal(ours.canonical[~inside], ours.points[~inside]) == zero_outside_box
     random_loss(ours).backward()
     random_loss(theirs).backward()
     assert_same_gradient(moving.density.grad, truth.density.grad)
@@ -168,8 +168,8 @@ def test_samples_and_gradients_are_those_of_the_definition(
 @pytest.mark.parametrize("space", SPACES)
 def test_without_displacements(space: str, rng: torch.Generator) -> None:
     given = setting(space, 300, rng)
-    resting = medium(given, rng, moves=False)
-    rays = clear_rays(given.rays, given.path, resting)
+    resting = inputs(given, rng, moves=False)
+    rays = clear_rays(given.rays, given.range, resting)
     resting.density.requires_grad_()
     truth = exact(resting, learned=True)
     ours, theirs = march(rays, resting), definition.march(doubled(rays), truth)
@@ -183,8 +183,8 @@ def test_without_displacements(space: str, rng: torch.Generator) -> None:
 @pytest.mark.parametrize("output", ["canonical", "weight", "transmittance"])
 def test_each_output_has_its_own_gradient(output: str, rng: torch.Generator) -> None:
     given = setting("world", 300, rng)
-    moving = medium(given, rng)
-    rays = clear_rays(given.rays, given.path, moving)
+    moving = inputs(given, rng)
+    rays = clear_rays(given.rays, given.range, moving)
     moving.density.requires_grad_()
     moving.displacement.requires_grad_()
     truth = exact(moving, learned=True)
@@ -200,7 +200,7 @@ def test_each_output_has_its_own_gradient(output: str, rng: torch.Generator) -> 
 @pytest.mark.parametrize("learned", ["density", "displacement"])
 def test_only_what_needs_a_gradient_gets_one(learned: str, rng: torch.Generator) -> None:
     given = setting("world", 50, rng)
-    moving = medium(given, rng)
+    moving = inputs(given, rng)
     assert not march(given.rays, moving).weight.requires_grad
     getattr(moving, learned).requires_grad_()
     samples = march(given.rays, moving)
@@ -219,13 +219,13 @@ def test_tiny_opacities_keep_their_digits(
     given = setting("world", 300, rng)
     # As at first in the search for geometry: a base voxel's opacity is about 10⁻⁶.
     faint = replace(
-        medium(given, rng, moves=moves),
+        inputs(given, rng, moves=moves),
         density=1.5 * torch.randn(6, 7, 5, 1, generator=rng),
         shift=math.log(1 / (1 - 1e-6) - 1),
         delta=0.5,
         threshold=threshold,
     )
-    rays = clear_rays(given.rays, given.path, faint)
+    rays = clear_rays(given.rays, given.range, faint)
     faint.density.requires_grad_()
     truth = exact(faint, learned=True)
     ours, theirs = march(rays, faint), definition.march(doubled(rays), truth)
@@ -243,8 +243,8 @@ def test_tiny_opacities_keep_their_digits(
 
 def test_opaque_matter_has_weight_one_and_finite_gradients(rng: torch.Generator) -> None:
     given = setting("world", 300, rng, share=1.0)
-    solid = replace(medium(given, rng), density=torch.full((6, 7, 5, 1), 300.0))
-    rays = clear_rays(given.rays, given.path, solid)
+    solid = replace(inputs(given, rng), density=torch.full((6, 7, 5, 1), 300.0))
+    rays = clear_rays(given.rays, given.range, solid)
     solid.density.requires_grad_()
     solid.displacement.requires_grad_()
     samples = march(rays, solid)
@@ -263,8 +263,8 @@ def test_opaque_matter_has_weight_one_and_finite_gradients(rng: torch.Generator)
 @pytest.mark.parametrize("moves", [False, True])
 def test_no_ray_and_one_ray(space: str, moves: bool, rng: torch.Generator) -> None:
     given = setting(space, 300, rng)
-    moving = medium(given, rng, moves=moves)
-    rays = clear_rays(given.rays, given.path, moving)
+    moving = inputs(given, rng, moves=moves)
+    rays = clear_rays(given.rays, given.range, moving)
     seen = march(rays, moving)
     number = int(seen.ray.bincount().argmax())
     learned = [t.requires_grad_() for t in (moving.density, moving.displacement) if t is not None]
@@ -283,14 +283,14 @@ def test_no_ray_and_one_ray(space: str, moves: bool, rng: torch.Generator) -> No
 
 def test_rays_that_meet_nothing(rng: torch.Generator) -> None:
     given = setting("world", 200, rng)
-    moving = medium(given, rng)
+    moving = inputs(given, rng)
     moving.density.requires_grad_()
     moving.displacement.requires_grad_()
     away = Rays(given.rays.origins + 20.0, given.rays.directions, given.rays.viewdirs)
-    nothing = Occupancy(torch.zeros(9, 8, 7, dtype=torch.bool), given.path.box).surroundings
-    empty = replace(given.path, surroundings=nothing)
-    for rays, path in ((away, given.path), (given.rays, empty)):
-        samples = march(rays, replace(moving, path=path))
+    nothing = Occupancy(torch.zeros(9, 8, 7, dtype=torch.bool), given.range.box).distances
+    empty = replace(given.range, distances=nothing)
+    for rays, limits in ((away, given.range), (given.rays, empty)):
+        samples = march(rays, replace(moving, range=limits))
         assert len(samples.ray) == 0
         assert torch.equal(samples.transmittance, torch.ones(200))
         (samples.canonical.sum() + samples.weight.sum() + samples.transmittance.sum()).backward()
@@ -303,8 +303,10 @@ def test_the_last_plane_counts(rng: torch.Generator) -> None:
     box = Box((-9.0, -9.0, -1.0), (9.0, 9.0, 1.0))
     assert box.contains(rays.origins).sum() > 20
     for planes in (2, 16, 65, 129):
-        path = Path(box, Occupancy.full((2, 2, 2), box).surroundings, 1 / (planes - 1), 0.0, 1.0)
-        clear = Medium(path, torch.full((2, 2, 2, 1), -30.0), 0.0, 1.0, 0.0)
+        limits = MarchRange(
+            box, Occupancy.full((2, 2, 2), box).distances, 1 / (planes - 1), 0.0, 1.0
+        )
+        clear = MarchInputs(limits, torch.full((2, 2, 2, 1), -30.0), 0.0, 1.0, 0.0)
         ours, theirs = (
             m.march(rays, clear) for m in (definition, __import__("devrf").kernels.march)
         )
@@ -340,9 +342,9 @@ def test_curved_rays_never_skip_what_is_occupied(
     # Cells as long as wide, or as many along every axis.
     shape = space.box.grid_shape(30**3) if cubic else (30, 30, 30)
     occupancy = Occupancy(torch.rand(*shape, generator=rng) < 1e-3, space.box)
-    path = Path(space.box, occupancy.surroundings, 0.02, 0.05, math.inf)
-    rays = clear_rays(wide_rays(space, 6000, rng), path)
-    nothing_hidden = Medium(path, torch.full((2, 2, 2, 1), -30.0), 0.0, 1.0, 0.0)
+    limits = MarchRange(space.box, occupancy.distances, 0.02, 0.05, math.inf)
+    rays = clear_rays(wide_rays(space, 6000, rng), limits)
+    nothing_hidden = MarchInputs(limits, torch.full((2, 2, 2, 1), -30.0), 0.0, 1.0, 0.0)
     ours, theirs = (
         march(rays, nothing_hidden),
         definition.march(doubled(rays), exact(nothing_hidden)),
@@ -379,9 +381,9 @@ def test_the_fastest_curved_rays_skip_nothing(
             reach = 10 + number % 20
             box = Box.of(point - reach * cell, point + reach * cell)
             part = slice(30 - reach, 31 + reach)
-            surroundings = Surroundings(distances[part, part, part].contiguous(), box)
-            path = Path(space.box, surroundings, step, 0.05, math.inf)
-            clear = Medium(path, torch.full((2, 2, 2, 1), -30.0), 0.0, 1.0, 0.0)
+            nearby = OccupancyDistances(distances[part, part, part].contiguous(), box)
+            limits = MarchRange(space.box, nearby, step, 0.05, math.inf)
+            clear = MarchInputs(limits, torch.full((2, 2, 2, 1), -30.0), 0.0, 1.0, 0.0)
             assert len(march(ray, clear).ray) > 0
 
 
@@ -389,9 +391,9 @@ def test_the_fastest_curved_rays_skip_nothing(
 def test_straight_rays_never_skip_what_is_occupied(share: float, rng: torch.Generator) -> None:
     given = setting("world", 3000, rng)
     occupancy = Occupancy(torch.rand(41, 30, 52, generator=rng) < share, WORLD_BOX)
-    path = replace(given.path, surroundings=occupancy.surroundings, step=0.013)
-    rays = clear_rays(given.rays, path)
-    nothing_hidden = Medium(path, torch.full((2, 2, 2, 1), -30.0), 0.0, 1.0, 0.0)
+    limits = replace(given.range, distances=occupancy.distances, step=0.013)
+    rays = clear_rays(given.rays, limits)
+    nothing_hidden = MarchInputs(limits, torch.full((2, 2, 2, 1), -30.0), 0.0, 1.0, 0.0)
     ours, theirs = (
         march(rays, nothing_hidden),
         definition.march(doubled(rays), exact(nothing_hidden)),
@@ -402,7 +404,7 @@ def test_straight_rays_never_skip_what_is_occupied(share: float, rng: torch.Gene
 
 def test_a_gradient_that_the_densities_have_is_added_to(rng: torch.Generator) -> None:
     given = setting("world", 200, rng)
-    moving = medium(given, rng)
+    moving = inputs(given, rng)
     density = moving.density.requires_grad_()
     march(given.rays, moving).weight.sum().backward()
     first, place = density.grad.clone(), density.grad
@@ -416,7 +418,7 @@ def test_a_gradient_that_the_densities_have_is_added_to(rng: torch.Generator) ->
 
 def test_rays_and_gradients_may_lie_in_memory_anyhow(rng: torch.Generator) -> None:
     given = setting("world", 200, rng)
-    moving = medium(given, rng)
+    moving = inputs(given, rng)
     moving.displacement.requires_grad_()
     whole = march(given.rays, moving)
     scattered = Rays(

@@ -21,7 +21,7 @@ from devrf.kernels.trilinear import interpolate
 from devrf.ops import adam, trilinear
 from devrf.ops import march as definition
 from devrf.ops.adam import AdamRule
-from devrf.ops.march import Medium, Path
+from devrf.ops.march import MarchInputs, MarchRange
 from devrf.rendering.occupancy import Occupancy
 
 BOX = Box((-1.0, -0.5, 0.0), (1.0, 1.5, 1.0))
@@ -92,22 +92,22 @@ def test_kernels_are_not_kept_where_others_may_write(tmp_path, mode, private):
     assert list(own.iterdir()) == ([] if private else [own / "devrf-kernels-of-a-killed-run"])
 
 
-def scene(rng: torch.Generator, count: int = 500) -> tuple[Rays, Medium]:
-    """Random rays through a random medium that moves."""
+def scene(rng: torch.Generator, count: int = 500) -> tuple[Rays, MarchInputs]:
+    """Random rays through a random scene that moves."""
     origins, targets = torch.randn(2, count, 3, generator=rng)
     directions = torch.nn.functional.normalize(targets - 2 * origins, dim=1)
     occupancy = Occupancy(torch.rand(9, 8, 7, generator=rng) < 0.4, BOX)
-    medium = Medium(
-        Path(BOX, occupancy.surroundings, 0.05, 0.1, 6.0),
+    inputs = MarchInputs(
+        MarchRange(BOX, occupancy.distances, 0.05, 0.1, 6.0),
         density=4 * torch.randn(6, 7, 5, 1, generator=rng),
         shift=-1.5,
         delta=0.4,
         threshold=0.01,
         displacement=0.15 * torch.randn(7, 3, 5, 3, generator=rng),
         motion_box=BOX.scaled(0.7),
-        still_outside=True,
+        zero_outside_box=True,
     )
-    return Rays(2 * origins, directions, directions), medium
+    return Rays(2 * origins, directions, directions), inputs
 
 
 def test_kernels_take_single_precision_where_they_run() -> None:
@@ -123,10 +123,10 @@ def test_kernels_can_be_left_out(in_torch: None) -> None:
     assert is_supported(torch.zeros(1))
 
 
-def everything(given: tuple[Rays, Medium], points: Tensor, grid: Tensor) -> list[Any]:
+def everything(given: tuple[Rays, MarchInputs], points: Tensor, grid: Tensor) -> list[Any]:
     """What all functions of the kernels give."""
-    rays, medium = given
-    samples = march(rays, medium)
+    rays, inputs = given
+    samples = march(rays, inputs)
     interpolated = interpolate(grid, points, BOX)
     return [*vars(samples).values(), interpolated, *optimised(grid)]
 
@@ -140,14 +140,14 @@ def optimised(grid: Tensor) -> list[Tensor]:
     return [smoothed, *stepped]
 
 
-def by_definition(given: tuple[Rays, Medium], points: Tensor, grid: Tensor) -> list[Any]:
+def by_definition(given: tuple[Rays, MarchInputs], points: Tensor, grid: Tensor) -> list[Any]:
     """The same, by the definitions."""
-    rays, medium = given
+    rays, inputs = given
     stepped = [grid.clone(), grid.clone(), grid.clone(), grid.abs()]
     adam.adam_step(*stepped, AdamRule(0.1, 2))
     smoothed = torch.zeros_like(grid)
     adam.add_total_variation_gradient(grid, smoothed, 0.5)
-    samples = definition.march(rays, medium)
+    samples = definition.march(rays, inputs)
     interpolated = trilinear.interpolate(grid, points, BOX)
     return [*vars(samples).values(), interpolated, smoothed, *stepped]
 
@@ -177,20 +177,20 @@ def test_doubles_are_taken_by_the_definition(rng: torch.Generator) -> None:
     assert places.grad.abs().max() > 0
 
 
-def with_gradients(given: tuple[Rays, Medium], points: Tensor, grid: Tensor) -> list[Tensor]:
+def with_gradients(given: tuple[Rays, MarchInputs], points: Tensor, grid: Tensor) -> list[Tensor]:
     """What all functions give, and all gradients."""
-    rays, medium = given
+    rays, inputs = given
     results = everything(given, points, grid)
-    leaves = [medium.density, medium.displacement, grid, points]
+    leaves = [inputs.density, inputs.displacement, grid, points]
     for leaf in leaves:
         leaf.grad = None
         leaf.requires_grad_()
-    samples = march(rays, medium)
+    samples = march(rays, inputs)
     loss = (samples.canonical**2).sum() + (samples.weight**2).sum()
     loss = loss + (samples.transmittance**2).sum() + (interpolate(grid, points, BOX) ** 2).sum()
     loss.backward()
     # Once more, added to the gradients that are there.
-    (march(rays, medium).weight.sum() + interpolate(grid, points, BOX).sum()).backward()
+    (march(rays, inputs).weight.sum() + interpolate(grid, points, BOX).sum()).backward()
     results += [leaf.grad for leaf in leaves]
     for leaf in leaves:
         leaf.requires_grad_(False)

@@ -12,7 +12,7 @@ from torch.autograd import gradcheck
 from devrf.geometry.box import Box
 from devrf.geometry.contraction import ContractedSpace
 from devrf.geometry.rays import Rays
-from devrf.ops.march import STOP, Medium, Path, march, steps_through
+from devrf.ops.march import STOP, MarchInputs, MarchRange, march, steps_through
 from devrf.rendering.occupancy import Occupancy
 
 BOX = Box((-1.0, -0.5, 0.0), (1.0, 1.5, 1.0))
@@ -27,13 +27,13 @@ def scattered_rays(count, rng):
 
 
 def through(occupancy, step, near, far, *, box=BOX):
-    return Path(box, occupancy.surroundings, step, near, far)
+    return MarchRange(box, occupancy.distances, step, near, far)
 
 
-def fog(path, tau=1e-9, threshold=0.0):
-    """A medium in which every sample has optical depth ``tau``."""
+def fog(limits, tau=1e-9, threshold=0.0):
+    """A scene in which every sample has optical depth ``tau``."""
     density = torch.full((2, 2, 2, 1), math.log(math.expm1(tau)), dtype=torch.float64)
-    return Medium(path, density, shift=0.0, delta=1.0, threshold=threshold)
+    return MarchInputs(limits, density, shift=0.0, delta=1.0, threshold=threshold)
 
 
 def slowly(rays, occupancy, step, near, far):
@@ -73,8 +73,7 @@ def test_curved_rays_find_them_too(high, rng):
     ray = torch.repeat_interleave(count)
     number = torch.arange(len(ray)) - (count.cumsum(0) - count)[ray]
     kept = occupancy.at(rays.at(ray, entry[ray] + 0.05 * number))
-    path = through(occupancy, **limits, box=space.box)
-    samples = march(rays, fog(path))
+    samples = march(rays, fog(through(occupancy, **limits, box=space.box)))
     assert len(samples.ray) > 100 and torch.equal(samples.ray, ray[kept])
     torch.testing.assert_close(samples.distance, (entry[ray] + 0.05 * number)[kept])
 
@@ -93,52 +92,59 @@ def test_sample_places_by_hand(cube):
 def test_weights_by_hand(cube):
     d = torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64)
     rays = Rays(torch.tensor([[-3.0, 0.0, 0.0]], dtype=torch.float64), d, d)
-    path = through(Occupancy.full((5, 5, 5), cube), 0.5, near=0.0, far=9.0, box=cube)
+    limits = through(Occupancy.full((5, 5, 5), cube), 0.5, near=0.0, far=9.0, box=cube)
     # Each of five samples lets a half pass.
-    samples = march(rays, fog(path, math.log(2)))
+    samples = march(rays, fog(limits, math.log(2)))
     assert samples.weight.tolist() == pytest.approx([1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32])
     assert samples.transmittance.item() == pytest.approx(1 / 32)
     # What has too little weight shades all the same.
-    samples = march(rays, fog(path, math.log(2), threshold=0.2))
+    samples = march(rays, fog(limits, math.log(2), threshold=0.2))
     assert samples.weight.tolist() == pytest.approx([1 / 2, 1 / 4])
     assert samples.transmittance.item() == pytest.approx(1 / 32)
     # What is too faint does not.
-    samples = march(rays, fog(path, math.log(2), threshold=0.51))
+    samples = march(rays, fog(limits, math.log(2), threshold=0.51))
     assert len(samples.ray) == len(samples.weight) == 0 and samples.transmittance.item() == 1
 
 
 def test_nothing_is_sampled_behind_what_nothing_is_seen_through(cube):
     d = torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64)
     rays = Rays(torch.tensor([[-3.0, 0.0, 0.0]], dtype=torch.float64), d, d)
-    path = through(Occupancy.full((5, 5, 5), cube), 0.01, near=0.0, far=9.0, box=cube)
-    samples = march(rays, fog(path, math.log(10)))
+    limits = through(Occupancy.full((5, 5, 5), cube), 0.01, near=0.0, far=9.0, box=cube)
+    samples = march(rays, fog(limits, math.log(10)))
     # 10⁻⁴ is not less than STOP, up to rounding.
     assert STOP == 1e-4 and len(samples.ray) in (4, 5)
-    samples = march(rays, fog(path, math.log(9.9)))
+    samples = march(rays, fog(limits, math.log(9.9)))
     assert samples.weight.tolist() == pytest.approx([8.9 / 9.9**k for k in range(1, 6)])
     assert samples.transmittance.item() == pytest.approx(9.9**-5)
 
 
 def test_no_rays_and_missing_rays_give_no_samples(cube):
-    path = through(Occupancy.full((3, 3, 3), cube), 0.1, near=0.0, far=9.0, box=cube)
+    limits = through(Occupancy.full((3, 3, 3), cube), 0.1, near=0.0, far=9.0, box=cube)
     none = Rays(*[torch.zeros(0, 3, dtype=torch.float64)] * 3)
-    assert len(march(none, fog(path)).ray) == 0
+    assert len(march(none, fog(limits)).ray) == 0
     d = torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]], dtype=torch.float64)
     past = Rays(torch.tensor([[-3.0, 2.0, 0.0], [-3.0, 0.0, 0.0]], dtype=torch.float64), d, d)
-    samples = march(past, fog(path))
+    samples = march(past, fog(limits))
     assert len(samples.ray) == 0 and samples.transmittance.tolist() == [1.0, 1.0]
 
 
-@pytest.mark.parametrize("still_outside", [False, True])
-def test_gradients_of_densities_and_displacements(still_outside, rng):
+@pytest.mark.parametrize("zero_outside_box", [False, True])
+def test_gradients_of_densities_and_displacements(zero_outside_box, rng):
     rays = scattered_rays(24, rng)
     # Smaller than the field's box, so that some samples are outside.
     motion_box = Box((-0.6, -0.3, 0.1), (0.7, 1.1, 0.8))
-    path = through(Occupancy.full((3, 4, 3), BOX), 0.4, near=0.3, far=6.0)
+    limits = through(Occupancy.full((3, 4, 3), BOX), 0.4, near=0.3, far=6.0)
 
     def outputs(density, displacement):
-        moving = Medium(
-            path, density, 0.3, 0.8, 0.05, displacement, motion_box, still_outside=still_outside
+        moving = MarchInputs(
+            limits,
+            density,
+            0.3,
+            0.8,
+            0.05,
+            displacement,
+            motion_box,
+            zero_outside_box=zero_outside_box,
         )
         samples = march(rays, moving)
         return samples.canonical, samples.weight, samples.transmittance
@@ -154,14 +160,14 @@ def test_gradients_of_densities_and_displacements(still_outside, rng):
 def test_what_is_outside_of_moving_space_may_stay(cube):
     d = torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64)
     rays = Rays(torch.tensor([[-3.0, 0.0, 0.0]], dtype=torch.float64), d, d)
-    path = through(Occupancy.full((5, 5, 5), cube), 0.5, near=0.0, far=9.0, box=cube)
+    limits = through(Occupancy.full((5, 5, 5), cube), 0.5, near=0.0, far=9.0, box=cube)
     shift = torch.tensor([0.1, 0.2, -0.1], dtype=torch.float64)
     moving = replace(
-        fog(path), displacement=shift.expand(2, 2, 2, 3), motion_box=Box((-0.5,) * 3, (0.5,) * 3)
+        fog(limits), displacement=shift.expand(2, 2, 2, 3), motion_box=Box((-0.5,) * 3, (0.5,) * 3)
     )
     moved = march(rays, moving)
     torch.testing.assert_close(moved.canonical - moved.points, shift.expand(5, 3))
-    still = march(rays, replace(moving, still_outside=True))
+    still = march(rays, replace(moving, zero_outside_box=True))
     # The faces belong to the box.
     moves = torch.tensor([[0.0], [1.0], [1.0], [1.0], [0.0]], dtype=torch.float64)
     torch.testing.assert_close(still.canonical - still.points, moves * shift)

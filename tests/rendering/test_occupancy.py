@@ -37,9 +37,9 @@ def test_distances_are_those_along_the_farthest_axis_up_to_eight(cube):
     cells = torch.cartesian_prod(torch.arange(20), torch.arange(7), torch.arange(9))
     away = [(cells - torch.tensor(one)).abs().amax(dim=1) for one in ((3, 2, 8), (19, 6, 0))]
     expected = torch.minimum(*away).clamp(max=8).view(20, 7, 9)
-    surroundings = occupancy.surroundings
-    assert surroundings.box == cube and surroundings.distances.dtype == torch.uint8
-    assert torch.equal(surroundings.distances.long(), expected)
+    distances = occupancy.distances
+    assert distances.box == cube and distances.cells.dtype == torch.uint8
+    assert torch.equal(distances.cells.long(), expected)
     assert Occupancy.FARTHEST == expected.max() == 8
 
 
@@ -48,7 +48,7 @@ def test_nothing_nearer_than_its_distance_is_occupied(rng):
     box = Box((0.0, 0.0, 0.0), (1.0, 2.0, 4.0))
     occupancy = Occupancy(torch.rand(9, 9, 9, generator=rng) < 0.012, box)
     points = torch.rand(400, 3, generator=rng) * torch.tensor([1.6, 2.6, 4.6]) - 0.3
-    cells = occupancy.surroundings.at(points)
+    cells = occupancy.distances.at(points)
     assert torch.equal(cells == 0, occupancy.at(points))
     assert set(cells.tolist()) >= {0, 1, 2, 3} and cells.max() <= 8
     assert (cells[~box.scaled(1.3).contains(points)] == 1).all()
@@ -90,10 +90,10 @@ def test_a_stored_mask_of_other_shape_and_box_loads_with_its_distances(cube, rng
     box = Box((-2.0, 0.0, 0.0), (2.0, 1.0, 3.0))
     stored = Occupancy(torch.rand(6, 4, 5, generator=rng) < 0.1, box)
     fresh = Occupancy.full((2, 2, 2), cube)
-    assert not fresh.surroundings.distances.any()
+    assert not fresh.distances.cells.any()
     fresh.load_state_dict(stored.state_dict())
-    assert fresh.box == fresh.surroundings.box == box
+    assert fresh.box == fresh.distances.box == box
     assert torch.equal(fresh.mask, stored.mask)
-    assert torch.equal(fresh.surroundings.distances, stored.surroundings.distances)
+    assert torch.equal(fresh.distances.cells, stored.distances.cells)
     points = torch.rand(200, 3, generator=rng) * 5 - 2.5
     assert torch.equal(fresh.at(points), stored.at(points))

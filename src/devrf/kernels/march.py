@@ -29,7 +29,7 @@ from devrf.kernels.runtime import (
 from devrf.kernels.trilinear import add_to_grid
 from devrf.ops import march as definition
 from devrf.ops.compositing import LEAST_MASS
-from devrf.ops.march import EXIT, STOP, Medium, Samples
+from devrf.ops.march import EXIT, STOP, MarchInputs, Samples
 from devrf.ops.trilinear import shape_of
 
 # Half edges of the inner box that a ray moves along any axis while its distance grows by what one
@@ -40,16 +40,16 @@ CONTRACTED_PACE = 3.0
 Density = row_type(1)
 
 
-def march(rays: Rays, medium: Medium) -> Samples:
+def march(rays: Rays, inputs: MarchInputs) -> Samples:
     """As :func:`devrf.ops.march.march`, differentiable once.
 
     A leaf of densities that has a gradient is added to there.
     """
     if not is_supported(rays.origins):
-        return definition.march(rays, medium)
-    kept = medium.density.grad if medium.density.is_leaf else None
+        return definition.march(rays, inputs)
+    kept = inputs.density.grad if inputs.density.is_leaf else None
     results = _March.apply(  # type: ignore[no-untyped-call]
-        medium.density, medium.displacement, rays, medium, kept
+        inputs.density, inputs.displacement, rays, inputs, kept
     )
     return Samples(*results)
 
@@ -61,18 +61,18 @@ class _March(torch.autograd.Function):
         density: Tensor,
         displacement: Tensor | None,
         rays: Rays,
-        medium: Medium,
+        inputs: MarchInputs,
         kept: Tensor | None,
     ) -> tuple[Tensor, ...]:
         device = density.device
-        geometry = _geometry(rays, medium)
+        geometry = _geometry(rays, inputs)
         lines = empty_structs(Ray, len(rays), device)
         counts = torch.empty(len(rays), dtype=torch.int32, device=device)
         # Straight rays have no course; their origins stand in for it.
         course = rays.course if isinstance(rays, ContractedRays) else rays.origins
-        inputs = [each.contiguous() for each in (rays.origins, rays.directions, course)]
-        inputs = [geometry, *inputs, medium.path.near, medium.path.far, lines, counts]
-        launch(enter_kernel, len(rays), inputs, device)
+        arguments = [each.contiguous() for each in (rays.origins, rays.directions, course)]
+        arguments = [geometry, *arguments, inputs.range.near, inputs.range.far, lines, counts]
+        launch(enter_kernel, len(rays), arguments, device)
 
         # Room for all of a ray's samples; how many are visible is known afterwards.
         visible_start, length = _starts(counts)
@@ -82,11 +82,11 @@ class _March(torch.autograd.Function):
         transmittance = torch.empty(len(rays), device=device)
         # Without displacements there is an array that is not read.
         moves = density.new_empty(0, 3) if displacement is None else displacement.contiguous()
-        inputs = [geometry, lines, medium.path.surroundings.distances.flatten()]
-        inputs += [density.contiguous(), moves, int(device.type == "cpu"), visible_start]
-        inputs += [visible, visible_count, significant_count, transmittance]
+        arguments = [geometry, lines, inputs.range.distances.cells.flatten()]
+        arguments += [density.contiguous(), moves, int(device.type == "cpu"), visible_start]
+        arguments += [visible, visible_count, significant_count, transmittance]
         kernel = march_kernel(isinstance(rays, ContractedRays))
-        launch(kernel, len(rays), inputs, device, grain=GRAIN_OF_RAYS)
+        launch(kernel, len(rays), arguments, device, grain=GRAIN_OF_RAYS)
 
         start, length = _starts(significant_count)
         ray = torch.empty(length, dtype=torch.int64, device=device)
@@ -95,9 +95,9 @@ class _March(torch.autograd.Function):
         canonical = torch.empty(length, 3, device=device)
         weight = torch.empty(length, device=device)
         depth = torch.empty(len(rays), device=device)
-        inputs = [geometry, lines, visible_start, visible, visible_count, start]
-        inputs += [ray, distance, points, canonical, weight, depth]
-        launch(keep_significant_kernel, len(rays), inputs, device)
+        arguments = [geometry, lines, visible_start, visible, visible_count, start]
+        arguments += [ray, distance, points, canonical, weight, depth]
+        launch(keep_significant_kernel, len(rays), arguments, device)
 
         fixed = displacement is None or not displacement.requires_grad
         ctx.mark_non_differentiable(ray, distance, points, depth, *([canonical] if fixed else []))
@@ -106,33 +106,33 @@ class _March(torch.autograd.Function):
             density, displacement, visible_start, visible_count, stop, transmittance
         )
         ctx.geometry, ctx.lines, ctx.visible = geometry, lines, visible
-        ctx.medium, ctx.kept = medium, kept
+        ctx.inputs, ctx.kept = inputs, kept
         return ray, distance, points, canonical, weight, transmittance, depth
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         density, displacement, visible_start, visible_count, stop, transmittance = ctx.saved_tensors
-        medium, device = ctx.medium, density.device
+        inputs, device = ctx.inputs, density.device
         given = [stop, *(each.contiguous() for each in gradients[3:6]), transmittance]
         start, length = _starts(visible_count)
         raw = torch.empty(length, 1, device=device)
         moved = torch.empty(length, 3, device=device)
         points = torch.empty(length, 3, device=device)
         canonical = torch.empty(length, 3, device=device)
-        inputs = [ctx.geometry, ctx.lines, density.contiguous()]
-        inputs += [visible_start, ctx.visible, visible_count]
-        inputs += [*given, start, raw, moved, points, canonical]
-        launch(adjoint_kernel, len(visible_count), inputs, device, grain=GRAIN_OF_RAYS)
+        arguments = [ctx.geometry, ctx.lines, density.contiguous()]
+        arguments += [visible_start, ctx.visible, visible_count]
+        arguments += [*given, start, raw, moved, points, canonical]
+        launch(adjoint_kernel, len(visible_count), arguments, device, grain=GRAIN_OF_RAYS)
 
         of_density = of_displacement = None
         if ctx.needs_input_grad[0]:
             of_density = torch.zeros_like(density) if ctx.kept is None else None
             into = ctx.kept if of_density is None else of_density
-            add_to_grid(into, canonical, raw, medium.path.box)
+            add_to_grid(into, canonical, raw, inputs.range.box)
         if ctx.needs_input_grad[1]:
             of_displacement = torch.zeros_like(displacement)
-            add_to_grid(of_displacement, points, moved, medium.motion_box)
+            add_to_grid(of_displacement, points, moved, inputs.motion_box)
         return of_density, of_displacement, None, None, None
 
 
@@ -142,21 +142,21 @@ def _starts(counts: Tensor) -> tuple[Tensor, int]:
     return stops - counts, int(stops[-1]) if len(stops) else 0
 
 
-def _geometry(rays: Rays, medium: Medium) -> Geometry:
-    surroundings = medium.path.surroundings
+def _geometry(rays: Rays, inputs: MarchInputs) -> Geometry:
+    distances = inputs.range.distances
     motion = None
-    if medium.displacement is not None and medium.motion_box is not None:
-        motion = grid_over(medium.motion_box, shape_of(medium.displacement))
+    if inputs.displacement is not None and inputs.motion_box is not None:
+        motion = grid_over(inputs.motion_box, shape_of(inputs.displacement))
     return geometry_of(
-        density=grid_over(medium.path.box, shape_of(medium.density)),
-        occupancy=grid_over(surroundings.box, shape_of(surroundings.distances)),
+        density=grid_over(inputs.range.box, shape_of(inputs.density)),
+        occupancy=grid_over(distances.box, shape_of(distances.cells)),
         motion=motion,
-        still_outside=medium.still_outside,
+        zero_outside_box=inputs.zero_outside_box,
         space=rays.space if isinstance(rays, ContractedRays) else None,
-        step=medium.path.step,
-        shift=medium.shift,
-        delta=medium.delta,
-        threshold=medium.threshold,
+        step=inputs.range.step,
+        shift=inputs.shift,
+        delta=inputs.delta,
+        threshold=inputs.threshold,
     )
 
 
@@ -166,21 +166,21 @@ def geometry_of(
     density: Grid,
     occupancy: Grid,
     motion: Grid | None,
-    still_outside: bool,
+    zero_outside_box: bool,
     space: ContractedSpace | None,
     step: float,
     shift: float,
     delta: float,
     threshold: float,
 ) -> Geometry:
-    """What rays are followed through; with a ``space``, rays in contracted space."""
+    """Grids and settings of a march; with a ``space``, of rays in contracted space."""
     geometry = Geometry()
     geometry.density = density
     geometry.occupancy = occupancy
     if motion is not None:
         geometry.moves = 1
         geometry.motion = motion
-        geometry.still_outside = int(still_outside)
+        geometry.zero_outside_box = int(zero_outside_box)
     if space is not None:
         inner = space.inner()
         geometry.contracted = 1
@@ -201,27 +201,27 @@ def geometry_of(
 
 @wp.struct
 class Geometry:
-    """What rays are followed through.
+    """Grids and settings of a march.
 
     Attributes:
-        density: where the grid of raw densities is.
-        occupancy: where the grid of distances to occupied cells is.
-        motion: where the grid of displacements is.
+        density: the grid of raw densities.
+        occupancy: the grid of distances to occupied cells.
+        motion: the grid of displacements.
         moves: 1 where there are displacements, else 0.
-        still_outside: 1 where nothing moves outside the motion's grid, else 0.
+        zero_outside_box: 1 where nothing moves outside the motion's grid, else 0.
         contracted: 1 in contracted space, else 0.
         center: of the contracted space's inner box.
         half: its half edges.
         shell: its shell's thickness in half edges.
         faintest: the raw density whose opacity is the threshold.
-        step, shift, delta, threshold: as of a ``Medium`` and its ``Path``.
+        step, shift, delta, threshold: as of a ``MarchInputs`` and its ``MarchRange``.
     """
 
     density: Grid
     occupancy: Grid
     motion: Grid
     moves: int
-    still_outside: int
+    zero_outside_box: int
     contracted: int
     center: wp.vec3
     half: wp.vec3
@@ -320,7 +320,7 @@ def warped(geometry: Geometry, displacements: wp.array(dtype=wp.vec3), point: wp
     """q = x + Δ(x)."""
     if geometry.moves == 0:
         return point
-    if geometry.still_outside == 1:
+    if geometry.zero_outside_box == 1:
         if wp.min(inside(geometry.motion, point)) == 0.0:
             return point
     row, fraction = cell(geometry.motion, point)
@@ -569,7 +569,7 @@ def adjoint_kernel(
             row, fraction = cell(geometry.density, sample.canonical)
             change = slope(density, Density(slope_of_raw), geometry.density, row, fraction)
             slope_of_canonical += wp.cw_mul(change, inside(geometry.density, sample.canonical))
-            if geometry.still_outside == 1:
+            if geometry.zero_outside_box == 1:
                 slope_of_canonical *= wp.min(inside(geometry.motion, point))
             result_points[into] = point
             result_moved[into] = slope_of_canonical

@@ -14,7 +14,7 @@ from torch.nn.functional import softplus
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 from devrf.ops.compositing import composite, mean_distance, transmittances
-from devrf.ops.trilinear import interpolate
+from devrf.ops.trilinear import interpolate, shape_of
 
 # A ray ends where its transmittance is less: what is behind cannot be seen.
 STOP = 1e-4
@@ -23,76 +23,76 @@ EXIT = 1e-3
 
 
 @dataclass(frozen=True)
-class Surroundings:
-    """How far it is to what is occupied, so that empty space is not sampled.
+class OccupancyDistances:
+    """Distances to the nearest occupied cell, so that empty space is not sampled.
 
     Attributes:
-        distances: (X, Y, Z) uint8, from each grid point the cells to the nearest occupied one along
-            the axis along which it is farthest, at least; 0 in occupied cells.
-        box: the box of the grid; a point is looked up at its nearest grid point, and outside the
-            box everything is empty.
+        cells: (X, Y, Z) uint8, from each grid point at least so many cells to the nearest occupied
+            one, along the axis along which it is farthest; 0 in occupied cells.
+        box: the box of the grid; a point reads its nearest grid point, and outside the box
+            everything is empty.
     """
 
-    distances: Tensor
+    cells: Tensor
     box: Box
 
     def at(self, points: Tensor) -> Tensor:
         """Distances (M,) uint8 at ``points`` (M, 3); outside the box 1."""
-        shape = self.distances.shape
-        place = self.box.to_grid(points, (shape[0], shape[1], shape[2])).round().long()
+        shape = shape_of(self.cells)
+        index = self.box.to_grid(points, shape).round().long()
         size = torch.tensor(shape, device=points.device)
-        inside = ((place >= 0) & (place < size)).all(dim=1)
-        x, y, z = place.clamp(min=0).minimum(size - 1).unbind(1)
-        return torch.where(inside, self.distances[x, y, z], 1)
+        inside = ((index >= 0) & (index < size)).all(dim=1)
+        x, y, z = index.clamp(min=0).minimum(size - 1).unbind(1)
+        return torch.where(inside, self.cells[x, y, z], 1)
 
 
 @dataclass(frozen=True)
-class Path:
-    """Where rays are sampled.
+class MarchRange:
+    """The part of rays that is sampled.
 
     Attributes:
-        box: nothing is outside.
-        surroundings: where something may be.
+        box: rays are sampled inside it.
+        distances: occupied cells are sampled.
         step: the distance between samples, in units of the rays' directions.
-        near: the distance before which nothing is sampled.
-        far: the distance behind which nothing is sampled.
+        near: the distance of the first sample, at least.
+        far: the distance of the last sample, at most.
     """
 
     box: Box
-    surroundings: Surroundings
+    distances: OccupancyDistances
     step: float
     near: float
     far: float
 
 
 @dataclass(frozen=True)
-class Medium:
-    """What rays are followed through.
+class MarchInputs:
+    """A scene at one time, as the march reads it.
 
     Attributes:
-        path: where rays are sampled, within the box of the densities.
+        range: the part of rays that is sampled, within the box of the densities.
         density: (X, Y, Z, 1) raw densities v.
         shift: b, added to raw densities.
         delta: δ, the length of a step in base voxels.
         threshold: the opacity, and then the weight, from which on a sample is worth a colour.
         displacement: (X, Y, Z, 3) Δ of x → q = x + Δ(x); None is the identity.
         motion_box: where the displacements lie; None without.
-        still_outside: whether Δ is 0 outside that box; else it is as on its border.
+        zero_outside_box: whether Δ is 0 outside that box; else it is as on its border.
     """
 
-    path: Path
+    range: MarchRange
     density: Tensor
     shift: float
     delta: float
     threshold: float
     displacement: Tensor | None = None
     motion_box: Box | None = None
-    still_outside: bool = False
+    zero_outside_box: bool = False
 
 
 @dataclass(frozen=True)
 class Samples:
-    """What R rays meet: K samples that are worth a colour, by ray, then front to back.
+    """K samples of R rays that are worth a colour, by ray, then front to back.
 
     Attributes:
         ray: (K,) int64, ascending, the ray of each.
@@ -114,7 +114,7 @@ class Samples:
     depth: Tensor
 
 
-def march(rays: Rays, medium: Medium) -> Samples:
+def march(rays: Rays, inputs: MarchInputs) -> Samples:
     """Samples every step from a ray's entry into the box to its exit, in occupied cells.
 
     The k-th of a ray is at entry + k·step. Those of too low an opacity count as empty, and what is
@@ -123,21 +123,21 @@ def march(rays: Rays, medium: Medium) -> Samples:
 
     Args:
         rays: R rays.
-        medium: what they are followed through.
+        inputs: the scene at the rays' time.
     """
-    ray, distance, points = samples_in_box(rays, medium.path)
-    occupied = (medium.path.surroundings.at(points) == 0).nonzero()[:, 0]
+    ray, distance, points = samples_in_box(rays, inputs.range)
+    occupied = (inputs.range.distances.at(points) == 0).nonzero()[:, 0]
     ray, distance, points = ray[occupied], distance[occupied], points[occupied]
-    canonical = warped(points, medium)
-    raw = interpolate(medium.density, canonical, medium.path.box)[:, 0]
-    tau = softplus(raw + medium.shift) * medium.delta
+    canonical = warped(points, inputs)
+    raw = interpolate(inputs.density, canonical, inputs.range.box)[:, 0]
+    tau = softplus(raw + inputs.shift) * inputs.delta
 
     with torch.no_grad():
-        visible = (-torch.expm1(-tau) >= medium.threshold).nonzero()[:, 0]
-        left = transmittances(tau[visible], ray[visible], len(rays))
-        visible = visible[left >= STOP]
+        visible = (-torch.expm1(-tau) >= inputs.threshold).nonzero()[:, 0]
+        before = transmittances(tau[visible], ray[visible], len(rays))
+        visible = visible[before >= STOP]
     weight, transmittance = composite(tau[visible], ray[visible], len(rays))
-    significant = (weight >= medium.threshold).nonzero()[:, 0]
+    significant = (weight >= inputs.threshold).nonzero()[:, 0]
     kept = visible[significant]
     depth = mean_distance(weight[significant], distance[kept], ray[kept], len(rays))
     return Samples(
@@ -151,21 +151,23 @@ def march(rays: Rays, medium: Medium) -> Samples:
     )
 
 
-def samples_in_box(rays: Rays, path: Path) -> tuple[Tensor, Tensor, Tensor]:
+def samples_in_box(rays: Rays, limits: MarchRange) -> tuple[Tensor, Tensor, Tensor]:
     """Ray (S,), distance (S,) and position (S, 3) of all samples, in empty space, too."""
-    entry, count = steps_through(rays, path.box, step=path.step, near=path.near, far=path.far)
+    entry, count = steps_through(
+        rays, limits.box, step=limits.step, near=limits.near, far=limits.far
+    )
     ray, number = numbered(count)
-    distance = entry[ray] + path.step * number
+    distance = entry[ray] + limits.step * number
     return ray, distance, rays.at(ray, distance)
 
 
-def warped(points: Tensor, medium: Medium) -> Tensor:
+def warped(points: Tensor, inputs: MarchInputs) -> Tensor:
     """q = x + Δ(x) (M, 3) of ``points`` x (M, 3)."""
-    if medium.displacement is None or medium.motion_box is None:
+    if inputs.displacement is None or inputs.motion_box is None:
         return points
-    move = interpolate(medium.displacement, points, medium.motion_box)
-    if medium.still_outside:
-        move = torch.where(medium.motion_box.contains(points)[:, None], move, 0.0)
+    move = interpolate(inputs.displacement, points, inputs.motion_box)
+    if inputs.zero_outside_box:
+        move = torch.where(inputs.motion_box.contains(points)[:, None], move, 0.0)
     return points + move
 
 

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from devrf.geometry.box import Box
-from devrf.ops.march import Surroundings
+from devrf.ops.march import OccupancyDistances
 from devrf.system.plain_data import built
 
 
@@ -39,9 +39,9 @@ class Occupancy(nn.Module):
         return Occupancy(torch.ones(shape, dtype=torch.bool), box)
 
     @property
-    def surroundings(self) -> Surroundings:
+    def distances(self) -> OccupancyDistances:
         """How many cells away something may be, so that rays can skip what is empty."""
-        return Surroundings(self.find_distances(), self.box)
+        return OccupancyDistances(self.find_distances(), self.box)
 
     def find_distances(self) -> Tensor:
         """Cells (X, Y, Z) to the nearest occupied one, uint8, found once for a mask."""

@@ -18,7 +18,7 @@ from devrf.methods.devrf.canonical_field import (
     SigmoidColor,
     VoxelGrid,
 )
-from devrf.methods.devrf.volume_rendering import medium
+from devrf.methods.devrf.volume_rendering import march_inputs
 from devrf.ops.compositing import composite
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.sampling import RenderSettings
@@ -155,7 +155,7 @@ def test_samples_are_evenly_spaced_from_the_first_plane_to_the_last():
     settings = RenderSettings(step=0.5, alpha_threshold=0.0, near=0.0, far=1.0)
     with torch.no_grad():
         field.density.values.fill_(-60.0)  # nothing is hidden
-        samples = march(ray, medium(field, everywhere, settings))
+        samples = march(ray, march_inputs(field, everywhere, settings))
     count = (PLANES - 1) * 2 + 1
     assert len(samples.ray) == count
     depth = samples.points[:, 2]

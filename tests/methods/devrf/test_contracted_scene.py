@@ -36,7 +36,7 @@ def test_displacements_are_zero_outside_where_they_are_asked_to_be():
     points = torch.tensor([[0.5, 0.0, 0.0], [1.0, 1.0, 1.0], [1.001, 0.0, 0.0], [0.0, 1.4, 0.0]])
     grid, box = torch.full((3, 3, 3, 3), 0.25), SPACE.inner()
     assert torch.equal(GridWarp((grid,), box)(points), points + 0.25)
-    still = GridWarp((grid,), box, still_outside=True)
+    still = GridWarp((grid,), box, zero_outside_box=True)
     moved = still(points)
     torch.testing.assert_close(moved[:2], points[:2] + 0.25)
     assert torch.equal(moved[2:], points[2:])
@@ -44,13 +44,13 @@ def test_displacements_are_zero_outside_where_they_are_asked_to_be():
 
 def test_a_field_knows_that_what_is_outside_stays():
     clock = FrameClock((0.0, 1.0))
-    field = DeformationField(SPACE.inner(), clock, voxels=27, still_outside=True)
+    field = DeformationField(SPACE.inner(), clock, voxels=27, zero_outside_box=True)
     field.to_canonical[1:] = 0.25
     outside = torch.tensor([[1.3, 0.0, 0.0]])
     assert torch.equal(field.warp(outside, 1.0), outside)
     again = DeformationField(Box((0.0,) * 3, (1.0,) * 3), clock, voxels=8)
     again.set_extra_state(field.get_extra_state())
-    assert again.still_outside and again.box == SPACE.inner()
+    assert again.zero_outside_box and again.box == SPACE.inner()
 
 
 @pytest.fixture
@@ -65,7 +65,7 @@ def model() -> DeVRFModel:
         canonical.density.values[solid] = 12.0
         canonical.color.values.copy_(torch.randn(*canonical.color.shape, 4))
     motion = DeformationField(
-        SPACE.inner(), FrameClock((0.0, 0.5, 1.0)), voxels=8**3, still_outside=True
+        SPACE.inner(), FrameClock((0.0, 0.5, 1.0)), voxels=8**3, zero_outside_box=True
     )
     motion.to_canonical[1, ..., 0], motion.to_canonical[2, ..., 0] = -0.1, -0.2
     settings = RenderSettings(step=0.5, alpha_threshold=1e-3, near=0.2, far=math.inf)
@@ -157,7 +157,7 @@ def test_a_room_is_learned_and_moves_inside_the_inner_box(tiny_room, trainer):
         extensions={"tracks": StartAlongFlow("flow")},
     )
     trainer(max_epochs=1).fit(moving, datamodule=data)
-    assert moving.field.box == room.space.inner(room.bounds.box) and moving.field.still_outside
+    assert moving.field.box == room.space.inner(room.bounds.box) and moving.field.zero_outside_box
     far = torch.tensor([[room.bounds.box.high[0], 0.0, 0.0]])
     assert torch.equal(moving.scene_model.deformation.warp(far, 1.0), far)
     assert bool(moving.field.to_canonical[1].any())

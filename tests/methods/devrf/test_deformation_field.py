@@ -48,10 +48,10 @@ def test_between_frames_by_hand(cube):
     torch.testing.assert_close(field.unwarp(x, 0.3), x)
 
 
-@pytest.mark.parametrize("still_outside", [False, True])
+@pytest.mark.parametrize("zero_outside_box", [False, True])
 @pytest.mark.parametrize("time", [0.0, 0.2, 0.3])
-def test_the_points_of_any_grid_are_moved_as_points_are(cube, time, still_outside):
-    field = DeformationField(cube, CLOCK, voxels=80, planes=3, still_outside=still_outside)
+def test_the_points_of_any_grid_are_moved_as_points_are(cube, time, zero_outside_box):
+    field = DeformationField(cube, CLOCK, voxels=80, planes=3, zero_outside_box=zero_outside_box)
     field.to_canonical[1:].normal_()
     # A grid that reaches out of the field on some sides, one that shares its faces, one within.
     larger = Box((-1.5, -1.0, -0.5), (1.0, 2.0, 0.5))

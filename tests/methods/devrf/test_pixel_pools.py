@@ -14,7 +14,7 @@ from devrf.geometry.rays import Rays
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.pixel_pools import HIT_CELLS, block_size, rays_hit_occupied, rays_that_hit
-from devrf.ops.march import Path, samples_in_box
+from devrf.ops.march import MarchRange, samples_in_box
 from devrf.rendering.occupancy import Occupancy, dilate
 from devrf.rendering.sampling import RenderSettings
 
@@ -36,18 +36,18 @@ def test_a_ray_hits_what_is_two_cells_away_and_nothing_farther(
 ) -> None:
     mask = torch.zeros(21, 21, 21, dtype=torch.bool)
     mask[10, 10, 10] = True
-    surroundings = Occupancy(mask, cube).surroundings
+    distances = Occupancy(mask, cube).distances
     heights = torch.tensor([0.0, 0.1, 0.2, 0.24, 0.26, 0.3], dtype=kind)
     origins = torch.stack([torch.full_like(heights, -3.0), heights, 0 * heights], dim=1)
     along_x = torch.tensor([[1.0, 0.0, 0.0]], dtype=kind).expand(6, 3)
     rays = Rays(origins, along_x, along_x)
     # Cells are 0.1 wide, and points belong to the nearest.
     assert HIT_CELLS == 2
-    path = Path(cube, surroundings, step=0.1, near=0.0, far=9.0)
-    assert rays_that_hit(rays, path).tolist() == [True] * 4 + [False] * 2
-    before = Path(cube, surroundings, step=0.1, near=0.0, far=2.74)
+    limits = MarchRange(cube, distances, step=0.1, near=0.0, far=9.0)
+    assert rays_that_hit(rays, limits).tolist() == [True] * 4 + [False] * 2
+    before = MarchRange(cube, distances, step=0.1, near=0.0, far=2.74)
     assert not rays_that_hit(rays, before).any()
-    assert rays_that_hit(rays[:0], path).shape == (0,)
+    assert rays_that_hit(rays[:0], limits).shape == (0,)
 
 
 @pytest.mark.parametrize("kind", [torch.float32, torch.float64])
@@ -61,10 +61,10 @@ def test_a_ray_with_a_sample_in_an_occupied_cell_is_never_left_out(
     rays = CURVED.rays(rays) if curved else rays
     occupancy = Occupancy(torch.rand(24, 20, 28, generator=rng) < share, box)
     far = math.inf if curved else 6.0
-    path = Path(box, occupancy.surroundings, step=0.02, near=0.1, far=far)
-    ray, _, points = samples_in_box(rays, path)
+    limits = MarchRange(box, occupancy.distances, step=0.02, near=0.1, far=far)
+    ray, _, points = samples_in_box(rays, limits)
     seen = ray[occupancy.at(points)].unique()
-    coarse = Path(box, occupancy.surroundings, occupancy.cell / rays.pace, near=0.1, far=far)
+    coarse = MarchRange(box, occupancy.distances, occupancy.cell / rays.pace, near=0.1, far=far)
     hits = rays_that_hit(rays, coarse)
     assert len(seen) > 25 and hits[seen].all() and not hits.all()
 
@@ -94,8 +94,8 @@ def test_no_pixel_that_meets_matter_is_left_out(cube: Box, by: int, block: int) 
     together = rays_hit_occupied(cameras, torch.tensor([0, 0, 0]), model, occupancy)
     found = together[0]
     assert torch.equal(together, found.expand(3, -1))
-    path = Path(cube, occupancy.surroundings, step=0.03, near=0.1, far=9.0)
-    ray, _, points = samples_in_box(cameras.image_rays(0), path)
+    limits = MarchRange(cube, occupancy.distances, step=0.03, near=0.1, far=9.0)
+    ray, _, points = samples_in_box(cameras.image_rays(0), limits)
     seen = torch.zeros(width * height, dtype=torch.bool)
     seen[ray[occupancy.at(points)]] = True
     assert found.shape == seen.shape

@@ -48,7 +48,7 @@ from devrf.geometry.ndc import NormalizedDevice
 from devrf.methods.devrf.canonical_field import ColorDecoder
 from devrf.methods.devrf.deformation_field import DeformationField, GridWarp
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.volume_rendering import deformed_occupancy, medium
+from devrf.methods.devrf.volume_rendering import deformed_occupancy, march_inputs
 from devrf.ops.trilinear import shape_of
 from devrf.rendering.occupancy import Occupancy, dilate
 from devrf.rendering.renderable import Renderable
@@ -132,7 +132,7 @@ def _parts(model: DeVRFModel, eyes: Tensor) -> Iterator[tuple[str, Tensor]]:
     residual = model.color_residual
     seen = _seen(motion, rest.cell, occupied) if motion else []
     for part, mask in ({"rest": rest.mask} | dict(enumerate(seen))).items():
-        yield f"distances-{part}", Occupancy(mask, model.box).surroundings.distances
+        yield f"distances-{part}", Occupancy(mask, model.box).distances.cells
     for k in range(len(motion.clock) if motion else 0):
         assert motion is not None
         mask = torch.stack(seen[max(k - 1, 0) : k + 1]).any(dim=0)
@@ -213,7 +213,7 @@ def _description(model: DeVRFModel, viewpoints: Viewpoints) -> dict[str, Any]:
     motion = model.deformation
     space = model.space
     sampling = model.at(0.0).picture_settings
-    path = medium(field, model.occupancy, sampling).path
+    path = march_inputs(field, model.occupancy, sampling).range
     inner = space.inner(model.box)
     decoder = field.decoder
     assert isinstance(decoder, ColorDecoder)
@@ -247,7 +247,7 @@ def _description(model: DeVRFModel, viewpoints: Viewpoints) -> dict[str, Any]:
         uniforms |= {"innerHalf": [edge / 2 for edge in inner.size], "shell": space.shell}
     if motion is not None:
         uniforms |= {"motionLow": motion.box.low, "motionHigh": motion.box.high}
-        uniforms["stillOutside"] = motion.still_outside
+        uniforms["stillOutside"] = motion.zero_outside_box
         uniforms["motionStep"] = ROUNDED * model.occupancy.cell
     static = viewpoints.static
     return {

@@ -30,13 +30,13 @@ class GridWarp:
             between which t lies; none is the identity.
         box: where the grids live.
         weight: λ in [0, 1].
-        still_outside: whether Δ is 0 outside the box; else it is as on the border.
+        zero_outside_box: whether Δ is 0 outside the box; else it is as on the border.
     """
 
     slices: tuple[Tensor, ...]
     box: Box
     weight: float = 0.0
-    still_outside: bool = False
+    zero_outside_box: bool = False
 
     @property
     def displacement(self) -> Tensor | None:
@@ -52,7 +52,7 @@ class GridWarp:
             return points
         moves = [interpolate(frame, points, self.box) for frame in self.slices]
         move = moves[0] if len(moves) == 1 else moves[0].lerp(moves[1], self.weight)
-        if self.still_outside:
+        if self.zero_outside_box:
             move = torch.where(self.box.contains(points)[:, None], move, 0.0)
         return points + move
 
@@ -83,7 +83,7 @@ class GridWarp:
         place = (line.clamp(low, high) - low) * ((points - 1) / (high - low))
         away = (place[:, None] - torch.arange(points, device=line.device)).abs()
         weights = (1 - away).clamp(min=0)
-        if self.still_outside:
+        if self.zero_outside_box:
             weights *= ((line >= low) & (line <= high))[:, None]
         return weights
 
@@ -93,7 +93,7 @@ class DeformationField(FrameField):
 
     Attributes:
         frames: the displacements of all frames, in the box's units.
-        still_outside: whether nothing moves outside the box, which is then smaller than the
+        zero_outside_box: whether nothing moves outside the box, which is then smaller than the
             canonical field's; else displacements are as on the border there.
     """
 
@@ -104,11 +104,11 @@ class DeformationField(FrameField):
         voxels: int,
         planes: int | None = None,
         *,
-        still_outside: bool = False,
+        zero_outside_box: bool = False,
     ) -> None:
         """Zero displacements of T frames on grids of :meth:`~devrf.geometry.box.Box.grid_shape`."""
         super().__init__(box, clock)
-        self.still_outside = still_outside
+        self.zero_outside_box = zero_outside_box
         self.frames = FrameStore(len(clock), box.grid_shape(voxels, planes))
 
     @property
@@ -140,13 +140,13 @@ class DeformationField(FrameField):
 
     def warp_by(self, *slices: Tensor) -> GridWarp:
         """The map by ``slices`` (X, Y, Z, 3) over the field's box; by none, the identity."""
-        return GridWarp(slices, self.box, still_outside=self.still_outside)
+        return GridWarp(slices, self.box, zero_outside_box=self.zero_outside_box)
 
     def _at(self, frames: Tensor, time: float) -> GridWarp:
         moment, here = self.clock.at(time), self.frames.here
         chosen = [moment.before, moment.after] if moment.weight else [moment.before]
         slices = () if chosen == [0] else tuple(frames[k].to(here) for k in chosen)
-        return GridWarp(slices, self.box, moment.weight, self.still_outside)
+        return GridWarp(slices, self.box, moment.weight, self.zero_outside_box)
 
     @torch.no_grad()
     def resize(self, voxels: int, planes: int | None = None) -> None:
@@ -154,11 +154,11 @@ class DeformationField(FrameField):
         self.frames.resize(self.box.grid_shape(voxels, planes))
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Box and clock, as plain numbers, and whether nothing moves outside."""
-        outside = {"still_outside": True} if self.still_outside else {}
+        """Box and clock as plain numbers; where nothing moves outside, by the name in format 5."""
+        outside = {"still_outside": True} if self.zero_outside_box else {}
         return super().get_extra_state() | outside
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_extra_state` gave."""
         super().set_extra_state(state)
-        self.still_outside = bool(state.get("still_outside"))
+        self.zero_outside_box = bool(state.get("still_outside"))

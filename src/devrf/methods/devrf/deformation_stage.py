@@ -214,7 +214,7 @@ class DeformationStage(Stage):
         box = model.space.inner(model.box)
         voxels, planes = self.schedule.grid(0)
         model.deformation = DeformationField(
-            box, self.scene.clock, voxels, planes, still_outside=box != model.box
+            box, self.scene.clock, voxels, planes, zero_outside_box=box != model.box
         )
         device = self.trainer.strategy.root_device
         model.deformation.frames.keep(

@@ -14,7 +14,7 @@ from devrf.geometry.cameras import Cameras
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import WorldSpace
 from devrf.kernels.march import march
-from devrf.ops.march import Medium, Path
+from devrf.ops.march import MarchInputs, MarchRange
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.renderable import Renderable
 from devrf.scenes.scene import Views
@@ -59,27 +59,28 @@ def rays_hit_occupied(
         some = images[start : start + together]
         rays = coarse.rays(some.repeat_interleave(len(pixels)), pixels.repeat(len(some), 1))
         field_rays = model.space.rays(rays)
-        path = Path(
+        limits = MarchRange(
             box=model.box,
-            surroundings=occupancy.surroundings,
+            distances=occupancy.distances,
             step=occupancy.cell / max(field_rays.pace, 1e-9),
             near=near,
             far=far,
         )
-        hit = rays_that_hit(field_rays, path)
+        hit = rays_that_hit(field_rays, limits)
         rows = hit.view(-1, height, width).repeat_interleave(block, dim=1)[:, : cameras.height]
         masks.append(rows.repeat_interleave(block, dim=2)[:, :, : cameras.width].flatten(1))
     return torch.cat(masks)
 
 
 @torch.no_grad()
-def rays_that_hit(rays: Rays, path: Path) -> Tensor:
+def rays_that_hit(rays: Rays, limits: MarchRange) -> Tensor:
     """Mask (R,): which rays have a sample at most ``HIT_CELLS`` cells away from an occupied one."""
-    distances = path.surroundings.distances.clamp(min=HIT_CELLS) - HIT_CELLS
-    near = replace(path, surroundings=replace(path.surroundings, distances=distances))
+    distances = limits.distances
+    cells = distances.cells.clamp(min=HIT_CELLS) - HIT_CELLS
+    near = replace(limits, distances=replace(distances, cells=cells))
     # Where all is opaque a ray ends at its first sample.
-    wall = distances.new_full((2, 2, 2, 1), 100, dtype=rays.origins.dtype)
-    samples = march(rays, Medium(near, density=wall, shift=0.0, delta=1.0, threshold=0.5))
+    wall = cells.new_full((2, 2, 2, 1), 100, dtype=rays.origins.dtype)
+    samples = march(rays, MarchInputs(near, density=wall, shift=0.0, delta=1.0, threshold=0.5))
     return samples.transmittance < 0.5
 
 

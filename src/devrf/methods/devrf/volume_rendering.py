@@ -14,7 +14,7 @@ from devrf.kernels.march import march
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.deformation_field import GridWarp
 from devrf.ops.compositing import sum_by_ray
-from devrf.ops.march import Medium, Path
+from devrf.ops.march import MarchInputs, MarchRange
 from devrf.ops.trilinear import Shape
 from devrf.rendering.occupancy import Occupancy, dilate
 from devrf.rendering.output import ColorChange, VoxelOutput
@@ -48,7 +48,7 @@ def render(
         What the rays see; differentiable in the parameters of field, warp and colour change.
     """
     with span("sampling"):
-        samples = march(rays, medium(field, occupancy, settings, warp))
+        samples = march(rays, march_inputs(field, occupancy, settings, warp))
     with span("decoder"):
         residual = None if color_change is None else color_change(samples.canonical)
         color = field.rgb(samples.canonical, rays.viewdirs, samples.ray, precision, residual)
@@ -69,30 +69,30 @@ def render(
     )
 
 
-def medium(
+def march_inputs(
     field: CanonicalField,
     occupancy: Occupancy,
     settings: RenderSettings,
     warp: GridWarp | None = None,
-) -> Medium:
-    """What rays are followed through: a field, where it is occupied, and its warp."""
+) -> MarchInputs:
+    """A field, its occupancy and its warp, as the march reads them."""
     displacement = None if warp is None else warp.displacement
-    path = Path(
+    limits = MarchRange(
         box=field.box,
-        surroundings=occupancy.surroundings,
+        distances=occupancy.distances,
         step=field.step_length(settings.step),
         near=settings.near,
         far=settings.far,
     )
-    return Medium(
-        path=path,
+    return MarchInputs(
+        range=limits,
         density=field.density.values,
         shift=field.shift,
         delta=field.step_in_base_voxels(settings.step),
         threshold=settings.alpha_threshold,
         displacement=displacement,
         motion_box=None if warp is None or displacement is None else warp.box,
-        still_outside=warp is not None and warp.still_outside,
+        zero_outside_box=warp is not None and warp.zero_outside_box,
     )
 
 

@@ -258,7 +258,7 @@ def start_from_tracks(
         space: the space that the field lives in.
         steps: optimiser steps of each fit.
     """
-    if field.still_outside:
+    if field.zero_outside_box:
         tracks = tracks[field.box.contains(tracks.canonical)]
     if len(tracks) == 0:
         return
