@@ -9,7 +9,7 @@ import torch
 
 from devrf.data.batch import (
     BackgroundColor,
-    FramePool,
+    FrameSortedPixels,
     PixelPool,
     all_pixels,
     concatenated,
@@ -178,6 +178,6 @@ def test_what_is_beside_an_image_is_never_drawn(two_sizes):
     first = {(0, 24 * row + column) for row in range(18) for column in range(18)}
     assert places == first | {(1, number) for number in range(24 * 16)}
     # The middle is that of the image: rows 4 to 13 and columns 4 to 13 of 18.
-    middle = FramePool.of(shown[torch.tensor([0])], centre=True).pool
+    middle = FrameSortedPixels.of(shown[torch.tensor([0])], centre=True).pool
     inner = {24 * row + column for row in range(4, 14) for column in range(4, 14)}
     assert set(middle.flat.tolist()) == inner

@@ -1,4 +1,4 @@
-"""Pixels, the pools that they are drawn from, and the batches of rays that they become."""
+"""Pools of pixels, and batches of rays that are drawn from them."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class PixelPool:
         """``count`` pixels with replacement: image (count,) and number (count,), int64.
 
         Args:
-            count: how many.
+            count: number of pixels.
             generator: of the random choice, on the pool's device.
         """
         pick = torch.randint(len(self), (count,), device=self.pixels.device, generator=generator)
@@ -52,7 +52,7 @@ class PixelPool:
         return image, flat
 
     def mask(self, images: Tensor, area: int) -> Tensor:
-        """Which pixels of ``images`` (K,), ascending, are here: (K, ``area``) bool."""
+        """Mask (K, ``area``) of the pixels of ``images`` (K,), ascending, that the pool has."""
         mask = torch.zeros(len(images), area, dtype=torch.bool, device=self.pixels.device)
         row = torch.searchsorted(images.to(torch.int32), self.image.contiguous())
         mask[row, self.flat.long()] = True
@@ -69,8 +69,8 @@ def all_pixels(views: Views, images: Tensor) -> PixelPool:
     """Every valid pixel of ``images`` (K,) int64."""
     area = views.height * views.width
     if views.valid_mask is not None:
-        everything = torch.ones(len(images), area, dtype=torch.bool, device=images.device)
-        return wanted_pixels(views, images, everything)
+        whole = torch.ones(len(images), area, dtype=torch.bool, device=images.device)
+        return wanted_pixels(views, images, whole)
     pixels = torch.empty(2, len(images), area, dtype=torch.int32, device=images.device)
     pixels[0] = images[:, None]
     pixels[1] = torch.arange(area, device=images.device)
@@ -86,13 +86,13 @@ def wanted_pixels(views: Views, images: Tensor, wanted: Tensor) -> PixelPool:
 
 
 @dataclass(frozen=True)
-class FramePool:
-    """The valid pixels of some images, in the order of their frames.
+class FrameSortedPixels:
+    """The valid pixels of some images, sorted by frame.
 
     Attributes:
         pool: the pixels.
-        ends: how many pixels the first k + 1 frames have, for each k.
-        images: how many images there are.
+        ends: number of pixels of the first k + 1 frames, for each k.
+        images: number of images.
     """
 
     pool: PixelPool
@@ -100,7 +100,7 @@ class FramePool:
     images: int
 
     @staticmethod
-    def of(views: Views, *, centre: bool = False) -> FramePool:
+    def of(views: Views, *, centre: bool = False) -> FrameSortedPixels:
         """All valid pixels of some views; of the ``centre`` half of rows and columns, if any is."""
         assert views.frames is not None
         images = torch.arange(len(views), device=views.frames.device)
@@ -117,11 +117,11 @@ class FramePool:
         frame = views.frames[pool.image.long()]
         order = frame.argsort(stable=True)
         _, counts = torch.unique(frame, return_counts=True)
-        return FramePool(pool[order], tuple(counts.cumsum(0).tolist()), len(views))
+        return FrameSortedPixels(pool[order], tuple(counts.cumsum(0).tolist()), len(views))
 
     @property
     def frames(self) -> int:
-        """How many frames there are."""
+        """Number of frames."""
         return len(self.ends)
 
     def draw(
@@ -130,10 +130,11 @@ class FramePool:
         """``count`` pixels with replacement: image and number, (count,) int64 each.
 
         Args:
-            count: how many.
-            frames: so many of the first frames are drawn from.
+            count: number of pixels.
+            frames: pixels are drawn from so many first frames.
             generator: of the random choice, on the pool's device.
-            times: so many frames alone, as many pixels of each, frame after frame; None: all.
+            times: number of frames that are drawn, with equally many pixels of each, frame after
+                frame; None: all of them.
         """
         pool = self.pool
         device = pool.pixels.device
@@ -142,8 +143,8 @@ class FramePool:
             pick = torch.randint(last, (count,), device=device, generator=generator)
         else:
             ends = torch.tensor((0, *self.ends), device=device)
-            chosen = torch.randperm(frames, device=device, generator=generator)[:times]
-            frame = chosen[torch.arange(count, device=device) * times // count]
+            drawn_frames = torch.randperm(frames, device=device, generator=generator)[:times]
+            frame = drawn_frames[torch.arange(count, device=device) * times // count]
             size = ends[frame + 1] - ends[frame]
             part = torch.rand(count, dtype=torch.float64, device=device, generator=generator)
             pick = ends[frame] + (part * size).long()
@@ -192,24 +193,24 @@ def gather_batch(
 
     Args:
         views: images and cameras, on the device of the indices.
-        image: (R,) int64, which image.
+        image: (R,) int64, the image of each ray.
         flat: (R,) int64, row-major pixel number within it.
         background: (3,) or (R, 3) RGB in [0, 1] that colours are composited on.
         space: the space that the fields live in.
     """
     assert views.frames is not None, "views of a scene know their frames"
-    place = image * (views.height * views.width) + flat
+    index = image * (views.height * views.width) + flat
     pixel = pixel_positions(flat, views.width)
-    shown = views.pixels.flatten(0, 2).index_select(0, place).float() / 255
-    color = shown[:, :3]
-    alpha = shown[:, 3] if views.has_alpha else None
+    rgba = views.pixels.flatten(0, 2).index_select(0, index).float() / 255
+    color = rgba[:, :3]
+    alpha = rgba[:, 3] if views.has_alpha else None
     if alpha is not None:
         color = background + alpha[:, None] * (color - background)
     flow = flow_valid = None
     if views.flow is not None:
-        flow_valid = views.flow.valid.flatten()[place]
-        # What was observed where it is not valid may be anything, NaN included.
-        flow = torch.where(flow_valid[:, None], views.flow.vectors.flatten(0, 2)[place], 0.0)
+        flow_valid = views.flow.valid.flatten()[index]
+        # Flow that is not valid may be NaN.
+        flow = torch.where(flow_valid[:, None], views.flow.vectors.flatten(0, 2)[index], 0.0)
     return RayBatch(
         rays=space.rays(views.cameras.rays(image, pixel)),
         color=color,

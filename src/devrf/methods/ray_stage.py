@@ -15,7 +15,7 @@ from torch import Tensor
 from warp import Kernel
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
-from devrf.data.batch import BackgroundColor, FramePool, RayBatch, concatenated, gather_batch
+from devrf.data.batch import BackgroundColor, FrameSortedPixels, RayBatch, concatenated, gather_batch
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.grid_adam import GridAdam
 from devrf.engine.schedule import Phase
@@ -208,8 +208,8 @@ class RayStage(Stage):
         if schedule.times_per_batch is not None:
             self.useful_share = 1 / schedule.times_per_batch
         self.weights = counted_weights(loss, self.scene_model.losses, "ray_stage.loss")
-        self.pools: list[FramePool] = []
-        self._centres: list[FramePool] = []
+        self.pools: list[FrameSortedPixels] = []
+        self._centres: list[FrameSortedPixels] = []
         self._rays = schedule.rays
 
     @classmethod
@@ -342,9 +342,9 @@ class RayStage(Stage):
         views = [self.training_views(images) for images in self.images]
         if self.scene_model.random_background and all(view_set.has_alpha for view_set in views):
             self.background = BackgroundColor("random")
-        self.pools = [FramePool.of(view_set) for view_set in views]
+        self.pools = [FrameSortedPixels.of(view_set) for view_set in views]
         if self.settings.centre_crop:
-            self._centres = [FramePool.of(view_set, centre=True) for view_set in views]
+            self._centres = [FrameSortedPixels.of(view_set, centre=True) for view_set in views]
         self.scene_model.prepare_priors(views, self.weights)
 
     def prepare(self) -> None:
@@ -391,7 +391,7 @@ class RayStage(Stage):
         whole = self.settings.times_per_batch
         return None if whole is None else max(1, round(whole * self.batch_size.share))
 
-    def _shown_frames(self, pool: FramePool) -> int:
+    def _shown_frames(self, pool: FrameSortedPixels) -> int:
         """How many frames the curriculum shows by now."""
         share = self.settings.curriculum * self.schedule.total
         iteration = self.position.iteration
