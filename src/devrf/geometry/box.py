@@ -1,4 +1,4 @@
-"""Axis-aligned boxes: where a field lives, how many voxels it holds, where rays cross it."""
+"""Axis-aligned boxes: their voxels, their grid points, and their crossings with rays."""
 
 from __future__ import annotations
 
@@ -84,8 +84,8 @@ class Box:
         At least two along each axis, since grid corners sit on the box's corners.
 
         Args:
-            voxels: about how many.
-            planes: points along z, where these are given; voxels are square along x and y, then.
+            voxels: their number, about.
+            planes: points along z; then voxels are square along x and y. None: they are cubes.
             aspect: with planes, points across a unit of x to those across a unit of y.
         """
         width, height, _ = self.size

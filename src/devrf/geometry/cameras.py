@@ -142,15 +142,15 @@ class Cameras:
         """World-space rays through pixels.
 
         Args:
-            camera: (M,) which camera each ray belongs to.
+            camera: (M,) the camera of each ray.
             pixels: (M, 2) x, y in pixels (a pixel's centre is at i + 0.5).
 
         Returns:
             M rays with unit directions that start at the camera centres.
         """
         center = self.center.index_select(0, camera)
-        place = (pixels - center) / self.focal.index_select(0, camera)
-        x, y = place[..., None].unbind(1)
+        offsets = (pixels - center) / self.focal.index_select(0, camera)
+        x, y = offsets[..., None].unbind(1)
         pose = self.camera_to_world.index_select(0, camera)
         right, up, backward, _ = pose.unbind(-1)
         directions = right * x - up * y - backward
@@ -161,7 +161,7 @@ class Cameras:
         """Pixels on which world points fall: the inverse of :meth:`rays`.
 
         Args:
-            camera: (M,) which camera looks at each point.
+            camera: (M,) the camera of each point.
             points: (M, 3) world units.
 
         Returns:
@@ -195,8 +195,8 @@ class Cameras:
     def image_rays(self, camera: int) -> Rays:
         """All H·W rays of one camera, in row-major order.
 
-        They are those of :meth:`rays`, computed from what columns and rows share: a GPU has half
-        as many launches.
+        They are those of :meth:`rays`, computed from columns and rows: a GPU has half as many
+        launches.
         """
         device = self.focal.device
         dtype = self.focal.dtype
@@ -258,7 +258,7 @@ class Cameras:
 
         Args:
             positions: camera centres, world units.
-            targets: what each looks at, world units.
+            targets: the point that each looks at, world units.
             focal: focal length in pixels; the principal point is the image's centre.
             width: image width in pixels.
             height: image height in pixels.
@@ -266,7 +266,7 @@ class Cameras:
         """
         backward = torch.nn.functional.normalize(positions - targets, dim=-1)
         up = positions.new_tensor([0.0, 0.0, 1.0]) if up is None else up
-        # A camera that looks straight up or down has no horizon: any other direction will do.
+        # A camera that looks straight up or down has no horizon: any other direction serves.
         other = torch.eye(3).to(up)[int(up.abs().argmin())]
         vertical = (backward @ up).abs()[:, None] > 0.999
         up = torch.where(vertical, other, up)
@@ -293,7 +293,7 @@ def _on_image(local: Tensor, focal: Tensor, center: Tensor) -> tuple[Tensor, Ten
 
 @dataclass(frozen=True)
 class Distortion:
-    """How a real lens moves a pinhole's points in the image (Brown 1966, as in OpenCV).
+    """A real lens's displacement of a pinhole's points (Brown 1966, as in OpenCV).
 
     Points are (x/z, y/z) of a camera whose x points right and y down, before focal lengths and
     principal point. With r² = x² + y² and g = 1 + k1·r² + k2·r⁴ + k3·r⁶ + k4·r⁸,
@@ -314,7 +314,7 @@ class Distortion:
         return not any(self.radial) and not any(self.tangential)
 
     def distort(self, points: Tensor) -> Tensor:
-        """Where the lens puts the pinhole's ``points`` (..., 2)."""
+        """The lens's images (..., 2) of the pinhole's ``points`` (..., 2)."""
         x, y = points.unbind(-1)
         square, gain, _ = self._radial(x, y)
         p1, p2 = self.tangential

@@ -29,10 +29,10 @@ class Moment:
 
 @dataclass(frozen=True)
 class FrameClock:
-    """The frames' times, in ascending order; frame 0 is at time 0, where nothing has moved.
+    """The frames' times, in ascending order; frame 0 is at time 0, the canonical state.
 
     Attributes:
-        times: T times in [0, 1]; 0 alone for a scene at rest.
+        times: T times in [0, 1]; 0 alone for a static scene.
     """
 
     times: tuple[float, ...]
@@ -61,7 +61,7 @@ class FrameClock:
         return FrameClock(tuple(frames))
 
     def at(self, time: float) -> Moment:
-        """Where ``time`` lies; times outside the clock's range stay on the first or last frame."""
+        """The moment of ``time``; times outside the clock's range are the first or last frame's."""
         frame = bisect_right(self.times, time, key=lambda t: t - self.TOLERANCE) - 1
         frame = max(frame, 0)
         before = self.times[frame]

@@ -1,6 +1,6 @@
 """Scene contraction: all of space becomes a box (docs/method.md#scene-contraction).
 
-Inside an inner box nothing changes; what is beyond is squeezed into a shell around it. With
+An inner box stays as it is; the space around it is squeezed into a shell. With
 u = (x − c) / h, c the inner box's centre and h its half edges, and m = max |u_i| > 1, a point goes
 to c + h (1 + b − b/m) u/m: its direction stays, and infinity is on the faces of c ± (1 + b) h
 (mip-NeRF 360's contraction, with boxes in place of balls).
@@ -23,7 +23,7 @@ Xyz = tuple[float, float, float]
 # Points nearer to the outer faces than this share of the shell are taken to be at this distance: a
 # float32 can still tell what is a million inner boxes away from infinity.
 INFINITY = 1e-6
-# The most contracted units that most rays move in a unit of their distance.
+# Most rays move no more contracted units than this in a unit of their distance.
 PACE = 1.25
 
 
@@ -44,7 +44,7 @@ class ContractedSpace:
     is_linear: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        Box(self.low, self.high)  # which refuses what is no box
+        Box(self.low, self.high)  # it refuses other corners
 
     @property
     def side_factor(self) -> float:
@@ -79,8 +79,8 @@ class ContractedSpace:
         center, half = self._frame(points)
         u = (points - center) / half
         m = u.abs().amax(dim=-1, keepdim=True).clamp(min=1)
-        left = (1 + self.shell - m).clamp(min=INFINITY * self.shell)
-        return torch.where(m > 1, center + half * (self.shell / left / m) * u, points)
+        gap = (1 + self.shell - m).clamp(min=INFINITY * self.shell)
+        return torch.where(m > 1, center + half * (self.shell / gap / m) * u, points)
 
     def rays(self, rays: Rays) -> Rays:
         """World rays, whose points are in contracted space (:class:`ContractedRays`)."""
@@ -90,7 +90,7 @@ class ContractedSpace:
         axis = slope.abs().argmax(dim=-1, keepdim=True)
         along = origin.gather(1, axis)
         pace = slope.gather(1, axis)
-        # How fast a ray moves sideways in the shell, if it does not lead away from the centre.
+        # A ray's sideways pace in the shell, if it does not lead away from the centre.
         sideways = (slope * along - origin * pace).abs().amax(dim=-1) / pace[:, 0].abs()
         stretch = (0.5 * (1 + self.shell) * sideways).clamp(min=self.shell)
         start = along[:, 0] * pace[:, 0].sign()
@@ -107,7 +107,7 @@ class ContractedSpace:
     ) -> tuple[float, float]:
         """From the camera to the outer face behind the centre, in contracted rays' own distance.
 
-        In the inner box that is world units, as for :class:`ContractedRays`.
+        That is world units in the inner box, as for :class:`ContractedRays`.
         """
         center, half = self._frame(position)
         away = float(((position - center) / half).abs().amax())
@@ -149,8 +149,8 @@ class ContractedRays(Rays):
         """t (S,), world units from the rays' origins, of distances s (S,)."""
         start, pace, stretch = self.course.t().contiguous().index_select(1, ray).unbind(0)
         y = torch.addcmul(start, pace, distance)
-        left = (1 - (y.abs() - 1) / stretch).clamp(min=INFINITY)
-        x = y.sign() / left
+        disparity = (1 - (y.abs() - 1) / stretch).clamp(min=INFINITY)
+        x = y.sign() / disparity
         return torch.where(y.abs() > 1, (x - start) / pace, distance)
 
     def crossing(self, low: Tensor, high: Tensor, near: float, far: float) -> tuple[Tensor, Tensor]:
@@ -162,7 +162,7 @@ class ContractedRays(Rays):
 
     @property
     def pace(self) -> float:
-        """What most rays stay below; sideways through the shell they may be three times as fast."""
+        """A bound for most rays; sideways through the shell they may be three times as fast."""
         return PACE
 
     def ends(self) -> Tensor:

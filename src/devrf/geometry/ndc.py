@@ -16,8 +16,8 @@ from torch import Tensor
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 
-# A point at z' = 1 is moved so much nearer, to two million near planes: at infinity its pixel would
-# be no number, and so would all that is learned from it.
+# A point at z' = 1 is moved so much nearer, to two million near planes: at infinity its pixel, and
+# all that is learned from it, would be NaN.
 BEFORE_INFINITY = 1e-6
 
 
@@ -58,7 +58,7 @@ class NormalizedDevice:
     def to_world(self, points: Tensor) -> Tensor:
         """World points (..., 3) of NDC (..., 3) with z' < 1: the inverse of :meth:`from_world`.
 
-        What is at infinity comes out far away, at a finite distance.
+        Points at infinity come out far away, at a finite distance.
         """
         sx, sy = self.slopes
         x, y, z = points.unbind(-1)

@@ -1,19 +1,19 @@
 """Worlds far from the origin: an offset that is kept apart, so that float32 tells cameras apart.
 
 UTM or ECEF coordinates are of millions of metres, where a float32 goes in steps of half a metre.
-Readers have positions in double precision. Where cameras are far away for how far they are apart,
-a scene is computed with in the capture's world − offset:
+Readers have positions in double precision. Where cameras are much farther from
+the origin than from one another, a scene lives in the capture's world − offset:
 
 - The offset is found once, from the first camera file that is read, and holds for all files of a
   scene (:class:`devrf.scenes.transforms.TransformsFiles`). It is subtracted there, before poses are
   compared with one another or become float32.
-- What options or files say in the capture's world, a box, has it subtracted where it is used
+- It is subtracted from a box that options or files state in the capture's world
   (:meth:`devrf.scenes.reader.InwardReader.placed`). Distances need nothing.
-- The scene keeps it, and checkpoints do, beside the cameras.
+- The scene and checkpoints keep it, beside the cameras.
 - It is added to all positions that leave the program, and subtracted from those that come in:
   written scenes, exported geometry, camera paths, links to a page.
 
-Near the origin there is none. Readers that give the world an origin of their own, as COLMAP's and
+There is none near the origin. Readers that give the world an origin of their own, as COLMAP's and
 LLFF's, do so in double precision, and have none either.
 """
 
@@ -30,7 +30,7 @@ NO_OFFSET: Offset = (0.0, 0.0, 0.0)
 
 # The share of the cameras' spread that float32 may lose of a position.
 LOST = 1e-5
-# Cameras count as no nearer to one another than this: one that stands still is not far away.
+# Cameras count as no nearer to one another than this: a fixed one is not far away.
 LEAST_SPREAD = 0.1
 # A float32 is wrong by up to this share of itself.
 ROUNDING = 2.0**-24

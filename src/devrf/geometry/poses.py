@@ -1,4 +1,4 @@
-"""Rigid poses: their average, how others are seen from one, and motion along a screw."""
+"""Rigid poses: their average, poses relative to one of them, and motion along a screw."""
 
 from __future__ import annotations
 

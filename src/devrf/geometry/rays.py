@@ -1,4 +1,4 @@
-"""Rays: origin, direction and viewing direction, in whatever space the fields live in."""
+"""Rays: origin, direction and viewing direction, in the fields' space."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Rays:
     Attributes:
         origins: (M, 3) start points, in the fields' space (world units, or NDC).
         directions: (M, 3) unit vectors in world space; in NDC, from the near to the far plane.
-        viewdirs: (M, 3) unit viewing directions in world space, what the colour decoder sees.
+        viewdirs: (M, 3) unit viewing directions in world space, for the colour decoder.
     """
 
     origins: Tensor
@@ -37,7 +37,7 @@ class Rays:
     def at(self, ray: Tensor, distance: Tensor) -> Tensor:
         """Points (S, 3) at ``distance`` (S,) along the rays numbered ``ray`` (S,).
 
-        They lie in memory axis by axis: what is done to millions of points is several times
+        They lie in memory axis by axis: operations on millions of points are several times
         faster on whole vectors than on rows of three.
         """
         origins = self.origins.t().contiguous().index_select(1, ray)
@@ -73,7 +73,7 @@ class Rays:
         return float(self.directions.norm(dim=1).amax()) if len(self) else 0.0
 
     def ends(self) -> Tensor | None:
-        """Where rays meet infinity, (M, 3) in the fields' space; None where that is not in it."""
+        """Points (M, 3) at infinity in the fields' space; None where they are not in it."""
         return None
 
     @staticmethod

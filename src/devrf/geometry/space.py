@@ -31,11 +31,11 @@ class Space(Protocol):
 
     @property
     def side_factor(self) -> float:
-        """How many times longer a grid's side is here than the configured one."""
+        """Length of a grid's side here, as a multiple of the configured one."""
         ...
 
     def inner(self, box: Box) -> Box:
-        """The part of the fields' ``box`` where things may move: what the cameras look at."""
+        """The part of the fields' ``box`` that the cameras look at, where things may move."""
         ...
 
     def from_world(self, points: Tensor) -> Tensor:
@@ -56,8 +56,8 @@ class Space(Protocol):
         """Depths between which a scene in ``box`` lies, about, for pictures of depth.
 
         Args:
-            box: what holds the scene, in this space.
-            limits: distances before and behind which nothing is sampled, in this space.
+            box: the scene's, in this space.
+            limits: the distances between which rays are sampled, in this space.
             position: (3,) the camera's, in world units.
         """
         ...
@@ -96,7 +96,7 @@ class WorldSpace:
 
 
 WORLD = WorldSpace()
-# By the name that a checkpoint has for them.
+# By their names in checkpoints.
 KINDS: dict[str, type[NormalizedDevice] | type[ContractedSpace]] = {
     "ndc": NormalizedDevice,
     "contracted": ContractedSpace,
@@ -105,8 +105,8 @@ KINDS: dict[str, type[NormalizedDevice] | type[ContractedSpace]] = {
 
 def space_config(space: Space) -> dict[str, Any]:
     """A space as plain data with its ``kind``; the world is empty."""
-    for kind, known in KINDS.items():
-        if isinstance(space, known):
+    for kind, space_type in KINDS.items():
+        if isinstance(space, space_type):
             return {"kind": kind, **asdict(space)}
     return {}
 

@@ -9,6 +9,6 @@ support (:func:`devrf.kernels.runtime.is_supported`) these functions call their 
 | ``march`` | ``march``: samples, warped and composited |
 | ``trilinear`` | ``interpolate``: values of a grid between its points |
 | ``adam`` | ``adam_step``, ``add_total_variation_gradient``: a step of the optimiser |
-| ``grid`` | what the kernels share: where grids are, and which cell a point is in |
-| ``runtime`` | where kernels run, and how they are launched |
+| ``grid`` | shared by the kernels: grids, and the cell that holds a point |
+| ``runtime`` | tensors that kernels support, and launches |
 """

@@ -27,8 +27,8 @@ def adam_step(
 ) -> None:
     """As :func:`devrf.ops.adam.adam_step`; all tensors are contiguous.
 
-    Outside the voxels ``rows`` (K,), int32, if they are given, the gradient is zero and so is not
-    read; with ``skip_zero``.
+    ``rows`` (K,), int32, are the only voxels with a gradient, and the only ones that are read; they
+    need ``skip_zero``. None: all voxels.
     """
     if not is_supported(values):
         definition.adam_step(values, gradient, mean, square, rule)
@@ -99,10 +99,10 @@ def adam_kernel(channels: int) -> wp.Kernel:
         rate are the voxels', if there are any.
         """
         start = (first + wp.tid()) * run
-        for place in range(start, wp.min(start + run, count)):
-            row = place
+        for index in range(start, wp.min(start + run, count)):
+            row = index
             if rows.shape[0] > 0:
-                row = rows[place]
+                row = rows[index]
             g = gradient[row]
             if skip_zero == 1 and g == numbers():
                 continue

@@ -15,22 +15,22 @@ from devrf.kernels.runtime import compiling, is_supported
 
 log = logging.getLogger(__name__)
 
-# With compiled kernels on disk, loading them takes less.
+# Seconds; loading compiled kernels from disk takes less.
 WAITED = 1.0
-# Of a block, as launches have them: kernels are compiled for their number.
+# Threads of a block, as in launches: kernels are compiled for this number.
 THREADS = {"cpu": 1, "cuda": 256}
 
 
 def march_kernels() -> list[wp.Kernel]:
-    """What marches along rays, and their adjoints."""
+    """The kernels of the march and its adjoints."""
     kernels = [march.enter_kernel, march.march_kernel(False), march.keep_significant_kernel]
     kernels += [march.adjoint_kernel, trilinear.add_kernel(1), adam.total_variation_kernel(1)]
-    # The last is for contracted space.
+    # The last one is for contracted space.
     return [*kernels, adam.adam_kernel(1), march.march_kernel(True)]
 
 
 def grid_kernels(channels: Collection[int]) -> list[wp.Kernel]:
-    """What looks up, and steps, grids of these numbers of channels."""
+    """The kernels that interpolate and step grids of these numbers of channels."""
     kernels: list[wp.Kernel] = []
     for count in sorted({*channels}):
         kernels += [trilinear.interpolate_kernel(count), trilinear.slope_kernel(count)]

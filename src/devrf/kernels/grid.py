@@ -1,4 +1,4 @@
-"""What kernels know of a grid: where it lies, and which cell a point is in."""
+"""A grid as kernels know it, the cell that holds a point, and interpolation in the cell."""
 
 from __future__ import annotations
 
@@ -58,9 +58,9 @@ def coordinates(grid: Grid, point: wp.vec3):
 
 @wp.func
 def cell(grid: Grid, point: wp.vec3):
-    """The row of a cell's lowest corner, and where in the cell the point is, in [0, 1]³.
+    """The row of the lowest corner of a point's cell, and the position in the cell, in [0, 1]³.
 
-    For a point outside the grid, of the nearest point on its border.
+    A point outside the grid counts as the nearest point on its border.
     """
     at = coordinates(grid, point)
     x = wp.clamp(at[0], 0.0, float(grid.x - 1))
@@ -86,7 +86,7 @@ def inside(grid: Grid, point: wp.vec3):
 
 @wp.func
 def interpolate_cell(values: wp.array(dtype=Any), grid: Grid, row: int, f: wp.vec3):
-    """Σ over a cell's corners of weight · value: trilinear, at the place ``f`` in the cell."""
+    """Σ over a cell's corners of weight · value: trilinear, at the position ``f`` in the cell."""
     total = values[row] * ((1.0 - f[0]) * (1.0 - f[1]) * (1.0 - f[2]))
     total += values[row + grid.next_y] * ((1.0 - f[0]) * f[1] * (1.0 - f[2]))
     total += values[row + grid.next_x] * (f[0] * (1.0 - f[1]) * (1.0 - f[2]))
@@ -104,7 +104,7 @@ def interpolate_cell(values: wp.array(dtype=Any), grid: Grid, row: int, f: wp.ve
 def slope(values: wp.array(dtype=Any), factor: Any, grid: Grid, row: int, f: wp.vec3):
     """∂/∂ position of the scalar product of :func:`interpolate_cell`'s value and ``factor``.
 
-    Per unit of length, at the place ``f`` in the cell.
+    Per unit of length, at the position ``f`` in the cell.
     """
     next_x = grid.next_x
     next_y = grid.next_y

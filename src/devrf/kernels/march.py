@@ -68,19 +68,19 @@ class _March(torch.autograd.Function):
         geometry = _geometry(rays, inputs)
         lines = empty_structs(Ray, len(rays), device)
         counts = torch.empty(len(rays), dtype=torch.int32, device=device)
-        # Straight rays have no course; their origins stand in for it.
+        # Straight rays have no course: their origins stand in for it.
         course = rays.course if isinstance(rays, ContractedRays) else rays.origins
         arguments = [each.contiguous() for each in (rays.origins, rays.directions, course)]
         arguments = [geometry, *arguments, inputs.range.near, inputs.range.far, lines, counts]
         launch(enter_kernel, len(rays), arguments, device)
 
-        # Room for all of a ray's samples; how many are visible is known afterwards.
+        # Room for all of a ray's samples: the number of visible ones is known afterwards.
         visible_start, length = _starts(counts)
         visible = empty_structs(VisibleSample, length, device)
         visible_count = torch.empty_like(counts)
         significant_count = torch.empty_like(counts)
         transmittance = torch.empty(len(rays), device=device)
-        # Without displacements there is an array that is not read.
+        # Without displacements the kernel gets an array that it does not read.
         moves = density.new_empty(0, 3) if displacement is None else displacement.contiguous()
         arguments = [geometry, lines, inputs.range.distances.cells.flatten()]
         arguments += [density.contiguous(), moves, int(device.type == "cpu"), visible_start]
@@ -137,7 +137,7 @@ class _March(torch.autograd.Function):
 
 
 def _starts(counts: Tensor) -> tuple[Tensor, int]:
-    """Where each ray's samples begin, (R,) int64, if they lie one after another; and their sum."""
+    """First sample (R,) int64 of each ray, if samples lie one after another; and their number."""
     stops = counts.cumsum(0)
     return stops - counts, int(stops[-1]) if len(stops) else 0
 
@@ -248,8 +248,8 @@ class Ray:
     """A ray: in the fields' space, or if it is contracted in the world, with its course.
 
     It has ``count`` samples from the distance ``entry`` on, and moves by a cell of the occupancy in
-    ``samples_per_cell`` or more. In straight space its k-th sample is at ``place`` + k · ``pace``
-    among the occupancy's points; in contracted space these mean nothing.
+    ``samples_per_cell`` or more. Its k-th sample is at ``start`` + k · ``pace`` in the occupancy's
+    grid coordinates; in contracted space these mean nothing.
     """
 
     origin: wp.vec3
@@ -257,7 +257,7 @@ class Ray:
     course: wp.vec3
     entry: float
     count: int
-    place: wp.vec3
+    start: wp.vec3
     pace: wp.vec3
     samples_per_cell: float
 
@@ -270,8 +270,8 @@ def position(geometry: Geometry, ray: Ray, distance: float):
     world = distance
     y = ray.course[0] + ray.course[1] * distance
     if wp.abs(y) > 1.0:
-        left = wp.max(1.0 - (wp.abs(y) - 1.0) / ray.course[2], wp.static(INFINITY))
-        world = (wp.sign(y) / left - ray.course[0]) / ray.course[1]
+        disparity = wp.max(1.0 - (wp.abs(y) - 1.0) / ray.course[2], wp.static(INFINITY))
+        world = (wp.sign(y) / disparity - ray.course[0]) / ray.course[1]
     point = ray.origin + ray.direction * world
     u = wp.cw_div(point - geometry.center, geometry.half)
     m = wp.max(wp.abs(u))
@@ -283,7 +283,7 @@ def position(geometry: Geometry, ray: Ray, distance: float):
 
 @wp.func
 def own_distance(course: wp.vec3, world: float):
-    """The distance along a contracted ray, of one in the world; as ``ContractedRays`` has it."""
+    """The distance along a contracted ray of a distance in the world, as in ``ContractedRays``."""
     x = course[0] + course[1] * world
     if wp.abs(x) <= 1.0:
         return world
@@ -292,21 +292,21 @@ def own_distance(course: wp.vec3, world: float):
 
 
 @wp.func
-def place_of(geometry: Geometry, ray: Ray, k: int):
-    """Where a ray's k-th sample is among the occupancy's grid points."""
+def grid_position(geometry: Geometry, ray: Ray, k: int):
+    """The occupancy's grid coordinates of a ray's k-th sample."""
     point = position(geometry, ray, ray.entry + float(k) * geometry.step)
     return coordinates(geometry.occupancy, point)
 
 
 @wp.func
-def straight_place(geometry: Geometry, ray: Ray, k: int):
+def straight_grid_position(geometry: Geometry, ray: Ray, k: int):
     """The same in straight space, by one multiplication."""
-    return ray.place + ray.pace * float(k)
+    return ray.start + ray.pace * float(k)
 
 
 @wp.func
 def clearance(grid: Grid, distances: wp.array(dtype=wp.uint8), at: wp.vec3):
-    """How many cells away something is occupied, at least; 0 in an occupied cell."""
+    """Cells to the nearest occupied one, at least; 0 in an occupied cell."""
     i = int(wp.rint(at[0]))
     j = int(wp.rint(at[1]))
     k = int(wp.rint(at[2]))
@@ -387,7 +387,7 @@ def enter_kernel(
             to_high = (geometry.density.high[axis] - ray.origin[axis]) / along
             ray.entry = wp.max(ray.entry, wp.min(to_low, to_high))
             leave = wp.min(leave, wp.max(to_low, to_high))
-        ray.place = coordinates(geometry.occupancy, ray.origin + ray.direction * ray.entry)
+        ray.start = coordinates(geometry.occupancy, ray.origin + ray.direction * ray.entry)
         ray.pace = wp.cw_mul(ray.direction, geometry.occupancy.scale) * geometry.step
         cells = wp.max(wp.abs(ray.pace))
     # A little less: positions are rounded.
@@ -402,7 +402,7 @@ def enter_kernel(
 @cached_kernel
 def march_kernel(contracted: bool) -> wp.Kernel:
     """The march in straight or in contracted space; one for both takes a third longer."""
-    place = place_of if contracted else straight_place
+    coordinates_of = grid_position if contracted else straight_grid_position
 
     @wp.kernel(module="unique", enable_backward=False)
     def march(
@@ -421,9 +421,9 @@ def march_kernel(contracted: bool) -> wp.Kernel:
     ):
         """τ_i and w_i = T_i α_i of each ray's visible samples, and T_end.
 
-        Where a launch's part follows its rays ``in_order``, one after another in one thread, as on
-        a CPU, each ray's samples begin where those of the ray before end: what is written lies
-        close together. Else each has its room.
+        On a CPU a part of a launch follows its rays ``in_order``, one after another in one thread:
+        each ray's samples begin where those of the ray before end, close together in memory. Else
+        each ray has its own room.
         """
         number = first + wp.tid()
         ray = rays[number]
@@ -433,10 +433,10 @@ def march_kernel(contracted: bool) -> wp.Kernel:
             visible_start[number] = wp.int64(start)
         count = int(0)
         significant = int(0)
-        left = float(1.0)
+        remaining = float(1.0)
         k = int(0)
         while k < ray.count:
-            cells = clearance(geometry.occupancy, distances, place(geometry, ray, k))
+            cells = clearance(geometry.occupancy, distances, coordinates_of(geometry, ray, k))
             if cells > 0:
                 # In cells - 1 cells' way the nearest cell changes by less than that and one.
                 k += int(float(cells - 1) * ray.samples_per_cell)
@@ -451,18 +451,18 @@ def march_kernel(contracted: bool) -> wp.Kernel:
                     sample.distance = distance
                     sample.canonical = canonical
                     sample.tau = softplus(raw + geometry.shift) * geometry.delta
-                    sample.weight = left * opacity(sample.tau)
+                    sample.weight = remaining * opacity(sample.tau)
                     visible[start + count] = sample
                     count += 1
                     if sample.weight >= geometry.threshold:
                         significant += 1
-                    left -= sample.weight
-                    if left < wp.static(STOP):
+                    remaining -= sample.weight
+                    if remaining < wp.static(STOP):
                         k = ray.count
             k += 1
         visible_count[number] = count
         significant_count[number] = significant
-        transmittance[number] = left
+        transmittance[number] = remaining
 
     return march
 
@@ -528,7 +528,7 @@ def adjoint_kernel(
     result_points: wp.array(dtype=wp.vec3),
     result_canonical: wp.array(dtype=wp.vec3),
 ):
-    """From gradients of what the march gives to those of raw densities and displacements.
+    """Gradients of raw densities and displacements from those of the march's results.
 
     ∂L/∂v and ∂L/∂Δ of visible samples, and their positions, lie without gaps.
 

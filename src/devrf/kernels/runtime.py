@@ -1,4 +1,4 @@
-"""Where the kernels run, and how they are launched.
+"""Support of tensors by kernels, and launches.
 
 NVIDIA Warp compiles a kernel's Python source when it is first launched, and keeps the result on
 disk, in ``WARP_CACHE_PATH`` or the user's cache folder, if nobody else may write there. A kernel
@@ -31,8 +31,8 @@ from devrf.system.folder_lock import private_folder
 
 log = logging.getLogger(__name__)
 
-# What computes the hot operations: Warp's kernels or their definitions in PyTorch; auto: Warp's
-# kernels where they run.
+# The hot operations' implementation: torch: their definitions in PyTorch; auto: Warp's kernels
+# where they run.
 Kernels = Literal["auto", "torch"]
 _chosen: Kernels = "auto"
 # Fewer threads of a kernel take less time than another core takes to begin with them, 0.1 ms: at
@@ -45,7 +45,7 @@ _of_thread = local()
 
 
 def choose(kernels: Kernels, *, deterministic: bool = False) -> None:
-    """Say what computes the hot operations of this process, before it computes the first.
+    """Choose the implementation of this process's hot operations, before the first of them.
 
     Args:
         kernels: Warp's where they run, or PyTorch.
@@ -76,9 +76,9 @@ def launch(
 ) -> None:
     """Run ``kernel(first, *inputs)`` with ``count`` threads, of which thread k is ``first`` + k.
 
-    On a CPU in parts of ``grain`` threads or more side by side, of which this thread runs the
-    first; None: in one part, else no two threads may write to the same place. The inputs are made
-    ready once, in this thread, so that the others begin at once.
+    A CPU runs parts of ``grain`` threads or more side by side, the first of them in this thread.
+    None: it runs one part; else no two threads may write to the same address. This thread prepares
+    the inputs once, so that the others begin at once.
 
     Warp sees tensors as :func:`array` has them, and checks them at the first launch alone: that
     takes longer than a small launch runs. Later ones write addresses and numbers in their place.
@@ -93,16 +93,16 @@ def launch(
     commands = _commands(kernel, parts, inputs, device)
     begin, *others = commands
     for index, value in enumerate(inputs, 1):
-        given = begin.params[index + 1]
+        parameter = begin.params[index + 1]
         if isinstance(value, Tensor):
             assert value.is_contiguous()
-            given.data = value.data_ptr()
-            given.shape[0] = _rows(value)
+            parameter.data = value.data_ptr()
+            parameter.shape[0] = _rows(value)
         elif isinstance(value, wp.array):
-            given.data = value.ptr
-            given.shape[0] = value.shape[0]
+            parameter.data = value.ptr
+            parameter.shape[0] = value.shape[0]
         elif isinstance(value, int | float):
-            given.value = value
+            parameter.value = value
         else:
             begin.set_param_at_index(index, value)
     for other in others:
@@ -123,8 +123,8 @@ def launch(
 def array(tensor: Tensor, kind: Any = None) -> wp.array:
     """A contiguous tensor (N,) of numbers, or (…, C) of rows, as Warp's array of N; not a copy.
 
-    ``kind`` is Warp's type of a row; None: of so many floats. Made from the address, which takes a
-    fifth of the time of ``wp.from_torch``: 6 µs in place of 30.
+    ``kind`` is Warp's type of a row; None: that of C floats. The array is made from the address, in
+    a fifth of the time of ``wp.from_torch``: 6 µs in place of 30.
     """
     is_row = tensor.ndim > 1
     assert tensor.is_contiguous() and (tensor.dtype == torch.float32 or not is_row)
@@ -196,12 +196,12 @@ def _arrays(inputs: Sequence[Any]) -> list[Any]:
 
 @cache
 def _stream(stream: torch.cuda.Stream) -> wp.Stream:
-    """One of torch's streams as Warp has it."""
+    """One of torch's streams as a stream of Warp's."""
     return wp.stream_from_torch(stream)
 
 
 def _parts(device: torch.device, count: int, grain: int | None) -> int:
-    """Into how many parts a launch of ``count`` threads is divided."""
+    """Number of parts of a launch of ``count`` threads."""
     if device.type != "cpu" or grain is None:
         return 1
     return max(min(torch.get_num_threads(), count // grain), 1)
@@ -253,19 +253,19 @@ def _own_folder() -> str:
     """A folder that ends with this process."""
     until_the_end = ExitStack()
     atexit.register(until_the_end.close)
-    place = Path(tempfile.gettempdir())
-    return str(until_the_end.enter_context(private_folder(place, "devrf-kernels-")))
+    parent = Path(tempfile.gettempdir())
+    return str(until_the_end.enter_context(private_folder(parent, "devrf-kernels-")))
 
 
 @contextmanager
 def _silent() -> Iterator[None]:
-    """Without what libraries write to the standard error: Warp's, where there is no GPU."""
-    kept = os.dup(2)
+    """Discard the standard error: without a GPU Warp's libraries write to it."""
+    stderr = os.dup(2)
     nothing = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nothing, 2)
     try:
         yield
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
+        os.dup2(stderr, 2)
+        os.close(stderr)
         os.close(nothing)

@@ -62,8 +62,8 @@ class _Interpolate(torch.autograd.Function):
             add_to_grid(into, points, gradient, ctx.box, ctx.stride)
         if ctx.needs_input_grad[1]:
             of_points = torch.empty_like(points)
-            place = grid_over(ctx.box, shape_of(grid), ctx.stride)
-            inputs = [place, points, grid, gradient, of_points]
+            geometry = grid_over(ctx.box, shape_of(grid), ctx.stride)
+            inputs = [geometry, points, grid, gradient, of_points]
             launch(slope_kernel(grid.shape[-1]), len(points), inputs, points.device)
         return of_grid, of_points, None, None, None
 
@@ -71,9 +71,9 @@ class _Interpolate(torch.autograd.Function):
 def add_to_grid(grid: Tensor, points: Tensor, values: Tensor, box: Box, stride: int = 1) -> None:
     """Add weight · ``values`` (M, C) to the corners around ``points``: interpolation's adjoint.
 
-    On a GPU by atomic additions, on a CPU in one thread, in the order of the points. Two threads,
-    each with planes of its own, took twice as long: one that guesses wrongly whose plane it is
-    fetches memory that the other writes.
+    A GPU adds atomically, a CPU in one thread, in the order of the points. Two threads, each with
+    planes of its own, took twice as long: a thread that guesses wrongly whose plane it is fetches
+    memory that the other writes.
 
     Args:
         grid: (X, Y, Z, C), changed in place.

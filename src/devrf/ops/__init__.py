@@ -1,4 +1,4 @@
-"""The hot operations in plain PyTorch: what the equations say, once each.
+"""The hot operations in plain PyTorch: each equation once.
 
 Autograd differentiates them. They are the definitions of the kernels (:mod:`devrf.kernels`), and
 compute where those do not run.

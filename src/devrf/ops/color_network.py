@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import linear
 
-# Samples of a picture whose colours are found at once on a CPU: what a layer gives them fits its
-# caches (docs/notebook/costs.md).
+# Samples of a picture that are decoded at once on a CPU: a layer's outputs fit its caches
+# (docs/notebook/costs.md).
 TILE = 4096
 # A layer with its activation by oneDNN, as torch's compiler calls it; None: torch lacks it.
 LAYER = getattr(torch.ops.mkldnn, "_linear_pointwise", None)
@@ -58,22 +58,22 @@ def decode(
         viewdirs: (R, 3) unit directions of the rays, in world space.
         ray: (S,) int64, ascending, the ray of each sample.
         network: the network.
-        precision: what the hidden layers and their gradients are computed in. Weights,
-            sums, and the last layer stay in single precision, so that colours do.
-        residual: (S, 3) what is added before the sigmoid; None: nothing.
+        precision: type of the hidden layers and their gradients. Weights, sums and the last layer,
+            and so colours, stay in single precision.
+        residual: (S, 3) added before the sigmoid; None: nothing.
     """
     # The directions' part of the first layer is the same for all samples of a ray.
-    place = ray
+    row = ray
     if not torch.is_grad_enabled():
         # Most rays of a picture have no samples: their directions are not encoded.
-        seen, place = torch.unique_consecutive(ray, return_inverse=True)
-        viewdirs = viewdirs.index_select(0, seen)
+        met, row = torch.unique_consecutive(ray, return_inverse=True)
+        viewdirs = viewdirs.index_select(0, met)
     encoded = _encode(viewdirs, network.octaves)
     along = linear(encoded, network.direction_weight, network.feature_bias)
     if torch.is_grad_enabled() or not features.is_cpu or len(ray) <= TILE:
-        return _color(features, along.index_select(0, place), network, precision, residual)
+        return _color(features, along.index_select(0, row), network, precision, residual)
     added = repeat(None) if residual is None else torch.split(residual, TILE)
-    tiles = zip(torch.split(features, TILE), torch.split(place, TILE), added, strict=False)
+    tiles = zip(torch.split(features, TILE), torch.split(row, TILE), added, strict=False)
     return torch.cat(
         [
             _color(tile, along.index_select(0, at), network, precision, further)
@@ -93,7 +93,7 @@ def _color(
     if precision != torch.float32:
         along = along.to(precision)
     weight = network.feature_weight.to(along.dtype)
-    # In place: no layer's gradient needs what it gave before its activation.
+    # In place: no gradient needs a layer's output before its activation.
     x = along.addmm_(features.to(along.dtype), weight.t()).relu_()
     logits = _logits(x, network)
     if residual is not None:
@@ -102,10 +102,10 @@ def _color(
 
 
 def _logits(x: Tensor, network: ColorNetwork) -> Tensor:
-    """What the second hidden and the last layer give to ``x`` (S, H).
+    """The last layer's outputs (S, 3) for ``x`` (S, H), the first hidden layer's outputs.
 
-    Of a whole tile on a CPU by oneDNN, in two thirds of MKL's time (Intel, AVX-512). Other numbers
-    of samples it would compile for anew, in 0.2 ms.
+    On a CPU oneDNN computes whole tiles, in two thirds of MKL's time (Intel, AVX-512). It would
+    compile anew, in 0.2 ms, for any other number of samples.
     """
     weight, bias = network.output_weight, network.output_bias
     tile = len(x) == TILE and x.is_cpu and x.dtype == weight.dtype == torch.float32

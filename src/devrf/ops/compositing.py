@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-# The least Σ w of a ray that something is divided by.
+# A ray's Σ w is at least this in divisions.
 LEAST_MASS = 1e-6
 
 
@@ -68,7 +68,7 @@ def firsts(ray: Tensor, rays: int) -> Tensor:
 
 
 def running_sum(values: Tensor) -> Tensor:
-    """Sums (S + 1,) of all values before each place, over all rays.
+    """Sums (S + 1,) of all values before each position, over all rays.
 
     In double precision: a ray's own sum is the difference of two of these, which may be large.
     """
@@ -95,7 +95,7 @@ def sums_before(running: Tensor, edges: Tensor, ray: Tensor) -> Tensor:
 def sum_by_doubling(values: Tensor) -> Tensor:
     """Running sums (S,) in ⌈log₂ S⌉ passes, with additions in a fixed order.
 
-    On a GPU ``cumsum`` adds in the order in which its blocks finish.
+    ``cumsum`` on a GPU adds in the order in which its blocks finish.
     """
     reach = 1
     while reach < len(values):
