@@ -9,7 +9,7 @@ import torch
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Distortion
 from devrf.scenes.lens import Lens
-from devrf.scenes.resampling import as_pinhole, look_up_pixels, shrink_pixels
+from devrf.scenes.resampling import as_pinhole, interpolate_pixels, shrink_pixels
 
 BARREL = Distortion((-0.2, 0.05, 0.0, 0.0), (0.004, -0.006))
 PINCUSHION = Distortion((0.15, 0.02, 0.01, 0.0), (-0.004, 0.003))
@@ -51,7 +51,7 @@ def test_a_pincushion_is_zoomed_until_nothing_is_missing():
 def test_colours_behind_the_matte_do_not_bleed_in():
     image = np.array([[[200, 100, 50, 255], [0, 255, 0, 0]]], dtype=np.uint8)
     places = np.array([[[1.0, 0.5], [1.5, 0.5], [0.5, 0.5]]], dtype=np.float32)
-    between = look_up_pixels(image, places)
+    between = interpolate_pixels(image, places)
     assert between[0].tolist() == [[200, 100, 50, 128], [0, 0, 0, 0], [200, 100, 50, 255]]
 
 

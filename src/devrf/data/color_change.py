@@ -1,4 +1,4 @@
-"""How much colours change along the observed motion, without training."""
+"""The change of colours along the observed motion, without training."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from torch.nn.functional import grid_sample, max_pool2d
 from devrf.data.flow import previous_images
 from devrf.scenes.scene import Views
 
-# The number of images whose colours are followed, evenly spread.
+# Number of images whose colours are followed, evenly spread.
 IMAGES = 64
-# The number of frames that they are followed back.
+# Number of frames over which they are followed back.
 STEPS = 4
-# With this drift or more, colours are not those of the rest state (docs/method.md#color-drift).
+# With this drift or more, colours are not the canonical ones (docs/method.md#color-drift).
 CHANGING = 0.07
-# Colours are smoothed before they are compared: what is finer than the pixels flickers as it moves.
+# Colours are smoothed before they are compared: detail finer than pixels flickers as it moves.
 SIGMA = 1.5
 TAPS = 9
 # Pixels nearer than this to the alpha mask's edge, or to an occlusion, are left out.
@@ -29,7 +29,7 @@ def color_change(views: Views) -> float | None:
 
     C' is the image of the same view ``STEPS`` frames earlier (fewer, where the recording is
     shorter), and the flow is followed back through the images between; both are smoothed. Without
-    alpha masks only pixels that move by more than half a pixel count: a backdrop says nothing.
+    alpha masks only pixels that move by more than half a pixel count, not the backdrop.
 
     Args:
         views: the dynamic training views.
@@ -42,10 +42,10 @@ def color_change(views: Views) -> float | None:
 
 
 def color_drift(views: Views) -> float | None:
-    """By how much colours change in the whole recording, if they go on as they do for a few frames.
+    """Change of colours over the whole recording, extrapolated from a few frames.
 
     See docs/method.md#color-drift: noise and blur change colours as much over two times ``STEPS``
-    frames as over ``STEPS``, so what lies between the two is change of the scene.
+    frames as over ``STEPS``, so the difference of the two is change of the scene.
 
     Args:
         views: the dynamic training views.
@@ -63,7 +63,7 @@ def color_drift(views: Views) -> float | None:
 
 
 def _mean_change(views: Views, steps: int) -> tuple[float | None, int]:
-    """The mean change over ``steps`` frames, or over the most that there are, and how many."""
+    """The mean change over ``steps`` frames, or over as many as there are, and their number."""
     if views.flow is None:
         return None, 0
     previous = previous_images(views).tolist()
@@ -91,21 +91,21 @@ def _change(views: Views, chain: list[int]) -> float | None:
     x = torch.arange(width) + 0.5
     y = torch.arange(height) + 0.5
     start = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
-    place = start
+    position = start
     usable = _inside(views, chain[0])
     for image, earlier in zip(chain, chain[1:], strict=False):
         valid = views.flow.valid[image]
         vectors = torch.where(valid[..., None], views.flow.vectors[image], 0.0)
-        usable = usable & (_look_up(valid[None].float(), place)[0] > 0.999)
-        place = place + _look_up(vectors.permute(2, 0, 1), place).permute(1, 2, 0)
-        usable = usable & (_look_up(_inside(views, earlier)[None].float(), place)[0] > 0.999)
+        usable = usable & (_bilinear(valid[None].float(), position)[0] > 0.999)
+        position = position + _bilinear(vectors.permute(2, 0, 1), position).permute(1, 2, 0)
+        usable = usable & (_bilinear(_inside(views, earlier)[None].float(), position)[0] > 0.999)
     if not views.has_alpha:
-        usable = usable & ((place - start).norm(dim=-1) > 0.5)
+        usable = usable & ((position - start).norm(dim=-1) > 0.5)
     if int(usable.sum()) < MARGIN**2:
         return None
     now = _smooth(views, chain[0])
     before = _smooth(views, chain[-1])
-    return float((_look_up(before, place) - now).abs()[:, usable].mean())
+    return float((_bilinear(before, position) - now).abs()[:, usable].mean())
 
 
 def _inside(views: Views, image: int) -> Tensor:
@@ -133,8 +133,8 @@ def _gaussian(image: Tensor) -> Tensor:
     return gaussian_blur2d(image[None], TAPS, (SIGMA, SIGMA), "replicate")[0]
 
 
-def _look_up(image: Tensor, place: Tensor) -> Tensor:
-    """An image (C, H, W) at ``place`` (H', W', 2) in pixels, x then y: bilinear, (C, H', W')."""
+def _bilinear(image: Tensor, position: Tensor) -> Tensor:
+    """An image (C, H, W) at ``position`` (H', W', 2), pixels x then y: bilinear, (C, H', W')."""
     _, height, width = image.shape
-    scaled = 2 * place / torch.tensor([width, height]) - 1
+    scaled = 2 * position / torch.tensor([width, height]) - 1
     return grid_sample(image[None], scaled[None], padding_mode="border", align_corners=False)[0]

@@ -17,19 +17,19 @@ from devrf.scenes.scene import ImagesName, Scene, Views
 class SceneDataModule(LightningDataModule, ABC):
     """Serves a scene to the stages.
 
-    A training batch is the whole set of training views that the stage learns from (its attribute
-    ``images``: ``static``, ``dynamic``, both, or ``at_rest``), moved to the device once. The
-    stage draws its rays from it on the device, under its own schedule: no pixel crosses from the
-    host during training. A test batch is the position of one held-out image.
+    A training batch is the whole set of the stage's training views (its attribute ``images``:
+    ``static``, ``dynamic``, both, or ``at_rest``), moved to the device once. The stage draws its
+    rays from it on the device, under its own schedule: no pixel crosses from the host during
+    training. A test batch is the position of one held-out image.
     """
 
     # The factor by which images were made smaller as they were read.
     downscale = 1
-    # Whether methods are told what the scene tells beside its images.
+    # Whether methods get the scene's priors beside its images.
     priors: Priors = "all"
     # Whether validation views are served, too, where the scene has any.
     validation = False
-    # What is made of the scene that was read; None: it is served as it is.
+    # A change of the scene that was read; None: it is served as it is.
     change: Callable[[Scene], Scene] | None = None
 
     def __init__(self) -> None:
@@ -51,19 +51,19 @@ class SceneDataModule(LightningDataModule, ABC):
         return self._scene
 
     def provide(self, priors: Collection[str]) -> None:
-        """Add to the scene what a method wants of it, where it can be had.
+        """Add priors that a method needs to the scene, if it has them.
 
         Args:
-            priors: names of what is wanted: ``forward_flow`` of the dynamic training views.
+            priors: their names: ``forward_flow`` of the dynamic training views.
         """
 
     def replace(self, scene: Scene) -> None:
-        """Serve ``scene`` from now on, which knows more of the same images."""
+        """Serve ``scene`` from now on: the same images with more priors."""
         self._scene = scene
         self._on_device = {}
 
     def prepare_data(self) -> None:
-        """Read the scene in one process of several, before the others find what it has kept."""
+        """Read the scene in one process of several first: it fills caches for the others."""
         _ = self.scene
 
     def setup(self, stage: str) -> None:
@@ -71,7 +71,7 @@ class SceneDataModule(LightningDataModule, ABC):
         _ = self.scene
 
     def train_dataloader(self) -> Iterable[None]:
-        """Without end the same batch: the training views of the stage's capture."""
+        """The same batch without end: the training views of the stage's capture."""
         return repeat(None)
 
     def test_dataloader(self) -> Iterable[int]:

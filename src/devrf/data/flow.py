@@ -1,4 +1,4 @@
-"""Where a scene's optical flow comes from (files, an estimate, nowhere), and where it leads."""
+"""A scene's optical flow, from files or estimated, and the images that it leads to."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ log = logging.getLogger(__name__)
 
 
 def with_flow(scene: Scene, source: FlowSource, cache: Path | None) -> Scene:
-    """The scene with estimated flow of its moving training views, if that is asked for.
+    """The scene with flow of its moving training views, estimated if ``source`` says so.
 
-    It is valid only where the views' ``valid_mask`` is.
+    Flow is valid only where the views' ``valid_mask`` is.
 
     Args:
         scene: as its reader gave it, with flow from files or without.
         source: ``dis`` and ``raft`` estimate; the others change nothing.
-        cache: an ``.npz`` that keeps the estimate, or None.
+        cache: an ``.npz`` file for the estimate, or None.
 
     Raises:
         DevrfError: ``files`` of a scene in motion that has none.
@@ -44,7 +44,7 @@ def with_flow(scene: Scene, source: FlowSource, cache: Path | None) -> Scene:
 def with_forward_flow(
     scene: Scene, source: FlowSource, cache: Path | None, files: OpticalFlow | None
 ) -> Scene:
-    """The scene with forward flow of its moving training views, where it can be had.
+    """The scene with forward flow of its moving training views, if it has a source.
 
     It comes from the same source as backward flow (:func:`with_flow`).
 
@@ -52,7 +52,7 @@ def with_forward_flow(
         scene: with backward flow, or without.
         source: as of :func:`with_flow`.
         cache: an ``.npz`` beside which the estimate is kept, or None.
-        files: what was read from files, if any.
+        files: forward flow from files, or None.
     """
     train = scene.dynamic.train
     flow = files
@@ -66,7 +66,7 @@ def with_forward_flow(
 
 
 def _where_valid(flow: OpticalFlow, views: Views) -> OpticalFlow:
-    """The flow without what the views' ``valid_mask`` leaves out."""
+    """The flow, valid only within the views' ``valid_mask``."""
     if views.valid_mask is None:
         return flow
     return replace(flow, valid=flow.valid & views.valid_mask)
@@ -78,10 +78,10 @@ def _with_train(scene: Scene, train: Views) -> Scene:
 
 
 def previous_images(views: Views) -> Tensor:
-    """For each of N images the one that its backward flow leads to.
+    """The image that the backward flow of each of N images leads to.
 
     That is the image before it in the same view; a moving camera's images (each its own view)
-    follow one another as one sequence. An image without a predecessor is its own.
+    are one sequence. An image without a predecessor is its own.
 
     Returns:
         (N,) int64 on the device of the views.

@@ -1,6 +1,6 @@
-"""What a scene's camera files say about it, before anything else is read.
+"""A scene's kind, from its camera files, before anything else is read.
 
-A damaged file says nothing here: its reader reports it.
+A damaged file counts as absent here: its reader reports it.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from devrf.scenes.formats.dycheck import DycheckReader
 from devrf.scenes.formats.llff_poses import PRECOMPUTED
 from devrf.scenes.formats.nerfies import NerfiesReader
 from devrf.scenes.sparse_model import ONE_SIDE, scene_model, widest_angle
-from devrf.scenes.splits import distinct_poses, distinct_times, stand_still
+from devrf.scenes.splits import are_fixed, distinct_poses, distinct_times
 from devrf.scenes.transforms import TransformsFile
 from devrf.scenes.view_folders import dynamic_folders
 
 
 def faces_forward(choice: str, root: str | Path, space: str | None) -> bool:
-    """Whether the scene in ``root`` is forward-facing, where its reader leaves that to the files.
+    """Whether the scene in ``root`` is forward-facing, if its reader decides that by the files.
 
     Args:
         choice: the option of ``data=`` that reads it.
@@ -34,18 +34,18 @@ def faces_forward(choice: str, root: str | Path, space: str | None) -> bool:
         return space == "ndc"
     folder = Path(root).expanduser()
     if choice == "nerfstudio":
-        listings = [_transforms(folder / place / "transforms.json") for place in ("", "static")]
+        listings = [_transforms(folder / part / "transforms.json") for part in ("", "static")]
         bounds = [listing.scene_bounds for listing in listings if listing is not None]
-        return any(known is not None and known.space == "ndc" for known in bounds)
+        return any(stated is not None and stated.space == "ndc" for stated in bounds)
     with suppress(DevrfError):
         return widest_angle(scene_model(folder)[0].poses) <= ONE_SIDE
     return False
 
 
 def by_one_camera(choice: str, root: str | Path, *, ordered: bool = False) -> bool:
-    """Whether one camera takes all images, elsewhere in each as time passes, and no static set.
+    """Whether one moving camera takes all images while time passes: there is no static set.
 
-    ``ordered``: time passes in the order of their names (``data.times=order``).
+    ``ordered``: the times are in the order of the names (``data.times=order``).
     """
     folder = Path(root).expanduser()
     if choice in ("nerfies", "dycheck"):
@@ -61,17 +61,17 @@ def by_one_camera(choice: str, root: str | Path, *, ordered: bool = False) -> bo
     listing = None if file is None else _transforms(folder / file)
     if listing is None:
         return False
-    told = [frame.time for frame in listing.frames if frame.time is not None]
-    times = torch.arange(len(listing.frames)) if ordered else torch.tensor(told)
+    stated = [frame.time for frame in listing.frames if frame.time is not None]
+    times = torch.arange(len(listing.frames)) if ordered else torch.tensor(stated)
     poses = torch.tensor(
         [frame.transform_matrix[:3] for frame in listing.frames], dtype=torch.float64
     )
     alone = 1 < len(times) == len(distinct_times(times))
-    return alone and not stand_still(distinct_poses(subtracted(poses, offset_of(poses)).float()))
+    return alone and not are_fixed(distinct_poses(subtracted(poses, offset_of(poses)).float()))
 
 
 def _transforms(file: Path) -> TransformsFile | None:
-    """What a transforms file says; None where there is none, or a damaged one."""
+    """The content of a transforms file; None if it is absent or damaged."""
     with suppress(DevrfError):
         return read_json(file, TransformsFile, "it poses the images")
     return None

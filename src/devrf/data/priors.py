@@ -1,4 +1,4 @@
-"""What a scene provides beside its images, and the scene without it: ``priors=none``."""
+"""A scene without its priors, all that it has beside images: ``priors=none``."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ Priors = Literal["all", "none"]
 
 
 def without_priors(scene: Scene) -> Scene:
-    """The scene as posed images before a known background, with nothing that helps a method.
+    """The scene as posed images before a known background, without priors.
 
     Training images lose optical flow, depth and alpha masks; the box loses the room for motion that
-    masks, or an embedded scene, told. Held-out images keep what they are scored with. The box at
-    rest and the space stay: without them no method would know where to look.
+    masks, or an embedded scene, gave. Held-out images keep the maps that metrics use. The static
+    box and the space stay: no method would know where to look without them.
     """
     plain: Background = "white" if scene.background == "random" else scene.background
     scale = max(scene.bounds.scale, FALLBACK_BOUND_SCALE)

@@ -38,21 +38,21 @@ READERS: dict[str, type[SceneReader]] = {
 
 
 class RecordedDataModule(SceneDataModule):
-    """A scene read from disk when it is first needed, its flow estimated if that is asked for."""
+    """A scene that is read from disk when it is first needed."""
 
     def __init__(self, reader: Callable[..., SceneReader], *where: Any, **options: Any) -> None:
-        """Say who reads the scene, and how.
+        """Choose the reader and its options.
 
         Args:
-            reader: of :data:`READERS`, or another.
+            reader: one of :data:`READERS`, or another.
             where: the scene's folder.
-            options: of the reader.
+            options: the reader's.
         """
         super().__init__()
         self.reader = reader(*where, **options)
 
     def load(self) -> Scene:
-        """Read the scene, and estimate its optical flow if that is asked for."""
+        """Read the scene, and estimate its optical flow if ``data.flow`` says so."""
         if self.validation:
             self.reader = replace(self.reader, validation=True)
         try:
@@ -75,7 +75,7 @@ class RecordedDataModule(SceneDataModule):
         return with_flow(scene, self.reader.flow, self._cache)
 
     def provide(self, priors: Collection[str]) -> None:
-        """Read or estimate forward flow, if a method wants it."""
+        """Read or estimate forward flow, if a method needs it."""
         scene = self.scene
         reader = self.reader
         if "forward_flow" in priors and scene.dynamic.train.forward_flow is None and scene.moves:
@@ -86,7 +86,7 @@ class RecordedDataModule(SceneDataModule):
 
     @property
     def _cache(self) -> Path | None:
-        """Where estimated flow is kept."""
+        """The file of estimated flow."""
         cache = self.reader.flow_cache
         return None if cache is None else Path(cache)
 
@@ -97,7 +97,7 @@ class InwardFacingDataModule(RecordedDataModule):
     def __init__(
         self, *where: Any, reader: Callable[..., SceneReader] = BlenderReader, **options: Any
     ) -> None:
-        """Say where the scene is and how to read it; see :class:`BlenderReader`."""
+        """Choose the scene and the options of its reader; see :class:`BlenderReader`."""
         super().__init__(reader, *where, **options)
 
 
@@ -107,5 +107,5 @@ class ForwardFacingDataModule(RecordedDataModule):
     def __init__(
         self, *where: Any, reader: Callable[..., SceneReader] = LlffReader, **options: Any
     ) -> None:
-        """Say where the scene is and how to read it; see :class:`LlffReader`."""
+        """Choose the scene and the options of its reader; see :class:`LlffReader`."""
         super().__init__(reader, *where, **options)

@@ -35,14 +35,14 @@ class ProceduralDataModule(SceneDataModule):
         flow: Flow = "exact",
         **numbers: Any,
     ) -> None:
-        """Say what to render.
+        """Choose the scene.
 
         Args:
-            shape: which shape, or the scene's name.
+            shape: the shape, or the scene's name.
             recipe: :class:`ProceduralScene` or :class:`ProceduralForwardScene`.
             export: the folder that ``stage=prepare`` writes the scene to.
-            flow: the optical flow that is learned from.
-            numbers: of the recipe.
+            flow: the training images' optical flow.
+            numbers: the recipe's options.
         """
         super().__init__()
         self.recipe = recipe(*shape, **numbers)
@@ -60,7 +60,7 @@ class ProceduralDataModule(SceneDataModule):
         return replace(scene, dynamic=dynamic)
 
     def provide(self, priors: Collection[str]) -> None:
-        """Compute exact forward flow, if a method wants it."""
+        """Compute exact forward flow, if a method needs it."""
         scene = self.scene
         train = self.scene.dynamic.train
         wanted = "forward_flow" in priors and train.forward_flow is None

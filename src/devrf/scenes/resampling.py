@@ -42,7 +42,7 @@ def shrink_pixels(image: Pixels, width: int, height: int, *, alpha_weighted: boo
     return _rounded(averaged(image.astype(np.float32)))
 
 
-def look_up_pixels(image: Pixels, source: Array) -> Pixels:
+def interpolate_pixels(image: Pixels, source: Array) -> Pixels:
     """An 8-bit image (H, W, 1, 3 or 4) looked up elsewhere, bilinearly; colours weighted by alpha.
 
     ``source`` (H', W', 2) is x, y in pixels of ``image``, where a pixel's centre is at i + 0.5.
@@ -136,7 +136,7 @@ def as_pinhole(
             )
         plain[row], source = view
         image = pixels[row, :height, :width]
-        image.copy_(torch.from_numpy(look_up_pixels(image.numpy(), source.numpy())))
+        image.copy_(torch.from_numpy(interpolate_pixels(image.numpy(), source.numpy())))
     return pixels, tuple(plain)
 
 

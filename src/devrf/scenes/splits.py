@@ -113,7 +113,7 @@ def distinct_poses(poses: Tensor) -> Tensor:
     return torch.from_numpy(numbers)
 
 
-def stand_still(pose: Tensor) -> bool:
+def are_fixed(pose: Tensor) -> bool:
     """Whether cameras are fixed, by the number of each image's pose (N,).
 
     They are if a pose has two images or more in the mean: a moving camera may come back to a place.
@@ -170,14 +170,14 @@ def one_moment(*sets: Transforms) -> bool:
 def in_motion(transforms: Transforms) -> Split:
     """A split of a scene in motion.
 
-    Cameras are fixed (:func:`stand_still`), or one camera moves and each image is its own view.
+    Cameras are fixed (:func:`are_fixed`), or one camera moves and each image is its own view.
     Without times in the file, the images of V fixed views are time-major (frame = position // V;
     DevrfError if the views do not take turns) and those of a moving camera consecutive.
     """
     order = torch.arange(len(transforms.images))
     camera = distinct_poses(transforms.poses)
     views = int(camera.max()) + 1
-    fixed = stand_still(camera)
+    fixed = are_fixed(camera)
     if transforms.times is not None:
         times = torch.tensor(transforms.times)
     else:

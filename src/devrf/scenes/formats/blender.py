@@ -17,12 +17,12 @@ from devrf.scenes.reader import InwardReader, Time
 from devrf.scenes.scene import OpticalFlow, Views
 from devrf.scenes.splits import (
     Split,
+    are_fixed,
     check_timed_alike,
     distinct_poses,
     every_nth,
     file_sizes,
     one_moment,
-    stand_still,
 )
 from devrf.scenes.transforms import Transforms, TransformsFiles
 from devrf.scenes.view_folders import chosen_dynamic, dynamic_folders
@@ -137,7 +137,7 @@ def _train_and_test(files: TransformsFiles, folder: Path) -> Pair:
 def _held_out_of(train: Transforms) -> tuple[list[int], list[int]] | None:
     """Positions to learn from and to hold out: the last of three fixed cameras or more, or some."""
     camera = distinct_poses(train.poses)
-    if not stand_still(camera):
+    if not are_fixed(camera):
         return every_nth(len(camera), HOLDOUT) if len(camera) > 1 else None
     last = camera == camera.max()
     parts = ((~last).nonzero()[:, 0].tolist(), last.nonzero()[:, 0].tolist())
