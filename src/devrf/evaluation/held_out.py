@@ -16,17 +16,17 @@ from devrf.scenes.scene import Background, Views
 
 @dataclass(frozen=True)
 class HeldOutView:
-    """A held-out image, what the model renders there, and metrics over the valid pixels.
+    """A held-out image, the model's prediction of it, and metrics over the valid pixels.
 
     Attributes:
         truth: (H, W, 3) RGB in [0, 1].
         prediction: (H, W, 3) RGB in [0, 1].
         psnr: dB.
-        rest_pose_psnr: PSNR in dB of the scene at rest, in place of the prediction.
-        further: other metrics by name; None where there is nothing to compare with.
+        rest_pose_psnr: PSNR in dB of the canonical scene, in place of the prediction.
+        further: other metrics by name; None where a view has no truth to compare with.
         compared: (H, W, 3) RGB in [0, 1], the prediction at valid pixels, else the truth.
-        depth: (H, W) mean distance of what is seen, in the space of the fields.
-        opacity: (H, W) in [0, 1], how much is seen there.
+        depth: (H, W) mean distance of the visible samples, in the space of the fields.
+        opacity: (H, W) in [0, 1], 1 − transmittance.
     """
 
     name: str
@@ -61,12 +61,12 @@ def score(
     """Render image ``index`` of held-out ``views`` and compare it with the truth.
 
     Only valid pixels are compared, for SSIM in windows of valid pixels alone. For other metrics
-    over neighbourhoods the prediction at other pixels is the truth. What is rendered has first been
-    given the image's own exposure, where a part of it is there to tell that.
+    over neighbourhoods the prediction at other pixels is the truth. The prediction gets the image's
+    own exposure first, if a part of the image is there to estimate it.
 
     ``views`` are on the host. ``suite`` has metrics beside PSNR and SSIM. ``time`` in [0, 1] is
-    rendered; None: the image's own. ``rest_pose_psnr`` is that of the image where it is known
-    already; None: the scene at rest is rendered, too.
+    rendered; None: the image's own. ``rest_pose_psnr`` is the image's, if it
+    was computed before; None: the canonical scene is rendered, too.
     """
     own_time = float(views.times[index])
     time = own_time if time is None else time
@@ -81,9 +81,9 @@ def score(
     if rest_pose_psnr is None:
         rest_pose_psnr = psnr
         if not renderer.at(time).at_rest:
-            rest = _image(renderer.view(camera, 0, 0.0, behind), truth)
-            rest = compare(exposed(rest, truth, views, index), truth, valid_mask)
-            rest_pose_psnr = _psnr(rest, truth, valid_mask)
+            canonical = _image(renderer.view(camera, 0, 0.0, behind), truth)
+            canonical = compare(exposed(canonical, truth, views, index), truth, valid_mask)
+            rest_pose_psnr = _psnr(canonical, truth, valid_mask)
     further: dict[str, float | None] = {}
     opacity = rendered.opacity.cpu().view(truth.shape[:2])
     if suite is not None and suite.metrics:
@@ -115,41 +115,41 @@ def compare(prediction: Tensor, truth: Tensor, valid_mask: Tensor | None) -> Ten
     return torch.where(valid_mask[..., None], prediction, truth)
 
 
-# Brighter or darker values than these say little of a gain, and no gain is a larger factor.
-TELLING = (0.04, 0.97)
+# Values between these determine a gain; gains are limited to this factor and its inverse.
+GAIN_VALUES = (0.04, 0.97)
 LARGEST_GAIN = 4.0
 
 
 def exposed(prediction: Tensor, truth: Tensor, views: Views, index: int) -> Tensor:
-    """The prediction with each channel's gain that is nearest to the truth where that tells it.
+    """The prediction, each channel times the gain that brings it nearest to the truth.
 
     Args:
         prediction: (H, W, 3) RGB in [0, 1] of image ``index`` of held-out ``views``.
         truth: the same.
         views: those with an ``exposure_mask`` have exposures of their own; else nothing changes.
-        index: which image.
+        index: the image's.
     """
     if views.exposure_mask is None:
         return prediction
-    low, high = TELLING
+    low, high = GAIN_VALUES
     within = (torch.minimum(prediction, truth) > low) & (torch.maximum(prediction, truth) < high)
     height, width = truth.shape[:2]
-    told = views.exposure_mask[index, :height, :width].cpu()[..., None] & within
-    squares = (prediction.square() * told).sum(dim=(0, 1))
-    gain = (prediction * truth * told).sum(dim=(0, 1)) / squares.clamp(min=1e-6)
+    used = views.exposure_mask[index, :height, :width].cpu()[..., None] & within
+    squares = (prediction.square() * used).sum(dim=(0, 1))
+    gain = (prediction * truth * used).sum(dim=(0, 1)) / squares.clamp(min=1e-6)
     gain = torch.where(squares > 0, gain, 1.0).clamp(1 / LARGEST_GAIN, LARGEST_GAIN)
     return (prediction * gain).clamp(0, 1)
 
 
 def _psnr(compared: Tensor, truth: Tensor, valid_mask: Tensor | None) -> float:
-    # Readers refuse a mask that leaves nothing.
+    # Readers refuse an empty mask.
     value = None if valid_mask is None else psnr_masked(compared, truth, valid_mask)
     return psnr(compared, truth) if value is None else value
 
 
 def _ssim(compared: Tensor, truth: Tensor, valid_mask: Tensor | None) -> float:
-    # If no window has valid pixels alone, those centred on valid pixels are taken; if no such
-    # window is inside the image, all windows.
+    # If no window has valid pixels alone, those centred on valid pixels count; if no such window is
+    # inside the image, all windows count.
     if valid_mask is not None:
         for measure in (ssim_within, ssim_masked):
             value = measure(compared, truth, valid_mask)
@@ -159,9 +159,9 @@ def _ssim(compared: Tensor, truth: Tensor, valid_mask: Tensor | None) -> float:
 
 
 def truth_image(views: Views, index: int, background: Background) -> Tensor:
-    """A held-out image (H, W, 3) in [0, 1] on the background (white where that is random).
+    """A held-out image (H, W, 3) in [0, 1], of its own size, on the background.
 
-    It is of its own size.
+    A random background is white here.
     """
     value = views.single(index).pixels[0].float() / 255
     if not views.has_alpha:

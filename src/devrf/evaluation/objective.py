@@ -1,4 +1,4 @@
-"""The number of ``metrics.json`` that a search for settings looks at."""
+"""The objective of a search for settings, a number of ``metrics.json``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 from devrf.errors import DevrfError, did_you_mean
 
-# Figures of the training, from the checkpoint, that stand beside the scores.
+# Figures of the training, from the checkpoint, beside the scores.
 TRAINING = (
     "seconds",
     "iterations",
@@ -38,11 +38,11 @@ def check_objective(key: str, metrics: Sequence[str]) -> None:
         expected = "static.NAME, dynamic.NAME or validation.NAME"
         raise DevrfError(f"objective: expected {expected}, not {key!r}")
     recorded = SCORES if section == VALIDATION else OF_BOTH
-    known = [*recorded, *metrics, *(OF_MOTION if section in DYNAMIC else ())]
-    if name not in known:
+    names = [*recorded, *metrics, *(OF_MOTION if section in DYNAMIC else ())]
+    if name not in names:
         raise DevrfError(
-            f"objective: {section} has no {name!r}; choose from {', '.join(known)}"
-            f"{did_you_mean(name, known, f'objective={section}.')}"
+            f"objective: {section} has no {name!r}; choose from {', '.join(names)}"
+            f"{did_you_mean(name, names, f'objective={section}.')}"
         )
 
 

@@ -28,7 +28,7 @@ class MetricInput:
         truth: (H, W, 3) RGB in [0, 1].
         depth: (H, W) rendered distance along each pixel's ray, world units.
         opacity: (H, W) in [0, 1].
-        lpips: the perceptual metric, or None where it cannot be had.
+        lpips: the perceptual metric, or None without its weights.
     """
 
     renderer: Renderer
@@ -86,7 +86,7 @@ def _depth_error(inputs: MetricInput) -> float | None:
     return depth_error(inputs.depth, inputs.opacity, truth[0].cpu())
 
 
-# By name, in the order of tables; None where a view has nothing to compare with.
+# By name, in the order of tables; None where a view has no truth to compare with.
 MEASURES: dict[str, Callable[[MetricInput], float | None]] = {
     "ms_ssim": _ms_ssim,
     "lpips": lambda inputs: _lpips(inputs, inputs.valid_mask),
@@ -142,14 +142,14 @@ class MetricSuite:
 
     Attributes:
         metrics: names of :data:`MEASURES`.
-        lpips: the perceptual metric, or None where it cannot be had.
+        lpips: the perceptual metric, or None without its weights.
     """
 
     metrics: tuple[str, ...] = ()
     lpips: Lpips | None = None
 
     def scores(self, inputs: MetricInput) -> dict[str, float | None]:
-        """Each metric by name; None where there is nothing to compare with."""
+        """Each metric by name; None where a view has no truth to compare with."""
         return {name: MEASURES[name](inputs) for name in self.metrics}
 
 
@@ -162,7 +162,7 @@ def flow_error(renderer: Renderer, views: Views, index: int) -> float | None:
     if views.flow is None:
         return None
     before = int(previous_images(views)[index])
-    # On the raster of all: flow beside an image is not valid.
+    # On the raster of all images: flow beside an image is not valid.
     flat = views.flow.valid[index].flatten().nonzero()[:, 0]
     if before == index or len(flat) == 0:
         return None

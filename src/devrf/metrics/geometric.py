@@ -1,4 +1,4 @@
-"""How far rendered geometry and motion are from the truth."""
+"""Errors of rendered geometry and motion."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ SOLID = 0.5
 def depth_error(depth: Tensor, opacity: Tensor, truth: Tensor) -> float | None:
     """Mean absolute error of depths (H, W), in their unit.
 
-    Over the pixels where both are finite and more than half of the ray is stopped: how far what
-    is seen is from where it should be, not how much is missing. None without such pixels.
+    It is the mean over the pixels where both are finite and more than half of the ray is stopped:
+    it measures displaced surfaces, not missing ones. None without such pixels.
 
     Args:
         depth: rendered distance along each pixel's ray.
-        opacity: in [0, 1], how much of each ray is stopped.
+        opacity: in [0, 1], the part of each ray that is stopped.
         truth: true distance, +inf where the ray hits nothing.
     """
     valid_mask = truth.isfinite() & depth.isfinite() & (opacity > SOLID)

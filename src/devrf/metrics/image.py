@@ -1,4 +1,4 @@
-"""How alike two images are, as a whole or inside a mask."""
+"""Similarity of two images, as a whole or inside a mask."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def ssim(prediction: Tensor, truth: Tensor) -> float:
 def ssim_map(prediction: Tensor, truth: Tensor) -> Tensor:
     """Structural similarity at each pixel that :func:`ssim` counts: (H − 10, W − 10, 3).
 
-    It is (H, W, 3) for images smaller than a window; what is missing is mirrored.
+    It is (H, W, 3) for images smaller than a window, with mirrored borders.
     """
     a = _batched(prediction)
     b = _batched(truth)
@@ -82,7 +82,7 @@ def ssim_within(prediction: Tensor, truth: Tensor, mask: Tensor) -> float | None
     Pixels outside the mask do not count. None where no window lies inside.
     """
     values = ssim_map(prediction, truth)
-    # What images smaller than a window lack is mirrored, and so not beyond the mask.
+    # Images smaller than a window have mirrored borders, which are not beyond the mask.
     padding = (WINDOW - 1) // 2 if values.shape[:2] == mask.shape else 0
     touched = max_pool2d((~mask).float()[None], WINDOW, 1, padding)[0] > 0
     return None if bool(touched.all()) else float(values[~touched].mean())
@@ -91,10 +91,10 @@ def ssim_within(prediction: Tensor, truth: Tensor, mask: Tensor) -> float | None
 def ssim_partial(prediction: Tensor, truth: Tensor, mask: Tensor) -> float | None:
     """DyCheck's masked SSIM (mSSIM) of two (H, W, 3) images in [0, 1], within ``mask`` (H, W).
 
-    Windows are partial convolutions (Liu et al. 2018): along rows, then along columns, what is
-    beyond the mask counts 0, and the sum is scaled by 11 over the number of pixels that count. The
-    mean is over all windows inside the image; one without any such pixel has the similarity 1.
-    None for images smaller than a window, or if the mask is empty.
+    Windows are partial convolutions (Liu et al. 2018): along rows, then along columns, pixels
+    beyond the mask count 0, and the sum is scaled by 11 over the number of pixels that count. The
+    mean is over all windows inside the image; one without any such pixel has the similarity 1. None
+    for images smaller than a window, or if the mask is empty.
     """
     if min(mask.shape) < WINDOW or not bool(mask.any()):
         return None

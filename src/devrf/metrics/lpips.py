@@ -122,7 +122,7 @@ class Lpips(nn.Module):
     ) -> float | None:
         """LPIPS of two (H, W, 3) images in [0, 1], where ``mask`` (H, W) is True if one is given.
 
-        Outside it the prediction is taken to be right; the layers' differences, interpolated to the
+        The prediction counts as right outside it; the layers' differences, interpolated to the
         image's size, are averaged inside. None where it is empty or the images are too small.
         """
         if mask is not None:
@@ -160,9 +160,9 @@ class Lpips(nn.Module):
 def load_lpips(
     network: Network = "vgg", weights: str | Path | None = None, download: bool = False
 ) -> Lpips | None:
-    """The metric, or None where its weights cannot be had; one logged line says why.
+    """The metric, or None without its weights; one logged line says why.
 
-    The weights of the trunk are those of torchvision's network trained on ImageNet: from the file
+    The trunk has the weights of torchvision's network trained on ImageNet: from the file
     ``weights``, else from torch's cache (``torch.hub.get_dir()/checkpoints``), else downloaded
     into it (528 MB for ``vgg``, 233 MB for ``alex``). The heads come with torchmetrics.
 

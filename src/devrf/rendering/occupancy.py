@@ -14,10 +14,10 @@ from devrf.system.plain_data import built
 
 
 class Occupancy(nn.Module):
-    """A mask (X, Y, Z) over a box; a point is looked up at its nearest grid point.
+    """A mask (X, Y, Z) over a box; a point reads its nearest grid point.
 
     Attributes:
-        mask: (X, Y, Z) bool, True where something may be.
+        mask: (X, Y, Z) bool, True where the scene may be.
         box: the box of the mask; outside it everything is empty.
     """
 
@@ -40,17 +40,17 @@ class Occupancy(nn.Module):
 
     @property
     def distances(self) -> OccupancyDistances:
-        """How many cells away something may be, so that rays can skip what is empty."""
+        """Distances to occupied cells, by which rays skip empty space."""
         return OccupancyDistances(self.find_distances(), self.box)
 
     def find_distances(self) -> Tensor:
-        """Cells (X, Y, Z) to the nearest occupied one, uint8, found once for a mask."""
+        """Cells (X, Y, Z) to the nearest occupied one, uint8, computed once for a mask."""
         if self._distances is None:
-            grown, away = self.mask, (~self.mask).to(torch.uint8)
+            grown, cells = self.mask, (~self.mask).to(torch.uint8)
             for _ in range(self.FARTHEST - 1):
                 grown = dilate(grown, 1)
-                away += ~grown
-            self._distances = away
+                cells += ~grown
+            self._distances = cells
         return self._distances
 
     @property
@@ -64,19 +64,19 @@ class Occupancy(nn.Module):
         return float(self.mask.float().mean())
 
     def at(self, points: Tensor) -> Tensor:
-        """Mask (M,): whether something may be at ``points`` (M, 3)."""
-        # A border of empty cells, to which all that is outside belongs, and what is no number.
+        """Mask (M,) of the ``points`` (M, 3) that may be occupied."""
+        # A border of empty cells stands for all points outside, and for NaN.
         bordered = pad(self.mask, (1, 1) * 3)
         row = torch.zeros(len(points), dtype=torch.int32, device=points.device)
         # Axis by axis: several times faster than rows of three.
         for axis, count in enumerate(self.mask.shape):
             scale = (count - 1) / self.box.size[axis]
-            place = points[:, axis].sub(self.box.low[axis]).mul_(scale).nan_to_num_(nan=-1.0)
-            row.mul_(count + 2).add_(place.round_().clamp_(-1, count).to(torch.int32).add_(1))
+            index = points[:, axis].sub(self.box.low[axis]).mul_(scale).nan_to_num_(nan=-1.0)
+            row.mul_(count + 2).add_(index.round_().clamp_(-1, count).to(torch.int32).add_(1))
         return bordered.view(-1).index_select(0, row)
 
     def points_near(self, shape: tuple[int, int, int], box: Box) -> Tensor:
-        """The points of a grid over ``box`` that interpolation near anything occupied reads."""
+        """Mask of a grid's points over ``box`` that interpolation near occupied cells reads."""
         cells = zip(self.mask.shape, shape, strict=True)
         # A cell of the grid may span several of the occupancy's cells.
         reach = max(1, *(-(-(theirs - 1) // max(ours - 1, 1)) for theirs, ours in cells))

@@ -1,4 +1,4 @@
-"""What renderers give: a method's output with gradients, and images without."""
+"""Outputs of renderers: a method's, with gradients, and images, without."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from devrf.ops.march import Samples
 
-# Canonical points (M, 3) → what is added to the logits of their colours, (M, 3).
+# Canonical points (M, 3) → additions (M, 3) to the logits of their colours.
 ColorChange = Callable[[Tensor], Tensor]
 
 
@@ -64,7 +64,7 @@ class RenderedImage:
 
 @dataclass(frozen=True, kw_only=True)
 class VoxelOutput(RenderOutput):
-    """What R rays see, and the K samples whose colour was computed.
+    """The rendering of R rays, and the K samples whose colour was computed.
 
     Attributes:
         samples: their positions x_i at the rays' time and q_i in canonical space, and weights w_i.

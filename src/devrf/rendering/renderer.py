@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 Part = TypeVar("Part")
 
-# Smaller chunks would hardly need less memory, and take as long.
+# Smaller chunks would hardly need less memory, and would take as long.
 MIN_CHUNK = 256
 # Chunks that are rendered at once on a CPU: each takes memory.
 MOST_WORKERS = 8
@@ -36,7 +36,7 @@ MOST_WORKERS = 8
 class Renderer:
     """Renders a learned scene of any method, without gradients, on the scene's device.
 
-    Views of the last few times are cached: changes of the model do not show at these times.
+    Views of the last few times are cached: a change of the model does not show at these times.
 
     Attributes:
         at: time in [0, 1] → the :class:`~devrf.rendering.view.View` of that time, cached.
@@ -61,7 +61,7 @@ class Renderer:
             rays: R rays in world space, on any device.
             time: in [0, 1].
             background: grey level, or RGB (3,).
-            crop: what is outside this box is left out (:class:`CroppedRays`).
+            crop: only the part of the scene in this box is rendered (:class:`CroppedRays`).
         """
         view = self.at(time)
         if not isinstance(background, Tensor):
@@ -70,10 +70,10 @@ class Renderer:
         cropped = crop and CroppedRays.of(rays, crop, space, self.model.depth_limits[0])
         field_rays = cropped.rays if cropped else space.rays(rays)
 
-        def shown(part: slice) -> RenderedImage:
+        def rendered(part: slice) -> RenderedImage:
             return view.render(field_rays[part], background)
 
-        image = RenderedImage.joined(in_chunks(shown, len(field_rays), view.chunk, self.device))
+        image = RenderedImage.joined(in_chunks(rendered, len(field_rays), view.chunk, self.device))
         return cropped.completed(image, background) if cropped else image
 
     def view(
@@ -111,7 +111,7 @@ class Renderer:
     def reach(self, position: Tensor) -> Box | None:
         """The scene's box, if a camera at ``position`` (3,) is so far off that it must be cropped.
 
-        Nothing is sampled beyond the far limit: from further away rays have to begin at the box.
+        Nothing is sampled beyond the far limit: rays from further away have to begin at the box.
         """
         if not isinstance(self.model.space, WorldSpace):
             return None
@@ -132,9 +132,9 @@ def in_chunks(
 ) -> list[Part]:
     """``render(slice(k, l))`` for consecutive chunks of R ``rays``, in order; at least one.
 
-    On a CPU several at once, each on its share of the cores: one chunk's operations are too small
-    for all of them. They are smaller there, so that all workers get as many, of one size. When
-    memory runs out, this and later chunks are halved, down to ``MIN_CHUNK``.
+    A CPU renders several at once, each on its share of the cores: one chunk's operations are too
+    small for all of them. Chunks are smaller there, so that all workers get equally many, of one
+    size. When memory runs out, this and later chunks are halved, down to ``MIN_CHUNK``.
     """
     most = chunk
 
@@ -175,12 +175,12 @@ def in_chunks(
 class CroppedRays:
     """Rays that begin where they enter a box.
 
-    What is before the box is cut off exactly. What is behind it is left out pixel by pixel: where
-    the mean depth lies behind the box, the background is seen.
+    The part before the box is cut off exactly, the part behind it pixel by pixel: pixels whose mean
+    depth lies behind the box show the background.
 
     Attributes:
         rays: the K of R rays that meet the box, in the fields' space, from where they enter it.
-        hit: (R,) bool, which they are.
+        hit: (R,) bool, the mask of these rays.
         skipped: (K,) the distance from the origin of each ray to where it begins now.
         length: (K,) the distance from there to where it leaves the box.
     """
@@ -194,8 +194,8 @@ class CroppedRays:
     def of(rays: Rays, box: Box, space: Space, near: float) -> CroppedRays:
         """Crop R world rays to a box in the fields' space ``space``.
 
-        Of a contracted scene the box is in its inner box, where that space is the world. ``near``
-        is the distance before which a view samples nothing.
+        The box of a contracted scene lies in the inner box, where that space is the world. ``near``
+        is the distance of a view's first sample.
         """
         lines = space.rays(rays) if space.is_linear else rays
         entry, leave = lines.crossing(*box.corners(lines.origins), 0.0, math.inf)

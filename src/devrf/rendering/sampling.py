@@ -1,4 +1,4 @@
-"""How rays are sampled."""
+"""The sampling of rays."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from pydantic.dataclasses import dataclass
 
 from devrf.system.options import Options
 
-# A distance between samples, in voxels: with less a ray fills memory and shows no more.
+# A distance between samples, in voxels: shorter ones fill memory and show no more.
 Step = Annotated[float, Ge(0.01)]
 
 
 @dataclass(frozen=True)
 class RenderSettings(Options):
-    """How rays are sampled at the present resolution.
+    """The sampling of rays at the present resolution.
 
     Attributes:
         step: distance between samples in voxels of the present resolution.
         alpha_threshold: samples of a lower opacity, and then of a lower weight, are dropped before
             their colour is computed.
-        near: distance before which nothing is sampled, in world units (or NDC).
-        far: distance behind which nothing is sampled, likewise.
+        near: the distance of the first sample, at least, in world units (or NDC).
+        far: the distance of the last sample, at most, likewise.
     """
 
     key: ClassVar[str] = "sampling"

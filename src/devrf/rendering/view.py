@@ -1,4 +1,4 @@
-"""What films, stills, evaluation, the viewer and exports need of a method."""
+"""A method as videos, pictures, evaluation, the viewer and exports see it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class View(Protocol):
 
     @property
     def at_rest(self) -> bool:
-        """Whether the scene is in its rest state, as at time 0."""
+        """Whether the scene is in its canonical state, as at time 0."""
 
     def render(self, rays: Rays, background: Tensor) -> RenderedImage:
         """Render R rays in the fields' space without gradients, before a background (3,) RGB."""
@@ -29,7 +29,7 @@ class View(Protocol):
 
 @runtime_checkable
 class MovingView(View, Protocol):
-    """A view that knows how its points move between two times."""
+    """A view that knows the motion of its points between two times."""
 
     def induced_flow(
         self, rays: Rays, pixels: Tensor, cameras: Cameras, time: float
@@ -49,11 +49,11 @@ class MovingView(View, Protocol):
 
 
 class SurfaceField(Protocol):
-    """What is where at rest, as a function of canonical points in the fields' space."""
+    """Density and colour as functions of canonical points in the fields' space."""
 
     @property
     def box(self) -> Box:
-        """What holds the scene at rest, in the fields' space."""
+        """The box of the canonical scene, in the fields' space."""
 
     @property
     def shape(self) -> tuple[int, int, int]:

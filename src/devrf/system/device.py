@@ -1,4 +1,4 @@
-"""What a device does: waiting for its queue, and the arithmetic that it is quick at."""
+"""A device's queue, and the arithmetic that it is quick at."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import torch
 
 
 def wait(device: torch.device) -> None:
-    """Return when the device has done all that is queued."""
+    """Wait until the device has done all queued work."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 

@@ -35,13 +35,13 @@ def utf8_path(path: Path) -> Path:
     try:
         str(path).encode()
     except UnicodeEncodeError:
-        shown = os.fsencode(path).decode(errors="backslashreplace")
-        raise DevrfError(f"{shown}: its name is not UTF-8 text; rename it") from None
+        escaped = os.fsencode(path).decode(errors="backslashreplace")
+        raise DevrfError(f"{escaped}: its name is not UTF-8 text; rename it") from None
     return path
 
 
 def make_folder(folder: Path) -> None:
-    """Make ``folder``, and those above it, where they are not there.
+    """Make ``folder`` and those above it, unless they exist.
 
     Raises:
         OSError: naming the first folder that cannot be made; below ``/proc``, where the system says
@@ -54,23 +54,23 @@ def make_folder(folder: Path) -> None:
 
 
 def refuse_links(folder: Path, *, itself: bool = False) -> None:
-    """Refuse, by a DevrfError, a folder in which what is written would go elsewhere.
+    """Raise a DevrfError if files that are written to a folder would go elsewhere.
 
-    No link or pipe may be at its top; in the folders there, links may lead to what is below it, as
-    wandb's do. In ``checkpoints``, and further down, what is written replaces a name. The folder
-    may be a link, unless ``itself``, or lie below one; it need not be there yet.
+    No link or pipe may be at its top; links in the folders there may lead to files below it, as
+    wandb's do. Files in ``checkpoints``, and further down, are replaced by name. The folder may be
+    a link, unless ``itself``, or lie below one; it need not exist yet.
     """
     whole = os.path.realpath(folder)
     top = [*os.scandir(folder)] if folder.is_dir() else []
     folders = [p for p in top if p.is_dir(follow_symlinks=False) and p.name != "checkpoints"]
-    found = [str(folder)] if itself and folder.is_symlink() else []
-    for entry in [*top, *(entry for place in folders for entry in os.scandir(place))]:
+    refused = [str(folder)] if itself and folder.is_symlink() else []
+    for entry in [*top, *(entry for below in folders for entry in os.scandir(below))]:
         real = entry.is_file(follow_symlinks=False) or entry.is_dir(follow_symlinks=False)
         inside = entry.is_symlink() and os.path.realpath(entry).startswith(whole + os.sep)
         if not real and not (inside and entry not in top):
-            found.append(entry.path)
-    if found:
-        raise DevrfError(f"{found[0]}: a link or a pipe; remove it: devrf writes there")
+            refused.append(entry.path)
+    if refused:
+        raise DevrfError(f"{refused[0]}: a link or a pipe; remove it: devrf writes there")
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Folders in which one process works at a time, and those that it has for itself.
+"""Folders for one process at a time, and private folders of a process.
 
 The lock is the system's on an open file, so it ends with its process. A file beside it tells other
 processes which one that is.
@@ -33,10 +33,10 @@ _held: dict[Path, FileLock] = {}
 
 
 def lock_folder(folder: Path, key: str) -> None:
-    """Lock a folder unless this process has done so; a file system without locks is told.
+    """Lock a folder, unless this process holds it; a file system without locks gets a warning.
 
     Args:
-        folder: is made.
+        folder: the folder, which is made.
         key: the setting that chooses another folder.
 
     Raises:
@@ -44,9 +44,9 @@ def lock_folder(folder: Path, key: str) -> None:
     """
     if folder.resolve() in _held:
         return
-    place = folder / PLACE
-    make_folder(place)
-    lock, owner = FileLock(place / LOCK), place / OWNER
+    lock_files = folder / PLACE
+    make_folder(lock_files)
+    lock, owner = FileLock(lock_files / LOCK), lock_files / OWNER
     try:
         lock.acquire(timeout=0)
     except Timeout:
@@ -78,22 +78,22 @@ def release_folder(folder: Path) -> None:
 
 
 @contextmanager
-def private_folder(place: Path, prefix: str) -> Iterator[Path]:
-    """A new folder in ``place`` for this process alone, which is removed at the end.
+def private_folder(parent: Path, prefix: str) -> Iterator[Path]:
+    """A new folder in ``parent`` for this process alone, which is removed at the end.
 
-    What killed processes of this user have left by that ``prefix`` is removed first.
+    Folders of that ``prefix`` that killed processes of this user left are removed first.
     """
-    for left in place.glob(f"{glob.escape(prefix)}*"):
+    for stale in parent.glob(f"{glob.escape(prefix)}*"):
         with suppress(OSError, NotImplementedError):  # in use, or no locks there
-            info = left.lstat()
+            info = stale.lstat()
             if stat.S_ISDIR(info.st_mode) and info.st_uid == os.getuid():
-                with FileLock(left / LOCK, timeout=0):
-                    shutil.rmtree(left)
-    made = Path(tempfile.mkdtemp(prefix=".devrf-", dir=place))
+                with FileLock(stale / LOCK, timeout=0):
+                    shutil.rmtree(stale)
+    made = Path(tempfile.mkdtemp(prefix=".devrf-", dir=parent))
     lock = FileLock(made / LOCK, timeout=0)
     with suppress(OSError, NotImplementedError):
         lock.acquire()
-    folder = made.rename(place / f"{prefix}{made.name[7:]}")  # others see it when it is locked
+    folder = made.rename(parent / f"{prefix}{made.name[7:]}")  # others see it when it is locked
     try:
         yield folder
     finally:

@@ -38,25 +38,25 @@ def free_memory(device: torch.device) -> int:
     if device.type != "cuda":
         return free_host_memory()
     free, _ = torch.cuda.mem_get_info(device)
-    # What torch has reserved but does not use is free, too.
+    # Memory that torch has reserved but does not use is free, too.
     return free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
 
 
 def free_host_memory(root: Path = Path("/")) -> int:
     """Bytes that this process could still take on the host.
 
-    The least of what the system calls available and what the process's control groups (containers,
-    SLURM) leave it. ``root`` holds ``proc`` and ``sys``.
+    The least of the bytes that the system calls available and those that the process's control
+    groups (containers, SLURM) leave it. ``root`` holds ``proc`` and ``sys``.
     """
     available: int = psutil.virtual_memory().available
     return min([available, *_left_by_groups(root)])
 
 
 def need_memory(size: int, what: str, device: torch.device | str = "cpu") -> None:
-    """Refuse what would take ``size`` bytes on ``device`` where fewer are free.
+    """Check that ``size`` bytes are free on ``device`` for ``what``.
 
     Raises:
-        OutOfMemoryError: ``what`` takes more.
+        OutOfMemoryError: fewer are free.
     """
     if size > (free := free_memory(torch.device(device))):
         raise OutOfMemoryError(
@@ -104,9 +104,9 @@ def is_oom(error: BaseException) -> bool:
 
 
 def free_cache(device: torch.device) -> None:
-    """Free what torch and the C library keep without using it.
+    """Free memory that torch and the C library keep without using it.
 
-    What an error's traceback holds stays: call this after the ``except`` block.
+    An error's traceback keeps its tensors: call this after the ``except`` block.
     """
     gc.collect()
     if device.type == "cuda":
@@ -136,7 +136,7 @@ def shortage_in_words(stage: str, device: torch.device, rays: str | None) -> Ite
 
 
 def numbers(message: str, device: torch.device) -> str:
-    """In words, what was asked for, if the ``message`` says so, and what is free on ``device``."""
+    """Memory asked for, if the ``message`` says so, and memory free on ``device``, in words."""
     match, free = ASKED.search(message), f"{gib(free_memory(device))} GiB free on {device}"
     if not match or match.group(2).lower() not in UNITS:
         return free

@@ -1,4 +1,4 @@
-"""Settings that check themselves: what is wrong, where, and what to do, in one line."""
+"""Settings that check themselves: an error names key, expectation and remedy in one line."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pydantic_core import ArgsKwargs
 from devrf.errors import DevrfError
 from devrf.system.printed import shown
 
-# Types of settings: how many, how many that make a grid or a series, shares, and factors.
+# Types of settings: counts, counts of a grid or a series, shares, and factors.
 Whole = Annotated[int, Field(strict=True, ge=0)]
 Count = Annotated[int, Field(strict=True, ge=1)]
 Several = Annotated[int, Field(strict=True, ge=2)]
@@ -56,11 +56,11 @@ def _shortened(text: str, most: int) -> str:
 
 
 def first_error(error: ValidationError, where: str, *, in_file: bool = True) -> DevrfError:
-    """The first thing that pydantic found wrong: key, expectation, and the value that was given.
+    """The first of pydantic's errors in words: key, expectation, and the wrong value.
 
     Args:
-        error: what a model or an adapter raised.
-        where: what comes before the key: ``FILE: `` for values in a file, ``data.`` for options.
+        error: raised by a model or an adapter.
+        where: text before the key: ``FILE: `` for values in a file, ``data.`` for options.
         in_file: whether the value is in a file; an option may have one of several types.
     """
     issues = error.errors(include_url=False)
@@ -71,8 +71,8 @@ def first_error(error: ValidationError, where: str, *, in_file: bool = True) -> 
         # The other parts name types that pydantic tried.
         loc = (*loc[:1], *(part for part in loc[1:] if isinstance(part, int)))
     key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc)
-    place = f"{where}{key.removeprefix('.')}" if key else where.rstrip(": .")
-    return DevrfError(one_line(place, _complaint(issues[0], [issue["msg"] for issue in alike])))
+    key_path = f"{where}{key.removeprefix('.')}" if key else where.rstrip(": .")
+    return DevrfError(one_line(key_path, _complaint(issues[0], [issue["msg"] for issue in alike])))
 
 
 def _complaint(issue: Any, alike: Sequence[str]) -> str:
@@ -90,10 +90,10 @@ def _complaint(issue: Any, alike: Sequence[str]) -> str:
 def expectation(messages: Sequence[str], value: str) -> str:
     """``expected at least 1, not 0`` of "Input should be greater than or equal to 1" and 0.
 
-    Several ``messages`` of pydantic say what else the value might be.
+    Several ``messages`` of pydantic name the alternatives.
     """
     said = " or ".join(dict.fromkeys(re.sub(r"^\w+ should (be|have) ", "", m) for m in messages))
-    said = re.sub("|".join(WORDS), lambda found: WORDS[found[0]], said)
+    said = re.sub("|".join(WORDS), lambda match: WORDS[match[0]], said)
     said = said.replace(" after validation", "")
     said = f"expected {said}" if " should " in messages[0] else f"{said[0].lower()}{said[1:]}"
     # For lists that are too short or too long, the message says the length itself.
@@ -107,7 +107,7 @@ class Options:
     Subclasses are pydantic's dataclasses, too.
 
     Attributes:
-        key: where they are in a config.
+        key: their group in a config.
     """
 
     key: ClassVar[str]

@@ -1,4 +1,4 @@
-"""Settings as words to type: what is printed to be typed reaches the config as it was meant.
+"""Settings as words to type, which reach the config as the values that were printed.
 
 Two readers come between a terminal and the config: the shell, and Hydra's grammar of overrides.
 """
@@ -13,11 +13,11 @@ from pathlib import Path
 from devrf.errors import DevrfError
 from devrf.system.files import utf8_path
 
-# Text that the grammar takes for just that text: no number, no truth value, nothing to be closed.
+# Text that the grammar takes for the same text: no number, no truth value, no open bracket.
 _PLAIN = re.compile(
     r"(?!(?:true|false|null|nan|inf)$)(?:[a-z_/]|\.+/)[\w/.-]*", re.ASCII | re.IGNORECASE
 )
-# What ends a text in quotes, or would: backslashes before it count as half as many.
+# The end of a text in quotes, or a quote: backslashes before it count as half as many.
 _ENDING = re.compile(r'(\\*)("|$)')
 
 
@@ -41,7 +41,7 @@ def literal(value: object) -> str:
     if isinstance(value, str):
         if _PLAIN.fullmatch(value):
             return value
-        # Of an empty end there is nothing to double.
+        # An empty end has nothing to double.
         escaped = _ENDING.sub(lambda end: end[1] * 2 + end[2].replace('"', '\\"'), value)
         return f'"{escaped}"'
     return str(value) if isinstance(value, float) else json.dumps(value)

@@ -1,4 +1,4 @@
-"""Text from elsewhere where it is shown: nothing in it is obeyed. A function for each target.
+"""Text from elsewhere, made harmless where it is shown. A function for each target.
 
 HTML's is :func:`html.escape`; matplotlib's is ``text.parse_math`` false.
 """
@@ -11,7 +11,7 @@ from unicodedata import bidirectional, category
 
 # Control characters, halves of characters, ends of lines and paragraphs.
 CONTROLS = ("Cc", "Cs", "Zl", "Zp")
-# What turns the direction of all that follows.
+# They turn the direction of all that follows.
 TURNS = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
 # pandas' own escapes leave the symbols below the first two lines as they are.
 LATEX = str.maketrans(

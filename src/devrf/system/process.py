@@ -31,11 +31,11 @@ def tune_for_cpu() -> None:
     threads that sleep at once gain nothing over one thread; a short spin suits both. A training
     step frees and takes the same dozens of megabytes again and again: mapping and zeroing those
     pages anew would be a tenth of the run. Threads share two heaps, unless
-    ``MALLOC_ARENA_MAX`` says otherwise: what heaps of their own kept was 0.06 to 0.14 GB of the
+    ``MALLOC_ARENA_MAX`` says otherwise: heaps of their own kept 0.06 to 0.14 GB of the
     quickstart's 1.2.
 
-    What threads do is fixed once torch is loaded; the rest has no effect where the C library is not
-    glibc.
+    The threads' waiting is fixed once torch is loaded; the rest has no effect unless the C library
+    is glibc.
     """
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", "1000")
@@ -50,7 +50,7 @@ def tune_for_cpu() -> None:
 
 
 def return_free_memory() -> None:
-    """Give back to the system what the C library keeps free; nothing where that is not glibc."""
+    """Return free memory of the C library to the system; no effect unless it is glibc."""
     trim = _of_glibc("malloc_trim")
     if trim is not None:
         trim(0)
@@ -69,7 +69,7 @@ def _of_glibc(name: str) -> Callable[..., int] | None:
 
 @contextmanager
 def importing() -> Iterator[None]:
-    """Python looks for no garbage among what is imported inside, now or later: it stays.
+    """Python looks for no garbage among modules that are imported inside, now or later.
 
     The program's imports take a fifth less then.
     """
@@ -97,7 +97,7 @@ def use_utf8() -> None:
 
 @contextmanager
 def quiet_if_unread() -> Iterator[None]:
-    """When nobody reads any more what is printed (``| head -1``), end as SIGPIPE ends a program.
+    """When nobody reads the output any more (``| head -1``), end as SIGPIPE ends a program.
 
     Python ignores that signal, for sockets that are closed send it, too. A stage whose log nobody
     reads goes on.

@@ -1,4 +1,4 @@
-"""Progress of long work, and how long the rest will take."""
+"""Progress of long work, and the time that is left."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ def followed(
 ) -> Iterator[Item]:
     """The items, with a bar on a terminal, else a line of the log every so often.
 
-    ``name`` is what they make, for the bar and the lines.
+    ``name`` is their product's, for the bar and the lines.
     """
     console = Console()
     if console.is_terminal:
         yield from track(items, name, total, console=console)
         return
-    began = shown = time.perf_counter()
+    began = logged = time.perf_counter()
     for done, item in enumerate(items, 1):
         now = time.perf_counter()
-        if now - shown >= line_every_seconds and done < total:
-            shown = now
-            left = time_left((now - began) / done * (total - done))
-            log.info("%s: %d of %d, %s", name, done, total, left)
+        if now - logged >= line_every_seconds and done < total:
+            logged = now
+            remaining = time_left((now - began) / done * (total - done))
+            log.info("%s: %d of %d, %s", name, done, total, remaining)
         yield item
 
 

@@ -1,4 +1,4 @@
-"""How many of torch's threads work on a part of a program."""
+"""The number of torch's threads in a part of a program."""
 
 from __future__ import annotations
 

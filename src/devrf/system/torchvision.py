@@ -1,4 +1,4 @@
-"""A torchvision that was built for another torch: who does not ask for it does not notice."""
+"""A torchvision that was built for another torch counts as not installed."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from lightning_utilities.core.imports import RequirementCache
 def pass_over_unusable() -> None:
     """Have a torchvision that cannot be imported count as not installed.
 
-    torchmetrics, and with it Lightning, imports torchvision wherever it is installed; nothing of
-    what it then offers is used here. pip installs CUDA's build beside a CPU's torch without a word.
+    torchmetrics, and with it Lightning, imports torchvision wherever it is installed; nothing
+    here uses that part of it. pip installs CUDA's build beside a CPU's torch without a word.
     """
     installed = RequirementCache.__bool__
 
