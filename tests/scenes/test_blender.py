@@ -34,7 +34,7 @@ def test_published_layout(scene_folder):
     assert train.names[3] == "dynamic_2views/train/r_003.png"
     assert train.pixels[3, 10, 15].tolist() == [3, 100, 200, 255]
     assert scene.clock.times == (0.0, 0.5, 1.0)
-    assert train.flow is None and not scene.is_film
+    assert train.flow is None and not scene.is_monocular
     assert scene.static.train.times.tolist() == [0] * 6
     assert scene.static.train.view.tolist() == list(range(6))
 
@@ -155,7 +155,7 @@ def test_a_lens_is_undistorted_and_its_flow_files_are_left_out(scene_folder, cap
     # Pincushion: the pinhole needs a longer focal length to see no empty border.
     scene_folder.edit(file, lambda content: content.update(k1=0.3))
     train = BlenderReader(scene_folder.root).read().dynamic.train
-    assert train.flow is None and "left out: they are of images before undistortion" in caplog.text
+    assert train.flow is None and "left out: they are for images before undistortion" in caplog.text
     assert float(train.cameras.focal[0, 0]) > 16 / math.tan(0.4) + 0.5
 
 
@@ -209,7 +209,7 @@ def test_single_folder_learns_the_static_scene_from_early_images(single_folder, 
 def test_a_film_keeps_its_bounds_where_a_method_has_no_static_set(single_folder, static_until):
     read = BlenderReader(single_folder, static_until=static_until, near=0.3, far=9.0).read()
     for scene in (read, without_priors(read)):
-        assert scene.is_film
+        assert scene.is_monocular
         alone = dynamic_only(scene)
         assert alone.bounds == scene.bounds and (alone.bounds.near, alone.bounds.far) == (0.3, 9.0)
 

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from devrf.errors import DevrfError
-from devrf.scenes.footage import chosen, film_header, pictures
+from devrf.scenes.footage import footage_header, frames_at, pictures
 
 WIDTH, HEIGHT, FRAMES, RATE = 96, 64, 12, 10
 
@@ -78,24 +78,24 @@ KINDS = {
 @pytest.mark.parametrize("name", KINDS)
 def test_every_frame_is_read_once_at_its_time(film, name):
     path = film(name, *KINDS[name])
-    assert film_header(path).size == (WIDTH, HEIGHT)
+    assert footage_header(path).size == (WIDTH, HEIGHT)
     times, shown = zip(*pictures(path), strict=True)
     assert times == pytest.approx(np.arange(FRAMES) / RATE, abs=1e-3)
     assert [number(picture) for picture in shown] == list(range(FRAMES))
     assert shown[0][4:12, 30:].reshape(-1, 3).mean(axis=0) == pytest.approx([250, 20, 20], abs=6)
     assert shown[0][24:56, 4:12].reshape(-1, 3).mean(axis=0) == pytest.approx([20, 20, 250], abs=6)
-    some = [(position, number(picture)) for position, picture in chosen(path, [9, 2, 2, 11])]
+    some = [(position, number(picture)) for position, picture in frames_at(path, [9, 2, 2, 11])]
     assert some == [(2, 2), (9, 9), (11, 11)]
 
 
 def test_pixels_are_square_and_frames_upright(film, tmp_path):
     path = film("wide.mp4", *H264, "-vf", "setsar=4/3")
-    assert film_header(path).size == (128, 64)
+    assert footage_header(path).size == (128, 64)
     _, picture = next(pictures(path))
     assert picture.shape == (64, 128, 3)
     assert picture[4:12].reshape(-1, 3).mean(axis=0) == pytest.approx([250, 20, 20], abs=6)
     ffmpeg("-display_rotation", 90, "-i", path, "-c", "copy", tmp_path / "turned.mp4")
-    assert film_header(tmp_path / "turned.mp4").size == (64, 128)
+    assert footage_header(tmp_path / "turned.mp4").size == (64, 128)
     # A quarter turn to the left.
     _, picture = next(pictures(tmp_path / "turned.mp4"))
     assert picture.shape == (128, 64, 3)
@@ -134,7 +134,7 @@ def test_a_film_that_was_cut_off_is_said(film, caplog, name, options):
     (record,) = caplog.records
     assert f"{name}: ends after {len(shown)} frames, but states 12;" in record.getMessage()
     with pytest.raises(DevrfError, match=rf"{name}: ends after {len(shown)} frames, expected 12"):
-        list(chosen(path, [0, 11]))
+        list(frames_at(path, [0, 11]))
 
 
 def test_sound_that_lasts_longer_is_no_cut(film, tmp_path, caplog):

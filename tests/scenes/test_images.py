@@ -55,7 +55,7 @@ def test_a_set_is_of_one_size_once_it_is_turned(tmp_path, caplog):
         loaded = load_images(paths, 2, [WIDE, WIDE])
     assert loaded.pixels.shape == (2, 8, 12, 3) and loaded.files == [WIDE, WIDE]
     assert not bool(loaded.ambiguous_orientation.any())
-    assert "1 of them turned as their EXIF orientation says" in caplog.text
+    assert "1 of them are turned as their EXIF orientation says" in caplog.text
     # Without cameras none is turned, and they are of two sizes.
     loaded = load_images(paths, 1)
     assert loaded.pixels.shape == (2, 24, 24, 3) and loaded.sizes == [WIDE, HIGH]

@@ -235,7 +235,7 @@ def test_a_film_far_from_the_origin_is_one_of_a_moving_camera(moving, balls):
     balls.edit(moving, carry)
     assert by_one_camera("nerfstudio", moving)
     film = NerfstudioReader(moving).read()
-    assert film.is_film and film.offset == FAR
+    assert film.is_monocular and film.offset == FAR
 
 
 def parts(scene: Scene) -> list[Views]:

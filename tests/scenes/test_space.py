@@ -206,14 +206,14 @@ def test_without_its_static_set_a_scene_keeps_bounds_that_it_does_not_owe_to_it(
     alone = dynamic_only(scene)
     assert alone.bounds == scene.bounds and alone.space == scene.space
     assert alone.static.train.times.tolist() == [0.0] * 4
-    assert scene.is_film
+    assert scene.is_monocular
 
     moved = views.cameras.camera_to_world.clone()
     moved[:, :, 3] *= 2
     cameras = replace(views.cameras, camera_to_world=moved)
     farther = replace(views, cameras=cameras, names=tuple(f"static {n}" for n in views.names))
     found = replace(film(farther), dynamic=scene.dynamic)
-    assert not found.is_film
+    assert not found.is_monocular
     assert dynamic_only(found).space == film(views).space != found.space
     given = replace(film(farther, box=BOX, near=0.2), dynamic=scene.dynamic)
     assert dynamic_only(given).bounds == given.bounds

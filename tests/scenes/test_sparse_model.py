@@ -11,7 +11,7 @@ import pytest
 from devrf.scenes.sparse_model import (
     AROUND,
     LEFT_OUT,
-    LEFT_OUT_OF_FILM,
+    LEFT_OUT_OF_VIDEO,
     ModelImage,
     SparseModel,
     ndc_holds,
@@ -64,7 +64,7 @@ def test_hand_held_cameras_share_contraction_around_their_points(scattered):
     assert inside.mean() > 0.8
 
 
-@pytest.mark.parametrize("left_out", [LEFT_OUT, LEFT_OUT_OF_FILM])
+@pytest.mark.parametrize("left_out", [LEFT_OUT, LEFT_OUT_OF_VIDEO])
 def test_the_inner_box_leaves_out_points_at_each_face(left_out):
     world = normalised(model(NEAR_ONE_ANOTHER, turns=(-30, 30)), "inward", left_out=left_out)
     low, high = (np.array(corner) for corner in world.box)

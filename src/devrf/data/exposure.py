@@ -63,7 +63,7 @@ def with_equal_exposure(scene: Scene, choice: Exposure) -> Scene:
             all equal, ``none`` changes nothing.
     """
     train = scene.dynamic.train
-    possible = scene.is_film and scene.moves and not train.cut_out
+    possible = scene.is_monocular and scene.moves and not train.cut_out
     theta = exposures(train) if possible and choice != "none" else None
     if theta is None:
         if choice == "equal":

@@ -60,7 +60,7 @@ class Box:
 
     @property
     def diagonal(self) -> float:
-        """From corner to corner."""
+        """The distance of opposite corners."""
         return math.hypot(*self.size)
 
     @property

@@ -1,8 +1,8 @@
 """Worlds far from the origin: an offset that is kept apart, so that float32 tells cameras apart.
 
 UTM or ECEF coordinates are of millions of metres, where a float32 goes in steps of half a metre.
-Readers have positions in double precision. Where cameras are much farther from
-the origin than from one another, a scene lives in the capture's world − offset:
+Readers have positions in double precision. If cameras are much farther from the origin than from
+one another, a scene lives in the capture's world − offset:
 
 - The offset is found once, from the first camera file that is read, and holds for all files of a
   scene (:class:`devrf.scenes.transforms.TransformsFiles`). It is subtracted there, before poses are

@@ -1,8 +1,8 @@
 """The hot operations as kernels that Warp compiles for the CPU and for CUDA: one source for both.
 
-Each module defines kernels, and the functions that launch them. On tensors that kernels do not
-support (:func:`devrf.kernels.runtime.is_supported`) these functions call their definition in
-:mod:`devrf.ops`, against which every kernel is tested.
+Each module defines kernels, and the functions that launch them. These functions call their
+definition in :mod:`devrf.ops` for tensors that kernels do not support
+(:func:`devrf.kernels.runtime.is_supported`). Every kernel is tested against its definition.
 
 | module | functions |
 |---|---|

@@ -75,7 +75,7 @@ def cell(grid: Grid, point: wp.vec3):
 
 @wp.func
 def inside(grid: Grid, point: wp.vec3):
-    """For each axis 1 where the point lies in the grid along it, else 0."""
+    """1 for each axis along which the point lies in the grid, else 0."""
     at = coordinates(grid, point)
     return wp.vec3(
         wp.where(at[0] >= 0.0 and at[0] <= float(grid.x - 1), 1.0, 0.0),

@@ -22,7 +22,7 @@ def interpolate(grid: Tensor, points: Tensor, box: Box, stride: int = 1) -> Tens
             all z. A leaf that has a gradient is added to there, without a temporary tensor of the
             grid's size.
         points: (M, 3) in the box's units.
-        box: where the grid's outer points lie.
+        box: the grid's outer points lie on it.
         stride: use every stride-th of the grid's points along each axis; X, Y, Z are one more than
             a multiple of it.
 
@@ -79,7 +79,7 @@ def add_to_grid(grid: Tensor, points: Tensor, values: Tensor, box: Box, stride: 
         grid: (X, Y, Z, C), changed in place.
         points: (M, 3) in the box's units.
         values: (M, C).
-        box: where the grid's outer points lie.
+        box: the grid's outer points lie on it.
         stride: as of :func:`interpolate`.
     """
     inputs = [grid_over(box, shape_of(grid), stride), points, values, grid]

@@ -70,7 +70,7 @@ def firsts(ray: Tensor, rays: int) -> Tensor:
 def running_sum(values: Tensor) -> Tensor:
     """Sums (S + 1,) of all values before each position, over all rays.
 
-    In double precision: a ray's own sum is the difference of two of these, which may be large.
+    They are in double precision: a ray's own sum is the difference of two large ones.
     """
     values = values.double()
     if values.is_cuda and torch.are_deterministic_algorithms_enabled():

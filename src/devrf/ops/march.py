@@ -76,7 +76,7 @@ class MarchInputs:
         delta: δ, the length of a step in base voxels.
         threshold: the opacity, and then the weight, from which on a sample is worth a colour.
         displacement: (X, Y, Z, 3) Δ of x → q = x + Δ(x); None is the identity.
-        motion_box: where the displacements lie; None without.
+        motion_box: the box of the displacements; None without.
         zero_outside_box: whether Δ is 0 outside that box; else it is as on its border.
     """
 

@@ -21,7 +21,7 @@ def interpolate(grid: Tensor, points: Tensor, box: Box, stride: int = 1) -> Tens
         grid: (X, Y, Z, C), at least two points along x and y; one along z is a plane, the same for
             all z.
         points: (M, 3) in the box's units.
-        box: where the grid's outer points lie.
+        box: the grid's outer points lie on it.
         stride: use every stride-th of the grid's points along each axis; X, Y, Z are one more than
             a multiple of it.
 

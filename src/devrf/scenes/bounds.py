@@ -1,4 +1,4 @@
-"""Where a scene is, found from its cameras: inward-facing (world units), forward-facing (NDC)."""
+"""Bounds of a scene from its cameras: inward-facing (world units), forward-facing (NDC)."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from devrf.scenes.scene import Bounds, Views
 from devrf.scenes.silhouettes import motion_box
 from devrf.scenes.validation import FARTHEST, scene_error
 
-# Room for motion where nothing else is known: the published scenes use 1.05 to 2.
+# Room for motion if nothing else is known: the published scenes use 1.05 to 2.
 FALLBACK_BOUND_SCALE = 1.5
-# Room around a scene at rest: as much as around the rest state where the room for motion is known.
-REST_BOUND_SCALE = 1.05
-STILL = "no motion: the scene is at rest"
+# Room around a static scene, and around the canonical state if the room for motion is known.
+STATIC_BOUND_SCALE = 1.05
+NO_MOTION = "no motion: the scene is at rest"
 # Mean square sine of the angle between the axes and their common direction: about 2 degrees.
 NEARLY_PARALLEL = 1e-3
-# A near plane inside the box's sphere would be 0 or less: stay this share of the way out.
+# A near plane inside the box's sphere would be 0 or less: near is at least this share of far.
 NEAR_SHARE = 0.02
 # Shortest edge of a box, as a share of its distance from the origin: in a float32 a thousand
 # steps along it are still a thousand places.
 LEAST_EDGE = 1e-4
-# What to do where the cameras do not say where the scene is.
+# The remedy if the cameras do not determine the scene's bounds.
 GIVE = "set data.box=[[x,y,z],[x,y,z]], data.near and data.far"
 
 
@@ -46,16 +46,16 @@ def nearest_point(origins: Tensor, axes: Tensor, parallel: float) -> Tensor | No
     return point
 
 
-# Poses are taken for those of another convention where cameras look at one point if they are read
-# in that way, with this cosine in the median, and with less as they are. Simulated cameras that
-# look past their subject by up to 25 degrees raised no false alarm.
+# Poses seem to be of another convention if cameras look at one point when they are read in that
+# way, with this cosine in the median, and less so as they are. Simulated cameras that look past
+# their subject by up to 25 degrees raised no false alarm.
 AT_ONE_POINT = 0.9
 AT_LESS = 0.97
 AT_NOTHING = 0.5
-# Transposed, they come this much nearer to 1; inverted, they are this much further apart.
+# Transposed poses come this much nearer to 1; inverted ones are this much further apart.
 NEARER = 0.25
 FURTHER = 3.0
-# How other programs write poses: what it is called, and what to do about it.
+# Other programs' conventions of poses: name and remedy.
 OPENCV = "in OpenCV's axes (y down, z ahead): negate the second and third column of each matrix"
 WORLD_TO_CAMERA = "from world to camera: invert each matrix"
 BOTH = f"{WORLD_TO_CAMERA}, then negate the second and third column"
@@ -65,8 +65,8 @@ TRANSPOSED = "transposed: transpose each rotation"
 def axes_meet(cameras: Cameras) -> Tensor:
     """The point (3,) nearest to all optical axes, by least squares.
 
-    DevrfError if the axes are nearly parallel, or meet behind the cameras, or if they would meet
-    only were the poses of another convention.
+    DevrfError if the axes are nearly parallel, or meet behind the cameras, or would meet only if
+    the poses were of another convention.
     """
     poses = cameras.camera_to_world.double()
     point, aim = _aim(poses)
@@ -82,9 +82,9 @@ def axes_meet(cameras: Cameras) -> Tensor:
 
 
 def _aim(poses: Tensor) -> tuple[Tensor | None, float]:
-    """The point nearest to the axes of poses (N, 3, 4), and the cameras' cosine of looking at it.
+    """The point nearest to the axes of poses (N, 3, 4), and their cosine with its direction.
 
-    The cosine is the median; without a point it is 0.
+    The cosine is the cameras' median; without a point it is 0.
     """
     origin = poses[:, :, 3]
     axis = -poses[:, :, 2]
@@ -95,9 +95,9 @@ def _aim(poses: Tensor) -> tuple[Tensor | None, float]:
 
 
 def _likely_convention(poses: Tensor, aim: float) -> str:
-    """What their poses look like, if cameras (N, 3, 4) would look at one point then; else empty.
+    """The convention of poses (N, 3, 4) by which they would look at one point, in words, or empty.
 
-    ``aim`` is the cosine with which they look at one as they are.
+    ``aim`` is the cosine with which they look at one point as they are.
     """
     if aim > AT_LESS:
         return ""
@@ -146,9 +146,9 @@ def seen_radius(cameras: Cameras, center: Tensor) -> float:
 
 
 def _turned_to_crops(cameras: Cameras) -> Cameras:
-    """The cameras; where an image is a crop beside its axis, one that looks at the crop's middle.
+    """The cameras, with those of crops beside their axis turned to the crop's middle.
 
-    Its image has the same middle, and its nearest edge lies as many degrees from it.
+    A turned image has the same middle, and its nearest edge lies as many degrees from it.
     """
     beside = ((cameras.center <= 0) | (cameras.center >= cameras.extents)).any(dim=1)
     if not bool(beside.any()):
@@ -173,7 +173,7 @@ def _turned_to_crops(cameras: Cameras) -> Cameras:
 
 
 def box_from_cameras(cameras: Cameras) -> Box:
-    """The cube around the point all cameras look at whose half edge is what they see of it."""
+    """The cube around the point that all cameras look at; its half edge is :func:`seen_radius`."""
     cameras = _turned_to_crops(cameras)
     center = axes_meet(cameras)
     radius = seen_radius(cameras, center)
@@ -197,8 +197,8 @@ def resolved_box(low: Tensor, high: Tensor) -> Box:
 
 
 def box_of_frusta(cameras: Cameras, near: float, far: float) -> Box:
-    """The box of all that the cameras see between two distances (world units) along their rays."""
-    # Ends of rays lie on a sphere, which bulges between its corners: the grid has to be this fine.
+    """The box of the cameras' frusta between two distances (world units) along their rays."""
+    # The ends of rays lie on a sphere, which bulges between its corners: hence the fine grid.
     steps = torch.linspace(0, 1, 17).to(cameras.center)
     share = torch.cartesian_prod(steps, steps)
     pixels = share * cameras.extents[:, None]
@@ -231,11 +231,11 @@ def inward_bounds(
     far: float | None = None,
     box: Box | None = None,
 ) -> Bounds:
-    """Bounds in the world of a scene that its cameras look in at.
+    """Bounds in the world of an inward-facing scene.
 
     Arguments and errors are those of :func:`devrf.scenes.space.inward_space`. With
-    ``bound_scale="auto"`` silhouettes say where it moves, where there are alpha masks; else the
-    given box, or a fixed scale, leaves room.
+    ``bound_scale="auto"`` the room for motion is that of the silhouettes of alpha masks; without
+    masks it is the given box, or a fixed scale.
     """
     box_is_given = box is not None
     scale = FALLBACK_BOUND_SCALE if bound_scale == "auto" else float(bound_scale)
@@ -243,8 +243,8 @@ def inward_bounds(
     motion = None
     source = f"canonical box x bound scale {scale:g}"
     if dynamic is None and bound_scale == "auto":
-        scale = REST_BOUND_SCALE
-        source = STILL
+        scale = STATIC_BOUND_SCALE
+        source = NO_MOTION
     elif dynamic is not None and bound_scale == "auto":
         motion = motion_box(dynamic, box)
         if motion is None:
@@ -273,7 +273,7 @@ def inward_bounds(
 
 # Cosine of the steepest angle, about 84 degrees, to −z: beyond it the box grows without bound.
 LEAST_COSINE = 0.1
-# How many times as wide as the reference camera's view the box may be: beyond it the other
+# The box is at most so many times as wide as the reference camera's view: beyond it the other
 # cameras are not before the same scene, and a float32 cannot tell its points apart.
 WIDEST = 1e3
 
@@ -288,11 +288,11 @@ def reference_space(cameras: Cameras, near: float) -> NormalizedDevice:
 
 
 def forward_bounds(everyone: list[Views], space: NormalizedDevice, source: str) -> Bounds:
-    """The box that holds all that cameras see from the near plane to infinity, in NDC.
+    """The box of the cameras' frusta from the near plane to infinity, in NDC.
 
     Rays are straight in NDC too: ``origin`` is on the near plane (z' = −1), ``origin + direction``
-    at infinity (z' = 1); hence near = 0 and far = 1. ``source`` says where the room for motion
-    comes from. Errors are those of :func:`box_between`.
+    at infinity (z' = 1); hence near = 0 and far = 1. ``source`` names the source of the room for
+    motion. Errors are those of :func:`box_between`.
     """
     return Bounds(box_between(everyone, space), 0.0, 1.0, None, 1.0, source)
 
@@ -300,9 +300,9 @@ def forward_bounds(everyone: list[Views], space: NormalizedDevice, source: str) 
 def box_between(
     everyone: list[Views], space: NormalizedDevice, front: float = -1.0, back: float = 1.0
 ) -> Box:
-    """The box, in NDC, of what cameras see from z' = ``front`` to ``back``.
+    """The box, in NDC, of the cameras' frusta from z' = ``front`` to ``back``.
 
-    −1 is the near plane, 1 infinity. DevrfError if a camera sees something that is not before the
+    −1 is the near plane, 1 infinity. DevrfError if a camera sees points that are not before the
     reference camera.
     """
     ends = torch.cat([_seen(views, space, (front, back)) for views in everyone])

@@ -55,23 +55,22 @@ def time_major(views: Views) -> Views:
     return views[by_view[torch.argsort(views.times[by_view], stable=True)]]
 
 
-# The layout has a validation split, which nothing here uses: it gets a few of the test images.
+# The layout's validation split, which nothing here uses, gets a few of the test images.
 _VALIDATION_VIEWS = 4
 
 
 def export(scene: Scene, folder: Path) -> None:
-    """Write ``scene`` for ``data=inward`` or ``data=forward`` to read, as its kind says.
+    """Write an embedded ``scene`` for ``data=inward`` or ``data=forward``, depending on its kind.
 
-    It is an embedded one: images of one size have one focal length, and principal points are in the
-    middle;
-    fixed cameras stand still, and one of them is held out. What one camera has filmed by hand is
-    written for ``data=nerfstudio``. ``folder`` is a new or an empty one.
-    Positions are those of the capture's world. DevrfError if it is in use or cannot be written, or
-    a frame is left out by some views of a forward-facing scene.
+    Images of one size have one focal length, and principal points are in the middle; cameras are
+    fixed, and one of them is held out. A video by one moving camera is written for
+    ``data=nerfstudio``. ``folder`` is new or empty. Positions are those of the capture's world.
+    DevrfError if the folder is in use or cannot be written, or if some views of a forward-facing
+    scene lack a frame.
     """
     write = _export_blender if scene.kind == "inward" else _export_llff
     if scene.dynamic.train.by_moving_camera:
-        write = _export_film
+        write = _export_video
     write(_in_capture_world(scene), folder)
 
 
@@ -87,22 +86,22 @@ def _in_capture_world(scene: Scene) -> Scene:
     return replace(scene, static=scene.static.mapped(moved), dynamic=scene.dynamic.mapped(moved))
 
 
-def _export_film(scene: Scene, folder: Path) -> None:
-    """Write ``folder/images``, the film, ``folder/others``, what is held out, and their true poses.
+def _export_video(scene: Scene, folder: Path) -> None:
+    """Write the video to ``folder/images``, held-out views to ``folder/others``, and true poses.
 
-    ``folder/masks`` says what of the others is scored. Poses, times and images read back exactly;
-    ``stage=capture`` takes ``images`` alone.
+    ``folder/masks`` has the valid pixels of the held-out views. Poses, times and images read back
+    exactly; ``stage=capture`` takes ``images`` alone.
     """
     assert isinstance(scene.space, NormalizedDevice)
     bounds = {"space": "ndc", "near": scene.space.near}
     with whole_folder(folder) as partial:
         frames = list[dict[str, Any]]()
         names: dict[str, list[str]] = {}
-        for place, views in (("images", scene.dynamic.train), ("others", scene.dynamic.test)):
-            _write_images(views, range(len(views)), partial / place)
-            names[place] = [f"{place}/{k:03d}.png" for k in range(len(views))]
+        for subfolder, views in (("images", scene.dynamic.train), ("others", scene.dynamic.test)):
+            _write_images(views, range(len(views)), partial / subfolder)
+            names[subfolder] = [f"{subfolder}/{k:03d}.png" for k in range(len(views))]
             posed = zip(
-                names[place],
+                names[subfolder],
                 views.cameras.camera_to_world.tolist(),
                 views.times.tolist(),
                 strict=True,
@@ -129,7 +128,7 @@ def _export_film(scene: Scene, folder: Path) -> None:
 
 
 def _lens(cameras: Cameras, index: int) -> dict[str, float]:
-    """What a transforms file says of a pinhole, in pixels."""
+    """The keys of a pinhole in a transforms file, in pixels."""
     fx, fy = cameras.focal[index].tolist()
     cx, cy = cameras.center[index].tolist()
     width, height = cameras.size_of(index)
@@ -181,8 +180,8 @@ def _write_split(views: Views, split: str, folder: Path) -> None:
     write_json(folder / f"transforms_{split}.json", content)
 
 
-# The published scenes are read at this factor, from folders images_4; larger images are not needed,
-# and not written.
+# The published scenes are read at this factor, from folders images_4: larger images are not
+# written.
 FACTOR = 4
 # Readers hold out every eighth static image, the first one included.
 HOLDOUT = 8
@@ -195,8 +194,8 @@ Flags = np.ndarray[Any, np.dtype[np.bool_]]
 def _export_llff(scene: Scene, folder: Path) -> None:
     """Write ``folder/static`` and ``folder/dynamic_<V>views``.
 
-    ``static/poses_bounds.npy`` (N, 17) speaks of images four times as large as those in
-    ``static/images_4``, as LLFF's does. The moving capture has V − 1 views to learn from and,
+    ``static/poses_bounds.npy`` (N, 17) is for images four times as large as those in
+    ``static/images_4``, as LLFF's is. The moving capture has V − 1 training views and,
     the last one, the held-out view; flow goes to ``view<k>/images_4_flow/<frame>_bwd.npz``.
     Least depths are written as 1/0.75, so a reader scales by one; a scene whose static cameras
     have the identity as their average pose reads back as it is.
@@ -235,9 +234,9 @@ def _check_times(views: list[Views]) -> None:
 
 
 def _farthest(everyone: list[Views]) -> float:
-    """The largest known distance from a camera, else one that is as good as infinity."""
-    known = [views.depth[views.depth.isfinite()] for views in everyone if views.depth is not None]
-    return max(float(depth.max()) for depth in known) if known else _FAR / BOUND_FACTOR
+    """The largest known distance from a camera, or a very large one."""
+    depths = [views.depth[views.depth.isfinite()] for views in everyone if views.depth is not None]
+    return max(float(depth.max()) for depth in depths) if depths else _FAR / BOUND_FACTOR
 
 
 def _intrinsics(views: Views, factor: int) -> Numbers:
@@ -272,7 +271,7 @@ def _write_moving(views: list[Views], bounds: Numbers, folder: Path) -> None:
 
 
 def _double(poses: Tensor) -> Numbers:
-    """Poses in double precision: what was exact in single precision stays so."""
+    """Poses in double precision: values that were exact in single precision stay so."""
     array: Numbers = poses.double().cpu().numpy()
     return array
 

@@ -53,15 +53,15 @@ MOST_FOLDERS = 32
 
 @contextmanager
 def decoding(path: Path, what: str, remedy: str) -> Iterator[None]:
-    """The place where a library decodes ``path``: what it raises becomes a DevrfError.
+    """Turn the errors of a library that decodes ``path`` into a DevrfError.
 
-    ``what`` says what the file should be, ``remedy`` what to do when it is not.
+    ``what`` names the expected kind of file, ``remedy`` the way to get one.
     """
     try:
         yield
     except DevrfError:
         raise
-    # Any exception: what decoders raise depends on the format and the damage.
+    # Any exception: the type depends on the format and the damage.
     except Exception as error:
         reason = str(error) or type(error).__name__
         raise scene_error(
@@ -70,7 +70,7 @@ def decoding(path: Path, what: str, remedy: str) -> Iterator[None]:
 
 
 def _stands_in(path: Path) -> str:
-    """What to do about a file that only stands for the one of its name; empty if it does not."""
+    """The remedy if a file is a mere placeholder of the one of its name; else empty."""
     try:
         with path.open("rb") as stream:
             start = stream.read(64).lower()
@@ -87,9 +87,9 @@ ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar")
 
 
 def scene_folder(root: str | Path) -> Path:
-    """The folder that the user calls ``root``, with ``~`` filled in; else DevrfError.
+    """The user's folder ``root``, with ``~`` filled in; else DevrfError.
 
-    A scene has its folder's name in all records, so it has to be text that can be shown.
+    All records of a scene have its folder's name, so it has to be printable text.
     """
     try:
         folder = existing_folder(Path(root).expanduser())
@@ -113,14 +113,14 @@ def existing_folder(folder: Path) -> Path:
 
 
 def existing_file(file: Path, purpose: str) -> Path:
-    """``file`` itself, or DevrfError, which says what it is needed for, when there is none."""
+    """``file`` itself, or a DevrfError with its ``purpose`` if there is no such file."""
     if not os.path.isfile(file):
         raise scene_error(file, f"no such file; {purpose}")
     return file
 
 
 def entries(folder: Path) -> list[Path]:
-    """What lies in ``folder``, in order of names; DevrfError if that may not be known."""
+    """The entries of ``folder``, in order of names; DevrfError if they may not be listed."""
     try:
         return sorted(folder.iterdir())
     except OSError as error:
@@ -130,12 +130,12 @@ def entries(folder: Path) -> list[Path]:
 
 
 def inside(root: Path, folder: Path, name: str, file: Path) -> Path:
-    """Where ``name``, text in ``file``, leads from ``folder``: a path somewhere below ``root``.
+    """The path below ``root`` that ``name``, text in ``file``, means from ``folder``.
 
-    ``..`` is taken out of the text itself; links that lie in the scene's folder are followed; back
-    slashes part folders, too. An absolute path on another machine is taken for its tail of which
-    the folder is there. Whether there is such a file is not looked up. DevrfError if the name leads
-    outside, or no file can have it.
+    ``..`` is resolved in the text itself; links in the scene's folder are followed; back slashes
+    separate folders, too. An absolute path of another machine means its longest tail whose folder
+    exists here. The file need not exist. DevrfError if the name leads outside, or no file can have
+    it.
     """
     if "\0" in name or len(name) > LONGEST_PATH:
         raise scene_error(file, f"{abbreviated(name)} is not a path; correct it")
@@ -169,15 +169,15 @@ def _tail(root: Path, folder: Path, path: str) -> str | None:
     parts = PurePosixPath(path).parts[1:][-MOST_FOLDERS:]
     for above in (folder, root):
         for start in range(len(parts)):
-            place = above.joinpath(*parts[start:])
-            there = os.path.isdir(place.parent) if start < len(parts) - 1 else os.path.isfile(place)
-            if there:
-                return os.path.relpath(place, folder)
+            tail = above.joinpath(*parts[start:])
+            exists = os.path.isdir(tail.parent) if start < len(parts) - 1 else os.path.isfile(tail)
+            if exists:
+                return os.path.relpath(tail, folder)
     return None
 
 
 def read_json(file: Path, kind: type[Content], purpose: str) -> Content:
-    """The content of a JSON file that holds one object; ``purpose`` says what it is needed for.
+    """The content of a JSON file of one object; ``purpose`` is for the message if it is missing.
 
     DevrfError if there is no such file, it is no JSON, a key is missing or its value wrong.
     """
@@ -196,7 +196,7 @@ def read_json(file: Path, kind: type[Content], purpose: str) -> Content:
 
 
 def read_numbers(path: Path, expected: str) -> Numbers:
-    """The array in an ``.npy`` file, in double precision; ``expected`` says what it should hold.
+    """The array in an ``.npy`` file, in double precision; ``expected`` describes it.
 
     DevrfError if there is no such file, it is damaged, or holds no numbers, or NaN or infinity.
     """

@@ -27,11 +27,11 @@ from devrf.system.files import atomic_write
 log = logging.getLogger(__name__)
 
 REMEDY = "compute the flow again, or set data.flow=none"
-# Backward or forward: what a file's name ends with.
+# Backward or forward: the end of a file's name.
 FlowDirection = Literal["bwd", "fwd"]
 # Bytes a pixel of vectors and mask once they are read.
 _BYTES = 9
-# Bytes of the widest numbers, and what an array may have before them.
+# Bytes of the widest numbers, and of the header of an array.
 _WIDEST = 16
 _HEADER = 2**16
 
@@ -68,9 +68,9 @@ def read_flow_file(
 
 
 def _arrays(path: Path, shapes: Mapping[str, tuple[int, ...]], remedy: str) -> dict[str, Any]:
-    """The arrays of an npz file that are called as ``shapes``, none of them much larger than that.
+    """The arrays of an npz file with the names of ``shapes``, none of them much larger than that.
 
-    What is packed may be a thousand times as large as its file. DevrfError if it is no npz.
+    Unpacked data may be a thousand times as large as the file. DevrfError if it is no npz.
     """
     with decoding(path, "npz", remedy), np.load(path, allow_pickle=False) as archive:
         for member in archive.zip.infolist():
@@ -92,15 +92,15 @@ def read_flow(
     """The backward flow (``fwd``: forward) of N images in ``<index>_<direction>.npz``.
 
     Args:
-        folder: where the files lie.
-        index: N positions in the list of frames, which the files are numbered by.
+        folder: the files' folder.
+        index: N positions in the list of frames, which number the files.
         expected: N flags: whether the image has an earlier frame (a later one), and so a file.
         source_sizes: N (width, height) of the images before downscaling.
         cameras: N, of the images after downscaling: the flow's pixels.
         direction: backward or forward.
 
     Returns:
-        None when not one expected file is there.
+        None if no expected file exists.
     """
     files = {
         row: folder / f"{number:03d}_{direction}.npz"
@@ -116,7 +116,7 @@ def read_flow(
 
 
 def warn_of_missing(present: int, expected: int, folder: Path) -> None:
-    """Log how many of the expected flow files are missing in ``folder``, if any."""
+    """Log the number of expected flow files that are missing in ``folder``, if any are."""
     if present < expected:
         log.warning(
             "%d of %d flow files are missing in %s; those images go without flow",
@@ -174,7 +174,7 @@ VERSION = "2"
 
 
 def content_key(views: Views, method: str) -> str:
-    """A hash of everything that the flow of ``views`` depends on."""
+    """A hash of the images, times and views that the flow of ``views`` depends on."""
     digest = hashlib.sha256(f"{VERSION} {method} {tuple(views.pixels.shape)}".encode())
     for part in (views.pixels, views.times, views.view):
         digest.update(part.cpu().contiguous().numpy().data)

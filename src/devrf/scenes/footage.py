@@ -31,7 +31,7 @@ Picture = npt.NDArray[np.uint8]
 # Width, height.
 Size = tuple[int, int]
 
-# Suffixes of videos; FFmpeg tells what they are by their content.
+# Suffixes of videos; FFmpeg recognises their formats by content.
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mts", ".m2ts", ".3gp")
 
 # What else FFmpeg reads are lists of other files, of any number, and what nobody films in.
@@ -39,10 +39,10 @@ _FORMATS = "mov,matroska,avi,mpeg,mpegts,mpegvideo,m4v,h264,hevc,asf,flv,ogg,mxf
 _REMEDY = "convert it, for example to H.264 in an mp4 file"
 # Pixels of a frame's longer side.
 _LARGEST = 2**14
-# A film that has fewer of its frames, and ends before this share of its duration, was cut off.
+# A video that has fewer of its frames, and ends before this share of its duration, was cut off.
 _WHOLE = 0.95
-# Lines of FFmpeg's log: a frame, numbered from 0, and its time in microseconds; how long the file
-# says that it is.
+# Lines of FFmpeg's log: a frame, numbered from 0, and its time in microseconds; the file's stated
+# duration.
 _FRAME = re.compile(rb" n: *(\d+) pts: *(-?\d+) ")
 _DURATION = re.compile(rb"Duration: (\d+):(\d+):(\d+\.\d+)")
 
@@ -53,12 +53,12 @@ def is_folder(path: Path) -> bool:
 
 
 @dataclass(frozen=True)
-class FilmHeader:
-    """What footage says of itself.
+class FootageHeader:
+    """Stated properties of footage.
 
     Attributes:
         size: width and height of its frames in pixels, turned as the file says, pixels square.
-        frames: how many it has; of a video not to be relied on, cameras and converters miscount.
+        frames: stated number of frames; unreliable for videos: cameras and converters miscount.
         rate: frames a second, on average; 1 of photographs.
     """
 
@@ -67,14 +67,14 @@ class FilmHeader:
     rate: float = field(compare=False)
 
 
-def film_header(path: Path) -> FilmHeader:
-    """What footage says of itself, no frame of a video decoded; DevrfError if it is none."""
+def footage_header(path: Path) -> FootageHeader:
+    """The stated properties of footage, without decoding a video; DevrfError if it is none."""
     if is_folder(path):
         files = listed_images(path)
         height, width = _photograph(files[0]).shape[:2]
-        return FilmHeader((width, height), len(files), 1.0)
+        return FootageHeader((width, height), len(files), 1.0)
     existing_file(path, "give a video that is there")
-    # FFmpeg and OpenCV would print on stderr what is said here in a line.
+    # FFmpeg and OpenCV would print the error on stderr, too.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", f"format_whitelist;{_FORMATS}")
     level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
@@ -103,16 +103,16 @@ def film_header(path: Path) -> FilmHeader:
     if not 0 < min(width, height) <= max(width, height) <= _LARGEST:
         raise scene_error(path, f"states {width}x{height} px, expected sides of 1 to {_LARGEST}")
     # A frame takes some bytes, whatever the header says.
-    return FilmHeader((width, height), min(frames, path.stat().st_size // 8), rate)
+    return FootageHeader((width, height), min(frames, path.stat().st_size // 8), rate)
 
 
 def frame_count(path: Path) -> int:
-    """How many frames the footage claims to have, at least 1: for progress, not to rely on."""
-    return max(1, film_header(path).frames)
+    """The stated number of frames, at least 1: good enough for progress only."""
+    return max(1, footage_header(path).frames)
 
 
 def pictures(path: Path) -> Iterator[tuple[float, Picture]]:
-    """Time in seconds since the first frame, and each frame, as :func:`chosen` gives them.
+    """Time in seconds since the first frame, and each frame, as :func:`frames_at` gives them.
 
     The times of photographs are their positions. DevrfError if it is no footage. A warning says
     that a video ends well before its stated end.
@@ -125,8 +125,8 @@ def pictures(path: Path) -> Iterator[tuple[float, Picture]]:
         yield time, picture
 
 
-def chosen(path: Path, positions: Sequence[int]) -> Iterator[tuple[int, Picture]]:
-    """The frames at ``positions``, ascending, each with its position; no others are kept.
+def frames_at(path: Path, positions: Sequence[int]) -> Iterator[tuple[int, Picture]]:
+    """The frames at ``positions``, ascending, each with its position; others are not kept.
 
     They are turned as their file says, pixels are square, and interlaced frames of a video are
     deinterlaced. DevrfError if it is no footage, or ends before the last position.
@@ -145,10 +145,10 @@ def _decoded(
     path: Path, wanted: Sequence[int] | None = None
 ) -> Iterator[tuple[int, float, Picture]]:
     """Position, time in seconds since the first frame, and picture: of all frames, or of some."""
-    header = film_header(path)
+    header = footage_header(path)
     width, height = header.size
     with _ffmpeg(path, header.size, wanted) as (frames, lines):
-        shown = _shown(path, lines, header.rate)
+        frame_times = _frame_times(path, lines, header.rate)
         position, time = -1, 0.0
         for target in count() if wanted is None else wanted:
             picture = np.empty((height, width, 3), np.uint8)
@@ -156,13 +156,13 @@ def _decoded(
                 break
             # FFmpeg has written a frame's line before the frame.
             while position < target:
-                position, time = next(shown)
+                position, time = next(frame_times)
             yield position, time, picture
         else:
             return
-        *_, (position, time) = [(position, time), *shown]
+        *_, (position, time) = [(position, time), *frame_times]
         lines.seek(0)
-        said = lines.read()
+        messages = lines.read()
     number = position + 1
     if wanted is not None:
         raise scene_error(
@@ -174,10 +174,12 @@ def _decoded(
             f"a video of {number or 'no'} frame{'s' * (number != 1)}, expected at least 2; "
             f"give a longer one, or {_REMEDY}",
         )
-    # Frames that an edit leaves out are counted, too, and where no number is stated it is a guess
-    # from the duration, which may be that of the sound: only both together tell.
+    # The stated number also counts frames that an edit leaves out, or is a guess from the duration,
+    # which may be that of the sound: only both together are evidence.
     duration = header.frames / header.rate
-    if (match := _DURATION.search(said)) and b"Input #0, avi" not in said:  # FFmpeg corrects AVI's
+    if (
+        match := _DURATION.search(messages)
+    ) and b"Input #0, avi" not in messages:  # FFmpeg corrects AVI's
         hours, minutes, seconds = map(float, match.groups())
         duration = 3600 * hours + 60 * minutes + seconds
     if number < _WHOLE * header.frames and time + 1 / header.rate < _WHOLE * duration:
@@ -187,7 +189,7 @@ def _decoded(
         )
 
 
-def _shown(path: Path, lines: BufferedReader, rate: float) -> Iterator[tuple[int, float]]:
+def _frame_times(path: Path, lines: BufferedReader, rate: float) -> Iterator[tuple[int, float]]:
     """Position and time of each frame that FFmpeg has decoded so far."""
     start = time = 0.0
     matches = (match for line in iter(lines.readline, b"") if (match := _FRAME.search(line)))
@@ -209,11 +211,11 @@ def _shown(path: Path, lines: BufferedReader, rate: float) -> Iterator[tuple[int
 def _ffmpeg(
     path: Path, size: Size, wanted: Sequence[int] | None
 ) -> Iterator[tuple[BufferedReader, BufferedReader]]:
-    """FFmpeg at work: the pixels of the wanted frames, one after the other, and its log."""
-    kept = "1" if wanted is None else "+".join(f"eq(n,{position})" for position in wanted)
+    """Run FFmpeg: the pixels of the wanted frames, one after the other, and its log."""
+    selected = "1" if wanted is None else "+".join(f"eq(n,{position})" for position in wanted)
     filters = (
         "yadif=deint=interlaced,settb=1/1000000,showinfo=checksum=0,"
-        f"select='{kept}',scale={size[0]}:{size[1]}"
+        f"select='{selected}',scale={size[0]}:{size[1]}"
     )
     try:
         command = [imageio_ffmpeg.get_ffmpeg_exe(), "-nostdin", "-nostats"]
@@ -225,7 +227,7 @@ def _ffmpeg(
     command += ["-vf", filters, "-fps_mode", "passthrough"]
     command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "pipe:1"]
     with TemporaryDirectory() as folder:
-        # A file: of two pipes one could fill while the other is waited for.
+        # A file: with two pipes one could fill up while the other is read.
         log_file = Path(folder) / "log"
         with (
             log_file.open("wb") as stderr,

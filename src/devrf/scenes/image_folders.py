@@ -1,4 +1,4 @@
-"""Folders of images: which size to read, and how much smaller to make it."""
+"""Folders of images: the size to read, and the factor by which it is made smaller."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ImageFolder:
-    """The folder to read images from, and what is left to do.
+    """The folder to read images from, and the factor that remains.
 
     Attributes:
         path: the folder.
@@ -40,11 +40,12 @@ class ImageFolder:
 def image_folder(
     parent: Path, downscale: int, *, full: str = "images", reduced: str = "images_{}"
 ) -> ImageFolder:
-    """The folder in ``parent`` that saves most of the work of making images smaller.
+    """The folder in ``parent`` with the smallest images that are large enough.
 
-    That is ``images_<downscale>``, else the largest factor that divides ``downscale``, down to
-    ``images`` itself; the rest is left to area averages. ``full`` and ``reduced`` are the folders'
-    names, ``{}`` in place of the factor. DevrfError if there is none.
+    That is ``images_<downscale>``, else the folder of the largest factor that divides
+    ``downscale``, down to ``images`` itself; area averages make images smaller by what remains.
+    ``full`` and ``reduced`` are the folders' names, ``{}`` in place of the factor. DevrfError if
+    there is none.
     """
     pattern = re.compile(re.escape(reduced).replace(r"\{\}", r"([1-9]\d{0,3})"))
     folders = {}
@@ -80,8 +81,8 @@ def listed_images(folder: Path, *, by_characters: bool = False) -> list[Path]:
 
 # Images with a shorter side of fewer pixels teach little.
 LEAST_SIDE = 64
-# The longer side has at most so many pixels with ``cpu`` and ``gpu``: the grids that a CPU learns
-# show no more; scenes are published at about the size for a GPU.
+# Most pixels of the longer side with ``cpu`` and ``gpu``: the grids that a CPU learns show no more
+# detail; scenes are published at about the size for a GPU.
 LONGEST = {"cpu": 640, "gpu": 1600}
 _UP_TO = re.compile(r"up_to_([1-9]\d{0,3})")
 
@@ -96,7 +97,7 @@ def _downscale(value: object) -> object:
     return value
 
 
-# A factor, what it is to be chosen for, or ``up_to_<factor>``.
+# A factor, a kind of device, or ``up_to_<factor>``.
 Downscale = Annotated[int | str, PlainValidator(_downscale)]
 SizeAt = Callable[[int], tuple[int, int] | None]
 
@@ -104,10 +105,10 @@ SizeAt = Callable[[int], tuple[int, int] | None]
 def whole_factor(downscale: int | str, size_at: SizeAt) -> int:
     """The factor by which images are made smaller.
 
-    A number is taken as it is. ``cpu`` and ``gpu`` take the least power of two that leaves no more
-    than :data:`LONGEST`, ``auto`` that of this machine, ``up_to_<N>`` the largest factor up to N.
-    All keep 64 pixels of the shorter side; if no factor does, that counts which leaves the most.
-    ``size_at`` gives (width, height) at a factor, None where there are no such images.
+    A number is the factor itself. ``cpu`` and ``gpu`` take the least power of two that leaves no
+    more than :data:`LONGEST`, ``auto`` that of this machine, ``up_to_<N>`` the largest factor up to
+    N. All keep 64 pixels of the shorter side; if no factor does, the one that leaves the most
+    counts. ``size_at`` gives (width, height) at a factor, None where there are no such images.
     """
     if isinstance(downscale, int):
         return downscale

@@ -1,8 +1,8 @@
-"""Image files → uint8 tensors: measured, turned where they have to be, made smaller.
+"""Image files → uint8 tensors: measured, turned if necessary, made smaller.
 
-A photo may carry an EXIF orientation: viewers turn it, most tools that find cameras do not. The
-camera's own size may tell which of the two it was found on: an image is turned if only the turned
-one has the camera's shape; otherwise it is read as it is stored.
+A photo may carry an EXIF orientation: viewers turn it, most tools that pose cameras do not. The
+camera's size may tell them apart: an image is turned if only the turned one has the camera's
+shape; otherwise it is read as it is stored.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from devrf.scenes.validation import check_memory, reduced_size, same_shape, scen
 log = logging.getLogger(__name__)
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
-# By content, not by name. Pillow reads many more formats, some by starting other programs.
+# Formats by content, not by name. Pillow reads many more, some by starting other programs.
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 # Suffixes of images in formats that are not read.
 UNREAD = frozenset(
@@ -41,7 +41,7 @@ UNREAD = frozenset(
 warnings.filterwarnings("ignore", module=r"PIL\.")
 # 16-bit and float greys have no fixed white; the rest converts to 8 bits without a choice.
 DEEP_MODES = ("I", "F", "I;16", "I;16B", "I;16L", "I;16N")
-# How the stored image becomes the one to be seen, by its EXIF orientation; 1 is as it is.
+# The turn of a stored image, by its EXIF orientation; 1 is none.
 TURNS = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -59,13 +59,13 @@ Size = tuple[float, float]
 
 @dataclass(frozen=True)
 class Header:
-    """What a file claims to be, nothing decoded.
+    """The stated properties of an image file.
 
     Attributes:
-        width: columns of the image as it will be read.
+        width: columns of the image when it is read.
         height: its rows.
         has_alpha: whether it has an alpha channel.
-        turn: the EXIF orientation by which it has to be turned; 1 is as it is stored.
+        turn: the EXIF orientation by which it has to be turned; 1 is none.
         ambiguous_orientation: its EXIF orientation asks for a turn, and its camera neither
             confirms nor refutes it.
     """
@@ -78,7 +78,7 @@ class Header:
 
 
 def unread(folder: Path) -> str:
-    """What to do about images in ``folder`` in formats that are not read; empty: there are none."""
+    """The remedy for images in ``folder`` in formats that are not read; empty without any."""
     kinds = {path.suffix.lower() for path in entries(folder)} & UNREAD
     if not kinds:
         return ""
@@ -92,10 +92,10 @@ def open_image(path: Path) -> Image.Image:
 
 
 def read_header(path: Path, camera: Size | None = None) -> Header:
-    """What an image file claims to be.
+    """The stated properties of an image file.
 
-    ``camera`` is the (width, height) of the images that its camera is for; None: unknown.
-    DevrfError if it is no image with 8 bits a channel, or one that Pillow takes for too large.
+    ``camera`` is the (width, height) of its camera's images; None: unknown. DevrfError if it is no
+    image with 8 bits a channel, or too large for Pillow.
     """
     with open_image(path) as image:
         if image.mode in DEEP_MODES:
@@ -146,7 +146,7 @@ def image_size(path: Path, camera: Size | None = None) -> tuple[int, int]:
 def decode(path: Path, header: Header, mode: str) -> npt.NDArray[np.uint8]:
     """The pixels (H, W, …) of a file whose header has been read, in Pillow's mode RGB or RGBA.
 
-    DevrfError if it is damaged, or not what it claimed to be.
+    DevrfError if it is damaged, or contradicts its header.
     """
     with open_image(path) as image, decoding(path, "image", "replace the file"):
         converted: Image.Image = image.convert(mode)
@@ -158,7 +158,7 @@ def decode(path: Path, header: Header, mode: str) -> npt.NDArray[np.uint8]:
     return pixels
 
 
-# What the images that are decoded at one time may take, at 8 bytes a pixel each.
+# Bytes of the images that are decoded at one time, at 8 bytes a pixel each.
 _IN_FLIGHT = 2**30
 
 # (position in the set, RGBA) → RGBA.
@@ -214,15 +214,15 @@ def load_images(
     Args:
         paths: at least one existing file, 8 bits a channel, with or without alpha.
         downscale: integer factor ≥ 1; each side becomes floor(side / downscale), by area averages.
-        cameras: (width, height) of the images that each camera is for, of any scale; None if it
-            is unknown, for one image or for all.
-        finish: what to make of each RGBA image, by its position, before it is made smaller; images
-            without alpha come to it opaque.
+        cameras: (width, height) of each camera's images, of any scale; None if it is unknown, for
+            one image or for all.
+        finish: maps the position and pixels of each image, as RGBA, to the pixels that are made
+            smaller; images without alpha are opaque.
         alpha_weighted: whether colours are weighted by their alpha in these averages.
 
     Raises:
-        DevrfError: a file cannot be read, or would fall under 8 px a side; or there are more than
-            fit into memory.
+        DevrfError: a file cannot be read, or would fall under 8 px a side; or memory is too small
+            for the images.
     """
     start = time.perf_counter()
     with ThreadPoolExecutor(8) as pool:
@@ -238,7 +238,7 @@ def load_images(
     shape = (len(paths), height, width, 4 if alpha else 3)
     what = f"{len(paths)} images of {'several sizes up to ' * several}{width}x{height} px"
     check_memory(math.prod(shape), paths[0].parent, what)
-    # NumPy in the threads: each would otherwise start a team of torch threads of its own.
+    # NumPy in the threads: with torch each would start a team of threads of its own.
     pixels = np.empty(shape, dtype=np.uint8)
     if several:
         pixels[:] = 0
@@ -257,7 +257,7 @@ def load_images(
     log.info("read %s from %s in %.1f s", what, paths[0].parent, time.perf_counter() - start)
     if turned := sum(header.turn != 1 for header in headers):
         log.info(
-            "%d of them turned as their EXIF orientation says: only so they fit their cameras",
+            "%d of them are turned as their EXIF orientation says, to fit their cameras",
             turned,
         )
     ambiguous_orientation = torch.tensor([header.ambiguous_orientation for header in headers])

@@ -1,4 +1,4 @@
-"""The four splits that make a scene, whichever format lists them."""
+"""The four splits of a scene, in any layout."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from devrf.scenes.scene import Capture, Views
 from devrf.scenes.splits import (
     Split,
     at_one_moment,
-    at_rest,
     at_times,
     distinct_times,
     evenly_spread,
@@ -25,13 +24,14 @@ from devrf.scenes.splits import (
     load_views,
     one_moment,
     standing,
+    static_split,
 )
 from devrf.scenes.transforms import SceneBounds, Transforms
 from devrf.scenes.validation import scene_error
 
 log = logging.getLogger(__name__)
 
-# The images of a capture to learn from, and those held out.
+# A capture's training images, and its held-out ones.
 Pair = tuple[Transforms, Transforms]
 
 
@@ -40,11 +40,12 @@ class Layout:
     """A scene's splits, ordered but not yet loaded.
 
     Attributes:
-        static_train: images of the scene at rest.
-        static_test: held-out images of the scene at rest.
-        dynamic_train: images of the scene in motion; ``static_train`` itself if it is at rest.
-        dynamic_test: held-out images of the scene in motion.
-        validation: images as those of ``dynamic_test``, by which settings are chosen, or None.
+        static_train: training images of the static capture.
+        static_test: its held-out images.
+        dynamic_train: training images of the dynamic capture; ``static_train`` itself if the scene
+            is static.
+        dynamic_test: its held-out images.
+        validation: further held-out images of it, for the choice of settings, or None.
         thinned: whether times were left out, so that frames have lost their neighbours.
         alpha_weighted: as for :func:`devrf.scenes.images.load_images`.
     """
@@ -59,12 +60,12 @@ class Layout:
 
     @property
     def offset(self) -> Offset:
-        """What is subtracted from positions: one offset for all files of the scene."""
+        """The offset that is subtracted from positions, one for all files of the scene."""
         return self.static_train.transforms.offset
 
     @property
     def bounds(self) -> SceneBounds | None:
-        """Where the scene is, if its files say so."""
+        """The bounds that the scene's files state, if any."""
         return self.static_train.transforms.bounds
 
     @property
@@ -82,15 +83,15 @@ class Layout:
         transforms = self.static_train.transforms
         first: dict[Size | None, int] = {}
         for k in self.static_train.index.tolist():
-            # Images whose cameras are for one size are of one size, too.
+            # Images of cameras of one size have one size, too.
             first.setdefault(transforms.intrinsics[k].size, k)
         sizes = [image_size(transforms.images[k], camera) for camera, k in first.items()]
         return max(sizes, key=max)
 
     def with_validation(self, transforms: Transforms) -> Layout:
-        """The layout with a validation split, of the images that are not learned from or tested on.
+        """The layout with a validation split, of images that are not in the other splits.
 
-        An image with the pose and the time of one of these is that image under another name.
+        An image with the pose and the time of one of theirs is that image under another name.
         """
         if not transforms.images:
             return self
@@ -109,7 +110,7 @@ def _poses_and_times(split: Split) -> Tensor:
 
 
 def static_alone(train: Transforms, test: Transforms, why: str) -> Layout:
-    """The layout of a scene at rest, whose images all show one moment; ``why`` is for the log."""
+    """The layout of a static scene, whose images all show one moment; ``why`` is for the log."""
     log.info("%s: %s: all images show one moment, the scene is at rest", train.file, why)
     if cameras := standing(torch.cat([train.poses, test.poses])):
         unread = f", not {' or '.join(train.unread_times)}" * bool(train.unread_times)
@@ -126,17 +127,17 @@ def static_alone(train: Transforms, test: Transforms, why: str) -> Layout:
 
 
 def two_captures(static: Pair, dynamic: Pair) -> Layout:
-    """The layout of a scene that was recorded at rest and in motion; each to train and to test."""
+    """The layout of a static and a dynamic capture, each with training and held-out images."""
     return Layout(
-        static_train=at_rest(static[0]),
-        static_test=at_rest(static[1]),
+        static_train=static_split(static[0]),
+        static_test=static_split(static[1]),
         dynamic_train=in_motion(dynamic[0]),
         dynamic_test=in_motion(dynamic[1]),
     )
 
 
 def one_capture(train: Transforms, test: Transforms, static_until: float) -> Layout:
-    """The layout of one capture: at rest without times, or with one, else without a static set."""
+    """The layout of one capture: static with one time or none, else without a static set."""
     if one_moment(train, test):
         times = "no time" if train.times is None else "one time"
         return static_alone(train, test, f"its frames have {times}")
@@ -146,7 +147,7 @@ def one_capture(train: Transforms, test: Transforms, static_until: float) -> Lay
 def without_static_set(train: Split, test: Split, static_until: float) -> Layout:
     """The layout of one capture in motion, whose images up to ``static_until`` count as static.
 
-    DevrfError if no image to learn from is that early.
+    DevrfError if no training image is that early.
     """
     early = train.where(train.times <= static_until + 1e-6)
     early_test = test.where(test.times <= static_until + 1e-6)
@@ -172,8 +173,8 @@ def fewer(layout: Layout, train_views: int | None, frames: int | None) -> Layout
     """The layout with fewer dynamic views and times.
 
     It keeps the first ``train_views`` dynamic views and ``frames`` times, evenly spread, first and
-    last included; None: all. DevrfError if the dynamic images have one time only, or fewer views;
-    or there are none.
+    last included; None: all. DevrfError if the dynamic images have one time only, or fewer views,
+    or if there are none.
     """
     if not layout.moves:
         for key, count in (("train_views", train_views), ("frames", frames)):
@@ -210,7 +211,7 @@ def fewer(layout: Layout, train_views: int | None, frames: int | None) -> Layout
 def load_layout(layout: Layout, root: Path, downscale: int) -> tuple[Capture, Capture]:
     """The static and the dynamic capture, images read from below the scene's folder ``root``.
 
-    Images are made smaller by ``downscale``, those of transforms with a factor of their own by it.
+    Images are made smaller by ``downscale``, or by their transforms' own factor, if they have one.
     """
     loaded: list[tuple[Split, Views]] = []
 

@@ -16,7 +16,7 @@ from devrf.system.options import abbreviated
 # Focal lengths as shares of the image's longer side: a view of 0.0006 to 178.9 degrees.
 LEAST_FOCAL = 0.01
 MOST_FOCAL = 1e5
-# How far from the image its principal point, or its skew, may be: images are cropped.
+# Largest distance of the principal point from the image, and largest skew: images are cropped.
 MOST_OFFSET = 1e3
 
 
@@ -143,8 +143,8 @@ class Intrinsics:
     def lens(self, width: int, height: int, where: object) -> Lens:
         """The lens in pixels of a file of ``width`` × ``height`` pixels.
 
-        DevrfError if ``where``, the file, has another shape than its camera, or a camera of which
-        it can show nothing.
+        DevrfError if ``where``, the file, has another shape than its camera, or a camera that
+        cannot be an image's.
         """
         w, h = (width, height) if self.size is None else self.size
         if not same_shape((width, height), (w, h)):
@@ -202,7 +202,7 @@ def frame_intrinsics(shared: CameraKeys, frame: CameraKeys, where: object) -> In
     own = frame.model_dump(include=KEYS, exclude_unset=True)
     if not own:
         return None
-    # What a frame says of its view stands against what the file says of other images.
+    # A frame's own focal length or angle replaces both of the file.
     others = ANGLES if "fl_x" in own else FOCAL | ANGLES if own.keys() & ANGLES else set()
     merged = shared.model_dump(include=KEYS - others, exclude_unset=True) | own
     return intrinsics_of(CameraKeys.model_construct(**merged), where)

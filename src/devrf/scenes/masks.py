@@ -1,7 +1,7 @@
-"""Masks beside images (nerfstudio's ``mask_path``): black where they leave out, white elsewhere.
+"""Masks beside images (nerfstudio's ``mask_path``): black pixels are left out, white ones kept.
 
-What a mask leaves out is either to be ignored (a passer-by, a tripod: nerfstudio's meaning) or
-known to be background (everything around a person). A file does not say which; the user does.
+Black pixels are either to be ignored (a passer-by, a tripod: nerfstudio's meaning) or known to be
+background (everything around a person). The user says which, the files do not.
 """
 
 from __future__ import annotations
@@ -38,17 +38,17 @@ Masks = Literal["ignore", "alpha", "none"]
 Grey = npt.NDArray[np.uint8]
 
 WHITE = 255
-# A pixel is left out that is darker than half white; compression leaves edges grey.
+# Pixels darker than half white are left out; compression makes edges grey.
 HALF = 127
 # Levels by which the channels of a grey image may differ, as JPEG's do.
 GREY_NOISE = 16
 
 
 def white_in(masks: Iterable[Grey], where: object) -> int:
-    """The value of white in masks that belong together: 255, or 1 where they are labels 0 and 1.
+    """The value of white in a set of masks: 255, or 1 if they are labels 0 and 1.
 
-    One mask alone does not tell: a frame without its subject is black, up to noise. DevrfError if
-    no value of any is nearer to white than to black, and they are no such labels.
+    One mask alone does not determine it: a frame without its subject is black, up to noise.
+    DevrfError if no value of any is nearer to white than to black, and they are no such labels.
     """
     values = set[int]()
     for mask in masks:
@@ -77,7 +77,7 @@ def read_mask(
     Args:
         path: a file of 8 bits a channel that is grey, or whose alpha channel is the mask.
         image: (width, height) of the image's file.
-        camera: (width, height) that its camera is for; a mask may be given at that size, too.
+        camera: (width, height) of its camera's images; the mask may have that size, too.
         name: the image, for messages.
         white: the value in the file that becomes 255, by :func:`white_in_files`.
 
@@ -99,7 +99,7 @@ def read_mask(
 
 
 def _grey(path: Path, header: Header) -> Grey:
-    """The values (H, W) of a mask as its file has them."""
+    """The values (H, W) of a mask in its file."""
     pixels = decode(path, header, "RGBA")
     colors = pixels[..., :3]
     alpha = pixels[..., 3]
@@ -107,9 +107,9 @@ def _grey(path: Path, header: Header) -> Grey:
         if int(np.ptp(colors, axis=2).max()) > GREY_NOISE:
             raise scene_error(path, "a mask with colours; give one channel, black and white")
         return np.ascontiguousarray(pixels[..., 0])
-    # An alpha mask: what shows is of one colour, or as light as it is opaque.
-    seen = colors[alpha > 0]
-    plain = len(seen) == 0 or int(np.ptp(seen, axis=0).max()) <= GREY_NOISE
+    # An alpha mask: its opaque pixels have one colour, or are as light as they are opaque.
+    opaque = colors[alpha > 0]
+    plain = len(opaque) == 0 or int(np.ptp(opaque, axis=0).max()) <= GREY_NOISE
     if not plain and np.abs(colors - alpha[..., None].astype(np.int16)).max() > GREY_NOISE:
         raise scene_error(path, "a mask whose colours and alpha channel differ; give one channel")
     return np.ascontiguousarray(alpha)
@@ -118,7 +118,7 @@ def _grey(path: Path, header: Header) -> Grey:
 def cutting_out(
     paths: Sequence[Path | None], cameras: Sequence[Size | None], names: Sequence[Path]
 ) -> Finish | None:
-    """What makes masks the alpha of their images, the lesser of the two; None: no masks.
+    """The function that limits the alpha of images by their masks; None: no masks.
 
     Arguments are those of :func:`valid_pixels`; DevrfError if only some images have a mask.
     """
@@ -151,22 +151,21 @@ def valid_pixels(
     lenses: Sequence[Lens],
     names: Sequence[Path],
 ) -> Tensor | None:
-    """Which pixels (N, H, W) are valid, after downscaling and undistortion; None: all of them.
+    """Mask (N, H, W) of the valid pixels, after downscaling and undistortion; None: all of them.
 
-    A pixel is valid if all source pixels that it is made of are. What is beside an image, where
-    others are larger, is not.
+    A pixel is valid if all of its source pixels are. Pixels beside an image that is smaller than
+    others are not.
 
     Args:
         paths: N masks, None for an image that is valid as a whole; or empty.
         images: N (width, height) of the images' files.
         sizes: N (width, height) after downscaling.
-        cameras: N sizes that the cameras are for, or None.
+        cameras: N sizes of the cameras' images, or None.
         lenses: N, in pixels of the smaller images, before undistortion.
         names: N images, for messages.
 
     Raises:
-        DevrfError: what :func:`read_mask` raises, a mask leaves nothing, or there is too little
-            memory.
+        DevrfError: as of :func:`read_mask`; or a mask leaves nothing, or memory is too small.
     """
     masked = [k for k, path in enumerate(paths) if path is not None]
     if not masked and len(set(sizes)) == 1:
@@ -176,8 +175,8 @@ def valid_pixels(
     masks = np.zeros((len(sizes), height, width, 1), dtype=np.uint8)
     for mask, (columns, rows) in zip(masks, sizes, strict=True):
         mask[:rows, :columns] = WHITE
-    there = [path for path in paths if path is not None]
-    white = white_in_files(there) if there else WHITE
+    files = [path for path in paths if path is not None]
+    white = white_in_files(files) if files else WHITE
 
     def fill(k: int) -> None:
         path = paths[k]

@@ -1,4 +1,4 @@
-"""Names of a scene's images: what order they have, and which file a name in a list means.
+"""Names of a scene's images: their order, and the file that a name in a list means.
 
 Lists are written by other programs on other systems: a name may lack its suffix, be spelled in
 another case or another Unicode form, have back slashes, or begin in a folder of another machine.
@@ -39,10 +39,10 @@ def in_order(
 ) -> list[Item]:
     """``items`` in the order of their names, in which runs of digits count as numbers.
 
-    A single number with a point before the suffix is a decimal one, unless such numbers are seen to
-    be counters: of several lengths, some with a zero at the end (``1.9``, ``1.10``).
-    ``by_characters``: names are compared as text, as LLFF does, whose files have a row for each.
-    Where both orders differ, a line in the log says which was taken of ``where``, which holds them.
+    A single number with a point before the suffix is a decimal one, unless such numbers look like
+    counters: of several lengths, some with a zero at the end (``1.9``, ``1.10``).
+    ``by_characters``: names are compared as text, as in LLFF's code, whose files have a row for
+    each. If both orders differ, a line in the log names the chosen one; ``where`` holds the items.
     """
     as_text = sorted(items, key=name)
     stems = [_SUFFIX.sub("", name(item)) for item in as_text]
@@ -77,37 +77,37 @@ class ImageFinder:
     """
 
     def __init__(self, root: Path) -> None:
-        """Of the scene in ``root``."""
+        """A finder for the scene in ``root``."""
         self.root = root
         self._names_in = cache(_names_in)
 
-    def find(self, place: Path) -> Path | None:
-        """The image that ``place``, below the root, means; None: there is none.
+    def find(self, path: Path) -> Path | None:
+        """The image that ``path``, below the root, means; None: there is none.
 
-        A name that is there as it is written comes first, then one with a suffix appended, then one
-        with another image suffix; of each, the same spelling before others.
+        The name as it is written comes first, then one with a suffix appended, then one with
+        another image suffix; of each, the same spelling before others.
         """
         folder = self.root
-        for part in place.relative_to(self.root).parts[:-1]:
+        for part in path.relative_to(self.root).parts[:-1]:
             same = self._names_in(folder).get(_spelling(part), [])
             if not same:
                 return None
             folder /= part if part in same else same[0]
         names = self._names_in(folder)
-        suffixed = place.suffix.lower() in SUFFIXES
-        wanted = [place.name] if suffixed else []
-        wanted += [place.name + suffix for suffix in SUFFIXES]
-        wanted += [place.stem + suffix for suffix in SUFFIXES if suffixed]
+        suffixed = path.suffix.lower() in SUFFIXES
+        wanted = [path.name] if suffixed else []
+        wanted += [path.name + suffix for suffix in SUFFIXES]
+        wanted += [path.stem + suffix for suffix in SUFFIXES if suffixed]
         for name in wanted:
             same = names.get(_spelling(name), [])
-            for found in ([name] if name in same else same)[:1]:
-                if os.path.isfile(folder / found):
-                    return folder / found
+            for spelled in ([name] if name in same else same)[:1]:
+                if os.path.isfile(folder / spelled):
+                    return folder / spelled
         return None
 
 
 def _names_in(folder: Path) -> dict[str, list[str]]:
-    """The names in a folder, by what is the same in all spellings; none if it cannot be listed."""
+    """The names in a folder, by their common spelling; none if there is no such folder."""
     names: dict[str, list[str]] = {}
     if os.path.isdir(folder):
         for path in entries(folder):
@@ -136,16 +136,15 @@ def present_images(
         file: the file that lists them.
         finder: of the scene.
         missing: whether absent images are an error, or left out with one warning.
-        relative_to: the folder that names begin in; None: the file's.
+        relative_to: the folder that names are relative to; None: the file's.
 
     Raises:
         DevrfError: an image is absent and must not be, or all are.
     """
     root = finder.root
-    places = [inside(root, relative_to or file.parent, name, file) for name in names]
-    found = [finder.find(place) for place in places]
-    present = {k: image for k, image in enumerate(found) if image is not None}
-    absent = [place for k, place in enumerate(places) if k not in present]
+    listed = [inside(root, relative_to or file.parent, name, file) for name in names]
+    present = {k: image for k, path in enumerate(listed) if (image := finder.find(path))}
+    absent = [path for k, path in enumerate(listed) if k not in present]
     if absent and (missing == "error" or not present):
         add = "add them" if len(absent) > 1 else "correct its name or add it"
         skip = ", or leave out what is absent with data.missing=skip" if present else ""
@@ -165,7 +164,7 @@ def present_images(
     others = [
         k
         for k, image in present.items()
-        if places[k].suffix.lower() in SUFFIXES and image.suffix.lower() != places[k].suffix.lower()
+        if listed[k].suffix.lower() in SUFFIXES and image.suffix.lower() != listed[k].suffix.lower()
     ]
     if others:
         log.info(
@@ -173,7 +172,7 @@ def present_images(
             file,
             len(others),
             present[others[0]].name,
-            places[others[0]].name,
+            listed[others[0]].name,
         )
     moved = [name for name in names if from_elsewhere(root, name)]
     if moved:

@@ -1,4 +1,4 @@
-"""Optical flow for scenes without: estimated once, by DIS (OpenCV) or RAFT (torchvision)."""
+"""Optical flow of scenes without flow files, by DIS (OpenCV) or RAFT (torchvision)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from devrf.scenes.validation import scene_error
 log = logging.getLogger(__name__)
 
 
-# Both methods work on coarse levels of an image pyramid and see nothing in smaller images.
+# Both methods work on coarse levels of an image pyramid and fail on smaller images.
 LEAST_SIDE = 128
 RAFT_MULTIPLE = 8
 
@@ -89,7 +89,7 @@ def _raft() -> Estimator:
 
     def flow(image: Tensor, other: Tensor) -> Tensor:
         height, width = image.shape[:2]
-        # Edge pixels are repeated to the right and below, so that positions stay as they are.
+        # Edge pixels are repeated to the right and below, so that positions do not change.
         margin = (0, _padded(width) - width, 0, _padded(height) - height)
         pair = torch.stack([image, other]).to(device).permute(0, 3, 1, 2).float() / 127.5 - 1
         first, second = pad(pair, margin, mode="replicate").chunk(2)
@@ -126,8 +126,8 @@ def estimate_flow(
     Args:
         views: N images of the scene in motion.
         method: "dis" (OpenCV, on the CPU) or "raft" (torchvision, on the GPU if there is one).
-        cache: an npz to read the flow from, or to write it to; ignored and written again when
-            it belongs to other images or is damaged.
+        cache: an npz to read the flow from, or to write it to; it is overwritten if it belongs to
+            other images or is damaged.
         forward: estimate forward flow instead, to the image a frame later.
 
     Raises:
@@ -165,9 +165,9 @@ def estimate_flow(
 
 
 def flow_between(views: Views, image: int, other: int, between: Estimator) -> tuple[Tensor, Tensor]:
-    """Flow (H, W, 2) of an image to another, in pixels, and where it is valid, (H, W) bool.
+    """Flow (H, W, 2) of an image to another, in pixels, and its valid mask (H, W).
 
-    Of images of two sizes it is that of the part at the top left that both have.
+    For images of two sizes it is the flow of their common part at the top left.
     """
     whole = [views.single(k).pixels[0] for k in (image, other)]
     height = min(pixels.shape[0] for pixels in whole)
@@ -192,7 +192,7 @@ def frame_pairs(views: Views) -> list[tuple[int, int]]:
 
 
 def consistent(backward: Tensor, forward: Tensor) -> Tensor:
-    """Where two flows agree.
+    """The mask of pixels on which two flows agree.
 
     Args:
         backward: (H, W, 2) from an image to the earlier one, pixels, x then y.
@@ -208,13 +208,13 @@ def consistent(backward: Tensor, forward: Tensor) -> Tensor:
     inside = ((end >= 0) & (end <= end.new_tensor([width - 1, height - 1]))).all(dim=-1)
     at_x = np.ascontiguousarray(end[..., 0])
     at_y = np.ascontiguousarray(end[..., 1])
-    looked_up = cv2.remap(
+    interpolated = cv2.remap(
         forward.numpy(), at_x, at_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
-    back = torch.from_numpy(np.asarray(looked_up, dtype=np.float32))
+    back = torch.from_numpy(np.asarray(interpolated, dtype=np.float32))
     miss: Tensor = torch.linalg.vector_norm(backward + back, dim=-1)
     length: Tensor = torch.linalg.vector_norm(backward, dim=-1)
-    # NaN compares false: what is not a number is not trusted.
+    # NaN compares false: such vectors are not trusted.
     return inside & (miss < CLOSED_PIXELS + CLOSED_SHARE * length)
 
 

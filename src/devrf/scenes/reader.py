@@ -1,4 +1,4 @@
-"""What the readers of all layouts share: their options, each declared and checked once."""
+"""The options that the readers of all layouts share, each declared and checked once."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 
 FlowSource = Literal["auto", "files", "dis", "raft", "none"]
 Exposure = Literal["auto", "equal", "none"]
-# The flow sources of layouts that have no place for flow files.
+# The flow sources of layouts without flow files.
 EstimatedFlow = Literal["auto", "dis", "raft", "none"]
 
 Time = Annotated[Number, Field(ge=0, le=1)]
@@ -48,29 +48,29 @@ def _box(value: Any) -> Box | None:
 
 
 BoundScale = Annotated[float | str, PlainValidator(_bound_scale)]
-# A config gives corners, of which the reader makes a Box.
+# A config gives corners; the reader turns them into a Box.
 BoxOption = Annotated[Any, PlainValidator(_box)]
 
 
 @dataclass(frozen=True)
 class SceneReader(Options, ABC):
-    """Where a scene is on disk and how it is to be read.
+    """A scene on disk, and the options of its reader.
 
     Attributes:
         root: the scene's folder.
         name: short name; None takes the folder's.
         downscale: integer factor ≥ 1 by which images and flow are made smaller; ``auto``, ``cpu``,
             ``gpu``, ``up_to_<factor>``: see :func:`~devrf.scenes.image_folders.whole_factor`.
-        factor: by what images were made smaller; known once they have been read.
-        has_flow_files: whether the layout has a place for flow files.
-        background: what is behind the alpha masks of RGBA images; RGB images are used as they are.
-        flow: ``auto`` reads the scene's backward flow where it has files of it, ``files`` insists
-            on them, ``dis`` and ``raft`` estimate it, ``none`` does without.
-        flow_cache: an ``.npz`` that keeps estimated flow; None estimates it every time.
-        exposure: whether the images of one moving camera are given one exposure: ``auto`` where it
-            changes by more than a seventh, ``equal`` or ``none`` always or never.
+        factor: the factor by which images were made smaller, set when they are read.
+        has_flow_files: whether the layout may have flow files.
+        background: the colour behind the alpha masks of RGBA images; RGB images stay as they are.
+        flow: ``auto`` reads files of backward flow if the scene has them, ``files`` requires them,
+            ``dis`` and ``raft`` estimate flow, ``none`` does without it.
+        flow_cache: an ``.npz`` file for estimated flow; None: flow is estimated every time.
+        exposure: whether the images of one moving camera get one exposure: ``auto``: if it changes
+            by more than a seventh; ``equal``: always; ``none``: never.
         frames: keep so many times, evenly spread, first and last included; None: all.
-        validation: whether the layout's validation split is read, too, where it has one beside the
+        validation: whether to read the layout's validation split, too, if it has one beside the
             test split (Blender's, nerfstudio's).
 
     Raises:
@@ -99,45 +99,45 @@ class SceneReader(Options, ABC):
 
     @abstractmethod
     def read(self) -> Scene:
-        """Read the scene, with flow from files where they are asked for.
+        """Read the scene, with flow from files if :attr:`wants_flow_files`.
 
-        DevrfError if a file is wrong, or does not go with an option; the message names it.
+        DevrfError if a file is wrong, or contradicts an option; the message names it.
         """
 
     def forward_flow(self, views: Views) -> OpticalFlow | None:
         """Forward flow of the dynamic training ``views`` of :meth:`read`, from the scene's files.
 
-        None where there are none, or no place for them; DevrfError if a file is wrong.
+        None without such files; DevrfError if a file is wrong.
         """
         return None
 
     @property
     def wants_flow_files(self) -> bool:
-        """Whether flow is to be read from files, and there is a place for them."""
+        """Whether flow is to be read from files, and the layout may have them."""
         return self.has_flow_files and self.flow in ("auto", "files")
 
     @property
     def scene_name(self) -> str:
-        """The scene's name, its folder's where none was given."""
+        """The scene's name; its folder's if none is given."""
         return self.name or scene_folder(self.root).resolve().name
 
 
 @dataclass(frozen=True)
 class LayoutReader(SceneReader):
-    """Reads what lists images and their poses: a :class:`~devrf.scenes.layout.Layout`."""
+    """Reads lists of images and their poses: a :class:`~devrf.scenes.layout.Layout`."""
 
     @abstractmethod
     def layout(self, folder: Path) -> Layout:
-        """The splits of the scene in ``folder``, no image read but its header."""
+        """The splits of the scene in ``folder``, from files and the headers of images."""
 
     @abstractmethod
     def placed(self, layout: Layout, static: Capture, dynamic: Capture) -> Scene:
-        """The scene of the captures that were read, its bounds found."""
+        """The scene of the captures, with its bounds."""
 
     def flow_of(self, split: Split, views: Views, direction: FlowDirection) -> OpticalFlow | None:
-        """The flow in the files of a split's images, which are ``views``; None: there are none.
+        """The flow in the files of a split's images, which are ``views``; None without files.
 
-        It is asked for only where :attr:`has_flow_files`.
+        It is called only if :attr:`has_flow_files`.
         """
         return None
 
@@ -170,11 +170,11 @@ class LayoutReader(SceneReader):
 class FixedViewsReader(LayoutReader):
     """Options of layouts with folders ``dynamic_<V>views/view1`` … of fixed cameras.
 
-    Images come from ``images_<downscale>`` where it is there; else larger ones are made smaller.
+    Images come from ``images_<downscale>`` if it exists; else larger ones are made smaller.
 
     Attributes:
-        dynamic: which ``dynamic_*views`` folder, where there are several.
-        test_view: the fixed view to hold out: 4 is ``view4``, −1 the last, −2 the last but one.
+        dynamic: name of the ``dynamic_*views`` folder, if there are several.
+        test_view: the held-out fixed view: 4 is ``view4``, −1 the last, −2 the last but one.
         train_views: train on the first so many of the views that are not held out; None: all.
         holdout: every ``holdout``-th static image, in the order of their names, is held out, the
             first one included.
@@ -190,19 +190,19 @@ class FixedViewsReader(LayoutReader):
 
 @dataclass(frozen=True)
 class InwardReader(LayoutReader):
-    """Options of scenes that cameras look in at.
+    """Options of inward-facing scenes.
 
     Attributes:
         bound_scale: ``auto`` (room for motion from silhouettes) or a number ≥ 1 by which the
             tightened canonical box is enlarged.
-        near: distance in world units before which nothing is; None: from the cameras.
-        far: distance in world units behind which nothing is; None: from the cameras.
+        near: least distance of the scene in world units; None: from the cameras.
+        far: largest distance of the scene in world units; None: from the cameras.
         box: [[x, y, z], [x, y, z]] in world units, enlarged only for silhouettes that move
             beyond it, or by a ``bound_scale``; None: from the cameras.
-        space: ``world``: the scene is in the box, and nothing is around it; ``contracted``: it is
-            unbounded, and the box is what is looked at; ``auto``: contracted if the images have no
-            alpha masks and no box is given.
-        missing: whether listed images that are absent are an ``error``, or left out (``skip``).
+        space: ``world``: the whole scene is in the box; ``contracted``: the scene is unbounded, and
+            the cameras look at the box; ``auto``: contracted if the images have no alpha masks and
+            no box is given.
+        missing: whether absent images of the list are an ``error``, or left out (``skip``).
     """
 
     _: KW_ONLY
@@ -216,7 +216,7 @@ class InwardReader(LayoutReader):
     def placed(self, layout: Layout, static: Capture, dynamic: Capture) -> Scene:
         """See :meth:`LayoutReader.placed`.
 
-        The layout's offset is subtracted from positions already, and here from the box.
+        Positions have the layout's offset subtracted already; here it is subtracted from the box.
         """
         offset = layout.offset
         name = self.scene_name
@@ -250,9 +250,9 @@ class PosedReader(InwardReader):
     Attributes:
         space: as of :class:`~devrf.scenes.reader.InwardReader`, or ``ndc`` for cameras that face
             the scene from one side: then the world is that of their average pose, ``near`` is
-            the near plane, and the scene is a forward-facing one. Stated bounds say what ``auto``
-            is, and ``near``, ``far`` and ``box`` where they are None.
-        stater: who states them, in words.
+            the near plane, and the scene is a forward-facing one. Stated bounds are the values of
+            ``auto``, and of ``near``, ``far`` and ``box`` that are None.
+        stater: the source of stated bounds, in words.
     """
 
     stater: ClassVar[str]
@@ -261,13 +261,13 @@ class PosedReader(InwardReader):
     space: SpaceChoice | Literal["ndc"] = "auto"  # type: ignore[assignment]
 
     def stated(self, layout: Layout, static: Capture) -> SceneBounds | None:
-        """Where the scene is, if that is known."""
+        """The stated bounds, if there are any."""
         return layout.bounds
 
     def placed(self, layout: Layout, static: Capture, dynamic: Capture) -> Scene:
-        """See :meth:`LayoutReader.placed`; captures of a scene always at rest are one.
+        """See :meth:`LayoutReader.placed`; a static scene's captures are one.
 
-        DevrfError if neither options nor cameras say where it is.
+        DevrfError if neither options nor cameras determine its bounds.
         """
         reader = _with_bounds(self, self.stated(layout, static))
         if reader.space != "ndc":
@@ -283,14 +283,14 @@ class PosedReader(InwardReader):
             apart = float(static.train.cameras.positions.norm(dim=1).max())
             raise scene_error(
                 "data.near",
-                "data.space=ndc needs a near plane before all that is seen, in world units; try "
-                f"data.near={apart:.3g}, which is as far as cameras are from their middle",
+                "data.space=ndc needs a near plane before the whole scene, in world units; try "
+                f"data.near={apart:.3g}, the cameras' largest distance from their middle",
             )
         return forward_facing_scene(name, static, dynamic, reader.near, self.background)
 
 
 def _with_bounds(options: PosedReader, stated: SceneBounds | None) -> PosedReader:
-    """The options, with what is stated where they leave it open."""
+    """The options, with stated values in place of open ones."""
     if stated is None:
         return options
     space = stated.space if options.space == "auto" else options.space

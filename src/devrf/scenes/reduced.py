@@ -1,4 +1,4 @@
-"""A scene of smaller images: what a rehearsal learns from."""
+"""A scene of smaller images, for rehearsals."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from devrf.scenes.validation import MIN_SIDE
 def reduced(scene: Scene, longest: int) -> Scene:
     """The scene with images of at most ``longest`` pixels a side; bounds and times stay.
 
-    Sides keep their proportion, but are no shorter than what a reader takes.
+    Sides keep their proportion, but are at least as long as readers require.
     """
     space = scene.space
     if isinstance(space, NormalizedDevice):
@@ -45,7 +45,7 @@ def _reduced_views(views: Views, longest: int) -> Views:
     for name in ("flow", "forward_flow"):
         if (flow := getattr(views, name)) is not None:
             further[name] = _reduced_flow(flow, width, height)
-    # Whether a pixel counts, and how far away it is, is not averaged: the middle one tells.
+    # Masks and depths are not averaged: those of the middle pixel count.
     rows = ((torch.arange(height) + 0.5) * views.height / height).long()
     columns = ((torch.arange(width) + 0.5) * views.width / width).long()
     for name in ("depth", "valid_mask", "exposure_mask"):

@@ -1,4 +1,4 @@
-"""Images and optical flow on another raster: made smaller, looked up, undistorted."""
+"""Images and optical flow on another raster: made smaller, interpolated, undistorted."""
 
 from __future__ import annotations
 
@@ -43,20 +43,20 @@ def shrink_pixels(image: Pixels, width: int, height: int, *, alpha_weighted: boo
 
 
 def interpolate_pixels(image: Pixels, source: Array) -> Pixels:
-    """An 8-bit image (H, W, 1, 3 or 4) looked up elsewhere, bilinearly; colours weighted by alpha.
+    """An 8-bit image (H, W, 1, 3 or 4), bilinearly at ``source``; colours weighted by alpha.
 
     ``source`` (H', W', 2) is x, y in pixels of ``image``, where a pixel's centre is at i + 0.5.
-    Alpha is not premultiplied; black where it is 0. Places outside take the nearest pixel of the
+    Alpha is not premultiplied; black where it is 0. Positions outside get the nearest pixel of the
     border.
     """
     x = np.ascontiguousarray(source[..., 0] - np.float32(0.5))
     y = np.ascontiguousarray(source[..., 1] - np.float32(0.5))
 
-    def looked_up(values: Array) -> Array:
-        looked = cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return np.asarray(looked, dtype=np.float32).reshape(*x.shape, image.shape[2])
+    def interpolated(values: Array) -> Array:
+        result = cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(result, dtype=np.float32).reshape(*x.shape, image.shape[2])
 
-    return _weighted_by_alpha(image, looked_up)
+    return _weighted_by_alpha(image, interpolated)
 
 
 def _weighted_by_alpha(image: Pixels, linear: Callable[[Array], Array]) -> Pixels:
@@ -98,7 +98,7 @@ def shrink_flow(
     return shrunk.astype(np.float32), trusted
 
 
-# A lens that has to be zoomed by more than this to fill its image is given up as folded.
+# A lens that has to be zoomed by more than this to fill its image counts as folded.
 _LONGEST = 2.0
 _HALVINGS = 24
 
@@ -111,14 +111,14 @@ def as_pinhole(
 ) -> tuple[Tensor, tuple[Lens, ...]]:
     """Undistort the images that need it, bilinearly.
 
-    The principal point stays and the focal lengths grow just enough that every pixel has been seen
-    by the lens: there are no empty borders to learn from.
+    The principal point stays, and the focal lengths grow just enough that the lens saw every pixel:
+    there are no empty borders.
 
     Args:
         pixels: (N, H, W, 1, 3 or 4) uint8, alpha not premultiplied; changed in place.
         lenses: N, in pixels of these images; those returned have no distortion and skew.
         names: N, for messages.
-        sizes: N (width, height): of how much, at the top left, each image is.
+        sizes: N (width, height) of the images, at the top left.
 
     Raises:
         DevrfError: a distortion is so strong that the image folds over.
@@ -143,7 +143,7 @@ def as_pinhole(
 # One lens for all images is the rule; several take turns at most.
 @lru_cache(maxsize=4)
 def _pinhole_view(lens: Lens, width: int, height: int) -> tuple[Lens, Tensor] | None:
-    """The pinhole and, for each of its pixels, where the lens has it (H, W, 2); None: folded."""
+    """The pinhole, and the lens's pixel (H, W, 2) of each of its pixels; None: folded."""
     centres = _centres(width, height)
     zoom = _zoom(lens, centres)
     if zoom is None:

@@ -1,4 +1,4 @@
-"""What a scene is, whatever files it came from: frozen, typed, on the host, uint8."""
+"""A scene, from any files: frozen, typed, on the host, uint8."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from devrf.geometry.space import WORLD, Space
 
 Background = Literal["white", "black", "random"]
 CaptureName = Literal["static", "dynamic"]
-# What is learned from: the images of a capture, or all of the scene at rest (Scene.at_rest).
+# Training images: those of a capture, or all of the canonical state (Scene.at_rest).
 ImagesName = Literal["static", "dynamic", "at_rest"]
 
 
 @dataclass(frozen=True)
 class OpticalFlow:
-    """Optical flow of N images: backward, where each pixel was one frame earlier in its own view.
+    """Optical flow of N images: backward, to one frame earlier in the same view.
 
-    Forward flow is the same of one frame later.
+    Forward flow leads to one frame later.
 
     Attributes:
         vectors: (N, H, W, 2) float32, pixels, x then y: (pixel one frame earlier) − (this pixel).
-        valid: (N, H, W) bool; False where the flow is unknown or not to be trusted, and on all
-            of an image without an earlier frame.
+        valid: (N, H, W) bool; False where the flow is unknown or unreliable, and on all of an image
+            without an earlier frame.
     """
 
     vectors: Tensor
@@ -49,19 +49,19 @@ class Views:
         pixels: (N, H, W, 3 or 4) uint8, RGB or RGBA (alpha not premultiplied).
         cameras: N cameras on that raster, world units.
         times: (N,) float32 in [0, 1].
-        view: (N,) int64, which fixed camera took the image (0 … V−1); in a static set, or for a
-            moving camera, the image's own number.
+        view: (N,) int64, the fixed camera of each image (0 … V−1); in a static set, or for a moving
+            camera, the image's own number.
         names: N file names or labels, for messages and tables.
-        flow: backward optical flow, or None where there is none.
-        forward_flow: forward optical flow; None where there is none, or no method asked for it.
+        flow: backward optical flow, or None.
+        forward_flow: forward optical flow; None if it is unknown, or no method needs it.
         depth: (N, H, W) float32 distance along each pixel's ray in world units, +inf where the
             ray hits nothing; None where it is unknown.
-        ambiguous_orientation: (N,) bool, files whose EXIF orientation says that they are to be seen
-            turned, which nothing confirms or refutes: they are as they are stored. None: none.
-        valid_mask: (N, H, W) bool, the pixels that are learned from and scored; the others are
+        ambiguous_orientation: (N,) bool, images that are read as they are stored although their
+            EXIF orientation asks for a turn, which nothing confirms or refutes. None: none.
+        valid_mask: (N, H, W) bool, the pixels that count in training and scores; the others are
             ignored. None: all of them.
-        exposure_mask: (N, H, W) bool, of held-out images that each have an exposure of their own:
-            the pixels that tell it. None: they have that of the images learned from.
+        exposure_mask: (N, H, W) bool, the pixels of held-out images that determine the exposure of
+            each. None: they have the training images' exposure.
         frames: (N,) int64, the frame of the scene's clock that is nearest to each image's time;
             None until the images are those of a :class:`Scene`.
     """
@@ -99,12 +99,12 @@ class Views:
 
     @property
     def cut_out(self) -> bool:
-        """Whether something is left out by the alpha masks: an opaque one says nothing."""
+        """Whether the alpha masks leave out anything: some are not opaque."""
         return self.has_alpha and bool((self.pixels[..., 3] < 255).any())
 
     @property
     def by_moving_camera(self) -> bool:
-        """Whether no two images are of one place: a camera moved between all of them."""
+        """Whether each image is its own view: the camera moved between all of them."""
         return len(set(self.view.tolist())) == len(self)
 
     def __getitem__(self, index: Tensor) -> Views:
@@ -115,12 +115,12 @@ class Views:
         )
 
     def single(self, image: int) -> Views:
-        """One of the images alone, its raster no larger than itself; nothing is copied.
+        """One of the images alone, on a raster of its own size; nothing is copied.
 
-        It has a ``valid_mask`` if some of its pixels are not valid, or that of images of one size.
+        Among images of several sizes it has a ``valid_mask`` only if some pixels are not valid.
         """
-        place = slice(image, image + 1)
-        view = replace(self.mapped(lambda of_views: of_views[place]), names=self.names[place])
+        index = slice(image, image + 1)
+        view = replace(self.mapped(lambda of_views: of_views[index]), names=self.names[index])
         if self.cameras.sizes is None:
             return view
         width, height = self.cameras.size_of(image)
@@ -160,13 +160,13 @@ class Views:
 
 @dataclass(frozen=True)
 class Capture:
-    """One recording: images to learn from and images held out.
+    """One recording: training images and held-out images.
 
     Attributes:
-        train: what the fields are learned from.
-        test: held-out views, never seen in training.
-        validation: held-out views by which settings are chosen, none of them in ``test``; None
-            where they were not asked for, or there are none.
+        train: training views.
+        test: held-out views.
+        validation: held-out views for the choice of settings, none of them in ``test``; None if
+            they are not used, or there are none.
     """
 
     train: Views
@@ -195,21 +195,21 @@ def both_mapped(
 
 @dataclass(frozen=True)
 class Bounds:
-    """Where the scene is, in the space that its fields live in (world units, or NDC).
+    """The bounds of a scene, in the space of its fields (world units, or NDC).
 
     Attributes:
-        box: holds everything that can be seen of the static scene (before it is tightened).
-        near: distance from a camera under which nothing is.
-        far: distance from a camera beyond which nothing is.
-        motion: holds everything that moves at any time, or None where it is unknown and the
-            canonical box is enlarged by ``scale`` instead.
-        scale: how much larger than the tightened canonical box the fields' box is made, about
-            its centre, so that motion has room; not used when ``motion`` is known.
-        source: where the motion box came from, in words, for the log.
-        limited: whether motion has no more room than the box: it was given, and nothing is known.
-        box_given: whether the box was given by options or files, not found from the cameras.
-        reason: why the scene is learned in its space, in words.
-        box_source: where the box came from, in words.
+        box: the box of the visible static scene (before it is tightened).
+        near: least distance of the scene from a camera.
+        far: largest distance of the scene from a camera.
+        motion: the box of all that moves at any time; None if it is unknown: then the canonical
+            box is enlarged by ``scale`` instead.
+        scale: factor of the tightened canonical box, about its centre, that makes room for motion;
+            not used when ``motion`` is known.
+        source: the source of the motion box, in words, for the log.
+        limited: whether motion has no more room than the box, which was given.
+        box_given: whether options or files gave the box, not the cameras.
+        reason: the reason for the scene's space, in words.
+        box_source: the source of the box, in words.
     """
 
     box: Box
@@ -225,7 +225,7 @@ class Bounds:
 
     @property
     def whole(self) -> Box:
-        """Holds the static scene and everything that moves."""
+        """The box of the static scene and all that moves."""
         return self.box if self.motion is None else self.box.union(self.motion)
 
 
@@ -236,13 +236,13 @@ class Scene:
     Attributes:
         name: short name for folders and tables.
         kind: ``inward`` (cameras around the scene) or ``forward`` (cameras before it, NDC).
-        static: many views of the scene at rest (t = 0).
-        dynamic: a few fixed views of the scene as it deforms; the static capture itself if the
-            scene is always at rest. It alone has validation views.
-        bounds: where the scene is.
-        background: what is behind the alpha mask.
-        space: the space that the fields live in, and in which ``bounds`` are given.
-        offset: what was subtracted from all positions of the capture's world
+        static: many views of the canonical state (t = 0).
+        dynamic: a few fixed views of the deforming scene; the static capture itself if the scene
+            never moves. It alone has validation views.
+        bounds: its bounds, in ``space``.
+        background: the colour behind the alpha mask.
+        space: the space of the fields.
+        offset: the offset that was subtracted from all positions of the capture's world
             (:mod:`devrf.geometry.offset`); 0 near the origin.
     """
 
@@ -266,22 +266,22 @@ class Scene:
         object.__setattr__(self, "dynamic", dynamic)
 
     @property
-    def is_film(self) -> bool:
-        """Whether a camera that moves took all images: there is no static set.
+    def is_monocular(self) -> bool:
+        """Whether one moving camera took all images: there is no static set.
 
-        Images of the film stand in for it. Of two captures the fixed cameras' first images may
-        belong to both.
+        Images of the video stand in for it. Two captures may share only the fixed cameras' first
+        images.
         """
-        film = self.dynamic.train
-        shared = not {*self.static.train.names}.isdisjoint(film.names)
-        return shared and film.by_moving_camera
+        video = self.dynamic.train
+        shared = not {*self.static.train.names}.isdisjoint(video.names)
+        return shared and video.by_moving_camera
 
     @property
     def at_rest(self) -> Views:
         """The static training views and the first frames of the dynamic ones, at time 0.
 
-        The static ones alone, if the others are of another size or by a moving camera, or if only
-        one of both sets has masks. An image from the place of a static one is left out.
+        They are the static ones alone if the others have another size or a moving camera, or if
+        only one of both sets has masks. An image with the pose of a static one is left out.
         """
         static = self.static.train
         moving = self.dynamic.train
@@ -316,7 +316,7 @@ class Scene:
 
     @property
     def captures(self) -> dict[CaptureName, Capture]:
-        """The captures by name; the static one alone if the scene is at rest."""
+        """The captures by name; the static one alone if the scene never moves."""
         static: dict[CaptureName, Capture] = {"static": self.static}
         return {**static, "dynamic": self.dynamic} if self.moves else static
 
@@ -327,12 +327,12 @@ class Scene:
 
     @property
     def moves(self) -> bool:
-        """Whether it was seen at more than one time."""
+        """Whether the training images have more than one time."""
         return len(self.clock) > 1
 
     @property
     def fingerprint(self) -> str:
-        """A short hash of cameras, times and image sizes: tells one scene from another."""
+        """A short hash of cameras, times and image sizes, by which scenes are told apart."""
         digest = hashlib.sha256(self.kind.encode())
         if any(self.offset):
             digest.update(f"{self.offset}".encode())

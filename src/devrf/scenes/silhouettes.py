@@ -33,13 +33,13 @@ def motion_box(views: Views, box: Box, *, resolution: int = 64, search: float = 
     """The box of the union over all frames of the visual hulls.
 
     A point belongs to a frame's hull when at least two views see it inside their silhouettes
-    and none rules it out. A view rules out what it sees beside its silhouette, and what lies
-    beyond its image when the silhouette keeps clear of the image's border: then nothing is cut
-    off. (A second object that is out of one view while the first is whole in it goes unseen.)
+    and none rules it out. A view rules out points that it sees beside its silhouette, and points
+    beyond its image if the silhouette keeps clear of the image's border: then nothing is cut
+    off. (A second object that is out of one view while the first is whole in it is missed.)
 
     Args:
         views: the dynamic training views.
-        box: where the static scene is, world units.
+        box: the static scene's, world units.
         resolution: grid points along each edge of the searched box.
         search: size of the searched box as a multiple of ``box``.
 
@@ -60,20 +60,20 @@ def motion_box(views: Views, box: Box, *, resolution: int = 64, search: float = 
     cached: dict[tuple[int, tuple[int, int]], Array] = {}
     hull = np.zeros(len(points), dtype=np.bool_)
     for images in frames:
-        # Only points not yet in the union need a look; each view leaves fewer of them.
-        left = np.flatnonzero(~hull)
-        inside_views = np.zeros(len(left), dtype=np.int64)
+        # Only points that are not yet in the union are tested; each view leaves fewer of them.
+        open_points = np.flatnonzero(~hull)
+        inside_views = np.zeros(len(open_points), dtype=np.int64)
         for image in images:
-            seen = (int(views.view[image]), views.cameras.size_of(image))
-            if seen not in cached:
-                if len(cached) >= 16:  # moving cameras: no projection is asked for twice
+            key = (int(views.view[image]), views.cameras.size_of(image))
+            if key not in cached:
+                if len(cached) >= 16:  # moving cameras: no projection is used twice
                     cached.clear()
-                cached[seen] = _pixel_index(views.cameras.single(image), points)
-            verdict = masks[image][cached[seen][left]]
+                cached[key] = _pixel_index(views.cameras.single(image), points)
+            verdict = masks[image][cached[key][open_points]]
             keep = verdict != OUTSIDE
-            left = left[keep]
+            open_points = open_points[keep]
             inside_views = inside_views[keep] + (verdict[keep] == INSIDE)
-        hull[left[inside_views >= 2]] = True
+        hull[open_points[inside_views >= 2]] = True
     if not hull.any():
         return None
     held = points[torch.from_numpy(hull).to(points.device)]
@@ -97,18 +97,17 @@ def _frames(views: Views) -> list[list[int]] | None:
 def _reach(views: Views, cell: float, distance: float, focal: float) -> int:
     """Pixels that half a grid cell's diagonal covers at a distance, all in world units.
 
-    Silhouettes are dilated by them: else a part thinner than a cell could pass between the grid's
-    points unseen.
+    Silhouettes are dilated by them: else the grid's points could miss a part thinner than a cell.
     """
     pixels = math.sqrt(3) / 2 * cell * focal / max(distance, cell)
     return max(1, min(math.ceil(pixels), max(views.width, views.height)))
 
 
 def _silhouettes(views: Views, reach: int) -> list[Array]:
-    """N times (H·W + 1,) uint8: whether a pixel is INSIDE or OUTSIDE the dilated silhouette.
+    """N codes (H·W + 1,) uint8: pixels are INSIDE or OUTSIDE the dilated silhouette.
 
-    Pixels that are not valid are UNSEEN. The last entry stands for all that is beyond the image:
-    OUTSIDE, or UNSEEN where the image's border cuts the silhouette or the whole object off.
+    Pixels that are not valid are UNSEEN. The last entry is for all points beyond the image:
+    OUTSIDE, or UNSEEN if the image's border cuts off the silhouette or the whole object.
     """
 
     def silhouette(view: Views) -> Array:
@@ -131,10 +130,10 @@ def _dilated(mask: Array, reach: int) -> Array:
 
 
 def _pixel_index(camera: Cameras, points: Tensor) -> Array:
-    """(P,) where each point falls in the flattened image; H·W where the image does not hold it."""
+    """(P,) the pixel of each point in the flattened image; H·W for points beyond it."""
     width, height = camera.width, camera.height
-    which = torch.zeros(len(points), dtype=torch.long, device=points.device)
-    pixels, depth = camera.project(which, points)
+    first = torch.zeros(len(points), dtype=torch.long, device=points.device)
+    pixels, depth = camera.project(first, points)
     column, row = pixels.floor().unbind(-1)
     held = (depth > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
     index = row.long() * width + column.long()
@@ -151,25 +150,25 @@ def visual_hull(
 ) -> Tensor:
     """The visual hull (X, Y, Z) bool of one state of the scene, on a grid.
 
-    A grid point is outside when any view that has it in the picture sees no alpha mask within half
-    a grid cell of it; so the hull holds everything, and more where no view looks, or where its
-    pixels are not valid.
+    A grid point is outside if any view that has it in the picture has no alpha mask within half a
+    grid cell of it; so the hull holds everything, and more where no view looks, or where its pixels
+    are not valid.
 
     Args:
         views: images with alpha masks that all show the same state.
-        box: where the grid is, world units; its corners sit on the box's corners.
+        box: the grid's, world units; its corners are the box's corners.
         shape: grid points along x, y, z.
-        device: where to work, one image after another; None: where the views are.
-        whole_in_view: whether nothing is beyond an image whose silhouette keeps clear of its
-            border, as for :func:`motion_box`; else everything may be.
+        device: the device of the work, one image after another; None: that of the views.
+        whole_in_view: whether an image whose silhouette keeps clear of its border shows the whole
+            scene, as for :func:`motion_box`.
     """
     cameras = views.cameras if device is None else views.cameras.to(device)
     points = box.grid_points(shape, cameras.focal).reshape(-1, 3)
     cell = max(edge / (n - 1) for edge, n in zip(box.size, shape, strict=True))
     held = torch.ones(len(points), dtype=torch.bool, device=points.device)
     for k in range(len(views)):
-        left = held.nonzero()[:, 0]
-        pixel, depth = cameras.project_into(k, points[left])
+        open_points = held.nonzero()[:, 0]
+        pixel, depth = cameras.project_into(k, points[open_points])
         position = views.cameras.positions[k]
         nearest = float((position - box.nearest(position)).norm())
         reach = _reach(views, cell, nearest, float(views.cameras.focal[k].max()))
@@ -183,5 +182,5 @@ def visual_hull(
         row = torch.where(in_image, y * view.width + x, 0)
         border = torch.cat([solid[[0, -1]].flatten(), solid[:, [0, -1]].flatten()])
         ends = whole_in_view and bool(solid.any()) and not bool(border.any())
-        held[left[torch.where(in_image, grown.view(-1)[row] == 0, ends)]] = False
+        held[open_points[torch.where(in_image, grown.view(-1)[row] == 0, ends)]] = False
     return held.view(shape)

@@ -1,4 +1,4 @@
-"""Which space a scene is learned in (world, contracted, NDC), and where it is there."""
+"""The space of a scene's fields (world, contracted, NDC), and its bounds there."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.poses import average_pose, relative_to
 from devrf.geometry.space import WORLD, Space
 from devrf.scenes.bounds import (
-    STILL,
+    NO_MOTION,
     box_from_cameras,
     forward_bounds,
     inward_bounds,
@@ -29,11 +29,11 @@ log = logging.getLogger(__name__)
 
 SpaceChoice = Literal["auto", "world", "contracted"]
 
-# Thickness of the shell in half edges of the inner box, as in the paper of contraction. In a
-# thinner one walls are a voxel or two deep, and are learned as fog before them (measured).
+# Thickness of the shell in half edges of the inner box, as in the paper of contraction. Walls are a
+# voxel or two deep in a thinner one, and are learned as fog before them (measured).
 SHELL = 1.0
-# The near plane, as a share of a camera's distance to what it looks at. If it is nearer, fog before
-# each lens explains its picture and spoils those of others (measured).
+# The near plane, as a share of a camera's distance to the middle of the scene. If it is nearer, fog
+# before each lens explains its picture and spoils those of others (measured).
 NEAR_SHARE = 0.25
 
 
@@ -48,21 +48,21 @@ def inward_space(
     far: float | None = None,
     box: Box | None = None,
 ) -> tuple[Space, Bounds]:
-    """The space of a scene that its cameras look in at, and its bounds there.
+    """The space of an inward-facing scene, and its bounds there.
 
     Args:
         choice: the space, or ``auto``: contracted without alpha masks and ``box``, else the world.
-        static: training views at rest, whose cameras give the box.
-        dynamic: training views in motion; None: the scene is at rest.
+        static: static training views, whose cameras give the box.
+        dynamic: dynamic training views; None: the scene never moves.
         everyone: all views, test included.
         bound_scale: as for :func:`~devrf.scenes.bounds.inward_bounds`; a number makes the inner
             box of contracted space so much larger.
-        near: distance in world units, or None for the cameras to say.
+        near: distance in world units; None: from the cameras.
         far: distance in world units, or None; contracted space is unbounded.
         box: the scene's box, or None.
 
     Raises:
-        DevrfError: the cameras do not say where the scene is, or near is not before far.
+        DevrfError: the cameras do not determine the bounds, or near is not before far.
     """
     given = "data.box is given" if box else ""
     masks = "the images have alpha masks" if static.cut_out else "the images have no alpha masks"
@@ -105,7 +105,7 @@ def inward_space(
     )
 
 
-# Where the room for motion comes from.
+# The source of the room for motion.
 SEEN = "all that the cameras see (forward-facing)"
 
 
@@ -115,20 +115,20 @@ def forward_facing_scene(
     """The scene of two captures whose static cameras have the identity as their average pose.
 
     Its space is NDC of a camera at the origin that looks along −z, with the near plane ``near``
-    world units before it. DevrfError if a camera sees something that is not before that one.
+    world units before it. DevrfError if a camera sees points that are not before that one.
     """
     space = reference_space(static.train.cameras, near)
-    # The captures of a scene at rest, and of a video, share images.
+    # The captures of a static scene, and of a video, share images.
     learned = list({id(views): views for views in (static.train, dynamic.train)}.values())
     held_out = list({id(views): views for views in (static.test, dynamic.test)}.values())
     moves = dynamic.train is not static.train or len(set(dynamic.train.times.tolist())) > 1
-    bounds = forward_bounds(learned, space, SEEN if moves else STILL)
+    bounds = forward_bounds(learned, space, SEEN if moves else NO_MOTION)
     # The held-out cameras need not see inside the box, but they have to look the same way.
     forward_bounds(held_out, space, "")
     foremost = max(-float(v.cameras.positions[:, 2].min()) for v in learned + held_out)
     for views in learned + held_out:
         beyond = (views.cameras.positions[:, 2] <= -near).nonzero().flatten()
-        if len(beyond):  # it would look through what is behind the near plane
+        if len(beyond):  # they would look through the scene
             log.warning(
                 "%d cameras are beyond the near plane, %s the first of them; set data.near=%.3g",
                 len(beyond),
@@ -153,21 +153,21 @@ def centred(static: Capture, dynamic: Capture) -> tuple[Capture, Capture]:
 def dynamic_only(scene: Scene) -> Scene:
     """The scene without its static set: the dynamic images of time 0 stand in for it.
 
-    Bounds that the static cameras have told are found anew, from the dynamic training cameras
-    alone; DevrfError if these do not tell. Those of a film stay, and so do a box that was given,
-    near and far beside it.
+    Bounds from the static cameras are replaced by bounds from the dynamic training cameras alone;
+    DevrfError if these do not determine them. The bounds of a video stay, and so do a given box and
+    its near and far.
     """
     views = scene.dynamic.train
     held_out = scene.dynamic.test
-    at_rest = Capture(train=earliest(views), test=earliest(held_out))
+    static = Capture(train=earliest(views), test=earliest(held_out))
     if isinstance(scene.space, NormalizedDevice):
         bounds = forward_bounds([views], scene.space, "all that the dynamic cameras see")
-        return replace(scene, static=at_rest, bounds=bounds)
-    if scene.is_film or scene.bounds.box_given:
-        return replace(scene, static=at_rest)
+        return replace(scene, static=static, bounds=bounds)
+    if scene.is_monocular or scene.bounds.box_given:
+        return replace(scene, static=static)
     choice: SpaceChoice = "world" if scene.space.is_linear else "contracted"
     space, bounds = inward_space(choice, views, views, [views, held_out])
-    return replace(scene, static=at_rest, bounds=bounds, space=space)
+    return replace(scene, static=static, bounds=bounds, space=space)
 
 
 def earliest(views: Views) -> Views:

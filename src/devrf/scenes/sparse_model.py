@@ -1,4 +1,4 @@
-"""COLMAP's sparse models, and the world of one: its origin, axes and unit, where the scene is."""
+"""COLMAP's sparse models, and the normalised world of one, with the scene's bounds."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ from devrf.system.options import abbreviated
 
 # The files of a model, binary or as text.
 PARTS = ("cameras", "images", "points3D")
-# Records of binary files that end with a list: their bytes before it but for a name, of its length,
-# and of an entry.
+# Records of binary files that end with a list: bytes before it without a name, bytes of its length,
+# and bytes of an entry.
 LISTS = {"frames": (64, 4, 16), "images": (64, 8, 24), "points3D": (43, 8, 8)}
 # Parameters of each camera model that can be read, in COLMAP's order; further ones have to be 0.
 PARAMETERS = {
@@ -70,7 +70,7 @@ class SparseModel:
     """A model, images in the order of their names.
 
     Attributes:
-        folder: where it is from.
+        folder: its folder.
         cameras: by their numbers, in the keys of a transforms file (``fl_x``, ``cx``, ``k1``);
             pixels, (0, 0) is the outer corner of the first one.
         images: N of them.
@@ -104,12 +104,12 @@ class SparseModel:
         ]
 
     def depths(self, image: int) -> Tensor:
-        """(K,) float64: how far along its axis the points of an image are, world units."""
-        shown = np.intersect1d(self.images[image].points, self.numbers)
-        place = np.searchsorted(self.numbers, shown)
+        """(K,) float64 depths of the points of an image along its axis, world units."""
+        visible = np.intersect1d(self.images[image].points, self.numbers)
+        row = np.searchsorted(self.numbers, visible)
         pose = self.poses[image]
-        away = torch.from_numpy(self.points[place]) - pose[:, 3]
-        return -(away @ pose[:, 2])
+        offset = torch.from_numpy(self.points[row]) - pose[:, 3]
+        return -(offset @ pose[:, 2])
 
 
 @dataclass(frozen=True)
@@ -126,11 +126,11 @@ class ModelFolders:
 
     @property
     def lacks(self) -> Path | None:
-        """The missing file, where no model is whole, but some files of one are there."""
+        """The missing file, if no model is whole, but some files of one exist."""
         return None if self.whole else next(iter(self.missing.values()), None)
 
     def check(self) -> None:
-        """DevrfError that names the missing file, if :attr:`lacks` says that there is one."""
+        """DevrfError that names the missing file :attr:`lacks`, if there is one."""
         if self.lacks is not None:
             raise scene_error(
                 self.lacks,
@@ -140,8 +140,8 @@ class ModelFolders:
 
 
 def model_folders(root: Path) -> ModelFolders:
-    """Where models are: in folders of ``sparse/``, in it, and in the same below ``colmap/``."""
-    found = ModelFolders()
+    """The folders of models: those in ``sparse/``, itself, and the same below ``colmap/``."""
+    models = ModelFolders()
     for above in (root / "sparse", root / "colmap/sparse"):
         inner = [path for path in entries(above) if path.is_dir()] if os.path.isdir(above) else []
         for folder in (*in_order(inner, name=lambda path: path.name, where=above), above):
@@ -151,24 +151,24 @@ def model_folders(root: Path) -> ModelFolders:
             ]
             fewest = min(lacks, key=len)
             if not fewest:
-                found.whole.append(folder)
+                models.whole.append(folder)
             elif len(fewest) < len(PARTS):
-                found.missing[folder] = fewest[0]
-    return found
+                models.missing[folder] = fewest[0]
+    return models
 
 
 def scene_model(root: Path) -> tuple[SparseModel, list[str]]:
-    """The model of a scene that poses the most images, of equal ones the first; and the others.
+    """The model of a scene that poses the most images, the first of equal ones; and the others.
 
-    The mapper writes several where it cannot join all images. The others are in words, for the
-    log. DevrfError where there is no model, or none can be read; the message says what is missing.
+    The mapper writes several if it cannot join all images. The others are in words, for the log.
+    DevrfError if there is no model, or none can be read; the message names the missing file.
     """
-    found = model_folders(root)
-    found.check()
+    folders = model_folders(root)
+    folders.check()
     models = dict[Path, Any]()
-    others = {folder: f"no {file.name}" for folder, file in found.missing.items()}
+    others = {folder: f"no {file.name}" for folder, file in folders.missing.items()}
     errors = list[DevrfError]()
-    for folder in found.whole:
+    for folder in folders.whole:
         try:
             models[folder] = _opened(folder)
             others[folder] = f"{models[folder].num_reg_images()} images"
@@ -185,7 +185,7 @@ def scene_model(root: Path) -> tuple[SparseModel, list[str]]:
 
 
 def read_model(folder: Path) -> SparseModel:
-    """The sparse model in a folder, as pycolmap reads it: binary where both forms are there.
+    """The sparse model in a folder, read by pycolmap: binary if both forms exist.
 
     DevrfError without pycolmap, for a missing or damaged file, or an unknown camera model.
     """
@@ -205,9 +205,9 @@ def _opened(folder: Path) -> Any:
 
 
 def _check_counts(folder: Path) -> None:
-    """ValueError if a binary file counts more than it holds: COLMAP would read on behind its end.
+    """ValueError if a binary file counts more than it holds: COLMAP would read beyond its end.
 
-    It notices that by itself in the files that are not looked at.
+    COLMAP itself checks the files that are not checked here.
     """
     for part, (fixed, width, entry) in LISTS.items():
         if not (file := folder / f"{part}.bin").is_file():
@@ -272,30 +272,29 @@ def _image(folder: Path, image: Any) -> ModelImage:
     pose = image.cam_from_world()
     x, y, z, w = pose.rotation.quat.tolist()
     shift = tuple(pose.translation.tolist())
-    shown = np.array([point.point3D_id for point in image.get_observation_points2D()], np.int64)
-    return ModelImage(name, image.camera_id, (w, x, y, z), shift, shown)
+    visible = np.array([point.point3D_id for point in image.get_observation_points2D()], np.int64)
+    return ModelImage(name, image.camera_id, (w, x, y, z), shift, visible)
 
 
 Corner = tuple[float, float, float]
 Facing = Literal["auto", "forward", "inward"]
 
-# Cameras that all look within so many degrees of one direction face the scene from one side.
+# Cameras that look within so many degrees of one direction face the scene from one side.
 ONE_SIDE = 45.0
-# The widest box that is worth normalised device coordinates, in pictures of their reference camera
-# side by side: DirectVoxGO's boxes of LLFF's scenes are 1.67 wide. Cameras that turn, or come near,
-# make a wider one, of which most is seen by none.
+# The widest box that is worth normalised device coordinates, in widths of their reference camera's
+# picture: DirectVoxGO's boxes of LLFF's scenes are 1.67 wide. Cameras that turn, or come near, make
+# a wider one, most of which no camera sees.
 WIDEST = 1.7
-# The least number of points, each counted in every image that shows it, from which near and far are
-# found.
+# The least number of points, counted in every image that shows them, for near and far.
 LEAST_POINTS = 50
 # So many per cent of the points on either side may be wrong.
 OUTLIERS = 1.0
 # So many per cent of the points around the middle lie beyond each face of the inner box, before
-# its margin is added. Of a film they are more, so that voxels are finer where it looks: films are
-# learned by methods that also move what is outside the box.
+# its margin is added. In a video they are more, so that voxels are finer where it looks: methods
+# for videos also move points outside the box.
 LEFT_OUT = 2.0
-LEFT_OUT_OF_FILM = 5.0
-# In the forward-facing world, the unit that makes the nearest point's distance 1/0.75: LLFF's.
+LEFT_OUT_OF_VIDEO = 5.0
+# The nearest point's distance in the forward-facing world, whose unit is LLFF's.
 NEAREST = 1 / 0.75
 # Median distance of cameras around a scene from its middle, in world units.
 AROUND = 4.0
@@ -309,10 +308,10 @@ class World:
         poses: (N, 3, 4) float64 camera-to-world, OpenGL axes, world units.
         points: (P, 3) float64.
         space: ``ndc`` or ``contracted``.
-        near: distance before which nothing is, world units.
-        far: distance behind which no sparse point is, world units.
-        box: low and high corner of what is looked at; None for ``ndc``, and if the cameras' axes
-            meet: what all cameras see is then the better guess.
+        near: least distance of the scene, world units.
+        far: largest distance of a sparse point, world units.
+        box: low and high corner of the part that the cameras look at; None for ``ndc``, and if the
+            cameras' axes meet: then the part that all cameras see is the better guess.
     """
 
     poses: Tensor
@@ -326,9 +325,9 @@ class World:
 def normalised(model: SparseModel, facing: Facing = "auto", *, left_out: float = LEFT_OUT) -> World:
     """The scene of a model in a world of its own origin, axes and unit.
 
-    ``facing`` says from where the cameras look; ``left_out`` how many per cent of the points lie
-    beyond each face of the inner box before it has its margin, where points give it. DevrfError if
-    points or cameras do not tell.
+    ``facing`` is the kind of capture; ``left_out`` is the percentage of the points beyond each face
+    of the inner box, before its margin, if points give the box. DevrfError if points or cameras do
+    not determine the bounds.
     """
     poses = model.poses
     points = torch.from_numpy(model.points)
@@ -363,11 +362,11 @@ def _depth_range(model: SparseModel) -> tuple[float, float]:
 
 
 def ndc_holds(model: SparseModel) -> bool:
-    """Whether NDC is a good space for what one hand-held camera has filmed.
+    """Whether NDC is a good space for the video of one hand-held camera.
 
-    It has looked within :data:`ONE_SIDE` of one direction, from behind one plane, before which all
-    of the scene is, and what it has seen from there on is no wider than :data:`WIDEST`. DevrfError
-    if the points do not tell.
+    The camera looks within :data:`ONE_SIDE` of one direction, from behind one plane with all of the
+    scene before it, and its view from there on is no wider than :data:`WIDEST`. DevrfError if there
+    are too few points.
     """
     nearest, _ = _depth_range(model)
     if widest_angle(model.poses) > ONE_SIDE:
@@ -386,11 +385,11 @@ def ndc_holds(model: SparseModel) -> bool:
     rays = normalize(ahead @ poses[:, :, :3].mT, dim=-1)
     if float((-rays[..., 2]).min()) < LEAST_COSINE:
         return False
-    # Where rays through the corners are on the plane, and at infinity; by depth.
-    endless = rays[..., :2] / -rays[..., 2:]
-    place = poses[:, None, :, 3]
-    on_plane = (place[..., :2] + endless * (plane + place[..., 2:])) / plane
-    slopes = torch.cat([endless, on_plane]).flatten(0, 1)
+    # Positions of rays through the corners, on the plane and at infinity, over depth.
+    at_infinity = rays[..., :2] / -rays[..., 2:]
+    position = poses[:, None, :, 3]
+    on_plane = (position[..., :2] + at_infinity * (plane + position[..., 2:])) / plane
+    slopes = torch.cat([at_infinity, on_plane]).flatten(0, 1)
     wide = (slopes.amax(dim=0) - slopes.amin(dim=0)) * (focal / size).mean(dim=0)
     return float(wide.max()) <= WIDEST
 
@@ -411,7 +410,7 @@ def _forward(poses: Tensor, points: Tensor, near: float, far: float) -> World:
 
 def _inward(poses: Tensor, points: Tensor, near: float, far: float, left_out: float) -> World:
     axes_meet = nearest_point(poses[:, :, 3], poses[:, :, 2], 1e-2)
-    # Of cameras that do not go round it, the axes meet anywhere, or behind them.
+    # The axes of cameras that do not go round the scene meet anywhere, or behind them.
     if axes_meet is not None and (widest_angle(poses) <= ONE_SIDE or _is_behind(axes_meet, poses)):
         axes_meet = None
     middle = points.median(dim=0).values if axes_meet is None else axes_meet
@@ -425,10 +424,10 @@ def _inward(poses: Tensor, points: Tensor, near: float, far: float, left_out: fl
     near = 0.5 * near * scale
     far = far * scale
     if axes_meet is not None:
-        # Sparse points are on floor and walls, too: in their box what is looked at would have a
-        # fraction of the voxels.
+        # Sparse points are on floor and walls, too: the subject would have a fraction of the voxels
+        # in their box.
         return World(poses, points, "contracted", near, far, None)
-    # What the sparse points around the middle span, and no more than the cameras go round.
+    # The span of the sparse points around the middle, within the cameras' circle.
     around = points[points.norm(dim=1) < AROUND]
     if len(around) < 10:
         around = points

@@ -1,4 +1,4 @@
-"""Which images are held out, and which camera and time each belongs to, by poses and times."""
+"""Held-out images, and each image's camera and time, from poses and times."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ log = logging.getLogger(__name__)
 
 
 def every_nth(count: int, holdout: int, start: int | None = None) -> tuple[list[int], list[int]]:
-    """The positions to learn from and those to hold out, of ``count`` ≥ 2 images.
+    """The positions of training and held-out images, of ``count`` ≥ 2 images.
 
     Every ``holdout``-th (≥ 2) is held out, or the last one if there are fewer. ``start`` is the
-    first that is held out: 0 for images at rest, as LLFF's scenes are scored; None:
-    ``holdout`` − 1, since a sequence begins at rest.
+    first held-out one: 0 for static images, as LLFF's scenes are scored; None: ``holdout`` − 1,
+    since a sequence begins in the canonical state.
     """
     start = holdout - 1 if start is None else start
     held_out = list(range(start, count, holdout)) or [count - 1]
@@ -43,9 +43,10 @@ def parted(
     where: object,
     start: int | None = None,
 ) -> tuple[list[int], list[int]]:
-    """The positions to learn from and to hold out; without ``test``, some of ``train`` are.
+    """The positions of training and held-out images.
 
-    These are then as :func:`every_nth` says. DevrfError if ``where`` lists too few of them.
+    Without ``test``, :func:`every_nth` chooses those held out among ``train``. DevrfError if
+    ``where`` lists too few.
     """
     if test and not train:
         raise scene_error(where, "all images are held out; list some to learn from")
@@ -67,10 +68,10 @@ class Split:
     """A split that is ordered but not yet loaded.
 
     Attributes:
-        transforms: what the file says, in the order of the file.
+        transforms: the file's images, in the order of the file.
         times: (N,) float32 in [0, 1].
         view: (N,) int64: the fixed camera of each image, or the image's own number.
-        fixed: whether the cameras stand still while time passes.
+        fixed: whether the cameras are fixed while time passes.
         index: (K,) int64, the positions in the file that are used, ascending.
     """
 
@@ -81,7 +82,7 @@ class Split:
     index: Tensor
 
     def where(self, keep: Tensor) -> Split:
-        """The same split, with only those used images for which the mask ``keep`` (N,) holds."""
+        """The same split, with only the used images that the mask ``keep`` (N,) has."""
         return replace(self, index=self.index[keep[self.index]])
 
     @property
@@ -91,7 +92,7 @@ class Split:
 
 
 def distinct_poses(poses: Tensor) -> Tensor:
-    """(N,) int64: which of the distinct poses each of (N, 3, 4) is, in order of appearance."""
+    """(N,) int64: number of the distinct pose of each of (N, 3, 4), in order of appearance."""
     near = SAME_POSE * (1 + float(poses[:, :, 3].norm(dim=1).median()))
     entries = poses.flatten(1).double().numpy()
     # Poses that are near each other are so along any line, too: only few have to be compared. The
@@ -116,12 +117,12 @@ def distinct_poses(poses: Tensor) -> Tensor:
 def are_fixed(pose: Tensor) -> bool:
     """Whether cameras are fixed, by the number of each image's pose (N,).
 
-    They are if a pose has two images or more in the mean: a moving camera may come back to a place.
+    They are if poses have two images or more in the mean: a moving camera may return to a pose.
     """
     return len(pose) >= 2 * (int(pose.max()) + 1)
 
 
-# Where at least this share of images is by cameras that have others, too, the scene may well move.
+# The scene may well move if at least this share of images is by cameras that have others, too.
 MANY_AGAIN = 0.25
 
 
@@ -138,7 +139,7 @@ def standing(poses: Tensor) -> str | None:
 
 
 def check_timed_alike(*sets: Transforms) -> None:
-    """DevrfError if images of a file have several times and those of another none."""
+    """DevrfError if images of one file have several times and those of another have none."""
     timed = [transforms for transforms in sets if transforms.times is not None]
     untimed = [transforms for transforms in sets if transforms.times is None]
     if untimed and not one_moment(*timed):
@@ -149,7 +150,7 @@ def check_timed_alike(*sets: Transforms) -> None:
         )
 
 
-def at_rest(transforms: Transforms) -> Split:
+def static_split(transforms: Transforms) -> Split:
     """A split of a scene at rest: every image its own view, time 0 unless the file says more."""
     count = len(transforms.images)
     times = torch.zeros(count) if transforms.times is None else torch.tensor(transforms.times)
@@ -157,12 +158,12 @@ def at_rest(transforms: Transforms) -> Split:
 
 
 def at_one_moment(transforms: Transforms) -> Split:
-    """A split of a scene that never moves: as :func:`at_rest`, at time 0 whatever the file says."""
-    return replace(at_rest(transforms), times=torch.zeros(len(transforms.images)))
+    """A split of a static scene: as :func:`static_split`, at time 0 whatever the file says."""
+    return replace(static_split(transforms), times=torch.zeros(len(transforms.images)))
 
 
 def one_moment(*sets: Transforms) -> bool:
-    """Whether some sets of images have no times, or one time altogether."""
+    """Whether sets of images have no times, or one time altogether."""
     times = [time for transforms in sets for time in transforms.times or ()]
     return len(distinct_times(torch.tensor(times))) < 2
 
@@ -246,15 +247,15 @@ def load_views(
     """Read the used images of a split, made smaller; their cameras are pinholes.
 
     Images of a lens with distortion are undistorted, and masks with them. ``root`` is the scene's
-    folder; ``downscale`` counts if the images have no factor of their own; ``alpha_weighted`` is as
-    for :func:`devrf.scenes.images.load_images`. DevrfError if an image, a mask or a lens is wrong,
-    or they do not go together.
+    folder; ``downscale`` applies unless the images have a factor of their own; ``alpha_weighted``
+    is as for :func:`devrf.scenes.images.load_images`. DevrfError if an image, a mask or a lens is
+    wrong, or they contradict each other.
     """
     used = split.index
     transforms = split.transforms[used.tolist()]
     files = transforms.images
     intrinsics = transforms.intrinsics
-    sizes = [known.size for known in intrinsics]
+    sizes = [camera.size for camera in intrinsics]
     masks = transforms.masks or ()
     finish = cutting_out(masks, sizes, files) if transforms.cut_out else None
     by = transforms.downscale or downscale
@@ -262,13 +263,13 @@ def load_views(
     if loaded.pixels.shape[3] == 4 and not bool(loaded.pixels[..., 3].any()):
         raise scene_error(
             files[0],
-            f"its alpha is 0 everywhere, and that of all {len(files)} images of its set: nothing "
-            "of them would be seen; save them without alpha, or with that of the subject",
+            f"its alpha is 0 everywhere, as in all {len(files)} images of its set: they would be "
+            "invisible; save them without alpha, or with that of the subject",
         )
     _check_shared(intrinsics, loaded.files, files)
     distorted = [
-        known.lens(width, height, file).scaled(columns / width, rows / height)
-        for known, file, (width, height), (columns, rows) in zip(
+        camera.lens(width, height, file).scaled(columns / width, rows / height)
+        for camera, file, (width, height), (columns, rows) in zip(
             intrinsics, files, loaded.files, loaded.sizes, strict=True
         )
     ]
@@ -292,7 +293,7 @@ def load_views(
 def _check_shared(
     cameras: Sequence[Intrinsics], sizes: Sequence[tuple[int, int]], names: Sequence[Path]
 ) -> None:
-    """DevrfError if a camera that names no size is that of images of several sizes.
+    """DevrfError if a camera that names no size has images of several sizes.
 
     Its pixels are those of one of them; an angle alone holds for one image at several scales.
     """

@@ -1,7 +1,7 @@
 """``transforms*.json``: posed images, as NeRF's Blender scenes and nerfstudio list them.
 
-Keys that only say how the poses came to be (``applied_transform``, ``applied_scale``) are left
-alone: poses and images are consistent as they are.
+Keys about the origin of the poses (``applied_transform``, ``applied_scale``) are not read: poses
+and images are consistent as they are.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from devrf.scenes.names import ImageFinder, Missing, in_order, present_images
 from devrf.scenes.validation import check_poses, scene_error
 
 TIME_TOLERANCE = 1e-6
-# By how much the last row of a matrix may differ from 0, 0, 0, 1.
+# Largest difference of the last row of a matrix from 0, 0, 0, 1.
 LAST_ROW = 1e-3
 
 
@@ -62,7 +62,7 @@ class Frame(CameraKeys):
         transform_matrix: 4×4 or 3×4 camera-to-world, OpenGL axes, world units.
         time: in [0, 1]; None where no frame has one.
         mask_path: a grey image, relative to the file's folder.
-        timestep_index: with ``timestamp``, what other programs say of time; not read.
+        timestep_index: with ``timestamp``, other programs' times; not read.
     """
 
     file_path: Name
@@ -81,13 +81,13 @@ FileNames = Annotated[list[Name], Field(fail_fast=True, max_length=MOST_IMAGES)]
 
 
 class SceneBounds(BaseModel):
-    """What devrf itself writes about a scene that it has captured; other programs ignore it.
+    """A scene's bounds, which devrf writes when it captures a scene; other programs ignore them.
 
     Attributes:
-        space: in which the scene is learned: ``ndc`` for cameras that face it from one side.
-        near: distance before which nothing is, world units; for ``ndc`` the near plane's.
-        far: distance behind which nothing is, world units; None: unknown.
-        box: the part that is looked at, low and high corner, world units; None: unknown.
+        space: the space of its fields: ``ndc`` for cameras that face it from one side.
+        near: its least distance, world units; for ``ndc`` the near plane's.
+        far: its largest distance, world units; None: unknown.
+        box: the part that cameras look at, low and high corner, world units; None: unknown.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -99,14 +99,14 @@ class SceneBounds(BaseModel):
 
 
 class TransformsFile(CameraKeys):
-    """What a transforms file says.
+    """The content of a transforms file.
 
     Attributes:
         frames: the posed images.
-        train_filenames: images to learn from, as nerfstudio lists them; None: no list.
-        val_filenames: images held out while a run goes on.
-        test_filenames: images held out to the end.
-        scene_bounds: where the scene is, if devrf has written the file.
+        train_filenames: training images, as nerfstudio lists them; None: no list.
+        val_filenames: held-out images for the course of a run.
+        test_filenames: held-out images for its end.
+        scene_bounds: the scene's bounds, if devrf wrote the file.
     """
 
     frames: Annotated[list[Frame], Field(fail_fast=True, min_length=1, max_length=MOST_IMAGES)]
@@ -127,13 +127,13 @@ class Transforms:
         poses: (N, 3, 4) float32 camera-to-world, OpenGL axes, world units, without ``offset``.
         times: N times in [0, 1], or None when the file gives none.
         masks: N existing files inside the scene's folder, None for an image without one; None if
-            they were not asked for.
-        cut_out: whether what masks leave out is background; else it is ignored.
-        downscale: by what the images are yet to be made smaller; None: that is not chosen yet.
-        skipped: how many images of the file are absent, and left out.
-        bounds: where the scene is, if the file says so, in the world of the file.
-        unread_times: keys of frames that say something of time, but are not read.
-        offset: what is subtracted from positions (:mod:`devrf.geometry.offset`).
+            masks are not used.
+        cut_out: whether pixels that masks leave out are background; else they are ignored.
+        downscale: the factor by which the images are yet to be made smaller; None: not chosen yet.
+        skipped: number of images of the file that are absent, and left out.
+        bounds: the scene's bounds in the world of the file, if it states them.
+        unread_times: keys of frames about time that are not read.
+        offset: the offset that is subtracted from positions (:mod:`devrf.geometry.offset`).
     """
 
     file: Path
@@ -162,15 +162,15 @@ class Transforms:
 
 
 class TransformsFiles:
-    """The transforms files of one scene: all are read in one way, with the offset of the first."""
+    """The transforms files of one scene, all with the offset of the first."""
 
     def __init__(self, root: Path, missing: Missing, masks: Masks = "none") -> None:
-        """Say how they are read.
+        """Choose how to read them.
 
         Args:
             root: the scene's folder.
             missing: as for :func:`devrf.scenes.names.present_images`.
-            masks: what the images of ``mask_path`` are taken for; ``none``: it is not followed.
+            masks: the meaning of the images of ``mask_path``; ``none``: they are not read.
         """
         self._missing = missing
         self._masks = masks
@@ -181,7 +181,7 @@ class TransformsFiles:
     def read(
         self, file: Path, *, times_by_order: bool = False
     ) -> tuple[TransformsFile, Transforms]:
-        """What a file says, and its posed images.
+        """The content of a file, and its posed images.
 
         ``times_by_order``: times are spread evenly over the images in the order of their names,
         whatever the file says of times.
@@ -201,8 +201,8 @@ class TransformsFiles:
             names = in_order((frame.file_path for frame in frames), name=str, where=file)
             moments = {name: k / max(len(names) - 1, 1) for k, name in enumerate(names)}
             times = [moments[frame.file_path] for frame in frames]
-        known = [t for t in times if t is not None]
-        if known and len(known) < len(times):
+        stated = [t for t in times if t is not None]
+        if stated and len(stated) < len(times):
             raise scene_error(
                 where[times.index(None)],
                 'has no "time" although others have; give every frame its time, or none',
@@ -211,14 +211,14 @@ class TransformsFiles:
         check_poses(poses, lambda index: f"{where[index]}: transform_matrix")
         self._offset = offset_of(poses) if self._offset is None else self._offset
         lenses = [frame_intrinsics(listing, f, at) for f, at in zip(frames, where, strict=True)]
-        shared = cache(lambda: intrinsics_of(listing, file))  # asked for only where it is needed
+        shared = cache(lambda: intrinsics_of(listing, file))  # only if it is needed
         masked = self._masks != "none"
         transforms = Transforms(
             file,
             tuple(own or shared() for own in lenses),
             tuple(images.values()),
             subtracted(poses, self._offset).float(),
-            tuple(known) or None,
+            tuple(stated) or None,
             tuple(self._mask(frame.mask_path, file) for frame in frames) if masked else None,
             cut_out=self._masks == "alpha",
             skipped=len(listing.frames) - len(frames),
@@ -237,7 +237,7 @@ class TransformsFiles:
         return self._finder.find(inside(self._finder.root, file.parent, name, file))
 
     def any_image(self, file: Path) -> bool:
-        """Whether any image is there that a file lists, if there is one."""
+        """Whether the file exists, and any of its images does."""
         if not os.path.isfile(file):
             return False
         return any(self.find(frame.file_path, file) for frame in self._listing(file).frames)
@@ -245,8 +245,8 @@ class TransformsFiles:
     def _mask(self, name: str | None, file: Path) -> Path | None:
         mask = None if name is None else self.find(name, file)
         if name is not None and mask is None:
-            place = inside(self._finder.root, file.parent, name, file)
-            raise scene_error(place, "no such mask; correct mask_path, or set data.masks=none")
+            path = inside(self._finder.root, file.parent, name, file)
+            raise scene_error(path, "no such mask; correct mask_path, or set data.masks=none")
         return mask
 
 

@@ -1,4 +1,4 @@
-"""Checks shared by the scene readers: what is wrong, where, and what to do, in one line."""
+"""Checks shared by the scene readers; errors name fault, place and remedy in one line."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.system.options import one_line
 
-# Below this the fields see nothing and the window of SSIM does not fit.
+# In smaller images there is nothing to learn, and the window of SSIM does not fit.
 MIN_SIDE = 8
-# Numbers become float32 tensors: what overflows there is as bad as infinity.
+# Numbers become float32 tensors: overflow there is as bad as infinity.
 LARGEST = 3e38
 
 
@@ -39,7 +39,7 @@ def reduced_size(width: int, height: int, downscale: int, where: object) -> tupl
 def same_shape(size: tuple[float, float], other: tuple[float, float]) -> bool:
     """Whether two (width, height) are those of one image at two scales.
 
-    Sides of the smaller one may be rounded, by a pixel each: beyond this it was cropped or turned.
+    Sides of the smaller one may be rounded by a pixel each: with more it was cropped or turned.
     """
     smaller, larger = sorted((size, other), key=math.prod)
     least = max((few - 1) / many for few, many in zip(smaller, larger, strict=True))
@@ -77,15 +77,14 @@ def check_memory(needed: int, where: object, what: str) -> None:
 
 # Rotations are written with 5 digits or more; further off they are scaled, sheared or mirrored.
 ROTATION_TOLERANCE = 1e-2
-# World units in which a distance, squared twice, still is a float32.
+# World units; a distance, squared twice, still is a float32.
 FARTHEST = 1e9
 
 
 def is_rotation(matrices: Tensor) -> Tensor:
-    """Which matrices (..., 3, 3) turn without scaling, shearing or mirroring, up to rounding.
+    """Mask (...,) of the matrices (..., 3, 3) that are rotations, up to rounding.
 
-    Returns:
-        A mask (...,); false where a matrix holds NaN.
+    It is false for matrices that scale, shear or mirror, or hold NaN.
     """
     eye = torch.eye(3).to(matrices)
     off = (matrices.mT @ matrices - eye).abs().amax(dim=(-2, -1))
@@ -94,7 +93,7 @@ def is_rotation(matrices: Tensor) -> Tensor:
 
 
 def in_reach(positions: Tensor) -> Tensor:
-    """Which positions (..., 3), world units, can be computed with; false where one holds NaN."""
+    """Mask (...,) of the positions (..., 3), world units, that float32 can hold; false for NaN."""
     near: Tensor = (positions.abs() <= FARTHEST).all(dim=-1)
     return near
 

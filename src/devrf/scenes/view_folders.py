@@ -19,7 +19,7 @@ from devrf.scenes.image_folders import ImageFolder, image_folder, listed_images
 from devrf.scenes.layout import Layout, Pair
 from devrf.scenes.lens import Intrinsics
 from devrf.scenes.scene import OpticalFlow, Views
-from devrf.scenes.splits import Split, at_rest, file_sizes
+from devrf.scenes.splits import Split, file_sizes, static_split
 from devrf.scenes.transforms import Transforms
 from devrf.scenes.validation import scene_error
 from devrf.system.files import utf8_path
@@ -36,17 +36,17 @@ def dynamic_folders(root: Path) -> list[Path]:
     ]
 
 
-def chosen_dynamic(root: Path, chosen: str | None) -> Path | None:
-    """The one of :func:`dynamic_folders` called ``chosen``, or (None) the only one, if there is.
+def dynamic_folder(root: Path, name: str | None) -> Path | None:
+    """The one of :func:`dynamic_folders` called ``name``; for None the only one, or None.
 
-    DevrfError if there is none of that name, or there are several to choose from.
+    DevrfError if there is none of that name, or there are several for None.
     """
     folders = dynamic_folders(root)
     names = ", ".join(folder.name for folder in folders)
-    named = [folder for folder in folders if chosen in (None, folder.name)]
-    if chosen is not None and not named:
+    named = [folder for folder in folders if name in (None, folder.name)]
+    if name is not None and not named:
         raise scene_error(
-            root, f"no folder {chosen!r} (found: {names or 'none'}); correct data.dynamic"
+            root, f"no folder {name!r} (found: {names or 'none'}); correct data.dynamic"
         )
     if len(named) > 1:
         raise scene_error(root, f"several captures ({names}); choose one with data.dynamic=NAME")
@@ -59,7 +59,7 @@ _DIGITS = re.compile(r"\d+")
 
 @dataclass(frozen=True)
 class ViewFolder(ImageFolder):
-    """What one fixed camera recorded: T ``images`` in order of time."""
+    """One fixed camera's T ``images`` in order of time."""
 
     images: list[Path]
 
@@ -128,41 +128,41 @@ def with_fixed_views(
     lenses: Sequence[Intrinsics],
     test: int,
 ) -> Layout:
-    """The layout of a scene that was seen at rest, and in motion by V fixed cameras.
+    """The layout of a static capture, and a dynamic one by V fixed cameras.
 
-    Their images are all at the first frame, then all at the next. The ``views`` have ``poses``
-    (V, 3, 4), camera-to-world, and ``lenses``, both from the file ``posed_by``; ``test`` is the
-    position of the held-out one.
+    The dynamic images are all of the first frame, then all of the next. The ``views`` have
+    ``poses`` (V, 3, 4), camera-to-world, and ``lenses``, both from the file ``posed_by``; ``test``
+    is the position of the held-out one.
     """
     frames = len(views[0].images)
 
-    def seen(chosen: list[int]) -> Split:
-        shots = [(t, v) for t in range(frames) for v in chosen]
-        cameras = [v for _, v in shots]
+    def split_of(cameras: list[int]) -> Split:
+        shots = [(t, v) for t in range(frames) for v in cameras]
+        camera = [v for _, v in shots]
         transforms = Transforms(
             posed_by,
-            tuple(lenses[v] for v in cameras),
+            tuple(lenses[v] for v in camera),
             tuple(views[v].images[t] for t, v in shots),
-            poses[cameras].float(),
+            poses[camera].float(),
             tuple(t / (frames - 1) for t, _ in shots),
             downscale=views[0].downscale,
         )
-        number = torch.arange(len(chosen)).repeat(frames)
+        number = torch.arange(len(cameras)).repeat(frames)
         times = torch.tensor(transforms.times)
         return Split(transforms, times, number, True, torch.arange(len(shots)))
 
-    learned = seen([v for v in range(len(views)) if v != test])
-    return Layout(at_rest(static[0]), at_rest(static[1]), learned, seen([test]))
+    train = split_of([v for v in range(len(views)) if v != test])
+    return Layout(static_split(static[0]), static_split(static[1]), train, split_of([test]))
 
 
 def flow_of_views(split: Split, views: Views, direction: FlowDirection) -> OpticalFlow | None:
-    """The flow in ``<folder>_flow`` beside the folders of images by fixed cameras; None: no file.
+    """The flow in ``<folder>_flow`` beside the folders of fixed cameras' images; None: no file.
 
     Backward flow is in ``<frame>_bwd.npz``, and frame 0 has none; forward flow in
-    ``<frame>_fwd.npz``, and the last frame has none. The name may tell the frame in three ways: by
-    its image's name (``0007`` for ``0007.png``), by the last number in it (``7`` for
-    ``img_0007.png``), or by its position, counted from 0. The way that finds the most files holds
-    for all views; of equal ones the first.
+    ``<frame>_fwd.npz``, and the last frame has none. A name gives the frame in one of three ways:
+    by its image's name (``0007`` for ``0007.png``), by the last number in it (``7`` for
+    ``img_0007.png``), or by its position, counted from 0. The way that matches the most files holds
+    for all views, the first of equal ones.
     """
     suffix = f"_{direction}.npz"
     ways: tuple[Callable[[int, Path], str | int | None], ...] = (
@@ -199,7 +199,7 @@ def flow_of_views(split: Split, views: Views, direction: FlowDirection) -> Optic
 
 
 def _named(folder: Path, suffix: str) -> dict[str | int | None, Path]:
-    """The files whose names end with ``suffix``, by what comes before it, as text and as number."""
+    """The files whose names end with ``suffix``, by the text before it, and by it as a number."""
     files: dict[str | int | None, Path] = {}
     for path in sorted(folder.glob(f"*{suffix}")):
         name = path.name.removesuffix(suffix)

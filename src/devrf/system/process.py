@@ -166,7 +166,7 @@ def handle_signals(answer: Answer) -> Iterator[Callable[[], None]]:
     """Handle signals by ``answer(number)`` within the block; earlier handlers return after it.
 
     A signal that is ignored or has another program's handler keeps it: launchers requeue their
-    jobs by handlers of their own. Of no effect outside the main thread.
+    jobs by handlers of their own. It has no effect outside the main thread.
 
     Yields:
         A function that takes the signals back from a library that has replaced the handler.

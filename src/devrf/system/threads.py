@@ -12,8 +12,8 @@ import torch
 def one_thread() -> Iterator[None]:
     """PyTorch on one thread inside, on as many as before afterwards.
 
-    For many operations too small for two: a second thread gains little, and where the cores are
-    shared with others it waits at each of them, which takes several times as long.
+    It is for many small operations: a second thread gains little, and on cores that are shared with
+    others it waits at each operation, which takes several times as long.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -139,7 +139,7 @@ def test_the_box_of_a_film_leaves_out_more_points(capture, footage, structure):
     usual = capture(facing="inward", holdout=6)
     film = capture(static=None, views=[footage[0]], offsets=None, facing="inward", holdout=6)
     scenes = (usual, film)
-    assert [scene.is_film for scene in scenes] == [False, True]
+    assert [scene.is_monocular for scene in scenes] == [False, True]
     wide, tight = (Box.of(scene.space.low, scene.space.high).longest for scene in scenes)
     assert 0.7 * wide < tight < 0.98 * wide
 

@@ -19,7 +19,7 @@ from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.files import entries
-from devrf.scenes.footage import VIDEOS, Picture, chosen, frame_count, is_folder, pictures
+from devrf.scenes.footage import VIDEOS, Picture, frame_count, frames_at, is_folder, pictures
 from devrf.scenes.image_folders import listed_images
 from devrf.scenes.masks import HALF, WHITE, read_mask, white_in, white_in_files
 from devrf.scenes.scene import Views
@@ -82,7 +82,7 @@ def write_frames(folder: Path, footage: Chosen, size: Size, filmed: Size) -> Ite
     masks: Iterator[Mask | None] = repeat(None, len(wanted))
     if footage.masks is not None:
         masks = chosen_masks(footage.masks, footage.path, wanted, filmed)
-    for (position, picture), mask in zip(chosen(footage.path, wanted), masks, strict=False):
+    for (position, picture), mask in zip(frames_at(footage.path, wanted), masks, strict=False):
         path = folder / places[position]
         image = cv2.cvtColor(fitted(picture, size), cv2.COLOR_RGB2BGR)
         if mask is not None:
@@ -195,7 +195,7 @@ def chosen_masks(
             yield read_mask(files[position], size, None, footage, white)
         return
     white = white_in((_grey(picture) for _, picture in pictures(masks)), masks)
-    for _, picture in chosen(masks, positions):
+    for _, picture in frames_at(masks, positions):
         height, width = picture.shape[:2]
         if (width, height) != size:
             raise DevrfError(

@@ -30,7 +30,7 @@ from devrf.scenes.formats.nerfstudio import FILE
 from devrf.scenes.sparse_model import (
     AROUND,
     LEFT_OUT,
-    LEFT_OUT_OF_FILM,
+    LEFT_OUT_OF_VIDEO,
     SparseModel,
     World,
     ndc_holds,
@@ -97,7 +97,7 @@ def scene_from_footage(settings: CaptureSettings) -> Path:
     facing = settings.facing
     if facing == "auto" and settings.monocular:
         facing = "forward" if ndc_holds(model) else "inward"
-    left_out = LEFT_OUT_OF_FILM if settings.monocular else LEFT_OUT
+    left_out = LEFT_OUT_OF_VIDEO if settings.monocular else LEFT_OUT
     world = normalised(model, facing, left_out=left_out)
     if settings.facing == "auto":
         facing = "forward" if world.space == "ndc" else "inward"

@@ -1,4 +1,4 @@
-"""Which layout a scene's folder has, told by the files that are there."""
+"""The layout of a scene's folder, by its files."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ class KnownLayout:
 
     Attributes:
         choice: the option of ``data=`` whose reader reads it.
-        name: whose layout it is.
-        files: what has to be there, relative to the scene's folder; ``*`` stands for any text.
-        remark: what else a folder of this layout holds; else empty.
+        name: its name.
+        files: necessary files, relative to the scene's folder; ``*`` stands for any text.
+        remark: other contents of a folder of this layout, in words, or empty.
     """
 
     choice: str
@@ -42,10 +42,10 @@ def _in_any_case(suffix: str) -> str:
     return "".join(f"[{letter}{letter.upper()}]" for letter in suffix)
 
 
-# Where else its models may be, and in which form, says model_folders.
+# Other places and forms of models are in model_folders.
 COLMAP = KnownLayout("colmap", "COLMAP", tuple(f"sparse/0/{part}.bin" for part in PARTS))
 # A folder with files of several layouts has the first of them: layouts of two captures come before
-# those of one, and files that say more about the images before files that say less.
+# those of one, and files with more about the images before files with less.
 LAYOUTS = (
     KnownLayout("dycheck", "DyCheck", ("splits/train.json", "scene.json")),
     KnownLayout("nerfies", "Nerfies", ("dataset.json", "scene.json")),
@@ -65,14 +65,14 @@ LAYOUTS = (
 
 
 def recognise(root: str | Path) -> KnownLayout:
-    """The layout of the scene in ``root``; if none fits, DevrfError says what to do about it."""
+    """The layout of the scene in ``root``; DevrfError with the remedy if none fits."""
     folder, fitting = _fitting(root)
-    chosen = fitting[0]
-    others = sorted({layout.choice for layout in fitting} - {chosen.choice})
+    layout = fitting[0]
+    others = sorted({other.choice for other in fitting} - {layout.choice})
     also = f"; it would fit data={' and data='.join(others)} too" if others else ""
     if COLMAP not in fitting and (file := model_folders(folder).lacks):
         also += f"; its sparse/ is incomplete, no {file.relative_to(folder)}: left alone"
-    return replace(chosen, remark=also)
+    return replace(layout, remark=also)
 
 
 def check_choice(root: str | Path, choice: str) -> None:
@@ -90,7 +90,7 @@ def check_choice(root: str | Path, choice: str) -> None:
 
 
 def _fitting(root: str | Path) -> tuple[Path, list[KnownLayout]]:
-    """The scene's folder, and the layouts that it has, at least one."""
+    """The scene's folder, and its layouts, at least one."""
     file = Path(os.path.expanduser(root))
     if file.suffix.lower() in VIDEOS and os.path.isfile(file):
         raise _footage(file, file)
@@ -103,10 +103,10 @@ def _fitting(root: str | Path) -> tuple[Path, list[KnownLayout]]:
 
 
 def _layouts(folder: Path) -> list[KnownLayout]:
-    """The layouts that a folder has, the preferred one first; installed packages' come before."""
+    """The layouts of a folder, the preferred one first; installed packages' come before."""
     installed = [point.load() for point in entry_points(group="devrf.layouts")]
-    known = (*installed, *LAYOUTS)
-    return [layout for layout in known if _fits(layout, folder)]
+    layouts = (*installed, *LAYOUTS)
+    return [layout for layout in layouts if _fits(layout, folder)]
 
 
 def _fits(layout: KnownLayout, folder: Path) -> bool:
@@ -116,7 +116,7 @@ def _fits(layout: KnownLayout, folder: Path) -> bool:
 
 
 def _of_no_layout(folder: Path) -> DevrfError:
-    """What to do about a folder of no known layout: scenes, images or videos may be around it."""
+    """The remedy for a folder of no known layout: scenes, images or videos may be around it."""
     above = folder.absolute().parent
     inside = entries(folder)
     if _layouts(above):
@@ -125,14 +125,14 @@ def _of_no_layout(folder: Path) -> DevrfError:
         if os.path.isdir(path) and _layouts(path):
             word = to_type("data.root", path)
             return scene_error(folder, f"{path.name}/ in it is a scene; write", word)
-    for place in (folder, folder / "images"):
-        if os.path.isdir(place) and any(p.suffix.lower() in SUFFIXES for p in entries(place)):
-            return _footage(folder, place)
+    for images in (folder, folder / "images"):
+        if os.path.isdir(images) and any(p.suffix.lower() in SUFFIXES for p in entries(images)):
+            return _footage(folder, images)
     if videos := [path for path in inside if path.suffix.lower() in VIDEOS]:
         return _footage(folder, *videos)
-    for place in (folder, folder / "images"):
-        if os.path.isdir(place) and (kinds := unread(place)):
-            return scene_error(place, f"no known layout, and no images that are read{kinds}")
+    for images in (folder, folder / "images"):
+        if os.path.isdir(images) and (kinds := unread(images)):
+            return scene_error(images, f"no known layout, and no images that are read{kinds}")
     if packed := [path for path in inside if path.suffix.lower() in ARCHIVES]:
         return scene_error(packed[0], "is an archive; unpack it, and set data.root to its folder")
     # A layout is left out if another one lacks only some of the same files.
@@ -148,7 +148,7 @@ def _of_no_layout(folder: Path) -> DevrfError:
 
 
 def _footage(where: Path, static: Path, *views: Path) -> DevrfError:
-    """What to type to make a scene of photographs or videos; the first one is taken at rest."""
+    """The command that makes a scene of photographs or videos, the first one of them static."""
     name = static.parent.name if static.name == "images" else static.stem
     words = [to_type("capture.static", static)]
     words += [to_type("capture.views", views)] if views else []

@@ -25,15 +25,15 @@ from devrf.scenes.splits import (
     one_moment,
 )
 from devrf.scenes.transforms import Transforms, TransformsFiles
-from devrf.scenes.view_folders import chosen_dynamic, dynamic_folders
+from devrf.scenes.view_folders import dynamic_folder, dynamic_folders
 from devrf.system.options import Count
 
 log = logging.getLogger(__name__)
 
 VAL = "transforms_val.json"
-# The scene of D-NeRF's whose test images show it otherwise than those that are learned from.
+# The scene of D-NeRF's whose test images differ from its training images.
 SCORED_ON_VAL = "lego"
-# One training image in so many is held out where no held-out image is there.
+# One training image in so many is held out if there are no held-out images.
 HOLDOUT = 8
 
 
@@ -41,18 +41,18 @@ HOLDOUT = 8
 class BlenderReader(InwardReader):
     """Reads ``transforms_{train,test}.json`` and images.
 
-    Two layouts: ``static/``, next to ``dynamic_<V>views/`` unless the scene is at rest; or the
-    JSON files in ``root`` itself: with times (D-NeRF) the static capture is taken from the training
-    images, without them (NeRF-synthetic) the scene is at rest. Without ``transforms_test.json``
-    ``transforms_val.json`` is held out; beside it, it is the validation split. Where none of the
-    held-out images is there, some of the others are held out: one in :data:`HOLDOUT`, or the last
-    of three fixed cameras or more.
+    Two layouts: ``static/``, with ``dynamic_<V>views/`` unless the scene is static; or the JSON
+    files in ``root`` itself: with times (D-NeRF) the static capture is taken from the training
+    images, without them (NeRF-synthetic) the scene is static. ``transforms_val.json`` is the
+    validation split, or held out if there is no ``transforms_test.json``. If no held-out image
+    exists, some of the others are held out: one in :data:`HOLDOUT`, or the last of three fixed
+    cameras or more.
 
     Attributes:
-        dynamic: which ``dynamic_*views`` folder, where there are several.
+        dynamic: name of the ``dynamic_*views`` folder, if there are several.
         train_views: train on the first so many dynamic views; None: all.
         static_until: without a static set, the latest time of an image that counts as static.
-        alpha_weighted: whether colours are weighted by their alpha where images are made smaller;
+        alpha_weighted: whether colours are weighted by their alpha when images are made smaller;
             DeVRF's authors average each channel by itself.
     """
 
@@ -76,12 +76,12 @@ class BlenderReader(InwardReader):
                 _, test = files.read(val)
                 check_timed_alike(train, test)
             layout = one_capture(train, test, self.static_until)
-        elif (moving := chosen_dynamic(folder, self.dynamic)) is None:
+        elif (moving := dynamic_folder(folder, self.dynamic)) is None:
             train, test = _train_and_test(files, static)
             layout = static_alone(train, test, "there is no folder dynamic_<V>views")
         else:
-            resting = _train_and_test(files, existing_folder(static))
-            layout = two_captures(resting, _train_and_test(files, moving))
+            static_pair = _train_and_test(files, existing_folder(static))
+            layout = two_captures(static_pair, _train_and_test(files, moving))
         test_file = layout.dynamic_test.transforms.file
         val = test_file.with_name(VAL)
         if self.validation and val != test_file and os.path.isfile(val):
@@ -95,10 +95,12 @@ class BlenderReader(InwardReader):
         """See :meth:`devrf.scenes.reader.LayoutReader.flow_of`."""
         folder = split.transforms.file.with_name("train_flow")
         if split.transforms.skipped:
-            log.info("flow files dropped: they are numbered by images of which some are left out")
+            log.info("flow files dropped: images that number them are left out")
             return None
-        if any(not known.distortion.none for known in split.transforms.intrinsics):
-            log.warning("flow files in %s left out: they are of images before undistortion", folder)
+        if any(not camera.distortion.none for camera in split.transforms.intrinsics):
+            log.warning(
+                "flow files in %s left out: they are for images before undistortion", folder
+            )
             return None
         end = split.times.min() if direction == "bwd" else split.times.max()
         return read_flow(
@@ -112,7 +114,7 @@ class BlenderReader(InwardReader):
 
 
 def _train_and_test(files: TransformsFiles, folder: Path) -> Pair:
-    """The images of the capture in a folder to learn from, and those held out."""
+    """The training and held-out images of the capture in a folder."""
     file = folder / "transforms_train.json"
     _, train = files.read(file)
     listings = (folder / "transforms_test.json", folder / VAL)
@@ -135,7 +137,7 @@ def _train_and_test(files: TransformsFiles, folder: Path) -> Pair:
 
 
 def _held_out_of(train: Transforms) -> tuple[list[int], list[int]] | None:
-    """Positions to learn from and to hold out: the last of three fixed cameras or more, or some."""
+    """Positions of training and held-out images: the last of three fixed cameras, or some."""
     camera = distinct_poses(train.poses)
     if not are_fixed(camera):
         return every_nth(len(camera), HOLDOUT) if len(camera) > 1 else None

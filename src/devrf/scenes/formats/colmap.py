@@ -1,4 +1,4 @@
-"""Scenes as COLMAP leaves them: a sparse model, and the images that it poses."""
+"""COLMAP's scenes: a sparse model, and the images that it poses."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from devrf.scenes.splits import parted
 from devrf.scenes.transforms import SceneBounds, Transforms
 from devrf.scenes.validation import scene_error
 from devrf.scenes.view_folders import (
-    chosen_dynamic,
+    dynamic_folder,
     held_out_view,
     view_folders,
     with_fixed_views,
@@ -40,8 +40,8 @@ FACING: dict[str, Facing] = {"auto": "auto", "ndc": "forward"}
 def images_of(model: SparseModel, root: Path, factor: int) -> ImageFolder:
     """The folder of the model's images, which are read ``factor`` times smaller; or DevrfError.
 
-    A folder of smaller images is passed over if ``images/`` has more of them: LLFF's tools rename
-    what they make smaller, and copies may be incomplete.
+    A folder of smaller images is not used if ``images/`` has more of them: LLFF's tools rename the
+    images that they make smaller, and copies may be incomplete.
     """
     source = image_folder(root, factor)
     full = root / IMAGES
@@ -51,11 +51,11 @@ def images_of(model: SparseModel, root: Path, factor: int) -> ImageFolder:
     finder = ImageFinder(root)
 
     def absent(folder: Path) -> int:
-        places = [inside(root, folder, image.name, model.folder) for image in model.images]
-        found = [finder.find(place) for place in places]
+        listed = [inside(root, folder, image.name, model.folder) for image in model.images]
+        images = [finder.find(path) for path in listed]
         return sum(
-            image is None or image.name.lower() != place.name.lower()
-            for image, place in zip(found, places, strict=True)
+            image is None or image.name.lower() != path.name.lower()
+            for image, path in zip(images, listed, strict=True)
         )
 
     lacks = absent(source.path)
@@ -77,7 +77,7 @@ def warn_of_unposed(posed: int, folder: Path) -> None:
     total = sum(map(os.path.isfile, files))
     if total - posed > UNPOSED * total:
         log.warning(
-            "%d of the %d images in %s are posed, the others are left out; for more of them, "
+            "%d of the %d images in %s are posed, the others are left out; to pose more of them, "
             "film with more overlap, or run COLMAP's mapper again",
             posed,
             total,
@@ -89,37 +89,37 @@ def fixed_cameras(model: SparseModel, folder: Path, count: int) -> list[int]:
     """The positions in the model of an image by each of ``count`` fixed cameras.
 
     The model poses, among others, ``view1.png`` or an image in ``view1/``; ``folder`` is
-    ``dynamic_<V>views``, for the DevrfError where a camera has no pose.
+    ``dynamic_<V>views``, for the DevrfError if a camera has no pose.
     """
-    known: dict[str, int] = {}
+    positions: dict[str, int] = {}
     for position, image in enumerate(model.images):
         path = PurePosixPath(image.name)
-        known.setdefault(path.stem, position)
-        known.setdefault(path.parent.name, position)
+        positions.setdefault(path.stem, position)
+        positions.setdefault(path.parent.name, position)
     names = [f"view{number}" for number in range(1, count + 1)]
     for name in names:
-        if name not in known:
+        if name not in positions:
             raise scene_error(
                 model.folder,
                 f"poses no image {name}.png, nor one in a folder {name}; put the first frame of "
                 f"{folder.name}/{name} among the images, and run COLMAP again",
             )
-    return [known[name] for name in names]
+    return [positions[name] for name in names]
 
 
 @dataclass(frozen=True)
 class ColmapReader(PosedReader, FixedViewsReader):
     """Reads COLMAP's ``sparse/0``, binary or as text, and ``images/``.
 
-    Of several models in ``sparse/`` that with the most images is read.
+    It reads the model with the most images, if there are several in ``sparse/``.
 
-    The scene is at rest, unless there are folders ``dynamic_<V>views/view1`` … of fixed cameras, as
+    The scene is static, unless there are folders ``dynamic_<V>views/view1`` … of fixed cameras, as
     in DeVRF's forward-facing layout; the model then poses an image of each, ``view1.png`` or in
     ``view1/``.
 
     The world is that of :func:`devrf.scenes.sparse_model.normalised`: for cameras around a scene, z
-    points up and the origin is the middle of what they look at; cameras that all look within 45° of
-    one direction make a forward-facing scene. The sparse points give near and far, and the box if
+    points up and the origin is the middle of the scene; cameras that all look within 45° of one
+    direction make a forward-facing scene. The sparse points give near and far, and the box if
     the cameras' axes do not meet. Images are undistorted.
 
     Attributes:
@@ -165,7 +165,7 @@ class ColmapReader(PosedReader, FixedViewsReader):
             bounds=SceneBounds(space=world.space, near=world.near, far=world.far, box=world.box),
         )
         train, test = parted(range(len(positions)), (), self.holdout, model.folder, start=0)
-        moving = chosen_dynamic(folder, self.dynamic)
+        moving = dynamic_folder(folder, self.dynamic)
         if moving is None:
             why = "there is no folder dynamic_<V>views"
             layout = static_alone(images[train], images[test], why)
@@ -173,7 +173,7 @@ class ColmapReader(PosedReader, FixedViewsReader):
             views = view_folders(moving, factor)
             posed = fixed_cameras(model, moving, len(views))
             test_view = held_out_view(len(views), self.test_view)
-            # What the held-out camera saw of the scene at rest is held out, too.
+            # The held-out camera's static image is held out, too.
             unseen = {k for k, position in enumerate(positions) if position == posed[test_view]}
             train = [k for k in train if k not in unseen]
             test = sorted({*test, *unseen})
@@ -188,9 +188,9 @@ class ColmapReader(PosedReader, FixedViewsReader):
         return fewer(layout, self.train_views, self.frames)
 
     def stated(self, layout: Layout, static: Capture) -> SceneBounds | None:
-        """What the sparse points say of where the scene is."""
-        known = layout.bounds
-        if known and known.space == "contracted" and static.train.cut_out:
-            # Nothing is around it, whatever points lie there.
-            return SceneBounds(space="world", box=known.box)
-        return known
+        """The bounds of the sparse points."""
+        bounds = layout.bounds
+        if bounds and bounds.space == "contracted" and static.train.cut_out:
+            # The scene is bounded, whatever points lie around it.
+            return SceneBounds(space="world", box=bounds.box)
+        return bounds

@@ -1,4 +1,4 @@
-"""DyCheck's captures: Nerfies' layout with split lists and masks of what training has seen."""
+"""DyCheck's captures: Nerfies' layout with split lists and covisibility masks."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ VAL = f"{SPLITS}/val.json"
 
 
 class _Split(BaseModel):
-    """``splits/<name>.json``: K images and when they were taken, on some scale."""
+    """``splits/<name>.json``: K images and their times, on some scale."""
 
     frame_names: Ids
     time_ids: Annotated[list[Number], Field(fail_fast=True)]
@@ -39,12 +39,12 @@ class _Split(BaseModel):
 class DycheckReader(ItemsReader):
     """Reads ``splits/train.json``, ``splits/val.json``, ``scene.json``, ``camera/``, ``rgb/<n>x/``.
 
-    One moving camera is learned from, others are held out. Times are the ``time_ids`` of the
-    splits, brought to [0, 1]. Depth is left alone.
+    One moving camera takes the training images, others are held out. Times are the ``time_ids`` of
+    the splits, brought to [0, 1]. Depth is not read.
 
     Attributes:
-        masks: ``ignore``: what ``covisible/`` says that training has hardly seen is not scored;
-            ``none``: all of the held-out images is.
+        masks: ``ignore``: only pixels in the masks of ``covisible/``, which enough training images
+            show, are scored; ``none``: all pixels of held-out images are.
     """
 
     listing: ClassVar[str] = SPLITS
@@ -83,9 +83,9 @@ class DycheckReader(ItemsReader):
         if self.masks == "none":
             return None
         for size in (images.path.name, "1x"):
-            place = Path(COVISIBLE, size, "val")
-            if os.path.isdir(folder / place):
-                files = (inside(folder, folder, f"{place}/{item}", folder / SPLITS) for item in ids)
+            masks = Path(COVISIBLE, size, "val")
+            if os.path.isdir(folder / masks):
+                files = (inside(folder, folder, f"{masks}/{item}", folder / SPLITS) for item in ids)
                 return tuple(map(ImageFinder(folder).find, files))
         return (None,) * len(ids)
 

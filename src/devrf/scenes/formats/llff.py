@@ -30,7 +30,7 @@ from devrf.scenes.splits import Split, at_times, evenly_spread, every_nth, in_mo
 from devrf.scenes.transforms import SceneBounds, Transforms
 from devrf.scenes.validation import scene_error
 from devrf.scenes.view_folders import (
-    chosen_dynamic,
+    dynamic_folder,
     dynamic_folders,
     flow_of_views,
     held_out_view,
@@ -43,20 +43,20 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class LlffReader(FixedViewsReader):
-    """Reads a scene that cameras face from one side.
+    """Reads a forward-facing scene.
 
     Three layouts: ``static/`` and ``dynamic_<V>views/``; LLFF's ``poses_bounds.npy`` and images in
-    ``root`` itself, or in ``static/`` alone: a scene at rest; or the same as a video by one camera
-    (NR-NeRF's, with ``precomputed.json``), each image a time of its own, in the order of names.
+    ``root`` itself, or in ``static/`` alone: a static scene; or the same as a video by one camera
+    (NR-NeRF's, with ``precomputed.json``), each image with its own time, in the order of names.
 
     The world's unit is 0.75 of the least depth of the static cameras, their average pose its origin
     and axes (x right, y up, −z forward). The scene's space is NDC of that camera.
 
     Attributes:
         near: distance of the near plane from the average camera, in the world's unit; the nearest
-            point of the static scene is at 1/0.75. None: 1; of a video, whose camera comes nearer,
+            point of the static scene is at 1/0.75. None: 1; for a video, whose camera comes nearer,
             :meth:`~devrf.scenes.formats.llff_poses.PosedSet.near_plane`.
-        monocular: whether LLFF's images are a video; None: where NR-NeRF's ``precomputed.json`` is.
+        monocular: whether LLFF's images are a video; None: if there is a ``precomputed.json``.
         static_until: in a video, the latest time of an image that counts as static.
     """
 
@@ -70,13 +70,13 @@ class LlffReader(FixedViewsReader):
     def layout(self, folder: Path) -> Layout:
         """See :meth:`devrf.scenes.reader.LayoutReader.layout`."""
         static = static_folder(folder)
-        moving = chosen_dynamic(folder, self.dynamic)
+        moving = dynamic_folder(folder, self.dynamic)
         if moving and self.monocular:
             raise scene_error(
                 "data.monocular", f"{folder} has fixed views, so it is no video; leave it null"
             )
         factor = self.choose_factor(folder_size(static))
-        # The cameras of fixed views are in LLFF's own unit, and the static ones have to be, too.
+        # The cameras of fixed views have LLFF's own unit, so the static ones need it, too.
         posed = _read_cameras(static, with_strays=moving is not None)
         images = _posed_images(posed, image_folder(static, factor))
         video = self.monocular
@@ -135,7 +135,7 @@ class LlffReader(FixedViewsReader):
 
 
 def static_folder(root: Path) -> Path:
-    """Where the static cameras and images are: ``static/`` or ``root`` itself; else DevrfError."""
+    """The folder of static cameras and images: ``static/`` or ``root`` itself; else DevrfError."""
     static = root / "static"
     here = (root / POSES, root / PRECOMPUTED)
     if not os.path.isdir(static) and any(map(os.path.isfile, here)) and not dynamic_folders(root):

@@ -23,14 +23,14 @@ from devrf.scenes.validation import check_poses, in_reach, scene_error
 
 log = logging.getLogger(__name__)
 
-# The file of LLFF's cameras, and that of NR-NeRF's, whose images follow one another in time.
+# The file of LLFF's cameras, and that of NR-NeRF's, whose images are a video.
 POSES = "poses_bounds.npy"
 PRECOMPUTED = "precomputed.json"
 # The nearest point of the scene is placed at 1/0.75 of the near plane's distance, as LLFF does.
 BOUND_FACTOR = 0.75
-# A camera's least depth below this share of their median is taken for that of a stray point.
+# A camera's least depth below this share of their median counts as that of a stray point.
 STRAY_SHARE = 0.5
-# So many of a video's cameras may see stray points, too: those that are beyond that share.
+# This share of a video's cameras may see stray points, too, at depths above that share.
 STRAY_CAMERAS = 0.1
 
 
@@ -39,10 +39,10 @@ class PosedSet:
     """N cameras as a file gives them, in double precision.
 
     Attributes:
-        file: where they are from, for messages.
+        file: their file, for messages.
         poses: (N, 3, 4) camera-to-world, OpenGL axes, the unit of the file.
         intrinsics: N, in pixels of images of the size that the file states.
-        bounds: (N, 2) least and largest depth of what each camera sees, the unit of the file.
+        bounds: (N, 2) least and largest depth of each camera's points, the unit of the file.
     """
 
     file: Path
@@ -56,8 +56,8 @@ class PosedSet:
     def normalised(self, *, with_strays: bool) -> PosedSet:
         """The set in units of 0.75 · its least depth, its average pose the identity.
 
-        Least depths of stray points count only ``with_strays``, as LLFF's own unit has them. A
-        DevrfError if the cameras look in too different directions, or are too far apart.
+        Least depths of stray points count only ``with_strays``, as in LLFF's own unit. DevrfError
+        if the cameras look in too different directions, or are too far apart.
         """
         least = self.bounds[:, 0]
         agreed = least[(least >= STRAY_SHARE * least.median()) | with_strays]
@@ -84,10 +84,10 @@ class PosedSet:
         return replace(self, poses=poses, bounds=self.bounds * scale)
 
     def near_plane(self) -> float:
-        """Distance from the origin of a plane before what a camera sees that moves along −z, too.
+        """Distance of the near plane from the origin, for a camera that also moves along −z.
 
-        It is :data:`BOUND_FACTOR` of the way from the foremost position to the nearest point, but
-        for what :data:`STRAY_CAMERAS` see alone; at least 1, LLFF's plane in a normalised set.
+        It is :data:`BOUND_FACTOR` of the way from the foremost position to the nearest point,
+        except points of :data:`STRAY_CAMERAS` alone; at least 1, LLFF's plane in a normalised set.
         """
         position = self.poses[:, 2, 3]
         depth = self.bounds[:, 0] * self.poses[:, 2, 2] - position

@@ -48,8 +48,8 @@ class World(BaseModel):
     Attributes:
         center: centre of the world, in the cameras' units.
         scale: world units in one of the cameras'.
-        near: distance before which nothing is, world units.
-        far: distance behind which nothing is, world units.
+        near: least distance of the scene, world units.
+        far: largest distance of the scene, world units.
     """
 
     center: Vector3
@@ -59,7 +59,7 @@ class World(BaseModel):
 
 
 class Camera(BaseModel):
-    """What a camera file says; pixels are those of the full image.
+    """The content of a camera file; pixels are those of the full image.
 
     Attributes:
         orientation: rows of the world-to-camera rotation.
@@ -96,8 +96,8 @@ def read_camera(folder: Path, item: str, world: World) -> tuple[Tensor, Intrinsi
     world_to_camera = torch.tensor(camera.orientation, dtype=torch.float64)
     # OpenCV's y points down and its z ahead; ours point up and back.
     axes = world_to_camera.T * world_to_camera.new_tensor([1, -1, -1])
-    where = (axes.new_tensor(camera.position) - axes.new_tensor(world.center)) * world.scale
-    pose = torch.cat([axes, where[:, None]], dim=1)
+    position = (axes.new_tensor(camera.position) - axes.new_tensor(world.center)) * world.scale
+    pose = torch.cat([axes, position[:, None]], dim=1)
     check_poses(pose[None], lambda _: f"{file}: orientation or position")
     focal = camera.focal_length
     intrinsics = Intrinsics(
@@ -110,7 +110,7 @@ def read_camera(folder: Path, item: str, world: World) -> tuple[Tensor, Intrinsi
     return pose, intrinsics
 
 
-# N ids, and the positions of those to learn from and of those held out.
+# N ids, and the positions of training and held-out images.
 Listed = tuple[list[str], list[int], list[int]]
 
 
@@ -118,13 +118,13 @@ Listed = tuple[list[str], list[int], list[int]]
 class ItemsReader(InwardReader):
     """Reads layouts that keep a camera file for each image, and have no static set.
 
-    World units are those of ``scene.json``: (position − center) · scale; it gives near and far,
-    too. Images come from ``rgb/<downscale>x``, or from a larger folder and are made smaller.
-    Without alpha masks the scene is unbounded, or, where the cameras look in nearly one direction,
-    the box is all that they see between near and far.
+    World units, near and far are those of ``scene.json``: (position − center) · scale. Images come
+    from ``rgb/<downscale>x``, or from a larger folder and are made smaller. Without alpha masks the
+    scene is unbounded; if the cameras look in nearly one direction, the box is that of their frusta
+    between near and far.
 
     Attributes:
-        holdout: one of so many images is held out, if no list says which.
+        holdout: one of so many images is held out, if there is no list of them.
         static_until: the latest time of an image that counts as static.
     """
 
@@ -137,16 +137,16 @@ class ItemsReader(InwardReader):
 
     @abstractmethod
     def listed(self, folder: Path) -> Listed:
-        """What ``listing``, in the scene's folder, lists."""
+        """The images in ``listing``, in the scene's folder."""
 
     @abstractmethod
     def moments(self, folder: Path, ids: Sequence[str]) -> Sequence[float]:
-        """When images were taken, on some scale."""
+        """The times of images, on some scale."""
 
     def masks_of(
         self, folder: Path, ids: Sequence[str], images: ImageFolder
     ) -> tuple[Path | None, ...] | None:
-        """The masks of images; what they leave out is ignored. None: no masks."""
+        """The masks of images; pixels that they leave out are ignored. None: no masks."""
         return None
 
     def layout(self, folder: Path) -> Layout:
@@ -161,8 +161,8 @@ class ItemsReader(InwardReader):
         files = [f"rgb/{images.path.name}/{item}" for item in items]
         present = present_images(files, listing, ImageFinder(folder), self.missing)
         ids = [items[position] for position in present]
-        place = {position: k for k, position in enumerate(present)}
-        train, test = ([place[p] for p in part if p in place] for part in split)
+        row = {position: k for k, position in enumerate(present)}
+        train, test = ([row[p] for p in part if p in row] for part in split)
         if not train or not test:
             raise scene_error(
                 listing, "all images to learn from, or all that are held out, are absent; add them"
@@ -198,7 +198,7 @@ class ItemsReader(InwardReader):
         wide = self.box is None and not static.train.cut_out and 0 <= near < far
         if not wide or (self.space != "world" and axes_do_meet(cameras)):
             return InwardReader.placed(options, layout, static, dynamic)
-        # Without alpha masks the backdrop is to be learned too.
+        # Without alpha masks the backdrop is learned, too.
         frusta_box = box_of_frusta(cameras, near, far).moved(layout.offset)
         scale = FALLBACK_BOUND_SCALE if self.bound_scale == "auto" else self.bound_scale
         options = replace(options, box=frusta_box, space="world", bound_scale=scale)
@@ -209,7 +209,7 @@ class ItemsReader(InwardReader):
 
 
 class _Dataset(BaseModel):
-    """``dataset.json``: the ids of the images; numbers are taken for text."""
+    """``dataset.json``: the ids of the images; numbers become text."""
 
     model_config = ConfigDict(coerce_numbers_to_str=True)
 
@@ -219,7 +219,7 @@ class _Dataset(BaseModel):
 
 
 class _Moment(BaseModel):
-    """An entry of ``metadata.json``: when an image was taken, on some scale."""
+    """An entry of ``metadata.json``: the time of an image, on some scale."""
 
     time_id: Number | None = None
     warp_id: Number | None = None
@@ -233,7 +233,7 @@ class NerfiesReader(ItemsReader):
     """Reads ``dataset.json``, ``metadata.json``, ``scene.json``, ``camera/`` and ``rgb/<n>x/``.
 
     The time of an image is its ``time_id`` (HyperNeRF), else its ``warp_id``, brought to [0, 1].
-    Images are undistorted. With one time for all of them the scene is at rest.
+    Images are undistorted. The scene is static if they all have one time.
     """
 
     listing: ClassVar[str] = "dataset.json"

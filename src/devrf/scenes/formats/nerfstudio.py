@@ -24,7 +24,7 @@ from devrf.system.options import Count, Several, abbreviated
 log = logging.getLogger(__name__)
 
 FILE = "transforms.json"
-# The least number of images at time 0 that make a static set: fewer teach no field.
+# The least number of images at time 0 that make a static set.
 _SEVERAL = 3
 
 
@@ -34,26 +34,26 @@ class NerfstudioReader(PosedReader):
 
     The file may lie in ``root``, with a ``time`` in [0, 1] on every frame, or in ``root/static``
     and, with times, in ``root/dynamic``. Without times, or without ``root/dynamic``, the scene is
-    at rest. Cameras may stand still or move. Held-out images are those in ``test_filenames`` (else
+    static. Cameras may be fixed or move. Held-out images are those in ``test_filenames`` (else
     ``val_filenames``), else every ``holdout``-th; beside ``test_filenames``, ``val_filenames`` are
     the validation split. Images are undistorted; the world is that of the file's poses.
 
-    A frame's ``mask_path`` is a grey image of the size of the image or of its camera, black where
-    pixels are left out.
+    A frame's ``mask_path`` is a grey image of the size of the image or of its camera, with black
+    pixels left out.
 
     Attributes:
         train_views: train on the first so many dynamic views; None: all.
         holdout: without lists in the file, one of so many images is held out.
         times: ``file`` takes each frame's ``time``; ``order`` spreads times evenly over the images
-            in the order of their names: of a film that another program has posed.
-        static_until: in one file, the latest time of an image that counts as static; None: 0 where
-            several images are of time 0, else 1.
-        masks: what the masks are taken for. ``ignore``, nerfstudio's meaning: their pixels (people
-            who walk by) are neither learned from nor scored. ``alpha``: they are background, as of
-            a person who was cut out; that also shows where the scene is and where it moves.
-            ``none``: they are left alone.
-        space: as of :class:`~devrf.scenes.reader.PosedReader`; a file of ``stage=capture`` says
-            itself (``scene_bounds``) what ``auto`` is.
+            in the order of their names, for a video that another program posed.
+        static_until: in one file, the latest time of an image that counts as static; None: 0 if
+            several images have time 0, else 1.
+        masks: the meaning of black pixels. ``ignore``, nerfstudio's meaning: they (people who walk
+            by) count neither in training nor in scores. ``alpha``: they are background, as around
+            a person who was cut out; then masks also give the bounds of scene and motion.
+            ``none``: masks are not read.
+        space: as of :class:`~devrf.scenes.reader.PosedReader`; a file of ``stage=capture`` states
+            the value of ``auto`` itself (``scene_bounds``).
     """
 
     stater: ClassVar[str] = f"scene_bounds in {FILE}"
@@ -74,19 +74,19 @@ class NerfstudioReader(PosedReader):
             train, test, validation = self._splits(files, folder / FILE)
             layout = _one_file(train, test, self.static_until)
             if layout.static_train.transforms is not layout.dynamic_train.transforms:
-                validation = validation[_seen_moving(validation)]
+                validation = validation[_dynamic_images(validation)]
         else:
-            still = folder / "static" / FILE
+            static = folder / "static" / FILE
             moving = folder / "dynamic" / FILE
-            train, test, validation = replace(self, times="file")._splits(files, still)
+            train, test, validation = replace(self, times="file")._splits(files, static)
             if os.path.isfile(moving):
-                resting = (train, test)
+                static_pair = (train, test)
                 train, test, validation = self._splits(files, moving)
                 if train.times is None:
                     raise scene_error(
                         moving, 'its frames have no "time"; give every frame its time in [0, 1]'
                     )
-                layout = two_captures(resting, (train, test))
+                layout = two_captures(static_pair, (train, test))
             else:
                 layout = static_alone(train, test, f"there is no dynamic/{FILE}")
         layout = layout.with_validation(validation)
@@ -95,12 +95,12 @@ class NerfstudioReader(PosedReader):
     def _splits(
         self, files: TransformsFiles, file: Path
     ) -> tuple[Transforms, Transforms, Transforms]:
-        """The images of a file to learn from, to test on, and in its validation list, if wanted."""
+        """The training, held-out and validation images of a file, the last if ``validation``."""
         listing, transforms = files.read(file, times_by_order=self.times == "order")
         position = {image: k for k, image in enumerate(transforms.images)}
 
         def listed(key: str) -> set[int]:
-            """Positions of the images that it lists."""
+            """Positions of the images in a list of the file."""
             positions = set[int]()
             for name in getattr(listing, key) or ():
                 image = files.find(name, file)
@@ -131,7 +131,7 @@ class NerfstudioReader(PosedReader):
 
 
 def _one_file(train: Transforms, test: Transforms, static_until: float | None) -> Layout:
-    """The layout of a file that holds the scene at rest and in motion."""
+    """The layout of a file of static and dynamic images."""
     if one_moment(train, test):
         return one_capture(train, test, 1.0)
     times = _times(train)
@@ -140,30 +140,31 @@ def _one_file(train: Transforms, test: Transforms, static_until: float | None) -
         static_until = 0.0 if int(at_zero.sum()) >= _SEVERAL else 1.0
     if static_until > 0 or not bool(at_zero.any()):
         return one_capture(train, test, static_until)
-    still = at_zero.nonzero()[:, 0].tolist()
-    still_test = (_times(test) <= TIME_TOLERANCE).nonzero()[:, 0].tolist()
-    moving = _seen_moving(train)
-    moving_test = _seen_moving(test)
+    static = at_zero.nonzero()[:, 0].tolist()
+    static_test = (_times(test) <= TIME_TOLERANCE).nonzero()[:, 0].tolist()
+    moving = _dynamic_images(train)
+    moving_test = _dynamic_images(test)
     if not moving or not moving_test:
         raise scene_error(
             train.file,
             f"{len(moving)} images to learn motion from and {len(moving_test)} held out; expected "
             "one of each above time 0: correct the times, or train_filenames and test_filenames",
         )
-    rest_test = test
-    if not still_test:
+    static_test_source = test
+    if not static_test:
         log.warning("no held-out image at time 0: the static scene is tested on one in training")
-        still_test = still[:1]
-        rest_test = train
-    log.info("%d images at time 0 are the static set of %d", len(still), len(times))
-    return two_captures((train[still], rest_test[still_test]), (train[moving], test[moving_test]))
+        static_test = static[:1]
+        static_test_source = train
+    log.info("%d images at time 0 are the static set of %d", len(static), len(times))
+    static_pair = (train[static], static_test_source[static_test])
+    return two_captures(static_pair, (train[moving], test[moving_test]))
 
 
-def _seen_moving(transforms: Transforms) -> list[int]:
-    """The images at later times, and those at time 0 by cameras that stay to see more.
+def _dynamic_images(transforms: Transforms) -> list[int]:
+    """The images at later times, and those at time 0 by cameras that also have later ones.
 
-    Other images at time 0 tell nothing of motion, and their many cameras would hide that the
-    others stand still.
+    Other images at time 0 do not show motion, and their many cameras would hide that the others are
+    fixed.
     """
     later = _times(transforms) > TIME_TOLERANCE
     camera = distinct_poses(transforms.poses)
@@ -172,5 +173,5 @@ def _seen_moving(transforms: Transforms) -> list[int]:
 
 
 def _times(transforms: Transforms) -> Tensor:
-    assert transforms.times is not None  # else the scene is at rest
+    assert transforms.times is not None  # else the scene is static
     return torch.tensor(transforms.times)

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from devrf.scenes.files import Positive, entries, scene_folder
-from devrf.scenes.footage import VIDEOS, FilmHeader, Size, chosen, film_header
+from devrf.scenes.footage import VIDEOS, FootageHeader, Size, footage_header, frames_at
 from devrf.scenes.formats.llff_poses import PosedSet, read_static_poses
 from devrf.scenes.image_folders import Downscale
 from devrf.scenes.images import in_threads
@@ -45,28 +45,29 @@ class CameraVideos:
         names: V names, in their order, of the files or folders.
         numbers: V numbers in these names.
         paths: V files, or folders of images.
-        header: what each of them says of itself.
+        header: the stated properties of each.
     """
 
     names: tuple[str, ...]
     numbers: tuple[int, ...]
     paths: tuple[Path, ...]
-    header: FilmHeader
+    header: FootageHeader
 
 
 def camera_videos(folder: Path) -> CameraVideos:
     """The videos in a folder, or folders of their frames; no frames of videos are read yet.
 
-    Where there are both of one number, the video is taken: its frames may be some, or smaller.
-    DevrfError if they are fewer than two, one cannot be read, or they differ in length or size.
+    If there are both of one number, the video is read: the folder may hold fewer, or smaller,
+    frames. DevrfError if they are fewer than two, one cannot be read, or they differ in length or
+    size.
     """
-    places = [
+    paths = [
         path
         for path in entries(folder)
         if _NAME.fullmatch(path.name)
         and (os.path.isfile(path) if path.suffix.lower() in VIDEOS else os.path.isdir(path))
     ]
-    ordered = in_order(places, name=lambda path: path.name, where=folder, by_characters=True)
+    ordered = in_order(paths, name=lambda path: path.name, where=folder, by_characters=True)
     named = {path: int(path.stem[len("cam") :]) for path in ordered}
     filmed = {number for path, number in named.items() if path.suffix}
     numbers = {p: number for p, number in named.items() if p.suffix or number not in filmed}
@@ -81,7 +82,7 @@ def camera_videos(folder: Path) -> CameraVideos:
             "frames, expected 2 or more; set data.root",
         )
     paths = [path / "images" if os.path.isdir(path / "images") else path for path in numbers]
-    headers = [film_header(path) for path in paths]
+    headers = [footage_header(path) for path in paths]
     header = headers[0]
     for path, other in zip(paths, headers, strict=True):
         if other != header or other.frames < 2:
@@ -94,16 +95,14 @@ def camera_videos(folder: Path) -> CameraVideos:
     return CameraVideos(names, tuple(numbers.values()), tuple(paths), header)
 
 
-def _in_words(header: FilmHeader) -> str:
+def _in_words(header: FootageHeader) -> str:
     return f"{header.frames} frames of {header.size[0]}x{header.size[1]} px"
 
 
-def read_frames(
-    paths: Sequence[Path], frames: Sequence[int], filmed: Size, downscale: int
-) -> Tensor:
-    """The chosen ``frames`` (T, ascending) of K videos; no other frames are kept in memory.
+def read_frames(paths: Sequence[Path], frames: Sequence[int], size: Size, downscale: int) -> Tensor:
+    """The ``frames`` (T, ascending) of K videos; other frames are not kept in memory.
 
-    ``filmed`` is their (width, height); sides become floor(side / ``downscale``), by area averages.
+    ``size`` is their (width, height); sides become floor(side / ``downscale``), by area averages.
 
     Returns:
         (T · K, H, W, 3) uint8: all videos at the first frame, then all at the next.
@@ -113,24 +112,24 @@ def read_frames(
     """
     start = time.perf_counter()
     folder = paths[0].parent
-    width, height = reduced_size(filmed[0], filmed[1], downscale, paths[0])
+    width, height = reduced_size(*size, downscale, paths[0])
     shape = (len(frames), len(paths), height, width, 3)
     what = f"{len(frames)} frames of {len(paths)} videos at {width}x{height} px"
     check_memory(math.prod(shape), folder, what)
     pixels = np.empty(shape, dtype=np.uint8)
 
     def fill(column: int) -> None:
-        for row, (frame, picture) in enumerate(chosen(paths[column], frames)):
-            if picture.shape[1::-1] != filmed:
+        for row, (frame, picture) in enumerate(frames_at(paths[column], frames)):
+            if picture.shape[1::-1] != size:
                 raise scene_error(
                     paths[column],
-                    f"frame {frame} is not of {filmed[0]}x{filmed[1]} px; convert the video",
+                    f"frame {frame} is not of {size[0]}x{size[1]} px; convert the video",
                 )
             if downscale != 1:
                 picture = shrink_pixels(picture, width, height)
             pixels[row, column] = picture
 
-    in_threads(fill, range(len(paths)), filmed)
+    in_threads(fill, range(len(paths)), size)
     log.info("read %s from %s in %.1f s", what, folder, time.perf_counter() - start)
     return torch.from_numpy(pixels.reshape(-1, *shape[2:]))
 
@@ -139,16 +138,16 @@ def read_frames(
 class Neural3DVideoReader(SceneReader):
     """Reads ``poses_bounds.npy`` and ``cam00.mp4``, ``cam01.mp4`` … of one length.
 
-    In place of a video there may be a folder of its frames, ``cam00/`` or ``cam00/images/``.
+    A folder of frames, ``cam00/`` or ``cam00/images/``, may replace a video.
 
     Row k of the poses is the camera of the k-th video in the order of names: numbers may be left
-    out. No camera moves. The static set is the first frame of every camera, the dynamic set the
-    chosen frames. World, near plane and space are those of LLFF's scenes
+    out. No camera moves. The static set is the first frame of every camera, the dynamic set all
+    frames that are read. World, near plane and space are those of LLFF's scenes
     (:class:`devrf.scenes.formats.llff.LlffReader`).
 
     Attributes:
         test_view: the number in the name of the video to hold out: 0 is ``cam00.mp4``.
-        length: the first so many frames of each video are the recording; None: all.
+        length: read only so many first frames of each video; None: all.
         frames: keep so many of them, evenly spread, first and last included; None: all.
         near: distance of the near plane from the average camera, in the world's unit; the
             nearest point of the scene is at 1/0.75.
@@ -183,11 +182,11 @@ class Neural3DVideoReader(SceneReader):
             train=_views(videos, posed, train, frames, times, factor),
             test=_views(videos, posed, [test], frames, times, factor),
         )
-        still = moving.mapped(earliest)
-        return forward_facing_scene(self.scene_name, still, moving, self.near, self.background)
+        static = moving.mapped(earliest)
+        return forward_facing_scene(self.scene_name, static, moving, self.near, self.background)
 
     def _split(self, videos: CameraVideos) -> tuple[int, list[int]]:
-        """Positions of the held-out video and of those to learn from."""
+        """Positions of the held-out video and of the training videos."""
         if self.test_view not in videos.numbers:
             raise scene_error(
                 "data.test_view",
@@ -205,10 +204,12 @@ class Neural3DVideoReader(SceneReader):
 
     def _moments(self, videos: CameraVideos) -> tuple[list[int], Tensor]:
         """The frames that are read, ascending, and their times in [0, 1]."""
-        filmed = videos.header.frames
-        total = filmed if self.length is None else self.length
-        if total > filmed:
-            raise scene_error("data.length", f"{total} is more than the {filmed} frames of a video")
+        recorded = videos.header.frames
+        total = recorded if self.length is None else self.length
+        if total > recorded:
+            raise scene_error(
+                "data.length", f"{total} is more than the {recorded} frames of a video"
+            )
         count = total if self.frames is None else min(self.frames, total)
         frames = torch.linspace(0, total - 1, count, dtype=torch.float64).round().long()
         return frames.tolist(), (frames / (total - 1)).float()
@@ -217,21 +218,21 @@ class Neural3DVideoReader(SceneReader):
 def _views(
     videos: CameraVideos,
     posed: PosedSet,
-    chosen: list[int],
+    cameras: list[int],
     frames: list[int],
     times: Tensor,
     factor: int,
 ) -> Views:
-    """All chosen videos at the first frame, then all at the next."""
-    paths = [videos.paths[video] for video in chosen]
+    """The images of ``cameras`` at the first frame, then all at the next."""
+    paths = [videos.paths[video] for video in cameras]
     pixels = read_frames(paths, frames, videos.header.size, factor)
     height, width = pixels.shape[1:3]
-    view = torch.arange(len(chosen)).repeat(len(frames))
-    lenses = [posed.intrinsics[video].lens(width, height, posed.file) for video in chosen]
+    view = torch.arange(len(cameras)).repeat(len(frames))
+    lenses = [posed.intrinsics[video].lens(width, height, posed.file) for video in cameras]
     return Views(
         pixels,
-        pinholes(posed.poses[chosen], lenses, [(width, height)] * len(chosen))[view],
-        times.repeat_interleave(len(chosen)),
+        pinholes(posed.poses[cameras], lenses, [(width, height)] * len(cameras))[view],
+        times.repeat_interleave(len(cameras)),
         view,
-        tuple(f"{videos.names[video]} frame {frame}" for frame in frames for video in chosen),
+        tuple(f"{videos.names[video]} frame {frame}" for frame in frames for video in cameras),
     )
