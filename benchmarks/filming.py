@@ -168,7 +168,7 @@ def _kept(file: Path, cameras: Cameras, times: list[float]) -> np.ndarray:
     """(N, H, W, 3) uint8: what cameras see of the robot in its room, each at its time."""
     if not file.is_file():
         room = ProceduralScene(surroundings="room", texture="fine")
-        film = Filming(room.filmed(), REACH, steps=STEPS, opaque=True)
+        film = Filming(room.visible_shape(), REACH, steps=STEPS, opaque=True)
         shown = [film.pictures(cameras[[k]], time)[0] for k, time in enumerate(times)]
         torch.save(torch.cat(shown), file)
     pixels: Tensor = torch.load(file, weights_only=True)

@@ -85,7 +85,7 @@ def test_views_are_ordered_time_major(built: Built) -> None:
 
 def test_depth_ends_on_the_surface(built: Built) -> None:
     recipe, scene = built
-    shape = recipe.filmed()
+    shape = recipe.visible_shape()
     for views in all_views(scene):
         assert views.depth is not None
         for k, time in enumerate(views.times.tolist()):
@@ -96,7 +96,7 @@ def test_depth_ends_on_the_surface(built: Built) -> None:
 
 def test_flow_is_the_projected_scene_flow(built: Built) -> None:
     recipe, scene = built
-    shape = recipe.filmed()
+    shape = recipe.visible_shape()
     for views in (scene.dynamic.train, scene.dynamic.test):
         assert views.flow is not None and views.depth is not None
         assert not views.flow.valid[views.times == 0].any()
@@ -178,7 +178,7 @@ def test_flow_of_a_hand_held_camera_leads_to_the_same_point_of_the_wall() -> Non
 
 def test_a_pixel_is_covisible_if_five_images_show_its_point_or_half_or_a_tenth() -> None:
     recipe = replace(FORWARD, camera="handheld", frames=2, speed=0.0)
-    surface = recipe.filmed()
+    surface = recipe.visible_shape()
     one = recipe().dynamic.train[torch.tensor([0])]
 
     def learned(count: int, hidden: int) -> Views:
@@ -200,7 +200,7 @@ def test_a_pixel_is_covisible_if_five_images_show_its_point_or_half_or_a_tenth()
 
 def test_a_moving_point_is_covisible_where_it_has_gone() -> None:
     recipe = replace(FORWARD, shape="cushion", camera="handheld", frames=5, width=40, height=30)
-    surface = recipe.filmed()
+    surface = recipe.visible_shape()
     train = recipe().dynamic.train
     first = train[torch.tensor([0])]
     last = train[torch.tensor([4])]
@@ -281,7 +281,7 @@ MAKERS: dict[str, Callable[[], Shape]] = {
     "random": lambda: random_body(3, 1.0, True),
     "loop": lambda: random_body(5),
     "plush": lambda: Surrounded(Plush(2.0), Backdrop()),
-    "hung": lambda: HUNG.filmed(),
+    "hung": lambda: HUNG.visible_shape(),
 }
 each_alone = pytest.mark.parametrize("shape", list(MAKERS)[:4], indirect=True)
 each_shape = pytest.mark.parametrize("shape", MAKERS, indirect=True)
@@ -320,7 +320,7 @@ def test_forward_undoes_the_backward_warp_and_rests_at_zero(shape: Shape, time: 
     assert len(points) > 90
     material = shape.material(points, time)
     torch.testing.assert_close(shape.forward(material, time), points, atol=1e-5, rtol=0)
-    torch.testing.assert_close(shape.forward(material, 0.0), material.rest, atol=2e-6, rtol=0)
+    torch.testing.assert_close(shape.forward(material, 0.0), material.canonical, atol=2e-6, rtol=0)
 
 
 @pytest.mark.parametrize("time", [0.0, 0.6])
@@ -341,7 +341,7 @@ def test_distance_never_exceeds_that_to_a_seen_surface_point(shape: Shape, time:
 @each_alone
 def test_motion_stays_within_the_extent(shape: Body) -> None:
     where = extent(shape)
-    assert where.rest.contains(surface(shape, 0.0)).all()
+    assert where.canonical.contains(surface(shape, 0.0)).all()
     for time in (0.0, 0.6, 1.0):
         points = surface(shape, time)
         assert where.motion.contains(points).all()
@@ -352,19 +352,19 @@ def test_motion_stays_within_the_extent(shape: Body) -> None:
 def test_a_random_body_has_the_size_and_the_motion_that_are_said(seed: int) -> None:
     body = random_body(seed)
     outline = body.outline()
-    size = outline.rest.amax(dim=0) - outline.rest.amin(dim=0)
-    ways = [body.forward(outline, k / 12) - outline.rest for k in range(13)]
+    size = outline.canonical.amax(dim=0) - outline.canonical.amin(dim=0)
+    ways = [body.forward(outline, k / 12) - outline.canonical for k in range(13)]
     picture = 2 * STUDIO.distance * math.tan(STUDIO.field_of_view / 2)
     assert 0.15 <= float(size.max() / picture) ** 2 <= 0.7
     assert 0.09 < float(torch.stack(ways).norm(dim=-1).max() / size.max()) < 0.9
     same, other = random_body.__wrapped__(seed), random_body(seed + 1)
-    torch.testing.assert_close(same.outline().rest, outline.rest)
+    torch.testing.assert_close(same.outline().canonical, outline.canonical)
     assert len(other.parts) != len(body.parts) or other.parts[0].paint != body.parts[0].paint
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_a_hung_body_touches_neither_wall_nor_floor(seed: int) -> None:
-    hung = replace(HUNG, scene_seed=seed).filmed()
+    hung = replace(HUNG, scene_seed=seed).visible_shape()
     assert isinstance(hung, Surrounded) and hung.surroundings.parts == 2
     body = hung.shape
     assert isinstance(body, Assembled) and hung.reach is not None

@@ -65,6 +65,6 @@ class ProceduralDataModule(SceneDataModule):
         train = self.scene.dynamic.train
         wanted = "forward_flow" in priors and train.forward_flow is None
         if self.flow == "exact" and wanted and isinstance(self.recipe, Recipe):
-            flow = exact_flow(self.recipe.filmed(), train, forward=True)
+            flow = exact_flow(self.recipe.visible_shape(), train, forward=True)
             train = replace(train, forward_flow=flow)
             self.replace(replace(scene, dynamic=replace(scene.dynamic, train=train)))

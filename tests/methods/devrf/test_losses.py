@@ -252,7 +252,7 @@ def exact(scene: Scene, recipe: ProceduralScene, frame: int) -> MotionPrediction
         return shape.forward(Material(q, material.part), time)
 
     return MotionPrediction(
-        seen(batch, every, points, material.rest, torch.ones(len(flat))),
+        seen(batch, every, points, material.canonical, torch.ones(len(flat))),
         batch,
         lambda q: at(times[frame], q),
         lambda q: at(times[frame - 1], q),

@@ -143,7 +143,7 @@ def test_exact_surfaces_agree_with_the_priors(
     assert hit.sum() == 6
     distance = torch.where(hit, truth, 1.0)
     output = opaque_surface(placed, batch, distance)
-    shape, world = tiny_recipe.filmed(), batch.rays.at(torch.arange(8), distance)
+    shape, world = tiny_recipe.visible_shape(), batch.rays.at(torch.arange(8), distance)
     moved = shape.forward(shape.material(world, 0.5), 0.0) - world
     flow = output.dynamic.flow.clone()
     flow[:, 1] = torch.where(hit[:, None], moved / placed.placement.half_edge, 0.0)

@@ -1,6 +1,6 @@
 """Bodies assembled from parts that carry each other, and turn, slide, bend, twist and are squashed.
 
-Everything that moves a part can be undone exactly. Lengths in world units, angles in radians.
+All motion of parts can be undone exactly. Lengths in world units, angles in radians.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from devrf.scenes.procedural.flower import Blade
 from devrf.scenes.procedural.motion import Swing, length, rotation, stretch, turn
 from devrf.scenes.procedural.solids import Material, Paint, PaintedParts, Xyz, rounded_box
 
-STILL = Swing(0.0, 1.0, 0.0)
+NO_SWING = Swing(0.0, 1.0, 0.0)
 # The most that a ramp 3u² − 2u³ over the distance u shears, per radian: u · 6u (1 − u) at 2/3.
 BEND_SHEAR = 8 / 9
 # Farther than this from a part's ball, the distance to the part is taken from the ball.
@@ -32,12 +32,12 @@ class Part:
         kind: ``box``, ``capsule``, ``ellipsoid`` or ``blade``.
         half: half edges along its own x, y, z; a blade is thin along y.
         parent: number of the part that carries it, which stands before it; −1 for the world.
-        base: (3,) float64, where it begins at rest, in the world.
-        axes: (3, 3) float64, its axes at rest as columns.
-        hinge: unit axis at rest about which it turns at its base, in the world.
+        base: (3,) float64, its canonical base, in the world.
+        axes: (3, 3) float64, its canonical axes as columns.
+        hinge: unit canonical axis about which it turns at its base, in the world.
         paint: its texture.
         swing: the angle about its hinge.
-        slide: how far it is along its own axis from where it was.
+        slide: its displacement along its own axis.
         bend: the angle at its tip towards its x axis.
         twist: the angle at its tip about its z axis.
         squash: log of its length's factor; its volume stays.
@@ -51,12 +51,12 @@ class Part:
     axes: Tensor
     hinge: Xyz
     paint: Paint
-    swing: Swing = STILL
-    slide: Swing = STILL
-    bend: Swing = STILL
-    twist: Swing = STILL
-    squash: Swing = STILL
-    spin: Swing = STILL
+    swing: Swing = NO_SWING
+    slide: Swing = NO_SWING
+    bend: Swing = NO_SWING
+    twist: Swing = NO_SWING
+    squash: Swing = NO_SWING
+    spin: Swing = NO_SWING
 
     @property
     def along(self) -> float:
@@ -65,16 +65,16 @@ class Part:
 
     @property
     def reach(self) -> float:
-        """Radius of a ball about its base that holds it at rest."""
+        """Radius of a ball about its base that holds its canonical state."""
         return math.hypot(self.along, *self.half[:2])
 
     @property
     def rigid(self) -> bool:
         """Whether it keeps its form: it neither bends, nor twists, nor is squashed."""
-        return {self.bend, self.twist, self.squash} == {STILL}
+        return {self.bend, self.twist, self.squash} == {NO_SWING}
 
     def distance(self, local: Sequence[Tensor]) -> Tensor:
-        """Lower bound (M,) at rest of points (M,), (M,), (M,) in its frame."""
+        """Canonical lower bound (M,) of points (M,), (M,), (M,) in its frame."""
         x, y, z = local
         a, b, c = self.half
         if self.kind == "blade":
@@ -87,7 +87,7 @@ class Part:
         return rounded_box(x, y, z, (a, b, c), rounding)
 
     def deformed(self, local: Sequence[Tensor], speed: float, time: float) -> Sequence[Tensor]:
-        """Where points of its frame are in it at ``time``: spun, squashed, twisted, then bent."""
+        """Points of its frame at ``time``: spun, squashed, twisted, then bent."""
         x, y, z = local
         x, y = turn(x, y, self.spin(speed, time))
         if self.rigid:
@@ -164,20 +164,20 @@ class Assembled:
     def material(self, points: Tensor, time: float) -> Material:
         """The nearest part's material."""
         part = self.distances(points, time).argmin(dim=0)
-        rest = torch.zeros_like(points)
+        canonical = torch.zeros_like(points)
         for k, (own, frame) in enumerate(zip(self.parts, _frames(self, time), strict=True)):
-            chosen = part == k
-            local = own.undeformed(_into(frame, points[chosen]), self.speed, time)
-            rest[chosen] = _out_of(_frames(self, 0.0)[k], local)
-        return Material(rest, part)
+            own_points = part == k
+            local = own.undeformed(_into(frame, points[own_points]), self.speed, time)
+            canonical[own_points] = _out_of(_frames(self, 0.0)[k], local)
+        return Material(canonical, part)
 
     def forward(self, material: Material, time: float) -> Tensor:
         """Each point deformed in its part's frame, which then moves."""
-        points = torch.zeros_like(material.rest)
+        points = torch.zeros_like(material.canonical)
         for k, (own, frame) in enumerate(zip(self.parts, _frames(self, time), strict=True)):
-            chosen = material.part == k
-            local = _into(_frames(self, 0.0)[k], material.rest[chosen])
-            points[chosen] = _out_of(frame, own.deformed(local, self.speed, time))
+            own_points = material.part == k
+            local = _into(_frames(self, 0.0)[k], material.canonical[own_points])
+            points[own_points] = _out_of(frame, own.deformed(local, self.speed, time))
         return points
 
     def color(self, material: Material) -> Tensor:
@@ -200,9 +200,9 @@ def _frames(body: Assembled, time: float) -> tuple[Tensor, ...]:
         slid = part.slide(body.speed, time) * part.axes[:, 2]
         link[:3, 3] = part.base - link[:3, :3] @ part.base + slid
         links.append(link if part.parent < 0 else links[part.parent] @ link)
-    rest = [torch.cat([part.axes, part.base[:, None]], dim=1) for part in body.parts]
+    canonical = [torch.cat([part.axes, part.base[:, None]], dim=1) for part in body.parts]
     corner = torch.tensor([[0.0, 0, 0, 1]], dtype=torch.float64)
-    return tuple((m @ torch.cat([r, corner]))[:3] for m, r in zip(links, rest, strict=True))
+    return tuple((m @ torch.cat([r, corner]))[:3] for m, r in zip(links, canonical, strict=True))
 
 
 def _into(frame: Tensor, points: Tensor) -> tuple[Tensor, ...]:

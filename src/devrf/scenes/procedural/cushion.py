@@ -1,6 +1,6 @@
-"""The cushion: a large thing of fine texture that turns, bends and twists (non-rigid motion).
+"""The cushion: a large body of fine texture that turns, bends and twists (non-rigid motion).
 
-It fills a third of a picture. Structure from motion that takes it for the world is misled.
+It fills a third of a picture. It misleads structure from motion that takes it for the world.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from devrf.scenes.procedural.motion import Swing
 from devrf.scenes.procedural.solids import Material, Paint, Rgb, Xyz
 from devrf.scenes.procedural.surroundings import WAVES, WEAVE, mural
 
-# Where it begins; x right, y up, the cameras look along −z from about the origin.
+# Its base; x right, y up, the cameras look along −z from about the origin.
 BASE: Xyz = (0.0, -0.70, -2.7)
 # Half edges across (x), deep (z) and upright (y).
 HALF: Xyz = (0.78, 0.45, 0.72)
 MIDDLE: Xyz = (BASE[0], BASE[1] + HALF[2], BASE[2])
 # Radius of a ball about the middle that holds it at all times, at speeds of up to 2.
 REACH = 1.6
-# What multiplies the paint of the wall.
+# Factors of the wall's paint.
 _TINT: Rgb = (1.0, 0.72, 0.5)
 # Radians at time 1 and speed 1: it turns by 50 degrees, and its top by 20 more.
 _TURN = Swing(0.87, 1.57, 0.0)
@@ -50,5 +50,5 @@ class Cushion(Assembled):
         super().__init__((part,), speed)
 
     def color(self, material: Material) -> Tensor:
-        """The wall's paint, tinted; it depends on where the material is at rest."""
-        return mural(material.rest, (*WAVES, *WEAVE)) * material.rest.new_tensor(_TINT)
+        """The wall's paint, tinted, at the canonical positions."""
+        return mural(material.canonical, (*WAVES, *WEAVE)) * material.canonical.new_tensor(_TINT)

@@ -1,4 +1,4 @@
-"""A moving shape filmed: posed images at rest and in motion, with exact depth and flow."""
+"""Views of a moving shape: static and dynamic posed images, with exact depth and flow."""
 
 from __future__ import annotations
 
@@ -50,28 +50,28 @@ _MARGIN = 0.04
 
 @dataclass(frozen=True)
 class Extent:
-    """Where a shape is.
+    """The extent of a shape.
 
     Attributes:
-        rest: a cube about the origin that holds the shape at rest.
-        motion: holds the shape at all times in [0, 1].
-        reach: radius of a ball about the origin that does so too, world units.
+        canonical: a cube about the origin that holds the canonical shape.
+        motion: the box of the shape at all times in [0, 1].
+        reach: radius of a ball about the origin that holds it at all times, world units.
     """
 
-    rest: Box
+    canonical: Box
     motion: Box
     reach: float
 
 
 def extent(shape: Body) -> Extent:
-    """Where ``shape`` is, from the paths of the points around its parts."""
+    """The extent of ``shape``, from the paths of the points around its parts."""
     outline = shape.outline()
     times = torch.linspace(0, 1, _TIMES).tolist()
     paths = torch.stack([shape.forward(outline, time) for time in times])
-    half = float(outline.rest.abs().max()) + _MARGIN
+    half = float(outline.canonical.abs().max()) + _MARGIN
     points = paths.reshape(-1, 3)
     return Extent(
-        rest=Box.of([-half] * 3, [half] * 3),
+        canonical=Box.of([-half] * 3, [half] * 3),
         motion=Box.of(points.amin(dim=0) - _MARGIN, points.amax(dim=0) + _MARGIN),
         reach=float(points.norm(dim=-1).max()) + _MARGIN,
     )
@@ -87,8 +87,8 @@ def exact_flow(shape: Shape, views: Views, *, forward: bool = False) -> OpticalF
 
     They may have moved between frames. The point that the ray through a pixel's centre meets is
     carried to the frame before (after) and projected into its camera there; it may be hidden there,
-    or outside of the image. Where the ray meets nothing, and in the first (last) frame, the flow is
-    0 and not valid.
+    or outside of the image. Flow is 0 and not valid for rays that meet nothing, and in the first
+    (last) frame.
     """
     assert views.depth is not None
     times = torch.unique(views.times).tolist()
@@ -114,18 +114,18 @@ def exact_flow(shape: Shape, views: Views, *, forward: bool = False) -> OpticalF
 
 
 # A point is seen well if so many images show it, or a tenth of all if these are more (DyCheck);
-# half of all suffice where there are few.
+# half of all suffice if there are few.
 _SEEN_BY = 5
-# It is the point that an image shows there if it is at most so much farther away, as a share.
+# A point is visible in an image if it is at most so much farther away, as a share.
 _SAME_DEPTH = 0.02
 
 
 def covisible(shape: Shape, views: Views, learned: Views) -> Tensor:
-    """Which pixels of ``views`` show what enough images of ``learned`` show, too: (N, H, W) bool.
+    """Mask (N, H, W) of the pixels of ``views`` whose points enough images of ``learned`` show.
 
-    The point that the ray through a pixel's centre meets is carried to the time of each image that
-    is learned from, and projected into it. What training has hardly seen is not to be scored (Gao
-    et al., *Monocular Dynamic View Synthesis: A Reality Check*, 2022).
+    The point that the ray through a pixel's centre meets is carried to the time of each training
+    image, and projected into it. Points that training hardly saw are not scored (Gao et al.,
+    *Monocular Dynamic View Synthesis: A Reality Check*, 2022).
     """
     assert views.depth is not None and learned.depth is not None
     needed = min(max(_SEEN_BY, len(learned) // 10), math.ceil(len(learned) / 2))
@@ -142,24 +142,24 @@ def covisible(shape: Shape, views: Views, learned: Views) -> Tensor:
             pixels, ahead = learned.cameras.project_into(image, there)
             inside = (ahead > 0) & ((pixels >= 0) & (pixels < size)).all(dim=-1)
             column, row = pixels.clamp(min=torch.zeros(2), max=size - 1).long().unbind(-1)
-            shown = learned.depth[image][row, column]
+            depth = learned.depth[image][row, column]
             away = (there - learned.cameras.positions[image]).norm(dim=-1)
-            count += inside & (away <= (1 + _SAME_DEPTH) * shown)
+            count += inside & (away <= (1 + _SAME_DEPTH) * depth)
         masks[k].view(-1)[met] = count >= needed
     return masks
 
 
 @dataclass(frozen=True)
 class Filming:
-    """What is filmed, and how.
+    """A shape and the settings of its views.
 
     Attributes:
-        shape: what all cameras see, from outside of it.
+        shape: the shape; all cameras are outside of it.
         reach: radius of a ball about the origin that holds the shape at all times, world units.
         supersample: n: colour and alpha are the mean of n × n rays a pixel.
         light: share of the lamp in the lighting, 0 (albedo alone) … 1.
-        steps: after how many steps a ray counts as a miss.
-        opaque: whether every ray meets something, so that the images need no alpha.
+        steps: the number of steps after which a ray counts as a miss.
+        opaque: whether every ray meets a surface, so that the images need no alpha.
     """
 
     shape: Shape
@@ -169,7 +169,7 @@ class Filming:
     steps: int = MAX_STEPS
     opaque: bool = False
 
-    def at_rest(self, train: Cameras, test: Cameras) -> Capture:
+    def static(self, train: Cameras, test: Cameras) -> Capture:
         """One image from each camera at time 0."""
         pixels, depth = self.pictures(train.joined(test), 0.0)
         count = len(train)
@@ -178,31 +178,33 @@ class Filming:
             test=_each(test, pixels[count:], depth[count:], torch.zeros(len(test)), "static test"),
         )
 
-    def moving(
+    def dynamic(
         self, train: Cameras, test: Cameras, frames: int, unseen: Sequence[int] = ()
     ) -> Capture:
         """All fixed cameras at frame 0, then all at frame 1, …, with the exact backward flow.
 
-        There are ``frames`` ≥ 2 frames, at times k / (T − 1); the cameras to learn from leave out
-        those in ``unseen``.
+        There are ``frames`` ≥ 2 frames, at times k / (T − 1); the training cameras leave out those
+        in ``unseen``.
         """
         everyone = train.joined(test)
         times = torch.arange(frames) / (frames - 1)
         pixels, depth = self._shot([everyone] * frames, times)
-        seen = [frame for frame in range(frames) if frame not in unseen]
+        learned = [frame for frame in range(frames) if frame not in unseen]
         count = len(train)
-        views = _moving(train, pixels[seen, :count], depth[seen, :count], times, seen, "train")
+        views = _moving(
+            train, pixels[learned, :count], depth[learned, :count], times, learned, "train"
+        )
         others = _moving(test, pixels[:, count:], depth[:, count:], times, range(frames), "test")
         return Capture(
             train=replace(views, flow=exact_flow(self.shape, views)),
             test=replace(others, flow=exact_flow(self.shape, others)),
         )
 
-    def by_hand(self, camera: Cameras, others: Cameras) -> Capture:
-        """What one moving camera films, with the exact backward flow, and others to test on.
+    def handheld(self, camera: Cameras, others: Cameras) -> Capture:
+        """The video of one moving camera, with the exact backward flow, and held-out views.
 
-        ``camera`` is where it is at each of T ≥ 2 frames, at times k / (T − 1); ``others`` has
-        another view at each of them, of which only what is :func:`covisible` is scored.
+        ``camera`` has its pose at each of T ≥ 2 frames, at times k / (T − 1); ``others`` has
+        another view at each of them, of which only :func:`covisible` pixels are scored.
         """
         times = torch.arange(len(camera)) / (len(camera) - 1)
         pairs = [camera[[k]].joined(others[[k]]) for k in range(len(camera))]
@@ -273,19 +275,19 @@ def _moving(
     pixels: Tensor,
     depth: Tensor,
     times: Tensor,
-    shown: Sequence[int],
+    frames: Sequence[int],
     split: str,
 ) -> Views:
-    view = torch.arange(len(cameras)).repeat(len(shown))
+    view = torch.arange(len(cameras)).repeat(len(frames))
     names = (
         f"dynamic {split} frame {frame:03d} view {v}"
-        for frame in shown
+        for frame in frames
         for v in range(len(cameras))
     )
     return Views(
         pixels.flatten(0, 1),
         cameras[view],
-        times[list(shown)].repeat_interleave(len(cameras)),
+        times[list(frames)].repeat_interleave(len(cameras)),
         view,
         tuple(names),
         depth=depth.flatten(0, 1),

@@ -63,10 +63,10 @@ class Blade:
 
 @dataclass(frozen=True)
 class Leaf:
-    """A leaf on the stem, at rest; lengths in world units, angles in radians.
+    """A leaf on the canonical stem; lengths in world units, angles in radians.
 
     Attributes:
-        height: where it leaves the stem.
+        height: its height on the stem.
         azimuth: direction in which it points.
         elevation: angle above the horizon.
         blade: its shape.
@@ -86,13 +86,13 @@ class Whorl:
 
     A petal curls in the plane of the blossom's axis and its own: each point turns about the
     hinge by an angle that depends on its distance ρ from the hinge in that plane. Lengths in
-    world units, angles in radians; ``opening`` arguments are 0 at rest and 1 when open.
+    world units, angles in radians; ``opening`` arguments are 0 canonically and 1 when open.
 
     Attributes:
         first_part: part number of petal 0; the others follow.
         count: number of petals.
         hinge: distance of the hinges from the blossom's axis.
-        elevation: angle above the horizon at which the petals stand at rest.
+        elevation: canonical angle of the petals above the horizon.
         opening: by how much their tips turn downward when open.
         blade: a petal's shape.
         paints: textures of the petals with even and with odd numbers.
@@ -122,9 +122,9 @@ class Whorl:
         shear = abs(self.opening * opening) * (1 - _AT_HINGE)
         return self.blade.distance(x, y, z) / stretch(shear)
 
-    def curled(self, rest: Tensor, petal: Tensor, opening: float) -> Tensor:
-        """Rest points (M, 3) of the petals (M,), opened; the opposite opening undoes it."""
-        x, y, z = self._at_hinge(rest, petal)
+    def curled(self, points: Tensor, petal: Tensor, opening: float) -> Tensor:
+        """Points (M, 3) of the petals (M,), opened; the opposite opening undoes it."""
+        x, y, z = self._at_hinge(points, petal)
         x, z = self._curl(x, z, opening)
         x, y = turn(x + self.hinge, y, self._azimuth(petal, x))
         return torch.stack([x, y, z + HEAD], dim=-1)
@@ -202,8 +202,8 @@ STEM_PAINT = Paint(LEAF_GREEN, SPRING, (0, 0, 0.24), 0.0)
 HEART_PAINT = Paint(BROWN, GOLD, (0.14, 0.14, 0), 0.2, 5)
 
 
-# Where along the distance from the stem's base bending and twisting build up: nothing below,
-# one rigid turn above, which leaves the blossom undistorted.
+# The distances from the stem's base between which bending and twisting build up: no turn below, one
+# rigid turn above, which leaves the blossom undistorted.
 _RAMP = (0.05, 0.85)
 _BENDING = Bending(_RAMP, ((0, 1, Swing(0.6, 1.4, -0.4)), (2, 0, Swing(0.66, 1.2, -0.1))))
 _OPENING = Swing(1.0, 1.7, -0.5)
@@ -246,26 +246,28 @@ class Flower:
     speed: float = 1.0
 
     def distance(self, points: Tensor, time: float) -> Tensor:
-        """A lower bound (M,): distances at rest over the most that the motion stretches."""
+        """A lower bound (M,): canonical distances over the largest stretch of the motion."""
         return self._distances(points, self._unbent(points, time), time).amin(dim=0)
 
     def material(self, points: Tensor, time: float) -> Material:
         """The nearest part's material: unbent, and for a petal uncurled."""
-        rest = self._unbent(points, time)
-        kind = self._distances(points, rest, time).argmin(dim=0)
+        canonical = self._unbent(points, time)
+        kind = self._distances(points, canonical, time).argmin(dim=0)
         part = kind.clone()
-        rest = torch.where((kind == POT)[:, None], points, rest)
+        canonical = torch.where((kind == POT)[:, None], points, canonical)
         opening = _OPENING(self.speed, time)
         for own_kind, whorl in enumerate(WHORLS, start=FIRST_PETAL):
             own = kind == own_kind
-            petal = whorl.nearest(rest)
+            petal = whorl.nearest(canonical)
             part = torch.where(own, whorl.first_part + petal, part)
-            rest = torch.where(own[:, None], whorl.curled(rest, petal, -opening), rest)
-        return Material(rest, part)
+            canonical = torch.where(
+                own[:, None], whorl.curled(canonical, petal, -opening), canonical
+            )
+        return Material(canonical, part)
 
     def forward(self, material: Material, time: float) -> Tensor:
         """Curl, then bend and twist; the pot stays."""
-        points = material.rest
+        points = material.canonical
         opening = _OPENING(self.speed, time)
         for whorl in WHORLS:
             petal = material.part - whorl.first_part
@@ -274,7 +276,7 @@ class Flower:
             points = torch.where(own[:, None], curled, points)
         base = points.new_tensor(_BASE)
         moved = _BENDING.bent(points - base, self.speed, time) + base
-        return torch.where((material.part == POT)[:, None], material.rest, moved)
+        return torch.where((material.part == POT)[:, None], material.canonical, moved)
 
     def color(self, material: Material) -> Tensor:
         """The parts' paints."""

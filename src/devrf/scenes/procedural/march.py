@@ -27,13 +27,13 @@ def trace(
     """Distance (M,) along each ray to the surface at ``time``, +inf where it meets none.
 
     Args:
-        shape: what to meet.
+        shape: the shape to meet.
         rays: M rays from outside of the shape, world units.
         time: in [0, 1].
-        start: (M,) distances before which nothing is; +inf for a ray known to miss.
+        start: (M,) distances up to which rays are free; +inf for a ray known to miss.
         reach: radius of a ball about the origin that holds the shape at ``time``.
-        steps: a ray that has met nothing after so many counts as a miss; if every ray meets
-            something, many are needed so that none is missed.
+        steps: a ray that has met nothing after so many counts as a miss; if every ray meets a
+            surface, many are needed so that none is missed.
     """
     result = torch.full_like(start, math.inf)
     entry, leave = _ball_crossing(rays, reach)
@@ -60,7 +60,7 @@ def trace(
 
 
 def block_starts(shape: Shape, cameras: Cameras, time: float, reach: float) -> Tensor:
-    """Distances (N, H, W) before which no ray through a pixel meets the shape; +inf: never.
+    """Free distances (N, H, W) of all rays through each pixel; +inf: they miss the shape.
 
     A cone around a block of pixels, of angle θ, holds all its rays: at distance s they are within
     s·θ of its axis. From a free point at distance d to the surface all of them may go on to (s + d)
@@ -89,7 +89,7 @@ def block_starts(shape: Shape, cameras: Cameras, time: float, reach: float) -> T
 def _march_cones(
     shape: Shape, axes: Rays, time: float, entry: Tensor, leave: Tensor, theta: float
 ) -> Tensor:
-    """How far (M,) cones of angle ``theta`` are free, from ``entry`` on; +inf beyond ``leave``."""
+    """Free distance (M,) of cones of angle ``theta``, from ``entry`` on; +inf beyond ``leave``."""
     result = torch.full_like(entry, math.inf)
     active = torch.arange(len(entry))
     distance = entry.clamp_min(0)
@@ -104,7 +104,7 @@ def _march_cones(
         keep = (~near & (onward < leave[active])).nonzero().squeeze(-1)
         active = active[keep]
         distance = onward[keep]
-    # If a cone still creeps along a silhouette, its rays start where it is.
+    # The rays of a cone that still creeps along a silhouette start at its position.
     result[active] = distance
     return result
 

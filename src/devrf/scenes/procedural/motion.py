@@ -2,7 +2,7 @@
 
 A rotation about a point by an angle that depends only on the distance from that point keeps
 that distance; so it is undone exactly by the opposite angle at the same distance. It shears
-space, and :func:`stretch` says by how much at most it lengthens anything.
+space; :func:`stretch` is the largest factor by which it lengthens anything.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class Bending:
         self._shear = float((rho * 6 * u * (1 - u) / (end - start)).max())
 
     def bent(self, points: Tensor, speed: float, time: float) -> Tensor:
-        """Where rest points (M, 3) are at ``time``."""
+        """Canonical points (M, 3) at ``time``."""
         return self._turned(points, [(a, b, swing(speed, time)) for a, b, swing in self._turns])
 
     def unbent(self, points: Tensor, speed: float, time: float) -> Tensor:
@@ -97,7 +97,7 @@ class Bending:
         return self._turned(points, [(a, b, -swing(speed, time)) for a, b, swing in back])
 
     def stretch(self, speed: float, time: float) -> float:
-        """The most by which bending, or undoing it, lengthens anything."""
+        """The largest factor by which bending, or undoing it, lengthens anything."""
         angles = sum(abs(swing(speed, time)) for _, _, swing in self._turns)
         return stretch(angles * self._shear)
 

@@ -11,9 +11,9 @@ from torch import Tensor
 from devrf.scenes.procedural.motion import Bending, Swing
 from devrf.scenes.procedural.solids import Material, Paint, Rgb, Solid, SolidTable, Xyz
 
-# Where the toy stands: x right, y up, the cameras look along −z from about the origin.
+# The toy's base: x right, y up, the cameras look along −z from about the origin.
 BASE: Xyz = (0.0, -0.72, -2.6)
-# Radius of a ball about the base that holds the toy at rest.
+# Radius of a ball about the base that holds the canonical toy.
 REACH = 1.5
 
 
@@ -49,8 +49,8 @@ SOLIDS = (
 )
 
 
-# Twisting and bending build up from the toy's base: the feet stand still, ears and head turn
-# as one.
+# Twisting and bending build up from the toy's base: the feet do not move, ears and head turn as
+# one.
 _BENDING = Bending((0.3, 1.15), ((2, 0, Swing(0.45, 2.0, 0.0)), (0, 1, Swing(0.30, 3.0, -0.5))))
 # Logarithm of the height's factor: it is squashed first and stretched later.
 _SQUASH = Swing(-0.12, 4.0, 0.0)
@@ -72,7 +72,7 @@ class Plush:
     speed: float = 1.0
 
     def distance(self, points: Tensor, time: float) -> Tensor:
-        """A lower bound (M,): distances at rest over the most that the motion stretches.
+        """A lower bound (M,): canonical distances over the largest stretch of the motion.
 
         Far from the toy it is the distance to a ball around it, which is cheap.
         """
@@ -80,8 +80,8 @@ class Plush:
         reach = self.reach(time)
         ball: Tensor = (points - base).norm(dim=-1) - reach
         near = (ball < 0.1 * reach).nonzero().squeeze(-1)
-        local = self._at_rest(points[near] - base, time)
-        # Back to rest, lengths grow by no more than 1/s up and √s across.
+        local = self._canonical(points[near] - base, time)
+        # Lengths grow by no more than 1/s up and √s across, back to the canonical state.
         height = self._height(time)
         longer = _BENDING.stretch(self.speed, time) * max(1 / height, math.sqrt(height))
         ball[near] = 1 / longer * TABLE.distances_of(local).amin(dim=0)
@@ -90,14 +90,14 @@ class Plush:
     def material(self, points: Tensor, time: float) -> Material:
         """The nearest solid's material."""
         base = points.new_tensor(BASE)
-        local = self._at_rest(points - base, time)
+        local = self._canonical(points - base, time)
         return Material(local + base, TABLE.distances_of(local).argmin(dim=0))
 
     def forward(self, material: Material, time: float) -> Tensor:
         """Squash, then bend and twist, all about the base."""
-        base = material.rest.new_tensor(BASE)
+        base = material.canonical.new_tensor(BASE)
         height = self._height(time)
-        x, y, z = (material.rest - base).unbind(-1)
+        x, y, z = (material.canonical - base).unbind(-1)
         squashed = torch.stack([x / math.sqrt(height), y * height, z / math.sqrt(height)], dim=-1)
         return _BENDING.bent(squashed, self.speed, time) + base
 
@@ -111,11 +111,11 @@ class Plush:
         return REACH * max(height, 1 / math.sqrt(height))
 
     def _height(self, time: float) -> float:
-        """s: how high the toy is, relative to rest."""
+        """s: the toy's height, relative to the canonical one."""
         return math.exp(_SQUASH(self.speed, time))
 
-    def _at_rest(self, local: Tensor, time: float) -> Tensor:
-        """Rest positions (M, 3) of points (M, 3), both relative to the base."""
+    def _canonical(self, local: Tensor, time: float) -> Tensor:
+        """Canonical positions (M, 3) of points (M, 3), both relative to the base."""
         height = self._height(time)
         x, y, z = _BENDING.unbent(local, self.speed, time).unbind(-1)
         wide = math.sqrt(height)

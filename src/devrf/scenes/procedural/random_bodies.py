@@ -1,8 +1,8 @@
 """Bodies drawn at random, each from a number: scenes that no setting was chosen for.
 
 A chain, a tree or a loop of boxes, capsules, ellipsoids and blades, thick and thin. Parts turn on
-what carries them, or slide away from it along their own axis; those that carry none may bend, twist
-or be squashed, too.
+the part that carries them, or slide away from it along their own axis; parts that carry none may
+bend, twist or be squashed, too.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from devrf.scenes.procedural.assembled import STILL, Assembled, Part
+from devrf.scenes.procedural.assembled import NO_SWING, Assembled, Part
 from devrf.scenes.procedural.filming import extent
 from devrf.scenes.procedural.motion import Swing
 from devrf.scenes.procedural.rigs import STUDIO
@@ -30,19 +30,19 @@ ENTERED = 0.02
 # The share of a picture that the square around a body covers.
 MIN_COVERED = 0.15
 MAX_COVERED = 0.7
-# How far the point goes that moves most, as a share of the body's longest edge at rest.
+# Displacement of the point that moves most, as a share of the body's longest canonical edge.
 MIN_MOVED = 0.1
 MAX_MOVED = 0.8
-# How round parts turn about themselves where texture slides.
+# The spin of round parts if texture slides.
 SPIN = Swing(1.5, 1.2, 0.0)
 TIMES = tuple(k / 12 for k in range(13))
 
 
 @lru_cache(maxsize=32)
 def random_body(seed: int, speed: float = 1.0, sliding: bool = False) -> Assembled:
-    """The body that a ``seed`` gives: the one drawn whose parts enter each other the least.
+    """The body of a ``seed``: among those drawn, the one whose parts enter each other the least.
 
-    ``sliding``: round parts spin, so that their texture slides over a silhouette that stays.
+    ``sliding``: round parts spin, so that their texture slides over a fixed silhouette.
     """
     best = Assembled(())
     least = math.inf
@@ -59,7 +59,7 @@ def random_body(seed: int, speed: float = 1.0, sliding: bool = False) -> Assembl
         if least < ENTERED:
             break
     round_parts = [part.half[0] == part.half[1] and part.kind != "box" for part in best.parts]
-    spins = (SPIN if sliding and is_round else STILL for is_round in round_parts)
+    spins = (SPIN if sliding and is_round else NO_SWING for is_round in round_parts)
     spinning = (replace(part, spin=spin) for part, spin in zip(best.parts, spins, strict=True))
     return Assembled(tuple(spinning), speed)
 
@@ -152,9 +152,9 @@ def _fitted(parts: Sequence[Part], covers: float, moves: float) -> Assembled:
     motion = 1.0
     for _ in range(6):
         body = Assembled(tuple(_scaled(part, 1.0, motion) for part in parts))
-        rest, paths = _paths(body)
-        edge = float((rest.amax(dim=0) - rest.amin(dim=0)).max())
-        went = float((paths - rest).norm(dim=-1).max())
+        canonical, paths = _paths(body)
+        edge = float((canonical.amax(dim=0) - canonical.amin(dim=0)).max())
+        went = float((paths - canonical).norm(dim=-1).max())
         motion *= min(max(moves * edge / max(went, 1e-6), 0.3), 2.0)
     points = paths.reshape(-1, 3)
     middle = (points.amin(dim=0) + points.amax(dim=0)) / 2
@@ -169,7 +169,7 @@ def _scaled(part: Part, size: float, motion: float) -> Part:
     moving: dict[str, Any] = {
         name: replace(swing, amplitude=motion * swing.amplitude)
         for name in ("swing", "bend", "twist", "squash")
-        if (swing := getattr(part, name)) is not STILL
+        if (swing := getattr(part, name)) is not NO_SWING
     }
     slide = replace(part.slide, amplitude=size * motion * part.slide.amplitude)
     a, b, c = part.half
@@ -179,19 +179,19 @@ def _scaled(part: Part, size: float, motion: float) -> Part:
 
 
 def _paths(body: Assembled) -> tuple[Tensor, Tensor]:
-    """The points (M, 3) around the parts at rest, and at all times (T, M, 3)."""
+    """The canonical points (M, 3) around the parts, and those at all times (T, M, 3)."""
     outline = body.outline()
-    return outline.rest, torch.stack([body.forward(outline, time) for time in TIMES])
+    return outline.canonical, torch.stack([body.forward(outline, time) for time in TIMES])
 
 
 def _entered(body: Assembled) -> float:
-    """The share of the parts' axes that goes into a part it was not in at rest."""
+    """The share of the parts' axes that enters a part which it is not in canonically."""
     share = torch.linspace(0, 1, 9, dtype=torch.float64)
     axes = [part.base + share[:, None] * part.along * part.axes[:, 2] for part in body.parts]
     part = torch.arange(len(axes)).repeat_interleave(len(share))
-    rest = torch.cat(axes).float()
-    material = Material(rest, part)
-    before = body.distances(rest, 0.0) < 0
+    canonical = torch.cat(axes).float()
+    material = Material(canonical, part)
+    before = body.distances(canonical, 0.0) < 0
     inside = [
         (body.distances(body.forward(material, time), time) < 0) & ~before for time in TIMES[::3]
     ]

@@ -1,4 +1,4 @@
-"""The procedural scenes: the numbers that each is made from, and how it is rendered."""
+"""The procedural scenes: their numbers and their rendering."""
 
 from __future__ import annotations
 
@@ -53,16 +53,16 @@ class Recipe(Options, ABC):
     Attributes:
         width: image width in pixels.
         height: image height in pixels.
-        static_views: training views of the scene at rest.
-        train_views: fixed cameras that watch the scene move (V); one more is held out.
+        static_views: training views of the static scene.
+        train_views: fixed cameras of the moving scene (V); one more is held out.
         frames: number of frames T, at times k / (T − 1).
-        speed: scales how far everything moves; 0 is still.
+        speed: scales all displacements; 0 is no motion.
         supersample: n × n rays a pixel.
-        light: share of the lamp in the lighting, 0 … 1: how much motion changes the colours.
-        scene_seed: of ``shape`` ``random``: which body.
-        sliding: whether its round parts spin, so that texture slides over a still silhouette.
-        novel_times_every: n: every n-th frame is seen by the held-out camera alone, the last
-            frame excepted; None: all frames are learned from.
+        light: share of the lamp in the lighting, 0 … 1: with more, motion changes colours more.
+        scene_seed: of the body of ``shape`` ``random``.
+        sliding: whether its round parts spin, so that texture slides over a fixed silhouette.
+        novel_times_every: n: only the held-out camera has every n-th frame, except the last one;
+            None: all frames are training frames.
 
     Raises:
         DevrfError: a number is out of range; the message names it.
@@ -93,7 +93,7 @@ class Recipe(Options, ABC):
 
     @property
     def unseen_frames(self) -> list[int]:
-        """The frames that are not learned from."""
+        """The frames that are not training frames."""
         if self.novel_times_every is None:
             return []
         _, held_out = every_nth(self.frames, self.novel_times_every)
@@ -104,8 +104,8 @@ class Recipe(Options, ABC):
         """Render everything."""
 
     @abstractmethod
-    def filmed(self) -> Shape:
-        """All that the cameras see, for exact answers at any point and time."""
+    def visible_shape(self) -> Shape:
+        """All that the cameras see, exact at any point and time."""
 
 
 @dataclass(frozen=True)
@@ -114,10 +114,10 @@ class ProceduralScene(Recipe):
 
     Attributes:
         shape: ``robot`` (rigid parts, large fast motion), ``flower`` (non-rigid), or ``random``.
-        static_test_views: held-out views of the scene at rest.
+        static_test_views: held-out views of the static scene.
         surroundings: ``none``: the images have alpha masks; ``room``: the object stands in a
             furnished room, filmed from inside it, and the images have none.
-        texture: how the room is painted: ``soft``, or ``fine`` for images of about 240 pixels or
+        texture: the room's paint: ``soft``, or ``fine`` for images of about 240 pixels or
             more, in which no place looks like another.
     """
 
@@ -133,7 +133,7 @@ class ProceduralScene(Recipe):
         where = extent(self.model())
         inside = self.surroundings == "room"
         rig = HAND_HELD if inside else STUDIO
-        surface = self.filmed()
+        surface = self.visible_shape()
         learned, tested = static_rig(
             self.static_views,
             self.static_test_views,
@@ -145,17 +145,17 @@ class ProceduralScene(Recipe):
         watching, unseen = dynamic_rig(
             self.train_views, width=self.width, height=self.height, reach=where.reach, rig=rig
         )
-        film = Filming(surface, where.reach, self.supersample, self.light)
+        filming = Filming(surface, where.reach, self.supersample, self.light)
         if inside:
-            film = Filming(surface, REACH, self.supersample, self.light, STEPS, opaque=True)
-        static = film.at_rest(learned, tested)
-        dynamic = film.moving(watching, unseen, self.frames, self.unseen_frames)
+            filming = Filming(surface, REACH, self.supersample, self.light, STEPS, opaque=True)
+        static = filming.static(learned, tested)
+        dynamic = filming.dynamic(watching, unseen, self.frames, self.unseen_frames)
         if inside:
             everyone = [static.train, static.test, dynamic.train, dynamic.test]
             space, bounds = inward_space("auto", static.train, dynamic.train, everyone)
             return Scene(f"{self.shape}_room", "inward", static, dynamic, bounds, "white", space)
         bounds = Bounds(
-            box=where.rest,
+            box=where.canonical,
             near=rig.distance - where.reach,
             far=rig.distance + where.reach,
             motion=where.motion,
@@ -164,7 +164,7 @@ class ProceduralScene(Recipe):
         )
         return Scene(self.shape, "inward", static, dynamic, bounds, "white")
 
-    def filmed(self) -> Shape:
+    def visible_shape(self) -> Shape:
         """The moving shape, in its room if there is one."""
         shape = self.model()
         if self.surroundings == "none":
@@ -185,11 +185,11 @@ _REACH = 9.0
 # One static view in so many is held out, the first one included, as readers of LLFF do.
 HOLDOUT = 8
 NEAR = 1.0
-# Where a random body hangs, and the radius of a ball that it does not leave, so that it touches
+# The position of a random body, and the radius of a ball that it does not leave, so that it touches
 # neither wall nor floor.
 _HANGS = (0.0, 0.0, -2.6)
 _STAYS_WITHIN = 1.1
-# The contrast of the wall behind the cushion: features are found on the cushion, above all.
+# The contrast of the wall behind the cushion: most features are on the cushion.
 _PALE = 0.3
 
 
@@ -202,12 +202,12 @@ class ProceduralForwardScene(Recipe):
     ``static_views`` to learn from there are held-out ones, one in eight of all.
 
     Attributes:
-        shape: ``plush`` (the toy), ``cushion`` (a large, finely painted thing that fills a third of
+        shape: ``plush`` (the toy), ``cushion`` (a large, finely painted body that fills a third of
             the picture), or ``random``.
         camera: ``fixed``: a static set, and fixed cameras; ``handheld``: one camera that moves
             while the scene does, and at each time another view, held out; then there is no static
             set, and ``static_views`` and ``train_views`` are not used.
-        texture: how wall and floor are painted: ``soft``, or ``fine`` for images of about 240
+        texture: the paint of wall and floor: ``soft``, or ``fine`` for images of about 240
             pixels or more, in which it has waves of five to twelve pixels.
     """
 
@@ -222,34 +222,36 @@ class ProceduralForwardScene(Recipe):
     @one_thread()
     def __call__(self) -> Scene:
         """Render everything."""
-        film = Filming(self.filmed(), _REACH, self.supersample, self.light, STEPS, opaque=True)
+        filming = Filming(
+            self.visible_shape(), _REACH, self.supersample, self.light, STEPS, opaque=True
+        )
         name = {"random": "random_forward"}.get(self.shape, self.shape)
         if self.camera == "handheld":
-            one, others = hand_held_rig(self.frames, width=self.width, height=self.height)
-            film_by_hand = film.by_hand(one, others)
-            return self._scene(f"{name}_by_hand", film_by_hand, film_by_hand)
-        # Seven of each eight views are learned from.
+            camera, others = hand_held_rig(self.frames, width=self.width, height=self.height)
+            video = filming.handheld(camera, others)
+            return self._scene(f"{name}_by_hand", video, video)
+        # Seven of each eight views are training views.
         held_out = -(-self.static_views // (HOLDOUT - 1))
-        static = facing_static_rig(
+        cameras = facing_static_rig(
             self.static_views + held_out, width=self.width, height=self.height
         )
-        order = torch.arange(len(static))
-        learned = static[order % HOLDOUT != 0]
-        tested = static[order % HOLDOUT == 0]
+        order = torch.arange(len(cameras))
+        learned = cameras[order % HOLDOUT != 0]
+        tested = cameras[order % HOLDOUT == 0]
         watching, unseen = facing_dynamic_rig(
             self.train_views, width=self.width, height=self.height
         )
-        at_rest = film.at_rest(learned, tested)
-        moving = film.moving(watching, unseen, self.frames, self.unseen_frames)
-        return self._scene(name, at_rest, moving)
+        static = filming.static(learned, tested)
+        dynamic = filming.dynamic(watching, unseen, self.frames, self.unseen_frames)
+        return self._scene(name, static, dynamic)
 
-    def _scene(self, name: str, at_rest: Capture, moving: Capture) -> Scene:
-        space = reference_space(at_rest.train.cameras, NEAR)
+    def _scene(self, name: str, static: Capture, dynamic: Capture) -> Scene:
+        space = reference_space(static.train.cameras, NEAR)
         source = "all that the cameras see (procedural scene)"
-        bounds = forward_bounds([at_rest.train, moving.train], space, source)
-        return Scene(name, "forward", at_rest, moving, bounds, "white", space)
+        bounds = forward_bounds([static.train, dynamic.train], space, source)
+        return Scene(name, "forward", static, dynamic, bounds, "white", space)
 
-    def filmed(self) -> Shape:
+    def visible_shape(self) -> Shape:
         """The moving shape and its stage."""
         weave = self.texture == "fine"
         if self.shape == "plush":

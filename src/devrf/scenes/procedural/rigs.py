@@ -1,4 +1,4 @@
-"""Camera rigs, around the origin or facing one side: many at rest, a few that watch it move."""
+"""Camera rigs, around the origin or facing one side: many static views, a few dynamic ones."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from devrf.geometry.poses import average_pose, relative_to
 
 @dataclass(frozen=True)
 class Rig:
-    """How cameras stand around the origin.
+    """A rig of cameras around the origin.
 
     Attributes:
         distance: from the origin, world units.
@@ -31,7 +31,7 @@ class Rig:
 
 # As in NeRF's synthetic scenes.
 STUDIO = Rig(distance=4.0, field_of_view=0.69, lowest=-0.3, highest=0.95)
-# A phone in the hand of someone who walks around: above the floor, and a wider lens.
+# A phone in the hand of a walking person: above the floor, and a wider lens.
 HAND_HELD = Rig(distance=3.4, field_of_view=0.96, lowest=0.05, highest=0.75)
 _FIRST_AZIMUTH = math.radians(-60)
 _ELEVATIONS = (math.radians(22), math.radians(34))
@@ -66,7 +66,7 @@ def dynamic_rig(
     low, high = _ELEVATIONS
     elevation = torch.where(index % 2 == 0, low, high).double()
     cameras = _around(_FIRST_AZIMUTH + step * index, elevation, width, height, reach, rig)
-    # A lone camera sees one side only: then the held-out one stays on that side.
+    # A lone camera sees one side only: the held-out one is on that side, too.
     azimuth = torch.tensor([_FIRST_AZIMUTH + min(step / 2, math.pi / 4)], dtype=torch.float64)
     elevation = torch.full_like(azimuth, _TEST_ELEVATION)
     return cameras, _around(azimuth, elevation, width, height, reach, rig)
@@ -88,8 +88,8 @@ def _around(
 
 
 FIELD_OF_VIEW = 1.05  # radians across the image's longer side
-# Half axes (x, y) of the ellipse of static cameras and of that of the fixed dynamic ones; all
-# look at one point on the −z axis. World units.
+# Half axes (x, y) of the ellipse of static cameras and of that of the fixed dynamic ones; all look
+# at one point on the −z axis. World units.
 _STATIC = (0.45, 0.24)
 _DYNAMIC = (0.36, 0.18)
 _HELD_OUT = (0.07, -0.04)
@@ -118,16 +118,16 @@ def facing_dynamic_rig(train: int, *, width: int, height: int) -> tuple[Cameras,
     return _facing(around, width, height), _facing(middle, width, height)
 
 
-# Half widths (x, y, z) of a hand-held camera's path, and how often it goes to and fro in the film.
+# Half widths (x, y, z) of a hand-held camera's path, and its periods in the video.
 _SWAY = (0.70, 0.22, 0.15)
 _TIMES_AROUND = (1.0, 1.7, 1.3)
-# The others are where it is so much of the film later, and aside.
+# The others have its pose of so much of the video later, aside.
 _LATER = 0.4
 _ASIDE = (-0.08, 0.06, 0.0)
 
 
 def hand_held_rig(frames: int, *, width: int, height: int) -> tuple[Cameras, Cameras]:
-    """A camera that one hand moves, at each of ``frames`` times, and another view at each of them.
+    """A hand-held camera at each of ``frames`` times, and another view at each of them.
 
     It sways, trembles, and looks about the rig's target. The average pose of all is the identity.
     """
@@ -142,7 +142,7 @@ def hand_held_rig(frames: int, *, width: int, height: int) -> tuple[Cameras, Cam
 
 
 def _swayed(time: Tensor) -> Tensor:
-    """Where (N, 3) the hand is at times (N,), world units."""
+    """Positions (N, 3) of the hand at times (N,), world units."""
     turns = 2 * math.pi * time[:, None] * time.new_tensor(_TIMES_AROUND)
     tremor = 0.006 * (time[:, None] * time.new_tensor([157.0, 181.0, 139.0])).sin()
     return time.new_tensor(_SWAY) * (turns + time.new_tensor([0.0, 0.5, 1.0])).sin() + tremor
@@ -158,7 +158,7 @@ def _facing(
 ) -> Cameras:
     """Float32 cameras at positions (N, 3) float64 that look at the rig's target, y up.
 
-    ``wanders`` (N, 3) is how far from it each looks.
+    ``wanders`` (N, 3) is the offset of the point that each looks at from it.
     """
     cameras = Cameras.looking_at(
         positions,

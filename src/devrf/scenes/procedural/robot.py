@@ -1,6 +1,6 @@
 """The robot: rigid parts on joints that turn far and fast (articulated motion).
 
-At rest it stands with its arms stretched out, faces −y and has its left hand at +x. Lengths in
+Canonically it stands with its arms stretched out, faces −y and has its left hand at +x. Lengths in
 world units, angles in radians.
 """
 
@@ -27,9 +27,9 @@ class Joint:
     Attributes:
         name: of the link that it moves.
         parent: the link that carries it, "" for the world.
-        pivot: a point on the axis at rest.
-        axis: unit direction of the axis at rest.
-        swing: how its angle grows with time.
+        pivot: a point on the canonical axis.
+        axis: unit direction of the canonical axis.
+        swing: its angle over time.
     """
 
     name: str
@@ -131,13 +131,13 @@ SOLIDS = (
 
 
 _TABLE = SolidTable(SOLIDS)
-# Points whose distances to all solids are found at once: more leave the cache, and take memory.
+# Points whose distances are computed at once: more leave the cache, and take memory.
 AT_ONCE = 8192
 
 
 @lru_cache(maxsize=256)
 def solid_motions(speed: float, time: float) -> Tensor:
-    """M_k(time), world ← rest, of the K solids: (K, 3, 4) float64; identity at time 0."""
+    """M_k(time), world ← canonical, of the K solids: (K, 3, 4) float64; identity at time 0."""
     links = {"": torch.eye(4, dtype=torch.float64)}
     for joint in JOINTS:
         pivot = torch.tensor(joint.pivot, dtype=torch.float64)
@@ -182,13 +182,13 @@ class Robot:
         """The nearest solid's material: M_k(t)⁻¹ x."""
         part = self._distances(points, time).argmin(dim=0)
         motion = solid_motions(self.speed, time).to(points)[part]
-        rest = torch.einsum("mji,mj->mi", motion[:, :, :3], points - motion[:, :, 3])
-        return Material(rest, part)
+        canonical = torch.einsum("mji,mj->mi", motion[:, :, :3], points - motion[:, :, 3])
+        return Material(canonical, part)
 
     def forward(self, material: Material, time: float) -> Tensor:
         """M_k(t) x of each point's own solid."""
-        motion = solid_motions(self.speed, time).to(material.rest)[material.part]
-        return torch.einsum("mij,mj->mi", motion[:, :, :3], material.rest) + motion[:, :, 3]
+        motion = solid_motions(self.speed, time).to(material.canonical)[material.part]
+        return torch.einsum("mij,mj->mi", motion[:, :, :3], material.canonical) + motion[:, :, 3]
 
     def color(self, material: Material) -> Tensor:
         """The solids' paints."""

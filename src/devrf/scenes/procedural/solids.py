@@ -13,19 +13,19 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Material:
-    """M material points: the name a point of the object keeps while it moves.
+    """M material points, the same while the object moves.
 
     Attributes:
-        rest: (M, 3) where the points are at t = 0, world units.
-        part: (M,) int64, which part of the object each belongs to.
+        canonical: (M, 3) positions at t = 0, world units.
+        part: (M,) int64, the part of the object of each.
     """
 
-    rest: Tensor
+    canonical: Tensor
     part: Tensor
 
 
 class Shape(Protocol):
-    """A textured solid that deforms; at t = 0 it is at rest."""
+    """A textured solid that deforms; its state at t = 0 is the canonical one."""
 
     def distance(self, points: Tensor, time: float) -> Tensor:
         """Lower bound (M,) of the distance of ``points`` (M, 3) to the surface at ``time``.
@@ -35,14 +35,14 @@ class Shape(Protocol):
         ...
 
     def material(self, points: Tensor, time: float) -> Material:
-        """Which material is at world ``points`` (M, 3) on (or near) the surface at ``time``.
+        """The material at world ``points`` (M, 3) on (or near) the surface at ``time``.
 
-        ``material(points, time).rest`` is the exact backward warp.
+        ``material(points, time).canonical`` is the exact backward warp.
         """
         ...
 
     def forward(self, material: Material, time: float) -> Tensor:
-        """Where the material is at ``time``: (M, 3) world units; ``material.rest`` at t = 0."""
+        """Positions (M, 3) of the material at ``time``, world units; canonical at t = 0."""
         ...
 
     def color(self, material: Material) -> Tensor:
@@ -51,10 +51,10 @@ class Shape(Protocol):
 
 
 class Body(Shape, Protocol):
-    """A shape that stands alone, and knows where it is."""
+    """A shape that stands alone, and knows its outline."""
 
     def outline(self) -> Material:
-        """Points around all its parts at rest."""
+        """Canonical points around all its parts."""
         ...
 
 
@@ -103,7 +103,7 @@ class Paint:
         base: colour where the pattern is low.
         accent: colour where the pattern is high, as at the part's origin.
         periods: length of a full period along x, y, z in world units; 0: constant along it.
-        threshold: where, in −1 … 1, base turns into accent.
+        threshold: the value in −1 … 1 at which base turns into accent.
         sharpness: steepness of the edges. They stay soft, so that an image of about 100 pixels
             does not alias.
     """
@@ -119,8 +119,8 @@ class PaintedParts:
     """The paints of K parts in the parts' own frames.
 
     Attributes:
-        rotation: (K, 3, 3) axes of each part as columns, world ← part, at rest.
-        origin: (K, 3) origin of each part at rest, world units.
+        rotation: (K, 3, 3) canonical axes of each part as columns, world ← part.
+        origin: (K, 3) canonical origin of each part, world units.
     """
 
     def __init__(
@@ -144,29 +144,29 @@ class PaintedParts:
 
     def color(self, material: Material) -> Tensor:
         """Albedo (M, 3) of the material."""
-        rest = material.rest
+        canonical = material.canonical
         part = material.part
-        offset = rest - self.origin.to(rest)[part]
-        local = torch.einsum("mji,mj->mi", self.rotation.to(rest)[part], offset)
-        pattern = (local * self._wave.to(rest)[part]).cos().prod(dim=-1)
-        threshold, sharpness = self._edge.to(rest)[part].unbind(-1)
+        offset = canonical - self.origin.to(canonical)[part]
+        local = torch.einsum("mji,mj->mi", self.rotation.to(canonical)[part], offset)
+        pattern = (local * self._wave.to(canonical)[part]).cos().prod(dim=-1)
+        threshold, sharpness = self._edge.to(canonical)[part].unbind(-1)
         share = ((pattern - threshold) * sharpness).sigmoid()[:, None]
-        return torch.lerp(self._base.to(rest)[part], self._accent.to(rest)[part], share)
+        return torch.lerp(self._base.to(canonical)[part], self._accent.to(canonical)[part], share)
 
     def outline(self, half: Tensor, middle: Tensor) -> Material:
         """A grid of points over the boxes around the parts; the box of the points holds the object.
 
         Args:
             half: (K, 3) half edges along the parts' axes, world units.
-            middle: (K, 3) where in its frame each box has its middle.
+            middle: (K, 3) the middle of each box in its frame.
         """
         steps = torch.linspace(-1, 1, 7)
         cube = torch.cartesian_prod(steps, steps, steps)
         local = cube * half[:, None] + middle[:, None]
-        rest = torch.einsum("kij,kmj->kmi", self.rotation.float(), local)
-        rest = rest + self.origin.float()[:, None]
+        points = torch.einsum("kij,kmj->kmi", self.rotation.float(), local)
+        points = points + self.origin.float()[:, None]
         part = torch.arange(len(half)).repeat_interleave(len(cube))
-        return Material(rest.reshape(-1, 3), part)
+        return Material(points.reshape(-1, 3), part)
 
 
 @dataclass(frozen=True)
@@ -174,11 +174,11 @@ class Solid:
     """A rounded box; capsules and balls are boxes with large roundings.
 
     Attributes:
-        center: its centre at rest, world units; the paint's origin too.
+        center: its canonical centre, world units; the paint's origin too.
         half: outer half edges.
         rounding: radius of its edges.
         paint: its texture.
-        link: name of the joint that moves it, "" where none does.
+        link: name of the joint that moves it, "" for none.
     """
 
     center: Xyz
@@ -210,10 +210,10 @@ class SolidTable:
         return rounded_box(x, y, z, (a, b, c), self._rounding.to(x))
 
     def distances_of(self, points: Tensor) -> Tensor:
-        """Distance (K, M) at rest to each solid, of points (M, 3) relative to the base."""
+        """Canonical distance (K, M) to each solid, of points (M, 3) relative to the base."""
         x, y, z = points.T[:, None] - self.center.to(points).T[..., None]
         return self.distances(x, y, z)
 
     def outline(self) -> Material:
-        """Points around the solids at rest."""
+        """Canonical points around the solids."""
         return self.painted.outline(self._half, torch.zeros_like(self._half))

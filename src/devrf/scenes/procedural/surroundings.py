@@ -1,4 +1,4 @@
-"""A moving shape among things that stand still: a room, or a wall behind it."""
+"""A moving shape in static surroundings: a room, or a wall behind it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from devrf.scenes.procedural.solids import (
 
 @dataclass(frozen=True)
 class Surrounded:
-    """A :class:`~devrf.scenes.procedural.solids.Shape` among still surroundings.
+    """A :class:`~devrf.scenes.procedural.solids.Shape` in static surroundings.
 
     The first parts are those of the surroundings; the shape's own follow. ``reach`` is the radius
     of a ball about ``center`` that holds the moving shape at all times, world units; None: its
@@ -41,28 +41,28 @@ class Surrounded:
 
         Far from the shape its bound is the distance to the ball around it, where there is one.
         """
-        still = self.surroundings.distances(points).amin(dim=0)
+        static = self.surroundings.distances(points).amin(dim=0)
         if self.reach is None:
-            return torch.minimum(still, self.shape.distance(points, time))
+            return torch.minimum(static, self.shape.distance(points, time))
         ball = (points - points.new_tensor(self.center)).norm(dim=-1) - self.reach
         near = (ball < 0.1 * self.reach).nonzero().squeeze(-1)
         ball[near] = self.shape.distance(points[near], time)
-        return torch.minimum(still, ball)
+        return torch.minimum(static, ball)
 
     def material(self, points: Tensor, time: float) -> Material:
-        """The nearest thing's material; that of the surroundings is where it is."""
-        still, part = self.surroundings.distances(points).min(dim=0)
+        """The nearest surface's material; that of the surroundings does not move."""
+        static, part = self.surroundings.distances(points).min(dim=0)
         own = self.shape.material(points, time)
-        nearer = self.shape.distance(points, time) < still
+        nearer = self.shape.distance(points, time) < static
         return Material(
-            torch.where(nearer[:, None], own.rest, points),
+            torch.where(nearer[:, None], own.canonical, points),
             torch.where(nearer, own.part + self.surroundings.parts, part),
         )
 
     def forward(self, material: Material, time: float) -> Tensor:
-        """Where the shape goes; the surroundings stay."""
+        """The shape's motion; the surroundings stay."""
         moved = self.shape.forward(self._of_shape(material), time)
-        return torch.where(self._is_shape(material), moved, material.rest)
+        return torch.where(self._is_shape(material), moved, material.canonical)
 
     def color(self, material: Material) -> Tensor:
         """The shape's paint, or that of its surroundings."""
@@ -70,12 +70,12 @@ class Surrounded:
         return torch.where(self._is_shape(material), own, self.surroundings.color(material))
 
     def _is_shape(self, material: Material) -> Tensor:
-        """(M, 1) bool: which material is of the shape."""
+        """Mask (M, 1) of the shape's material."""
         return (material.part >= self.surroundings.parts)[:, None]
 
     def _of_shape(self, material: Material) -> Material:
         """The material with the shape's own part numbers, where it is of the shape."""
-        return Material(material.rest, (material.part - self.surroundings.parts).clamp_min(0))
+        return Material(material.canonical, (material.part - self.surroundings.parts).clamp_min(0))
 
 
 # The wall is the plane z = WALL, the floor the plane y = FLOOR; world units, y up.
@@ -92,8 +92,8 @@ _PEDESTAL = 2
 Wave = tuple[Xyz, float, Rgb]
 
 # Waves of the paint: direction (x, y, z) times angular frequency in radians per world unit, a
-# phase, and how much of it goes into red, green and blue. No two wavelengths have a common
-# multiple within the picture, so that no place looks like another.
+# phase, and its shares in red, green and blue. No two wavelengths have a common multiple within the
+# picture, so that no place looks like another.
 WAVES = (
     ((1.1, 0.7, 0.9), 0.3, (0.7, 0.3, -0.1)),
     ((-1.2, 2.3, -1.7), 1.1, (-0.1, 0.5, 0.4)),
@@ -111,7 +111,7 @@ WEAVE = (
     ((11.9, 37.1, -43.7), 5.1, (0.6, 0.8, 0.9)),
     ((-33.1, -43.3, 31.7), 1.6, (0.7, 0.6, 0.5)),
 )
-# The paint's darkest and lightest colour, paler than what stands before it.
+# The paint's darkest and lightest colour, paler than the subject before it.
 _DARKEST = (0.42, 0.45, 0.52)
 _LIGHTEST = (0.86, 0.88, 0.90)
 
@@ -123,8 +123,7 @@ class Backdrop:
     Attributes:
         weave: whether the paint is fine, for images of about 240 pixels or more; else soft.
         pedestal: whether there is one.
-        contrast: of the paint, about its middle; what stands on the pedestal draws more attention
-            where it is low.
+        contrast: of the paint, about its middle; with a low one the subject has more features.
     """
 
     weave: bool = False
@@ -133,7 +132,7 @@ class Backdrop:
 
     @property
     def parts(self) -> int:
-        """How many there are."""
+        """Number of parts."""
         return _PEDESTAL + self.pedestal
 
     def distances(self, points: Tensor) -> Tensor:
@@ -147,7 +146,7 @@ class Backdrop:
 
     def color(self, material: Material) -> Tensor:
         """The paint (M, 3): the pedestal stands out from the floor."""
-        painted = mural(material.rest, (*WAVES, *WEAVE) if self.weave else WAVES)
+        painted = mural(material.canonical, (*WAVES, *WEAVE) if self.weave else WAVES)
         middle = (painted.new_tensor(_DARKEST) + painted.new_tensor(_LIGHTEST)) / 2
         painted = torch.lerp(middle, painted, self.contrast)
         return torch.where((material.part == _PEDESTAL)[:, None], 0.5 * painted, painted)
@@ -253,7 +252,7 @@ class Room:
 
     def color(self, material: Material) -> Tensor:
         """The paper or the paint (M, 3)."""
-        lifted = material.rest - material.rest.new_tensor([0.0, 0.0, self.floor])
+        lifted = material.canonical - material.canonical.new_tensor([0.0, 0.0, self.floor])
         painted = _PAINTED.color(Material(lifted, material.part.clamp(max=self.parts - 1)))
         # A slow wave of brightness along each axis makes repeats of the pattern differ.
         slow = (lifted * lifted.new_tensor([0.55, 0.71, 0.83]) + 0.4).cos().mean(dim=-1)
@@ -261,4 +260,4 @@ class Room:
         color = torch.where((material.part < len(_SURFACES))[:, None], papered, painted)
         if not self.weave:
             return color
-        return color.lerp(mural(material.rest / _LONGER, (*WAVES, *WEAVE)), _MURAL)
+        return color.lerp(mural(material.canonical / _LONGER, (*WAVES, *WEAVE)), _MURAL)
