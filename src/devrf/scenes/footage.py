@@ -162,7 +162,7 @@ def _decoded(
             return
         *_, (position, time) = [(position, time), *frame_times]
         lines.seek(0)
-        messages = lines.read()
+        text = lines.read()
     number = position + 1
     if wanted is not None:
         raise scene_error(
@@ -177,9 +177,7 @@ def _decoded(
     # The stated number also counts frames that an edit leaves out, or is a guess from the duration,
     # which may be that of the sound: only both together are evidence.
     duration = header.frames / header.rate
-    if (
-        match := _DURATION.search(messages)
-    ) and b"Input #0, avi" not in messages:  # FFmpeg corrects AVI's
+    if (match := _DURATION.search(text)) and b"Input #0, avi" not in text:  # FFmpeg corrects AVI's
         hours, minutes, seconds = map(float, match.groups())
         duration = 3600 * hours + 60 * minutes + seconds
     if number < _WHOLE * header.frames and time + 1 / header.rate < _WHOLE * duration:

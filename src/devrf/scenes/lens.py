@@ -202,7 +202,7 @@ def frame_intrinsics(shared: CameraKeys, frame: CameraKeys, where: object) -> In
     own = frame.model_dump(include=KEYS, exclude_unset=True)
     if not own:
         return None
-    # A frame's own focal length or angle replaces both of the file.
+    # A frame's own focal length replaces the file's angles; its own angle, focal lengths, too.
     others = ANGLES if "fl_x" in own else FOCAL | ANGLES if own.keys() & ANGLES else set()
     merged = shared.model_dump(include=KEYS - others, exclude_unset=True) | own
     return intrinsics_of(CameraKeys.model_construct(**merged), where)

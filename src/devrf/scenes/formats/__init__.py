@@ -22,7 +22,7 @@ class KnownLayout:
 
     Attributes:
         choice: the option of ``data=`` whose reader reads it.
-        name: its name.
+        name: the program or data set that it is of.
         files: necessary files, relative to the scene's folder; ``*`` stands for any text.
         remark: other contents of a folder of this layout, in words, or empty.
     """
