@@ -110,7 +110,7 @@ def test_photographs_are_of_a_scene_without_end(folder):
     scene = ColmapReader(folder, downscale=1).read()
     assert not scene.space.is_linear
     assert scene.bounds.reason == "the sparse model"
-    assert scene.bounds.box_source == "what the static cameras all see"
+    assert scene.bounds.box_source == "the common view of the static cameras"
     # Half the depth of the nearest points, which lie on this side of the middle.
     assert 1.0 < scene.bounds.near < 2.0
 

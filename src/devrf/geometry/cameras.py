@@ -41,7 +41,7 @@ class Cameras:
     sizes: Tensor | None = None
 
     def check(self) -> None:
-        """Check what was read from a file.
+        """Check cameras from a file.
 
         Raises:
             ValueError: shapes that do not agree, or numbers that no camera has.

@@ -21,7 +21,7 @@ from devrf.geometry.rays import Rays
 Xyz = tuple[float, float, float]
 
 # Points nearer to the outer faces than this share of the shell are taken to be at this distance: a
-# float32 can still tell what is a million inner boxes away from infinity.
+# float32 can still distinguish a distance of a million inner boxes from infinity.
 INFINITY = 1e-6
 # Most rays move no more contracted units than this in a unit of their distance.
 PACE = 1.25

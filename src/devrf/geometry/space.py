@@ -21,7 +21,7 @@ class Space(Protocol):
 
     :class:`WorldSpace` for inward-facing scenes,
     :class:`~devrf.geometry.ndc.NormalizedDevice` for forward-facing ones,
-    :class:`~devrf.geometry.contraction.ContractedSpace` for what is unbounded on every side.
+    :class:`~devrf.geometry.contraction.ContractedSpace` for scenes unbounded on every side.
     """
 
     @property

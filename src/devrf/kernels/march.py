@@ -1,7 +1,7 @@
 """The march along rays: samples in occupied space, warped and composited, and its adjoint.
 
 See docs/method.md#rays, #warp, #density and #compositing. A thread follows one ray; empty space is
-skipped by the distances to what is occupied.
+skipped by the distances to occupied cells.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from devrf.ops.compositing import LEAST_MASS
 from devrf.ops.march import EXIT, STOP, MarchInputs, Samples
 from devrf.ops.trilinear import shape_of
 
-# Half edges of the inner box that a ray moves along any axis while its distance grows by what one
-# takes along the axis that it crosses fastest, at most; more in a thick shell, and where a ray
-# crosses several axes about as fast.
+# The most half edges of the inner box that a ray moves along any axis while its distance grows by
+# that of one half edge along its fastest axis; more in a thick shell, and if several axes are about
+# as fast.
 CONTRACTED_PACE = 3.0
 # A row of the grid of raw densities.
 Density = row_type(1)

@@ -3,7 +3,7 @@
 NVIDIA Warp compiles a kernel's Python source when it is first launched, and keeps the result on
 disk, in ``WARP_CACHE_PATH`` or the user's cache folder, if nobody else may write there. A kernel
 has a thread for each ray, sample or voxel. Warp runs these one after another on a CPU; so each of
-torch's threads takes a part, but of what is added to grids.
+torch's threads takes a part, except of additions to grids.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ from devrf.geometry.rays import Rays
 from devrf.ops.compositing import composite, mean_distance, transmittances
 from devrf.ops.trilinear import interpolate, shape_of
 
-# A ray ends where its transmittance is less: what is behind cannot be seen.
+# A ray ends where its transmittance is less: samples behind are invisible.
 STOP = 1e-4
 # A sample so little behind a ray's exit still counts, in steps: rounding does not decide on it.
 EXIT = 1e-3
@@ -117,8 +117,8 @@ class Samples:
 def march(rays: Rays, inputs: MarchInputs) -> Samples:
     """Samples every step from a ray's entry into the box to its exit, in occupied cells.
 
-    The k-th of a ray is at entry + k·step. Those of too low an opacity count as empty, and what is
-    behind a transmittance of ``STOP`` is left out. Differentiable in the densities and the
+    The k-th of a ray is at entry + k·step. Samples of too low an opacity count as empty, and
+    those behind a transmittance of ``STOP`` are left out. Differentiable in the densities and the
     displacements, through ``canonical``, ``weight`` and ``transmittance``.
 
     Args:

@@ -114,7 +114,7 @@ class Occupancy(nn.Module):
         return {"low": list(self.box.low), "high": list(self.box.high)}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`get_extra_state` gave."""
+        """Restore the state of :meth:`get_extra_state`."""
         self.box = built(Box, state)
 
 

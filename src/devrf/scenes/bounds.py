@@ -323,7 +323,7 @@ def _seen(views: Views, space: NormalizedDevice, depths: tuple[float, float]) ->
         raise scene_error(
             views.names[int(image[steep[0]])],
             "its camera does not look along the common viewing "
-            "direction, so normalised device coordinates cannot hold what it sees; leave the "
+            "direction, so normalised device coordinates cannot hold its view; leave the "
             "image out, or use data=inward for cameras around a scene",
         )
     device = space.rays(rays)
@@ -334,7 +334,7 @@ def _seen(views: Views, space: NormalizedDevice, depths: tuple[float, float]) ->
         raise scene_error(
             views.names[int(image[away[0]])],
             "its camera is too far from the others for "
-            "normalised device coordinates to hold what it sees; correct its position, or leave "
+            "normalised device coordinates to hold its view; correct its position, or leave "
             "the image out",
         )
     return torch.cat([device.origins + (z + 1) / 2 * device.directions for z in depths])

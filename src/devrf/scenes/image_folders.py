@@ -43,7 +43,7 @@ def image_folder(
     """The folder in ``parent`` with the smallest images that are large enough.
 
     That is ``images_<downscale>``, else the folder of the largest factor that divides
-    ``downscale``, down to ``images`` itself; area averages make images smaller by what remains.
+    ``downscale``, down to ``images`` itself; area averages do the rest.
     ``full`` and ``reduced`` are the folders' names, ``{}`` in place of the factor. DevrfError if
     there is none.
     """
@@ -122,7 +122,7 @@ def whole_factor(downscale: int | str, size_at: SizeAt) -> int:
         factors = list(range(int(match[1]), 0, -1))
     sizes = {factor: size for factor in factors if (size := size_at(factor)) is not None}
     if not sizes:
-        return factors[0]  # the reader of the files says what is missing
+        return factors[0]  # the reader of the files names the missing ones
     fitting = [factor for factor, size in sizes.items() if min(size) >= LEAST_SIDE]
     fitting = fitting or [max(sizes, key=lambda factor: (min(sizes[factor]), -factor))]
     factor = next((factor for factor in fitting if max(sizes[factor]) <= limit), fitting[-1])

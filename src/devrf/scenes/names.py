@@ -147,7 +147,7 @@ def present_images(
     absent = [path for k, path in enumerate(listed) if k not in present]
     if absent and (missing == "error" or not present):
         add = "add them" if len(absent) > 1 else "correct its name or add it"
-        skip = ", or leave out what is absent with data.missing=skip" if present else ""
+        skip = ", or leave absent images out with data.missing=skip" if present else ""
         raise scene_error(
             absent[0],
             f"no such image (looked for {', '.join(SUFFIXES)}); {len(absent)} of the {len(names)} "

@@ -71,16 +71,16 @@ def inward_space(
             static, dynamic, everyone, bound_scale=bound_scale, near=near, far=far, box=box
         )
         why = "data.space=world" if choice == "world" else given or masks
-        where = given or "what the static cameras all see"
+        where = given or "the common view of the static cameras"
         return WORLD, replace(bounds, reason=why, box_source=where)
     inner = box or box_from_cameras(static.cameras)
     where = given
     if box is None:
-        where = "what the static cameras all see"
+        where = "the common view of the static cameras"
         motion = motion_box(dynamic, inner) if dynamic is not None and dynamic.cut_out else None
         if motion is not None:
             inner = inner.union(motion)
-            where += ", and where the silhouettes move"
+            where += ", and the silhouettes' motion"
     if bound_scale != "auto":
         inner = inner.scaled(float(bound_scale))
         where += f" x {float(bound_scale):g}"

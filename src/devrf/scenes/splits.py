@@ -151,7 +151,7 @@ def check_timed_alike(*sets: Transforms) -> None:
 
 
 def static_split(transforms: Transforms) -> Split:
-    """A split of a scene at rest: every image its own view, time 0 unless the file says more."""
+    """A split of a static capture: every image its own view, time 0 unless the file has times."""
     count = len(transforms.images)
     times = torch.zeros(count) if transforms.times is None else torch.tensor(transforms.times)
     return Split(transforms, times, torch.arange(count), False, torch.arange(count))

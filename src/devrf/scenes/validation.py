@@ -20,7 +20,7 @@ LARGEST = 3e38
 
 
 def scene_error(where: object, what: str, typed: str = "") -> DevrfError:
-    """The error ``where: what`` in one line; it ends with what is to be ``typed``, if anything."""
+    """The error ``where: what`` in one line; it ends with words to be ``typed``, if any."""
     return DevrfError(one_line(where, what, typed))
 
 
@@ -64,7 +64,7 @@ def checked_box(value: object) -> Box:
 
 
 def check_memory(needed: int, where: object, what: str) -> None:
-    """DevrfError if ``what``, which ``where`` asks for, takes more bytes than the machine has."""
+    """DevrfError if ``what``, which ``where`` needs, takes more bytes than the machine has."""
     total = psutil.virtual_memory().total
     if needed > total:
         raise scene_error(

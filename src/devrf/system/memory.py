@@ -1,4 +1,4 @@
-"""Memory: what is free, and errors that say it has run out."""
+"""Free memory, and errors of memory that has run out."""
 
 from __future__ import annotations
 
@@ -130,8 +130,8 @@ def shortage_in_words(stage: str, device: torch.device, rays: str | None) -> Ite
             raise
         hint = f"lower {rays}" if rays else "free some of it, or use a larger machine"
         raise DevrfError(
-            f"stage={stage}: out of memory ({numbers(str(error), device)}); {hint}; what was "
-            "written before stays"
+            f"stage={stage}: out of memory ({numbers(str(error), device)}); {hint}; files "
+            "written before stay"
         ) from error
 
 

@@ -17,7 +17,7 @@ from typing import NoReturn
 
 # glibc's malloc.h
 M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -2, -3, -8
-# Ctrl-C, the system's request to end, and what SLURM sends some time before that.
+# Ctrl-C, the system's request to end, and SLURM's signals some time before that.
 NAMES = ("SIGINT", "SIGTERM", "SIGUSR1", "SIGUSR2")
 STOP_SIGNALS = tuple(getattr(signal, name) for name in NAMES if hasattr(signal, name))
 

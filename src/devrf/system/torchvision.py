@@ -20,7 +20,7 @@ def pass_over_unusable() -> None:
             return installed(self)
         try:
             importlib.import_module("torchvision")
-        except Exception:  # RuntimeError, or what else its parts raise
+        except Exception:  # a RuntimeError, or another error of its parts
             return False
         return True
 

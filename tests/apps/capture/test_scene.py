@@ -118,7 +118,7 @@ def test_cameras_around_a_thing_share_a_contracted_world(capture):
     scene = capture()
     assert not scene.space.is_linear
     assert scene.bounds.reason == "scene_bounds in transforms.json"
-    assert scene.bounds.box_source == "what the static cameras all see"
+    assert scene.bounds.box_source == "the common view of the static cameras"
     assert [len(v) for v in (scene.dynamic.train, scene.dynamic.test)] == [12, 6]
     distances = scene.static.train.cameras.positions.norm(dim=1)
     assert torch.allclose(distances, torch.full_like(distances, 4.0), atol=1e-3)

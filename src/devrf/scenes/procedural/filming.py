@@ -43,7 +43,7 @@ def _normals(shape: Shape, points: Tensor, time: float) -> Tensor:
     return torch.nn.functional.normalize(values.T @ corners, dim=-1)
 
 
-# Motion is sampled at this many times; the margin covers what happens between them.
+# Motion is sampled at this many times; the margin covers the motion between them.
 _TIMES = 97
 _MARGIN = 0.04
 
