@@ -15,7 +15,13 @@ from torch import Tensor
 from warp import Kernel
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
-from devrf.data.batch import BackgroundColor, FrameSortedPixels, RayBatch, concatenated, gather_batch
+from devrf.data.batch import (
+    BackgroundColor,
+    FrameSortedPixels,
+    RayBatch,
+    concatenated,
+    gather_batch,
+)
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.grid_adam import GridAdam
 from devrf.engine.schedule import Phase
