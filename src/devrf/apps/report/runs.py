@@ -23,28 +23,6 @@ from devrf.system.printed import shown
 
 log = logging.getLogger(__name__)
 
-# What every run has; further columns are what its file holds, by dotted name.
-COLUMNS = (
-    "folder",
-    "status",
-    "scene",
-    "method",
-    "protocol",
-    "at_rest",
-    "error",
-    "mistake",
-    "train_seconds",
-    "peak_gpu_gb",
-    "dynamic.psnr",
-    "dynamic.ssim",
-    "dynamic.lpips",
-    "run.device",
-    "run.overrides",
-    "run.seed",
-    "run.checkpoint",
-    "run.date",
-    "path",
-)
 SKIPPED = "%s: skipped; it is damaged, or not as devrf writes it"
 # The most values of a record, letters of a name, letters of a text or items of a list; the largest
 # number.
@@ -55,15 +33,34 @@ LARGEST = 1e9
 _Name = Annotated[str, Len(1, LONGEST_NAME)]
 _Text = Annotated[str, Len(0, LONGEST)]
 _Plain = _Text | bool | int | float | Annotated[list[Any], Len(0, LONGEST)] | None
-SECTIONS = ("static", "dynamic", "run", "choices")
 SAMPLING = "run.settings.ray_stage.model.settings.sampling"
-# What values are that are used, by their dotted names.
-KINDS: dict[str, Any] = dict.fromkeys(("scene", "method", "protocol"), _Name)
-for key in "device git devrf fingerprint date checkpoint lpips_network".split():
-    KINDS[f"run.{key}"] = _Text | None
-KINDS |= {SAMPLING: _Text | None, "run.overrides": list[_Text] | None, "error": _Text}
+# What every run has, and of what kind; further columns are what its file holds, by dotted name.
+COLUMNS: dict[str, Any] = {
+    "folder": _Plain,
+    "status": _Plain,
+    "scene": _Name,
+    "method": _Name,
+    "protocol": _Name,
+    "at_rest": bool,
+    "error": _Text,
+    "mistake": bool,
+    "train_seconds": _Plain,
+    "peak_gpu_gb": _Plain,
+    "dynamic.psnr": int | float | None,
+    "dynamic.ssim": _Plain,
+    "dynamic.lpips": _Plain,
+    "run.device": _Text | None,
+    "run.overrides": list[_Text] | None,
+    "run.seed": _Plain,
+    "run.checkpoint": _Text | None,
+    "run.date": _Text | None,
+    "path": _Plain,
+}
+# Of further values that are used, the kinds; the last ones are mappings, and no values.
+OTHERS = ("run.git", "run.devrf", "run.fingerprint", "run.lpips_network", SAMPLING)
+KINDS = COLUMNS | dict.fromkeys(OTHERS, _Text | None)
 KINDS |= {"run.image_size": Annotated[list[int], Len(2, 2)] | None}
-KINDS |= {"dynamic.psnr": int | float | None, "at_rest": bool, "mistake": bool}
+KINDS |= dict.fromkeys(("static", "dynamic", "run", "choices"), dict)
 # The first line of a table: to take many columns of one name apart would take pandas hours.
 HEADER = re.compile(rb'[^"\r\n]{1,1000}\r?\n')
 DEFAULT_METHOD = "devrf"
@@ -173,14 +170,10 @@ def _flat(record: dict[str, Any], above: str = "") -> dict[str, Any]:
             values |= _flat(value, f"{name}.")
         else:
             value = built(KINDS.get(name, _Plain), value)
-            values[name] = [*map(_shown, value)] if isinstance(value, list) else _shown(value)
-        if name in values.keys() & SECTIONS or len(name) > LONGEST_NAME or len(values) > MOST:
+            values[name] = shown(value) if isinstance(value, str) else value
+        if len(name) > LONGEST_NAME or len(values) > MOST:
             raise ValueError(name)
     return values
-
-
-def _shown(value: Any) -> Any:
-    return shown(value) if isinstance(value, str) else value
 
 
 def _finished(metrics: dict[str, Any]) -> dict[str, Any]:
