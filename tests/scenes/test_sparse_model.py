@@ -24,13 +24,12 @@ def model(places, turns=(0.0,)):
     points = np.random.default_rng(0).uniform([-2, -2, 4], [2, 2, 5], (100, 3))
     images = []
     for k, place in enumerate(places):
-        half = math.radians(turns[k % len(turns)]) / 2
-        cosine = math.cos(2 * half)
-        sine = math.sin(2 * half)
+        angle = math.radians(turns[k % len(turns)])
+        cosine = math.cos(angle)
+        sine = math.sin(angle)
         turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
-        shift = tuple(float(value) for value in -turn @ np.array(place))
-        quaternion = (math.cos(half), 0.0, math.sin(half), 0.0)
-        images.append(ModelImage(f"{k}.png", 1, quaternion, shift, np.arange(100)))
+        to_camera = np.column_stack([turn, -turn @ np.array(place)])
+        images.append(ModelImage(f"{k}.png", 1, to_camera, np.arange(100)))
     lens = {"fl_x": 100.0, "fl_y": 100.0, "w": 100, "h": 100, "cx": 50.0, "cy": 50.0}
     return SparseModel(Path("sparse"), {1: lens}, tuple(images), points, np.arange(100))
 

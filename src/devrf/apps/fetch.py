@@ -346,42 +346,36 @@ def _digest(files: dict[str, Path]) -> str:
     return hashlib.sha256(lines.encode()).hexdigest()
 
 
-def _check_size(packed: zipfile.ZipFile, archive: Path, work: Path) -> None:
-    """Check that an archive holds no more than a scene, and than images and cameras of its size.
+def _unpacked(scene: PublishedScene, work: Path) -> Path:
+    """The folder of the archive that holds the scene's marker, without the folders around it.
 
-    Python unpacks no more of a file than the archive says that it holds.
-
-    Raises:
-        DevrfError: it would expand far beyond that; ``work`` is removed, and the archive with it.
+    DevrfError if there is none, or it would expand far beyond images and cameras of its size.
     """
+    archive = work / "files" / ARCHIVE
     size = archive.stat().st_size
-    # A file takes 4 kB of a disk at least.
-    unpacked_size = sum(max(file.file_size, 2**12) for file in packed.infolist())
-    if unpacked_size > min(max(MOST_EXPANSION * size, SMALL), LARGEST):
+    most = min(max(MOST_EXPANSION * size, SMALL), LARGEST)
+    place = work / "unpacked"
+    shutil.rmtree(place, ignore_errors=True)
+    try:
+        with zipfile.ZipFile(archive) as packed:
+            # A file takes 4 kB of a disk at least. No more of it is unpacked than is said here.
+            unpacked_size = sum(max(file.file_size, 2**12) for file in packed.infolist())
+            if unpacked_size <= most:
+                packed.extractall(place)  # names that lead elsewhere are written below it, too
+    except Exception as error:  # of any kind, where an archive is damaged
+        if getattr(error, "errno", None) is not None:  # the disk's
+            raise
+        raise DevrfError(
+            f"{archive}: cannot be unpacked ({error}); remove it, and the same command fetches it "
+            "again"
+        ) from None
+    if unpacked_size > most:
         shutil.rmtree(work, ignore_errors=True)
         raise DevrfError(
             f"{archive}: {decimal(size)} would unpack to {decimal(unpacked_size)}, more than "
             f"{MOST_EXPANSION} times as much, or {decimal(LARGEST)}; it was removed: ask who "
             "published it"
         )
-
-
-def _unpacked(scene: PublishedScene, work: Path) -> Path:
-    """The folder of the archive that holds the scene's marker, without the folders around it."""
-    archive = work / "files" / ARCHIVE
-    place = work / "unpacked"
-    shutil.rmtree(place, ignore_errors=True)
-    try:
-        with zipfile.ZipFile(archive) as packed:
-            _check_size(packed, archive, work)
-            packed.extractall(place)  # names that lead elsewhere are written below it, too
-    except Exception as error:  # of any kind, where an archive is damaged
-        if getattr(error, "errno", None) is not None or isinstance(error, DevrfError):
-            raise  # the disk's, or that of the size
-        raise DevrfError(
-            f"{archive}: cannot be unpacked ({error}); remove it, and the same command fetches it "
-            "again"
-        ) from None
     source = scene.collection
     folder = source.folder and source.filled(source.folder, scene.name)
     marker = MARKERS[scene.collection.data]

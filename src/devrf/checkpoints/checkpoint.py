@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from lightning import Trainer
 from lightning.fabric.plugins import CheckpointIO
-from pydantic import ValidationError
+from pydantic import FiniteFloat, ValidationError
 
 from devrf.checkpoints.checkpoint_file import (
     read_checkpoint_file,
@@ -150,9 +150,8 @@ class Viewpoints:
         if len(followed) not in (0, len(cameras["dynamic"])):
             raise ValueError("times of other cameras")
         clock = built(FrameClock, entry["clock"])
-        offset = built(tuple[float, float, float], entry.get("offset", NO_OFFSET))
-        if not all(map(math.isfinite, offset)):
-            raise ValueError("an offset without end")
+        finite = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+        offset = built(finite, entry.get("offset", NO_OFFSET))
         return cls(**{**entry, **cameras, "clock": clock, "followed": followed, "offset": offset})
 
 

@@ -15,7 +15,6 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 import torch
-from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -53,15 +52,13 @@ class ModelImage:
     Attributes:
         name: relative to the folder of images.
         camera: number of its camera.
-        quaternion: w, x, y, z of the world-to-camera rotation, x right, y down, z ahead.
-        translation: translation of the same transform.
+        to_camera: (3, 4) rigid, from the world to the camera: x right, y down, z ahead.
         points: (K,) int64, numbers of the points that it shows.
     """
 
     name: str
     camera: int
-    quaternion: tuple[float, float, float, float]
-    translation: tuple[float, float, float]
+    to_camera: npt.NDArray[np.float64]
     points: npt.NDArray[np.int64]
 
 
@@ -87,13 +84,11 @@ class SparseModel:
     @cached_property
     def poses(self) -> Tensor:
         """(N, 3, 4) float64 camera-to-world, OpenGL axes, world units."""
-        quaternions = [image.quaternion for image in self.images]
-        translations = [image.translation for image in self.images]
-        to_camera = quaternion_to_rotation_matrix(torch.tensor(quaternions, dtype=torch.float64))
-        translation = torch.tensor(translations, dtype=torch.float64)
+        to_camera = torch.from_numpy(np.stack([image.to_camera for image in self.images]))
+        turned = to_camera[:, :, :3].mT
         # COLMAP's y points down and its z ahead; ours point up and back.
-        axes = to_camera.mT * to_camera.new_tensor([1, -1, -1])
-        return torch.cat([axes, -(to_camera.mT @ translation[:, :, None])], dim=2)
+        axes = turned * turned.new_tensor([1, -1, -1])
+        return torch.cat([axes, -(turned @ to_camera[:, :, 3:])], dim=2)
 
     @property
     def intrinsics(self) -> list[Intrinsics]:
@@ -270,10 +265,9 @@ def _image(folder: Path, image: Any) -> ModelImage:
         what = f"the name of its image {name} is not UTF-8 text; rename it, and run COLMAP again"
         raise scene_error(folder, what) from None
     pose = image.cam_from_world()
-    x, y, z, w = pose.rotation.quat.tolist()
-    shift = tuple(pose.translation.tolist())
+    pose.rotation.normalize()
     visible = np.array([point.point3D_id for point in image.get_observation_points2D()], np.int64)
-    return ModelImage(name, image.camera_id, (w, x, y, z), shift, visible)
+    return ModelImage(name, image.camera_id, pose.matrix(), visible)
 
 
 Corner = tuple[float, float, float]

@@ -41,8 +41,8 @@ def filmed(tmp_path):
                 picture[20 + STEP * k : 70 + STEP * k, 50:110] = thing
             name = f"{k}.png"
             cv2.imwrite(str(tmp_path / name), picture)
-            shift = (-STEP * k / FOCAL, 0.0, 0.0)
-            images.append(ModelImage(name, 1, (1.0, 0, 0, 0), shift, np.zeros(0, np.int64)))
+            to_camera = np.column_stack([np.eye(3), [-STEP * k / FOCAL, 0.0, 0.0]])
+            images.append(ModelImage(name, 1, to_camera, np.zeros(0, np.int64)))
         lens = {"fl_x": FOCAL, "fl_y": FOCAL, "w": WIDTH, "h": HEIGHT, "cx": 80.0, "cy": 60.0}
         points = np.zeros((0, 3))
         model = SparseModel(Path(), {1: lens}, tuple(images), points, np.zeros(0, np.int64))
@@ -76,11 +76,15 @@ def test_images_too_few_to_compare_are_not_masked(filmed, placed, masked):
 def test_what_stands_still_tells_which_cameras_are_right(filmed):
     film, model = filmed(patch=True)
     masks = film.masks_of_movers(model)
+
+    def risen_by(height):
+        return height * np.outer([0, 1, 0], [0, 0, 0, 1])
+
     # Cameras that rise as the patch goes down explain it, and nothing else.
     risen = replace(
         model,
         images=tuple(
-            replace(image, translation=(image.translation[0], STEP * k / FOCAL, 0.0))
+            replace(image, to_camera=image.to_camera + risen_by(STEP * k / FOCAL))
             for k, image in enumerate(model.images)
         ),
     )
