@@ -377,7 +377,7 @@ def test_a_scene_is_described_and_drawn(devrf, tmp_path, tiny):
 
 
 def test_a_mistake_in_footage_is_one_line_and_leaves_nothing(devrf, tmp_path, monkeypatch):
-    monkeypatch.setattr("devrf.apps.capture.pipeline.check_library", lambda: None)
+    monkeypatch.setattr("devrf.apps.capture.pipeline.colmap", lambda: None)
     outcome = devrf("stage=capture", "capture.static=my walk (1).mp4", "capture.into=scene")
     expected = "devrf: my walk (1).mp4: no such video; correct capture.static or capture.views\n"
     assert (outcome.status, outcome.err) == (2, expected)

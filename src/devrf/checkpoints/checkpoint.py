@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from lightning import Trainer
 from lightning.fabric.plugins import CheckpointIO
-from pydantic import FiniteFloat, ValidationError
+from pydantic import ValidationError
 
 from devrf.checkpoints.checkpoint_file import (
     read_checkpoint_file,
@@ -150,8 +150,9 @@ class Viewpoints:
         if len(followed) not in (0, len(cameras["dynamic"])):
             raise ValueError("times of other cameras")
         clock = built(FrameClock, entry["clock"])
-        finite = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
-        offset = built(finite, entry.get("offset", NO_OFFSET))
+        offset = built(tuple[float, float, float], entry.get("offset", NO_OFFSET))
+        if not all(map(math.isfinite, offset)):
+            raise ValueError("an offset without end")
         return cls(**{**entry, **cameras, "clock": clock, "followed": followed, "offset": offset})
 
 

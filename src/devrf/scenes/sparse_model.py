@@ -7,7 +7,6 @@ import mmap
 import os
 from dataclasses import dataclass, field
 from functools import cached_property
-from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
@@ -187,12 +186,19 @@ def read_model(folder: Path) -> SparseModel:
     return _of_reconstruction(folder, _opened(folder))
 
 
+def colmap(wanted: object = "stage=capture") -> Any:
+    """COLMAP's library, which is ``wanted``, without its log; DevrfError without the library."""
+    try:
+        library: Any = importlib.import_module("pycolmap")
+    except ModuleNotFoundError:
+        raise scene_error(wanted, 'needs pycolmap; run pip install "devrf[capture]"') from None
+    library.logging.minloglevel = 3
+    return library
+
+
 def _opened(folder: Path) -> Any:
     """The pycolmap.Reconstruction in a folder."""
-    if find_spec("pycolmap") is None:
-        raise scene_error(folder, 'pycolmap reads it; run pip install "devrf[capture]"')
-    library: Any = importlib.import_module("pycolmap")
-    library.logging.minloglevel = 3
+    library = colmap(folder)
     with decoding(folder, "COLMAP model", "run COLMAP's mapper again"):
         if all(os.path.isfile(folder / f"{part}.bin") for part in PARTS):
             _check_counts(folder)

@@ -73,7 +73,7 @@ def structure(monkeypatch):
 
     stand_in = Structure()
     stand_in.calls = []
-    monkeypatch.setattr("devrf.apps.capture.pipeline.check_library", lambda: None)
+    monkeypatch.setattr("devrf.apps.capture.pipeline.colmap", lambda: None)
     monkeypatch.setattr("devrf.apps.capture.pipeline.reconstruct", stand_in)
     return stand_in
 
@@ -178,7 +178,7 @@ def test_subtraction_gives_the_box_of_what_moves(capture):
 
 @pytest.fixture
 def into(tmp_path, monkeypatch):
-    monkeypatch.setattr("devrf.apps.capture.pipeline.check_library", lambda: None)
+    monkeypatch.setattr("devrf.apps.capture.pipeline.colmap", lambda: None)
     return tmp_path / "scene"
 
 

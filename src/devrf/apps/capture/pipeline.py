@@ -19,7 +19,7 @@ from devrf.apps.capture.images import (
     common_size,
     write_frames,
 )
-from devrf.apps.capture.structure import MODELS, check_library, checked_model, reconstruct
+from devrf.apps.capture.structure import MODELS, checked_model, reconstruct
 from devrf.apps.capture.survey import Survey, check_sharp, sharpest, survey
 from devrf.apps.settings import CaptureSettings
 from devrf.errors import DevrfError
@@ -33,6 +33,7 @@ from devrf.scenes.sparse_model import (
     LEFT_OUT_OF_VIDEO,
     SparseModel,
     World,
+    colmap,
     ndc_holds,
     normalised,
 )
@@ -58,7 +59,7 @@ def scene_from_footage(settings: CaptureSettings) -> Path:
             do. The folder then has no ``transforms.json``.
     """
     settings.check()
-    check_library()
+    colmap()
     into, work = _folders(settings)
     views = [] if settings.monocular else [Path(view).expanduser() for view in settings.views]
     source = settings.views[0] if settings.monocular else settings.static

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
 import logging
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from itertools import combinations, groupby
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -21,7 +18,7 @@ from devrf.apps.capture.movers import Film
 from devrf.apps.settings import CaptureSettings
 from devrf.errors import DevrfError
 from devrf.scenes.footage import is_folder
-from devrf.scenes.sparse_model import SparseModel, read_model
+from devrf.scenes.sparse_model import SparseModel, colmap, read_model
 
 log = logging.getLogger(__name__)
 
@@ -58,14 +55,6 @@ _FLAT = (
 )
 
 
-def check_library() -> None:
-    """Refuse to begin where COLMAP's Python package is not installed."""
-    if find_spec("pycolmap") is None:
-        raise DevrfError(
-            'stage=capture: pycolmap is not installed; run pip install "devrf[capture]"'
-        )
-
-
 def pairs(moving: Sequence[str], fixed: Sequence[str], matching: str) -> list[tuple[str, str]]:
     """Which images are compared: all with all, or those near in the moving camera's order.
 
@@ -94,8 +83,7 @@ def reconstruct(
     Raises:
         DevrfError: nothing could be matched, nothing shows depth, or a given mask does not fit.
     """
-    library: Any = importlib.import_module("pycolmap")
-    library.logging.minloglevel = 3
+    library = colmap()
     library.set_random_seed(0)
     models = work / MODELS
     shutil.rmtree(models, ignore_errors=True)
@@ -226,7 +214,7 @@ def _match(
     masks: dict[str, Mask],
 ) -> None:
     """Write a new data base of features, none of them where masks are 0, and their matches."""
-    library: Any = importlib.import_module("pycolmap")
+    library = colmap()
     base = work / DATA_BASE
     base.unlink(missing_ok=True)
     reading = library.ImageReaderOptions(camera_model=settings.camera)
@@ -257,7 +245,7 @@ def _match(
 
 def _shows_no_depth(base: Path) -> bool:
     """Whether a plane or a turning camera explains the matches of most pairs in a data base."""
-    library: Any = importlib.import_module("pycolmap")
+    library = colmap()
     database = library.Database.open(base)
     _, geometries = database.read_two_view_geometries()
     database.close()
@@ -280,7 +268,7 @@ def _written(masks: dict[str, Mask], folder: Path) -> Path:
 
 def _mapped(images: Path, work: Path, mapper: str, into: Path) -> _Mapped | None:
     """The largest model that a mapper finds in the data base; None where it finds none."""
-    library: Any = importlib.import_module("pycolmap")
+    library = colmap()
     into.mkdir(parents=True)
     base = work / DATA_BASE
     if mapper == "incremental":
