@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import logging
 import os
@@ -11,19 +10,19 @@ import shutil
 import time
 import tomllib
 import zipfile
-from collections.abc import Callable
-from concurrent.futures import Future, wait
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
-from threading import Thread
-from typing import Annotated, Any, Literal
+from types import SimpleNamespace
+from typing import Annotated, BinaryIO, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 from rich.console import Console
 from rich.filesize import decimal
 from rich.progress import track
+from typing_extensions import TypedDict
 
 from devrf.errors import DevrfError, did_you_mean
 from devrf.system.files import make_folder, read_record, refuse_links, write_json
@@ -163,61 +162,48 @@ def published_scene(name: str, file: str | Path | None = None) -> PublishedScene
     )
 
 
-@dataclass(frozen=True)
-class Fetched:
-    """A scene in its place.
+class Record(TypedDict):
+    """What is kept beside a scene: of its archive the SHA-256, of several files that of their list.
 
-    Attributes:
-        path: its folder.
-        sha256: of the archive; for several files, of the list of their checksums.
-        compared: whether it was compared with a checksum that was known before.
-        anew: whether it was fetched now, and not before.
+    ``compared``: whether it was compared with a checksum that was known before.
     """
 
-    path: Path
     sha256: str
     compared: bool
-    anew: bool
 
 
-def fetched_before(scene: PublishedScene, into: Path) -> Fetched | None:
-    """The scene, if it is in its place already; DevrfError if something else is there."""
-    path = into / scene.name
-    if not os.path.lexists(path):
-        return None
-    try:
-        record = json.loads(read_record(path / RECORD))
-        return Fetched(path, str(record["sha256"]), bool(record["compared"]), anew=False)
-    except (OSError, ValueError, KeyError, TypeError):
-        raise DevrfError(
-            f"{path}: there is something else, without {RECORD}; remove it, or give fetch.into=PATH"
-        ) from None
-
-
-def fetched(scene: PublishedScene, settings: FetchSettings, progress: bool) -> Fetched:
-    """A scene in ``settings.into``, downloaded unless it is there; the log says what was done.
+def fetched(scene: PublishedScene, settings: FetchSettings, progress: bool) -> Path:
+    """A scene's folder in ``settings.into``, downloaded unless it is there; the log says so.
 
     Raises:
-        DevrfError: it cannot be fetched, or is not what was expected.
+        DevrfError: it cannot be fetched, or is not what was expected, or something else is there.
         OSError: the disk refuses.
     """
     into = Path(settings.into).expanduser()
-    result = fetched_before(scene, into)
-    if result is None:
+    path = into / scene.name
+    there = os.path.lexists(path)
+    if there:
+        try:
+            record = built(Record, json.loads(read_record(path / RECORD)))
+        except (OSError, ValueError, RecursionError):
+            raise DevrfError(
+                f"{path}: there is something else, without {RECORD}; remove it, or give "
+                "fetch.into=PATH"
+            ) from None
+    else:
         source = scene.collection
         log.info(
             "%s: %s; from %s; licence: %s", scene.name, scene.about, source.page, source.licence
         )
-        result = fetch_scene(scene, into, settings.sha256, progress)
-    log.info(
-        "%s: %s", scene.name, f"in {result.path}" if result.anew else f"is in {result.path} already"
-    )
-    remark = f"none was known to compare it with; kept in {result.path / RECORD}"
-    log.info("SHA-256 %s%s", result.sha256, ", as expected" if result.compared else f": {remark}")
-    return result
+        record = fetch_scene(scene, into, settings.sha256, progress)
+    log.info("%s: %s", scene.name, f"is in {path} already" if there else f"in {path}")
+    remark = f"none was known to compare it with; kept in {path / RECORD}"
+    told = ", as expected" if record["compared"] else f": {remark}"
+    log.info("SHA-256 %s%s", record["sha256"], told)
+    return path
 
 
-def fetch_scene(scene: PublishedScene, into: Path, sha256: str | None, progress: bool) -> Fetched:
+def fetch_scene(scene: PublishedScene, into: Path, sha256: str | None, progress: bool) -> Record:
     """Download a scene to ``into``/<its name>, which appears when it is whole and checked.
 
     Files that have come are kept beside it until all are there: the same command goes on with the
@@ -240,23 +226,19 @@ def fetch_scene(scene: PublishedScene, into: Path, sha256: str | None, progress:
             "was removed: try again, and if it comes again, ask who published it"
         )
     ready = _unpacked(scene, work) if scene.is_archive else work / "files"
-    write_json(
-        ready / RECORD,
-        {
-            "scene": scene.name,
-            "page": scene.collection.page,
-            "url": scene.collection.filled(scene.collection.url, scene.name),
-            "licence": scene.collection.licence,
-            "date": datetime.now(UTC).isoformat(timespec="seconds"),
-            "files": len(files),
-            "sha256": digest,
-            "compared": expected is not None,
-        },
-    )
-    path = into / scene.name
-    ready.rename(path)
+    record: Record = {"sha256": digest, "compared": expected is not None}
+    source = {
+        "scene": scene.name,
+        "page": scene.collection.page,
+        "url": scene.collection.filled(scene.collection.url, scene.name),
+        "licence": scene.collection.licence,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "files": len(files),
+    }
+    write_json(ready / RECORD, {**source, **record})
+    ready.rename(into / scene.name)
     shutil.rmtree(work, ignore_errors=True)
-    return Fetched(path, digest, expected is not None, anew=True)
+    return record
 
 
 def _download(scene: PublishedScene, folder: Path, progress: bool) -> dict[str, Path]:
@@ -275,64 +257,46 @@ def _download(scene: PublishedScene, folder: Path, progress: bool) -> dict[str, 
     headers = {"User-Agent": "devrf", "Accept-Encoding": "identity"}
     get = pooch.HTTPDownloader(progressbar=progress and scene.is_archive, headers=headers)
 
-    def get_bounded(url: str, path: str, files: object) -> None:
-        with _Bounded(io.FileIO(path, "wb")) as file:
-            file.came = came
-            get(url, file, files)
+    came = 0
 
-    came = [0]
+    def write(file: BinaryIO, part: bytes) -> None:
+        nonlocal came
+        came += len(part)
+        if came > LARGEST:
+            raise ValueError(f"more than {decimal(LARGEST)} came")
+        file.write(part)
+
+    def get_bounded(url: str, path: str, files: object) -> None:
+        with open(path, "wb") as file:
+            get(url, SimpleNamespace(write=partial(write, file), flush=file.flush), files)
+
     until = time.monotonic() + LONGEST
     fetched = {}
     console = Console(stderr=True)
     hidden = scene.is_archive or not progress
-    for name in track(scene.downloads, scene.name, console=console, disable=hidden):
-        try:
-            fetch = partial(files.fetch, name, downloader=get_bounded)
-            fetched[name] = Path(_in_time(fetch, came, until))
-        except (OSError, ValueError) as error:
-            if getattr(error, "errno", None) is not None:  # the disk's
-                raise
-            url = scene.downloads[name]
-            raise DevrfError(
-                f"{url}: cannot be fetched ({error}); see that the network works, and that its "
-                f"page {scene.collection.page} names no other address"
-            ) from None
+    with ThreadPool(1) as thread:  # nothing else ends a wait for bytes that come one by one
+        for name in track(scene.downloads, scene.name, console=console, disable=hidden):
+            result = thread.apply_async(files.fetch, [name, None, get_bounded])
+            before = -LEAST
+            try:
+                while not result.ready():
+                    if came < before + LEAST or time.monotonic() > until:
+                        raise TimeoutError("it comes too slowly")
+                    before = came
+                    result.wait(PERIOD)
+                fetched[name] = Path(result.get())
+            except (OSError, ValueError) as error:
+                if getattr(error, "errno", None) is not None:  # the disk's
+                    raise
+                url = scene.downloads[name]
+                raise DevrfError(
+                    f"{url}: cannot be fetched ({error}); see that the network works, and that "
+                    f"its page {scene.collection.page} names no other address"
+                ) from None
     for path in folder.absolute().rglob("*"):  # of a download that was killed
         if path.is_file() and path not in fetched.values():
             path.unlink()
     return fetched
-
-
-class _Bounded(io.BufferedWriter):
-    """A file of a scene of which so many bytes ``came``, a list of one number, in all files."""
-
-    came: list[int]
-
-    def write(self, part: Any) -> int:
-        self.came[0] += len(part)
-        if self.came[0] > LARGEST:
-            raise ValueError(f"more than {decimal(LARGEST)} came")
-        return super().write(part)
-
-
-def _in_time(fetch: Callable[[], str], came: list[int], until: float) -> str:
-    """What ``fetch`` returns; it is left alone where fewer bytes ``came`` than have to."""
-    result: Future[str] = Future()
-
-    def run() -> None:
-        try:
-            result.set_result(fetch())
-        except Exception as error:
-            result.set_exception(error)
-
-    # Nothing else ends a wait for bytes that come one by one.
-    Thread(target=run, daemon=True).start()
-    before = came[0]
-    while not wait([result], PERIOD).done:
-        if came[0] < before + LEAST or time.monotonic() > until:
-            raise TimeoutError("it comes too slowly")
-        before = came[0]
-    return result.result()
 
 
 def _digest(files: dict[str, Path]) -> str:

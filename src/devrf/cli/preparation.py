@@ -44,7 +44,7 @@ def fetch(run: RunContext) -> None:
     """Download the scene ``scene=…`` into ``fetch.into``, and say what to do with it."""
     settings: FetchSettings = instantiate(run.config.fetch)
     scene = published_scene(run.config.scene, settings.catalogue)
-    root = to_type("data.root", fetched(scene, settings, progress=sys.stderr.isatty()).path)
+    root = to_type("data.root", fetched(scene, settings, progress=sys.stderr.isatty()))
     say_next(["stage=inspect", root], [*scene.collection.learn.split(), root])
 
 

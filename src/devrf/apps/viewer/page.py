@@ -13,7 +13,6 @@ import re
 import socket
 import sys
 import threading
-import time
 from contextlib import suppress
 from functools import cache, partial
 from http import HTTPStatus
@@ -36,8 +35,6 @@ START = 2000
 SERVED = re.compile(r"/(scene\.html|pictures/\w{1,80}/\d{1,9}\.jpg)", re.ASCII)
 # Seconds in which a request has to come, and in which a client has to take 64 KB of the answer.
 PATIENCE = 10.0
-# Connections on which a request is waited for.
-WAITING = 64
 
 
 def is_current(run: Path) -> bool:
@@ -104,25 +101,7 @@ class PageServer:
 
 
 class _Server(ThreadingHTTPServer):
-    """Ends connections on which no request has come in time, or that are too many, oldest first."""
-
-    daemon_threads = True
-    request_queue_size = WAITING
-
-    def __init__(self, *address_and_handler: Any) -> None:
-        self.waiting: dict[Any, float] = {}
-        super().__init__(*address_and_handler)
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        self.waiting[request] = time.monotonic()
-        super().process_request(request, client_address)
-
-    def service_actions(self) -> None:  # twice a second, and after each new connection
-        for request, began in [*self.waiting.items()]:
-            if len(self.waiting) > WAITING or time.monotonic() - began > PATIENCE:
-                with suppress(KeyError, OSError):  # answered just now, or its client has gone away
-                    del self.waiting[request]
-                    request.shutdown(socket.SHUT_RDWR)
+    request_queue_size = 64
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Say nothing of a client that has gone away, or is too slow."""
@@ -134,14 +113,24 @@ class _Handler(SimpleHTTPRequestHandler):
     """Answers requests for the page and its pictures, from this machine's own pages."""
 
     timeout = PATIENCE
-    server: _Server
 
     def __init__(self, *request: Any, names: frozenset[str], directory: str) -> None:
         self.names = names
         super().__init__(*request, directory=directory)
 
+    def setup(self) -> None:
+        super().setup()
+        # A request may come byte by byte.
+        self.waiting = threading.Timer(PATIENCE, self._end)
+        self.waiting.daemon = True
+        self.waiting.start()
+
+    def _end(self) -> None:
+        with suppress(OSError):  # answered, or its client has gone away
+            self.connection.shutdown(socket.SHUT_RDWR)
+
     def send_head(self) -> BinaryIO | None:
-        self.server.waiting.pop(self.request, None)
+        self.waiting.cancel()
         path = self.path.partition("?")[0]
         file = Path(self.directory + path)
         why = refusal(self.headers.get, self.names)
