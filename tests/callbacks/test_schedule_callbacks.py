@@ -127,9 +127,8 @@ def test_how_long_learning_takes_is_told_from_its_first_seconds(datamodule, monk
     monkeypatch.setattr("devrf.apps.trial.time.perf_counter", lambda: float(next(seconds)))
     moving = DeformationSchedule(levels=(Level(4, 2),), rays=32)
     plain = {"enable_checkpointing": False, "enable_progress_bar": False, "max_epochs": 1}
-    taken = seconds_to_learn(
-        stage, moving, datamodule, partial(Trainer, accelerator="cpu", **plain)
-    )
+    quiet = partial(Trainer, accelerator="cpu", **plain)
+    taken = seconds_to_learn(stage, [(moving.total(3), moving.rays)], datamodule, quiet)
     # Half the voxels have 0.7937 of the side: 5 iterations of 12.7 voxels a ray were tried in 10 s.
     # 20 of these, 20 of 16, and 2 for each of 3 frames of 16 with half of the rays.
     assert stage.iteration == 10

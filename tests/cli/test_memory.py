@@ -11,7 +11,8 @@ import pytest
 import torch
 
 from devrf.apps import fitting
-from devrf.apps.needs import StageNeeds, smaller, tensor_bytes
+from devrf.apps.needs import smaller
+from devrf.engine.needs import StageNeeds, tensor_bytes
 from devrf.scenes import image_folders
 from devrf.scenes.scene import Scene
 

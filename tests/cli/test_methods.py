@@ -101,6 +101,33 @@ def test_what_cannot_be_is_said_in_one_line(devrf, tiny_data, method, asked, sai
     assert done.status == 2 and said in done.err and done.err.count("\n") == 1, done.err
 
 
+def test_a_method_with_a_stage_of_its_own_needs_nothing_elsewhere(
+    devrf, tmp_path, tiny_data, monkeypatch
+):
+    section = PAGE.read_text().split("{ #own-stages }")[1].split("\n## ")[0]
+    texts = re.findall(r"```(?:python|yaml)\n(.*?)```", section, re.DOTALL)
+    names = ("grey/model.py", "conf/method/grey.yaml", "conf/protocol/grey.yaml")
+    for name, text in zip(names, texts, strict=True):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    asked = (
+        "--config-dir",
+        str(tmp_path / "conf"),
+        "method=grey",
+        "protocol=grey",
+        "video.frames=2",
+    )
+    asked += ("video.height=32", "hydra.run.dir=run")
+    done = devrf(*asked, *tiny_data, "schedule.seconds=1")
+    assert done.status == 0 and "needs about" in done.out, done.err
+    scores = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert scores["dynamic"]["psnr"] > 8 and scores["method"] == "grey"
+    assert devrf(*asked, *tiny_data, "stage=still").status == 0
+    done = devrf(*asked, *tiny_data, "rehearse=true", "hydra.run.dir=rehearsed")
+    assert "rehearsed: every stage learns" in done.out or "rehearse: " in done.err
+
+
 def test_the_method_of_the_documentation_is_learned_and_loaded(
     devrf, tmp_path, tiny_data, monkeypatch
 ):

@@ -12,9 +12,9 @@ from lightning import Callback, Trainer
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint, load_checkpoint, save_checkpoint
 from devrf.data.batch import RayBatch, gather_batch
+from devrf.engine.protocol import ProtocolStage
 from devrf.engine.stage import Stage
 from devrf.methods.base import RayTrainable
-from devrf.methods.protocol import ProtocolStage
 from devrf.methods.ray_stage import RaySchedule, RayStage
 from devrf.scenes.procedural.recipe import ProceduralForwardScene
 from devrf.scenes.scene import Scene

@@ -11,10 +11,10 @@ import torch
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
+from devrf.engine.protocol import ProtocolStage
 from devrf.errors import DevrfError
 from devrf.methods.dnerf.model import DNeRF, DNeRFSettings
 from devrf.methods.hypernerf.model import HyperNeRF, HyperNeRFSettings
-from devrf.methods.protocol import ProtocolStage
 from devrf.methods.ray_stage import RayStage
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene

@@ -11,7 +11,8 @@ from typing import Any
 
 import torch
 
-from devrf.apps.needs import StageNeeds, host_bytes
+from devrf.apps.needs import host_bytes
+from devrf.engine.needs import StageNeeds
 from devrf.errors import DevrfError
 from devrf.scenes.scene import Scene
 from devrf.system.files import free_disk

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from lightning import LightningModule, Trainer
@@ -12,8 +12,6 @@ from devrf.callbacks.schedule import GridUpscaling, LearningRateDecay
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.schedule import cost
 from devrf.engine.stage import Stage
-from devrf.methods.devrf.canonical_stage import CanonicalStage
-from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 
 
 class Trial(GridUpscaling):
@@ -44,20 +42,23 @@ class Trial(GridUpscaling):
 
 def seconds_to_learn(
     stage: Stage,
-    moving: DeformationSchedule,
+    later: Sequence[tuple[int, int]],
     datamodule: SceneDataModule,
     trainer: Callable[..., Trainer],
 ) -> float:
-    """How long both stages will take, by a trial of the canonical one with such a ``trainer``.
+    """How long all stages will take, by a trial of the first one with such a ``trainer``.
 
-    A batch of the deformation stage takes as long as one of as many rays at the end of the
-    canonical stage.
+    A batch of a later stage takes as long as one of as many rays at the end of the first.
+
+    Args:
+        stage: the first.
+        later: the iterations and rays of the others.
+        datamodule: serves the scene.
+        trainer: makes one, given callbacks and a logger.
     """
-    assert isinstance(stage, CanonicalStage)
     trial = Trial()
     trainer(callbacks=[trial, LearningRateDecay()], logger=False).fit(stage, datamodule=datamodule)
     end = stage.timeline.total
-    frames = len(datamodule.scene.clock)
-    batches = moving.total(frames) * moving.rays / stage.schedule.rays if frames > 1 else 0
-    moving_cost = batches * stage.timeline.phase(end).cost
-    return (cost(stage.timeline, 0, end) + moving_cost) / trial.pace
+    rays: int = stage.schedule.rays
+    batches = sum(iterations * rays_of_batch for iterations, rays_of_batch in later) / rays
+    return (cost(stage.timeline, 0, end) + batches * stage.timeline.phase(end).cost) / trial.pace

@@ -152,6 +152,11 @@ def in_sweep() -> bool:
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
+def stage_section(config: DictConfig, stage: str) -> str:
+    """The section of the config that says how a stage is built: its own, or of any ray stage."""
+    return stage if stage in config else "ray_stage"
+
+
 def leaves(value: Any, key: str) -> dict[str, Any]:
     """The plain values at and below a key of a config, by their keys, resolved."""
     if not isinstance(value, DictConfig):

@@ -26,16 +26,16 @@ from devrf.checkpoints.checkpoint import (
 )
 from devrf.checkpoints.file_metadata import OWN_REST, digest_of
 from devrf.checkpoints.progress import progress_files
-from devrf.cli.config import PIPELINE, scene_name
+from devrf.cli.config import PIPELINE, scene_name, stage_section
 from devrf.cli.restore_config import present_command
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.ddp import ManualDDP
+from devrf.engine.protocol import Protocol
 from devrf.engine.stage import Stage
-from devrf.errors import DevrfError, expect
+from devrf.errors import DevrfError
 from devrf.evaluation.objective import VALIDATION
 from devrf.evaluation.suite import Evaluation
 from devrf.loggers.trackers import Tracker, trackers
-from devrf.methods.protocol import Protocol
 from devrf.scenes.scene import Scene
 
 if TYPE_CHECKING:
@@ -160,33 +160,31 @@ class RunContext(ExitStack):
         what = f"protocol={self.protocol.name}: learns from images in motion"
         raise DevrfError(f"{what}, but {at_rest}; use protocol=two_stage")
 
+    def stage_settings(
+        self, name: str, config: DictConfig | None = None
+    ) -> tuple[type[Stage], dict[str, Any]]:
+        """The class and the arguments of a stage of the protocol, by ``config``, else the run's.
+
+        Raises:
+            DevrfError: the method has no such stage, or the protocol asks what it cannot do.
+        """
+        config = self.config if config is None else config
+        section = stage_section(config, name)
+        if section not in config:
+            does = f"method={config.method} does not learn by protocol={self.protocol.name}"
+            raise DevrfError(f"protocol: {does}; it has no stage {name!r}")
+        build: partial[Stage] = instantiate(config[section], _partial_=True, _convert_="all")
+        stage: type[Stage] = build.func  # type: ignore[assignment]
+        return stage, stage.of_protocol(build.keywords, self.protocol, name)
+
     def stage_builder(self, name: str) -> Callable[..., Stage]:
         """A function that builds a stage, given ``rest`` if it builds on another.
 
         Raises:
             DevrfError: the method has no such stage, or the protocol asks what it cannot do.
         """
-        method = self.config.method
-        protocol = self.protocol
-        key = name if name in self.config else "ray_stage"
-        if key not in self.config:
-            does = f"method={method} does not learn by protocol={protocol.name}"
-            raise DevrfError(f"protocol: {does}; it has no stage {name!r}")
-        build: partial[Stage] = instantiate(self.config[key], _partial_=True, _convert_="all")
-        stage: type[Stage] = build.func  # type: ignore[assignment]
-        by_protocol: dict[str, Any] = {}
-        if key == "ray_stage":
-            build.keywords["model"].check_protocol(protocol.name)
-            by_protocol = {"step": protocol[name], "static_share": protocol.static_share}
-        else:
-            stage.check_settings(**build.keywords)
-            own = f"true, as the stages of method={method} freeze what they build on"
-            expect(protocol.freeze is True, "protocol.freeze", own, protocol.freeze)
-        settings = build.keywords | by_protocol
-        self.whole_stages[name] = (stage, settings)
-        if self.rehearses:
-            return partial(stage, **stage.rehearsed(settings))
-        return partial(build, **by_protocol)
+        stage, settings = self.whole_stages[name] = self.stage_settings(name)
+        return partial(stage, **(stage.rehearsed(settings) if self.rehearses else settings))
 
     @cached_property
     def logger(self) -> Any:

@@ -6,7 +6,6 @@ import logging
 from collections.abc import Sequence
 
 import torch
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from devrf.apps.fitting import (
@@ -19,10 +18,11 @@ from devrf.apps.fitting import (
     needed_bytes,
 )
 from devrf.apps.inspection.advice import Advice
-from devrf.apps.needs import StageNeeds, needs_of_devrf, needs_of_networks, smaller
+from devrf.apps.needs import smaller
 from devrf.callbacks.time_budget import BATCHES, LEAST_BATCH
 from devrf.cli.context import RunContext
 from devrf.cli.messages import as_own_errors
+from devrf.engine.needs import StageNeeds
 from devrf.scenes.scene import Scene
 
 log = logging.getLogger(__name__)
@@ -32,27 +32,20 @@ LARGEST_BATCH = "callbacks.time_budget.largest_batch"
 
 
 def needs(run: RunContext, config: DictConfig, scene: Scene) -> dict[str, StageNeeds]:
-    """What each stage of a configured run needs; several processes share a batch."""
+    """Memory that each stage of a configured run needs; several processes share a batch."""
     processes = int(getattr(run.strategy, "world_size", 1))
     images = SIZE if "downscale" in config.data else "data.frames"
     # A scene at rest that the protocol has no stage for can be looked at all the same.
     names = run.stages_with_images or run.learning_stages
-    if "canonical" not in config:
-        with torch.device("meta"):
-            model = instantiate(config.ray_stage.model, _convert_="all")
-        schedule = config.ray_stage.schedule
-        rays = max(schedule.rays, schedule.get("rays_without_hull") or 0) / processes
-        return dict.fromkeys(names, needs_of_networks(scene, model, images, rays))
-    stages = needs_of_devrf(
-        scene,
-        instantiate(config.canonical, _convert_="all"),
-        instantiate(config.deformation.schedule, _convert_="all"),
-        images,
-        [name for name, row in config.schedule.deformation.levels.items() if row][-1],
-        offloaded=config.schedule.motion.store == "host",
-        processes=processes,
-    )
-    return {name: stages[name] for name in names}
+    found: dict[str, StageNeeds] = {}
+    with torch.device("meta"):
+        of_stages = {name: run.stage_settings(name, config) for name in run.learning_stages}
+    for name in names:
+        stage, settings = of_stages[name]
+        below = run.protocol[name].builds_on
+        rest = None if below is None else of_stages[below][1]
+        found[name] = stage.needs(settings, scene, images, processes, rest)
+    return found
 
 
 def _stages(

@@ -59,12 +59,17 @@ def capture(run: RunContext) -> None:
     _, _, change = compare(captured, captured.stages_with_images)
     config.merge_with_dotlist(change)
     seconds = config.schedule.seconds
-    if seconds is None and "canonical" in config:
+    if seconds is None:
         log.info("how long learning takes is tried out for some seconds")
-        moving = instantiate(config.deformation.schedule, _convert_="all")
-        stage = captured.stage_builder("canonical")()
+        first, *others = captured.stages_with_images
+        stage = captured.stage_builder(first)()
+        later = [captured.stage_settings(name) for name in others]
+        batches = [
+            (of.iterations_of(settings, captured.scene), settings["schedule"].rays)
+            for of, settings in later
+        ]
         trainer = partial(instantiate, config.trainer)
-        seconds = seconds_to_learn(stage, moving, captured.datamodule, trainer)
+        seconds = seconds_to_learn(stage, batches, captured.datamodule, trainer)
     if seconds is not None:
         log.info("learning takes %s on this machine", duration(seconds))
     say_next([to_type("data.root", folder), *change])

@@ -35,7 +35,7 @@ from devrf.checkpoints.checkpoint import (
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file, read_description
 from devrf.checkpoints.file_metadata import OWN_REST, digest_of
 from devrf.checkpoints.progress import progress_files
-from devrf.cli.config import command_line, leaves
+from devrf.cli.config import command_line, leaves, stage_section
 from devrf.cli.config_check import REFERENCE
 from devrf.cli.context import RunContext
 from devrf.errors import DevrfError
@@ -71,8 +71,10 @@ class ResumePoint:
 def deciding_settings(config: DictConfig, stage: str) -> dict[str, Any]:
     """The settings that decide what a stage learns, by the key at which the user sets them."""
     settings = {"method": config.method, "seed": config.seed}
-    for section in ("data", stage) if stage in config else ("data", "ray_stage", "protocol"):
-        settings |= _values(config, section)
+    section = stage_section(config, stage)
+    # Of a stage of its own the protocol decides nothing.
+    for part in ("data", section, *(() if section == stage else ("protocol",))):
+        settings |= _values(config, part)
     for key, usual in (("schedule.seconds", None), ("priors", "all"), ("rehearse", False)):
         if (value := OmegaConf.select(config, key)) != usual:
             settings[key] = value

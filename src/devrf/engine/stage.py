@@ -41,11 +41,13 @@ from devrf.engine.ddp import (
     check_strategy,
 )
 from devrf.engine.grid_adam import GridAdam
+from devrf.engine.needs import StageNeeds, tensor_bytes
 from devrf.engine.position import Position
+from devrf.engine.protocol import Protocol
 from devrf.engine.provenance import Provenance
 from devrf.engine.resumed_loops import resumed_fit_loop
 from devrf.engine.schedule import Phase, Schedule, same_place
-from devrf.errors import DevrfError
+from devrf.errors import DevrfError, expect
 from devrf.evaluation.held_out import HeldOutView, score
 from devrf.rendering.renderable import Renderable
 from devrf.rendering.renderer import Renderer
@@ -187,12 +189,37 @@ class Stage(LightningModule, ABC):
         return {**settings}
 
     @classmethod
-    def check_settings(cls, **settings: Any) -> None:
-        """Find errors in the arguments of the stage before what it builds on has been learned.
+    def of_protocol(
+        cls, settings: Mapping[str, Any], protocol: Protocol, name: str
+    ) -> dict[str, Any]:
+        """The arguments of the stage ``name`` of a protocol, checked before anything is learned.
 
         Raises:
-            DevrfError: one is wrong.
+            DevrfError: one is wrong, or the protocol asks what the stage cannot do.
         """
+        own = "true, as the method's stages freeze what they build on"
+        expect(protocol.freeze is True, "protocol.freeze", own, protocol.freeze)
+        return {**settings}
+
+    @classmethod
+    def needs(
+        cls,
+        settings: Mapping[str, Any],
+        scene: Scene,
+        images: str,
+        processes: int,
+        rest: Mapping[str, Any] | None,
+    ) -> StageNeeds:
+        """Memory that a stage with these arguments needs; of one that does not say, the images.
+
+        Args:
+            settings: the arguments.
+            scene: the scene that is learned.
+            images: the config key that changes the images' size.
+            processes: the number of processes that share a batch.
+            rest: the arguments of the stage that it builds on, if any.
+        """
+        return StageNeeds({images: tensor_bytes(scene.captures.values())}, 0)
 
     # The loop.
 

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor, nn
 
 from devrf.data.batch import RayBatch
+from devrf.engine.protocol import ProtocolStage
 from devrf.errors import DevrfError
-from devrf.methods.protocol import ProtocolStage
 from devrf.rendering.output import RenderOutput
 from devrf.rendering.renderable import Renderable
 from devrf.scenes.scene import Scene, Views

@@ -24,12 +24,13 @@ from devrf.data.batch import (
 )
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.grid_adam import GridAdam
+from devrf.engine.needs import LEARNED, StageNeeds, tensor_bytes
+from devrf.engine.protocol import Protocol, ProtocolStage
 from devrf.engine.schedule import Phase
 from devrf.engine.stage import Stage, Terms
 from devrf.errors import expect
 from devrf.kernels.ahead import grid_kernels
 from devrf.methods.base import RayTrainable
-from devrf.methods.protocol import ProtocolStage
 from devrf.methods.weighted_loss import counted_weights, visibility, weighted_sum
 from devrf.scenes.scene import Scene, Views
 from devrf.scenes.space import dynamic_only
@@ -129,6 +130,11 @@ class RayTimeline:
     milestones: Mapping[str, int] = field(default_factory=dict)
 
     @property
+    def rays(self) -> int:
+        """Rays of a batch."""
+        return self.schedule.rays
+
+    @property
     def total(self) -> int:
         """Iterations of the stage."""
         return self.schedule.iterations
@@ -223,6 +229,38 @@ class RayStage(Stage):
         """Look-ups and steps of the method's grids."""
         model: RayTrainable = settings["model"]
         return grid_kernels(model.grid_channels)
+
+    @classmethod
+    def of_protocol(
+        cls, settings: Mapping[str, Any], protocol: Protocol, name: str
+    ) -> dict[str, Any]:
+        """Add which data trains which parts of the method."""
+        model: RayTrainable = settings["model"]
+        model.check_protocol(protocol.name)
+        by_protocol = {"step": protocol[name], "static_share": protocol.static_share}
+        return {**settings, **by_protocol}
+
+    @classmethod
+    def needs(
+        cls,
+        settings: Mapping[str, Any],
+        scene: Scene,
+        images: str,
+        processes: int,
+        rest: Mapping[str, Any] | None,
+    ) -> StageNeeds:
+        """Images, the whole of the model, and a batch."""
+        model: RayTrainable = settings["model"]
+        schedule: RaySchedule = settings["schedule"]
+        rays = max(schedule.rays, schedule.rays_without_hull or 0) / processes
+        learned = tensor_bytes(model.parameters())
+        parts = {
+            images: float(tensor_bytes(scene.captures.values())),
+            "ray_stage.model.settings.width": LEARNED * learned,
+            # Three values are kept for each output of each layer, for 128 samples of a ray.
+            "ray_stage.schedule.rays": rays * 128 * 12 * model.sample_outputs,
+        }
+        return StageNeeds(parts, learned)
 
     @classmethod
     def iterations_of(cls, settings: Mapping[str, Any], scene: Scene) -> int:

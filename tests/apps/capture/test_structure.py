@@ -70,7 +70,7 @@ def reconstruct(monkeypatch, tmp_path):
         monkeypatch.setattr(structure, "Film", Film)
         monkeypatch.setattr(structure, "_shows_no_depth", lambda base: False)
         monkeypatch.setattr(structure, "read_model", read)
-        monkeypatch.setattr(structure.importlib, "import_module", lambda name: _Library())
+        monkeypatch.setattr(structure, "colmap", _Library)
         moving = SimpleNamespace(names=NAMES, still=None, path=tmp_path)
         settings = CaptureSettings(into=tmp_path, views=[tmp_path])
         folder = structure.reconstruct(tmp_path, tmp_path, moving, [], settings)

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
+from devrf.engine.protocol import ProtocolStage
 from devrf.errors import DevrfError
 from devrf.geometry.rays import Rays
 from devrf.methods.kplanes.decoders import (
@@ -27,7 +28,6 @@ from devrf.methods.kplanes.model import KPlanes
 from devrf.methods.kplanes.planes import SPACE, TIME, SixPlanes
 from devrf.methods.kplanes.proposals import drawn_edges, histogram_error, intervals
 from devrf.methods.kplanes.settings import KPlanesSettings
-from devrf.methods.protocol import ProtocolStage
 from devrf.methods.ray_stage import RayStage
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene

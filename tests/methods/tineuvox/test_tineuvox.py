@@ -12,9 +12,9 @@ import torch
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
+from devrf.engine.protocol import ProtocolStage
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
-from devrf.methods.protocol import ProtocolStage
 from devrf.methods.ray_stage import RayStage
 from devrf.methods.tineuvox.model import TiNeuVox
 from devrf.methods.tineuvox.networks import MultiDistanceGrid

@@ -13,6 +13,7 @@ from warp import Kernel
 
 from devrf.data.batch import PixelPool, gather_batch
 from devrf.engine.grid_adam import GridAdam
+from devrf.engine.needs import StageNeeds
 from devrf.engine.stage import Stage, Terms
 from devrf.errors import DevrfError
 from devrf.kernels.ahead import grid_kernels, march_kernels
@@ -38,6 +39,7 @@ from devrf.methods.devrf.losses import (
     total_variation_weight,
 )
 from devrf.methods.devrf.model import DeVRFModel
+from devrf.methods.devrf.needs import canonical_needs
 from devrf.methods.devrf.pixel_pools import rays_for_epochs, static_pool
 from devrf.methods.devrf.settings import (
     FINE_LOSS,
@@ -168,6 +170,18 @@ class CanonicalStage(Stage):
         """Of search and radiance field; contracted space has no search."""
         schedule: CanonicalSchedule = settings["schedule"]
         return schedule.in_space(scene.space).total
+
+    @classmethod
+    def needs(
+        cls,
+        settings: Mapping[str, Any],
+        scene: Scene,
+        images: str,
+        processes: int,
+        rest: Mapping[str, Any] | None,
+    ) -> StageNeeds:
+        """Images, grids and a batch."""
+        return canonical_needs(settings, scene, images, processes)
 
     @classmethod
     def rehearsed(cls, settings: Mapping[str, Any]) -> dict[str, Any]:

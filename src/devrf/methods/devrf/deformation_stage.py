@@ -15,6 +15,8 @@ from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import gather_batch
 from devrf.data.flow import previous_images
 from devrf.engine.grid_adam import GridAdam
+from devrf.engine.needs import StageNeeds
+from devrf.engine.protocol import Protocol
 from devrf.engine.stage import Stage, Terms
 from devrf.errors import DevrfError
 from devrf.methods.devrf.active_frame import ActiveFrame
@@ -33,6 +35,7 @@ from devrf.methods.devrf.frame_store import FrameField
 from devrf.methods.devrf.losses import FlowMean, MotionPrediction, batch_loss
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.motion_loss import MotionLoss
+from devrf.methods.devrf.needs import deformation_needs
 from devrf.methods.devrf.pixel_pools import frame_pools, rays_for_epochs
 from devrf.methods.devrf.settings import (
     DEFORMATION_LOSS,
@@ -131,10 +134,26 @@ class DeformationStage(Stage):
         self._losses: list[float] = []
 
     @classmethod
-    def check_settings(cls, **settings: Any) -> None:
-        """Check the loss, before what the stage builds on has been learned."""
+    def of_protocol(
+        cls, settings: Mapping[str, Any], protocol: Protocol, name: str
+    ) -> dict[str, Any]:
+        """Check the loss, too, before what the stage builds on has been learned."""
         extensions = tuple(settings.get("extensions", {}).values())
         MotionLoss(settings["loss"], extensions, settings["schedule"])
+        return super().of_protocol(settings, protocol, name)
+
+    @classmethod
+    def needs(
+        cls,
+        settings: Mapping[str, Any],
+        scene: Scene,
+        images: str,
+        processes: int,
+        rest: Mapping[str, Any] | None,
+    ) -> StageNeeds:
+        """Images, the frozen field, the motion grids, and a batch."""
+        assert rest is not None, "it builds on the canonical stage"
+        return deformation_needs(settings, rest, scene, images, processes)
 
     @classmethod
     def iterations_of(cls, settings: Mapping[str, Any], scene: Scene) -> int:

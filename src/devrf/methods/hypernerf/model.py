@@ -10,6 +10,7 @@ from annotated_types import Ge
 from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
+from devrf.engine.protocol import ProtocolStage
 from devrf.methods.nerf.networks import (
     SinusoidalEncoding,
     TimeCodes,
@@ -19,7 +20,6 @@ from devrf.methods.nerf.networks import (
 )
 from devrf.methods.nerf.settings import Bands, FieldSettings
 from devrf.methods.nerfies.model import Nerfies, NerfiesSettings
-from devrf.methods.protocol import ProtocolStage
 from devrf.system.options import Count, Share
 
 # Standard deviation of the last layer's first weights: all of space begins at w = 0, nearly.

@@ -11,6 +11,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
 from devrf.data.batch import RayBatch
+from devrf.engine.protocol import ProtocolStage
 from devrf.geometry.poses import rigid_motion
 from devrf.methods.nerf.deformable import DeformableField
 from devrf.methods.nerf.networks import (
@@ -22,7 +23,6 @@ from devrf.methods.nerf.networks import (
 )
 from devrf.methods.nerf.settings import Bands, FieldSettings, Initialisation, Samples
 from devrf.methods.nerfies.elastic import SCALE, drawn, jacobians, robust, strain
-from devrf.methods.protocol import ProtocolStage
 from devrf.rendering.output import RenderOutput
 from devrf.system.options import Share, Whole
 

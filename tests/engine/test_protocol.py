@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
+from devrf.engine.protocol import Protocol
 from devrf.errors import DevrfError
-from devrf.methods.protocol import Protocol
 
 STATIC = {"capture": "static", "iterations": 0.4}
 MOVING = {"capture": "dynamic", "iterations": 0.6, "frozen": ["canonical"]}
