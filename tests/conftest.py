@@ -15,8 +15,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
-import devrf  # noqa: F401 - before Lightning: an unusable torchvision ends no test
-
 gc.disable()  # what is imported until all tests are collected stays
 
 # A shell without job control starts what is in the background with SIGINT ignored, and so would

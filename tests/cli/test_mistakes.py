@@ -231,32 +231,20 @@ def test_a_name_that_is_not_utf8_ends_it_before_anything_is_written(
     assert [path.name for path in tmp_path.rglob("*")] == [latin]
 
 
-def test_a_torchvision_for_another_torch_ends_only_what_needs_it(
-    devrf, python, tmp_path, tiny, tiny_data, monkeypatch
-):
+@pytest.mark.parametrize("run", [[], ["hydra.run.dir=run"]])
+def test_a_torchvision_for_another_torch_is_one_line(python, tmp_path, monkeypatch, run):
+    """As pip leaves it beside a CPU's torch; Lightning imports it wherever it is installed."""
     (tmp_path / "torchvision").mkdir()
     fault = 'raise RuntimeError("operator torchvision::nms does not exist")'
     (tmp_path / "torchvision" / "__init__.py").write_text(fault)
-    # As pip leaves it: the version of what is installed is known.
     (tmp_path / "torchvision-0.29.dist-info").mkdir()
     record = "Metadata-Version: 2.1\nName: torchvision\nVersion: 0.29\n"
     (tmp_path / "torchvision-0.29.dist-info" / "METADATA").write_text(record)
-    assert devrf(*tiny_data, "stage=prepare", "data.export=scene").status == 0
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    learn = (*tiny, "stage=canonical", "hydra.run.dir=run")
-    script = (
-        "import sys\n"
-        "from devrf.__main__ import entry\n"
-        f"sys.argv[1:] = {learn!r}\n"
-        "entry()\n"
-        "print('learned', file=sys.stderr)\n"
-        "sys.argv[1:] = 'stage=inspect', 'data.root=scene', 'data.flow=raft'\n"
-        "entry()\n"
-    )
-    done = python(tmp_path, "-c", script)
-    learned, mistake = done.err.splitlines()
-    assert (done.status, learned) == (2, "learned")
-    assert mistake.startswith("devrf: data.flow=raft: torchvision cannot be imported (operator ")
+    done = python(tmp_path, "-m", "devrf", "stage=inspect", *run)
+    assert done.status == 2 and done.err.count("\n") == 1
+    assert done.err.startswith("devrf: torchvision cannot be imported (operator torchvision::nms ")
+    assert "run pip uninstall torchvision" in done.err
 
 
 def test_a_fault_of_the_program_keeps_its_traceback(devrf, monkeypatch):

@@ -71,12 +71,6 @@ def _raft() -> Estimator:
             "data.flow=raft",
             'torchvision is not installed; run pip install "devrf[raft]", or set data.flow=dis',
         ) from None
-    except Exception as error:  # a RuntimeError where it was built for another torch
-        raise scene_error(
-            "data.flow=raft",
-            f"torchvision cannot be imported ({error}); install the build that fits torch, as "
-            "pytorch.org says, or set data.flow=dis",
-        ) from None
     device = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         model = models.raft_large(weights=models.Raft_Large_Weights.DEFAULT, progress=False)

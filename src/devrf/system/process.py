@@ -11,9 +11,13 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
 from typing import NoReturn
+
+from devrf.errors import DevrfError
 
 # glibc's malloc.h
 M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -2, -3, -8
@@ -69,19 +73,36 @@ def _of_glibc(name: str) -> Callable[..., int] | None:
 
 @contextmanager
 def importing() -> Iterator[None]:
-    """Python looks for no garbage among modules that are imported inside, now or later.
+    """Imports torch, or Lightning, inside.
 
-    The program's imports take a fifth less then.
+    Python looks for no garbage among what is imported, now or later: it stays. The program's
+    imports take a fifth less then.
+
+    Raises:
+        DevrfError: an installed torchvision cannot be imported; Lightning would import it.
     """
     enabled, modules = gc.isenabled(), len(sys.modules)
     gc.disable()
     try:
+        _check_torchvision()
         yield
     finally:
         if len(sys.modules) > modules:
             gc.freeze()
         if enabled:
             gc.enable()
+
+
+def _check_torchvision() -> None:
+    if find_spec("torchvision") is None:
+        return
+    try:
+        import_module("torchvision")
+    except Exception as error:  # a RuntimeError where it was built for another torch
+        raise DevrfError(
+            f"torchvision cannot be imported ({error}); run pip uninstall torchvision, or install "
+            "the build that fits torch, as pytorch.org says"
+        ) from None
 
 
 def use_utf8() -> None:
