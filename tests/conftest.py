@@ -6,14 +6,12 @@ import copy
 import gc
 import json
 import logging
-import pickle
-import re
 import signal
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 gc.disable()  # what is imported until all tests are collected stays
 
@@ -26,25 +24,12 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
-from hydra._internal import config_loader_impl, defaults_list
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
-from hydra._internal.config_repository import IConfigRepository
-from hydra._internal.defaults_list import DefaultsList, Overrides, create_defaults_list
-from hydra._internal.hydra import Hydra
-from hydra._internal.sources_registry import SourcesRegistry
-from hydra.core.default_element import InputDefault, ResultDefault
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
-from hydra.core.plugins import Plugins
-from hydra.plugins.config_source import ConfigResult, ConfigSource
 from hypothesis import settings
 from lightning import Callback, Trainer
-from omegaconf import DictConfig
 from scipy.spatial.transform import Rotation
 
 from devrf.callbacks import GridUpscaling, LearningRateDecay
 from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, LoadedCheckpoint
-from devrf.cli.config import config_folder
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.stage import Stage
 from devrf.geometry.box import Box
@@ -79,98 +64,6 @@ def single_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
-
-
-@pytest.fixture(scope="session", autouse=True)
-def quick_composition() -> Iterator[None]:
-    """Configs composed in a fraction of Hydra's time.
-
-    It reads and merges every file anew for each command, though files do not change while tests
-    run: what it makes of the same options of the same groups is kept, pickled: that is read in
-    2.3 ms, where a deep copy takes 9.5. And it composes a first time only to see in which mode to
-    run, which some files and overrides say. The same text is parsed once, and what names in a
-    defaults list refer to is listed only for lists with such names.
-    """
-    Plugins.instance()  # registers the sources
-    files = SourcesRegistry.instance().resolve("file")
-    read, asked = files.load_config, Hydra.get_mode
-    chosen, merged = create_defaults_list, ConfigLoaderImpl._compose_config_from_defaults_list
-    listed, parse = defaults_list._create_interpolation_map, OverridesParser.parse_rule
-    known: dict[tuple[str, str], bytes] = {}
-    rules: dict[tuple[str, str], Any] = {}
-    lists: dict[tuple[object, ...], DefaultsList] = {}
-    configs: dict[int, bytes] = {}
-    files_of_sweeps = {
-        file.stem
-        for file in config_folder().rglob("*.y*ml")
-        if "mode: MULTIRUN" in file.read_text()
-    }
-
-    def is_ours(source: ConfigSource) -> bool:
-        return source.scheme() != "file" or source.path.startswith(str(config_folder()))
-
-    def load_config(self: ConfigSource, config_path: str) -> ConfigResult:
-        if not is_ours(self):
-            return read(self, config_path)
-        place = self.path, config_path
-        if place not in known:
-            known[place] = pickle.dumps(read(self, config_path))
-        return cast(ConfigResult, pickle.loads(known[place]))
-
-    def list_defaults(
-        repo: IConfigRepository,
-        config_name: str | None,
-        overrides_list: list[Override],
-        prepend_hydra: bool,
-        skip_missing: bool,
-    ) -> DefaultsList:
-        how = {"prepend_hydra": prepend_hydra, "skip_missing": skip_missing}
-        options = [one for one in overrides_list if repo.group_exists(one.key_or_group)]
-        of_hydra = any(one.key_or_group.startswith("hydra") for one in options)
-        if of_hydra or not all(map(is_ours, repo.get_sources())):
-            return chosen(repo, config_name, overrides_list, **how)
-        place = (config_name, *how.values(), *(one.input_line for one in options))
-        if place not in lists:
-            lists[place] = chosen(repo, config_name, options, **how)
-        values = Overrides(repo, overrides_list).config_overrides
-        return replace(lists[place], config_overrides=values)
-
-    def merge(
-        self: ConfigLoaderImpl, defaults: list[ResultDefault], repo: IConfigRepository
-    ) -> DictConfig:
-        if not any(defaults is one.defaults for one in lists.values()):
-            return merged(self, defaults, repo)
-        if id(defaults) not in configs:
-            configs[id(defaults)] = pickle.dumps(merged(self, defaults, repo))
-        return cast(DictConfig, pickle.loads(configs[id(defaults)]))
-
-    def get_mode(self: Hydra, config_name: str | None, overrides: list[str]) -> Any:
-        others = (one for one in overrides if one != "hydra.mode=RUN")  # that is the usual
-        words = {word for one in others for word in re.split(r"[=,+]", one)}
-        if words & {"hydra.mode", "hydra", *files_of_sweeps}:
-            return asked(self, config_name, overrides)
-        return None
-
-    def list_names(
-        overrides: Overrides, defaults: list[InputDefault], self_added: bool
-    ) -> DictConfig | None:
-        if not any(default.is_interpolation() for default in defaults):
-            return None
-        return listed(overrides, defaults, self_added)
-
-    def parse_rule(self: OverridesParser, text: str, rule: str) -> Any:
-        if (text, rule) not in rules:
-            rules[text, rule] = parse(self, text, rule)
-        return copy.copy(rules[text, rule])  # it is told its loader later
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(files, "load_config", load_config)
-        patch.setattr(defaults_list, "_create_interpolation_map", list_names)
-        patch.setattr(OverridesParser, "parse_rule", parse_rule)
-        patch.setattr(config_loader_impl, "create_defaults_list", list_defaults)
-        patch.setattr(ConfigLoaderImpl, "_compose_config_from_defaults_list", merge)
-        patch.setattr(Hydra, "get_mode", get_mode)
-        yield
 
 
 def pytest_collection_finish() -> None:
