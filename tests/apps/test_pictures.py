@@ -27,6 +27,7 @@ from devrf.pictures.images import (
 )
 from devrf.pictures.video_file import write_pictures
 from devrf.rendering.renderer import Renderer
+from pictures import plain_picture
 
 
 def flat(height, width, color):
@@ -116,9 +117,7 @@ def test_a_film_that_fails_leaves_nothing_behind(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_held_out_pictures_are_rendered_in_the_films_size_beside_the_truth(
-    moving, reference, tiny_scene
-):
+def test_held_out_pictures_are_rendered_in_the_films_size_beside_the_truth(moving, tiny_scene):
     views, film = tiny_scene.dynamic.test, VideoSettings(height=36)
     images = held_out_images(views, 3)
     shown = list(held_out_pictures(Renderer(moving), views, images, film, "white"))
@@ -127,7 +126,7 @@ def test_held_out_pictures_are_rendered_in_the_films_size_beside_the_truth(
     for image, index, time in zip(shown, images, (0.0, 0.5, 1.0), strict=True):
         truth, rendered = image[18:, :48], image[18:, 52:100]
         assert torch.equal(truth, to_bytes(scaled(truth_image(views, index, "white"), 36)))
-        seen = reference(moving, large.image_rays(index), time, torch.ones(3))
+        seen = plain_picture(moving, large.image_rays(index), time, torch.ones(3))
         shades = rendered.reshape(-1, 3) / 255
         torch.testing.assert_close(shades, seen.color, atol=0.51 / 255, rtol=0)
 

@@ -6,7 +6,6 @@ import csv
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
@@ -15,6 +14,7 @@ import torch
 
 from devrf.checkpoints.checkpoint import load_checkpoint
 from devrf.scenes.scene import Scene
+from layouts import write_scene
 
 # Where a passer-by stands, of another grey in each of two recordings.
 MASKED = (slice(0, 7), slice(3, 12))
@@ -22,7 +22,7 @@ LAYOUT = ("data=nerfstudio", "data.flow=none")
 
 
 @pytest.fixture
-def recorded(tiny_scene: Scene, write_scene: Any, tmp_path: Path) -> Callable[[str, int], Path]:
+def recorded(tiny_scene: Scene, tmp_path: Path) -> Callable[[str, int], Path]:
     """``recorded(name, grey)``: the tiny scene on white in nerfstudio's layout."""
 
     def write(name: str, grey: int) -> Path:

@@ -12,12 +12,13 @@ from devrf.cli import preparation
 from devrf.scenes.export import export
 from devrf.scenes.procedural import ProceduralForwardScene, ProceduralScene
 from devrf.scenes.view_folders import dynamic_folders
+from layouts import write_scene
 
 FILM = ("video.frames=1", "video.height=24")
 
 
 @pytest.fixture
-def mill(write_scene, tmp_path, monkeypatch) -> None:
+def mill(tmp_path, monkeypatch) -> None:
     """A folder ``mill`` in DyCheck's layout: one camera, elsewhere at each of three times."""
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     sizes = {"width": 24, "height": 20, "static_views": 16, "static_test_views": 3}
@@ -120,7 +121,7 @@ def test_devrf_learns_such_a_capture_where_it_is_chosen(devrf, short, mill, tmp_
     ],
 )
 def test_a_capture_ends_with_the_command_that_learns_it(
-    devrf, mill, write_scene, tmp_path, monkeypatch, layout, said
+    devrf, mill, tmp_path, monkeypatch, layout, said
 ) -> None:
     sizes = {"width": 24, "height": 20, "static_views": 8, "frames": 3, "supersample": 1}
     write_scene("nerfstudio", ProceduralScene(train_views=2, **sizes)(), tmp_path / "robot")

@@ -9,11 +9,12 @@ import imageio.v3 as iio
 import torch
 
 from devrf.checkpoints.checkpoint import load_checkpoint
+from layouts import write_scene, write_sparse
 
 BRIEF = ("video.frames=2", "evaluation.metrics=[psnr_masked]", "data.flow=dis")
 
 
-def test_a_listed_scene_of_two_sizes(devrf, short, two_sizes, write_scene, tmp_path):
+def test_a_listed_scene_of_two_sizes(devrf, short, two_sizes, tmp_path):
     write_scene("nerfstudio", two_sizes, tmp_path / "robot")
     place = ("data=nerfstudio", "data.root=robot", "hydra.run.dir=run")
     run = devrf(*short, *place, *BRIEF)
@@ -36,7 +37,7 @@ def test_a_listed_scene_of_two_sizes(devrf, short, two_sizes, write_scene, tmp_p
     assert "18 x 18, 24 x 16" in looked.out
 
 
-def test_a_sparse_model_of_two_sizes(devrf, short, two_sizes, write_sparse, tmp_path):
+def test_a_sparse_model_of_two_sizes(devrf, short, two_sizes, tmp_path):
     train = two_sizes.static.train
     names = [f"{k}.png" for k in range(len(train))]
     points = 0.4 * torch.rand(30, 3, generator=torch.Generator().manual_seed(0)) - 0.2

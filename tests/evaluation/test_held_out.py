@@ -17,6 +17,7 @@ from devrf.evaluation.suite import MetricSuite
 from devrf.metrics.image import psnr, ssim
 from devrf.rendering.renderer import Renderer
 from devrf.system.progress import followed
+from pictures import plain_picture
 
 
 def test_truth_by_hand(tiny_scene):
@@ -53,12 +54,12 @@ def test_only_pixels_that_count_are_scored(learned, tiny_scene):
     assert rim.psnr == pytest.approx(psnr(whole.prediction[:1, :8], whole.truth[:1, :8]))
 
 
-def test_a_score_is_that_of_the_picture_at_the_views_time(learned, tiny_scene, reference):
+def test_a_score_is_that_of_the_picture_at_the_views_time(learned, tiny_scene):
     views, model = tiny_scene.dynamic.test, learned[0].scene_model
     scored = score(Renderer(model), views, 2, "white")
     assert scored.name == views.names[2] and scored.time == 1.0
     assert scored.prediction.shape == scored.truth.shape == (18, 24, 3)
-    seen = reference(model, views.cameras.image_rays(2), 1.0, torch.ones(3)).color.clamp(0, 1)
+    seen = plain_picture(model, views.cameras.image_rays(2), 1.0, torch.ones(3)).color.clamp(0, 1)
     torch.testing.assert_close(scored.prediction, seen.view(18, 24, 3))
     assert scored.psnr == pytest.approx(psnr(scored.prediction, scored.truth))
     assert scored.ssim == pytest.approx(ssim(scored.prediction, scored.truth))

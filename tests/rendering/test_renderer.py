@@ -12,6 +12,7 @@ from devrf.geometry.space import WORLD
 from devrf.methods.devrf import view as module
 from devrf.rendering.output import RenderedImage
 from devrf.rendering.renderer import MIN_CHUNK, Renderer, in_chunks
+from pictures import assert_same_picture, plain_picture
 
 CPU = torch.device("cpu")
 WHITE = torch.ones(3)
@@ -20,10 +21,10 @@ NEAR, FAR = 0.5, 10.0
 
 
 @pytest.mark.parametrize("time", [0.0, 0.4, 0.55, 1.0])
-def test_it_renders_what_the_model_renders(moving, tiny_scene, time, same, reference):
+def test_it_renders_what_the_model_renders(moving, tiny_scene, time):
     cameras = tiny_scene.dynamic.test.cameras
     seen = Renderer(moving).view(cameras, 1, time, 1.0)
-    same(seen, reference(moving, cameras.image_rays(1), time, WHITE))
+    assert_same_picture(seen, plain_picture(moving, cameras.image_rays(1), time, WHITE))
     assert 20 < int((seen.opacity > 0.5).sum()) < 24 * 18 / 2
     assert not seen.color.requires_grad
 
@@ -101,7 +102,7 @@ def test_errors_that_smaller_chunks_do_not_prevent(error, sizes):
     assert tried == sizes
 
 
-def test_an_image_is_the_same_with_less_memory(rest, tiny_scene, same, monkeypatch, caplog):
+def test_an_image_is_the_same_with_less_memory(rest, tiny_scene, monkeypatch, caplog):
     rays = tiny_scene.static.test.cameras.image_rays(0)
     rays = rays[torch.arange(len(rays)).repeat(2)]
     whole = Renderer(rest.model).picture(rays, 0.0, 1.0)
@@ -114,7 +115,7 @@ def test_an_image_is_the_same_with_less_memory(rest, tiny_scene, same, monkeypat
         return usual(some, *others, **named)
 
     monkeypatch.setattr(module, "render", render)
-    same(Renderer(rest.model).picture(rays, 0.0, 1.0), whole)
+    assert_same_picture(Renderer(rest.model).picture(rays, 0.0, 1.0), whole)
     assert tried == [864, 432, 432]
     assert caplog.messages[-1].startswith("out of memory: pictures are rendered 432 rays")
 

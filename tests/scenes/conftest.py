@@ -24,6 +24,7 @@ from devrf.scenes.lens import Lens
 from devrf.scenes.reader import SceneReader
 from devrf.scenes.resampling import shrink_pixels
 from devrf.scenes.scene import Scene, Views
+from layouts import write_rig, write_scene, write_sparse
 
 
 @pytest.fixture
@@ -256,9 +257,6 @@ LISTED = ("nerfstudio", "nerfies", "dycheck")
 def write_layout(
     tiny_scene: Scene,
     tiny_toy: Scene,
-    write_sparse: Callable[..., None],
-    write_rig: Callable[..., None],
-    write_scene: Callable[[str, Scene, Path], None],
 ) -> Callable[[str, Path], None]:
     """A function that writes a tiny scene in the layout that ``data=CHOICE`` reads."""
 

@@ -24,6 +24,7 @@ from devrf.scenes.formats.colmap import ColmapReader
 from devrf.scenes.lens import Lens
 from devrf.scenes.sparse_model import normalised, read_model, scene_model
 from devrf.system.memory import own_memory
+from layouts import write_sparse
 
 # Not square, the principal point off the middle.
 WIDTH, HEIGHT, COUNT = 80, 60, 17
@@ -42,7 +43,7 @@ def message_of(refusal) -> Callable[..., str]:
 
 
 @pytest.fixture
-def folder(tmp_path, ring_cameras, picture, write_sparse) -> Path:
+def folder(tmp_path, ring_cameras, picture) -> Path:
     """A ring of pictures of the balls, taken through a lens with distortion."""
     root = tmp_path / "balls"
     ring = ring_cameras(COUNT, width=WIDTH, height=HEIGHT, angle=0.9)
@@ -85,9 +86,7 @@ def opaque(folder: Path) -> None:
         iio.imwrite(path, iio.imread(path)[..., :3])
 
 
-def test_a_model_far_from_the_origin_is_read_as_the_same_near_it(
-    folder, ring_cameras, write_sparse
-):
+def test_a_model_far_from_the_origin_is_read_as_the_same_near_it(folder, ring_cameras):
     near = ColmapReader(folder, downscale=1).read()
     far = torch.tensor([500_000.0, 5_600_000.0, 200.0], dtype=torch.float64)
     ring = ring_cameras(COUNT, width=WIDTH, height=HEIGHT, angle=0.9)
@@ -115,7 +114,7 @@ def test_photographs_are_of_a_scene_without_end(folder):
     assert 1.0 < scene.bounds.near < 2.0
 
 
-def test_cameras_on_one_side_make_a_forward_facing_scene(tmp_path, ring_cameras, write_sparse):
+def test_cameras_on_one_side_make_a_forward_facing_scene(tmp_path, ring_cameras):
     ring = ring_cameras(60, width=WIDTH, height=HEIGHT, angle=0.9)[torch.arange(6)]
     (tmp_path / "images").mkdir()
     names = [f"{k}.jpg" for k in range(6)]
@@ -158,9 +157,7 @@ def test_smaller_images_that_are_not_complete_are_passed_over(folder, caplog):
     assert "images_2 lacks 1 of the 17 posed images: those in images/ are made" in caplog.text
 
 
-def test_the_model_of_most_images_is_read_and_the_others_are_named(
-    folder, ring_cameras, write_sparse, caplog
-):
+def test_the_model_of_most_images_is_read_and_the_others_are_named(folder, ring_cameras, caplog):
     (folder / "sparse/0").rename(folder / "sparse/12")
     ring = ring_cameras(COUNT, width=WIDTH, height=HEIGHT, angle=0.9)
     write_sparse(folder / "sparse/0", ring[:3], NAMES[:3], POINTS)
@@ -177,7 +174,7 @@ def test_the_model_of_most_images_is_read_and_the_others_are_named(
     assert scene_model(folder)[0].folder == folder / "sparse/2"  # the first of equal ones
 
 
-def test_images_without_a_pose_are_said(folder, ring_cameras, write_sparse, caplog):
+def test_images_without_a_pose_are_said(folder, ring_cameras, caplog):
     ColmapReader(folder, downscale=1).read()
     assert "are posed" not in caplog.text
     shutil.rmtree(folder / "sparse/0")

@@ -16,6 +16,7 @@ import torch
 
 from devrf.scenes.formats.dycheck import DycheckReader
 from devrf.scenes.lens import Lens
+from layouts import write_camera
 
 # Not square. Camera 0 goes half around, cameras 1 and 2 stand and take every third moment.
 WIDTH, HEIGHT, MOMENTS = 40, 32, 9
@@ -41,7 +42,7 @@ def split(shots: list[tuple[int, int]]) -> dict[str, Any]:
 
 
 @pytest.fixture
-def folder(tmp_path, ring_cameras, picture, write_camera) -> Path:
+def folder(tmp_path, ring_cameras, picture) -> Path:
     """The balls from 15 places: nine of a moving camera, two of cameras that stand."""
     root = tmp_path / "windmill"
     ring = ring_cameras(2 * MOMENTS, width=WIDTH, height=HEIGHT, angle=0.9)

@@ -17,6 +17,7 @@ import torch
 from devrf.geometry.cameras import Distortion
 from devrf.scenes.formats.nerfies import NerfiesReader
 from devrf.scenes.lens import Lens
+from layouts import write_camera
 
 # Not square, the principal point off the middle, and pixels that are neither.
 WIDTH, HEIGHT, COUNT = 80, 60, 9
@@ -46,7 +47,7 @@ class Folder:
 
 
 @pytest.fixture
-def folder(tmp_path, ring_cameras, picture, write_camera) -> Folder:
+def folder(tmp_path, ring_cameras, picture) -> Folder:
     """The scene of the balls, in a world that scene.json moves back to the origin."""
     made = Folder(tmp_path / "scene")
     ring = ring_cameras(COUNT, width=WIDTH, height=HEIGHT, angle=0.9)

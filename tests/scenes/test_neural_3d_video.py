@@ -16,6 +16,7 @@ from devrf.geometry.cameras import Cameras
 from devrf.pictures.video_file import write_pictures
 from devrf.scenes.formats import recognise
 from devrf.scenes.formats.neural_3d_video import Neural3DVideoReader
+from layouts import write_rig
 
 # Not square. The numbers of the videos leave some out.
 WIDTH, HEIGHT, FRAMES = 32, 24, 7
@@ -34,7 +35,7 @@ def film(camera: int, frames: int = FRAMES, width: int = WIDTH) -> Iterator[np.n
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory, write_rig) -> Path:
+def written(tmp_path_factory) -> Path:
     """Four cameras 1 apart, 6 before what is nearest."""
     root = tmp_path_factory.mktemp("rig") / "coffee"
     where = torch.tensor([[k - 1.5, 0.0, 0.0] for k in range(4)])

@@ -28,6 +28,7 @@ from devrf.scenes.scene import Scene, Views
 from devrf.scenes.silhouettes import motion_box, visual_hull
 from devrf.scenes.sparse_model import normalised, read_model
 from devrf.scenes.validation import same_shape
+from layouts import write_sparse
 
 COUNT = 9
 # Landscape and portrait in turn, by one phone; principal points off the middle.
@@ -105,7 +106,7 @@ def test_each_image_is_read_with_its_own_camera(listed, balls_are_where_they_pro
         assert np.array_equal(train.single(0).pixels[0].numpy(), file)
 
 
-def test_a_sparse_model_with_two_cameras(photos, write_sparse, balls_are_where_they_project):
+def test_a_sparse_model_with_two_cameras(photos, balls_are_where_they_project):
     root, cameras = photos
     balls = torch.tensor([[1.2, 0.1, 0.45], [-0.6, 1.0, 0.0], [0.1, -1.1, -0.45]])
     points = torch.cat([balls, torch.rand(20, 3, generator=torch.Generator().manual_seed(0))])

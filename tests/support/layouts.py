@@ -1,0 +1,153 @@
+"""Scenes as other programs leave them on disk: a writer for each layout."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from devrf.pictures.video_file import write_pictures
+from devrf.geometry.cameras import Cameras
+from devrf.scenes.lens import Lens
+from devrf.scenes.scene import Scene, Views
+
+
+def write_sparse(
+    folder: Path,
+    cameras: Cameras,
+    names: Sequence[str],
+    points: torch.Tensor,
+    model: str = "PINHOLE",
+    parameters: Sequence[float] | None = None,
+) -> None:
+    """Write a sparse model as COLMAP's text files: one lens, all points in all images.
+
+    ``parameters`` are those of ``model``; None: a pinhole with the first camera's numbers.
+    """
+    folder.mkdir(parents=True)
+    given = parameters or [*cameras.focal[0].tolist(), *cameras.center[0].tolist()]
+    numbers = " ".join(map(repr, given))
+    (folder / "cameras.txt").write_text(f"1 {model} {cameras.width} {cameras.height} {numbers}\n")
+    lines = []
+    for k, pose in enumerate(cameras.camera_to_world.double()):
+        turn = Rotation.from_matrix((pose[:, :3] * pose.new_tensor([1, -1, -1])).T.numpy())
+        x, y, z, w = turn.as_quat().tolist()
+        moved = (-turn.as_matrix() @ pose[:, 3].numpy()).tolist()
+        lines.append(" ".join(map(repr, (k + 1, w, x, y, z, *moved, 1))) + f" {names[k]}")
+        lines.append(" ".join(f"0.5 0.5 {number}" for number in range(len(points))))
+    (folder / "images.txt").write_text("\n".join(lines) + "\n")
+    rows = [f"{n} {x!r} {y!r} {z!r} 9 9 9 0.5" for n, (x, y, z) in enumerate(points.tolist())]
+    (folder / "points3D.txt").write_text("\n".join(rows) + "\n")
+
+
+def write_rig(
+    root: Path, films: Mapping[str, Iterable[np.ndarray]], cameras: Cameras, near: float, far: float
+) -> None:
+    """Write a video for each of the fixed cameras, and ``poses_bounds.npy``, as Neural 3D Video.
+
+    A row of it is [down, right, back, position, (H, W, f)] as 3 × 5, then two depths.
+    """
+    root.mkdir(parents=True)
+    for name, pictures in films.items():
+        write_pictures(root / name, iter(pictures), 10)
+    right, up, back, position = cameras.camera_to_world.double().unbind(dim=2)
+    size = [cameras.height, cameras.width, float(cameras.focal[0, 0])]
+    column = torch.tensor(size, dtype=torch.float64).expand(len(cameras), 3)
+    rows = torch.stack([-up, right, back, position, column], dim=2).reshape(-1, 15)
+    depths = torch.tensor([[near, far]], dtype=torch.float64).expand(len(cameras), 2)
+    np.save(root / "poses_bounds.npy", torch.cat([rows, depths], dim=1).numpy())
+
+
+def put_json(file: Path, content: Any) -> None:
+    """Write a JSON file, and the folders above it."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(json.dumps(content))
+
+
+def write_camera(
+    root: Path, size: str, item: str, pixels: np.ndarray, pose: torch.Tensor, lens: Lens
+) -> None:
+    """An image and its camera file as Nerfies has them; the lens is that of the full image."""
+    (root / "rgb" / size).mkdir(parents=True, exist_ok=True)
+    iio.imwrite(root / f"rgb/{size}/{item}.png", pixels)
+    factor, (fx, fy) = int(size[0]), lens.focal
+    camera = {
+        "orientation": (pose[:, :3] * torch.tensor([1.0, -1.0, -1.0])).T.tolist(),
+        "position": pose[:, 3].tolist(),
+        "focal_length": fx,
+        "pixel_aspect_ratio": fy / fx,
+        "skew": lens.skew,
+        "principal_point": lens.center,
+        "image_size": [pixels.shape[1] * factor, pixels.shape[0] * factor],
+        "radial_distortion": lens.distortion.radial[:3],
+        "tangential_distortion": lens.distortion.tangential,
+    }
+    put_json(root / f"camera/{item}.json", camera)
+
+
+def in_one_list(scene: Scene) -> dict[str, tuple[Views, int]]:
+    """Every image of an inward-facing scene by a name, held-out ones last."""
+    parts = {
+        "static": scene.static.train,
+        "moving": scene.dynamic.train,
+        "test_static": scene.static.test,
+        "test_moving": scene.dynamic.test,
+    }
+    return {f"{name}_{i}": (views, i) for name, views in parts.items() for i in range(len(views))}
+
+
+def write_nerfstudio(scene: Scene, root: Path) -> None:
+    """The scene as nerfstudio lists it: all images in one file, at rest at time 0."""
+    root.mkdir(parents=True)
+    frames: list[dict[str, Any]] = []
+    for name, (views, i) in in_one_list(scene).items():
+        view = views.single(i)
+        iio.imwrite(root / f"{name}.png", view.pixels[0].numpy())
+        pose = [*view.cameras.camera_to_world[0].tolist(), [0, 0, 0, 1]]
+        (fx, fy), (cx, cy) = view.cameras.focal[0].tolist(), view.cameras.center[0].tolist()
+        lens = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": view.width, "h": view.height}
+        placed = {"time": float(view.times[0]), "transform_matrix": pose}
+        frames.append({"file_path": f"{name}.png", **placed, **lens})
+    names = [frame["file_path"] for frame in frames]
+    listed = {"frames": frames, "test_filenames": [n for n in names if n.startswith("test")]}
+    put_json(root / "transforms.json", listed)
+
+
+def write_nerfies(scene: Scene, root: Path, size: str = "4x") -> None:
+    """The scene as Nerfies lists it, its images already made smaller."""
+    images, factor = in_one_list(scene), int(size[0])
+    for name, (views, i) in images.items():
+        focal, center = views.cameras.focal[i] * factor, views.cameras.center[i] * factor
+        lens = Lens(tuple(focal.tolist()), tuple(center.tolist()))
+        pose = views.cameras.camera_to_world[i]
+        write_camera(root, size, name, views.pixels[i].numpy(), pose, lens)
+    ids = list(images)
+    held_out = [name for name in ids if name.startswith("test")]
+    times = {name: {"warp_id": round(2 * float(v.times[i]))} for name, (v, i) in images.items()}
+    train = [name for name in ids if name not in held_out]
+    put_json(root / "dataset.json", {"ids": ids, "train_ids": train, "val_ids": held_out})
+    put_json(root / "metadata.json", times)
+    world = {"center": [0, 0, 0], "scale": 1, "near": scene.bounds.near, "far": scene.bounds.far}
+    put_json(root / "scene.json", world)
+
+
+def write_dycheck(scene: Scene, root: Path) -> None:
+    """The scene as DyCheck lists it: the dynamic images alone, made smaller by two."""
+    write_nerfies(scene, root, "2x")
+    times = json.loads((root / "metadata.json").read_text())
+    for split, part in (("train", "moving"), ("val", "test_moving")):
+        names = [name for name in times if name.startswith(part)]
+        ids = [times[name]["warp_id"] for name in names]
+        put_json(root / f"splits/{split}.json", {"frame_names": names, "time_ids": ids})
+
+
+def write_scene(choice: str, scene: Scene, root: Path) -> None:
+    """Write an inward-facing scene as ``data=CHOICE`` reads it."""
+    writers = {"nerfstudio": write_nerfstudio, "nerfies": write_nerfies, "dycheck": write_dycheck}
+    writers[choice](scene, root)
