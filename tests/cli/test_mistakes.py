@@ -185,8 +185,8 @@ def unread(python, folder, *arguments):
     return python(folder, "-c", script)
 
 
-@pytest.mark.parametrize("argument", ["--help", "--version"])
-@pytest.mark.parametrize("unbuffered", ["", "1"])  # empty is as not set
+# Python writes what is buffered as it ends; empty is as not set.
+@pytest.mark.parametrize(("argument", "unbuffered"), [("--help", ""), ("--version", "1")])
 def test_output_that_nobody_reads_ends_it_quietly(
     python, tmp_path, monkeypatch, argument, unbuffered
 ):

@@ -16,6 +16,7 @@ from omegaconf import OmegaConf
 from devrf.cli.complete import completed
 from devrf.cli.config import command_line
 from devrf.cli.restore_config import parsed, value, values
+from devrf.errors import DevrfError
 from devrf.system.override import to_type
 
 PARSER = OverridesParser.create()
@@ -98,14 +99,29 @@ SITUATIONS = [(a_file_of_a_scene, name) for name in NAMES]
 SITUATIONS += [(place, name) for place in PLACES[1:] for name in AWKWARD]
 
 
+def words_in(line: str) -> list[str]:
+    """The words that a line says to type."""
+    (words,) = re.findall(r"(?:; write|make a scene of it:) (.*?)(?:, or with .*)?$", line)
+    return shlex.split(words)
+
+
 @pytest.mark.parametrize(("place", "name"), SITUATIONS)
-def test_the_words_of_a_line_reach_the_config(devrf, tmp_path, monkeypatch, place: Place, name):
+def test_the_words_of_a_line_are_read_as_the_names(tmp_path, monkeypatch, place: Place, name):
     monkeypatch.chdir(tmp_path)
     typed, said = place(tmp_path, name)
+    with pytest.raises(DevrfError) as refusal:
+        completed([typed])
+    read = parsed(words_in(str(refusal.value)))
+    assert {word.key_or_group: word.value() for word in read if word.key_or_group in said} == said
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_the_words_of_a_line_reach_the_config(devrf, tmp_path, monkeypatch, place: Place):
+    monkeypatch.chdir(tmp_path)
+    typed, said = place(tmp_path, "it's, a (1)")
     outcome = devrf(typed)
     assert outcome.status == 2 and outcome.err.count("\n") == 1
-    (words,) = re.findall(r"(?:; write|make a scene of it:) (.*?)(?:, or with .*)?$", outcome.err)
-    composed = devrf(*shlex.split(words), "--cfg", "job")
+    composed = devrf(*words_in(outcome.err), "--cfg", "job")
     assert (composed.status, composed.err) == (0, "")
     config = OmegaConf.create(composed.out)
     assert {key: OmegaConf.select(config, key) for key in said} == said
@@ -154,12 +170,12 @@ def test_values_with_commas_are_printed_as_text_and_as_a_list(devrf):
     assert read == ["2,b c", [2, "b c"]]
 
 
-@pytest.mark.parametrize("name", AWKWARD)
-def test_a_command_that_goes_on_names_the_present_run(devrf, tmp_path, name):
-    command = command_line("stage=view", to_type("hydra.run.dir", tmp_path / name))
+def test_a_command_that_goes_on_names_the_present_run(devrf, tmp_path):
+    place = tmp_path / "it's, a (1)"
+    command = command_line("stage=view", to_type("hydra.run.dir", place))
     assert command.startswith("python -m devrf stage=view ")
     composed = devrf(*shlex.split(command)[3:], "--cfg", "hydra")
-    assert OmegaConf.create(composed.out).hydra.run.dir == str(tmp_path / name)
+    assert OmegaConf.create(composed.out).hydra.run.dir == str(place)
 
 
 def test_a_run_ends_with_commands_that_work(devrf, tiny_data, short, tmp_path):
