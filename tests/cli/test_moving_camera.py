@@ -14,8 +14,6 @@ from devrf.scenes.procedural import ProceduralForwardScene, ProceduralScene
 from devrf.scenes.view_folders import dynamic_folders
 from layouts import write_scene
 
-FILM = ("video.frames=1", "video.height=24")
-
 
 @pytest.fixture
 def mill(tmp_path, monkeypatch) -> None:
@@ -35,7 +33,9 @@ def test_a_capture_needs_no_flag_beside_its_folder(devrf, mill, tmp_path) -> Non
     small = (
         "ray_stage.model.settings.side=12",
         "ray_stage.schedule.iterations=4",
+        "ray_stage.schedule.rays=64",
         "video.frames=1",
+        "video.height=24",
     )
     run = devrf("data.root=mill", "schedule.seconds=null", *small, "evaluation.metrics=[]")
     assert (run.status, run.err) == (0, "")

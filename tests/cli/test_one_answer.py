@@ -22,7 +22,8 @@ def test_the_command_line_adds_nothing_to_what_is_typed(data):
 
 
 @pytest.mark.parametrize(
-    ("data", "experiment"), [("procedural", "quickstart"), ("forward", "paper"), ("colmap", "phone")]
+    ("data", "experiment"),
+    [("procedural", "quickstart"), ("forward", "paper"), ("colmap", "phone")],
 )
 def test_python_and_the_command_line_compose_the_same(devrf, data, experiment):
     register_config()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -65,7 +66,8 @@ def test_the_papers_settings_learn_an_inward_facing_scene(paper):
 
 
 def test_the_papers_settings_learn_a_forward_facing_scene(devrf, tmp_path):
-    done = devrf("data=procedural_forward", *PAPER, "hydra.run.dir=run")
+    alone = ("stage=canonical", "hydra.run.dir=run")
+    done = devrf("data=procedural_forward", *PAPER, *alone)
     assert done.status == 0, done.err
     found = record(tmp_path / "run")["rehearsal"]
     assert found["learned"]["static"]["psnr"] > found["learned"]["static"]["blank"] + 8
@@ -130,8 +132,9 @@ def test_settings_by_which_nothing_is_found_end_with_status_2(devrf):
     assert done.status == 2 and "the geometry search found nothing opaque" in done.err
 
 
-def test_a_stage_that_does_not_learn_ends_with_status_2(devrf, tmp_path):
-    still = ("schedule.motion.learning_rate=0", "loss.deformation.flow=0")
+def test_a_stage_that_does_not_learn_ends_with_status_2(paper, devrf, tmp_path):
+    shutil.copytree(paper[0] / "outputs/robot/paper-rehearsal", tmp_path / "run")
+    still = ("schedule.motion.learning_rate=0", "loss.deformation.flow=0", "stage=deformation")
     done = devrf(*PAPER, *still, "hydra.run.dir=run")
     assert done.status == 2
     assert "rehearse: the deformation stage has learned no motion: " in done.err

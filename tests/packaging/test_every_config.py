@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from itertools import cycle
 from pathlib import Path
 
 import pytest
@@ -24,29 +25,24 @@ from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.ray_stage import RaySchedule
 
 NAMES = group_choices()
-CHOICES = [f"{group}={name}" for group, names in NAMES.items() for name in names]
 NEEDS = {
     "logger=tensorboard": "tensorboard",
     "hparams_search=loss_weights": "hydra_plugins.hydra_optuna_sweeper",
 }
 
 
-def rooted(composed, folder, *overrides):
-    """The composed config, with a folder for a scene from disk where one is asked for."""
-    config = composed(*overrides)
-    if not OmegaConf.is_missing(config.data, "root"):
-        return config
-    (folder / "scene").mkdir()
-    (folder / "scene" / "transforms.json").touch()  # so that a layout is recognised
-    return composed(*overrides, f"data.root={folder}/scene")
+EMBEDDED = {"procedural", "flower", "procedural_forward"}
+FORWARD = {"forward", "neural_3d_video", "pig_toy", "plant", "rabbit", "procedural_forward"}
 
-
-# What is learned is not DeVRF's two stages, or it is no choice by itself, or in every config.
-OTHERS = ("method", "comparison=", "hydra/", "protocol=", "profile=", "for_scene=", "source=")
-OTHERS += ("paper_scene=",)
-CHOSEN = [
-    name for name in CHOICES if not name.startswith(OTHERS) and name.split("=")[1] != "default"
-]
+# Options of these groups go together: a config with one of each.
+TOGETHER = ("field", "schedule", "sampling", "loss", "facing", "video", "trainer")
+COLUMNS = [cycle(f"{group}={name}" for name in NAMES[group]) for group in TOGETHER]
+ROWS = [" ".join(map(next, COLUMNS)) for _ in range(max(len(NAMES[group]) for group in TOGETHER))]
+# Other tests compose these, or a choice in another group does.
+OTHERS = ("data", "method", "comparison", "protocol", "profile", "for_scene", "source")
+OTHERS += ("paper_scene", *(group for group in NAMES if group.startswith("hydra/")))
+ALONE = [group for group in NAMES if group not in (*TOGETHER, *OTHERS)]
+ALONE = [f"{group}={name}" for group in ALONE for name in NAMES[group] if name != "default"]
 
 
 def chain(group, name):
@@ -73,8 +69,7 @@ def test_cpu_small_is_best_small_for_forward_facing_scenes(composed):
 
 @pytest.mark.parametrize(("data", "factor"), [("inward", 1), ("colmap", "auto"), ("lego", 2)])
 def test_best_takes_images_at_the_size_that_the_scenes_choice_says(composed, data, factor):
-    for experiment in ("experiment=quickstart", "experiment=best"):
-        assert composed(f"data={data}", "data.root=x", experiment).data.downscale == factor
+    assert composed(f"data={data}", "data.root=x", "experiment=best").data.downscale == factor
 
 
 @pytest.mark.parametrize(("data", "iterations"), [("inward", 10), ("forward", 50)])
@@ -95,15 +90,50 @@ def is_new(*parts):
     return len(known) > before
 
 
-@pytest.mark.parametrize("choice", CHOSEN)
-def test_it_composes_and_builds(composed, tmp_path, choice):
+@pytest.fixture
+def scene(tmp_path) -> Path:
+    """A folder in which a layout is recognised."""
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "transforms.json").touch()
+    return tmp_path / "scene"
+
+
+@pytest.mark.parametrize("data", NAMES["data"])
+def test_data_composes_builds_its_datamodule_and_chooses_the_facing(composed, scene, data):
+    config = composed(f"data={data}", *([] if data in EMBEDDED else [f"data.root={scene}"]))
+    check_config(config)
+    assert isinstance(instantiate(config.data), SceneDataModule)
+    chosen = HydraConfig.get().runtime.choices
+    facing = "forward" if data in FORWARD else "inward"
+    assert (chosen.facing, chosen.loss) == (facing, facing)
+    assert (chosen.field, chosen.schedule) == (f"small_{facing}", f"quick_{facing}")
+    build_stages(config)
+
+
+def test_the_facing_that_is_typed_goes_before_that_of_the_data(composed):
+    composed("data=forward", "facing=inward")
+    assert HydraConfig.get().runtime.choices.schedule == "quick_inward"
+
+
+@pytest.mark.parametrize("choice", [*ROWS, *ALONE])
+def test_it_composes_and_builds(composed, scene, choice):
     needed = NEEDS.get(choice)
     if needed and importlib.util.find_spec(needed) is None:
         pytest.skip(f"{needed} is not installed")
-    config = rooted(composed, tmp_path, choice)
+    config = composed(*choice.split())
+    if OmegaConf.is_missing(config.data, "root"):
+        config = composed(*choice.split(), f"data.root={scene}")
     check_config(config)
-    if is_new(config.data):
-        assert isinstance(instantiate(config.data), SceneDataModule)
+    build_stages(config)
+    if is_new(config.trainer, config.logger, config.callbacks):
+        callbacks = list(instantiate(config.callbacks).values())
+        instantiate(config.trainer, logger=instantiate(config.logger), callbacks=callbacks)
+    if is_new(config.video):
+        assert instantiate(config.video).frames > 0
+
+
+def build_stages(config):
+    """Build the stages of a config, unless one before had just these parts."""
     if "ray_stage" in config:
         stage = instantiate(config.ray_stage, _partial_=True, _convert_="all")
         assert isinstance(stage.keywords["schedule"], RaySchedule)
@@ -113,11 +143,6 @@ def test_it_composes_and_builds(composed, tmp_path, choice):
         build = instantiate(config.deformation, _partial_=True, _convert_="all")
         assert build.func is DeformationStage
         assert isinstance(build.keywords["schedule"], DeformationSchedule)
-    if is_new(config.trainer, config.logger, config.callbacks):
-        callbacks = list(instantiate(config.callbacks).values())
-        instantiate(config.trainer, logger=instantiate(config.logger), callbacks=callbacks)
-    if is_new(config.video):
-        assert instantiate(config.video).frames > 0
 
 
 @pytest.mark.parametrize("method", NAMES["method"])
