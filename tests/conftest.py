@@ -20,7 +20,7 @@ from hypothesis import settings
 
 from devrf.geometry.box import Box
 
-pytest_plugins = ["tiny_scenes", "tiny_stages"]  # in support/
+pytest_plugins = ["composed_configs", "tiny_scenes", "tiny_stages"]  # in support/
 
 logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
 

@@ -9,10 +9,14 @@ import sys
 from pathlib import Path
 
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
 
 import devrf as package
 from devrf.cli.config import STEPS, known_stages
+from devrf.cli.config_check import check_config
 from devrf.cli.run import STEPS as TAKEN
+from devrf.errors import DevrfError
 
 # Arguments, and what the one line must name.
 MISTAKES = {
@@ -40,34 +44,11 @@ MISTAKES = {
         ["protocol=joint"],
         "protocol: method=devrf does not learn by protocol=joint",
     ),
-    "seed out of range": (["seed=-1"], "seed: expected at least 0, not -1"),
     "steps of no length": (["sampling.step=0"], "sampling.step: expected at least 0.01, not 0"),
-    "samples of which none counts": (
-        ["sampling.alpha_threshold=1"],
-        "sampling.alpha_threshold: expected below 1, not 1",
-    ),
-    "an opacity that is none": (
-        ["sampling.search_alpha_threshold=nan"],
-        "sampling.search_alpha_threshold: expected below 1, not nan",
-    ),
     "a level without a side": (
         ["schedule.deformation.levels.4={iterations:2}", "schedule.deformation.levels.3=null"],
         "schedule.deformation.levels: expected rows 1 to 3 with side and iterations",
     ),
-    "a level of a grid of one point": (
-        ["schedule.deformation.levels.2.side=1"],
-        "schedule.deformation.levels.2.side: expected at least 2, not 1",
-    ),
-    "no times to export": (["export.times=[]"], "export.times: expected at least 1 item, not 0"),
-    "unknown key of a level": (
-        ["+schedule.deformation.levels.3.sides=4"],
-        "schedule.deformation.levels.3.sides: no such key; did you mean",
-    ),
-    "a value in place of a part": (
-        ["schedule.extensions.bending=1"],
-        "schedule.extensions.bending: expected a section with _target_, not 1",
-    ),
-    "part that is not there": (["data._target_=devrf.nothing"], "data._target_: cannot load"),
     "unknown loss term": (["+loss.deformation.foo=1"], "unknown term 'foo'"),
     "unknown accelerator": (["trainer.accelerator=abacus"], "trainer: "),
     "several devices, each for itself": (
@@ -90,6 +71,45 @@ MISTAKES = {
         "data.export: stage=prepare needs a folder; give data.export=PATH",
     ),
 }
+
+
+# What the check of the composed config refuses, as it does steps of no length.
+VALUES = {
+    "seed out of range": (["seed=-1"], "seed: expected at least 0, not -1"),
+    "samples of which none counts": (
+        ["sampling.alpha_threshold=1"],
+        "sampling.alpha_threshold: expected below 1, not 1",
+    ),
+    "an opacity that is none": (
+        ["sampling.search_alpha_threshold=nan"],
+        "sampling.search_alpha_threshold: expected below 1, not nan",
+    ),
+    "a level of a grid of one point": (
+        ["schedule.deformation.levels.2.side=1"],
+        "schedule.deformation.levels.2.side: expected at least 2, not 1",
+    ),
+    "no times to export": (["export.times=[]"], "export.times: expected at least 1 item, not 0"),
+    "unknown key of a level": (
+        ["+schedule.deformation.levels.3.sides=4"],
+        "schedule.deformation.levels.3.sides: no such key; did you mean",
+    ),
+    "a value in place of a part": (
+        ["schedule.extensions.bending=1"],
+        "schedule.extensions.bending: expected a section with _target_, not 1",
+    ),
+    "part that is not there": (["data._target_=devrf.nothing"], "data._target_: cannot load"),
+}
+
+
+@pytest.mark.parametrize("name", VALUES)
+def test_a_value_that_does_not_fit_is_named(composed, tiny, name):
+    (argument,), expected = VALUES[name]
+    config = composed(*tiny)
+    override = OverridesParser.create().parse_override(argument)
+    OmegaConf.set_struct(config, False)
+    OmegaConf.update(config, override.key_or_group, override.value())
+    with pytest.raises(DevrfError, match=f"^{re.escape(expected)}"):
+        check_config(config)
 
 
 @pytest.mark.parametrize("name", MISTAKES)

@@ -15,7 +15,6 @@ LIMITS = [
     ("+trainer.limit_train_batches=2", 2),
     ("+trainer.max_time=00:00:00:00", 0),
     ("trainer.max_epochs=0", 0),
-    ("trainer.max_steps=0", 0),
 ]
 
 

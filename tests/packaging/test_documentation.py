@@ -114,16 +114,48 @@ def test_docstrings_cite_anchors_of_the_method():
         assert set(cited) <= set(anchors), source
 
 
-@pytest.mark.parametrize("command", commands())
-def test_commands_compose(command, composed, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "scene").mkdir()
-    (tmp_path / "scene" / "transforms_train.json").touch()  # so that a layout is recognised
-    # Of the values of a sweep, the first.
+def words_of(command: str) -> dict[str, str]:
+    """The command's arguments by key; of the values of a sweep the first, of a path ``scene``."""
     words = [word if "[" in word else word.split(",")[0] for word in shlex.split(command)]
     paths = r"=(PATH|FOLDER|…|mine|scenes/fox)$"
     words = [re.sub(paths, "=scene", word) for word in words if word != "-m"]
-    check_config(composed(*completed(words)))
+    return {word.partition("=")[0].lstrip("+~"): word for word in words}
+
+
+def batches() -> list[list[dict[str, str]]]:
+    """Commands that choose the same options and give no key two values: one config shows them."""
+    found: dict[object, list[list[dict[str, str]]]] = {}
+    for words in map(words_of, commands()):
+        chosen = frozenset(word for key, word in words.items() if key in group_choices())
+        known = found.setdefault((chosen, "data.root" in words), [])
+        for batch in known:
+            if not any(conflict(words, other) for other in batch):
+                batch.append(words)
+                break
+        else:
+            known.append([words])
+    return [batch for known in found.values() for batch in known]
+
+
+def conflict(words: dict[str, str], others: dict[str, str]) -> bool:
+    """Whether one sets what the other sets otherwise, or a part of it; all may have a stage."""
+
+    def overlap(key: str, other: str) -> bool:
+        return f"{key}.".startswith(f"{other}.") or f"{other}.".startswith(f"{key}.")
+
+    pairs = ((key, other) for key in words for other in others if key != "stage")
+    return any(overlap(*pair) and words[pair[0]] != others[pair[1]] for pair in pairs)
+
+
+@pytest.mark.parametrize("batch", batches())
+def test_commands_compose(batch, composed, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "transforms_train.json").touch()  # so that a layout is recognised
+    for words in batch:
+        assert words.get("stage", "stage=pipeline").partition("=")[2] in known_stages()
+    words = [word for words in batch for word in completed(list(words.values()))]
+    check_config(composed(*dict.fromkeys(words)))
 
 
 def test_workflows_fit_githubs_schema(tmp_path):

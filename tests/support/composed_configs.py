@@ -1,4 +1,4 @@
-"""The real configs, composed as the command line composes them."""
+"""The real configs, composed as the command line composes them: a fixture."""
 
 from __future__ import annotations
 
