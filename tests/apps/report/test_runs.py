@@ -99,27 +99,28 @@ def test_records_that_no_run_writes_are_skipped(runs, ran, key, value):
     assert found.skipped == (SKIPPED % file,)
 
 
-@pytest.mark.parametrize(
-    "further",
-    [
-        {"dynamic": {"psnr": 10**400, "ssim": -1e308, "lpips": math.nan, "seconds": "x"}},
-        {"static": {"psnr": 1e308, "seconds": 1e300}, "run": {"seed": "x", "choices": []}},
-        {
-            "run": {
-                "choices": {"experiment": [1], "ablation": {"a": []}},
-                "settings": {"priors": []},
-            }
-        },
-        {"row": 1, "label": [1], "PSNR": "x", "path": 5, "status": {}, "budget": 3, "views": "q"},
-        {"scene": "$x^{$", "run": {"train_views": [1], "frames": {"a": 2}, "overrides": None}},
-        {"scene": "x" * 255, "run": {"settings": {"schedule.seconds": 1e300, "k": "v" * 9999}}},
-    ],
-)
-def test_other_values_are_reported_as_far_as_they_are_known(runs, ran, further):
+FURTHER = [
+    {"dynamic": {"psnr": 10**400, "ssim": -1e308, "lpips": math.nan, "seconds": "x"}},
+    {"static": {"psnr": 1e308, "seconds": 1e300}, "run": {"seed": "x", "choices": []}},
+    {
+        "run": {
+            "choices": {"experiment": [1], "ablation": {"a": []}},
+            "settings": {"priors": []},
+        }
+    },
+    {"row": 1, "label": [1], "PSNR": "x", "path": 5, "status": {}, "budget": 3, "views": "q"},
+    {"scene": "$x^{$", "run": {"train_views": [1], "frames": {"a": 2}, "overrides": None}},
+    {"scene": "x" * 255, "run": {"settings": {"schedule.seconds": 1e300, "k": "v" * 9999}}},
+]
+
+
+def test_other_values_are_reported_as_far_as_they_are_known(runs, ran):
     ran("good", curve=[(0.0, 20.0)])
-    file = ran("other", curve=[(0.0, 1e308), (1.0, 20.0)]) / "metrics.json"
-    file.write_text(json.dumps({**json.loads(file.read_text()), **further}))
+    for k, further in enumerate(FURTHER):
+        file = ran(f"other{k}", curve=[(0.0, 1e308), (1.0, 20.0)]) / "metrics.json"
+        file.write_text(json.dumps({**json.loads(file.read_text()), **further}))
     assert "skipped" not in write_report(ReportSettings(runs))
+    assert len(collect(runs).runs) == 1 + len(FURTHER)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="here all names are UTF-8")
