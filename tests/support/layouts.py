@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from devrf.pictures.video_file import write_pictures
 from devrf.geometry.cameras import Cameras
+from devrf.pictures.video_file import write_pictures
 from devrf.scenes.lens import Lens
 from devrf.scenes.scene import Scene, Views
 
