@@ -59,8 +59,8 @@ chance: $(VENV)/.installed
 	$(BIN)/python benchmarks/robust_motion.py --small
 
 fuzz: $(VENV)/.installed-dev
-	DEVRF_FUZZ_INPUTS=100000 $(PYTEST) tests/scenes/test_damaged_files.py
-	DEVRF_FUZZ_INPUTS=5000 $(PYTEST) tests/checkpoints/test_contradictions.py
+	DEVRF_FUZZ_INPUTS=100000 $(PYTEST) tests/scenes/test_formats_damaged.py
+	DEVRF_FUZZ_INPUTS=5000 $(PYTEST) tests/checkpoints/test_checkpoint_contradictions.py
 
 format: $(VENV)/.installed-dev
 	$(BIN)/ruff check --fix .

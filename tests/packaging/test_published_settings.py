@@ -33,7 +33,7 @@ def paper(composed):
 
 def test_canonical_schedule(paper):
     schedule = instantiate(paper.schedule.canonical, _convert_="all")
-    # tests/methods/devrf/test_schedules.py has the phases of this.
+    # tests/methods/devrf/test_deformation_schedule.py has the phases of this.
     assert schedule == CanonicalSchedule(upsample_at=[1000, 2000, 3000, 4000])
     assert (schedule.rays, schedule.visual_hull_init, schedule.min_views) == (8192, False, 3)
     # A tenth over every 20 000 iterations, anew from the last growth.
