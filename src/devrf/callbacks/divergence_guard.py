@@ -80,7 +80,7 @@ class DivergenceGuard(Callback):
         Args:
             every_iterations: between checks; there is also one where a phase ends and before a
                 progress file is written.
-            rate_factor: what learning rates are multiplied by after a rollback.
+            rate_factor: factor of learning rates after a rollback.
         """
         if every_iterations < 1 or not 0 < rate_factor <= 1:
             raise DevrfError(
@@ -104,7 +104,7 @@ class DivergenceGuard(Callback):
         self._reset()
 
     def state_dict(self) -> dict[str, Any]:
-        """What later checks compare with."""
+        """The values that later checks compare with."""
         return {"kind": self._kind, "range": list(self._range)}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -247,7 +247,7 @@ def _not_finite(
     steps: Sequence[Mapping[str, float]],
     fields: Mapping[str, float],
 ) -> str | None:
-    """What is not finite, and where that was first seen, in words."""
+    """The value that is not finite, and where that was first seen, in words."""
     for iteration, means in zip(iterations, steps, strict=True):
         for name, value in means.items():
             if not math.isfinite(value):

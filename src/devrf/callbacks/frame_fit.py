@@ -1,4 +1,4 @@
-"""How well each frame's images are fitted in the end: what of a motion was lost."""
+"""Training PSNR of each frame in the end, and the frames that were lost."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How many rays of the schedule's batches are drawn: fewer for want of memory or of time."""
+"""The number of rays of a batch: fewer than scheduled for want of memory or of time."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class BatchSize:
         return True
 
     def state(self) -> dict[str, Any]:
-        """What a progress file holds."""
+        """The shares, for a progress file."""
         return {"batch_share": self.share, "largest_share": self.largest}
 
     def load(self, state: Mapping[str, Any]) -> None:

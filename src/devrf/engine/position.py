@@ -18,7 +18,7 @@ class Position:
         iteration: the next iteration; a phase that has converged is left for the next.
         iterations_done: optimiser iterations that were carried out.
         seed: of the whole run.
-        num_rollbacks: how often training diverged and was rolled back.
+        num_rollbacks: number of times that training diverged and was rolled back.
         lr_scale: factor of the scheduled learning rates; below 1 after a rollback.
         schedule_scale: the scheduled iterations, as a factor of those configured
             (``schedule.seconds``).

@@ -47,11 +47,11 @@ class Protocol:
     """An order of stages.
 
     Attributes:
-        name: what ``protocol=`` chooses, and tables say.
+        name: the choice of ``protocol=``, and the word of tables.
         stages: settings of each :class:`ProtocolStage` by its name, in their order.
         static_share: share of static rays in each batch of a stage that learns from both
             captures.
-        freeze: what of the stages' ``frozen`` holds: ``true``, as they say; ``false``, nothing is
+        freeze: the part of the stages' ``frozen`` that holds: ``true``, as they say; ``false``, nothing is
             frozen; ``all``, their parts with all that enters these (of a method whose frozen part
             has inputs that an earlier stage left shut, such as HyperNeRF).
     """

@@ -1,4 +1,4 @@
-"""What a stage was learned from, and with what settings, as its checkpoints say."""
+"""Provenance of a stage's result: settings, records and earlier stages, for its checkpoints."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from devrf.system.stored_class import class_path
 
 @dataclass
 class Provenance:
-    """How a stage's result came about.
+    """Where a stage's result comes from.
 
     Attributes:
         record: time, iterations and memory, once a ``TrainingRecord`` callback has measured them.

@@ -1,4 +1,4 @@
-"""What Lightning's loops count, in a run that goes on from a progress file."""
+"""Counts of Lightning's loops, in a run that goes on from a progress file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What schedules of all stages have in common: a pure map from an iteration to a phase."""
+"""Schedules of all stages: pure maps from an iteration to a phase."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Phase:
     Between two phases grids grow, or another frame becomes active.
 
     Attributes:
-        kind: what is learned, in a word or two: ``search``, ``fine``, ``level 2``.
+        kind: the thing that is learned, in a word or two: ``search``, ``fine``, ``level 2``.
         start: first iteration.
         stop: one past the last iteration.
         frame: the frame that is learned; None where all times are learned at once.
@@ -58,7 +58,7 @@ class Schedule(Protocol):
 
 
 class Scheduled(Protocol):
-    """What the callbacks of the schedule need of a stage (docs/extending.md#schedule-callbacks).
+    """A stage as callbacks of the schedule see it (docs/extending.md#schedule-callbacks).
 
     Attributes:
         phase: the phase whose tensors are ready; None before the first.

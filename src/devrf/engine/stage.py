@@ -69,7 +69,7 @@ class Stage(LightningModule, ABC):
     ``LearningRateDecay`` sets the learning rates before each optimiser step.
 
     Attributes:
-        name: what files, messages and protocols call the stage.
+        name: the stage's name in files, messages and protocols.
         capture: the part of the scene that is learned from.
         memory_keys: the config keys of what to lower when memory runs out.
         rate_keys: the config keys of what to lower when training diverges.
@@ -81,9 +81,9 @@ class Stage(LightningModule, ABC):
         optimizer: steps over everything that is learned; the same object throughout.
         phase: the phase that grids and optimiser are ready for; None before the first.
         position: the place in the schedule.
-        batch_size: how many rays of the schedule's batches are drawn.
+        batch_size: the share of the schedule's batches that is drawn.
         background: the colours behind the images' pixels.
-        provenance: what the result comes from.
+        provenance: settings, records and earlier stages, for checkpoints.
         generator: draws pixels, on the stage's device. Its state at the beginning of a Lightning
             step follows from the seed, the process, the iterations done and the rollbacks.
         has_scheduled_rates: whether a ``LearningRateDecay`` sets the learning rates.
@@ -91,7 +91,7 @@ class Stage(LightningModule, ABC):
         has_begun: whether it learns: a progress file has been restored, if there is one.
         time_share: the part of the whole method's seconds that is this stage's.
         abort_reason: why the stage ended before its schedule; None while it has not.
-        events: what has happened since the stage was set up in this process, and how often.
+        events: number of events since the stage was set up in this process, by name.
     """
 
     name: str
@@ -591,7 +591,7 @@ def fit(
     """Learn a stage, from a ``progress`` file on if one is given.
 
     Raises:
-        DevrfError: what that file holds contradicts itself.
+        DevrfError: that file contradicts itself.
     """
     try:
         trainer.fit(stage, datamodule=datamodule, ckpt_path=progress and str(progress))

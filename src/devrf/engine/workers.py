@@ -164,7 +164,7 @@ def _watch(others: ProcessContext, failures: Queue[Exception], over: threading.E
 
 
 def _failure(error: ProcessException) -> Exception:
-    """What ended another process: a user error in its one line, or else its traceback."""
+    """The error that ended another process: a user error in its one line, or its traceback."""
     if isinstance(error, ProcessExitedException):
         return DevrfError(
             f"trainer.devices: the process of rank {error.error_index + 1} ended by "

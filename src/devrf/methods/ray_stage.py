@@ -49,7 +49,7 @@ REHEARSED_CROP = 0.25
 
 @dataclass(frozen=True)
 class RaySchedule(Options):
-    """How long a method learns, on how many rays, and how fast.
+    """Iterations, rays and rates by which a method learns.
 
     Attributes:
         iterations: of the whole protocol; each of its stages takes a share.
@@ -197,12 +197,12 @@ class RayStage(Stage):
         """Build the stage.
 
         Args:
-            model: what is learned; not used where the stage builds on ``rest``.
+            model: the method; not used where the stage builds on ``rest``.
             schedule: iterations, rays and rates.
             loss: weights of the method's loss terms; a term of weight 0 is not computed.
             step: which data trains which parts.
             static_share: share of static rays in a batch of both captures.
-            rest: what an earlier stage learned, to go on with.
+            rest: the result of an earlier stage, to go on with.
         """
         super().__init__(schedule.iterations_per_step)
         self.name = step.name
@@ -223,6 +223,181 @@ class RayStage(Stage):
         self.pools: list[FrameSortedPixels] = []
         self._centres: list[FrameSortedPixels] = []
         self._rays = schedule.rays
+
+    def iterate(self, views: Views | tuple[Views, ...]) -> Terms:
+        """Learn the method from one batch."""
+        with span("batch"):
+            image, flat = self.draw()
+            background = self.background(image, self.generator)
+            batch = self._gather(views, image, flat, background)
+        output = self.scene_model(batch)
+        with span("losses"):
+            values = self.scene_model.loss_terms(output, batch, self.weights)
+            loss, terms = weighted_sum(values, self.weights)
+            terms |= visibility(output.transmittance, batch.alpha)
+        self.step(loss)
+        return {"loss": loss.detach(), **terms}
+
+    def draw(self) -> tuple[Tensor, Tensor]:
+        """Random pixels: their images (R,), numbered through, and places there (R,), int64.
+
+        Those of static images come first, where both captures are learned from; last are those
+        the model asks for.
+        """
+        rays = self.batch_size.rays(self._rays)
+        cropped = self.position.iteration < self.settings.centre_crop
+        pools = self._centres if cropped else self.pools
+        static = round(rays * self.static_share)
+        counts = [static, rays - static] if len(pools) > 1 else [rays]
+        images: list[Tensor] = []
+        flats: list[Tensor] = []
+        offset = 0
+        times_left = self._times_to_draw
+        for pool, count in zip(pools, counts, strict=True):
+            frames = self._shown_frames(pool)
+            image, flat = pool.draw(count, frames, self.generator, times=times_left)
+            images.append(image + offset)
+            flats.append(flat)
+            offset += pool.images
+            times_left = None if times_left is None else max(1, times_left - pool.frames)
+        extra = self.scene_model.extra_pixels(self.generator, self.batch_size.of_process)
+        if extra is not None:
+            image, flat = extra
+            images.append(image)
+            flats.append(flat)
+        return torch.cat(images), torch.cat(flats)
+
+    def timeline_of(self, schedule: RayTimeline) -> RayTimeline:
+        """The schedule itself."""
+        return schedule
+
+    @property
+    def settings(self) -> RaySchedule:
+        """The schedule's settings."""
+        return self.schedule.schedule
+
+    @property
+    def resolution(self) -> tuple[int, ...]:
+        """Present shape of the method's grid, if it has one."""
+        return self.scene_model.resolution
+
+    def setup(self, stage: str) -> None:
+        """Give the model what it needs of the scene, and make the optimiser."""
+        # Before the clock starts: priors are read, or made as a scene's reader makes them.
+        datamodule: SceneDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
+        if datamodule.priors == "all":
+            datamodule.provide(self.scene_model.priors)
+        super().setup(stage)
+        if not self._ready:
+            # A protocol without a stage that learns from the static set does not look at it.
+            alone = self.capture == "dynamic" and self.step_of_protocol.builds_on is None
+            self.scene_model.setup(dynamic_only(self.scene) if alone else self.scene)
+            self._ready = True
+        self.scene_model.begin_stage(self.step_of_protocol)
+        if hasattr(self, "optimizer"):
+            return
+        self.schedule = self._with_method()
+        settings = self.settings
+        highest = settings.learning_rate
+        if not self.scene_model.has_hull:
+            highest = settings.learning_rate_without_hull or highest
+        groups = self.scene_model.param_groups()
+        for group in groups:
+            rate = highest * group.pop("rate", 1.0)
+            group.update(lr=rate, base_lr=rate)
+        first, second = settings.betas
+        self.optimizer = GridAdam(groups, betas=(first, second), eps=settings.eps)
+
+    def _with_method(self) -> RayTimeline:
+        """The schedule with what the method itself does in the course of the stage."""
+        settings = self.settings
+        total = settings.iterations
+        milestones = dict(self.scene_model.milestones(total))
+        if settings.curriculum:
+            milestones["all frames shown"] = math.ceil(settings.curriculum * total)
+        if settings.centre_crop:
+            milestones["whole images shown"] = settings.centre_crop
+        if settings.warmup:
+            milestones["rate grown"] = math.ceil(settings.warmup * total)
+        growths = tuple(sorted({*self.scene_model.growths(total)}))
+        return RayTimeline(settings, growths, milestones)
+
+    def enter(self, phase: Phase) -> None:
+        """Let grids grow; when the stage begins or goes on, gather the pixels to draw from."""
+        self.events[GROWN] += self.phase is not None
+        self.phase = phase
+        self.scene_model.grow(sum(iteration <= phase.start for iteration in self.schedule.growths))
+        for index, group in enumerate(self.scene_model.param_groups()):
+            present = self.optimizer.param_groups[index]["params"]
+            parameters = group.pop("params")
+            group.pop("rate", None)
+            if any(new is not old for new, old in zip(parameters, present, strict=True)):
+                self.optimizer.replace(index, parameters, **group)
+        if self.pools:
+            return
+        fewer = self.settings.rays_without_hull
+        if fewer is not None and not self.scene_model.has_hull:
+            self._rays = fewer
+        views = [self.training_views(images) for images in self.images]
+        if self.scene_model.random_background and all(view_set.has_alpha for view_set in views):
+            self.background = BackgroundColor("random")
+        self.pools = [FrameSortedPixels.of(view_set) for view_set in views]
+        if self.settings.centre_crop:
+            self._centres = [FrameSortedPixels.of(view_set, centre=True) for view_set in views]
+        self.scene_model.prepare_priors(views, self.weights)
+
+    def prepare(self) -> None:
+        """Let the model follow the schedule, whose configured iterations it knows."""
+        total = self.schedule.total
+        whole = self.configured_timeline.total
+        iteration = self.position.iteration
+        self.scene_model.on_iteration(iteration * whole // total, whole)
+        for name, at in self.schedule.milestones.items():
+            self.events[name] = int(iteration >= at)
+
+    @property
+    def _times_to_draw(self) -> int | None:
+        """Number of times that a batch may have: fewer in a part of the schedule's batch."""
+        whole = self.settings.times_per_batch
+        return None if whole is None else max(1, round(whole * self.batch_size.share))
+
+    def _shown_frames(self, pool: FrameSortedPixels) -> int:
+        """Number of frames that the curriculum shows by now."""
+        share = self.settings.curriculum * self.schedule.total
+        iteration = self.position.iteration
+        if iteration >= share:
+            return pool.frames
+        return min(pool.frames, max(3, int(pool.frames * iteration / share)))
+
+    def _gather(
+        self,
+        views: Views | tuple[Views, ...],
+        image: Tensor,
+        flat: Tensor,
+        background: Tensor,
+    ) -> RayBatch:
+        """The batch of pixels, in the order of their images' captures."""
+        batches: list[RayBatch] = []
+        offset = 0
+        for view_set in views if isinstance(views, tuple) else (views,):
+            in_capture = (image >= offset) & (image < offset + len(view_set))
+            index = in_capture.nonzero()[:, 0]
+            batch = gather_batch(
+                view_set,
+                image=image[index] - offset,
+                flat=flat[index],
+                background=background if background.dim() == 1 else background[index],
+                space=self.scene_model.space,
+            )
+            batches.append(replace(batch, image=image[index]))
+            offset += len(view_set)
+        return batches[0] if len(batches) == 1 else concatenated(batches)
+
+    def restore(self, phase: Phase, state: dict[str, Any]) -> None:
+        """Go on with ``phase``: the images tell which pixels there are."""
+        self.enter(phase)
+
+    # What the arguments say before the stage is built.
 
     @classmethod
     def kernels(cls, settings: Mapping[str, Any]) -> Sequence[Kernel]:
@@ -297,176 +472,3 @@ class RayStage(Stage):
             ),
             "model": model.rehearsed(factor),
         }
-
-    def timeline_of(self, schedule: RayTimeline) -> RayTimeline:
-        """The schedule itself."""
-        return schedule
-
-    @property
-    def settings(self) -> RaySchedule:
-        """The schedule's settings."""
-        return self.schedule.schedule
-
-    @property
-    def resolution(self) -> tuple[int, ...]:
-        """Present shape of the method's grid, if it has one."""
-        return self.scene_model.resolution
-
-    def setup(self, stage: str) -> None:
-        """Give the model what it needs of the scene, and make the optimiser."""
-        # Before the clock starts: priors are read, or made as a scene's reader makes them.
-        datamodule: SceneDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
-        if datamodule.priors == "all":
-            datamodule.provide(self.scene_model.priors)
-        super().setup(stage)
-        if not self._ready:
-            # A protocol without a stage that learns from the static set does not look at it.
-            alone = self.capture == "dynamic" and self.step_of_protocol.builds_on is None
-            self.scene_model.setup(dynamic_only(self.scene) if alone else self.scene)
-            self._ready = True
-        self.scene_model.begin_stage(self.step_of_protocol)
-        if hasattr(self, "optimizer"):
-            return
-        self.schedule = self._with_method()
-        settings = self.settings
-        highest = settings.learning_rate
-        if not self.scene_model.has_hull:
-            highest = settings.learning_rate_without_hull or highest
-        groups = self.scene_model.param_groups()
-        for group in groups:
-            rate = highest * group.pop("rate", 1.0)
-            group.update(lr=rate, base_lr=rate)
-        first, second = settings.betas
-        self.optimizer = GridAdam(groups, betas=(first, second), eps=settings.eps)
-
-    def _with_method(self) -> RayTimeline:
-        """The schedule with what the method itself does in the course of the stage."""
-        settings = self.settings
-        total = settings.iterations
-        milestones = dict(self.scene_model.milestones(total))
-        if settings.curriculum:
-            milestones["all frames shown"] = math.ceil(settings.curriculum * total)
-        if settings.centre_crop:
-            milestones["whole images shown"] = settings.centre_crop
-        if settings.warmup:
-            milestones["rate grown"] = math.ceil(settings.warmup * total)
-        growths = tuple(sorted({*self.scene_model.growths(total)}))
-        return RayTimeline(settings, growths, milestones)
-
-    def iterate(self, views: Views | tuple[Views, ...]) -> Terms:
-        """Learn the method from one batch."""
-        with span("batch"):
-            image, flat = self.draw()
-            background = self.background(image, self.generator)
-            batch = self._gather(views, image, flat, background)
-        output = self.scene_model(batch)
-        with span("losses"):
-            values = self.scene_model.loss_terms(output, batch, self.weights)
-            loss, terms = weighted_sum(values, self.weights)
-            terms |= visibility(output.transmittance, batch.alpha)
-        self.step(loss)
-        return {"loss": loss.detach(), **terms}
-
-    def enter(self, phase: Phase) -> None:
-        """Let grids grow; when the stage begins or goes on, gather the pixels to draw from."""
-        self.events[GROWN] += self.phase is not None
-        self.phase = phase
-        self.scene_model.grow(sum(iteration <= phase.start for iteration in self.schedule.growths))
-        for index, group in enumerate(self.scene_model.param_groups()):
-            present = self.optimizer.param_groups[index]["params"]
-            parameters = group.pop("params")
-            group.pop("rate", None)
-            if any(new is not old for new, old in zip(parameters, present, strict=True)):
-                self.optimizer.replace(index, parameters, **group)
-        if self.pools:
-            return
-        fewer = self.settings.rays_without_hull
-        if fewer is not None and not self.scene_model.has_hull:
-            self._rays = fewer
-        views = [self.training_views(images) for images in self.images]
-        if self.scene_model.random_background and all(view_set.has_alpha for view_set in views):
-            self.background = BackgroundColor("random")
-        self.pools = [FrameSortedPixels.of(view_set) for view_set in views]
-        if self.settings.centre_crop:
-            self._centres = [FrameSortedPixels.of(view_set, centre=True) for view_set in views]
-        self.scene_model.prepare_priors(views, self.weights)
-
-    def prepare(self) -> None:
-        """Let the model follow the schedule, whose configured iterations it knows."""
-        total = self.schedule.total
-        whole = self.configured_timeline.total
-        iteration = self.position.iteration
-        self.scene_model.on_iteration(iteration * whole // total, whole)
-        for name, at in self.schedule.milestones.items():
-            self.events[name] = int(iteration >= at)
-
-    def draw(self) -> tuple[Tensor, Tensor]:
-        """Random pixels: their images (R,), numbered through, and places there (R,), int64.
-
-        Those of static images come first, where both captures are learned from; last are those
-        the model asks for.
-        """
-        rays = self.batch_size.rays(self._rays)
-        cropped = self.position.iteration < self.settings.centre_crop
-        pools = self._centres if cropped else self.pools
-        static = round(rays * self.static_share)
-        counts = [static, rays - static] if len(pools) > 1 else [rays]
-        images: list[Tensor] = []
-        flats: list[Tensor] = []
-        offset = 0
-        times_left = self._times_to_draw
-        for pool, count in zip(pools, counts, strict=True):
-            frames = self._shown_frames(pool)
-            image, flat = pool.draw(count, frames, self.generator, times=times_left)
-            images.append(image + offset)
-            flats.append(flat)
-            offset += pool.images
-            times_left = None if times_left is None else max(1, times_left - pool.frames)
-        extra = self.scene_model.extra_pixels(self.generator, self.batch_size.of_process)
-        if extra is not None:
-            image, flat = extra
-            images.append(image)
-            flats.append(flat)
-        return torch.cat(images), torch.cat(flats)
-
-    @property
-    def _times_to_draw(self) -> int | None:
-        """How many times a batch may have: fewer of them where it is a part of the schedule's."""
-        whole = self.settings.times_per_batch
-        return None if whole is None else max(1, round(whole * self.batch_size.share))
-
-    def _shown_frames(self, pool: FrameSortedPixels) -> int:
-        """How many frames the curriculum shows by now."""
-        share = self.settings.curriculum * self.schedule.total
-        iteration = self.position.iteration
-        if iteration >= share:
-            return pool.frames
-        return min(pool.frames, max(3, int(pool.frames * iteration / share)))
-
-    def _gather(
-        self,
-        views: Views | tuple[Views, ...],
-        image: Tensor,
-        flat: Tensor,
-        background: Tensor,
-    ) -> RayBatch:
-        """The batch of pixels, in the order of their images' captures."""
-        batches: list[RayBatch] = []
-        offset = 0
-        for view_set in views if isinstance(views, tuple) else (views,):
-            in_capture = (image >= offset) & (image < offset + len(view_set))
-            index = in_capture.nonzero()[:, 0]
-            batch = gather_batch(
-                view_set,
-                image=image[index] - offset,
-                flat=flat[index],
-                background=background if background.dim() == 1 else background[index],
-                space=self.scene_model.space,
-            )
-            batches.append(replace(batch, image=image[index]))
-            offset += len(view_set)
-        return batches[0] if len(batches) == 1 else concatenated(batches)
-
-    def restore(self, phase: Phase, state: dict[str, Any]) -> None:
-        """Go on with ``phase``: the images tell which pixels there are."""
-        self.enter(phase)

@@ -72,7 +72,7 @@ REHEARSED_SEARCH_SIDE = 40
 
 @dataclass(frozen=True)
 class Objective:
-    """What a kind of phase learns by: the geometry search, or the radiance field.
+    """Loss and thresholds of a kind of phase: the geometry search, or the radiance field.
 
     Attributes:
         weights: of the loss terms, by name.
@@ -96,7 +96,7 @@ class CanonicalStage(Stage):
     Attributes:
         scene_model: the canonical field and its occupancy.
         schedule: resolutions and iterations.
-        objectives: what is learned by, by the kind of the phase.
+        objectives: loss and thresholds, by the kind of the phase.
         pool: the pixels that batches are drawn from.
     """
 
@@ -125,7 +125,7 @@ class CanonicalStage(Stage):
             schedule: resolutions and iterations.
             architecture: sizes of the field.
             rates: learning rates.
-            sampling: how rays are sampled.
+            sampling: step lengths and thresholds of samples.
             search_loss: weights of the geometry search's terms; ``tv`` is that of both grids.
             fine_loss: of the radiance field's.
             iterations_per_step: optimiser iterations in one Lightning step.
@@ -142,100 +142,6 @@ class CanonicalStage(Stage):
             for kind, loss in (("search", search_loss), ("fine", fine_loss))
         }
         self.pool: PixelPool | None = None
-
-    def _objective(self, kind: str, loss: Mapping[str, float]) -> Objective:
-        """The objective of a kind of phase, whose ``loss`` is weights with that of ``tv``."""
-        sampling = self.sampling
-        searches = kind == "search"
-        key = f"loss.{kind}"
-        weights, tv = apart_from_total_variation(loss, key)
-        # The search begins far fainter than what counts as occupied at its end.
-        faint = sampling.search_alpha_threshold
-        return Objective(
-            weights=counted_weights(weights, PHOTOMETRIC_TERMS, key),
-            tv=tv,
-            alpha_threshold=faint if searches else sampling.alpha_threshold,
-            occupancy_threshold=faint if searches else sampling.occupancy_threshold,
-            searches=searches,
-        )
-
-    @classmethod
-    def kernels(cls, settings: Mapping[str, Any]) -> Sequence[Kernel]:
-        """Of both stages: the march, and look-ups of features, search colours, displacements."""
-        architecture: Architecture = settings["architecture"]
-        return [*march_kernels(), *grid_kernels({3, architecture.channels})]
-
-    @classmethod
-    def iterations_of(cls, settings: Mapping[str, Any], scene: Scene) -> int:
-        """Of search and radiance field; contracted space has no search."""
-        schedule: CanonicalSchedule = settings["schedule"]
-        return schedule.in_space(scene.space).total
-
-    @classmethod
-    def needs(
-        cls,
-        settings: Mapping[str, Any],
-        scene: Scene,
-        images: str,
-        processes: int,
-        rest: Mapping[str, Any] | None,
-    ) -> StageNeeds:
-        """Images, grids and a batch."""
-        return canonical_needs(settings, scene, images, processes)
-
-    @classmethod
-    def rehearsed(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """Grids of few voxels, and a search that begins as much less faint as it is shorter.
-
-        How long the search takes to see anything goes with the reciprocal of the opacity that it
-        begins with: gradients are as faint, and far below Adam's epsilon.
-        """
-        schedule: CanonicalSchedule = settings["schedule"]
-        architecture: Architecture = settings["architecture"]
-        factor = min(1.0, REHEARSED_ITERATIONS / schedule.total)
-        faint = architecture.search_alpha_init
-        planes = architecture.planes
-        return {
-            **settings,
-            "schedule": replace(
-                schedule.scaled(factor),
-                search_side=min(schedule.search_side, REHEARSED_SEARCH_SIDE),
-                side=min(schedule.side, REHEARSED_SIDE),
-                rays=min(schedule.rays, REHEARSED_RAYS),
-            ),
-            "architecture": replace(
-                architecture,
-                width=min(architecture.width, REHEARSED_WIDTH),
-                planes=planes and min(planes, REHEARSED_SIDE),
-                search_alpha_init=min(faint / factor, MOST_OPAQUE),
-            ),
-            "iterations_per_step": min(settings["iterations_per_step"], 10),
-        }
-
-    def timeline_of(self, schedule: CanonicalSchedule) -> CanonicalSchedule:
-        """The schedule itself, of search and radiance field."""
-        return schedule
-
-    @property
-    def objective(self) -> Objective:
-        """The objective of the present phase."""
-        assert self.phase is not None
-        return self.objectives[self.phase.kind]
-
-    @property
-    def images(self) -> tuple[ImagesName, ...]:
-        """The static views, with the dynamic ones' first frames if the schedule says so."""
-        return ("at_rest" if self.schedule.first_frames else "static",)
-
-    @property
-    def views(self) -> Views:
-        """The images that are learned from, on the stage's device."""
-        return self.training_views(self.images[0])
-
-    @property
-    def resolution(self) -> tuple[int, ...]:
-        """Present shape of the density and feature grids."""
-        return self.scene_model.canonical.density.shape
 
     def iterate(self, views: Views) -> Terms:
         """Learn the scene at rest from one batch (docs/method.md#canonical-stage)."""
@@ -268,6 +174,47 @@ class CanonicalStage(Stage):
         if schedule.epochs is not None and not self.objective.searches:
             most = rays_for_epochs(schedule.epochs, len(self.pool), schedule.iterations)
         return self.pool.draw(self.batch_size.rays(schedule.rays, most), self.generator)
+
+    def _objective(self, kind: str, loss: Mapping[str, float]) -> Objective:
+        """The objective of a kind of phase, whose ``loss`` is weights with that of ``tv``."""
+        sampling = self.sampling
+        searches = kind == "search"
+        key = f"loss.{kind}"
+        weights, tv = apart_from_total_variation(loss, key)
+        # The search begins far fainter than what counts as occupied at its end.
+        faint = sampling.search_alpha_threshold
+        return Objective(
+            weights=counted_weights(weights, PHOTOMETRIC_TERMS, key),
+            tv=tv,
+            alpha_threshold=faint if searches else sampling.alpha_threshold,
+            occupancy_threshold=faint if searches else sampling.occupancy_threshold,
+            searches=searches,
+        )
+
+    def timeline_of(self, schedule: CanonicalSchedule) -> CanonicalSchedule:
+        """The schedule itself, of search and radiance field."""
+        return schedule
+
+    @property
+    def objective(self) -> Objective:
+        """The objective of the present phase."""
+        assert self.phase is not None
+        return self.objectives[self.phase.kind]
+
+    @property
+    def images(self) -> tuple[ImagesName, ...]:
+        """The static views, with the dynamic ones' first frames if the schedule says so."""
+        return ("at_rest" if self.schedule.first_frames else "static",)
+
+    @property
+    def views(self) -> Views:
+        """The images that are learned from, on the stage's device."""
+        return self.training_views(self.images[0])
+
+    @property
+    def resolution(self) -> tuple[int, ...]:
+        """Present shape of the density and feature grids."""
+        return self.scene_model.canonical.density.shape
 
     def _with_distortion(self, loss: Tensor, terms: Terms, output: VoxelOutput) -> Weighted:
         """In unbounded space surfaces are drawn together; distances are in half edges."""
@@ -338,7 +285,7 @@ class CanonicalStage(Stage):
         )
 
     def render_settings(self, phase: CanonicalPhase) -> RenderSettings:
-        """How rays are sampled in a phase."""
+        """Step lengths and thresholds of samples in a phase."""
         return RenderSettings(
             step=self.sampling.step,
             alpha_threshold=self.objectives[phase.kind].alpha_threshold,
@@ -547,3 +494,58 @@ class CanonicalStage(Stage):
         if fine and self.schedule.search_iterations:
             box = self.scene_model.canonical.box
             self.scene_model.canonical = self.architecture.radiance_field(box, 8, 8)
+
+    # What the arguments say before the stage is built.
+
+    @classmethod
+    def kernels(cls, settings: Mapping[str, Any]) -> Sequence[Kernel]:
+        """Of both stages: the march, and look-ups of features, search colours, displacements."""
+        architecture: Architecture = settings["architecture"]
+        return [*march_kernels(), *grid_kernels({3, architecture.channels})]
+
+    @classmethod
+    def iterations_of(cls, settings: Mapping[str, Any], scene: Scene) -> int:
+        """Of search and radiance field; contracted space has no search."""
+        schedule: CanonicalSchedule = settings["schedule"]
+        return schedule.in_space(scene.space).total
+
+    @classmethod
+    def needs(
+        cls,
+        settings: Mapping[str, Any],
+        scene: Scene,
+        images: str,
+        processes: int,
+        rest: Mapping[str, Any] | None,
+    ) -> StageNeeds:
+        """Images, grids and a batch."""
+        return canonical_needs(settings, scene, images, processes)
+
+    @classmethod
+    def rehearsed(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
+        """Grids of few voxels, and a search that begins as much less faint as it is shorter.
+
+        How long the search takes to see anything goes with the reciprocal of the opacity that it
+        begins with: gradients are as faint, and far below Adam's epsilon.
+        """
+        schedule: CanonicalSchedule = settings["schedule"]
+        architecture: Architecture = settings["architecture"]
+        factor = min(1.0, REHEARSED_ITERATIONS / schedule.total)
+        faint = architecture.search_alpha_init
+        planes = architecture.planes
+        return {
+            **settings,
+            "schedule": replace(
+                schedule.scaled(factor),
+                search_side=min(schedule.search_side, REHEARSED_SEARCH_SIDE),
+                side=min(schedule.side, REHEARSED_SIDE),
+                rays=min(schedule.rays, REHEARSED_RAYS),
+            ),
+            "architecture": replace(
+                architecture,
+                width=min(architecture.width, REHEARSED_WIDTH),
+                planes=planes and min(planes, REHEARSED_SIDE),
+                search_alpha_init=min(faint / factor, MOST_OPAQUE),
+            ),
+            "iterations_per_step": min(settings["iterations_per_step"], 10),
+        }

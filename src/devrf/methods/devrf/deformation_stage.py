@@ -69,7 +69,7 @@ class DeformationStage(Stage):
         schedule: levels, iterations and rays.
         motion: learning rate and how batches are drawn.
         motion_loss: the loss terms, and their weights at each level.
-        context: what extensions work with, the active frame among it.
+        context: model, data, optimiser and active frame, as extensions see them.
     """
 
     scene_model: DeVRFModel
@@ -94,12 +94,12 @@ class DeformationStage(Stage):
         """Build the stage; the defaults are the paper's for inward-facing scenes.
 
         Args:
-            rest: what the canonical stage learned; its fields are frozen.
+            rest: the result of the canonical stage; its fields are frozen.
             schedule: resolutions, iterations and frames.
             motion: learning rate and how batches are drawn.
             loss: weights of the loss terms; ``tv`` is the total variation of both fields.
-            flow_mean: what the flow loss is a mean over (docs/method.md#flow).
-            extensions: what is added beyond the paper, by name.
+            flow_mean: whether the flow loss is a mean over rays or samples (docs/method.md#flow).
+            extensions: additions beyond the paper, by name.
             iterations_per_step: optimiser iterations in one Lightning step.
             decoder_precision: of the colour network while it learns; ``auto``: as the GPU allows.
         """
@@ -133,49 +133,59 @@ class DeformationStage(Stage):
         # Of the Lightning steps of the present visit.
         self._losses: list[float] = []
 
-    @classmethod
-    def of_protocol(
-        cls, settings: Mapping[str, Any], protocol: Protocol, name: str
-    ) -> dict[str, Any]:
-        """Check the loss, too, before what the stage builds on has been learned."""
-        extensions = tuple(settings.get("extensions", {}).values())
-        MotionLoss(settings["loss"], extensions, settings["schedule"])
-        return super().of_protocol(settings, protocol, name)
+    def iterate(self, views: Views) -> Terms:
+        """Learn the present frame from one batch (docs/method.md#deformation-stage)."""
+        frame = self.active
+        assert frame is not None
+        model = self.scene_model
+        field = self.field
+        with span("batch"):
+            image, flat = self.draw()
+            background = self.background(image, self.generator)
+            batch = gather_batch(views, image, flat, background, space=model.space)
+        output = render(
+            batch.rays,
+            model.canonical,
+            frame.occupancy,
+            model.settings,
+            batch.background,
+            warp=field.warp_by(frame.backward),
+            precision=self.context.precision,
+            color_change=self._color_change(frame),
+        )
+        # Before frame 1 nothing has moved.
+        unwarp_previous = field.warp_by(frame.before) if frame.number > 1 else field.warp_by()
+        with span("losses"):
+            prediction = MotionPrediction(
+                output=output,
+                batch=batch,
+                unwarp=field.warp_by(frame.forward),
+                unwarp_previous=unwarp_previous,
+                cameras=views.cameras,
+                previous_image=self.previous_images,
+                forward_slice=frame.forward,
+                box=field.box,
+                space=model.space,
+                flow_mean=self.flow_mean,
+            )
+            loss, terms = batch_loss(prediction, self.motion_loss.terms, self.context.weights)
+        self.step(loss)
+        return {"loss": loss.detach(), **terms}
 
-    @classmethod
-    def needs(
-        cls,
-        settings: Mapping[str, Any],
-        scene: Scene,
-        images: str,
-        processes: int,
-        rest: Mapping[str, Any] | None,
-    ) -> StageNeeds:
-        """Images, the frozen field, the motion grids, and a batch."""
-        assert rest is not None, "it builds on the canonical stage"
-        return deformation_needs(settings, rest, scene, images, processes)
+    def draw(self) -> tuple[Tensor, Tensor]:
+        """Random pixels of the frame, of its views in turn or of all.
 
-    @classmethod
-    def iterations_of(cls, settings: Mapping[str, Any], scene: Scene) -> int:
-        """Of all levels and frames."""
-        schedule: DeformationSchedule = settings["schedule"]
-        return schedule.total(len(scene.clock))
-
-    @classmethod
-    def rehearsed(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """Few iterations of each frame, in which voxels move as far, on motion grids of few."""
-        schedule: DeformationSchedule = settings["schedule"]
-        factor = min(1.0, REHEARSED_ITERATIONS / sum(row.iterations for row in schedule.levels))
-        scaled = schedule.scaled(factor).with_finest(REHEARSED_SIDE)
-        motion: MotionSettings = settings["motion"].scaled(factor)
-        if motion.unit == "box":  # of which a step is a small part
-            motion = replace(motion, learning_rate=min(motion.learning_rate, REHEARSED_RATE))
-        return {
-            **settings,
-            "schedule": replace(scaled, rays=min(schedule.rays, REHEARSED_RAYS)),
-            "motion": motion,
-            "iterations_per_step": min(settings["iterations_per_step"], 10),
-        }
+        The image of each (R,), and its row-major number there (R,), int64.
+        """
+        frame = self.active
+        phase = self.phase
+        assert frame is not None and phase is not None
+        most = None
+        if self.motion.epochs is not None:
+            pixels = sum(len(pool) for pool in frame.pools)
+            most = rays_for_epochs(self.motion.epochs, pixels, phase.stop - phase.start)
+        pool = frame.pools[self.position.iterations_done % len(frame.pools)]
+        return pool.draw(self.batch_size.rays(self.schedule.rays, most), self.generator)
 
     @property
     def field(self) -> DeformationField:
@@ -242,60 +252,6 @@ class DeformationStage(Stage):
             shape=box.grid_shape(*self.schedule.grid(-1)),
             half=self.motion.stored_half(device),
         )
-
-    def iterate(self, views: Views) -> Terms:
-        """Learn the present frame from one batch (docs/method.md#deformation-stage)."""
-        frame = self.active
-        assert frame is not None
-        model = self.scene_model
-        field = self.field
-        with span("batch"):
-            image, flat = self.draw()
-            background = self.background(image, self.generator)
-            batch = gather_batch(views, image, flat, background, space=model.space)
-        output = render(
-            batch.rays,
-            model.canonical,
-            frame.occupancy,
-            model.settings,
-            batch.background,
-            warp=field.warp_by(frame.backward),
-            precision=self.context.precision,
-            color_change=self._color_change(frame),
-        )
-        # Before frame 1 nothing has moved.
-        unwarp_previous = field.warp_by(frame.before) if frame.number > 1 else field.warp_by()
-        with span("losses"):
-            prediction = MotionPrediction(
-                output=output,
-                batch=batch,
-                unwarp=field.warp_by(frame.forward),
-                unwarp_previous=unwarp_previous,
-                cameras=views.cameras,
-                previous_image=self.previous_images,
-                forward_slice=frame.forward,
-                box=field.box,
-                space=model.space,
-                flow_mean=self.flow_mean,
-            )
-            loss, terms = batch_loss(prediction, self.motion_loss.terms, self.context.weights)
-        self.step(loss)
-        return {"loss": loss.detach(), **terms}
-
-    def draw(self) -> tuple[Tensor, Tensor]:
-        """Random pixels of the frame, of its views in turn or of all.
-
-        The image of each (R,), and its row-major number there (R,), int64.
-        """
-        frame = self.active
-        phase = self.phase
-        assert frame is not None and phase is not None
-        most = None
-        if self.motion.epochs is not None:
-            pixels = sum(len(pool) for pool in frame.pools)
-            most = rays_for_epochs(self.motion.epochs, pixels, phase.stop - phase.start)
-        pool = frame.pools[self.position.iterations_done % len(frame.pools)]
-        return pool.draw(self.batch_size.rays(self.schedule.rays, most), self.generator)
 
     def _color_change(self, frame: ActiveFrame) -> ColorChange | None:
         """The addition to the colours' logits by an extension; None: nothing."""
@@ -427,3 +383,49 @@ class DeformationStage(Stage):
         """Go on with the frame of ``phase``, the field being loaded."""
         self._activate(phase).load_state(state["frame"], self.context.views)
         self._losses = [float(loss) for loss in state["losses"]]
+
+    # What the arguments say before the stage is built.
+
+    @classmethod
+    def of_protocol(
+        cls, settings: Mapping[str, Any], protocol: Protocol, name: str
+    ) -> dict[str, Any]:
+        """Check the loss, too, before what the stage builds on has been learned."""
+        extensions = tuple(settings.get("extensions", {}).values())
+        MotionLoss(settings["loss"], extensions, settings["schedule"])
+        return super().of_protocol(settings, protocol, name)
+
+    @classmethod
+    def needs(
+        cls,
+        settings: Mapping[str, Any],
+        scene: Scene,
+        images: str,
+        processes: int,
+        rest: Mapping[str, Any] | None,
+    ) -> StageNeeds:
+        """Images, the frozen field, the motion grids, and a batch."""
+        assert rest is not None, "it builds on the canonical stage"
+        return deformation_needs(settings, rest, scene, images, processes)
+
+    @classmethod
+    def iterations_of(cls, settings: Mapping[str, Any], scene: Scene) -> int:
+        """Of all levels and frames."""
+        schedule: DeformationSchedule = settings["schedule"]
+        return schedule.total(len(scene.clock))
+
+    @classmethod
+    def rehearsed(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
+        """Few iterations of each frame, in which voxels move as far, on motion grids of few."""
+        schedule: DeformationSchedule = settings["schedule"]
+        factor = min(1.0, REHEARSED_ITERATIONS / sum(row.iterations for row in schedule.levels))
+        scaled = schedule.scaled(factor).with_finest(REHEARSED_SIDE)
+        motion: MotionSettings = settings["motion"].scaled(factor)
+        if motion.unit == "box":  # of which a step is a small part
+            motion = replace(motion, learning_rate=min(motion.learning_rate, REHEARSED_RATE))
+        return {
+            **settings,
+            "schedule": replace(scaled, rays=min(schedule.rays, REHEARSED_RAYS)),
+            "motion": motion,
+            "iterations_per_step": min(settings["iterations_per_step"], 10),
+        }

@@ -1,4 +1,4 @@
-"""What extensions of the deformation stage may add to it."""
+"""Extensions of the deformation stage: the hooks by which they add to it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from devrf.scenes.scene import Views
 
 @dataclass
 class MotionContext:
-    """What an extension works with while the motion is learned.
+    """The parts of the deformation stage that an extension works with.
 
     Attributes:
         model: the scene; its deformation has been built.
@@ -32,7 +32,7 @@ class MotionContext:
         optimizer: learns the active frame; extensions add groups.
         generator: of all random numbers.
         background: the colours behind the images' pixels.
-        batch_size: how many rays are drawn.
+        batch_size: the share of the schedule's rays that is drawn.
         precision: of the colour network.
         weights: of the loss terms that count at the present iteration.
         active: the frame that is trained; None before the first, and after the last.
