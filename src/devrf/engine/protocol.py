@@ -51,7 +51,7 @@ class Protocol:
         stages: settings of each :class:`ProtocolStage` by its name, in their order.
         static_share: share of static rays in each batch of a stage that learns from both
             captures.
-        freeze: the part of the stages' ``frozen`` that holds: ``true``, as they say; ``false``, nothing is
+        freeze: the part of the stages' ``frozen`` that holds: ``true``, all; ``false``, nothing is
             frozen; ``all``, their parts with all that enters these (of a method whose frozen part
             has inputs that an earlier stage left shut, such as HyperNeRF).
     """
