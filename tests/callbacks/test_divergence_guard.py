@@ -75,7 +75,7 @@ def test_the_first_time_is_rolled_back(fit, canonical, caplog, what):
     spoil, guard = Spoil(what, 14), DivergenceGuard(every_iterations=4)
     stage = fit(canonical(**SHORT), TrainingRecord(), spoil, guard)
     assert finite(stage.state_dict())
-    assert (stage.iteration, stage.position.num_rollbacks, stage.lr_scale) == (24, 1, 0.5)
+    assert (stage.iteration, stage.position.num_rollbacks, stage.position.lr_scale) == (24, 1, 0.5)
     assert stage.provenance.record["num_rollbacks"] == 1
     (said,) = caplog.messages
     # Checked after 18 iterations, or where the phase ended: the phase is learned again.
@@ -107,7 +107,7 @@ def test_the_second_time_ends_the_stage_in_its_last_good_state(fit, canonical, t
         assert finite(read_checkpoint_file(path)["state_dict"])
     # A stage that goes on from there remembers.
     again = fit(canonical(**SHORT), DivergenceGuard(), ckpt_path=newest)
-    assert (again.iteration, again.position.num_rollbacks, again.lr_scale) == (24, 2, 0.25)
+    assert (again.iteration, again.position.num_rollbacks, again.position.lr_scale) == (24, 2, 0.25)
 
 
 def test_a_frame_is_visited_again(fit, moving, caplog):

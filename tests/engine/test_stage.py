@@ -13,6 +13,7 @@ from lightning import Callback
 
 from devrf.callbacks import PeriodicCheckpoint
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
+from devrf.engine.schedule import configured_timeline, scale_schedule
 from devrf.engine.stage import Stage, mean_terms
 from devrf.errors import DevrfError
 from devrf.methods.devrf import canonical_stage, deformation_stage
@@ -158,11 +159,11 @@ def test_a_scaled_schedule_goes_on_at_the_same_place(fit):
     class Scale(Callback):
         def on_train_batch_end(self, trainer: Any, stage: Any, *_: Any) -> None:
             if stage.iteration == 6 and stage.position.schedule_scale == 1:
-                stage.scale_schedule(0.5)
+                scale_schedule(stage, 0.5)
                 assert stage.iteration == 3
             seen.append(stage.resolution)
 
     stage = fit(CanonicalStage(schedule, SMALL, iterations_per_step=1), Scale())
     assert stage.position.iterations_done == 6 + 3 and stage.timeline.total == 6
-    assert stage.configured_timeline.total == 12 and stage.is_complete
+    assert configured_timeline(stage).total == 12 and stage.is_complete
     assert seen == sorted(seen) and len(set(seen)) == 3

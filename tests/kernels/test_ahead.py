@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
-import torch
+from typing import Any
 
+import torch
+from warp import Kernel
+
+from devrf.engine.protocol import Protocol
+from devrf.engine.stage import Stage
 from devrf.geometry.box import Box
 from devrf.kernels.adam import adam_kernel, adam_step
 from devrf.kernels.ahead import compile_ahead, grid_kernels
@@ -37,12 +42,18 @@ def test_what_was_compiled_ahead_is_not_compiled_again() -> None:
     assert [set(module.execs) for module in modules] == built
 
 
+def kernels(stage: type[Stage], **settings: Any) -> list[Kernel]:
+    """The kernels of the only stage of a protocol."""
+    protocol = Protocol("joint", {"joint": {"capture": "both"}})
+    return [*stage.plan(stage, settings, protocol, "joint").kernels]
+
+
 def test_methods_with_grids_say_which_kernels_they_take() -> None:
     proposals = KPlanesSettings(sampling="proposals", channels=7, proposal_channels=2, resolution=4)
-    planes = RayStage.kernels({"model": KPlanes(proposals)})
+    planes = kernels(RayStage, model=KPlanes(proposals))
     assert {interpolate_kernel(7), interpolate_kernel(2), adam_kernel(7)} <= set(planes)
-    voxels = RayStage.kernels({"model": TiNeuVox(TiNeuVoxSettings(side=8, channels=9))})
+    voxels = kernels(RayStage, model=TiNeuVox(TiNeuVoxSettings(side=8, channels=9)))
     assert interpolate_kernel(9) in voxels and march_kernel(False) not in voxels
-    assert RayStage.kernels({"model": DNeRF()}) == []
-    stage = CanonicalStage.kernels({"architecture": Architecture(channels=11)})
+    assert kernels(RayStage, model=DNeRF()) == []
+    stage = kernels(CanonicalStage, architecture=Architecture(channels=11))
     assert {march_kernel(False), interpolate_kernel(3), interpolate_kernel(11)} <= set(stage)

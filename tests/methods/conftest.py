@@ -15,7 +15,8 @@ from devrf.data.batch import RayBatch, gather_batch
 from devrf.engine.protocol import ProtocolStage
 from devrf.engine.stage import Stage
 from devrf.methods.base import RayTrainable
-from devrf.methods.ray_stage import RaySchedule, RayStage
+from devrf.methods.ray_schedule import RaySchedule
+from devrf.methods.ray_stage import RayStage
 from devrf.scenes.procedural.recipe import ProceduralForwardScene
 from devrf.scenes.scene import Scene
 

@@ -22,7 +22,7 @@ from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.methods.ray_stage import RaySchedule
+from devrf.methods.ray_schedule import RaySchedule
 
 NAMES = group_choices()
 NEEDS = {
@@ -163,9 +163,9 @@ def test_a_method_learns_by_the_protocols_that_it_has_stages_for(composed, tmp_p
         for step in run.protocol.steps:
             if not learns or not {step.name, "ray_stage"} & {*config}:
                 with pytest.raises(DevrfError, match=f"method={method} .* protocol={protocol}"):
-                    run.stage_builder(step.name)
+                    run.plan(step.name)
             elif step.builds_on is None:
-                assert isinstance(run.stage_builder(step.name)(), Stage)
+                assert isinstance(run.plan(step.name).build(), Stage)
 
 
 @pytest.mark.parametrize("row", NAMES["comparison"])
@@ -177,7 +177,7 @@ def test_a_row_of_the_tables_is_a_method_and_a_protocol_that_it_learns_by(compos
     assert name.startswith(config.method)
     usual = "two_stage" if name == "devrf" else "joint"
     assert run.protocol.name == (name.removeprefix(config.method).removeprefix("_") or usual)
-    run.stage_builder(run.protocol.steps[0].name)  # refuses what the method does not learn by
+    run.plan(run.protocol.steps[0].name)  # refuses what the method does not learn by
 
 
 @pytest.mark.parametrize(

@@ -196,12 +196,12 @@ class DivergenceGuard(Callback):
     def _rollback(self, stage: Stage, good: Snapshot, wrong: str) -> None:
         """Restore the last good state; the second time, end there."""
         again = stage.position.num_rollbacks > 0
-        scale = stage.lr_scale
+        scale = stage.position.lr_scale
         for value, stored in zip(_trained(stage), good.values, strict=True):
             value.copy_(stored)
         stage.position.roll_back(good.iteration, good.iterations_done, self.rate_factor)
         stage.optimizer.forget()
-        stage.values_replaced()
+        stage.refresh()
         stage.position.seed_generator(stage.generator, stage.global_rank)
         stage.trainer.should_stop = False
         self._count_from(stage)
@@ -217,7 +217,7 @@ class DivergenceGuard(Callback):
             stage.name,
             wrong,
             stage.iteration,
-            stage.lr_scale,
+            stage.position.lr_scale,
         )
 
 

@@ -18,7 +18,7 @@ class GridUpscaling(Callback):
     ) -> None:
         """Enter the phase of the coming iteration, if it is another one."""
         stage = cast(Scheduled, pl_module)
-        phase = stage.timeline.phase(stage.iteration)
+        phase = stage.timeline.phase(stage.position.iteration)
         if phase != stage.phase:
             stage.enter(phase)
 
@@ -35,6 +35,7 @@ class LearningRateDecay(Callback):
     ) -> None:
         """Set ``lr`` to ``base_lr`` times the iteration's factor and the stage's ``lr_scale``."""
         stage = cast(Scheduled, pl_module)
-        factor = stage.timeline.learning_rate_factor(stage.iteration) * stage.lr_scale
+        position = stage.position
+        factor = stage.timeline.learning_rate_factor(position.iteration) * position.lr_scale
         for group in optimizer.param_groups:
             group["lr"] = group["base_lr"] * factor

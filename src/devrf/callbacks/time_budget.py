@@ -1,7 +1,7 @@
 """Scales a stage's schedule to a budget of wall time: ``schedule.seconds=N``.
 
 A short trial measures what iterations take, of two sizes of batches. Then the schedule is scaled
-(:meth:`~devrf.engine.stage.Stage.scale_schedule`): growths, decays and curricula take place as
+(:func:`~devrf.engine.schedule.scale_schedule`): growths, decays and curricula take place as
 they do in the configured one. It is fitted again when the kind of phase has changed, and when a
 quarter of the time is over that was left at the last fit; in the last phase the stage ends with
 its time.
@@ -28,7 +28,14 @@ from typing import Any, NamedTuple
 from lightning import Callback, LightningModule, Trainer
 
 from devrf.callbacks.training_record import TrainingRecord
-from devrf.engine.schedule import Phase, cost, phases, same_place
+from devrf.engine.schedule import (
+    Phase,
+    configured_timeline,
+    cost,
+    phases,
+    same_place,
+    scale_schedule,
+)
 from devrf.engine.stage import Stage
 from devrf.errors import DevrfError, expect
 from devrf.system.device import wait
@@ -92,7 +99,7 @@ class TimeBudget(Callback):
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
         self._record = next(other for other in callbacks if isinstance(other, TrainingRecord))
         self._budget = self.seconds * pl_module.time_share
-        self._phases = phases(pl_module.configured_timeline)
+        self._phases = phases(configured_timeline(pl_module))
         self._entering: dict[str, float] = {}  # seconds to enter a phase of a kind
         self._phase = pl_module.phase
         self._most_iterations = pl_module.iterations_per_step
@@ -195,7 +202,7 @@ class TimeBudget(Callback):
         if isinstance(fitted, str):
             raise DevrfError(fitted)
         factor, stage.batch_size.share, stage.iterations_per_step = fitted
-        stage.scale_schedule(factor)
+        scale_schedule(stage, factor)
         now = self._record.seconds
         left = self._budget - now
         self._next_fit = now + max(left / 4, STEP_SHARE * self._budget)
@@ -203,7 +210,7 @@ class TimeBudget(Callback):
     def _fitted(self, stage: Stage) -> tuple[float, float, int] | str:
         """Factor of the schedule, share of batches, iterations of a step; or why nothing fits."""
         assert self._pace is not None and stage.phase is not None
-        configured = stage.configured_timeline
+        configured = configured_timeline(stage)
         place = same_place(stage.position.iteration, stage.timeline, configured)
         later = [phase for phase in self._phases if phase.start > place]
         entering = self._to_enter(later)
@@ -226,7 +233,7 @@ class TimeBudget(Callback):
         ``iterations`` fit where a unit of cost takes a second.
         """
         assert self._pace is not None
-        total = stage.configured_timeline.total
+        total = configured_timeline(stage).total
         least = 1.0 if stage.keeps_batches else LEAST_BATCH
         most = min(self.largest_batch, stage.batch_size.largest)
         for share in (part for part in BATCHES if part >= stage.useful_share):
@@ -261,7 +268,7 @@ class TimeBudget(Callback):
             "%s: %d iterations for its %d, on %.3g%% of their rays, in %.1f s of %.1f",
             pl_module.name,
             pl_module.position.iterations_done,
-            pl_module.configured_timeline.total,
+            configured_timeline(pl_module).total,
             100 * pl_module.batch_size.share,
             self._record.seconds,
             self._budget,

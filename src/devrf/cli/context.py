@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import cached_property, partial
 from pathlib import Path
@@ -30,6 +30,7 @@ from devrf.cli.config import PIPELINE, scene_name, stage_section
 from devrf.cli.restore_config import present_command
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.ddp import ManualDDP
+from devrf.engine.plan import StagePlan
 from devrf.engine.protocol import Protocol
 from devrf.engine.stage import Stage
 from devrf.errors import DevrfError
@@ -63,8 +64,6 @@ class RunContext(ExitStack):
         device: the trainer's.
         rehearses: whether ``rehearse=true`` asks for all that the run does, in minutes.
         rehearsed: what the stages of a rehearsal came to, by name.
-        whole_stages: the class of each stage, and its arguments in the run itself, by name; known
-            once it has a builder.
         whole_scene: in a rehearsal, the scene with images of their own size, until what the run
             itself needs has been estimated.
         is_trial: whether ``trainer.fast_dev_run`` asks for a step of each stage, with nothing kept.
@@ -88,7 +87,6 @@ class RunContext(ExitStack):
         self.device = self.strategy.root_device
         self.rehearses = bool(config.rehearse)
         self.rehearsed: dict[str, RehearsedStage] = {}
-        self.whole_stages: dict[str, tuple[type[Stage], dict[str, Any]]] = {}
         self.whole_scene: Scene | None = None
         if self.rehearses:  # its schedules are short enough, its pictures small
             config.schedule.seconds = None
@@ -160,10 +158,8 @@ class RunContext(ExitStack):
         what = f"protocol={self.protocol.name}: learns from images in motion"
         raise DevrfError(f"{what}, but {at_rest}; use protocol=two_stage")
 
-    def stage_settings(
-        self, name: str, config: DictConfig | None = None
-    ) -> tuple[type[Stage], dict[str, Any]]:
-        """The class and the arguments of a stage of the protocol, by ``config``, else the run's.
+    def plan(self, name: str, config: DictConfig | None = None) -> StagePlan:
+        """The plan of a stage of the protocol, by ``config``, else the run's.
 
         Raises:
             DevrfError: the method has no such stage, or the protocol asks what it cannot do.
@@ -173,18 +169,19 @@ class RunContext(ExitStack):
         if section not in config:
             does = f"method={config.method} does not learn by protocol={self.protocol.name}"
             raise DevrfError(f"protocol: {does}; it has no stage {name!r}")
-        build: partial[Stage] = instantiate(config[section], _partial_=True, _convert_="all")
-        stage: type[Stage] = build.func  # type: ignore[assignment]
-        return stage, stage.of_protocol(build.keywords, self.protocol, name)
+        stage: partial[Stage] = instantiate(config[section], _partial_=True, _convert_="all")
+        kind: type[StagePlan] = stage.func.plan  # type: ignore[attr-defined]
+        plan = kind(stage.func, stage.keywords, self.protocol, name)
+        plan.check()
+        return plan
 
-    def stage_builder(self, name: str) -> Callable[..., Stage]:
-        """A function that builds a stage, given ``rest`` if it builds on another.
-
-        Raises:
-            DevrfError: the method has no such stage, or the protocol asks what it cannot do.
-        """
-        stage, settings = self.whole_stages[name] = self.stage_settings(name)
-        return partial(stage, **(stage.rehearsed(settings) if self.rehearses else settings))
+    @cached_property
+    def plans(self) -> dict[str, StagePlan]:
+        """The plans of the protocol's stages by name, as they are learned: in a rehearsal small."""
+        plans = {name: self.plan(name) for name in self.learning_stages}
+        if self.rehearses:
+            return {name: plan.rehearsed() for name, plan in plans.items()}
+        return plans
 
     @cached_property
     def logger(self) -> Any:

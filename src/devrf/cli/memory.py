@@ -39,12 +39,11 @@ def needs(run: RunContext, config: DictConfig, scene: Scene) -> dict[str, StageN
     names = run.stages_with_images or run.learning_stages
     found: dict[str, StageNeeds] = {}
     with torch.device("meta"):
-        of_stages = {name: run.stage_settings(name, config) for name in run.learning_stages}
+        plans = {name: run.plan(name, config) for name in run.learning_stages}
     for name in names:
-        stage, settings = of_stages[name]
         below = run.protocol[name].builds_on
-        rest = None if below is None else of_stages[below][1]
-        found[name] = stage.needs(settings, scene, images, processes, rest)
+        rest = None if below is None else plans[below]
+        found[name] = plans[name].needs(scene, images, processes, rest)
     return found
 
 

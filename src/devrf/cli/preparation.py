@@ -62,12 +62,9 @@ def capture(run: RunContext) -> None:
     if seconds is None:
         log.info("how long learning takes is tried out for some seconds")
         first, *others = captured.stages_with_images
-        stage = captured.stage_builder(first)()
-        later = [captured.stage_settings(name) for name in others]
-        batches = [
-            (of.iterations_of(settings, captured.scene), settings["schedule"].rays)
-            for of, settings in later
-        ]
+        stage = captured.plans[first].build()
+        later = [captured.plans[name] for name in others]
+        batches = [(plan.iterations(captured.scene), plan.rays) for plan in later]
         trainer = partial(instantiate, config.trainer)
         seconds = seconds_to_learn(stage, batches, captured.datamodule, trainer)
     if seconds is not None:

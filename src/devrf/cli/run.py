@@ -111,10 +111,7 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
         with shortage_in_words(config.stage, run.device, None):  # of networks that are too wide
             _check(run, learning, steps)
         if learning:
-            stages = [run.whole_stages[name] for name in run.learning_stages]
-            if run.rehearses:
-                stages = [(stage, stage.rehearsed(settings)) for stage, settings in stages]
-            kernels = dict.fromkeys(k for stage, of in stages for k in stage.kernels(of))
+            kernels = dict.fromkeys(k for plan in run.plans.values() for k in plan.kernels)
             compiling = compile_ahead([*kernels], run.device)  # while the scene is read
             if run.leads:
                 _prepare_to_learn(run, learning, steps)
@@ -219,8 +216,7 @@ def _check(run: RunContext, learning: Names, steps: Names) -> None:
     if not learning and not set(APART).isdisjoint(steps):
         return
     _ = run.datamodule
-    for name in run.learning_stages:
-        run.stage_builder(name)
+    _ = run.plans
     if learning or "evaluate" in steps:
         run.evaluation.check()
         check_objective(config.objective, run.evaluation.metrics)

@@ -38,7 +38,7 @@ def learn(run: RunContext, name: str) -> None:
         begin = run.strategy.broadcast(beginning(run, name) if run.leads else None)
     if begin is None:
         return
-    build = run.stage_builder(name)
+    build = run.plans[name].build
     below = run.protocol[name].builds_on
     if below is None:
         stage = build()
@@ -90,11 +90,10 @@ def _fit(run: RunContext, stage: Stage, begin: ResumePoint) -> None:
             _keep(run, trainer, stage)
         strategy.barrier("the checkpoint is written")
     if run.rehearses:
-        _, settings = run.whole_stages[stage.name]
         run.rehearsed[stage.name] = RehearsedStage(
             capture=stage.capture,
             iterations=stage.position.iterations_done,
-            whole=stage.iterations_of(settings, run.scene),
+            whole=run.plan(stage.name).iterations(run.scene),
             events={name: count for name, count in stage.events.items() if count},
             planned=dict(stage.timeline.planned_events),
         )

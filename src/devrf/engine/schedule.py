@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, Self
 
+from devrf.engine.position import Position
+
 
 @dataclass(frozen=True, kw_only=True)
 class Phase:
@@ -62,23 +64,17 @@ class Scheduled(Protocol):
 
     Attributes:
         phase: the phase whose tensors are ready; None before the first.
-        iteration: the next iteration.
-        lr_scale: factor of all learning rates, below 1 after a rollback.
+        position: the next iteration, and the factor of all learning rates.
         has_scheduled_rates: whether a callback sets the learning rates.
     """
 
     phase: Any
+    position: Position
     has_scheduled_rates: bool
 
     @property
-    def iteration(self) -> int: ...  # noqa: D102 - above
-
-    @property
-    def lr_scale(self) -> float: ...  # noqa: D102 - above
-
-    @property
     def timeline(self) -> Schedule:
-        """The schedule."""
+        """The course of the schedule."""
         ...
 
     def enter(self, phase: Any) -> None:
@@ -108,6 +104,40 @@ def cost(schedule: Schedule, first: int, last: int) -> float:
 def share_done(schedule: Schedule, iteration: int) -> float:
     """Estimated share of the whole duration that is over before an iteration, 0 to 1."""
     return cost(schedule, 0, iteration) / cost(schedule, 0, schedule.total)
+
+
+class Scalable(Scheduled, Protocol):
+    """A stage whose schedule can be scaled while it learns.
+
+    Attributes:
+        schedule: the present settings of the schedule.
+        configured_schedule: those before it was scaled; None until then.
+    """
+
+    schedule: Any
+    configured_schedule: Any
+
+    def timeline_of(self, schedule: Any) -> Schedule:
+        """The course of a schedule with the stage's scene."""
+        ...
+
+
+def configured_timeline(stage: Scalable) -> Schedule:
+    """The course of a stage's schedule as it was configured, before it was scaled."""
+    return stage.timeline_of(stage.configured_schedule or stage.schedule)
+
+
+def scale_schedule(stage: Scalable, factor: float) -> None:
+    """Have a stage go on at the same place of its schedule in ``factor`` times its iterations."""
+    stage.configured_schedule = stage.configured_schedule or stage.schedule
+    before = stage.timeline
+    position = stage.position
+    entered = stage.phase == before.phase(position.iteration)
+    stage.schedule = stage.configured_schedule.scaled(factor)
+    position.schedule_scale = factor
+    position.iteration = same_place(position.iteration, before, stage.timeline)
+    if entered:
+        stage.phase = stage.timeline.phase(position.iteration)
 
 
 def same_place(iteration: int, before: Schedule, after: Schedule) -> int:

@@ -6,7 +6,7 @@ import logging
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial, reduce
 from pathlib import Path
@@ -18,7 +18,6 @@ from lightning.pytorch.callbacks.early_stopping import EarlyStoppingReason
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from lightning.pytorch.trainer.states import TrainerFn
 from torch import Tensor
-from warp import Kernel
 
 from devrf.checkpoints.checkpoint import (
     MODEL,
@@ -41,13 +40,12 @@ from devrf.engine.ddp import (
     check_strategy,
 )
 from devrf.engine.grid_adam import GridAdam
-from devrf.engine.needs import StageNeeds, tensor_bytes
+from devrf.engine.plan import StagePlan
 from devrf.engine.position import Position
-from devrf.engine.protocol import Protocol
 from devrf.engine.provenance import Provenance
 from devrf.engine.resumed_loops import resumed_fit_loop
-from devrf.engine.schedule import Phase, Schedule, same_place
-from devrf.errors import DevrfError, expect
+from devrf.engine.schedule import Phase, Schedule, scale_schedule
+from devrf.errors import DevrfError
 from devrf.evaluation.held_out import HeldOutView, score
 from devrf.rendering.renderable import Renderable
 from devrf.rendering.renderer import Renderer
@@ -75,9 +73,11 @@ class Stage(LightningModule, ABC):
         rate_keys: the config keys of what to lower when training diverges.
         keeps_batches: whether whole batches learn more in a time than more, smaller ones.
         useful_share: the part of a batch than which a smaller one takes as long.
+        plan: the class of what is known of the stage before it is built.
         iterations_per_step: iterations of a Lightning step at most.
         scene_model: the scene that is learned.
         schedule: the settings of the schedule.
+        configured_schedule: those before it was scaled (``schedule.seconds``); None until then.
         optimizer: steps over everything that is learned; the same object throughout.
         phase: the phase that grids and optimiser are ready for; None before the first.
         position: the place in the schedule.
@@ -100,6 +100,7 @@ class Stage(LightningModule, ABC):
     rate_keys: ClassVar[str] = "the learning rates"
     keeps_batches: bool = False
     useful_share: float = 0.0
+    plan: ClassVar[type[StagePlan]] = StagePlan
     scene_model: Renderable
     schedule: Any
     optimizer: GridAdam
@@ -115,6 +116,7 @@ class Stage(LightningModule, ABC):
         self.background = BackgroundColor("white")
         self.provenance = Provenance()
         self.generator = torch.Generator()
+        self.configured_schedule: Any = None
         self.has_scheduled_rates = False
         self.began = 0.0
         self.has_begun = False
@@ -122,7 +124,6 @@ class Stage(LightningModule, ABC):
         self.abort_reason: str | None = None
         self.events: Counter[str] = Counter()
         self._stepping = False
-        self._configured: Any = None
         self._progress: dict[str, Any] | None = None
         self._finished: dict[str, Any] | None = None
 
@@ -160,66 +161,12 @@ class Stage(LightningModule, ABC):
         """Whether the rest of the phase can be skipped, by the mean ``loss`` () of a step."""
         return False
 
-    def values_replaced(self) -> None:
-        """Called when learned values were replaced by earlier ones: what follows from them goes."""
+    def refresh(self) -> None:
+        """Find anew what follows from the learned values, which have changed from outside."""
 
     def current_model(self) -> Renderable:
         """The model, with everything learned so far written back to it."""
         return self.scene_model
-
-    # What the settings of a stage say before it is built.
-
-    @classmethod
-    def kernels(cls, settings: Mapping[str, Any]) -> Sequence[Kernel]:
-        """Kernels that a stage with these arguments launches, to be compiled before it learns."""
-        return ()
-
-    @classmethod
-    def iterations_of(cls, settings: Mapping[str, Any], scene: Scene) -> int:
-        """Iterations, for a scene, of the stage with these arguments, which is not built."""
-        raise NotImplementedError
-
-    @classmethod
-    def rehearsed(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """The arguments of the stage, made to fit into seconds on a CPU.
-
-        The schedule is scaled, so that all that happens still does; batches, grids and networks
-        are smaller. All else is as it was.
-        """
-        return {**settings}
-
-    @classmethod
-    def of_protocol(
-        cls, settings: Mapping[str, Any], protocol: Protocol, name: str
-    ) -> dict[str, Any]:
-        """The arguments of the stage ``name`` of a protocol, checked before anything is learned.
-
-        Raises:
-            DevrfError: one is wrong, or the protocol asks what the stage cannot do.
-        """
-        own = "true, as the method's stages freeze what they build on"
-        expect(protocol.freeze is True, "protocol.freeze", own, protocol.freeze)
-        return {**settings}
-
-    @classmethod
-    def needs(
-        cls,
-        settings: Mapping[str, Any],
-        scene: Scene,
-        images: str,
-        processes: int,
-        rest: Mapping[str, Any] | None,
-    ) -> StageNeeds:
-        """Memory that a stage with these arguments needs; of one that does not say, the images.
-
-        Args:
-            settings: the arguments.
-            scene: the scene that is learned.
-            images: the config key that changes the images' size.
-            processes: the number of processes that share a batch.
-            rest: the arguments of the stage that it builds on, if any.
-        """
-        return StageNeeds({images: tensor_bytes(scene.captures.values())}, 0)
 
     # The loop.
 
@@ -338,22 +285,6 @@ class Stage(LightningModule, ABC):
         """The course of the present schedule."""
         return self.timeline_of(self.schedule)
 
-    @property
-    def configured_timeline(self) -> Schedule:
-        """The course of the schedule as it was configured, before it was scaled."""
-        return self.timeline_of(self._configured or self.schedule)
-
-    def scale_schedule(self, factor: float) -> None:
-        """Go on at the same place of the schedule in ``factor`` times its configured iterations."""
-        self._configured = self._configured or self.schedule
-        before = self.timeline
-        entered = self.phase == before.phase(self.position.iteration)
-        self.schedule = self._configured.scaled(factor)
-        self.position.schedule_scale = factor
-        self.position.iteration = same_place(self.position.iteration, before, self.timeline)
-        if entered:
-            self.phase = self.timeline.phase(self.position.iteration)
-
     def abort(self, why: str) -> None:
         """End the stage after the present step; the fit then raises an error that says ``why``."""
         self.abort_reason = f"{self.name} stage: {why}"
@@ -365,11 +296,6 @@ class Stage(LightningModule, ABC):
     def iteration(self) -> int:
         """The next iteration."""
         return self.position.iteration
-
-    @property
-    def lr_scale(self) -> float:
-        """Factor of all learning rates, below 1 after a rollback."""
-        return self.position.lr_scale
 
     @property
     def is_complete(self) -> bool:
@@ -454,7 +380,7 @@ class Stage(LightningModule, ABC):
         if progress is None:
             return
         if progress["schedule_scale"] != 1:
-            self.scale_schedule(progress["schedule_scale"])
+            scale_schedule(self, progress["schedule_scale"])
         total = self.timeline.total
         if (progress["stage"], progress["total"]) != (self.name, total):
             raise DevrfError(
@@ -476,13 +402,13 @@ class Stage(LightningModule, ABC):
             self.restore(self.phase, self._progress["phase_state"])
         return self.optimizer
 
-    def on_fit_start(self) -> None:
-        """Give every process the same tensors."""
+    def on_train_start(self) -> None:
+        """Give every process the same tensors; restore the random state last.
+
+        Nothing but iterations draws from it any more.
+        """
         self._finished = None
         broadcast([*self.parameters(), *self.buffers()])
-
-    def on_train_start(self) -> None:
-        """Restore the random state last, when nothing but iterations draws from it any more."""
         if self._progress is not None:
             set_rng_state(self._progress["random"], self.device)
             self._progress = None

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
-from collections.abc import Mapping, Sequence
-from dataclasses import field, replace
-from typing import Annotated, Any, ClassVar, Literal
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
 
 import torch
-from annotated_types import Ge, Lt
-from pydantic.dataclasses import dataclass
 from torch import Tensor
-from warp import Kernel
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import (
@@ -24,153 +20,16 @@ from devrf.data.batch import (
 )
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.grid_adam import GridAdam
-from devrf.engine.needs import LEARNED, StageNeeds, tensor_bytes
-from devrf.engine.protocol import Protocol, ProtocolStage
-from devrf.engine.schedule import Phase
+from devrf.engine.protocol import ProtocolStage
+from devrf.engine.schedule import Phase, configured_timeline
 from devrf.engine.stage import Stage, Terms
-from devrf.errors import expect
-from devrf.kernels.ahead import grid_kernels
 from devrf.methods.base import RayTrainable
+from devrf.methods.ray_plan import RayPlan
+from devrf.methods.ray_schedule import GROWN, RaySchedule, RayTimeline
 from devrf.methods.weighted_loss import counted_weights, visibility, weighted_sum
-from devrf.scenes.scene import Scene, Views
+from devrf.scenes.scene import Views
 from devrf.scenes.space import dynamic_only
-from devrf.system.options import Count, Options, Positive, Whole
 from devrf.system.profiling import span
-
-# What happens in the course of a stage, beside what a method says.
-GROWN = "grids grown"
-# What a rehearsal has: at most so many iterations, rays and times of a batch; at least this rate.
-REHEARSED_ITERATIONS = 800
-REHEARSED_RAYS = 256
-REHEARSED_TIMES = 2
-REHEARSED_RATE = 2e-3
-REHEARSED_CROP = 0.25
-
-
-@dataclass(frozen=True)
-class RaySchedule(Options):
-    """Iterations, rays and rates by which a method learns.
-
-    Attributes:
-        iterations: of the whole protocol; each of its stages takes a share.
-        rays: of a batch.
-        rays_without_hull: of a batch where no masks tell which space is empty, so that a ray has
-            more samples; None: as many.
-        learning_rate: of Adam at the first iteration of a stage.
-        learning_rate_without_hull: the same where no masks tell which space is empty, which large
-            steps may fill with fog; None: as elsewhere.
-        final_learning_rate: at its last; without a hull as many times less as the first.
-        decay: of the rate in between: ``exponential``, or half a ``cosine``.
-        warmup: share of a stage during which the rate grows evenly from nothing, beside its decay.
-        betas: of Adam.
-        eps: of Adam.
-        curriculum: share of a stage during which frames are added in the order of their times.
-        centre_crop: so many first iterations of a stage draw from the images' centre half alone.
-        times_per_batch: for a method whose cost grows with them, of a whole batch; of one of both
-            captures the static images' time is one of them. None: any number.
-        iterations_per_step: optimiser iterations in one Lightning step.
-    """
-
-    key: ClassVar[str] = "ray_stage.schedule"
-
-    iterations: Count
-    rays: Count
-    learning_rate: Positive
-    final_learning_rate: float
-    betas: Sequence[float] = (0.9, 0.999)
-    eps: float = 1e-8
-    curriculum: Annotated[float, Ge(0), Lt(1)] = 0.0
-    centre_crop: Whole = 0
-    times_per_batch: Count | None = None
-    rays_without_hull: Count | None = None
-    learning_rate_without_hull: Positive | None = None
-    decay: Literal["exponential", "cosine"] = "exponential"
-    warmup: Annotated[float, Ge(0), Lt(1)] = 0.0
-    iterations_per_step: Count = 10
-
-    def __post_init__(self) -> None:
-        positive = self.final_learning_rate > 0 or self.decay == "cosine"
-        expected = "more than 0, or decay=cosine"
-        expect(positive, f"{self.key}.final_learning_rate", expected, self.final_learning_rate)
-
-    def scaled(self, factor: float) -> RaySchedule:
-        """The schedule in ``factor`` times its iterations; the other numbers are shares of them."""
-        return replace(
-            self,
-            iterations=max(1, round(self.iterations * factor)),
-            centre_crop=math.ceil(self.centre_crop * factor),
-        )
-
-    def learning_rate_factor(self, iteration: int) -> float:
-        """At iteration n of N, with ρ = final / initial and x = n / (N − 1), after a warm-up.
-
-        ρ^x, or ρ + (1 − ρ) (1 + cos πx) / 2.
-        """
-        last = max(self.iterations - 1, 1)
-        done = min(iteration, last) / last
-        ratio = self.final_learning_rate / self.learning_rate
-        warmth = min(1.0, (iteration + 1) / (self.warmup * self.iterations + 1))
-        if self.decay == "cosine":
-            return warmth * (ratio + (1 - ratio) * (1 + math.cos(math.pi * done)) / 2)
-        return float(warmth * ratio**done)
-
-
-@dataclass(frozen=True)
-class RayTimeline:
-    """The schedule of a stage that learns a method (:class:`~devrf.engine.schedule.Schedule`).
-
-    Attributes:
-        schedule: of this stage alone.
-        growths: iterations at which the method's grids grow, ascending.
-        milestones: iterations of what happens once, by name.
-    """
-
-    schedule: RaySchedule
-    growths: tuple[int, ...] = ()
-    milestones: Mapping[str, int] = field(default_factory=dict)
-
-    @property
-    def rays(self) -> int:
-        """Rays of a batch."""
-        return self.schedule.rays
-
-    @property
-    def total(self) -> int:
-        """Iterations of the stage."""
-        return self.schedule.iterations
-
-    @property
-    def planned_events(self) -> Mapping[str, int]:
-        """Growths of grids, curricula, and what the method itself does in time."""
-        grown = {GROWN: len(self._edges) - 2} if len(self._edges) > 2 else {}
-        reached = [name for name, at in self.milestones.items() if at < self.total]
-        return {**grown, **dict.fromkeys(reached, 1)}
-
-    @property
-    def _edges(self) -> list[int]:
-        """The phases' ends."""
-        return [0, *(n for n in self.growths if 0 < n < self.total), self.total]
-
-    def phase(self, iteration: int) -> Phase:
-        """A phase lasts until the method's grids grow; all else stays as it is."""
-        edges = self._edges
-        number = min(bisect_right(edges, iteration), len(edges) - 1)
-        return Phase(kind="rays", start=edges[number - 1], stop=edges[number])
-
-    def learning_rate_factor(self, iteration: int) -> float:
-        """The schedule's."""
-        return self.schedule.learning_rate_factor(iteration)
-
-    def scaled(self, factor: float) -> RayTimeline:
-        """As many phases in ``factor`` times the iterations, one each at least."""
-        edges = [0]
-        for edge in self._edges[1:]:
-            edges.append(max(round(edge * factor), edges[-1] + 1))
-        return RayTimeline(
-            replace(self.schedule.scaled(factor), iterations=edges[-1]),
-            growths=tuple(edges[1:-1]),
-            milestones={name: round(at * factor) for name, at in self.milestones.items()},
-        )
 
 
 class RayStage(Stage):
@@ -182,6 +41,7 @@ class RayStage(Stage):
 
     rate_keys = "ray_stage.schedule.learning_rate or the weights of ray_stage.loss"
     memory_keys = ("ray_stage.schedule.rays",)
+    plan = RayPlan
     scene_model: RayTrainable
     schedule: RayTimeline
 
@@ -349,7 +209,7 @@ class RayStage(Stage):
     def prepare(self) -> None:
         """Let the model follow the schedule, whose configured iterations it knows."""
         total = self.schedule.total
-        whole = self.configured_timeline.total
+        whole = configured_timeline(self).total
         iteration = self.position.iteration
         self.scene_model.on_iteration(iteration * whole // total, whole)
         for name, at in self.schedule.milestones.items():
@@ -396,79 +256,3 @@ class RayStage(Stage):
     def restore(self, phase: Phase, state: dict[str, Any]) -> None:
         """Go on with ``phase``: the images tell which pixels there are."""
         self.enter(phase)
-
-    # What the arguments say before the stage is built.
-
-    @classmethod
-    def kernels(cls, settings: Mapping[str, Any]) -> Sequence[Kernel]:
-        """Look-ups and steps of the method's grids."""
-        model: RayTrainable = settings["model"]
-        return grid_kernels(model.grid_channels)
-
-    @classmethod
-    def of_protocol(
-        cls, settings: Mapping[str, Any], protocol: Protocol, name: str
-    ) -> dict[str, Any]:
-        """Add which data trains which parts of the method."""
-        model: RayTrainable = settings["model"]
-        model.check_protocol(protocol.name)
-        by_protocol = {"step": protocol[name], "static_share": protocol.static_share}
-        return {**settings, **by_protocol}
-
-    @classmethod
-    def needs(
-        cls,
-        settings: Mapping[str, Any],
-        scene: Scene,
-        images: str,
-        processes: int,
-        rest: Mapping[str, Any] | None,
-    ) -> StageNeeds:
-        """Images, the whole of the model, and a batch."""
-        model: RayTrainable = settings["model"]
-        schedule: RaySchedule = settings["schedule"]
-        rays = max(schedule.rays, schedule.rays_without_hull or 0) / processes
-        learned = tensor_bytes(model.parameters())
-        parts = {
-            images: float(tensor_bytes(scene.captures.values())),
-            "ray_stage.model.settings.width": LEARNED * learned,
-            # Three values are kept for each output of each layer, for 128 samples of a ray.
-            "ray_stage.schedule.rays": rays * 128 * 12 * model.sample_outputs,
-        }
-        return StageNeeds(parts, learned)
-
-    @classmethod
-    def iterations_of(cls, settings: Mapping[str, Any], scene: Scene) -> int:
-        """The stage's share of the schedule."""
-        schedule: RaySchedule = settings["schedule"]
-        step: ProtocolStage = settings["step"]
-        return step.share_of(schedule.iterations)
-
-    @classmethod
-    def rehearsed(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """Small networks and batches; rates at which networks learn in hundreds of iterations."""
-        schedule: RaySchedule = settings["schedule"]
-        model: RayTrainable = settings["model"]
-        factor = min(1.0, REHEARSED_ITERATIONS / schedule.iterations)
-        usual = schedule.learning_rate
-        rate = min(max(usual, REHEARSED_RATE), 10 * usual)
-        final = schedule.final_learning_rate * rate / usual
-        times = schedule.times_per_batch
-        scaled = schedule.scaled(factor)
-        # Few iterations may end in the background's colour unless they begin with the foreground.
-        centre_crop = max(scaled.centre_crop, round(REHEARSED_CROP * scaled.iterations))
-        return {
-            **settings,
-            "schedule": replace(
-                scaled,
-                # Where a batch has few times, its rays are not what takes time.
-                rays=min(schedule.rays, REHEARSED_RAYS * (1 if times is None else 16)),
-                rays_without_hull=None,
-                learning_rate=rate,
-                learning_rate_without_hull=None,
-                centre_crop=centre_crop,
-                final_learning_rate=final,
-                times_per_batch=None if times is None else min(times, REHEARSED_TIMES),
-            ),
-            "model": model.rehearsed(factor),
-        }

@@ -10,6 +10,7 @@ import torch
 from lightning import Callback, Trainer
 from lightning.pytorch.callbacks import LambdaCallback
 
+from devrf.engine.schedule import scale_schedule
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
@@ -151,16 +152,18 @@ def test_a_search_that_finds_nothing_says_what_to_check(datamodule, trainer):
 
 
 def test_a_shorter_search_begins_less_faintly(datamodule, trainer):
-    stage = CanonicalStage(SEARCHED, SMALL)
+    stage, opacities = CanonicalStage(SEARCHED, SMALL), []
 
     def shorten(trainer: Trainer, stage: CanonicalStage, *_: Any) -> None:
+        opacities.append(stage.scene_model.canonical.alpha_init)
         if stage.position.schedule_scale == 1:
-            stage.scale_schedule(0.5)
-            assert stage.scene_model.canonical.alpha_init == 2 * SMALL.search_alpha_init
+            scale_schedule(stage, 0.5)
 
     watch = LambdaCallback(on_train_batch_end=shorten)
     trainer(watch, max_epochs=1).fit(stage, datamodule=datamodule)
     assert stage.position.iterations_done < SEARCHED.total and stage.is_complete
+    faint = SMALL.search_alpha_init
+    assert opacities[:2] == [faint, 2 * faint]
 
 
 def test_afterwards_what_is_not_occupied_is_empty(learned):

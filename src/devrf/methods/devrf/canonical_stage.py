@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
-from warp import Kernel
 
 from devrf.data.batch import PixelPool, gather_batch
 from devrf.engine.grid_adam import GridAdam
-from devrf.engine.needs import StageNeeds
 from devrf.engine.stage import Stage, Terms
 from devrf.errors import DevrfError
-from devrf.kernels.ahead import grid_kernels, march_kernels
 from devrf.methods.devrf.architecture import Architecture, fitted_to, resolved_voxels
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.canonical_schedule import (
@@ -39,8 +36,8 @@ from devrf.methods.devrf.losses import (
     total_variation_weight,
 )
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.needs import canonical_needs
 from devrf.methods.devrf.pixel_pools import rays_for_epochs, static_pool
+from devrf.methods.devrf.plans import MOST_OPAQUE, CanonicalPlan
 from devrf.methods.devrf.settings import (
     FINE_LOSS,
     SEARCH_LOSS,
@@ -55,19 +52,10 @@ from devrf.ops.photometric import distortion
 from devrf.rendering.occupancy import Occupancy, bounding_box, dilate
 from devrf.rendering.output import VoxelOutput
 from devrf.rendering.sampling import RenderSettings
-from devrf.scenes.scene import CaptureName, ImagesName, Scene, Views
+from devrf.scenes.scene import CaptureName, ImagesName, Views
 from devrf.system.profiling import span
 
 log = logging.getLogger(__name__)
-
-# The opacity that a shorter search begins with, at most.
-MOST_OPAQUE = 1e-2
-# What a rehearsal has at most: iterations, rays, units of a layer, voxels along an edge.
-REHEARSED_ITERATIONS = 600
-REHEARSED_RAYS = 256
-REHEARSED_WIDTH = 64
-REHEARSED_SIDE = 48
-REHEARSED_SEARCH_SIDE = 40
 
 
 @dataclass(frozen=True)
@@ -107,6 +95,7 @@ class CanonicalStage(Stage):
     capture: CaptureName = "static"
     memory_keys = ("schedule.canonical.side", "schedule.canonical.rays")
     rate_keys = "schedule.rates or the weights of loss.fine"
+    plan = CanonicalPlan
 
     def __init__(
         self,
@@ -370,6 +359,16 @@ class CanonicalStage(Stage):
             field.forget_directions()
         return field
 
+    def _begin_less_faintly(self) -> None:
+        """Raise the opacity that a search begins with as it is made shorter (``schedule.seconds``).
+
+        How long a search takes to see anything goes with the reciprocal of that opacity: gradients
+        are as faint, and far below Adam's epsilon.
+        """
+        factor = min(self.position.schedule_scale, 1.0)
+        opacity = min(self.architecture.search_alpha_init / factor, MOST_OPAQUE)
+        self.scene_model.canonical.alpha_init = max(self.architecture.search_alpha_init, opacity)
+
     @torch.no_grad()
     def update_occupancy(self) -> None:
         """Find the occupancy at rest on the field's own grid, within the one before."""
@@ -443,6 +442,8 @@ class CanonicalStage(Stage):
     def prepare(self) -> None:
         """At the schedule's iterations renew the occupancy, smooth less, and learn directions."""
         schedule = self.schedule
+        if self.objective.searches:
+            self._begin_less_faintly()
         groups = self.optimizer.param_groups[:2]
         every = schedule.occupancy_every
         iteration = self.position.iteration
@@ -475,17 +476,6 @@ class CanonicalStage(Stage):
         self.scene_model.canonical.clear(~self.scene_model.occupancy.mask, alpha=1e-6)
         super().on_train_end()
 
-    def scale_schedule(self, factor: float) -> None:
-        """Begin a shorter search less faintly.
-
-        How long a search takes to see anything goes with the reciprocal of the opacity that it
-        begins with: gradients are as faint, and far below Adam's epsilon.
-        """
-        super().scale_schedule(factor)
-        if self.objectives[self.schedule.phase(self.position.iteration).kind].searches:
-            faint = self.architecture.search_alpha_init
-            self.scene_model.canonical.alpha_init = min(faint / min(factor, 1.0), MOST_OPAQUE)
-
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Take a radiance field in place of the search's, if that is what was stored."""
         super().on_load_checkpoint(checkpoint)
@@ -494,58 +484,3 @@ class CanonicalStage(Stage):
         if fine and self.schedule.search_iterations:
             box = self.scene_model.canonical.box
             self.scene_model.canonical = self.architecture.radiance_field(box, 8, 8)
-
-    # What the arguments say before the stage is built.
-
-    @classmethod
-    def kernels(cls, settings: Mapping[str, Any]) -> Sequence[Kernel]:
-        """Of both stages: the march, and look-ups of features, search colours, displacements."""
-        architecture: Architecture = settings["architecture"]
-        return [*march_kernels(), *grid_kernels({3, architecture.channels})]
-
-    @classmethod
-    def iterations_of(cls, settings: Mapping[str, Any], scene: Scene) -> int:
-        """Of search and radiance field; contracted space has no search."""
-        schedule: CanonicalSchedule = settings["schedule"]
-        return schedule.in_space(scene.space).total
-
-    @classmethod
-    def needs(
-        cls,
-        settings: Mapping[str, Any],
-        scene: Scene,
-        images: str,
-        processes: int,
-        rest: Mapping[str, Any] | None,
-    ) -> StageNeeds:
-        """Images, grids and a batch."""
-        return canonical_needs(settings, scene, images, processes)
-
-    @classmethod
-    def rehearsed(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """Grids of few voxels, and a search that begins as much less faint as it is shorter.
-
-        How long the search takes to see anything goes with the reciprocal of the opacity that it
-        begins with: gradients are as faint, and far below Adam's epsilon.
-        """
-        schedule: CanonicalSchedule = settings["schedule"]
-        architecture: Architecture = settings["architecture"]
-        factor = min(1.0, REHEARSED_ITERATIONS / schedule.total)
-        faint = architecture.search_alpha_init
-        planes = architecture.planes
-        return {
-            **settings,
-            "schedule": replace(
-                schedule.scaled(factor),
-                search_side=min(schedule.search_side, REHEARSED_SEARCH_SIDE),
-                side=min(schedule.side, REHEARSED_SIDE),
-                rays=min(schedule.rays, REHEARSED_RAYS),
-            ),
-            "architecture": replace(
-                architecture,
-                width=min(architecture.width, REHEARSED_WIDTH),
-                planes=planes and min(planes, REHEARSED_SIDE),
-                search_alpha_init=min(faint / factor, MOST_OPAQUE),
-            ),
-            "iterations_per_step": min(settings["iterations_per_step"], 10),
-        }

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -15,8 +14,6 @@ from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import gather_batch
 from devrf.data.flow import previous_images
 from devrf.engine.grid_adam import GridAdam
-from devrf.engine.needs import StageNeeds
-from devrf.engine.protocol import Protocol
 from devrf.engine.stage import Stage, Terms
 from devrf.errors import DevrfError
 from devrf.methods.devrf.active_frame import ActiveFrame
@@ -35,8 +32,8 @@ from devrf.methods.devrf.frame_store import FrameField
 from devrf.methods.devrf.losses import FlowMean, MotionPrediction, batch_loss
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.motion_loss import MotionLoss
-from devrf.methods.devrf.needs import deformation_needs
 from devrf.methods.devrf.pixel_pools import frame_pools, rays_for_epochs
+from devrf.methods.devrf.plans import DeformationPlan
 from devrf.methods.devrf.settings import (
     DEFORMATION_LOSS,
     MotionSettings,
@@ -45,17 +42,10 @@ from devrf.methods.devrf.settings import (
 )
 from devrf.methods.devrf.volume_rendering import possible_occupancy, render
 from devrf.rendering.output import ColorChange
-from devrf.scenes.scene import CaptureName, Scene, Views
+from devrf.scenes.scene import CaptureName, Views
 from devrf.system.profiling import span
 
 log = logging.getLogger(__name__)
-
-# What a rehearsal has at most: iterations of a frame, rays, voxels along an edge, and, of the box's
-# longest edge, what a voxel moves in a step.
-REHEARSED_ITERATIONS = 25
-REHEARSED_RAYS = 256
-REHEARSED_SIDE = 40
-REHEARSED_RATE = 1e-2
 
 
 class DeformationStage(Stage):
@@ -79,6 +69,7 @@ class DeformationStage(Stage):
     name = "deformation"
     capture: CaptureName = "dynamic"
     rate_keys = "schedule.motion.learning_rate or the weights of loss.deformation"
+    plan = DeformationPlan
 
     def __init__(
         self,
@@ -346,7 +337,7 @@ class DeformationStage(Stage):
         warp = self.field.warp_by(frame.backward)
         frame.occupancy.refill(possible_occupancy(self.scene_model.occupancy, warp))
 
-    def values_replaced(self) -> None:
+    def refresh(self) -> None:
         """Find the frame's occupancy anew, and judge its losses afresh."""
         self._losses = []
         self._update_occupancy()
@@ -383,49 +374,3 @@ class DeformationStage(Stage):
         """Go on with the frame of ``phase``, the field being loaded."""
         self._activate(phase).load_state(state["frame"], self.context.views)
         self._losses = [float(loss) for loss in state["losses"]]
-
-    # What the arguments say before the stage is built.
-
-    @classmethod
-    def of_protocol(
-        cls, settings: Mapping[str, Any], protocol: Protocol, name: str
-    ) -> dict[str, Any]:
-        """Check the loss, too, before what the stage builds on has been learned."""
-        extensions = tuple(settings.get("extensions", {}).values())
-        MotionLoss(settings["loss"], extensions, settings["schedule"])
-        return super().of_protocol(settings, protocol, name)
-
-    @classmethod
-    def needs(
-        cls,
-        settings: Mapping[str, Any],
-        scene: Scene,
-        images: str,
-        processes: int,
-        rest: Mapping[str, Any] | None,
-    ) -> StageNeeds:
-        """Images, the frozen field, the motion grids, and a batch."""
-        assert rest is not None, "it builds on the canonical stage"
-        return deformation_needs(settings, rest, scene, images, processes)
-
-    @classmethod
-    def iterations_of(cls, settings: Mapping[str, Any], scene: Scene) -> int:
-        """Of all levels and frames."""
-        schedule: DeformationSchedule = settings["schedule"]
-        return schedule.total(len(scene.clock))
-
-    @classmethod
-    def rehearsed(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """Few iterations of each frame, in which voxels move as far, on motion grids of few."""
-        schedule: DeformationSchedule = settings["schedule"]
-        factor = min(1.0, REHEARSED_ITERATIONS / sum(row.iterations for row in schedule.levels))
-        scaled = schedule.scaled(factor).with_finest(REHEARSED_SIDE)
-        motion: MotionSettings = settings["motion"].scaled(factor)
-        if motion.unit == "box":  # of which a step is a small part
-            motion = replace(motion, learning_rate=min(motion.learning_rate, REHEARSED_RATE))
-        return {
-            **settings,
-            "schedule": replace(scaled, rays=min(schedule.rays, REHEARSED_RAYS)),
-            "motion": motion,
-            "iterations_per_step": min(settings["iterations_per_step"], 10),
-        }

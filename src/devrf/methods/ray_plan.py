@@ -1,0 +1,98 @@
+"""What is known of a stage that learns a method from rays before it is built."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from warp import Kernel
+
+from devrf.engine.needs import LEARNED, StageNeeds, tensor_bytes
+from devrf.engine.plan import StagePlan
+from devrf.engine.protocol import Protocol, ProtocolStage
+from devrf.kernels.ahead import grid_kernels
+from devrf.methods.base import RayTrainable
+from devrf.methods.ray_schedule import RaySchedule
+from devrf.scenes.scene import Scene
+
+# A rehearsal has at most so many iterations, rays and times of a batch; at least this rate.
+REHEARSED_ITERATIONS = 800
+REHEARSED_RAYS = 256
+REHEARSED_TIMES = 2
+REHEARSED_RATE = 2e-3
+REHEARSED_CROP = 0.25
+
+
+class RayPlan(StagePlan):
+    """The plan of a :class:`~devrf.methods.ray_stage.RayStage`."""
+
+    def __init__(
+        self,
+        stage: Callable[..., Any],
+        settings: Mapping[str, Any],
+        protocol: Protocol,
+        name: str,
+    ) -> None:
+        """Add which data trains which parts of the method."""
+        by_protocol = {"step": protocol[name], "static_share": protocol.static_share}
+        super().__init__(stage, {**settings, **by_protocol}, protocol, name)
+
+    def check(self) -> None:
+        """Refuse a protocol that the method cannot learn by."""
+        self.model.check_protocol(self.protocol.name)
+
+    @property
+    def model(self) -> RayTrainable:
+        """The method, not set up."""
+        model: RayTrainable = self.settings["model"]
+        return model
+
+    @property
+    def kernels(self) -> Sequence[Kernel]:
+        """Look-ups and steps of the method's grids."""
+        return grid_kernels(self.model.grid_channels)
+
+    def iterations(self, scene: Scene) -> int:
+        """The stage's share of the schedule."""
+        schedule: RaySchedule = self.settings["schedule"]
+        step: ProtocolStage = self.settings["step"]
+        return step.share_of(schedule.iterations)
+
+    def needs(
+        self, scene: Scene, images: str, processes: int, rest: StagePlan | None
+    ) -> StageNeeds:
+        """Images, the whole of the model, and a batch."""
+        schedule: RaySchedule = self.settings["schedule"]
+        rays = max(schedule.rays, schedule.rays_without_hull or 0) / processes
+        learned = tensor_bytes(self.model.parameters())
+        parts = {
+            images: float(tensor_bytes(scene.captures.values())),
+            "ray_stage.model.settings.width": LEARNED * learned,
+            # Three values are kept for each output of each layer, for 128 samples of a ray.
+            "ray_stage.schedule.rays": rays * 128 * 12 * self.model.sample_outputs,
+        }
+        return StageNeeds(parts, learned)
+
+    def rehearsed(self) -> RayPlan:
+        """Small networks and batches; rates at which networks learn in hundreds of iterations."""
+        schedule: RaySchedule = self.settings["schedule"]
+        factor = min(1.0, REHEARSED_ITERATIONS / schedule.iterations)
+        usual = schedule.learning_rate
+        rate = min(max(usual, REHEARSED_RATE), 10 * usual)
+        times = schedule.times_per_batch
+        scaled = schedule.scaled(factor)
+        # Few iterations may end in the background's colour unless they begin with the foreground.
+        centre_crop = max(scaled.centre_crop, round(REHEARSED_CROP * scaled.iterations))
+        smaller = replace(
+            scaled,
+            # Where a batch has few times, its rays are not what takes time.
+            rays=min(schedule.rays, REHEARSED_RAYS * (1 if times is None else 16)),
+            rays_without_hull=None,
+            learning_rate=rate,
+            learning_rate_without_hull=None,
+            centre_crop=centre_crop,
+            final_learning_rate=schedule.final_learning_rate * rate / usual,
+            times_per_batch=None if times is None else min(times, REHEARSED_TIMES),
+        )
+        return self.with_settings(schedule=smaller, model=self.model.rehearsed(factor))
