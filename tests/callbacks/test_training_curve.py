@@ -131,7 +131,7 @@ def test_watching_changes_nothing_of_what_is_learned_and_curves_stand_beside_the
     rows = [row for row in album.rows if "static/psnr" in row]
     assert [row["step"] for row in rows] == [4, 8, 12]
     for row in rows:
-        assert row["static/psnr"] == pytest.approx(-10 * math.log10(row["static/color"]), abs=1e-4)
+        assert row["static/psnr"] == pytest.approx(-10 * math.log10(row["static/render"]), abs=1e-4)
         assert row["static/loss"] > 0 and row["static/iterations_per_second"] > 0
         factor = stage.schedule.learning_rate_factor(row["step"] - 1)
         assert row["static/lr/density"] == pytest.approx(0.1 * factor)

@@ -45,7 +45,7 @@ objective: dynamic.psnr
 decoder_precision: auto
 kernels: auto
 sizes: {{inner: {{_target_: {__name__}.Inner, size: 2}}}}
-loss: {{fine: {{color: 1.0}}}}
+loss: {{fine: {{render: 1.0}}}}
 outer:
   _target_: {__name__}.Outer
   root: there
@@ -83,9 +83,9 @@ def test_a_part_may_take_anything():
         ({"outer__rot": 1}, "outer.rot: no such key; did you mean outer.root?"),
         ({"sizes__inner__siez": 1}, "did you mean sizes.inner.size?"),
         ({"sizes__innr": {"size": 3}}, "sizes.innr.size: no such key"),
-        ({"loss__fien": {"color": 3.0}}, "loss.fien.color: no such key"),
+        ({"loss__fien": {"render": 3.0}}, "loss.fien.render: no such key"),
         ({"sizes__inner__size": "big"}, "sizes.inner.size: expected a valid integer, not 'big'"),
-        ({"loss__fine__color": "high"}, "loss.fine.color: expected a valid number, not 'high'"),
+        ({"loss__fine__render": "high"}, "loss.fine.render: expected a valid number, not 'high'"),
         ({"seed": -1}, "seed: expected at least 0, not -1"),
         ({"seed": None}, "seed: expected a valid integer, not None"),
         ({"outer__root": "${nowhere}"}, "nowhere"),

@@ -75,8 +75,8 @@ def test_in_a_folder_nothing_has_to_be_typed_again(devrf, tiny, run):
 def test_what_is_typed_differs(devrf, run):
     assert devrf("stage=still", "hydra.run.dir=run", "video.frames=2").status == 0
     assert (config(run).video.frames, config(run).data.frames) == (2, 3)
-    outcome = devrf("hydra.run.dir=run", "loss.fine.color=2")
-    assert outcome.status == 2 and outcome.err.startswith("devrf: loss.fine.color: ")
+    outcome = devrf("hydra.run.dir=run", "loss.fine.render=2")
+    assert outcome.status == 2 and outcome.err.startswith("devrf: loss.fine.render: ")
     outcome = devrf("hydra.run.dir=run", "data.widht=2")
     assert outcome.status == 2
     assert outcome.err.startswith("devrf: data.widht: no such key; did you mean data.width")

@@ -9,7 +9,7 @@ def test_the_settings_that_decide_are_named_as_the_user_sets_them(composed):
     config = composed("data=inward", "data.root=/somewhere")
     canonical = deciding_settings(config, "canonical")
     assert canonical["schedule.canonical.iterations"] == config.schedule.canonical.iterations
-    assert canonical["field.width"] == 64 and canonical["loss.search.color"] == 1.0
+    assert canonical["field.width"] == 64 and canonical["loss.search.render"] == 1.0
     assert canonical["seed"] == 0 and canonical["data.box"] is None
     moving = deciding_settings(config, "deformation")
     assert moving["loss.deformation.flow"] == 0.005

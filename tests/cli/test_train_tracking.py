@@ -98,7 +98,7 @@ def test_wandb_holds_config_and_name(watched):
 def test_wandb_holds_the_curves_of_both_stages(watched):
     history = watched.runs[0].history
     for stage, last, losses, groups in (
-        ("static", 6, ("color", "entropy"), ("density", "color", "decoder")),
+        ("static", 6, ("render", "entropy"), ("density", "color", "decoder")),
         ("dynamic", 12, ("render", "cycle", "flow"), ("motion",)),
     ):
         for name in ("loss", "iterations_per_second", "voxels", "peak_host_gb", *losses):
@@ -177,7 +177,7 @@ def test_tensorboard_holds_both_stages_and_the_scores(devrf, tmp_path, tiny):
     common += ("evaluation.metrics=[]", "video.frames=1")
     assert devrf(*common).status == 0
     events = read()
-    assert [event.step for event in events.Scalars("static/color")][-1] == 6
+    assert [event.step for event in events.Scalars("static/render")][-1] == 6
     assert [event.step for event in events.Scalars("dynamic/lr/motion")][-1] == 12
     assert [event.step for event in events.Images("static/view")][-1] == 6
     assert {"dynamic/depth", "held_out/static", "held_out/dynamic"} <= set(events.Tags()["images"])
@@ -191,5 +191,5 @@ def test_tensorboard_holds_both_stages_and_the_scores(devrf, tmp_path, tiny):
     # A run that begins anew in the folder has curves of its own.
     assert devrf(*common, "stage=canonical", "resume=false").status == 0
     events = read()
-    assert [event.step for event in events.Scalars("static/color")][-1] == 6
+    assert [event.step for event in events.Scalars("static/render")][-1] == 6
     assert "dynamic/lr/motion" not in events.Tags()["scalars"]

@@ -18,9 +18,9 @@ from devrf.methods.devrf.deformation_stage import DeformationStage
 
 def test_terms_and_psnr_are_in_callback_metrics(fit, canonical):
     metrics = fit(canonical(), every=1).trainer.callback_metrics
-    names = {"static/loss", "static/color", "static/per_sample_color", "static/psnr"}
+    names = {"static/loss", "static/render", "static/per_sample_color", "static/psnr"}
     assert names <= set(metrics)
-    expected = -10 * torch.log10(metrics["static/color"])
+    expected = -10 * torch.log10(metrics["static/render"])
     torch.testing.assert_close(metrics["static/psnr"], expected)
 
 

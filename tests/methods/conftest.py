@@ -55,7 +55,7 @@ def ray_stage() -> Callable[..., RayStage]:
         rates = {"learning_rate": 1e-2, "final_learning_rate": 1e-3}
         schedule = RaySchedule(**{**usual, **rates, **changes})
         step = STEPS[step] if isinstance(step, str) else step
-        return RayStage(model, schedule, loss or {"color": 1.0}, step, static_share, rest)
+        return RayStage(model, schedule, loss or {"render": 1.0}, step, static_share, rest)
 
     return make
 

@@ -34,7 +34,7 @@ def test_a_killed_run_goes_on_to_the_same_weights(
     ray_stage: Make, stopped_and_resumed: Callable[..., Any]
 ) -> None:
     def stage() -> RayStage:
-        return ray_stage(HyperNeRF(WHOLE), loss={"color": 1.0, "elastic": 0.01})
+        return ray_stage(HyperNeRF(WHOLE), loss={"render": 1.0, "elastic": 0.01})
 
     _, _, resumed = stopped_and_resumed(stage, at=2)
     assert resumed.iteration == 4

@@ -34,10 +34,10 @@ PUBLISHED = {
             "final_learning_rate": pytest.approx(5e-4 * 0.1 ** (8 / 5), rel=1e-3),
             "betas": [0.9, 0.999], "curriculum": 100 / 800,
         },
-        "loss": {"color": 1.0, "temporal": 0.0},
+        "loss": {"render": 1.0, "temporal": 0.0},
     },
     "nerfies": {
-        "settings": RIG, "schedule": RIG_SCHEDULE, "loss": {"color": 1.0, "elastic": 1e-3},
+        "settings": RIG, "schedule": RIG_SCHEDULE, "loss": {"render": 1.0, "elastic": 1e-3},
     },
     "hypernerf": {
         "settings": RIG | {
@@ -45,7 +45,7 @@ PUBLISHED = {
             "slicing_width": 64, "slicing_depth": 6, "slicing_skip": 4, "slicing_bands": 6,
         },
         "schedule": RIG_SCHEDULE,
-        "loss": {"color": 1.0, "elastic": 0.0},
+        "loss": {"render": 1.0, "elastic": 0.0},
     },
     "nsff": {
         "settings": TRUNK | {
@@ -61,7 +61,7 @@ PUBLISHED = {
             "final_learning_rate": pytest.approx(5e-4 * 0.1**1.2, rel=1e-3), "betas": [0.9, 0.999],
         },
         "loss": {
-            "color": 1, "dynamic": 1, "neighbours": 1, "chained": 1, "cycle": 1.0,
+            "render": 1, "dynamic": 1, "neighbours": 1, "chained": 1, "cycle": 1.0,
             "small_flow": pytest.approx(0.1 / 128, rel=2e-3), "smooth_space": 0.1,
             "smooth_time": 0.1, "depth": 0.04, "flow": 0.02, "disocclusion": 0.1,
             "blend_entropy": 1e-3,
@@ -78,7 +78,7 @@ PUBLISHED = {
             "iterations": 20_000, "rays": 4096, "learning_rate": 8e-4,
             "final_learning_rate": 8e-5, "betas": [0.9, 0.99],
         },
-        "loss": {"color": 1.0, "background_entropy": 0.001, "sample_color": 0.01},
+        "loss": {"render": 1.0, "background_entropy": 0.001, "sample_color": 0.01},
     },
     "kplanes": {
         "settings": {
@@ -92,7 +92,7 @@ PUBLISHED = {
             "decay": "cosine", "warmup": pytest.approx(512 / 30_001, rel=5e-3), "eps": 1e-15,
         },
         "loss": {
-            "color": 1, "tv": 1e-4, "smooth": 0.01, "smooth_proposals": 0.001, "change": 1e-4,
+            "render": 1, "tv": 1e-4, "smooth": 0.01, "smooth_proposals": 0.001, "change": 1e-4,
             "histogram": 1, "distortion": 0,
         },
     },
@@ -111,7 +111,7 @@ PUBLISHED = {
             "learning_rate": 1e-4, "final_learning_rate": 1e-4, "betas": [0.9, 0.999],
         },
         "loss": {
-            "color": 1,
+            "render": 1,
             "kl": pytest.approx(0.001 / UNIT, rel=2e-3),
             "opacity_prior": pytest.approx(0.01 / UNIT, rel=2e-3),
             "tv": pytest.approx(0.01 / UNIT, rel=2e-3),

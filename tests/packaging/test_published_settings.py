@@ -63,8 +63,8 @@ def test_rates_field_and_sampling(paper):
 
 
 def test_loss_weights(paper):
-    assert dict(paper.loss.search) == {"color": 1.0, "per_sample_color": 0.1, "entropy": 0.01}
-    fine = {"color": 1.0, "per_sample_color": 0.01, "entropy": 0.001, "alpha_mask": 0.0, "tv": 0.0}
+    assert dict(paper.loss.search) == {"render": 1.0, "per_sample_color": 0.1, "entropy": 0.01}
+    fine = {"render": 1.0, "per_sample_color": 0.01, "entropy": 0.001, "alpha_mask": 0.0, "tv": 0.0}
     assert dict(paper.loss.fine) == fine
     assert dict(paper.loss.deformation) == {
         "render": 1.0,

@@ -202,7 +202,7 @@ class Stage(LightningModule, ABC):
 
     def _log(self, means: Terms) -> None:
         """Log the terms and the PSNR of the batches, which is added, by iterations."""
-        error = means.get("render", means.get("color"))
+        error = means.get("render")
         if error is not None:
             means["psnr"] = -10 * error.clamp_min(1e-12).log10()
         values: dict[str, Any] = {f"{self.capture}/{name}": value for name, value in means.items()}

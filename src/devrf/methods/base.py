@@ -35,7 +35,7 @@ class RayTrainable(Renderable):
         random_background: whether it learns before random colours where all images have masks.
     """
 
-    losses: ClassVar[tuple[str, ...]] = ("color",)
+    losses: ClassVar[tuple[str, ...]] = ("render",)
     protocols: ClassVar[tuple[str, ...] | None] = None
     priors: ClassVar[tuple[str, ...]] = ()
     keeps_batches: ClassVar[bool] = False
@@ -93,14 +93,14 @@ class RayTrainable(Renderable):
     ) -> dict[str, Tensor]:
         """Unweighted loss terms () by name; may render again.
 
-        ``color`` is the mean squared colour error over rays and channels.
+        ``render`` is the mean squared colour error over rays and channels.
 
         Args:
             output: what :meth:`forward` gave.
             batch: the rays and the truth at their pixels.
             names: of the terms that count: the others need not be computed.
         """
-        return {"color": nn.functional.mse_loss(output.color, batch.color)}
+        return {"render": nn.functional.mse_loss(output.color, batch.color)}
 
     @abstractmethod
     def parts(self) -> dict[str, Iterable[nn.Parameter]]:

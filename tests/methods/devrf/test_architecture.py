@@ -100,7 +100,7 @@ def test_a_scene_seen_from_all_around_gets_what_its_pixels_resolve(side, finer, 
 def test_planes_of_both_fields(forward_scene, fit, serve):
     data = serve(forward_scene)
     schedule = CanonicalSchedule(0, 8, iterations=10, side=12, upsample_at=(), rays=16)
-    sizes, loss = Architecture(4, 16, 0, planes=7), {"color": 1.0, "tv": 1e-3}
+    sizes, loss = Architecture(4, 16, 0, planes=7), {"render": 1.0, "tv": 1e-3}
     rest = fit(CanonicalStage(schedule, sizes, fine_loss=loss), data=data)
     group, across = rest.optimizer.param_groups[0], max(rest.resolution[:2])
     assert rest.resolution[2] == 7 < across

@@ -259,7 +259,7 @@ def test_all_gradients_lie_where_the_optimiser_looks_for_them(fit, tv):
                 assert values.grad is None or not values.grad.any()
 
     schedule = replace(CARVED, iterations=30, occupancy_every=8, dense_tv_iterations=10)
-    fit(Watched(schedule, SMALL, fine_loss={"color": 1.0, "tv": tv}))
+    fit(Watched(schedule, SMALL, fine_loss={"render": 1.0, "tv": tv}))
     # Total variation reaches all voxels in the first ten iterations.
     assert len(looked_at) == (20 if tv else 30)
     assert 0 < looked_at[-1] < looked_at[0] < 1
@@ -267,7 +267,7 @@ def test_all_gradients_lie_where_the_optimiser_looks_for_them(fit, tv):
 
 def test_the_total_variation_reaches_all_voxels_until_the_schedule_says_so(datamodule, trainer):
     schedule = CanonicalSchedule(0, 8, True, 40, 8, (), rays=16, dense_tv_iterations=20)
-    stage = CanonicalStage(schedule, SMALL, fine_loss={"color": 1.0, "tv": 1e-3})
+    stage = CanonicalStage(schedule, SMALL, fine_loss={"render": 1.0, "tv": 1e-3})
     touched: list[list[bool]] = []
     watch = LambdaCallback(
         on_train_batch_end=lambda *_: touched.append(

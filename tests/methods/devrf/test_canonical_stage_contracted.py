@@ -149,7 +149,7 @@ def test_a_room_is_learned_and_moves_inside_the_inner_box(tiny_room, trainer):
     mean = room.static.train.pixels.float().div(255).mean(dim=(0, 1, 2))
     blank = float((room.static.train.pixels.float() / 255 - mean).square().mean())
     metrics = stage.trainer.callback_metrics
-    assert metrics["static/color"] < 0.9 * blank and metrics["static/distortion"] > 0
+    assert metrics["static/render"] < 0.9 * blank and metrics["static/distortion"] > 0
     moving = DeformationStage(
         stage.result(),
         DeformationSchedule(levels=(Level(6, 4),), rays=64),

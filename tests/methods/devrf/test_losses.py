@@ -78,7 +78,7 @@ def prediction() -> Prediction:
 
 
 def test_color_and_per_sample_color_by_hand(prediction):
-    assert PHOTOMETRIC_TERMS["color"](prediction).item() == pytest.approx((0.25 + 0.36 + 0.09) / 9)
+    assert PHOTOMETRIC_TERMS["render"](prediction).item() == pytest.approx((0.25 + 0.36 + 0.09) / 9)
     # |c − C|²: (0, .25, 0)² = .0625; (1, .75, 0)² = 1.5625; (.1, .1, .4)² = .18; three rays.
     expected = (0.5 * 0.0625 + 0.25 * 1.5625 + 0.8 * 0.18) / 3
     assert PHOTOMETRIC_TERMS["per_sample_color"](prediction).item() == pytest.approx(expected)
@@ -131,7 +131,7 @@ def test_alpha_mask_by_hand_and_without_one(prediction):
 
 
 def test_the_loss_weighs_what_counts_and_reports_it_unweighted(prediction):
-    weights = counted_weights({"alpha_mask": 2.0, "color": 0.0}, PHOTOMETRIC_TERMS, "loss.fine")
+    weights = counted_weights({"alpha_mask": 2.0, "render": 0.0}, PHOTOMETRIC_TERMS, "loss.fine")
     total, values = batch_loss(prediction, PHOTOMETRIC_TERMS, weights)
     assert (
         list(values) == ["alpha_mask", "opacity", "coverage"] and total == 2 * values["alpha_mask"]
@@ -141,10 +141,10 @@ def test_the_loss_weighs_what_counts_and_reports_it_unweighted(prediction):
     assert values["coverage"].item() == pytest.approx(0.5)
     without = replace(prediction, batch=replace(prediction.batch, alpha=None))
     assert batch_loss(without, PHOTOMETRIC_TERMS, weights)[1].keys() == {"alpha_mask", "opacity"}
-    with pytest.raises(DevrfError, match="loss.fine: unknown term 'colour'.*alpha_mask, color"):
+    with pytest.raises(DevrfError, match="loss.fine: unknown term 'colour'.*alpha_mask, entropy"):
         counted_weights({"colour": 1.0}, PHOTOMETRIC_TERMS, "loss.fine")
-    with pytest.raises(DevrfError, match="loss.fine.color: .*at least 0, not -1"):
-        counted_weights({"color": -1.0}, PHOTOMETRIC_TERMS, "loss.fine")
+    with pytest.raises(DevrfError, match="loss.fine.render: .*at least 0, not -1"):
+        counted_weights({"render": -1.0}, PHOTOMETRIC_TERMS, "loss.fine")
 
 
 def seen(

@@ -36,7 +36,7 @@ TINY = KPlanesSettings(
     resolution=6, scales=(1, 2), channels=4, width=8, basis_width=8, steps=24, samples=6,
     proposal_samples=(12, 8), proposal_resolutions=(4, 6), proposal_channels=2, occupancy_side=8,
 )  # fmt: skip
-LOSS = {"color": 1.0, "tv": 1e-4, "smooth": 1e-2, "change": 1e-4}
+LOSS = {"render": 1.0, "tv": 1e-4, "smooth": 1e-2, "change": 1e-4}
 LOSS |= {"smooth_proposals": 1e-3, "histogram": 1.0, "distortion": 1e-3}
 FORMS: list[Any] = [
     {}, {"decoder": "explicit"}, {"pairing": "hexplane"}, {"sampling": "proposals"},
@@ -231,7 +231,7 @@ def test_it_learns(form: dict[str, Any], learned_losses: Callable[..., list[floa
     model = KPlanes(replace(TINY, **form))
     sizes = {"iterations": 60, "rays": 128, "iterations_per_step": 10}
     rates = {"learning_rate": 3e-2, "final_learning_rate": 0.0, "decay": "cosine", "warmup": 0.1}
-    losses = learned_losses(model, term="color", loss=LOSS, **sizes, **rates)
+    losses = learned_losses(model, term="render", loss=LOSS, **sizes, **rates)
     assert losses[-1] < 0.7 * losses[0]
 
 

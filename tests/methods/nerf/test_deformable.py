@@ -37,7 +37,7 @@ def test_the_field_alone_learns_in_bfloat16_if_asked_to(
     assert torch.equal(output.extras["points"], exact.extras["points"])
     torch.testing.assert_close(output.color, exact.color, atol=0.02, rtol=0)
     assert not torch.equal(output.color, exact.color)
-    model.loss_terms(output, some_rays, ["color"])["color"].backward()
+    model.loss_terms(output, some_rays, ["render"])["render"].backward()
     for parameter in model.canonical.parameters():
         assert parameter.grad is not None and parameter.grad.isfinite().all()
     # What was learned is shown in all its digits.
@@ -62,7 +62,7 @@ def test_coarse_colors_count_where_coarse_samples_have_a_field_of_their_own(
     model = learner(settings, tiny_scene)
     output = model(some_rays)
     fine = (output.color - some_rays.color).square().mean()
-    loss = model.loss_terms(output, some_rays, ["color"])["color"]
+    loss = model.loss_terms(output, some_rays, ["render"])["render"]
     assert len(output.extras["weight"]) == 12 * len(some_rays.time)
     if not separate:
         torch.testing.assert_close(loss, fine)

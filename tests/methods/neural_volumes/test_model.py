@@ -22,7 +22,7 @@ TINY = NeuralVolumesSettings(
     template_channels=(8, 8, 8), warp_side=4, warp_channels=(4, 4), density_scale=10.0, step=0.2,
     hull=True, occupancy_side=8,
 )  # fmt: skip
-LOSS = {"color": 1.0, "kl": 1e-5, "opacity_prior": 1e-4, "tv": 1e-4}
+LOSS = {"render": 1.0, "kl": 1e-5, "opacity_prior": 1e-4, "tv": 1e-4}
 
 
 @pytest.mark.parametrize(("warp", "hull"), [("conv", False), ("affinemix", True)])

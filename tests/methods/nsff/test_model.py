@@ -29,8 +29,8 @@ def test_it_learns(
     sampling: Any, blend: Any, tiny: NSFFSettings, learned_losses: Callable[..., list[float]]
 ) -> None:
     model = NSFF(replace(tiny, sampling=sampling, blend=blend, hard_rays=0))
-    loss, sizes = {"color": 1.0, "neighbours": 0.1}, {"iterations": 45, "iterations_per_step": 15}
-    colors = learned_losses(model, "color", loss=loss, rays=64, **sizes)
+    loss, sizes = {"render": 1.0, "neighbours": 0.1}, {"iterations": 45, "iterations_per_step": 15}
+    colors = learned_losses(model, "render", loss=loss, rays=64, **sizes)
     assert len(colors) == 3 and colors[-1] < 0.8 * colors[0]
 
 

@@ -26,7 +26,7 @@ TINY = TiNeuVoxSettings(
     side=16, channels=2, width=8, bands=2, direction_bands=1, time_bands=2, feature_bands=1,
     alpha_init=1e-2, step=1.0, occupancy_side=8,
 )  # fmt: skip
-LOSS = {"color": 1.0, "background_entropy": 1e-3, "sample_color": 1e-2}
+LOSS = {"render": 1.0, "background_entropy": 1e-3, "sample_color": 1e-2}
 UNIT = Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
 
 

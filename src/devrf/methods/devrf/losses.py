@@ -41,7 +41,7 @@ Predicted = TypeVar("Predicted", bound=Prediction)
 
 # What compares rays with images; the equations are in devrf.ops.photometric.
 PHOTOMETRIC_TERMS: dict[str, Callable[[Prediction], Tensor]] = {
-    "color": lambda seen: color_error(seen.output.color, seen.batch.color),
+    "render": lambda seen: color_error(seen.output.color, seen.batch.color),
     "per_sample_color": lambda seen: per_sample_color(
         seen.output.samples.weight,
         seen.output.sample_color,
@@ -162,7 +162,7 @@ def total_variation_weight(weight: float, side: int, rays: int) -> float:
 MotionTerm = Callable[[MotionPrediction], Tensor]
 # The terms of the paper that constrain the motion, and the photometric ones through the warp.
 MOTION_TERMS: dict[str, MotionTerm] = {
-    **{("render" if name == "color" else name): term for name, term in PHOTOMETRIC_TERMS.items()},
+    **PHOTOMETRIC_TERMS,
     "cycle": cycle,
     "flow": flow,
 }

@@ -25,9 +25,9 @@ def decoder_dtype(precision: Precision, device: torch.device) -> torch.dtype:
     return torch.bfloat16 if precision == "bfloat16" else torch.float32
 
 
-SEARCH_LOSS = {"color": 1.0, "per_sample_color": 0.1, "entropy": 0.01}
+SEARCH_LOSS = {"render": 1.0, "per_sample_color": 0.1, "entropy": 0.01}
 FINE_LOSS = {
-    "color": 1.0,
+    "render": 1.0,
     "per_sample_color": 0.01,
     "entropy": 0.001,
     "alpha_mask": 0.0,

@@ -73,7 +73,7 @@ class DNeRF(DeformableField):
     """(σ, c) = T(x + Δ(x, t), d), with Δ = 0 at t = 0."""
 
     name: ClassVar[str] = "dnerf"
-    losses: ClassVar[tuple[str, ...]] = ("color", "temporal")
+    losses: ClassVar[tuple[str, ...]] = ("render", "temporal")
     settings_class = DNeRFSettings
 
     def __init__(self, settings: DNeRFSettings | None = None) -> None:
@@ -93,7 +93,7 @@ class DNeRF(DeformableField):
     def loss_terms(
         self, output: RenderOutput, batch: RayBatch, names: Collection[str]
     ) -> dict[str, Tensor]:
-        """``color``; ``temporal``: Σ |Δ(x, t) − Δ(x, t′)|², t′ towards a neighbouring frame."""
+        """``render``; ``temporal``: Σ |Δ(x, t) − Δ(x, t′)|², t′ towards a neighbouring frame."""
         terms = super().loss_terms(output, batch, names)
         if "temporal" in names:
             points = output.extras["points"].detach()

@@ -40,7 +40,7 @@ class KPlanes(SurfacedField):
 
     name: ClassVar[str] = "kplanes"
     losses: ClassVar[tuple[str, ...]] = (
-        "color", "tv", "smooth", "change", "smooth_proposals", "histogram", "distortion",
+        "render", "tv", "smooth", "change", "smooth_proposals", "histogram", "distortion",
     )  # fmt: skip
     random_background: ClassVar[bool] = True
     keeps_batches: ClassVar[bool] = True  # large steps need whole ones
@@ -140,7 +140,7 @@ class KPlanes(SurfacedField):
     def loss_terms(
         self, output: RenderOutput, batch: RayBatch, names: Collection[str]
     ) -> dict[str, Tensor]:
-        """``color``, and what keeps planes simple and proposals true.
+        """``render``, and what keeps planes simple and proposals true.
 
         See docs/methods/kplanes.md#losses. ``tv`` and ``change`` are of the field's planes and of
         proposals'. Without proposals their terms are 0.
@@ -150,7 +150,7 @@ class KPlanes(SurfacedField):
         # Even steps are of one length.
         length = extras.get("length", torch.full_like(extras["weight"], self.step_length))
         known: dict[str, Callable[[], Tensor]] = {
-            "color": lambda: nn.functional.mse_loss(output.color, batch.color),
+            "render": lambda: nn.functional.mse_loss(output.color, batch.color),
             "tv": lambda: sum_of([each.total_variation() for each in (self.planes, *rounds)]),
             "smooth": self.planes.roughness,
             "change": lambda: sum_of([each.change() for each in (self.planes, *rounds)]),

@@ -118,11 +118,11 @@ class DeformableField(SurfacedField):
     def loss_terms(
         self, output: RenderOutput, batch: RayBatch, names: Collection[str]
     ) -> dict[str, Tensor]:
-        """``color``: the mean squared error, and that of the coarse colours where these learn."""
-        if "color" not in names:
+        """``render``: the mean squared error, and that of the coarse colours where these learn."""
+        if "render" not in names:
             return {}
         terms = super().loss_terms(output, batch, names)
         coarse = output.extras.get("coarse_color")
         if coarse is not None:
-            terms["color"] = terms["color"] + nn.functional.mse_loss(coarse, batch.color)
+            terms["render"] = terms["render"] + nn.functional.mse_loss(coarse, batch.color)
         return terms

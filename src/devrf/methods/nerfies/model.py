@@ -114,7 +114,7 @@ class Nerfies(DeformableField):
     """
 
     name: ClassVar[str] = "nerfies"
-    losses: ClassVar[tuple[str, ...]] = ("color", "elastic")
+    losses: ClassVar[tuple[str, ...]] = ("render", "elastic")
     settings_class: ClassVar[type[FieldSettings]] = NerfiesSettings
     remembered: ClassVar[tuple[str, ...]] = ("rest_is_canonical",)
     settings: NerfiesSettings
@@ -176,7 +176,7 @@ class Nerfies(DeformableField):
     def loss_terms(
         self, output: RenderOutput, batch: RayBatch, names: Collection[str]
     ) -> dict[str, Tensor]:
-        """``color``; ``elastic``: the mean over rays of Σ_i w_i · c ρ(Σ_j log² s_j; c).
+        """``render``; ``elastic``: the mean over rays of Σ_i w_i · c ρ(Σ_j log² s_j; c).
 
         s are the singular values of ∂x′/∂x at sample i, and c = 0.03. The factor c before ρ is
         that of the released code; w has no gradient (docs/methods/nerfies.md#elastic).

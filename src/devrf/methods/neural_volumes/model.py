@@ -41,7 +41,7 @@ class NeuralVolumes(PlacedModel):
     """z from the images of a moment; a template and a warp from z, seen by adding up opacity."""
 
     name: ClassVar[str] = "neural_volumes"
-    losses: ClassVar[tuple[str, ...]] = ("color", "kl", "opacity_prior", "tv")
+    losses: ClassVar[tuple[str, ...]] = ("render", "kl", "opacity_prior", "tv")
     keeps_batches: ClassVar[bool] = True  # a volume takes most of an iteration
     protocols: ClassVar[tuple[str, ...] | None] = ("joint", "dynamic")
     settings_class = NeuralVolumesSettings
@@ -164,8 +164,8 @@ class NeuralVolumes(PlacedModel):
     def loss_terms(
         self, output: RenderOutput, batch: RayBatch, names: Collection[str]
     ) -> dict[str, Tensor]:
-        """``color``, and the priors of codes, rays and voxels (``volumes.py``)."""
-        terms = super().loss_terms(output, batch, names) if "color" in names else {}
+        """``render``, and the priors of codes, rays and voxels (``volumes.py``)."""
+        terms = super().loss_terms(output, batch, names) if "render" in names else {}
         if "kl" in names:
             terms["kl"] = code_divergence(output.extras["mean"], output.extras["log_deviation"])
         if "opacity_prior" in names:

@@ -24,7 +24,7 @@ def photometric(color: Tensor, truth: Tensor, weight: Tensor) -> Tensor:
     return (weight * error).sum() / weight.sum().clamp(min=EPS)
 
 
-def color(r: Renders) -> Tensor:
+def render(r: Renders) -> Tensor:
     """‖C − C_gt‖² of the blended render."""
     return photometric(r.output.color, r.batch.color, torch.ones_like(r.batch.time))
 
@@ -171,7 +171,7 @@ def blend_entropy(r: Renders) -> Tensor:
 
 
 TERMS: Mapping[str, Callable[[Renders], Tensor]] = {
-    "color": color,
+    "render": render,
     "dynamic": dynamic,
     "neighbours": neighbours,
     "chained": chained,

@@ -36,7 +36,7 @@ class TiNeuVox(SurfacedField):
     """
 
     name: ClassVar[str] = "tineuvox"
-    losses: ClassVar[tuple[str, ...]] = ("color", "background_entropy", "sample_color")
+    losses: ClassVar[tuple[str, ...]] = ("render", "background_entropy", "sample_color")
     keeps_batches: ClassVar[bool] = True  # large steps need whole ones
     settings_class = TiNeuVoxSettings
     settings: TiNeuVoxSettings
@@ -132,8 +132,8 @@ class TiNeuVox(SurfacedField):
     def loss_terms(
         self, output: RenderOutput, batch: RayBatch, names: Collection[str]
     ) -> dict[str, Tensor]:
-        """``color``; ``background_entropy`` of T_end; ``sample_color``, of each sample alone."""
-        terms = super().loss_terms(output, batch, names) if "color" in names else {}
+        """``render``; ``background_entropy`` of T_end; ``sample_color``, of each sample alone."""
+        terms = super().loss_terms(output, batch, names) if "render" in names else {}
         if "background_entropy" in names:
             terms["background_entropy"] = background_entropy(output.transmittance)
         if "sample_color" in names:
