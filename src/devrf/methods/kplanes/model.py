@@ -16,7 +16,7 @@ from devrf.methods.kplanes.decoders import ExplicitDecoder, HybridDecoder
 from devrf.methods.kplanes.planes import SixPlanes, sum_of
 from devrf.methods.kplanes.proposals import Proposal, drawn_edges, histogram_error, intervals
 from devrf.methods.kplanes.settings import KPlanesSettings
-from devrf.methods.nerf.placed_model import SurfacedField
+from devrf.methods.nerf.placed_model import DensityColorField
 from devrf.methods.nerf.samples import limits
 from devrf.ops.compositing import composite
 from devrf.ops.photometric import distortion
@@ -29,7 +29,7 @@ RARELY = 5
 SLOPE = 10
 
 
-class KPlanes(SurfacedField):
+class KPlanes(DensityColorField):
     """(σ, c) = R(f(x, t), d): features f of six planes, decoded (docs/methods/kplanes.md).
 
     Attributes:
@@ -45,7 +45,7 @@ class KPlanes(SurfacedField):
     random_background: ClassVar[bool] = True
     keeps_batches: ClassVar[bool] = True  # large steps need whole ones
     settings_class = KPlanesSettings
-    remembered: ClassVar[tuple[str, ...]] = ("sharpness",)
+    checkpointed_attributes: ClassVar[tuple[str, ...]] = ("sharpness",)
     settings: KPlanesSettings
 
     def __init__(self, settings: KPlanesSettings | None = None) -> None:

@@ -13,14 +13,14 @@ from torch import Tensor, nn
 from devrf.data.batch import RayBatch
 from devrf.geometry.rays import Rays
 from devrf.methods.nerf.networks import RadianceField
-from devrf.methods.nerf.placed_model import Sigma, SurfacedField
+from devrf.methods.nerf.placed_model import DensityColorField, Sigma
 from devrf.methods.nerf.samples import RaySamples, flattened, importance, limits, stratified
 from devrf.methods.nerf.settings import FieldSettings
 from devrf.ops.compositing import composite
 from devrf.rendering.output import RenderOutput
 
 
-class DeformableField(SurfacedField):
+class DeformableField(DensityColorField):
     """(σ, c) = T(x′, w, d), where a deformation leads a point x at time t to x′ and w.
 
     A method defines the deformation (:meth:`deform`). T lives in normalised space.

@@ -24,7 +24,7 @@ from devrf.ops.compositing import composite
 from devrf.rendering.output import RenderedImage, RenderOutput
 from devrf.rendering.view import SurfaceField
 from devrf.scenes.scene import Scene
-from devrf.system.plain_data import built
+from devrf.system.plain_data import validate
 
 # Rays of a view that are rendered at once: on a CPU what its caches hold, of a hundred samples a
 # ray; on a GPU what keeps it busy.
@@ -39,7 +39,7 @@ class PlacedModel(RayTrainable):
 
     Attributes:
         settings_class: what :attr:`settings` are: sizes and sampling.
-        remembered: the names of attributes that a checkpoint holds beside these.
+        checkpointed_attributes: the names of further attributes that a checkpoint holds.
         placement: the maps from the fields' space (world units, NDC or contracted) to normalised
             space, where the box's longest edge is 2, and back.
         occupancy: where something may be at each frame.
@@ -47,7 +47,7 @@ class PlacedModel(RayTrainable):
     """
 
     settings_class: ClassVar[type[Any]]
-    remembered: ClassVar[tuple[str, ...]] = ()
+    checkpointed_attributes: ClassVar[tuple[str, ...]] = ()
     settings: Any
 
     def __init__(self, settings: Any) -> None:
@@ -88,19 +88,19 @@ class PlacedModel(RayTrainable):
             "space": space_config(self.space),
             "limits": list(self.depth_limits),
             "times": list(self.clock.times),
-            **{name: getattr(self, name) for name in self.remembered},
+            **{name: getattr(self, name) for name in self.checkpointed_attributes},
         }
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
         """Networks of the same sizes in the same place."""
-        model = cls(built(cls.settings_class, config["settings"]))
+        model = cls(validate(cls.settings_class, config["settings"]))
         low, high = config["box"]
-        box = built(Box, {"low": low, "high": high})
-        depths = built(tuple[float, float], config["limits"])
+        box = validate(Box, {"low": low, "high": high})
+        depths = validate(tuple[float, float], config["limits"])
         model.set_place(box, space_from(config["space"]), depths)
-        model.set_times(built(FrameClock, config).times)
-        for name in cls.remembered:
+        model.set_times(validate(FrameClock, config).times)
+        for name in cls.checkpointed_attributes:
             setattr(model, name, config[name])
         return model
 
@@ -184,8 +184,8 @@ Sigma = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 Color = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
-class SurfacedField(NeuralField):
-    """A density and a colour of each point and time: what rays see of it, and its surface.
+class DensityColorField(NeuralField):
+    """A density and a colour at each point and time, their render and their surface.
 
     Attributes:
         least_weight: samples with no more weight are not coloured; 0: all are.
@@ -264,7 +264,7 @@ class SurfaceAtTime:
         shape: points of a grid over it, as fine as most such fields.
     """
 
-    def __init__(self, model: SurfacedField, time: float) -> None:
+    def __init__(self, model: DensityColorField, time: float) -> None:
         self.box = model.box
         self.shape = model.box.grid_shape(SURFACE_SIDE**3)
         self._model = model

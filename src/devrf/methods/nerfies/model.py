@@ -116,7 +116,7 @@ class Nerfies(DeformableField):
     name: ClassVar[str] = "nerfies"
     losses: ClassVar[tuple[str, ...]] = ("render", "elastic")
     settings_class: ClassVar[type[FieldSettings]] = NerfiesSettings
-    remembered: ClassVar[tuple[str, ...]] = ("rest_is_canonical",)
+    checkpointed_attributes: ClassVar[tuple[str, ...]] = ("rest_is_canonical",)
     settings: NerfiesSettings
 
     def __init__(self, settings: NerfiesSettings | None = None, ambient: int = 0) -> None:

@@ -49,7 +49,7 @@ class NSFF(NeuralField):
     protocols: ClassVar[tuple[str, ...]] = ("joint", "dynamic")
     priors: ClassVar[tuple[str, ...]] = ("forward_flow",)
     settings_class = NSFFSettings
-    remembered: ClassVar[tuple[str, ...]] = ("cut_out",)
+    checkpointed_attributes: ClassVar[tuple[str, ...]] = ("cut_out",)
     settings: NSFFSettings
     times: Tensor
 

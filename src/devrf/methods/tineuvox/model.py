@@ -13,7 +13,7 @@ from devrf.data.batch import RayBatch
 from devrf.geometry.box import Box
 from devrf.geometry.space import Space
 from devrf.methods.nerf.networks import SinusoidalEncoding, linear_by_ray, mlp
-from devrf.methods.nerf.placed_model import SurfacedField
+from devrf.methods.nerf.placed_model import DensityColorField
 from devrf.methods.tineuvox.networks import MultiDistanceGrid, RadianceNetwork
 from devrf.methods.tineuvox.settings import TiNeuVoxSettings
 from devrf.ops.photometric import background_entropy, per_sample_color
@@ -22,7 +22,7 @@ from devrf.rendering.output import RenderOutput
 from devrf.scenes.scene import Scene
 
 
-class TiNeuVox(SurfacedField):
+class TiNeuVox(DensityColorField):
     """(σ, c) = R(V(x + D(x, ω)), x, ω, d), ω = T(t): voxels at rest, networks that know the time.
 
     See docs/methods/tineuvox.md. Networks live in normalised space.
