@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 from devrf.cli.complete import completed
 from devrf.cli.config import PATHS
-from devrf.cli.restore_config import told
+from devrf.cli.restore_config import applied_defaults
 from devrf.scenes.export import export
 from devrf.scenes.procedural import ProceduralForwardScene, ProceduralScene
 
@@ -169,7 +169,7 @@ def test_one_moving_camera_is_learned_as_published_where_there_is_a_gpu(scenes, 
 
 def test_devrf_on_one_moving_camera_is_told_what_learns_more(scenes):
     completed([f"data.root={scenes}/hook", "stage=canonical"])
-    assert told[0].endswith("; experiment=phone learns more of it than method=devrf")
+    assert applied_defaults[0].endswith("; experiment=phone learns more of it than method=devrf")
 
 
 @pytest.mark.parametrize(

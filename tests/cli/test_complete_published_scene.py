@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from devrf.cli.complete import completed
-from devrf.cli.restore_config import told
+from devrf.cli.restore_config import applied_defaults
 
 
 @pytest.mark.parametrize(
@@ -19,4 +19,4 @@ from devrf.cli.restore_config import told
 def test_the_choice_of_the_scene_is_named(typed, said):
     completed([*typed.split(), "data.root=scenes/lego"])
     line = "scenes/lego: if it is DeVRF's, data=lego has what is published for it"
-    assert (told == [line]) is said
+    assert (applied_defaults == [line]) is said

@@ -26,19 +26,32 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf.errors import OmegaConfBaseException
 
-from devrf.cli.config import APART, PATHS, config_folder, group_choices
-from devrf.cli.restore_config import of_named_run, parsed, told, value, values
+from devrf.cli.config import PATHS, SCENELESS_STAGES, config_folder, group_choices
+from devrf.cli.restore_config import applied_defaults, of_named_run, parsed, value, values
 from devrf.cli.view import serves_page
 from devrf.errors import DevrfError
 from devrf.system.override import literal, without_reference
 from devrf.system.process import importing
 
 # Stages that DeVRF's protocol alone has.
-OF_DEVRF = ("canonical", "deformation")
+DEVRF_STAGES = ("canonical", "deformation")
 # What says how a scene is learned: groups, and keys that DeVRF alone has.
-HOW: tuple[str, ...] = ("method", "profile", "protocol", "comparison", "experiment", "ablation")
-HOW += ("hparams_search", "data.static_until", "field", "sampling", "loss")
-HOW += ("canonical", "deformation", "schedule.canonical", "schedule.deformation", "schedule.motion")
+TRAINING_KEYS: tuple[str, ...] = (
+    "method",
+    "profile",
+    "protocol",
+    "comparison",
+    "experiment",
+    "ablation",
+)
+TRAINING_KEYS += ("hparams_search", "data.static_until", "field", "sampling", "loss")
+TRAINING_KEYS += (
+    "canonical",
+    "deformation",
+    "schedule.canonical",
+    "schedule.deformation",
+    "schedule.motion",
+)
 ONE_CAMERA = "one moving camera, where method=devrf needs the scene at rest, too"
 # `viewer` is a group, whose choices Hydra wants to be text.
 SHORTHAND = {f"viewer={value}": f"viewer.training={value}" for value in ("true", "false")}
@@ -52,7 +65,7 @@ def completed(arguments: Sequence[str]) -> list[str]:
         DevrfError: a scene's folder cannot be recognised, the scenes of a sweep need different
             options, or a group's choice is null.
     """
-    told.clear()
+    applied_defaults.clear()
     known, _ = get_args_parser().parse_known_intermixed_args(arguments)
     flags = [word for word in arguments if word not in known.overrides]
     texts = [SHORTHAND.get(word.lower(), word) for word in known.overrides]
@@ -73,17 +86,24 @@ def completed(arguments: Sequence[str]) -> list[str]:
     before = of_named_run(typed, known.multirun)
     roots = values(typed, "data.root")
     overrides = parsed([*before, *texts])
-    if value(overrides, "data.camera") == "handheld" and value(overrides, "stage") not in APART:
+    if (
+        value(overrides, "data.camera") == "handheld"
+        and value(overrides, "stage") not in SCENELESS_STAGES
+    ):
         chosen = _for_one_camera("data.camera=handheld", overrides, continued=bool(before))
         if chosen:
-            told.append(f"data.camera=handheld: {ONE_CAMERA} ({' '.join(chosen)})")
+            applied_defaults.append(f"data.camera=handheld: {ONE_CAMERA} ({' '.join(chosen)})")
         return [*flags, *before, *texts, *chosen]
-    if not roots or value(overrides, "stage") in APART or any("${" in root for root in roots):
+    if (
+        not roots
+        or value(overrides, "stage") in SCENELESS_STAGES
+        or any("${" in root for root in roots)
+    ):
         return [*flags, *before, *texts]
     readers: list[str | None] = [*values(overrides, "data")]
     readers = readers or _of_experiments(overrides, known.config_dir)
     words = [
-        _told_by_scene(reader, root, overrides, continued=bool(before))
+        _defaults_of_scene(reader, root, overrides, continued=bool(before))
         for reader, root in product(readers, roots)
     ]
     if any(other != words[0] for other in words):
@@ -151,10 +171,10 @@ def _searchpath(config_dir: str | None) -> list[str]:
 def _says_how(override: Override) -> bool:
     """Whether an override says how a scene is learned."""
     key = f"{override.key_or_group}."
-    return any(key.startswith(f"{name}.") for name in HOW)
+    return any(key.startswith(f"{name}.") for name in TRAINING_KEYS)
 
 
-def _told_by_scene(
+def _defaults_of_scene(
     option: str | None, root: str, overrides: Sequence[Override], *, continued: bool
 ) -> list[str]:
     """What the files of a scene say, which ``data=option`` reads, and no override does.
@@ -189,9 +209,11 @@ def _told_by_scene(
     scene = Path(root).expanduser().resolve().name
     if value(overrides, "experiment") == "paper" and option in ("inward", "forward"):
         if (config_folder() / f"for_scene/paper_{scene}.yaml").is_file():
-            told.append(f"{root}: if it is DeVRF's, data={scene} has what is published for it")
+            applied_defaults.append(
+                f"{root}: if it is DeVRF's, data={scene} has what is published for it"
+            )
     if words:
-        told.append(f"{root}: {why} ({' '.join(words)}){remark}")
+        applied_defaults.append(f"{root}: {why} ({' '.join(words)}){remark}")
     return words
 
 
@@ -201,9 +223,11 @@ def _for_one_camera(scene: str, overrides: Sequence[Override], *, continued: boo
     None where a run is ``continued``; where DeVRF is asked for, the log says what it lacks.
     """
     method = value(overrides, "method")
-    if method == "devrf" or value(overrides, "stage") in OF_DEVRF:
+    if method == "devrf" or value(overrides, "stage") in DEVRF_STAGES:
         lacks = "one camera filmed it moving, and nothing shows it at rest"
-        told.append(f"{scene}: {lacks}; experiment=phone learns more of it than method=devrf")
+        applied_defaults.append(
+            f"{scene}: {lacks}; experiment=phone learns more of it than method=devrf"
+        )
     elif not continued and not any(map(_says_how, overrides)):
         with importing():
             import torch

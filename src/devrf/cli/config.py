@@ -19,9 +19,9 @@ from devrf.system.override import to_type
 
 PIPELINE = "pipeline"
 # Stages for which the run's scene need not be right.
-APART = ("report", "fetch", "capture", "selfcheck")
+SCENELESS_STAGES = ("report", "fetch", "capture", "selfcheck")
 # Stages that learn nothing; the protocol's stages come beside these.
-STEPS = ("prepare", "inspect", "evaluate", "render", "still", "view", "export", *APART)
+STEPS = ("prepare", "inspect", "evaluate", "render", "still", "view", "export", *SCENELESS_STAGES)
 # Of these, what uses a checkpoint.
 OF_A_CHECKPOINT = ("evaluate", "render", "still", "view", "export")
 # Keys whose values are files or folders.

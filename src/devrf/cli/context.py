@@ -60,7 +60,7 @@ class RunContext(ExitStack):
         learning_stages: names of the protocol's stages, in their order.
         evaluation: what is measured on held-out views.
         strategy: the configured trainer's: its device, rank and number of processes.
-        leads: whether this process writes files and logs: rank 0, or the only one.
+        is_rank_zero: whether this process writes files and logs: rank 0, or the only one.
         device: the trainer's.
         rehearses: whether ``rehearse=true`` asks for all that the run does, in minutes.
         rehearsed: what the stages of a rehearsal came to, by name.
@@ -83,7 +83,7 @@ class RunContext(ExitStack):
         self.learning_stages = tuple(self.protocol.stages)
         self.evaluation: Evaluation = instantiate(config.evaluation, _convert_="all")
         self.strategy = _strategy(config)
-        self.leads = bool(self.strategy.is_global_zero)
+        self.is_rank_zero = bool(self.strategy.is_global_zero)
         self.device = self.strategy.root_device
         self.rehearses = bool(config.rehearse)
         self.rehearsed: dict[str, RehearsedStage] = {}
@@ -189,7 +189,7 @@ class RunContext(ExitStack):
 
         Giving a tracker the config begins its run: use it once the config has been checked.
         """
-        if not self.leads or self.is_trial or self.rehearses:
+        if not self.is_rank_zero or self.is_trial or self.rehearses:
             return False
         logger = instantiate(self.config.logger)
         for tracker in trackers([logger]):

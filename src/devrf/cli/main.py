@@ -15,7 +15,7 @@ from devrf.cli.complete import completed
 from devrf.cli.config import config_folder, in_sweep, overrides, register_config
 from devrf.cli.config_check import check_config, check_extras
 from devrf.cli.messages import report_user_errors
-from devrf.cli.restore_config import log_told, parsed
+from devrf.cli.restore_config import log_applied_defaults, parsed
 from devrf.cli.run_folder import working_in
 from devrf.cli.sweep import naming_failures, record_failure
 from devrf.cli.view import serve_page, serves_page
@@ -67,7 +67,7 @@ def run(config: DictConfig) -> float | None:
     folder = Path(HydraConfig.get().runtime.output_dir)
     guard = record_failure(config, folder) if in_sweep() else report_user_errors()
     with guard, working_in(folder, config):
-        log_told()
+        log_applied_defaults()
         if serves_page(parsed(overrides()), folder):
             serve_page(config, folder)
             return None

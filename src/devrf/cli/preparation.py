@@ -22,7 +22,7 @@ from devrf.cli.complete import completed
 from devrf.cli.config import command_line
 from devrf.cli.context import RunContext
 from devrf.cli.memory import compare, needs
-from devrf.cli.restore_config import log_told
+from devrf.cli.restore_config import log_applied_defaults
 from devrf.engine.ddp import ManualDDP
 from devrf.errors import DevrfError
 from devrf.scenes.export import export
@@ -53,7 +53,7 @@ def capture(run: RunContext) -> None:
     settings: CaptureSettings = instantiate(run.config.capture, _convert_="all")
     folder = scene_from_footage(settings)
     config = compose("config", completed([f"data.root={literal(folder)}"]))
-    log_told()
+    log_applied_defaults()
     captured = RunContext(config, run.folder)
     inspect(captured)
     _, _, change = compare(captured, captured.stages_with_images)

@@ -65,7 +65,7 @@ MOST = 1000
 Command = dict[str, Any]
 
 # What was set that was not typed, and why, until a log is there to say so.
-told: list[str] = []
+applied_defaults: list[str] = []
 
 
 def present_command(config: DictConfig) -> Command:
@@ -169,9 +169,9 @@ def value(overrides: Sequence[Override], key: str) -> str | None:
     return texts[0] if len(texts) == 1 else None
 
 
-def log_told() -> None:
+def log_applied_defaults() -> None:
     """Say where the settings come from that were not typed."""
-    for line in told:
+    for line in applied_defaults:
         log.info("%s", line)
 
 
@@ -205,7 +205,7 @@ def of_named_run(typed: Sequence[Override], multirun: bool) -> list[str]:
     if {} in commands:
         said = "does not say how it was learned; what is typed and the defaults apply"
     if command or {} in commands:
-        told.append(f"{', '.join(map(str, checkpoints))}: {said}")
+        applied_defaults.append(f"{', '.join(map(str, checkpoints))}: {said}")
     put = [
         f"{key[1:]}={setting}" if key[0] == "/" else f"++{key}={literal(setting)}"
         for key, setting in command.items()
@@ -255,7 +255,7 @@ def _of_sweep(typed: Sequence[Override], folder: Path) -> list[str]:
             checked(record, {key: text})
         lines[key] = str(override.input_line)
     kept = [lines[key] for key in _beneath(typed, lines)]
-    told.append(f"{folder}: the sweep goes on, with {shlex.join(kept)}")
+    applied_defaults.append(f"{folder}: the sweep goes on, with {shlex.join(kept)}")
     return [*kept, "hydra.mode=MULTIRUN"]
 
 

@@ -20,7 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 from devrf.apps.render import camera_path
 from devrf.apps.settings import ViewerSettings
 from devrf.apps.viewer.page import PAGE
-from devrf.cli.config import APART, OF_A_CHECKPOINT, PIPELINE, in_sweep
+from devrf.cli.config import OF_A_CHECKPOINT, PIPELINE, SCENELESS_STAGES, in_sweep
 from devrf.cli.context import RunContext
 from devrf.cli.evaluate import evaluate
 from devrf.cli.memory import compare
@@ -113,18 +113,18 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
         if learning:
             kernels = dict.fromkeys(k for plan in run.plans.values() for k in plan.kernels)
             compiling = compile_ahead([*kernels], run.device)  # while the scene is read
-            if run.leads:
+            if run.is_rank_zero:
                 _prepare_to_learn(run, learning, steps)
             if config.schedule.seconds is not None:  # which are of learning alone
                 compiling.join()
             _learn(run, learning)
-        for name in steps if run.leads or not learning else ():
+        for name in steps if run.is_rank_zero or not learning else ():
             if not (learning and done(run, name)):
-                _take(run, name, AFTER_LEARNING.get(name) or STEPS[name])
-        if learning and run.rehearses and run.leads:
+                _run_step(run, name, AFTER_LEARNING.get(name) or STEPS[name])
+        if learning and run.rehearses and run.is_rank_zero:
             conclude(run)
-        scored = "evaluate" in steps and run.leads and not run.rehearses
-        return _ended(run, steps) if scored and unfinished(run) is None else None
+        scored = "evaluate" in steps and run.is_rank_zero and not run.rehearses
+        return _objective(run, steps) if scored and unfinished(run) is None else None
 
 
 def _prepare_to_learn(run: RunContext, requested: Names, steps: Names) -> None:
@@ -149,7 +149,7 @@ def _prepare_to_learn(run: RunContext, requested: Names, steps: Names) -> None:
         log.info("%s", needed)
 
 
-def _ended(run: RunContext, steps: Names) -> float | None:
+def _objective(run: RunContext, steps: Names) -> float | None:
     """The objective; a pipeline ends with its results, and what to try next."""
     scores = run.folder / "metrics.json"
     try:
@@ -180,7 +180,7 @@ def _learn(run: RunContext, learning: Names) -> None:
     strategy = run.strategy
     together: AbstractContextManager[None] = nullcontext()
     if isinstance(strategy, ManualDDP):
-        if run.leads:
+        if run.is_rank_zero:
             _ = run.scene  # its errors are reported once, and its estimated flow is stored
         plain = OmegaConf.to_container(run.config, resolve=True)
         together = launch_workers(strategy, learn_beside, (plain, run.folder))
@@ -191,10 +191,10 @@ def _learn(run: RunContext, learning: Names) -> None:
             shared = "give hydra.run.dir=FOLDER in a file system that all nodes share"
             raise DevrfError(f"{run.folder}: not there on every node; {shared}")
         for name in run.learnable(learning):
-            _take(run, name, partial(learn, name=name))
+            _run_step(run, name, partial(learn, name=name))
 
 
-def _take(run: RunContext, name: str, step: Step) -> None:
+def _run_step(run: RunContext, name: str, step: Step) -> None:
     seed_everything(run.config.seed, verbose=False)
     rays = f"schedule.{name}.rays"
     known = OmegaConf.select(run.config, rays) is not None
@@ -213,7 +213,7 @@ def _check(run: RunContext, learning: Names, steps: Names) -> None:
     if config.ckpt is not None and (begins or not {*steps} <= {*OF_A_CHECKPOINT}):
         instead = f"a stage that builds on another, stage={', '.join(OF_A_CHECKPOINT)}"
         raise DevrfError(f"ckpt: stage={config.stage} starts from nothing; give {instead}")
-    if not learning and not set(APART).isdisjoint(steps):
+    if not learning and not set(SCENELESS_STAGES).isdisjoint(steps):
         return
     _ = run.datamodule
     _ = run.plans
@@ -229,5 +229,5 @@ def _check(run: RunContext, learning: Names, steps: Names) -> None:
     instantiate(config.still)
     instantiate(config.export)
     viewer: ViewerSettings = instantiate(config.viewer)
-    if run.leads and ("view" in steps or (viewer.training and learning)):
+    if run.is_rank_zero and ("view" in steps or (viewer.training and learning)):
         viewer.check_free()

@@ -99,12 +99,12 @@ def working_in(folder: Path, config: DictConfig) -> Iterator[None]:
     Raises:
         DevrfError: another process works there.
     """
-    leads = not _is_worker(config)
-    if leads and config.stage not in UNRECORDED:
+    is_rank_zero = not _is_worker(config)
+    if is_rank_zero and config.stage not in UNRECORDED:
         lock_folder(folder, "hydra.sweep.dir" if in_sweep() else "hydra.run.dir")
         for path in (path for place in BEGUN for path in folder.glob(f"{place}/.partial-*")):
             path.unlink(missing_ok=True)
-    was_new = leads and not in_sweep() and holds_at_most(folder, AT_FIRST)
+    was_new = is_rank_zero and not in_sweep() and holds_at_most(folder, AT_FIRST)
     try:
         yield
         (folder / FAILURE).unlink(missing_ok=True)

@@ -35,7 +35,7 @@ def learn(run: RunContext, name: str) -> None:
     """Learn a stage of the protocol, or the rest of it."""
     begin: ResumePoint | None = ResumePoint({})  # of a trial
     if not run.is_trial:
-        begin = run.strategy.broadcast(beginning(run, name) if run.leads else None)
+        begin = run.strategy.broadcast(beginning(run, name) if run.is_rank_zero else None)
     if begin is None:
         return
     build = run.plans[name].build
@@ -57,7 +57,7 @@ def learn(run: RunContext, name: str) -> None:
 
 
 def _fit(run: RunContext, stage: Stage, begin: ResumePoint) -> None:
-    if run.leads:
+    if run.is_rank_zero:
         _ = run.scene  # errors in it come before a logger writes files
     stage.provenance.training_config = begin.training_config
     # The clock stops before curves are drawn.
@@ -67,7 +67,7 @@ def _fit(run: RunContext, stage: Stage, begin: ResumePoint) -> None:
     if saving is None:  # no periodic files, but still one at a signal
         saving = PeriodicCheckpoint(run.folder / "checkpoints", every_seconds=math.inf)
         callbacks.append(saving)
-    if run.config.viewer.training and run.leads:
+    if run.config.viewer.training and run.is_rank_zero:
         from devrf.apps.viewer.live_view import LiveView  # an extra
 
         callbacks.append(LiveView(run.page, run.config.viewer.share))
@@ -86,8 +86,8 @@ def _fit(run: RunContext, stage: Stage, begin: ResumePoint) -> None:
         strategy = trainer.strategy
         stopping = strategy.reduce_boolean_decision(stop.number is not None, all=False)
         finished = stage.is_complete
-        if run.leads and finished and not run.is_trial:
-            _keep(run, trainer, stage)
+        if run.is_rank_zero and finished and not run.is_trial:
+            _save_final(run, trainer, stage)
         strategy.barrier("the checkpoint is written")
     if run.rehearses:
         run.rehearsed[stage.name] = RehearsedStage(
@@ -103,7 +103,7 @@ def _fit(run: RunContext, stage: Stage, begin: ResumePoint) -> None:
         raise Interrupted(stop.number or signal.SIGTERM, f"interrupted at {where}; {again}")
     if run.is_trial:
         run.tried[stage.name] = stage.result()
-        if run.leads:
+        if run.is_rank_zero:
             tried = stage.iteration
             total = stage.timeline.total
             log.info("%s: a trial, %d of %d iterations; nothing is kept", stage.name, tried, total)
@@ -114,7 +114,7 @@ def _fit(run: RunContext, stage: Stage, begin: ResumePoint) -> None:
         raise DevrfError(f"{', '.join(limits) or 'callbacks'}: {ended}")
 
 
-def _keep(run: RunContext, trainer: Trainer, stage: Stage) -> None:
+def _save_final(run: RunContext, trainer: Trainer, stage: Stage) -> None:
     """Write the stage's checkpoint, and the config that it was learned with."""
     path = run.own_checkpoint(stage.name)
     # Goes into the checkpoint, so without the time of writing it.
