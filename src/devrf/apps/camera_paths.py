@@ -44,10 +44,10 @@ SMOOTH_STOPS = 1.5
 SMOOTH_MOST = 1 / 12
 
 # A swing leads so far from where it stops, as a share of the time that one camera filmed.
-SWING = 0.06
+SWING_SHARE = 0.06
 
 # The cameras of a video, from captured ones, what they look at (3,), and settings.
-Way = Callable[[Cameras, Tensor, VideoSettings], Cameras]
+CapturedPath = Callable[[Cameras, Tensor, VideoSettings], Cameras]
 # The cameras of a video of some settings, around a scene or before it.
 Ring = Callable[[VideoSettings], Cameras]
 # Cameras and as many times in [0, 1].
@@ -221,10 +221,10 @@ def _with_one_lens(cameras: Cameras, poses: Tensor) -> Cameras:
 
 
 # By the names that video.path has for them.
-WAYS: dict[str, Way] = {"orbit": orbit, "spiral": spiral, "captured": captured}
+CAMERA_PATHS: dict[str, CapturedPath] = {"orbit": orbit, "spiral": spiral, "captured": captured}
 
 
-def default_way(space: Space, closed: bool = False) -> str:
+def default_path(space: Space, closed: bool = False) -> str:
     """The way that suits a scene; ``closed``: one that comes back to where it began.
 
     In an unbounded scene it stays near the captured cameras: nothing else is known.
@@ -297,7 +297,7 @@ def swing(cameras: Cameras, seen_at: Sequence[float], settings: VideoSettings) -
     before, around, after = _thirds(stop, settings.frames)
     times = torch.cat([before, torch.full((around,), stop), after])
     turn = torch.linspace(0, 2 * math.pi, around)
-    there = torch.cat([before, stop + SWING * turn.sin(), after])
+    there = torch.cat([before, stop + SWING_SHARE * turn.sin(), after])
     seconds = settings.frames / settings.fps
     smooth = max(SMOOTH_SECONDS / seconds, SMOOTH_STOPS / len(cameras))
     nearness = (there[:, None] - torch.tensor(seen_at)) / smooth
@@ -308,6 +308,6 @@ def swing(cameras: Cameras, seen_at: Sequence[float], settings: VideoSettings) -
 # Beside them, videos in which the camera moves while time stands still.
 PRESETS = {"bullet_time": bullet_time, "time_freeze": time_freeze}
 # Of what one moving camera filmed, where it was: :func:`swing`.
-FOLLOWED = "swing"
+SWING = "swing"
 # What video.path may be beside a file.
-NAMES = (*WAYS, *PRESETS, FOLLOWED)
+NAMES = (*CAMERA_PATHS, *PRESETS, SWING)

@@ -12,11 +12,11 @@ from typing import NamedTuple
 from torch import Tensor
 
 from devrf.apps.camera_paths import (
-    FOLLOWED,
+    CAMERA_PATHS,
     NAMES,
     PRESETS,
-    WAYS,
-    default_way,
+    SWING,
+    default_path,
     focus_distance,
     looked_at,
     swing,
@@ -72,9 +72,9 @@ def videos(
     """
     behind = background_value(viewpoints.background)
     static = viewpoints.static
-    if settings.path == FOLLOWED and not viewpoints.followed:
+    if settings.path == SWING and not viewpoints.followed:
         expected = "another way, since it was not one moving camera that saw the scene move"
-        raise DevrfError(f"video.path: expected {expected}, not {FOLLOWED}")
+        raise DevrfError(f"video.path: expected {expected}, not {SWING}")
     path = camera_path(settings, viewpoints.offset)
     if path is not None:
         settings = replace(settings, frames=path.frames, fps=path.fps)
@@ -84,7 +84,7 @@ def videos(
 
     def filmed(name: str) -> Callable[[VideoSettings], Cameras]:
         target = looked_at(renderer.model, static, lambda: focus_distance(renderer, static))
-        return lambda of: WAYS[name](sized, target, of)
+        return lambda of: CAMERA_PATHS[name](sized, target, of)
 
     def video(name: str, pictures: Iterator[Tensor]) -> Video:
         return Video(name, settings.fps, settings.frames, pictures)
@@ -96,7 +96,7 @@ def videos(
         yield video(Path(str(settings.path)).stem, path_pictures(renderer, cameras, behind, times))
         return
     if settings.path in PRESETS:
-        ring = filmed(default_way(space, closed=True))
+        ring = filmed(default_path(space, closed=True))
         cameras, times = PRESETS[settings.path](ring, settings.time, settings)
         yield video(settings.path, path_pictures(renderer, cameras, behind, times))
         return
@@ -105,11 +105,11 @@ def videos(
         background = viewpoints.background
         shown = held_out_pictures(renderer, held_out, images, settings, background)
         yield video("held_out", shown)
-    name = settings.path or default_way(space)
-    if name == FOLLOWED or (viewpoints.followed and not settings.path and name != "orbit"):
+    name = settings.path or default_path(space)
+    if name == SWING or (viewpoints.followed and not settings.path and name != "orbit"):
         followed = settings.sized(viewpoints.dynamic)
         cameras, times = swing(followed, viewpoints.followed, settings)
-        yield video(FOLLOWED, path_pictures(renderer, cameras, behind, times))
+        yield video(SWING, path_pictures(renderer, cameras, behind, times))
         return
     yield video(name, path_pictures(renderer, filmed(name)(settings), behind))
 

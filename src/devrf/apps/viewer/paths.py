@@ -12,7 +12,7 @@ import numpy as np
 import torch
 import viser
 
-from devrf.apps.camera_paths import WAYS, bullet_time, default_way, looked_at, time_freeze
+from devrf.apps.camera_paths import CAMERA_PATHS, bullet_time, default_path, looked_at, time_freeze
 from devrf.apps.captured_cameras import distance_ahead
 from devrf.apps.keyframes import (
     CameraPath,
@@ -52,23 +52,23 @@ def known_paths(cameras: Cameras, model: Callable[[], Renderable]) -> dict[str, 
     def filmed(name: str, video: VideoSettings) -> Cameras:
         target = looked_at(model(), cameras, lambda: distance_ahead(cameras))
         if name == "captured":
-            return WAYS[name](cameras, target, replace(video, fps=KEYFRAMES / SECONDS))
+            return CAMERA_PATHS[name](cameras, target, replace(video, fps=KEYFRAMES / SECONDS))
         # Comes back to where it began.
         video = replace(video, frames=video.frames - 1)
-        return WAYS[name](cameras, target, video)[[*range(video.frames), 0]]
+        return CAMERA_PATHS[name](cameras, target, video)[[*range(video.frames), 0]]
 
     def running(name: str, _: float) -> tuple[Keyframe, ...]:
         return keyframes_of(filmed(name, once), times, SECONDS)
 
     def ring(video: VideoSettings) -> Cameras:
-        return filmed(default_way(model().space, closed=True), video)
+        return filmed(default_path(model().space, closed=True), video)
 
     def stopped(shoot: Any, video: VideoSettings, stop: float) -> tuple[Keyframe, ...]:
         shots, shot_times = shoot(ring, stop, video)
         return keyframes_of(shots, shot_times, SECONDS * video.frames / KEYFRAMES)
 
     return {
-        **{name: partial(running, name) for name in WAYS},
+        **{name: partial(running, name) for name in CAMERA_PATHS},
         "bullet time": partial(stopped, bullet_time, once),
         "time freeze": partial(stopped, time_freeze, longer),
     }
