@@ -98,7 +98,7 @@ def reconstruct(
         return first.folder
     best = None if given else _without_movers(images, work, moving, settings, first)
     if best is None:
-        best = _more([first, _mapped(images, work, "global", models / "global")])
+        best = _largest([first, _mapped(images, work, "global", models / "global")])
     if flat and best.images < LEAST_SHARE * len(moving.names):
         raise DevrfError(f"{moving.path}: {_FLAT}")
     log.info("structure from motion: the %s mapper's cameras are taken", best.mapper)
@@ -134,7 +134,7 @@ def _without_movers(
         placed = [model for model in tried if model and model.images >= FEWER * first.images]
         if not placed:
             break
-        found.append(_more(placed))
+        found.append(_largest(placed))
         used.append(masks)
     if not masks:
         return None
@@ -161,17 +161,18 @@ def _agreeing(film: Film, found: Sequence[_Mapped], masks: Sequence[dict[str, Ma
     errors = [film.error_of_still(model, still) for model in models]
     said = ", then ".join(f"{error:.2f}" for error in errors)
     log.info(
-        "structure from motion: by each time's cameras what stands still is off by %s px", said
+        "structure from motion: median epipolar error of static pixels per reconstruction: %s px",
+        said,
     )
     if min(errors) == float("inf"):
         return found[0]
-    return _more(
+    return _largest(
         [model for model, error in zip(found, errors, strict=True) if error <= ABOUT * min(errors)]
     )
 
 
-def _more(models: Sequence[_Mapped | None]) -> _Mapped:
-    """Of the models that there are, the one of most images; of as many, that of least error."""
+def _largest(models: Sequence[_Mapped | None]) -> _Mapped:
+    """The model with the most images; ties by reprojection error."""
     known = [model for model in models if model]
     return max(known, key=lambda model: (model.images, -model.error))
 
