@@ -227,7 +227,7 @@ def test_a_browser_draws_what_the_renderer_does(browser, scenes, tmp_path, space
         assert browser.said() == []
     moved = renderer.view(viewpoints.held_out.of_height(ROWS), 0, 1.0, behind).color
     assert psnr(moved, at_rest) < LEAST_PSNR - 3  # the times do not all look the same
-    # In haste: no picture is finished, and none may take time.
+    # Previews: no picture is finished, and none may take time.
     text = file.read_text("utf-8").replace("SETTLED = 120", "SETTLED = 1e9")
     file.write_text(text.replace("BUDGET = 70", "BUDGET = 0"), "utf-8")
     browser.open(file.as_uri() + link(camera, moment), camera.width, camera.height)

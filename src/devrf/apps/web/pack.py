@@ -4,7 +4,7 @@
 
 ==================== ==============================================================================
 ``density``          raw densities v at rest, half precision
-``rough``            colours in haste: RGB as the nearest camera sees it; bytes
+``rough``            preview colours: RGB as the nearest camera sees it; bytes
 ``features``         colour features f, a byte each: its share of its channel's range, which the
                      network's first layer knows; blocks of four channels, one behind another
 ``weights``          the colour network, single precision

@@ -1,7 +1,7 @@
 // What a pixel sees of the scene at one time. Names after "docs/method.md" are anchors there.
 //
 // Defined before: SPACE (0 the world, 1 NDC, 2 contracted); EXACT (1: all samples, their colours by
-// the network; 0, in haste: fewer, the same from all sides); FEATURES and WIDTH (vec4s of a sample's
+// the network; 0, preview: fewer, the same from all sides); FEATURES and WIDTH (vec4s of a sample's
 // features and of a hidden layer); FREQUENCIES (octaves of the direction); MOVES and SHADES
 // (whether there are displacements, and residual colours).
 
@@ -12,7 +12,7 @@ precision highp usampler3D;
 
 // Channels. A probe is how far a ray gets, a float's four bytes, for the page to read.
 const int COLOR = 0, DEPTH = 1, MOTION = 2, PROBE = 3;
-// A ray ends where its transmittance is less. In haste there are fewer samples.
+// A ray ends where its transmittance is less. A preview has fewer samples.
 const float STOP = EXACT == 1 ? 1e-4 : 1e-2;
 const float STRIDE = EXACT == 1 ? 1.0 : 2.0;
 // Points nearer to infinity are taken to be at this distance from it.
@@ -22,7 +22,7 @@ const float MOTION_STEP = 0.05, MOTION_FULL = 0.02;
 
 // Of all grids z is along the texture's width and x along its depth, as they lie in memory.
 uniform sampler3D density, features, weights;   // features: blocks of four channels
-uniform sampler3D rough;                        // colours in haste
+uniform sampler3D rough;                        // preview colours
 uniform sampler3D displacement0, displacement1, residual0, residual1; // before, after the time
 uniform usampler3D distances;
 uniform vec3 low, high, motionLow, motionHigh;  // the boxes of all fields, and of displacements

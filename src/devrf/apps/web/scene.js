@@ -76,7 +76,7 @@ class Graphics {
     gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.RENDERBUFFER, buffer);
   }
 
-  /** The program for the exact picture (1), or for one in haste (0). */
+  /** The program for the exact picture (1), or for the preview (0). */
   program(exact) {
     const { gl, scene } = this;
     if (this.programs[exact]) return this.programs[exact];
@@ -371,7 +371,7 @@ class Page {
     return count > 1 ? [{ ...now, warps: false, distances: REST }, now] : [now];
   }
 
-  /** The exact program if it is twice as fast as need be, or the one in haste; and its rows. */
+  /** The exact program if it is twice as fast as need be, or the preview; and its rows. */
   plan() {
     const { width, height } = this.graphics.canvas;
     const fast = this.graphics.program(0);
@@ -409,7 +409,7 @@ class Page {
     }
   }
 
-  /** Draws the next rows of the whole picture, from above: in haste, then at full quality. */
+  /** Draws the next rows of the whole picture, from above: a preview, then at full quality. */
   refine(parts) {
     const { width, height } = this.graphics.canvas;
     if (this.refined < 2 * height) {
