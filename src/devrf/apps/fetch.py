@@ -26,7 +26,7 @@ from typing_extensions import TypedDict
 
 from devrf.errors import DevrfError, did_you_mean
 from devrf.system.files import make_folder, read_record, refuse_links, write_json
-from devrf.system.plain_data import Line, built
+from devrf.system.plain_data import Line, validate
 
 log = logging.getLogger(__name__)
 
@@ -140,7 +140,7 @@ def catalogue(file: str | Path | None = None) -> list[PublishedScene]:
     try:
         if not path.is_file() or path.stat().st_size > LARGEST_CATALOGUE:
             raise ValueError("no file, or a larger one than a catalogue's")
-        listed = built(dict[str, list[Collection]], tomllib.loads(path.read_text()))
+        listed = validate(dict[str, list[Collection]], tomllib.loads(path.read_text()))
     except (OSError, ValueError, RecursionError) as error:
         why = " ".join(str(error).split())
         raise DevrfError(f"fetch.catalogue: {path} cannot be read ({why[:200]})") from None
@@ -184,7 +184,7 @@ def fetched(scene: PublishedScene, settings: FetchSettings, progress: bool) -> P
     there = os.path.lexists(path)
     if there:
         try:
-            record = built(Record, json.loads(read_record(path / RECORD)))
+            record = validate(Record, json.loads(read_record(path / RECORD)))
         except (OSError, ValueError, RecursionError):
             raise DevrfError(
                 f"{path}: there is something else, without {RECORD}; remove it, or give "

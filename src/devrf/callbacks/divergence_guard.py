@@ -15,7 +15,7 @@ from torch import Tensor
 from devrf.engine.schedule import Phase
 from devrf.engine.stage import Stage
 from devrf.errors import DevrfError
-from devrf.system.plain_data import built
+from devrf.system.plain_data import validate
 
 log = logging.getLogger(__name__)
 
@@ -110,7 +110,7 @@ class DivergenceGuard(Callback):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Compare with what :meth:`state_dict` gave."""
         self._kind = state_dict["kind"]
-        self._range = [*built(tuple[float, float], state_dict["range"])]
+        self._range = [*validate(tuple[float, float], state_dict["range"])]
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Count from here."""

@@ -10,7 +10,7 @@ from lightning import Callback, LightningModule, Trainer
 
 from devrf.engine.stage import Stage
 from devrf.system.device import wait
-from devrf.system.plain_data import built
+from devrf.system.plain_data import validate
 
 
 class TrainingRecord(Callback):
@@ -57,7 +57,7 @@ class TrainingRecord(Callback):
         """Count on from what :meth:`state_dict` gave."""
         peaks = state_dict["peaks"]
         self._seconds_before = float(state_dict["seconds"])
-        self._peaks_before = None if peaks is None else built(tuple[float, float], peaks)
+        self._peaks_before = None if peaks is None else validate(tuple[float, float], peaks)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Fill the record: wall-clock seconds without validation, memory in GiB (None on a CPU).

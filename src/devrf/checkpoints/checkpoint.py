@@ -28,7 +28,7 @@ from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Background, Scene
 from devrf.scenes.validation import check_poses
 from devrf.system.memory import OutOfMemoryError, is_oom
-from devrf.system.plain_data import Line, built
+from devrf.system.plain_data import Line, validate
 from devrf.system.printed import shown
 from devrf.system.stored_class import StoredClass, stored_class
 
@@ -146,11 +146,11 @@ class Viewpoints:
             for sides in map(sorted, sizes):
                 if not 0 < sides[0] <= sides[1] <= min(SIDE, ASPECT * sides[0]):
                     raise ValueError("an image of a size that cannot be")
-        followed = built(tuple[float, ...], entry.get("followed", ()))
+        followed = validate(tuple[float, ...], entry.get("followed", ()))
         if len(followed) not in (0, len(cameras["dynamic"])):
             raise ValueError("times of other cameras")
-        clock = built(FrameClock, entry["clock"])
-        offset = built(tuple[float, float, float], entry.get("offset", NO_OFFSET))
+        clock = validate(FrameClock, entry["clock"])
+        offset = validate(tuple[float, float, float], entry.get("offset", NO_OFFSET))
         if not all(map(math.isfinite, offset)):
             raise ValueError("an offset without end")
         return cls(**{**entry, **cameras, "clock": clock, "followed": followed, "offset": offset})
@@ -223,7 +223,7 @@ def load_checkpoint(
     try:
         _check_numbers((metadata.model, data["state_dict"], data.get("viewpoints")))
         state = {k.removeprefix(MODEL): v for k, v in data["state_dict"].items() if MODEL in k}
-        model = _outlined(model_class, metadata.model, state).to(device)
+        model = _build_checked(model_class, metadata.model, state).to(device)
         model.load_stored_state(state)
         viewpoints = Viewpoints.stored(data.get("viewpoints", {}))
         if viewpoints is not None:
@@ -251,7 +251,9 @@ def unfit(path: Path, error: Exception) -> DevrfError:
     )
 
 
-def _outlined(model_class: Any, description: Mapping[str, Any], state: Mapping[str, Any]) -> Any:
+def _build_checked(
+    model_class: Any, description: Mapping[str, Any], state: Mapping[str, Any]
+) -> Any:
     """The model that a checkpoint describes, before it takes its state.
 
     Raises:
@@ -333,9 +335,9 @@ def metadata_in(path: Path, data: dict[str, Any]) -> CheckpointMetadata:
     if not isinstance(data, dict) or not isinstance(data.get("devrf"), dict):
         raise DevrfError(f"{path}: not a devrf checkpoint; set ckpt to one that devrf wrote")
     try:
-        metadata = built(CheckpointMetadata, data["devrf"])
+        metadata = validate(CheckpointMetadata, data["devrf"])
         if data.get("progress") is not None:
-            built(Progress, data["progress"])
+            validate(Progress, data["progress"])
     except UNFIT as error:
         raise unfit(path, error) from error
     return metadata

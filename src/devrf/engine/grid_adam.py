@@ -11,7 +11,7 @@ from torch.optim.adam import adam
 
 from devrf.kernels.adam import adam_step, add_total_variation_gradient
 from devrf.ops.adam import AdamRule
-from devrf.system.plain_data import Count, built
+from devrf.system.plain_data import Count, validate
 
 # Devices on which torch's fused Adam is used.
 FUSED = ("cpu", "cuda")
@@ -185,7 +185,7 @@ class GridAdam(torch.optim.Optimizer):
             group |= own
             for state, parameter in ((self.state.get(p), p) for p in group["params"]):
                 if state:
-                    state["steps"] = built(Count, state["steps"])
+                    state["steps"] = validate(Count, state["steps"])
                     if not parameter.shape == state["mean"].shape == state["square"].shape:
                         raise ValueError("moments of another shape than what is learned")
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from lightning import Trainer
 
-from devrf.system.plain_data import Count, built
+from devrf.system.plain_data import Count, validate
 
 
 def resumed_fit_loop(stored: Any, trainer: Trainer) -> Any:
@@ -26,4 +26,4 @@ def _counts(stored: Any, like: Any) -> Any:
     """The stored counts at those keys at which ``like`` has some."""
     if isinstance(like, dict):
         return {key: _counts(stored[key], value) for key, value in like.items()}
-    return built(Count if type(like) is int else type(like), stored)
+    return validate(Count if type(like) is int else type(like), stored)

@@ -13,7 +13,7 @@ from devrf.geometry.box import Box
 from devrf.geometry.contraction import ContractedSpace
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.rays import Rays
-from devrf.system.plain_data import built
+from devrf.system.plain_data import validate
 
 
 class Space(Protocol):
@@ -116,5 +116,5 @@ def space_from(config: Mapping[str, Any]) -> Space:
     if not config:
         return WORLD
     values = dict(config)
-    space: Space = built(KINDS[values.pop("kind")], values)
+    space: Space = validate(KINDS[values.pop("kind")], values)
     return space

@@ -10,7 +10,7 @@ from torch.nn.functional import pad
 
 from devrf.geometry.box import Box
 from devrf.ops.march import OccupancyDistances
-from devrf.system.plain_data import built
+from devrf.system.plain_data import validate
 
 
 class Occupancy(nn.Module):
@@ -115,7 +115,7 @@ class Occupancy(nn.Module):
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore the state of :meth:`get_extra_state`."""
-        self.box = built(Box, state)
+        self.box = validate(Box, state)
 
 
 def dilate(mask: Tensor, radius: int) -> Tensor:

@@ -18,7 +18,7 @@ Factor = Annotated[float, Gt(0), Le(1e6)]
 Line = Annotated[str, Predicate(is_shown)]
 
 
-def built(kind: type[Kind], data: Any) -> Kind:
+def validate(kind: type[Kind], data: Any) -> Kind:
     """A ``kind`` (a dataclass, a TypedDict, a number) of ``data``.
 
     Raises:

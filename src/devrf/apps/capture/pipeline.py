@@ -39,7 +39,7 @@ from devrf.scenes.sparse_model import (
 )
 from devrf.scenes.splits import every_nth
 from devrf.system.files import make_folder, read_record, refuse_links, write_json, write_text
-from devrf.system.plain_data import Kind, built
+from devrf.system.plain_data import Kind, validate
 from devrf.system.progress import followed
 
 log = logging.getLogger(__name__)
@@ -140,14 +140,14 @@ def kept(file: Path, source: Any, kind: type[Kind], make: Callable[[], dict[str,
             stored = json.loads(read_record(file))
             same, result = stored["key"] == key, stored["result"]
             if same:
-                found = built(kind, result)
+                found = validate(kind, result)
                 log.info("%s: found before", file.stem)
                 return found
         except (ValueError, LookupError, TypeError, RecursionError, OverflowError):
             raise DevrfError(f"{file}: damaged; remove it, and it is made again") from None
     result = make()
     write_text(file, json.dumps({"key": key, "result": result}))
-    return built(kind, result)
+    return validate(kind, result)
 
 
 def _digest(source: Any) -> str:

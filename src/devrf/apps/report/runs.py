@@ -18,7 +18,7 @@ from annotated_types import Len
 from devrf.apps.settings import REHEARSAL
 from devrf.errors import DevrfError
 from devrf.system.files import read_record, utf8_path
-from devrf.system.plain_data import built
+from devrf.system.plain_data import validate
 from devrf.system.printed import shown
 
 log = logging.getLogger(__name__)
@@ -169,7 +169,7 @@ def _flat(record: dict[str, Any], above: str = "") -> dict[str, Any]:
         if isinstance(value, dict):
             values |= _flat(value, f"{name}.")
         else:
-            value = built(KINDS.get(name, _Plain), value)
+            value = validate(KINDS.get(name, _Plain), value)
             values[name] = shown(value) if isinstance(value, str) else value
         if len(name) > LONGEST_NAME or len(values) > MOST:
             raise ValueError(name)

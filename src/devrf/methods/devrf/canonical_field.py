@@ -15,7 +15,7 @@ from devrf.geometry.box import Box
 from devrf.kernels.trilinear import interpolate
 from devrf.ops.color_network import ColorNetwork, decode
 from devrf.ops.trilinear import resample, shape_of
-from devrf.system.plain_data import built
+from devrf.system.plain_data import validate
 
 
 class Sizes(TypedDict):
@@ -265,6 +265,6 @@ class CanonicalField(nn.Module):
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_extra_state` gave."""
-        self.box = built(Box, state)
-        for name, size in built(Sizes, state).items():
+        self.box = validate(Box, state)
+        for name, size in validate(Sizes, state).items():
             setattr(self, name, size)

@@ -19,7 +19,7 @@ from devrf.engine.ddp import world_size
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.ops.trilinear import resample, shape_of
-from devrf.system.plain_data import built
+from devrf.system.plain_data import validate
 
 log = logging.getLogger(__name__)
 
@@ -63,8 +63,8 @@ class FrameField(nn.Module):
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_extra_state` gave."""
-        self.box = built(Box, state)
-        self.clock = built(FrameClock, state)
+        self.box = validate(Box, state)
+        self.clock = validate(FrameClock, state)
 
 
 class FrameStore(StoredShape):

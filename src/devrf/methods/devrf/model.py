@@ -26,7 +26,7 @@ from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import ColorChange
 from devrf.rendering.renderable import Renderable
 from devrf.rendering.sampling import RenderSettings
-from devrf.system.plain_data import built
+from devrf.system.plain_data import validate
 from devrf.system.stored_class import StoredClass, class_path, stored_class
 
 # Samples of a ray, at most, before empty space is skipped.
@@ -101,7 +101,7 @@ class DeVRFModel(Renderable):
     def from_config(cls, config: Mapping[str, Any]) -> DeVRFModel:
         """Fields of a few voxels; the stored state gives them their shapes."""
         box = Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
-        build = built(Architecture, config["architecture"])
+        build = validate(Architecture, config["architecture"])
         # A stage that was stopped in its search has no colour network yet.
         radiance = config["radiance"]
         clock = FrameClock((0.0, 1.0))
@@ -113,7 +113,7 @@ class DeVRFModel(Renderable):
             build,
             build.radiance_field(box, 8, 8) if radiance else build.search_field(box, 8),
             Occupancy.full((2, 2, 2), box),
-            built(RenderSettings, config["settings"]),
+            validate(RenderSettings, config["settings"]),
             DeformationField(box, clock, voxels=8) if config["deforms"] else None,
             space_from(config["space"]),
             residual and residual(box, clock, voxels=8),
