@@ -40,7 +40,7 @@ GIVEN_REST = "ckpt"
 LARGEST = 2**14
 # Numbers of a file are at most this: their squares, too, are float32.
 FARTHEST = 1e12
-# What is raised where parts of a file contradict each other.
+# Errors that parts of a file raise which contradict each other.
 UNFIT: tuple[type[Exception], ...] = (
     DevrfError,
     RuntimeError,
@@ -57,26 +57,26 @@ UNSTORED = 2**16
 SIDE = 2**14
 # The most that one side of an image is longer than the other.
 ASPECT = 16
-# What training took: by name, numbers, and words that say how it ran.
+# Figures of a training, by name: numbers, and words that say how it ran.
 TrainingFigures = dict[str, int | float | str | list[float] | None]
 
 
 @dataclass(frozen=True)
 class CheckpointMetadata:
-    """What a checkpoint holds, in plain data.
+    """Metadata of a checkpoint, in plain data.
 
     Attributes:
         scene: the scene's name.
         fingerprint: the scene's cameras, times and image sizes, hashed.
         stage: the stage that wrote it.
         model: the path of the model's class (``class``) and its config.
-        protocol: which data trained which part; None outside a composed run.
-        records: what training took, by stage.
+        protocol: the stages, their data and parts; None outside a composed run.
+        records: figures of the training, by stage.
         training_config: the settings that decided what was learned, by config key; empty for a
             stage that was not trained from a config.
         earlier_configs: the same of the stages that this one builds on, by name.
-        command: what the command that learned it chose and set, except for what only says what to
-            do: the options of config groups by ``/group``, plain values by config key.
+        command: options of config groups, by ``/group``, and plain values, by config key, of the
+            command that learned it, but for those that only say what to do.
         complete: whether the stage has gone through its whole schedule.
         moves: whether the scene was seen at more than one time; None in a file of an earlier
             version.
@@ -97,17 +97,17 @@ class CheckpointMetadata:
 
 @dataclass(frozen=True)
 class Viewpoints:
-    """What is known about a scene without its images: the cameras that saw it, and when.
+    """The cameras that saw a scene, and their times: all that is known without its images.
 
     Attributes:
-        background: what is behind the alpha mask.
+        background: behind the alpha mask.
         clock: the times of the training images.
         static: cameras of the static training images.
         dynamic: cameras of the training images in motion, a fixed one once.
         held_out: the camera of the first held-out image of the moving scene: one camera.
-        followed: when each of the ``dynamic`` cameras was there, if they are those of one moving
-            camera; else empty.
-        offset: what was subtracted from the positions (:mod:`devrf.geometry.offset`).
+        followed: the times of the ``dynamic`` cameras, if they are those of one moving camera; else
+            empty.
+        offset: subtracted from the positions (:mod:`devrf.geometry.offset`).
     """
 
     background: Background
@@ -161,9 +161,9 @@ class LoadedCheckpoint:
     """A learned scene and where it came from.
 
     Attributes:
-        metadata: which scene, and how it was learned.
+        metadata: the scene, and the settings that it was learned with.
         model: a :class:`~devrf.rendering.renderable.Renderable`.
-        viewpoints: where the scene was seen from; None where the file does not say.
+        viewpoints: the cameras that saw the scene; None if the file does not say.
     """
 
     metadata: CheckpointMetadata
@@ -288,7 +288,7 @@ def _check_numbers(parts: Any) -> None:
 
 
 def _leaves(value: Any) -> Iterator[Any]:
-    """What nested data holds that is no mapping, list or tuple."""
+    """The leaves of nested mappings, lists and tuples."""
     if isinstance(value, Mapping):
         value = list(value.values())
     if not isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""What a checkpoint file says of itself, read from its header, without torch."""
+"""Metadata of a checkpoint file, read from its header without torch."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from devrf.errors import DevrfError
 FORMAT = "5"
 # Key of a training config for the digest of the run's canonical checkpoint that is built on.
 OWN_REST = "checkpoints/canonical.ckpt"
-# What nested data raise that are not as devrf writes them.
+# Errors of nested data that are not as devrf writes them.
 UNREADABLE = (LookupError, TypeError, ValueError, ArithmeticError, RecursionError)
 # Bytes of a header at most: usual are 20,000. In memory each may become 50.
 HEADER = 2**23

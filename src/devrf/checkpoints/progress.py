@@ -19,10 +19,10 @@ from devrf.system.plain_data import Count, Factor, Line, Share
 
 
 class Progress(TypedDict):
-    """Where a stage was left: name, length of its schedule, position and size of batches.
+    """Progress of a stage: name, length of its schedule, position and size of batches.
 
-    ``phase`` is the first iteration of the present phase; ``phase_state`` is what of it does not
-    follow from schedule and model, and ``random`` is what :func:`rng_state` gives.
+    ``phase`` is the first iteration of the present phase; ``phase_state`` is the part of its state
+    that does not follow from schedule and model; ``random`` is the result of :func:`rng_state`.
     """
 
     stage: Line
@@ -42,7 +42,7 @@ class Progress(TypedDict):
 
 
 def progress_file(folder: Path, stage: str, iteration: int) -> Path:
-    """Where the progress of a stage at an iteration is kept."""
+    """The file of a stage's progress at an iteration."""
     return folder / f"{stage}-progress-{iteration}.ckpt"
 
 

@@ -30,7 +30,7 @@ def pack(grids: Tensor, keep: Tensor, *, smooth: bool) -> Packed | Tensor:
     Args:
         grids: one grid (X, Y, Z, C), or N of them (N, X, Y, Z, C).
         keep: (N, X, Y, Z) bool, where detail is kept; (1, X, Y, Z) serves all N.
-        smooth: what values elsewhere are replaced by: True, the trilinear interpolation of every
+        smooth: the replacement of values elsewhere: True, the trilinear interpolation of every
             fourth grid point; False, each channel's mean over the voxels that are left out.
 
     Returns:

@@ -23,12 +23,12 @@ from devrf.scenes.scene import Scene, Views
 
 
 class RayTrainable(Renderable):
-    """A method that renders a batch of rays and says its losses.
+    """A method that renders a batch of rays and computes its losses.
 
     Attributes:
         losses: the names of its loss terms.
         protocols: the names of the protocols that it learns by; None: every one.
-        priors: what it wants of a scene beside images and backward flow, where it can be had:
+        priors: data that it uses beside images and backward flow, if a scene has it:
             ``forward_flow``.
         keeps_batches: whether whole batches learn more in a time than more, smaller ones: a time
             budget then cuts them only where not even a hundred iterations would fit, nor a quarter.
@@ -48,9 +48,9 @@ class RayTrainable(Renderable):
             DevrfError: :attr:`protocols` does not name it.
         """
         if self.protocols is not None and protocol not in self.protocols:
-            known = " or ".join(f"protocol={name}" for name in self.protocols)
+            names = " or ".join(f"protocol={name}" for name in self.protocols)
             raise DevrfError(
-                f"protocol: method={self.name} does not learn by protocol={protocol}; give {known}"
+                f"protocol: method={self.name} does not learn by protocol={protocol}; give {names}"
             )
 
     def setup(self, scene: Scene) -> None:
@@ -96,7 +96,7 @@ class RayTrainable(Renderable):
         ``render`` is the mean squared colour error over rays and channels.
 
         Args:
-            output: what :meth:`forward` gave.
+            output: the result of :meth:`forward`.
             batch: the rays and the truth at their pixels.
             names: of the terms that count: the others need not be computed.
         """
@@ -127,8 +127,8 @@ class RayTrainable(Renderable):
         for name in parts:
             matching = fnmatch.filter(parts_by_name, name)
             if not matching:
-                known = ", ".join(parts_by_name)
-                raise DevrfError(f"protocol: {self.name} has no part {name!r}; it has {known}")
+                names = ", ".join(parts_by_name)
+                raise DevrfError(f"protocol: {self.name} has no part {name!r}; it has {names}")
             frozen.update(matching)
         for name, parameters in parts_by_name.items():
             for parameter in parameters:
@@ -141,12 +141,12 @@ class RayTrainable(Renderable):
     def rehearsed(self, factor: float) -> RayTrainable:
         """The method, not set up yet, at a size for seconds on a CPU and ``factor`` times as long.
 
-        Nothing is left out: what it samples by, and what it says of its losses, is as it was.
+        Nothing is left out: its way of sampling and its losses are the same.
         """
         return self
 
     def milestones(self, total: int) -> Mapping[str, int]:
-        """What :meth:`on_iteration` brings about in a stage of ``total`` iterations: when each."""
+        """Iteration of each change by :meth:`on_iteration` in a stage of ``total``, by name."""
         return {}
 
     def on_iteration(self, step: int, total: int) -> None:
@@ -174,7 +174,7 @@ class RayTrainable(Renderable):
 
     @property
     def sample_outputs(self) -> int:
-        """How many numbers all layers give for one sample of a ray, to estimate memory by."""
+        """Numbers that all layers give for one sample of a ray, to estimate memory by."""
         return sum(layer.out_features for layer in self.modules() if isinstance(layer, nn.Linear))
 
     @property

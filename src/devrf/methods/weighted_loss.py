@@ -1,4 +1,4 @@
-"""Weighing the terms of a loss, whatever the method."""
+"""Weighted sums of loss terms, for all methods."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from devrf.errors import DevrfError, expect
 
 
 def counted_weights(
-    weights: Mapping[str, float], known: Collection[str], key: str
+    weights: Mapping[str, float], terms: Collection[str], key: str
 ) -> dict[str, float]:
     """The weights that are not zero.
 
     Args:
         weights: by the term's name.
-        known: the names of all terms.
+        terms: the names of all terms.
         key: the config key of the weights, for messages.
 
     Raises:
@@ -25,9 +25,9 @@ def counted_weights(
     """
     counted = {name: weight for name, weight in weights.items() if weight}
     for name in sorted(map(str, counted)):
-        if name not in known:
+        if name not in terms:
             raise DevrfError(
-                f"{key}: unknown term {name!r}; the terms are {', '.join(sorted(known))}"
+                f"{key}: unknown term {name!r}; the terms are {', '.join(sorted(terms))}"
             )
         expect(counted[name] > 0, f"{key}.{name}", "at least 0", counted[name])
     if not counted:
@@ -47,7 +47,7 @@ def weighted_sum(
 
 @torch.no_grad()
 def visibility(transmittance: Tensor, alpha: Tensor | None) -> dict[str, Tensor]:
-    """How much rays hit, and how much they should: means () over rays in [0, 1].
+    """The mean opacity () of rays in [0, 1], and that of their alpha masks.
 
     Args:
         transmittance: (R,) T_end.

@@ -28,7 +28,7 @@ class ActiveFrame:
         backward: (X, Y, Z, 3) Δ_b of the frame, a leaf.
         forward: (X, Y, Z, 3) Δ_f of the frame, a leaf.
         before: (X, Y, Z, 3) Δ_f of the frame before, frozen.
-        occupancy: where something is at the frame's time.
+        occupancy: at the frame's time.
         fields: further fields (T, …) whose frames are learned, by name.
         further: the frame's slice of each, a leaf.
         number: the frame; 0 before the first.
@@ -96,7 +96,7 @@ class ActiveFrame:
         """Occupancy and pixels as plain data, for a progress file.
 
         Args:
-            views: what is learned from.
+            views: the training views.
             exact: add the displacements, which the field would round.
         """
         images = images_of(views, self.number)

@@ -19,7 +19,7 @@ from devrf.system.plain_data import validate
 
 
 class Sizes(TypedDict):
-    """What a checkpoint holds of a field beside the tensors and the box: attributes by name."""
+    """A field's attributes in a checkpoint, beside the tensors and the box."""
 
     voxels: Annotated[int, Ge(1)]
     base_voxels: Annotated[int, Ge(1)]
@@ -126,9 +126,9 @@ class CanonicalField(nn.Module):
         density: raw densities v (X, Y, Z, 1), before the softplus.
         color: features f (X, Y, Z, C) for the decoder.
         decoder: features and directions → RGB.
-        box: B, where the field lives, in world units or NDC.
+        box: B, the field's box, in world units or NDC.
         voxels: N, about how many voxels the grids have.
-        base_voxels: how many they have at full resolution.
+        base_voxels: about how many voxels they have at full resolution.
         alpha_init: opacity of one base voxel before anything is learned.
         planes: P, in NDC the number of planes along the rays at every resolution, from the box's
             front to its back; None for cubic voxels.
@@ -237,7 +237,7 @@ class CanonicalField(nn.Module):
         nn.init.zeros_(self.decoder.from_direction.weight)
 
     def learn_directions(self, whether: bool) -> bool:
-        """Let the network learn from viewing directions, or not; whether it did not before."""
+        """Let the network learn from viewing directions, or not; return whether it begins to."""
         if not isinstance(self.decoder, ColorDecoder):
             return False
         begins = whether and not self.decoder.learns_directions
@@ -253,7 +253,7 @@ class CanonicalField(nn.Module):
 
     @torch.no_grad()
     def clear(self, where: Tensor, alpha: float) -> None:
-        """Lower the density to at most opacity ``alpha`` a base voxel ``where`` (X, Y, Z) bool."""
+        """Lower the opacity of a base voxel to at most ``alpha`` at points ``where`` (X, Y, Z)."""
         empty = math.log(math.expm1(-math.log1p(-alpha))) - self.shift
         raw = self.density.values[..., 0]
         raw[where] = raw[where].clamp(max=empty)
@@ -264,7 +264,7 @@ class CanonicalField(nn.Module):
         return {"low": list(self.box.low), "high": list(self.box.high), **sizes}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`get_extra_state` gave."""
+        """Restore the result of :meth:`get_extra_state`."""
         self.box = validate(Box, state)
         for name, size in validate(Sizes, state).items():
             setattr(self, name, size)

@@ -18,7 +18,7 @@ from devrf.system.options import Count, NotNegative, Options, Several, Whole
 
 Side = Annotated[float, Ge(2)]
 
-# What happens in the course of the stage.
+# Events of the stage.
 SEARCHED = "geometry searched"
 GROWN = "grids grown"
 RENEWED = "occupancy renewed"
@@ -56,7 +56,7 @@ class CanonicalSchedule(Options):
         upsample_at: iterations, from the search's end, at which the number of voxels doubles.
         decay_iterations: after as many iterations the learning rates have fallen to a tenth.
         restart_at_growth: whether decay and optimiser begin anew when the grid has grown.
-        density_drop: what raw densities are lowered by when the grid has grown.
+        density_drop: subtracted from raw densities when the grid has grown.
         occupancy_every: iterations between renewals of the occupancy; None: only at growth.
         rays: of a batch.
         min_views: cells that fewer training views have in the picture are empty from the start.
@@ -153,7 +153,7 @@ class CanonicalSchedule(Options):
 
     @property
     def planned_events(self) -> dict[str, int]:
-        """What the schedule brings about, and how often, as :attr:`Stage.events` counts it."""
+        """Counts of the schedule's events, by name, as in :attr:`Stage.events`."""
         lengths = (self.search_iterations, self.iterations)
         every = self.occupancy_every
         renewals = 0 if every is None else sum((n - 1 + every // 2) // every for n in lengths if n)
@@ -177,11 +177,11 @@ class CanonicalSchedule(Options):
         return 0 <= iteration - self.search_iterations < self.dense_tv_iterations
 
     def learns_directions(self, iteration: int) -> bool:
-        """Whether ``iteration`` teaches the network what viewing directions change."""
+        """Whether the network learns from viewing directions at ``iteration``."""
         return iteration - self.search_iterations >= (self.view_dependence_start or 0)
 
     def in_space(self, space: Space) -> CanonicalSchedule:
-        """The schedule with what contracted space changes (docs/method.md#scene-contraction)."""
+        """The schedule, changed for contracted space (docs/method.md#scene-contraction)."""
         if space.is_linear:
             return self
         side = self.side * space.side_factor

@@ -28,7 +28,7 @@ class GridWarp:
     Attributes:
         slices: Δ_k (X, Y, Z, 3) in the box's units: one frame's, or those of the two frames
             between which t lies; none is the identity.
-        box: where the grids live.
+        box: of the grids.
         weight: λ in [0, 1].
         zero_outside_box: whether Δ is 0 outside the box; else it is as on the border.
     """
@@ -77,11 +77,11 @@ class GridWarp:
         return points.view(3, -1).t()
 
     def _weights(self, axis: int, line: Tensor, points: int) -> Tensor:
-        """What values at ``points`` along an axis of the box weigh (N, points) at places (N,)."""
+        """Weights (N, points) of values at ``points`` along a box's axis, at coordinates (N,)."""
         low = self.box.low[axis]
         high = self.box.high[axis]
-        place = (line.clamp(low, high) - low) * ((points - 1) / (high - low))
-        away = (place[:, None] - torch.arange(points, device=line.device)).abs()
+        coordinate = (line.clamp(low, high) - low) * ((points - 1) / (high - low))
+        away = (coordinate[:, None] - torch.arange(points, device=line.device)).abs()
         weights = (1 - away).clamp(min=0)
         if self.zero_outside_box:
             weights *= ((line >= low) & (line <= high))[:, None]
@@ -144,8 +144,8 @@ class DeformationField(FrameField):
 
     def _at(self, frames: Tensor, time: float) -> GridWarp:
         moment, here = self.clock.at(time), self.frames.here
-        chosen = [moment.before, moment.after] if moment.weight else [moment.before]
-        slices = () if chosen == [0] else tuple(frames[k].to(here) for k in chosen)
+        numbers = [moment.before, moment.after] if moment.weight else [moment.before]
+        slices = () if numbers == [0] else tuple(frames[k].to(here) for k in numbers)
         return GridWarp(slices, self.box, moment.weight, self.zero_outside_box)
 
     @torch.no_grad()

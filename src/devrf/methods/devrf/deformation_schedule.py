@@ -19,7 +19,7 @@ from devrf.system.options import Count, NotNegative, Options, Positive, Several
 # Motion grids of this side take Adam about as long as a batch of rays takes; estimated.
 FINE_SIDE = 160
 
-# What happens in the course of the stage.
+# Events of the stage.
 LEVELS = "levels begun"
 GROWN = "grids grown"
 VISITS = "visits of frames"
@@ -34,7 +34,7 @@ class Level(Options):
         iterations: share of each frame.
         lr_factor: of the learning rate; None: the schedule's ``decay`` to the power of how often
             the side has changed.
-        lr_final_factor: what the learning rate falls to in a visit, exponentially.
+        lr_final_factor: of the learning rate at a visit's end; it falls exponentially.
         other_terms: factor of the weights of all terms of ``loss.deformation`` but ``render``.
         backwards: whether frames are gone through from the last to the first; not at the coarsest
             level, which begins at rest.
@@ -61,8 +61,8 @@ class DeformationPhase(Phase):
         frame: the frame, from 1 on.
         level: 0 is the coarsest resolution.
         side: the motion grid has about side³ voxels.
-        learning_rate_factor: what the learning rate is multiplied by at the visit's start.
-        lr_final_factor: what it has been multiplied by further at the visit's end.
+        learning_rate_factor: of the learning rate at the visit's start.
+        lr_final_factor: a further factor of it at the visit's end.
         init_from_previous: whether the frame starts from the result of the frame before it.
         step: 1, or −1 where frames are gone through from the last to the first.
     """
@@ -85,7 +85,7 @@ class DeformationPhase(Phase):
         return self.learning_rate_factor * math.pow(self.lr_final_factor, self.share(iteration))
 
     def share(self, iteration: int) -> float:
-        """What share of the visit is over, from 0 to below 1."""
+        """The share of the visit that is over, from 0 to below 1."""
         return (iteration - self.start) / (self.stop - self.start)
 
 
@@ -173,7 +173,7 @@ class DeformationSchedule(Options):
         return replace(self, levels=rows, planes=planes)
 
     def events(self, frames: int) -> dict[str, int]:
-        """What the schedule brings about, and how often, as :attr:`Stage.events` counts it."""
+        """Counts of the schedule's events, by name, as in :attr:`Stage.events`."""
         levels = len(self.levels)
         grown = sum(a.side != b.side for a, b in pairwise(self.levels))
         counts = {LEVELS: levels, GROWN: grown, VISITS: levels * (frames - 1)}
@@ -212,17 +212,17 @@ class DeformationSchedule(Options):
         row = self.levels[level]
         # The frame that is visited first takes the share of frame 0, too.
         share = (iteration - begins[level]) // row.iterations
-        place = min(max(share, 1), frames - 1)
+        number = min(max(share, 1), frames - 1)
         return DeformationPhase(
             kind=f"level {level + 1}",
-            start=begins[level] + (place if place > 1 else 0) * row.iterations,
-            stop=begins[level] + (place + 1) * row.iterations,
-            frame=frames - place if row.backwards else place,
+            start=begins[level] + (number if number > 1 else 0) * row.iterations,
+            stop=begins[level] + (number + 1) * row.iterations,
+            frame=frames - number if row.backwards else number,
             level=level,
             side=row.side,
             learning_rate_factor=self.learning_rate_factor(level),
             lr_final_factor=row.lr_final_factor,
-            init_from_previous=level == 0 and place > 1,
+            init_from_previous=level == 0 and number > 1,
             step=-1 if row.backwards else 1,
         )
 

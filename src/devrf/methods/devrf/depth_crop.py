@@ -38,7 +38,7 @@ def crop_to_visible(model: DeVRFModel, scene: Scene, views: Views, pool: PixelPo
     Args:
         model: the scene at rest as learned so far; its field is changed.
         scene: gives space and cameras.
-        views: what the field is learned from, on the model's device.
+        views: the training views, on the model's device.
         pool: the pixels of ``views`` that are drawn from.
     """
     space = scene.space
@@ -83,11 +83,11 @@ def seen_along_rays(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Samples on rays through pixels of ``pool``: depths z', weights, and rays, each (S,)."""
     # Evenly spread, not random: several processes have to find the same depths.
-    chosen = torch.linspace(0, len(pool) - 1, min(RAYS, len(pool)), dtype=torch.float64)
+    subset = torch.linspace(0, len(pool) - 1, min(RAYS, len(pool)), dtype=torch.float64)
     depths: list[Tensor] = []
     weights: list[Tensor] = []
     rays_of_samples: list[Tensor] = []
-    for k, part in enumerate(torch.split(chosen.long().to(pool.image.device), CHUNK)):
+    for k, part in enumerate(torch.split(subset.long().to(pool.image.device), CHUNK)):
         image = pool.image[part].long()
         flat = pool.flat[part].long()
         black = torch.zeros(3, device=model.device)
@@ -127,8 +127,8 @@ def _ends(ascending: Tensor, weights: Tensor, outside: float) -> tuple[float, fl
     """Depths before and behind which a share ``outside`` of the weights (S,) is."""
     total = weights.cumsum(0)
     ends = total.new_tensor([outside, 1 - outside]) * total[-1]
-    place = torch.searchsorted(total, ends).clamp(max=len(ascending) - 1)
-    first, last = ascending[place].tolist()
+    index = torch.searchsorted(total, ends).clamp(max=len(ascending) - 1)
+    first, last = ascending[index].tolist()
     return first, last
 
 

@@ -62,7 +62,7 @@ class MotionContext:
 
 
 class Extension:
-    """Adds to the deformation stage; what is not overridden adds nothing.
+    """Adds to the deformation stage; a hook that is not overridden adds nothing.
 
     An extension is one file of ``extensions/`` and one block of ``schedule.extensions``; without
     both, all else runs as before. Hooks are called in the order in which they stand here.
@@ -75,7 +75,7 @@ class Extension:
 
     @property
     def weights(self) -> Mapping[str, float]:
-        """How much they count, where ``loss.deformation`` does not say."""
+        """Their weights, unless ``loss.deformation`` gives them."""
         return {}
 
     @property
@@ -101,5 +101,5 @@ class Extension:
         """Give the phase's frame its first values, in the fields, before a visit."""
 
     def color_change(self, frame: ActiveFrame) -> ColorChange | None:
-        """What is added to the colours' logits of an active frame; None: nothing."""
+        """The residual that is added to the colours' logits of an active frame; None: none."""
         return None

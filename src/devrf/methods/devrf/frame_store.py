@@ -38,10 +38,10 @@ FRAMES_SHARE = 0.75
 
 
 class FrameField(nn.Module):
-    """Where the grids of T frames are, in space and in time; kept in checkpoints.
+    """A field of T grids, one for each frame, with its box and times; kept in checkpoints.
 
     Attributes:
-        box: where the field lives.
+        box: of the field.
         clock: the times of the T frames.
         values: (T, X, Y, Z, C) of a field that keeps all its frames in one tensor.
     """
@@ -163,7 +163,7 @@ class FrameStore(StoredShape):
         Args:
             store: on the device, on the host, or on the device if they fit there; several
                 processes keep them on their devices.
-            device: where they are learned.
+            device: the device that they are learned on.
             shape: of their grids in the end.
             half: whether in half precision.
         """

@@ -1,4 +1,4 @@
-"""What the static cameras tell before anything is learned (docs/method.md#geometry-search)."""
+"""Free space, by the static cameras alone (docs/method.md#geometry-search)."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from devrf.scenes.silhouettes import visual_hull
 
 
 def searched_box(scene: Scene, *, carve: bool) -> Box:
-    """Where the geometry search looks: all that the static cameras see between near and far.
+    """The box of the geometry search: all that the static cameras see between near and far.
 
-    That is the authors' box, a good deal larger than what all cameras see, and so has voxels that
-    more rays meet. It is the scene's own box where that was given, is not in world space, or is
+    It is the authors' box, a good deal larger than the cameras' common view; so more rays meet each
+    of its voxels. It is the scene's own box if that was given, is not in world space, or is
     carved (``carve``) by a visual hull.
     """
     bounds = scene.bounds
@@ -36,12 +36,12 @@ def possibly_occupied(
     min_views: int = 1,
     device: torch.device | None = None,
 ) -> Tensor:
-    """Where something can be at rest: (X, Y, Z) bool on the host, on a grid over ``box``.
+    """The mask (X, Y, Z) on the host of points over ``box`` that may be occupied at rest.
 
-    Not nearer to a camera of ``views`` than its near plane, and not where fewer than ``min_views``
-    of them look, if there are so many: fog would explain their images. ``carve`` leaves nothing
-    outside the visual hull, if the images have alpha masks and all show the rest state, and the box
-    is not unbounded. It is found on ``device``; None: on the host.
+    Points nearer to a camera of ``views`` than its near plane are free, and points that fewer than
+    ``min_views`` of them see, if there are so many: fog would explain their images. ``carve`` frees
+    all outside the visual hull, if the images have alpha masks and all show the rest state, and the
+    box is not unbounded. The mask is computed on ``device``; None: on the host.
     """
     space = scene.space
     cameras = views.cameras if device is None else views.cameras.to(device)
@@ -60,7 +60,7 @@ def possibly_occupied(
 
 
 def view_count(cameras: Cameras, points: Tensor) -> Tensor:
-    """How many cameras have each point (X, Y, Z, 3), in world units, in the picture: (X, Y, Z)."""
+    """The number (X, Y, Z) of cameras that see each point (X, Y, Z, 3), in world units."""
     flat = points.view(-1, 3)
     seen = torch.zeros(len(flat), device=flat.device)
     for k in range(len(cameras)):
@@ -72,9 +72,9 @@ def view_count(cameras: Cameras, points: Tensor) -> Tensor:
 
 
 def view_count_weight(cameras: Cameras, points: Tensor) -> Tensor:
-    """Share (X, Y, Z) in (0, 1] of the cameras that have each point (X, Y, Z, 3) in the picture.
+    """The share (X, Y, Z) in (0, 1] of the cameras that see each point (X, Y, Z, 3).
 
-    Relative to the best-seen point; a point that no camera sees gets the share of one camera.
+    It is relative to the best-seen point; a point that no camera sees gets the share of one camera.
     """
     seen = view_count(cameras, points)
     return seen.clamp(min=1) / seen.max().clamp(min=1)

@@ -23,7 +23,7 @@ from devrf.ops.photometric import (
 )
 from devrf.rendering.output import VoxelOutput
 
-# What the flow loss is a mean over.
+# The flow loss is a mean over these.
 FlowMean = Literal["rays", "samples"]
 # Σ weight · term (), and each term's value, by name.
 Weighted = tuple[Tensor, dict[str, Tensor]]
@@ -31,7 +31,7 @@ Weighted = tuple[Tensor, dict[str, Tensor]]
 
 @dataclass(frozen=True)
 class Prediction:
-    """What the rays of a batch see, and the truth at their pixels."""
+    """The render of a batch's rays, and the truth at their pixels."""
 
     output: VoxelOutput
     batch: RayBatch
@@ -39,7 +39,7 @@ class Prediction:
 
 Predicted = TypeVar("Predicted", bound=Prediction)
 
-# What compares rays with images; the equations are in devrf.ops.photometric.
+# Terms that compare rays with images; the equations are in devrf.ops.photometric.
 PHOTOMETRIC_TERMS: dict[str, Callable[[Prediction], Tensor]] = {
     "render": lambda seen: color_error(seen.output.color, seen.batch.color),
     "per_sample_color": lambda seen: per_sample_color(
@@ -63,9 +63,9 @@ class MotionPrediction(Prediction):
         cameras: the cameras of the images that the batch was drawn from.
         previous_image: (N,) int64, for each image the same view's one frame earlier, or itself.
         forward_slice: (X, Y, Z, 3) Δ_f(·, t) itself, for terms that need no samples.
-        box: where the slices live.
-        space: the space that points are in.
-        flow_mean: what the flow loss is a mean over.
+        box: of the slices.
+        space: of the points.
+        flow_mean: whether the flow loss is a mean over rays or samples.
     """
 
     unwarp: Warp
@@ -97,11 +97,11 @@ def flow(prediction: MotionPrediction) -> Tensor:
     if batch.flow is None or valid is None:
         return samples.weight.new_zeros(())
     # The gradient of index_select takes half the time of that of indexing.
-    known = valid.index_select(0, samples.ray).nonzero()[:, 0]
-    ray = samples.ray.index_select(0, known)
-    weight = samples.weight.index_select(0, known)
+    valid_samples = valid.index_select(0, samples.ray).nonzero()[:, 0]
+    ray = samples.ray.index_select(0, valid_samples)
+    weight = samples.weight.index_select(0, valid_samples)
     induced = induced_flow(
-        samples.canonical.index_select(0, known),
+        samples.canonical.index_select(0, valid_samples),
         prediction.unwarp_previous,
         prediction.cameras,
         prediction.previous_image[batch.image].index_select(0, ray),
@@ -173,6 +173,6 @@ def batch_loss(
     terms: Mapping[str, Callable[[Predicted], Tensor]],
     weights: Mapping[str, float],
 ) -> Weighted:
-    """Σ weight · term () over ``weights``; each term's value and how much rays hit, detached."""
+    """Σ weight · term () over ``weights``; each term's value and the visibility, detached."""
     total, values = weighted_sum({name: terms[name](prediction) for name in weights}, weights)
     return total, values | visibility(prediction.output.transmittance, prediction.batch.alpha)

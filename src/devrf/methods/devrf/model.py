@@ -37,7 +37,7 @@ class ColorField(StoredClass, FrameField):
     """A field of frames that changes colours; an extension brings it."""
 
     def at(self, time: float) -> ColorChange | None:
-        """What is added to the colours' logits at ``time`` in [0, 1]; None where nothing is."""
+        """The residual that is added to the colours' logits at ``time`` in [0, 1]; None: none."""
         raise NotImplementedError
 
 
@@ -46,12 +46,12 @@ class DeVRFModel(Renderable):
 
     Attributes:
         architecture: sizes of the canonical field.
-        canonical: what the scene looks like at rest.
-        occupancy: where something is at rest.
+        canonical: the scene's look at rest.
+        occupancy: of the scene at rest.
         deformation: V_motion; None shows the rest state at every time.
-        settings: how rays are sampled.
+        settings: of the sampling of rays.
         space: the space that the fields live in.
-        color_residual: how colours change over time; None: they do not.
+        color_residual: the change of colours over time; None: they do not change.
     """
 
     name: ClassVar[str] = "devrf"
@@ -77,7 +77,7 @@ class DeVRFModel(Renderable):
 
     @property
     def box(self) -> Box:  # type: ignore[override]
-        """Where the fields live."""
+        """The fields' box."""
         return self.canonical.box
 
     @property
@@ -129,7 +129,7 @@ class DeVRFModel(Renderable):
         return None if self.color_residual is None else self.color_residual.at(time)
 
     def occupancy_at(self, time: float) -> Occupancy:
-        """Where something is at ``time`` in [0, 1]."""
+        """The occupancy at ``time`` in [0, 1]."""
         warp = self.warp(time)
         if warp is None:
             return self.occupancy
@@ -178,17 +178,17 @@ class DeVRFModel(Renderable):
         A grid with a value that half precision cannot hold stays as it is.
         """
         state, motion, residual = self.state_dict(), self.deformation, self.color_residual
-        shown = self.occupancy.points_near(self.canonical.density.shape, self.box)[None]
+        occupied = self.occupancy.points_near(self.canonical.density.shape, self.box)[None]
         if not self.space.is_linear:  # rays end in the field's outer faces
-            rim = torch.ones_like(shown)
+            rim = torch.ones_like(occupied)
             rim[:, 1:-1, 1:-1, 1:-1] = False
-            shown |= rim
+            occupied |= rim
         for name in ("canonical.density.values", "canonical.color.values"):
-            state[name] = pack(state[name], shown, smooth=False)
+            state[name] = pack(state[name], occupied, smooth=False)
         if motion is not None:
-            place = motion.shape, motion.box
-            at_rest = self.occupancy.points_near(*place)[None]
-            near = [self.occupancy_at(t).points_near(*place) for t in motion.clock.times]
+            grid = motion.shape, motion.box
+            at_rest = self.occupancy.points_near(*grid)[None]
+            near = [self.occupancy_at(t).points_near(*grid) for t in motion.clock.times]
             # Between two frames both are blended.
             moving = [torch.stack(near[max(k - 1, 0) : k + 2]).any(dim=0) for k in range(len(near))]
             frames = {"to_canonical": torch.stack(moving), "to_time": at_rest}
@@ -214,8 +214,8 @@ class DeVRFModel(Renderable):
         if self.deformation is not None:
             names = [f"deformation.frames.{name}" for name in NAMES]
             frames = [full[name] for name in names]
-            place = _place_of_frames(frames[0], self.device)
-            frames = [unpack(value, place, torch.float16) for value in frames]
+            device = _device_of_frames(frames[0], self.device)
+            frames = [unpack(value, device, torch.float16) for value in frames]
             self.deformation.frames.take(*frames)
             full |= zip(names, frames, strict=True)
         self.load_state_dict({name: unpack(v, self.device) for name, v in full.items()})
@@ -226,8 +226,8 @@ class DeVRFModel(Renderable):
             raise ValueError("a ray of more samples than any grid has")
 
 
-def _place_of_frames(backward: Any, device: torch.device) -> torch.device:
-    """Where both directions are unpacked, one of them given: on ``device`` or on the host."""
+def _device_of_frames(backward: Any, device: torch.device) -> torch.device:
+    """The device on which both directions are unpacked, one of them given: it or the host."""
     if device.type != "cuda" or torch.is_tensor(backward):
         return torch.device("cpu")
     free, _ = torch.cuda.mem_get_info(device)

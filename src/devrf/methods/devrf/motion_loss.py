@@ -21,7 +21,7 @@ class MotionLoss:
     """Weights of Σ weight · factor · term; the factors are those of a level.
 
     Attributes:
-        terms: what can be computed, by name.
+        terms: all terms, by name.
     """
 
     def __init__(
@@ -45,12 +45,12 @@ class MotionLoss:
         for extension in extensions:
             self.terms |= extension.terms
             weights |= extension.weights
-        known = ", ".join(sorted(self.terms))
+        names = ", ".join(sorted(self.terms))
         for extension in extensions:
             for name in sorted(set(extension.scaled_terms) - self.terms.keys()):
                 raise DevrfError(
                     f"schedule.extensions: {name} is no term of loss.deformation; the terms are "
-                    f"{known}"
+                    f"{names}"
                 )
         self._weights = counted_weights(weights, self.terms, "loss.deformation")
         self._scaled_by_level = loss.keys() - {"render"}
@@ -58,7 +58,7 @@ class MotionLoss:
         self._schedule = schedule
 
     def leave_out(self, term: str) -> bool:
-        """Let a term count no more; whether it did."""
+        """Let a term count no more; return whether it did."""
         return bool(self._weights.pop(term, 0.0))
 
     def weights_at(self, level: int, share: float = 0.0) -> dict[str, float]:

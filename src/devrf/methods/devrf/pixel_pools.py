@@ -1,4 +1,4 @@
-"""Which pixels of a stage's images are worth drawing: those whose rays meet occupied space."""
+"""The pixels of a stage's images that are worth drawing: their rays meet occupied space."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def rays_hit_occupied(
         cameras: all cameras, on the model's device.
         images: (K,) int64, which of them.
         model: gives box, space, near and far.
-        occupancy: where something may be at the time of the images.
+        occupancy: an upper bound at the time of the images.
     """
     block = block_size(cameras, model, occupancy)
     width = -(-cameras.width // block)
@@ -78,7 +78,7 @@ def rays_that_hit(rays: Rays, limits: MarchRange) -> Tensor:
     distances = limits.distances
     cells = distances.cells.clamp(min=HIT_CELLS) - HIT_CELLS
     near = replace(limits, distances=replace(distances, cells=cells))
-    # Where all is opaque a ray ends at its first sample.
+    # If all is opaque a ray ends at its first sample.
     wall = cells.new_full((2, 2, 2, 1), 100, dtype=rays.origins.dtype)
     samples = march(rays, MarchInputs(near, density=wall, shift=0.0, delta=1.0, threshold=0.5))
     return samples.transmittance < 0.5
@@ -124,7 +124,7 @@ def frame_pools(
         views: the dynamic training views, on the model's device.
         frame: the frame.
         model: gives box, space, near and far.
-        occupancy: where something is at the frame's time.
+        occupancy: at the frame's time.
         occupied_only: only pixels on the alpha mask, or whose rays hit something occupied; all
             those of an image that has none.
         join_views: one pool of all views; else one pool a view.

@@ -14,12 +14,12 @@ from devrf.system.device import multiplies_bfloat16
 from devrf.system.options import NotNegative, Options, Positive
 
 Opacity = Annotated[float, Ge(0), Lt(1)]
-# What the colour network computes in.
+# The colour network's precision.
 Precision = Literal["auto", "float32", "bfloat16"]
 
 
 def decoder_dtype(precision: Precision, device: torch.device) -> torch.dtype:
-    """What the colour network computes in on ``device``; ``auto``: bfloat16 where it is fast."""
+    """The colour network's precision on ``device``; ``auto``: bfloat16 where it is fast."""
     if precision == "auto":
         precision = "bfloat16" if multiplies_bfloat16(device) else "float32"
     return torch.bfloat16 if precision == "bfloat16" else torch.float32
@@ -57,13 +57,13 @@ class CanonicalRates(Options):
 
 @dataclass(frozen=True)
 class Sampling(Options):
-    """How rays are sampled (docs/method.md#rays).
+    """Settings of the sampling of rays (docs/method.md#rays).
 
     Attributes:
         step: distance between samples in voxels.
         alpha_threshold: samples of a lower opacity, and then of a lower weight, get no colour.
         search_alpha_threshold: the same in the geometry search, which begins almost transparent;
-            there it is what empties cells, too.
+            there it empties cells, too.
         occupancy_threshold: opacity of a step up to which a cell counts as empty.
     """
 
@@ -77,7 +77,7 @@ class Sampling(Options):
 
 @dataclass(frozen=True)
 class MotionSettings(Options):
-    """How the deformation field is learned, beside its schedule (docs/method.md#departures).
+    """Settings of the deformation stage, beside its schedule (docs/method.md#departures).
 
     Attributes:
         learning_rate: base rate, in ``unit`` per step: how far a voxel moves at most.
@@ -86,7 +86,7 @@ class MotionSettings(Options):
         pixels: ``all``, or ``occupied``: of the alpha mask, and where rays hit the present field.
         epochs: batches are smaller where a visit would show each pixel more often.
         occupancy_every: iterations between updates of the frame's occupancy.
-        store: where frames are kept while one is learned; ``auto``: on the device if they fit.
+        store: the memory of the frames while one is learned; ``auto``: the device's if they fit.
         store_half: whether they are kept in half precision; ``auto``: on a GPU.
         adam_state: ``fresh`` at each visit, or above the coarsest level ``carried`` over.
         min_rel_improvement: of a visit's loss, in two Lightning steps; with less it ends early.

@@ -38,14 +38,14 @@ class DeVRFView:
     """The occupancy and the displacements of one time t; it shares the fields' memory.
 
     Attributes:
-        canonical: what the scene looks like at rest.
-        occupancy: where something is; at first at rest.
-        settings: how rays are sampled.
-        motion: how the scene moves; None: it is at rest at every time.
+        canonical: the scene's look at rest.
+        occupancy: of the scene; at first at rest.
+        settings: of the sampling of rays.
+        motion: the scene's; None: it is at rest at every time.
         space: the space that the fields live in.
         time: t in [0, 1].
-        color_change: what is added to the colours' logits at that time; None: nothing.
-        precision: what pictures' colour network computes in.
+        color_change: the residual of the colours' logits at that time; None: none.
+        precision: of the colour network for pictures.
         at_rest: whether the warp of this time is the identity.
     """
 
@@ -84,14 +84,14 @@ class DeVRFView:
 
     @property
     def picture_settings(self) -> RenderSettings:
-        """How the rays of pictures are sampled."""
+        """The settings by which rays of pictures are sampled."""
         if self.space.is_linear:
             return self.settings
         return replace(self.settings, step=UNBOUNDED_STEP * self.settings.step)
 
     @torch.no_grad()
     def render(self, rays: Rays, background: Tensor) -> RenderedImage:
-        """What R rays in the fields' space see."""
+        """The render of R rays in the fields' space."""
         output = render(
             rays,
             self.canonical,
@@ -139,7 +139,7 @@ class CanonicalSurface:
 
     @property
     def box(self) -> Box:
-        """Where the field lives."""
+        """The field's box."""
         return self.field.box
 
     @property

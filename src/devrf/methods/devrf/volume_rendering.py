@@ -37,11 +37,11 @@ def render(
     Args:
         rays: R rays.
         field: the canonical field.
-        occupancy: where something may be, in the space of the rays.
+        occupancy: an upper bound, in the space of the rays.
         settings: step length and thresholds.
         background: (3,) or (R, 3) RGB behind all; the field's own where the space holds infinity.
         warp: x → q = x + Δ_b(x, t); None is the identity.
-        precision: what the colour network works in.
+        precision: of the colour network.
         color_change: q → A_t(q), added to the colours' logits; None: nothing is.
 
     Returns:
@@ -107,8 +107,8 @@ def deformed_occupancy(
 
     Args:
         field: the canonical field.
-        occupancy: where something is at rest.
-        settings: how rays are sampled.
+        occupancy: of the scene at rest.
+        settings: of the sampling of rays.
         warp: x → x + Δ_b(x, t).
     """
     box, shape, densities = field.box, field.density.shape, field.density.values
@@ -137,8 +137,8 @@ def points_that_arrive(
     """The points of a grid that move to an occupied cell.
 
     Args:
-        occupancy: where something is at rest.
-        warp: how points move there.
+        occupancy: of the scene at rest.
+        warp: x → x + Δ_b(x, t) at that time.
         box: of the grid.
         shape: its points along x, y, z.
 

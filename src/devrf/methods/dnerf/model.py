@@ -39,9 +39,9 @@ class TranslationField(nn.Module):
     def forward(self, points: Tensor, time: Tensor) -> Tensor:
         """Displacements (S, 3) to canonical space of points (S, 3) at times (S,) in [0, 1]."""
         moving = (time > 0).nonzero()[:, 0]
-        place = points.index_select(0, moving)
+        moved = points.index_select(0, moving)
         when = time.index_select(0, moving)
-        encoded = torch.cat([self.encode_position(place), self.encode_time(when[:, None])], dim=-1)
+        encoded = torch.cat([self.encode_position(moved), self.encode_time(when[:, None])], dim=-1)
         displacement = self.output(self.trunk(encoded))
         return torch.zeros_like(points).index_copy(0, moving, displacement.to(points.dtype))
 

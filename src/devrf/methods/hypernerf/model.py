@@ -120,7 +120,7 @@ class HyperNeRF(Nerfies):
         self._shut = step.capture == "static"
 
     def milestones(self, total: int) -> dict[str, int]:
-        """When ambient space is open, if it opens."""
+        """The iteration at which ambient space is open, if it opens."""
         s = self.settings
         opened = round((s.ambient_delay + s.ambient_window) * total)
         further = {} if self._shut else {"ambient space open": opened}

@@ -1,4 +1,4 @@
-"""What makes density and colour of features; no layer has a bias."""
+"""Decoders of features into density and colour; no layer has a bias."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FACTORS = (
     0.2820948, -0.4886025, 0.4886025, -0.4886025, 1.0925484, -1.0925484, 0.3153916, -1.0925484,
     0.5462742, -0.5900436, 2.8906114, -0.4570458, 0.3731763, -0.4570458, 1.4453057, -0.5900436,
 )  # fmt: skip
-# What the first network gives beside the density.
+# Outputs of the first network beside the density.
 FURTHER = 15
 # The largest exponent of a density: more would be opaque likewise, and soon infinite.
 STEEPEST = 15.0

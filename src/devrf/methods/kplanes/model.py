@@ -70,10 +70,10 @@ class KPlanes(DensityColorField):
         self.proposals = nn.ModuleList(Proposal(side, points, s) for side in rounds).to(device)
 
     def milestones(self, total: int) -> dict[str, int]:
-        """When weights are as sharp, and proposals learn as rarely, as they ever do."""
+        """Iterations from which weights are sharpest, and proposals learn most rarely."""
         s = self.settings
-        known = {"weights sharpened": s.annealing, "proposals learn rarely": s.teaching}
-        last = {k: n for k, n in known.items() if n < total and s.sampling == "proposals"}
+        changes = {"weights sharpened": s.annealing, "proposals learn rarely": s.teaching}
+        last = {k: n for k, n in changes.items() if n < total and s.sampling == "proposals"}
         return {**super().milestones(total), **last}
 
     def on_iteration(self, step: int, total: int) -> None:
@@ -103,9 +103,9 @@ class KPlanes(DensityColorField):
     def render_rays(
         self, rays: Rays, time: Tensor, background: Tensor, *, jitter: bool = False
     ) -> RenderOutput:
-        """What rays see.
+        """The render of rays.
 
-        Of proposals, ``extras`` also has ``histogram`` (), the rounds' error, and of the samples
+        ``extras`` also has ``histogram`` (), the error of the rounds of proposals, and the samples'
         ``length`` (K,), in units of the ray's direction.
         """
         if self.settings.sampling == "occupancy":
@@ -149,7 +149,7 @@ class KPlanes(DensityColorField):
         extras = output.extras
         # Even steps are of one length.
         length = extras.get("length", torch.full_like(extras["weight"], self.step_length))
-        known: dict[str, Callable[[], Tensor]] = {
+        terms: dict[str, Callable[[], Tensor]] = {
             "render": lambda: nn.functional.mse_loss(output.color, batch.color),
             "tv": lambda: sum_of([each.total_variation() for each in (self.planes, *rounds)]),
             "smooth": self.planes.roughness,
@@ -165,7 +165,7 @@ class KPlanes(DensityColorField):
             ),
         }
         nothing = output.color.new_zeros(())
-        return {name: known[name]() for name in self.losses if name in names}
+        return {name: terms[name]() for name in self.losses if name in names}
 
     @property
     def grid_channels(self) -> Collection[int]:
@@ -174,7 +174,7 @@ class KPlanes(DensityColorField):
         return (s.channels, *([s.proposal_channels] if s.sampling == "proposals" else []))
 
     def parts(self) -> dict[str, Iterable[nn.Parameter]]:
-        """What space alone says, with the decoder; what time says; the proposals."""
+        """Planes of space, with the decoder; planes with time; the proposals."""
         return {
             "canonical": [*self.planes.space, *self.decoder.parameters()],
             "motion": self.planes.time,

@@ -49,10 +49,10 @@ def drawn_edges(edges: Tensor, weight: Tensor, count: int, *, jitter: bool) -> T
 
     ``weight`` (R, N) is that of the intervals between ``edges`` (R, N + 1), without gradient.
     """
-    place = torch.arange(count + 1, device=edges.device).repeat(len(edges), 1).to(edges.dtype)
+    position = torch.arange(count + 1, device=edges.device).repeat(len(edges), 1).to(edges.dtype)
     if jitter:
-        place[:, 1:-1] += torch.rand_like(place[:, 1:-1]) - 0.5
-    return drawn(edges, weight + PADDING, place / count)
+        position[:, 1:-1] += torch.rand_like(position[:, 1:-1]) - 0.5
+    return drawn(edges, weight + PADDING, position / count)
 
 
 def histogram_error(

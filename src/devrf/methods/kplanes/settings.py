@@ -25,7 +25,7 @@ class KPlanesSettings(OccupancySettings):
         scales: factors of it, a set of planes each.
         time_resolution: points along time, at all scales; None: half the frames.
         channels: numbers of a point.
-        pairing: how features of the six planes meet: ``product``, or as in ``hexplane``.
+        pairing: of the features of the six planes: ``product``, or as in ``hexplane``.
         decoder: ``hybrid`` (small networks) or ``explicit`` (linear, in a basis for a direction).
         width: units of the hybrid decoder's layers.
         harmonics: highest degree of its spherical harmonics of the direction; 0: colours are the

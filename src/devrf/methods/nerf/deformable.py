@@ -1,4 +1,4 @@
-"""What D-NeRF, Nerfies and HyperNeRF are: a deformation before one radiance field."""
+"""The common base of D-NeRF, Nerfies and HyperNeRF: a deformation before one radiance field."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ class DeformableField(DensityColorField):
 
     @abstractmethod
     def deform(self, points: Tensor, time: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Where points lead, in normalised space.
+        """Deformed points, in normalised space.
 
         Args:
             points: (S, 3) x.
             time: (S,) in [0, 1].
 
         Returns:
-            x′ (S, 3), and what enters T beside it, (S, ambient) or None.
+            x′ (S, 3), and the further input of T, (S, ambient) or None.
         """
 
     def radiance_parts(self) -> dict[str, Iterable[nn.Parameter]]:
@@ -80,10 +80,10 @@ class DeformableField(DensityColorField):
     def render_rays(
         self, rays: Rays, time: Tensor, background: Tensor, *, jitter: bool = False
     ) -> RenderOutput:
-        """What rays see: even samples, and more where these have weight, if not by occupancy.
+        """The render of even samples, and of more where these have weight, if not by occupancy.
 
-        If a coarse field learns, ``extras`` also has ``coarse_color`` (R, 3), and what there is of
-        fine samples with ``coarse_`` before its name.
+        If a coarse field learns, ``extras`` also has ``coarse_color`` (R, 3), and the entries of
+        the fine samples with ``coarse_`` before their names.
         """
         s = self.settings
         if s.sampling == "occupancy":

@@ -1,4 +1,4 @@
-"""What radiance fields are made of: encodings, trunks, codes of frames, and the field itself."""
+"""Parts of radiance fields: encodings, trunks, codes of frames, and the field itself."""
 
 from __future__ import annotations
 
@@ -118,10 +118,10 @@ class Trunk(nn.Module):
         Args:
             inputs: length of the input.
             width: units of each layer, and of the result.
-            depth: how many layers.
+            depth: the number of layers.
             skip: number, from 0, of the layer that the input enters again; None: the middle one, of
                 a trunk of three or more. A trunk without that layer has no such input.
-            skipped: how much of the input, from its beginning, does; None: all of it.
+            skipped: the length of the input's part, from its beginning, that does; None: all of it.
             beside: length of a second input that enters with the first one, both times.
         """
         super().__init__()
@@ -189,7 +189,7 @@ class TimeCodes(nn.Module):
 
 
 class ColorBranch(nn.Module):
-    """What colours a trunk's result by the viewing direction: NeRF's last layers."""
+    """Colours a trunk's result by the viewing direction: NeRF's last layers."""
 
     def __init__(self, width: int, bands: int) -> None:
         """For a trunk of ``width`` units; directions have so many ``bands``."""
@@ -245,11 +245,11 @@ class RadianceField(nn.Module):
         return torch.autocast(device.type, torch.bfloat16)
 
     def hidden(self, points: Tensor, ambient: Tensor | None = None) -> Tensor:
-        """What density and colour come from, (S, width).
+        """Hidden features (S, width), from which density and colour come.
 
         Args:
             points: (S, inputs) in normalised space, [−1, 1] inside the box.
-            ambient: (S, ambient) what enters beside γ(x), or None where nothing does.
+            ambient: (S, ambient) input beside γ(x), or None.
         """
         x: Tensor = self.trunk(self.encode_position(points), ambient)
         return x

@@ -1,4 +1,4 @@
-"""Where something may be at each frame, by alpha masks or the field itself: the rest is skipped."""
+"""The occupancy of each frame, by alpha masks or the field itself: empty space is skipped."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class LearnedOccupancy(StoredShape):
             step: iteration of a stage, from 0; at 0 what another stage saw is forgotten.
             total: iterations of the stage.
             share: share of these before which nothing is left out; None: nothing ever is.
-            box: where the cells are, in the fields' space.
+            box: of the cells, in the fields' space.
             opacity_at: the opacity (S,) of a step at points (S, 3) of that space and times (S,) in
                 [0, 1].
         """
@@ -100,10 +100,10 @@ class LearnedOccupancy(StoredShape):
 
     def _points(self, cells: Tensor, box: Box) -> Tensor:
         """A random point (S, 3) nearest to each of the grid points of numbers (S,)."""
-        place = torch.stack(torch.unravel_index(cells, self.opacity.shape), dim=1)
+        index = torch.stack(torch.unravel_index(cells, self.opacity.shape), dim=1)
         low, high = box.corners(self.opacity)
         last = torch.tensor(self.opacity.shape, device=cells.device) - 1
-        jittered = place + torch.rand(len(cells), 3, device=cells.device) - 0.5
+        jittered = index + torch.rand(len(cells), 3, device=cells.device) - 0.5
         return box.nearest(low + jittered / last * (high - low))
 
 
@@ -112,7 +112,7 @@ class OccupancyFrames(StoredShape):
 
     Attributes:
         mask: (T, X, Y, Z) bool, True where something may be.
-        learned: what the field leaves empty at all times, where alpha masks do not tell.
+        learned: space that the field leaves empty at all times, if alpha masks do not tell.
     """
 
     resizable: ClassVar = {"mask": 4}
@@ -151,10 +151,10 @@ class OccupancyFrames(StoredShape):
         for views in (scene.static.train, scene.dynamic.train) if carved else ():
             assert views.frames is not None
             for frame in torch.unique(views.frames).tolist() if views.has_alpha else ():
-                shown = views[(views.frames == frame).nonzero()[:, 0]]
-                masks.mask[frame] &= dilate(visual_hull(shown, box, shape), 1).cpu()
+                frame_views = views[(views.frames == frame).nonzero()[:, 0]]
+                masks.mask[frame] &= dilate(visual_hull(frame_views, box, shape), 1).cpu()
                 if frame > 0:
-                    held = visual_hull(shown, box, shape, whole_in_view=True)
+                    held = visual_hull(frame_views, box, shape, whole_in_view=True)
                     masks.mask[frame] &= dilate(held, 1).cpu() | masks.mask[0]
         if empty_from is not None and not masks.has_hull:
             masks.learned = LearnedOccupancy(shape)
@@ -175,7 +175,7 @@ class OccupancyFrames(StoredShape):
         Args:
             rays: R rays in the fields' space.
             frames: (R,) int64 twice: the frames before and after each ray's time.
-            box: where the masks live, in the fields' space.
+            box: of the masks, in the fields' space.
             depths: distances between which rays are sampled.
             step: in units of the rays' directions.
             jitter: move all samples of a ray by a random part of a step.

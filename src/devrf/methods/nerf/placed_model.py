@@ -1,4 +1,4 @@
-"""What the peers share: networks placed in a scene, whose empty space rays skip."""
+"""The peers' common base: networks placed in a scene, whose empty space rays skip."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from devrf.rendering.view import SurfaceField
 from devrf.scenes.scene import Scene
 from devrf.system.plain_data import validate
 
-# Rays of a view that are rendered at once: on a CPU what its caches hold, of a hundred samples a
-# ray; on a GPU what keeps it busy.
+# Rays of a view that are rendered at once: a CPU's caches hold them at a hundred samples a ray; a
+# GPU is kept busy.
 ON_CPU = 256
 ON_GPU = 2**14
-# Points along an edge of a cube of the box's size, of which a surface is taken.
+# Points along an edge of a cube of the box's size, from which a surface is extracted.
 SURFACE_SIDE = 128
 
 
@@ -38,11 +38,11 @@ class PlacedModel(RayTrainable):
     """A method with settings, placed in a box of the scene, whose frames it knows.
 
     Attributes:
-        settings_class: what :attr:`settings` are: sizes and sampling.
+        settings_class: the class of :attr:`settings`: sizes and sampling.
         checkpointed_attributes: the names of further attributes that a checkpoint holds.
         placement: the maps from the fields' space (world units, NDC or contracted) to normalised
             space, where the box's longest edge is 2, and back.
-        occupancy: where something may be at each frame.
+        occupancy: an upper bound at each frame.
         clock: the frames' times.
     """
 
@@ -56,7 +56,7 @@ class PlacedModel(RayTrainable):
         self.occupancy = OccupancyFrames(1, (2, 2, 2))
 
     def place(self) -> None:
-        """Build what depends on the scene, as yet for one at rest in a cube around the origin."""
+        """Build the parts that depend on the scene, for one at rest in a cube around the origin."""
         self.set_place(Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)), WORLD, (0.0, 1.0))
         self.set_times((0.0, 1.0))
 
@@ -68,11 +68,11 @@ class PlacedModel(RayTrainable):
         self.placement = Placement(box, space)
 
     def set_times(self, times: tuple[float, ...]) -> None:
-        """Take the frames' times; a method with codes for them makes these here."""
+        """Take the frames' times; a method with codes for them builds these here."""
         self.clock = FrameClock(times)
 
     def rehearsed(self, factor: float) -> Self:
-        """Of smaller settings."""
+        """The method with smaller settings."""
         return type(self)(self.settings.rehearsed(factor))
 
     @property
@@ -81,7 +81,7 @@ class PlacedModel(RayTrainable):
         return self.occupancy.has_hull
 
     def config(self) -> dict[str, Any]:
-        """Settings, and where and when the scene is."""
+        """Settings, and the scene's box, space, depth limits and times."""
         return {
             "settings": asdict(self.settings),
             "box": [list(self.box.low), list(self.box.high)],
@@ -120,13 +120,13 @@ class NeuralField(PlacedModel):
             ).to(self.device)
 
     def milestones(self, total: int) -> dict[str, int]:
-        """From when on space that the fields leave empty is not sampled, if it ever is."""
+        """The iteration from which space that the fields leave empty is skipped, if it is."""
         share = self.settings.empty_from
         learns = share is not None and self.occupancy.learned.opacity.numel() > 0
         return {"empty space left out": round(share * total)} if learns else {}
 
     def on_iteration(self, step: int, total: int) -> None:
-        """Look where the fields are empty."""
+        """Update the space that the fields leave empty."""
         share = self.settings.empty_from
         self.occupancy.learned.follow(step, total, share, self.box, self.opacity)
 
@@ -149,13 +149,13 @@ class NeuralField(PlacedModel):
     def render_rays(
         self, rays: Rays, time: Tensor, background: Tensor, *, jitter: bool = False
     ) -> RenderOutput:
-        """What R rays in the fields' space see at ``time`` (R,).
+        """The render of R rays in the fields' space at ``time`` (R,).
 
         Args:
             rays: R rays.
             time: (R,) in [0, 1].
             background: (3,) or (R, 3) RGB.
-            jitter: sample at random places, to learn from them.
+            jitter: sample at random positions, to learn from them.
         """
 
     def forward(self, batch: RayBatch) -> RenderOutput:
@@ -163,7 +163,7 @@ class NeuralField(PlacedModel):
         return self.render_rays(batch.rays, batch.time, batch.background, jitter=self.training)
 
     def march(self, rays: Rays, time: Tensor, *, jitter: bool) -> RaySamples:
-        """Even steps where something may be at the frames around each ray's time."""
+        """Even steps through the space occupied at the frames around each ray's time."""
         before, after, _ = self.clock.between(time)
         # In units of the longest direction.
         longest = float(rays.directions.norm(dim=1).amax()) if len(rays) else 1.0
@@ -177,10 +177,10 @@ class NeuralField(PlacedModel):
         return RayView(self, self.render_rays, time, half=half)
 
 
-# Of points (S, 3) in normalised space, times (R,) of rays, and the ray (S,) int64 of each point:
+# Points (S, 3) in normalised space, times (R,) of rays, and the ray (S,) int64 of each point →
 # densities (S,) per unit of that space, and features (S, ·) that colours are made of.
 Sigma = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
-# Of such features, unit viewing directions (R, 3) of rays, and the ray of each: RGB (S, 3).
+# Such features, unit viewing directions (R, 3) of rays, and the ray of each → RGB (S, 3).
 Color = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
@@ -195,7 +195,7 @@ class DensityColorField(NeuralField):
 
     @abstractmethod
     def sigma(self, points: Tensor, time: Tensor, ray: Tensor) -> tuple[Tensor, Tensor]:
-        """σ (S,) and what :meth:`rgb` takes; see :data:`Sigma`."""
+        """σ (S,) and the features for :meth:`rgb`; see :data:`Sigma`."""
 
     @abstractmethod
     def rgb(self, features: Tensor, viewdirs: Tensor, ray: Tensor) -> Tensor:
@@ -209,7 +209,7 @@ class DensityColorField(NeuralField):
     def render_rays(
         self, rays: Rays, time: Tensor, background: Tensor, *, jitter: bool = False
     ) -> RenderOutput:
-        """What rays see by even steps; ``extras`` as of :meth:`rendered`."""
+        """The render by even steps; ``extras`` as of :meth:`rendered`."""
         return self.rendered(self.march(rays, time, jitter=jitter), rays, time, background)
 
     def rendered(
@@ -224,9 +224,9 @@ class DensityColorField(NeuralField):
     ) -> RenderOutput:
         """The render of samples in the fields' space, or by another ``sigma`` and ``rgb``.
 
-        ``extras`` has, of the K samples that were coloured, ``points`` (K, 3) in normalised space,
-        ``time``, ``ray``, ``distance`` (in units of the ray's direction) and ``weight`` (K,), and
-        ``sample_color`` (K, 3).
+        ``extras`` describes the K samples that were coloured: ``points`` (K, 3) in normalised
+        space, ``time``, ``ray``, ``distance`` (in units of the ray's direction) and ``weight``
+        (K,), and ``sample_color`` (K, 3).
         """
         if not self.space.is_linear:
             samples = samples.unbounded()
@@ -235,10 +235,10 @@ class DensityColorField(NeuralField):
         depth = density.float() * samples.length
         weight, transmittance = composite(depth, samples.ray, samples.rays)
         if self.least_weight > 0:
-            shown = (weight > self.least_weight).nonzero()[:, 0]
-            samples = samples[shown]
-            weight = weight.index_select(0, shown)
-            features = features.index_select(0, shown)
+            visible = (weight > self.least_weight).nonzero()[:, 0]
+            samples = samples[visible]
+            weight = weight.index_select(0, visible)
+            features = features.index_select(0, visible)
         color = (rgb or self.rgb)(features, rays.viewdirs, samples.ray).float()
         output = accumulated(samples, weight, weight[:, None] * color, transmittance, background)
         extras = {
@@ -277,18 +277,18 @@ class SurfaceAtTime:
         moment = model.clock.at(self._time)
         frames = (moment.before, moment.after)
         index = model.occupancy.may_be_at(points, frames, self.box).nonzero()[:, 0]
-        place = model.placement.normalised(points[index])
+        position = model.placement.normalised(points[index])
         voxel = self.box.voxel_size(math.prod(self.shape)) / model.placement.half_edge
-        depth = model.optical_depth(place, torch.full_like(place[:, 0], self._time), voxel)
+        depth = model.optical_depth(position, torch.full_like(position[:, 0], self._time), voxel)
         return torch.zeros_like(points[:, 0]).index_copy(0, index, depth)
 
     @torch.no_grad()
     def color(self, points: Tensor, viewdirs: Tensor) -> Tensor:
         """RGB (M, 3) at ``points`` (M, 3) of the fields' space, along directions (M, 3)."""
-        place = self._model.placement.normalised(points)
-        time = torch.full_like(place[:, 0], self._time)
+        position = self._model.placement.normalised(points)
+        time = torch.full_like(position[:, 0], self._time)
         each = torch.arange(len(points), device=points.device)
-        return self._model.rgb(self._model.sigma(place, time, each)[1], viewdirs, each)
+        return self._model.rgb(self._model.sigma(position, time, each)[1], viewdirs, each)
 
 
 class RayView:
@@ -307,7 +307,7 @@ class RayView:
         *,
         half: bool,
     ) -> None:
-        """Keep what there is to know.
+        """Render ``model`` at one time.
 
         Args:
             model: the model.
@@ -324,7 +324,7 @@ class RayView:
 
     @torch.no_grad()
     def render(self, rays: Rays, background: Tensor) -> RenderedImage:
-        """What R rays in the fields' space see."""
+        """The render of R rays in the fields' space."""
         time = torch.full_like(rays.origins[:, 0], self._time)
         with torch.autocast(time.device.type, torch.float16, enabled=self._half):
             out = self._render_rays(rays, time, background)

@@ -1,4 +1,4 @@
-"""Where networks live: normalised space, and its maps to the world."""
+"""The networks' normalised space, and its maps to the world."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Placement:
 
     @property
     def half_edge(self) -> float:
-        """What 1 in normalised space is in the fields' space."""
+        """The length in the fields' space of 1 in normalised space."""
         return self.box.longest / 2
 
     @property

@@ -110,12 +110,12 @@ def stratified(near: Tensor, far: Tensor, count: int, *, jitter: bool) -> Tensor
     Args:
         near: (R,) where the first stretch begins.
         far: (R,) where the last one ends.
-        count: how many stretches.
-        jitter: a random place in each stretch; else its middle.
+        count: the number of stretches.
+        jitter: a random position in each stretch; else its middle.
     """
-    place = torch.arange(count, device=near.device).expand(len(near), count)
+    index = torch.arange(count, device=near.device).expand(len(near), count)
     offset = torch.rand_like(near[:, None].expand(-1, count)) if jitter else 0.5
-    return near[:, None] + (far - near)[:, None] * (place + offset) / count
+    return near[:, None] + (far - near)[:, None] * (index + offset) / count
 
 
 def importance(
@@ -124,14 +124,14 @@ def importance(
     """Distances (R, count) drawn in proportion to the weights of coarse samples.
 
     The stretches end half-way between the coarse samples; each is as likely as its weight says,
-    and a place within it is drawn evenly (inverse transform sampling).
+    and a position within it is drawn evenly (inverse transform sampling).
 
     Args:
         distance: (R, N) of the coarse samples, ascending.
         weight: (R, N) theirs.
         near: (R,) where the first stretch begins.
         far: (R,) where the last one ends.
-        count: how many to draw.
+        count: the number to draw.
         jitter: random numbers; else evenly spread ones.
     """
     middle = (distance[:, 1:] + distance[:, :-1]) / 2

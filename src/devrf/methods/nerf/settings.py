@@ -36,7 +36,7 @@ class MethodSettings(Options):
 
 @dataclass(frozen=True)
 class OccupancySettings(MethodSettings):
-    """How empty space is skipped.
+    """Settings of the skipping of empty space.
 
     Attributes:
         occupancy_side: the masks have about side³ cells.
@@ -57,7 +57,7 @@ class OccupancySettings(MethodSettings):
 
 @dataclass(frozen=True)
 class PlacedSettings(OccupancySettings):
-    """What D-NeRF, Nerfies, HyperNeRF and NSFF have in common.
+    """Common settings of D-NeRF, Nerfies, HyperNeRF and NSFF.
 
     Attributes:
         width: units of each layer of a radiance field.
@@ -67,7 +67,7 @@ class PlacedSettings(OccupancySettings):
         direction_bands: octaves of viewing directions.
         density_scale: density of a softplus of 1, per half of the box's longest edge.
         initialisation: of all layers: ``uniform`` (PyTorch's) or ``glorot``.
-        precision: what a radiance field computes in while it learns: float32, bfloat16, or
+        precision: of a radiance field while it learns: float32, bfloat16, or
             ``auto`` (bfloat16 on a GPU that multiplies it). All else is in float32.
         steps: samples along the box's diagonal (occupancy).
     """
@@ -95,7 +95,7 @@ class PlacedSettings(OccupancySettings):
 
 @dataclass(frozen=True)
 class FieldSettings(PlacedSettings):
-    """What D-NeRF, Nerfies and HyperNeRF have in common.
+    """Common settings of D-NeRF, Nerfies and HyperNeRF.
 
     Attributes:
         sampling: ``hierarchical`` (coarse, then fine by weight) or ``occupancy`` (even steps where

@@ -60,7 +60,7 @@ def drawn(weight: Tensor, ray: Tensor, rays: Tensor, count: int) -> tuple[Tensor
         weight: (S,) w ≥ 0.
         ray: (S,) int64, ascending: the ray of each sample.
         rays: (K,) int64, which rays.
-        count: how many rays there are.
+        count: the number of rays.
 
     Returns:
         The samples (M,) int64 of those of the rays that have any weight, and the rays' Σ w_i (M,).

@@ -55,7 +55,7 @@ class RigidWarp(nn.Module):
             nn.init.zeros_(head.bias)
 
     def forward(self, points: Tensor, code: Tensor) -> Tensor:
-        """Where points (S, 3) of normalised space lead; ``code`` (S, code) is of their times."""
+        """Deformed points (S, 3) of normalised space; ``code`` (S, code) is of their times."""
         window = octave_window(self.opened, self.bands)
         x = self.trunk(torch.cat([self.encode(points, window), code], dim=-1))
         rotation = self.rotation(x)
@@ -137,12 +137,12 @@ class Nerfies(DeformableField):
         self.codes = TimeCodes(times, self.settings.code).to(self.device)
 
     def begin_stage(self, step: ProtocolStage) -> None:
-        """What is learned from the static images alone is the canonical state."""
+        """Take the canonical state from the static images, if a stage learns from them alone."""
         super().begin_stage(step)
         self.rest_is_canonical |= step.capture == "static"
 
     def milestones(self, total: int) -> dict[str, int]:
-        """When all of the warp's octaves are open."""
+        """The iteration at which all of the warp's octaves are open."""
         opened = round(self.settings.window * total)
         return {**super().milestones(total), "octaves of the warp open": opened}
 
@@ -154,7 +154,7 @@ class Nerfies(DeformableField):
         self.warp.opened.fill_(opened * self.settings.warp_bands)
 
     def deform(self, points: Tensor, time: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Where points lead, and what enters T beside; nothing moves at a canonical rest state."""
+        """Deformed points, and T's further input; nothing moves at a canonical rest state."""
         if not self.rest_is_canonical:
             return self.bend(points, time)
         moving = (time > 0).nonzero()[:, 0]
@@ -194,11 +194,11 @@ class Nerfies(DeformableField):
         weight = output.extras[f"{prefix}weight"].detach()
         ray = output.extras[f"{prefix}ray"].detach()
         count = min(self.settings.elastic_rays or rays, rays)
-        chosen = torch.randperm(rays, device=ray.device)[:count]
+        subset = torch.randperm(rays, device=ray.device)[:count]
         if self.settings.elastic == "drawn":
-            sample, mass = drawn(weight, ray, chosen, rays)
+            sample, mass = drawn(weight, ray, subset, rays)
         else:
-            sample = torch.isin(ray, chosen).nonzero()[:, 0]
+            sample = torch.isin(ray, subset).nonzero()[:, 0]
             mass = weight[sample]
         if self.rest_is_canonical:
             moving = (time[sample] > 0).nonzero()[:, 0]

@@ -1,4 +1,4 @@
-"""What Neural Volumes needs of a scene, and the images that its encoder reads."""
+"""Requirements of Neural Volumes on a scene, and the images that its encoder reads."""
 
 from __future__ import annotations
 
@@ -61,8 +61,8 @@ def encoder_images(scene: Scene, settings: NeuralVolumesSettings) -> Tensor:
     images = torch.full((len(scene.clock), wanted, 3, height, width), behind, dtype=torch.uint8)
     for k in range(wanted):
         camera = cameras[k * (len(cameras) - 1) // max(wanted - 1, 1)]
-        for place in (views.view == camera).nonzero()[:, 0].tolist():
-            color = truth_image(views, place, scene.background).permute(2, 0, 1)
+        for index in (views.view == camera).nonzero()[:, 0].tolist():
+            color = truth_image(views, index, scene.background).permute(2, 0, 1)
             scale = min(1.0, height / color.shape[1], width / color.shape[2])
             rows = round(color.shape[1] * scale)
             columns = round(color.shape[2] * scale)
@@ -72,7 +72,7 @@ def encoder_images(scene: Scene, settings: NeuralVolumesSettings) -> Tensor:
                 color = nn.functional.interpolate(
                     color[None], (rows, columns), mode="bilinear", antialias=True
                 )[0]
-            target = images[int(views.frames[place]), k, :, top : top + rows, left : left + columns]
+            target = images[int(views.frames[index]), k, :, top : top + rows, left : left + columns]
             target.copy_((255 * color).round().clamp(0, 255))
     first = int(views.frames.min())
     images[:first] = images[first]

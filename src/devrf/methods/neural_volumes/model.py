@@ -137,7 +137,7 @@ class NeuralVolumes(PlacedModel):
         *,
         jitter: bool = False,
     ) -> RenderOutput:
-        """What R rays see: C = Σ w_i c_i + (1 − A) · background.
+        """The render of R rays: C = Σ w_i c_i + (1 − A) · background.
 
         Args:
             rays: R rays in world space.

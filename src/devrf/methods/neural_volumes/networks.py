@@ -1,4 +1,4 @@
-"""What Neural Volumes learns: an encoder of images, decoders of volumes, and warps."""
+"""Networks of Neural Volumes: an encoder of images, decoders of volumes, and warps."""
 
 from __future__ import annotations
 
@@ -178,8 +178,8 @@ class AffineMixWarp(nn.Module):
         shift = 0.1 * self.shift(code).view(count, self.maps, 3, 1)
         moved = scale * (rotation @ (self.grid.flatten(1) - shift))  # (M, K, 3, side³)
         weight = self.weight(code).exp().view(count * self.maps, 1, side, side, side)
-        place = moved.transpose(2, 3).reshape(count * self.maps, side, side, side, 3)
-        mixing = grid_sample(weight, place, padding_mode="border", align_corners=True)
+        position = moved.transpose(2, 3).reshape(count * self.maps, side, side, side, 3)
+        mixing = grid_sample(weight, position, padding_mode="border", align_corners=True)
         mixing = mixing.view(count, self.maps, 1, -1)
         mixed: Tensor = (mixing * moved).sum(dim=1) / mixing.sum(dim=1).clamp(min=1e-3)
         return mixed.view(count, 3, side, side, side)

@@ -29,7 +29,7 @@ class NeuralVolumesSettings(MethodSettings):
         template_channels: of each level, from 1³ on; the volume has 2^levels voxels along an edge.
         warp: ``affinemix`` (a mixture of affine maps) or ``conv`` (a grid of displacements).
         warp_side: grid points of the warp along an edge (affinemix).
-        maps: how many affine maps are mixed (affinemix).
+        maps: the number of affine maps that are mixed (affinemix).
         identity_start: whether the maps begin next to the identity; else, as published, with
             random scales around 0 (affinemix).
         warp_channels: of each level, from 1³ on; the grid has 2^levels points an edge (conv).

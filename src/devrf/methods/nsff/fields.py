@@ -180,8 +180,8 @@ class TwoFields(nn.Module):
     """Both fields, and how their densities join.
 
     Attributes:
-        static: what is always there.
-        dynamic: what is there at a time.
+        static: the field that is the same at all times.
+        dynamic: the field at a time.
     """
 
     def __init__(self, settings: NSFFSettings) -> None:

@@ -119,14 +119,14 @@ def depth(r: Renders) -> Tensor:
     """Mean squared difference of rendered and known depth, each normalised over the batch."""
     assert r.priors is not None
     truth = r.priors.distance(r.batch)
-    known = truth.isfinite().nonzero()[:, 0]
-    if len(known) < 2:
+    finite = truth.isfinite().nonzero()[:, 0]
+    if len(finite) < 2:
         return r.output.color.new_zeros(())
     samples = r.output.samples
     weight = r.seen[0]
     mass = sum_by_ray(weight, samples.ray, r.rays).clamp(min=1e-3)
     rendered = sum_by_ray(weight * samples.distance, samples.ray, r.rays) / mass
-    difference = normalised(rendered[known]) - normalised(truth[known])
+    difference = normalised(rendered[finite]) - normalised(truth[finite])
     return r.prior_factor * difference.square().mean()
 
 
@@ -145,9 +145,9 @@ def flow(r: Renders) -> Tensor:
     terms = []
     for side in (FORWARD, BACKWARD):
         observed, valid = r.priors.flow(r.batch, side)
-        place = weight[:, None] * out.samples.points + moving[:, None] * out.dynamic.flow[:, side]
+        moved = weight[:, None] * out.samples.points + moving[:, None] * out.dynamic.flow[:, side]
         mass = sum_by_ray(weight, ray, r.rays)
-        mean = sum_by_ray(place, ray, r.rays) / mass.clamp(min=1e-3)[:, None]
+        mean = sum_by_ray(moved, ray, r.rays) / mass.clamp(min=1e-3)[:, None]
         camera = r.priors.neighbour[r.batch.image, side]
         pixel, ahead = r.priors.cameras.project(camera, r.placement.world(mean))
         counts = (valid & (ahead > 0) & (mass > 1e-3))[:, None]
@@ -189,7 +189,7 @@ OF_A_SHARE = ("dynamic", "disocclusion")
 
 
 def missing_terms(priors: ImagePriors, terms: Collection[str], *, additive: bool) -> dict[str, str]:
-    """Which of the ``terms`` have nothing to be computed from, and why.
+    """Those of the ``terms`` whose data are missing, and why.
 
     Args:
         priors: of the images that are learned from.

@@ -85,10 +85,10 @@ class NSFF(NeuralField):
         return {"static": fields.static.parameters(), "dynamic": fields.dynamic.parameters()}
 
     def milestones(self, total: int) -> dict[str, int]:
-        """When priors count less, and when frames two steps away begin to count."""
+        """Iterations at which priors count less, and frames two steps away begin to count."""
         chained = round(self.settings.warmup.chained_from * self._first)
-        known = {"priors counted less": self._first, "frames two steps away counted": chained}
-        return {**super().milestones(total), **{k: n for k, n in known.items() if n < total}}
+        changes = {"priors counted less": self._first, "frames two steps away counted": chained}
+        return {**super().milestones(total), **{k: n for k, n in changes.items() if n < total}}
 
     def on_iteration(self, step: int, total: int) -> None:
         """Remember the iteration: weights change every N₀. Look where the fields are empty."""
@@ -140,7 +140,7 @@ class NSFF(NeuralField):
             near, far = limits(rays, self.box, self.depth_limits)
             distance = stratified(near, far, self.settings.samples, jitter=jitter)
             samples = flattened(rays, distance, far)
-        # Where masks cut the scene out it ends with its box; else the last sample is all behind it.
+        # If masks cut the scene out it ends with its box; else the last sample is all behind it.
         unbounded = not (self.cut_out and self.space.is_linear)
         samples = samples.unbounded() if unbounded else samples
         samples = samples.normalised(self.placement)
@@ -230,7 +230,7 @@ class FlowingView(RayView):
         return sum_by_ray(total, ray, len(rays)) / mass.clamp(min=LEAST_MASS)[:, None], mass
 
     def _moved(self, points: Tensor, viewdirs: Tensor, ray: Tensor, time: float) -> Tensor:
-        """Where dynamic points (S, 3), normalised, are at ``time``: led on from frame to frame.
+        """Dynamic points (S, 3), normalised, moved to ``time`` from frame to frame.
 
         If a step ends between two frames, that part of the flow counts.
         """

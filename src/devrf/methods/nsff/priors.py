@@ -1,4 +1,4 @@
-"""What training images provide beside their colours: flow both ways, depth, and what moves."""
+"""Priors of training images beside their colours: flow both ways, depth, and motion."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ class ImagePriors:
     @property
     def has_flow(self) -> tuple[bool, bool]:
         """Whether some image has forward flow, and whether some has backward flow."""
-        known = [[_known(_flow(view_set, side)) for view_set in self._views] for side in (0, 1)]
-        return any(known[0]), any(known[1])
+        has_flow = [[_known(_flow(view_set, side)) for view_set in self._views] for side in (0, 1)]
+        return any(has_flow[0]), any(has_flow[1])
 
     @property
     def has_depth(self) -> bool:
@@ -78,22 +78,22 @@ class ImagePriors:
             if (flow := _flow(views, side)) is not None:
                 valid[ray] = flow.valid.flatten()[row]
                 vectors[ray] = flow.vectors.flatten(0, 2)[row]
-        # What was observed where it is not valid may be anything, NaN included.
+        # An observation that is not valid may be anything, NaN included.
         return torch.where(valid[:, None], vectors, 0.0), valid
 
     def distance(self, batch: RayBatch) -> Tensor:
-        """How far along a batch's rays, in their own units, surfaces are (R,); inf: unknown."""
+        """Distances (R,) of surfaces along a batch's rays, in their own units; inf: unknown."""
         depth = torch.full_like(batch.time, torch.inf)
         for views, ray, row in self._captures(batch):
             if views.depth is not None:
                 depth[ray] = views.depth.flatten()[row]
-        known = depth.isfinite()
+        finite = depth.isfinite()
         world = self.cameras.rays(batch.image, batch.pixel)
-        points = world.origins + world.directions * torch.where(known, depth, 1.0)[:, None]
+        points = world.origins + world.directions * torch.where(finite, depth, 1.0)[:, None]
         along = batch.rays.directions
         away = self._space.from_world(points) - batch.rays.origins
         distance = (away * along).sum(dim=1) / along.square().sum(dim=1)
-        return torch.where(known, distance, torch.inf)
+        return torch.where(finite, distance, torch.inf)
 
     def _captures(self, batch: RayBatch) -> Iterator[tuple[Views, Tensor, Tensor]]:
         """Each capture's views, the batch's rays in it, and their pixels' numbers among all."""

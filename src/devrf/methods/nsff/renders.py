@@ -76,11 +76,11 @@ class Warp:
 
 @dataclass(frozen=True)
 class Renders:
-    """What an iteration's loss terms compare; further renders are made when first asked for.
+    """The renders of an iteration's loss terms; further ones are made when first asked for.
 
     Attributes:
         fields: the networks.
-        placement: where the networks live.
+        placement: of the networks.
         times: (T,) of the frames.
         priors: of the images that the rays were drawn from; None where nothing is known.
         output: the batch as it was rendered.
@@ -89,7 +89,7 @@ class Renders:
         both: render from both neighbouring frames; else from one at random.
         weighted: weigh rays by how much of them is dynamic: the first N₀ iterations are over.
         chains: whether flows are chained by now.
-        prior_factor: what the weights of depth and flow priors have decayed to.
+        prior_factor: the decayed factor of the weights of depth and flow priors.
     """
 
     fields: TwoFields

@@ -1,4 +1,4 @@
-"""What can be chosen of NSFF, and when its losses change."""
+"""Settings of NSFF, and the iterations at which its losses change."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class NSFFSettings(PlacedSettings):
         density_noise: deviation of the noise that densities have while they are learned.
         flow_reach: the most that a point moves from a frame to the next along an axis, in halves of
             the box's longest edge; None: 1 in NDC, 0.2 elsewhere.
-        blend: how static and dynamic densities join: ``v`` (a learned share) or ``additive``.
+        blend: of static and dynamic densities: ``v`` (a learned share) or ``additive``.
         sampling: ``stratified`` (one sample in each of equal stretches of a ray) or ``occupancy``
             (even steps where something may be).
         samples: number of a ray's samples (stratified).
@@ -65,7 +65,7 @@ class NSFFSettings(PlacedSettings):
             or from ``one`` at random.
         hard_rays: rays within the motion masks that a batch has beside the others in the first N₀
             iterations.
-        warmup: when the losses change.
+        warmup: the iterations at which the losses change.
     """
 
     density_noise: NotNegative = 1.0

@@ -94,8 +94,8 @@ class TiNeuVox(DensityColorField):
             self.grid.resize(shape)
 
     def _shape_after(self, count: int) -> Shape:
-        left = len(self.settings.upsample_at) - count
-        side = self.settings.side * self.space.side_factor / 2 ** (left / 3)
+        remaining = len(self.settings.upsample_at) - count
+        side = self.settings.side * self.space.side_factor / 2 ** (remaining / 3)
         return self.grid.fitting(self.grid_box, side)
 
     @property

@@ -73,9 +73,9 @@ class RadianceNetwork(nn.Module):
         self.color = ColorBranch(s.width, s.direction_bands)
 
     def hidden(self, features: Tensor, position: Tensor, code: Tensor, ray: Tensor) -> Tensor:
-        """What density and colour come from, (S, width), of S samples of the rays ``ray`` (S,).
+        """Hidden features (S, width), of density and colour, at S samples of rays ``ray`` (S,).
 
-        Looked up ``features`` (S, ·) and encoded ``position`` (S, ·) are the samples', ``code``
+        Interpolated ``features`` (S, ·) and encoded ``position`` (S, ·) are the samples', ``code``
         (R, ·) the rays'.
         """
         parts = [self.encode_feature(features), position]

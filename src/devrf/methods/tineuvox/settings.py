@@ -35,7 +35,7 @@ class TiNeuVoxSettings(OccupancySettings):
         grid_rate: factor of the learning rate of the grid.
         motion_rate: the same of the network of displacements.
         starts_still: displacements begin at 0, and so does what the time changes in density and
-            colour: what is learned first is at rest.
+            colour: the first state that is learned is at rest.
         tv: weight of the grid's total variation over the rays of a batch.
     """
 

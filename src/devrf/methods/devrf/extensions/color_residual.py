@@ -1,4 +1,4 @@
-"""How colours change over time: a residual in canonical space (docs/method.md#appearance)."""
+"""Colours that change over time: a residual in canonical space (docs/method.md#appearance)."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class ResidualField(ColorField, StoredShape):
 
     Attributes:
         values: (T, X, Y, Z, 3) logits.
-        box: where the field lives, in canonical space.
+        box: of the field, in canonical space.
         clock: the times of the T frames.
     """
 
@@ -111,8 +111,8 @@ class ColorResidual(Extension):
         self._start_if_static = start_level_static_color
         self._scale_if_drift = loss_scale_if_color_drift or {}
         for name, factor in self._scale_if_drift.items():
-            place = f"{key}.loss_scale_if_color_drift.{name}"
-            expect(factor >= 0, place, "at least 0", factor)
+            term_key = f"{key}.loss_scale_if_color_drift.{name}"
+            expect(factor >= 0, term_key, "at least 0", factor)
         self._residual = residual
         self._tv = tv
         # Once set up: the first level that learns it, from 0; factors of weights from it on.
@@ -183,7 +183,7 @@ class ColorResidual(Extension):
                 context.optimizer.replace(number, residuals, smoothing=weight)
 
     def weight_factor(self, term: str, level: int, share: float) -> float:
-        """Where a texture may slide over the surface, some terms tell less."""
+        """Lower some terms where a texture may slide over the surface."""
         return 1.0 if self._first is None or level < self._first else self._scale.get(term, 1.0)
 
     def initialise(self, context: MotionContext, phase: DeformationPhase) -> None:

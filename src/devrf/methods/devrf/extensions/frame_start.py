@@ -51,14 +51,16 @@ class StartFromBest(Extension):
         """Give the frame the displacements of the best candidate."""
         if phase.level >= self._levels:
             return
-        found = candidates(context, phase)
-        if len(found) < 2:
+        starts = candidates(context, phase)
+        if len(starts) < 2:
             return
-        errors = self._errors(context, phase.frame, list(found.values()))
-        best = min(zip(errors, found, strict=True))[1]
-        log.debug("%s frame %d: %s", phase.kind, phase.frame, dict(zip(found, errors, strict=True)))
+        errors = self._errors(context, phase.frame, list(starts.values()))
+        best = min(zip(errors, starts, strict=True))[1]
+        log.debug(
+            "%s frame %d: %s", phase.kind, phase.frame, dict(zip(starts, errors, strict=True))
+        )
         field = context.field
-        field.frames.write(phase.frame, found[best])
+        field.frames.write(phase.frame, starts[best])
         # Each process has looked at pixels of its own.
         broadcast([field.to_canonical[phase.frame], field.to_time[phase.frame]])
 
@@ -90,7 +92,7 @@ class StartFromBest(Extension):
 
 @torch.no_grad()
 def candidates(context: MotionContext, phase: DeformationPhase) -> dict[str, Directions]:
-    """What a visit may start from, by name; the frame's own displacements are the first."""
+    """Displacements that a visit may start from, by name; the frame's own are the first."""
     field = context.field
     like = field.frames.here.new_empty(*field.shape, 3)
 
@@ -99,20 +101,20 @@ def candidates(context: MotionContext, phase: DeformationPhase) -> dict[str, Dir
         field.frames.read(number, pair)
         return pair
 
-    found = {"own": read(phase.frame)}
+    starts = {"own": read(phase.frame)}
     near = phase.frame - phase.step
     far = near - phase.step
     frames = range(len(field.clock))
     if near not in frames:
-        return found
-    one = read(near)
+        return starts
+    previous = read(near)
     if phase.level:
-        found["as before"] = one
+        starts["as before"] = previous
     if far in frames:
-        velocity = one[1] - read(far)[1]
-        found["carried along"] = carried(one, velocity, field.box)
-        found["carried along, smoothed"] = carried(one, smoothed(velocity), field.box)
-    return found
+        velocity = previous[1] - read(far)[1]
+        starts["carried along"] = carried(previous, velocity, field.box)
+        starts["carried along, smoothed"] = carried(previous, smoothed(velocity), field.box)
+    return starts
 
 
 def carried(start: Directions, way: Tensor, box: Box) -> Directions:
@@ -124,7 +126,7 @@ def carried(start: Directions, way: Tensor, box: Box) -> Directions:
     Args:
         start: (X, Y, Z, 3) Δ_b and Δ_f.
         way: (X, Y, Z, 3) v, how far each canonical point goes.
-        box: where the grids live.
+        box: of the grids.
     """
     backward, forward = start
     shape = backward.shape

@@ -30,7 +30,7 @@ def elastic_energy(displacement: Tensor, box: Box, occupied: Tensor) -> Tensor:
 
     Args:
         displacement: (X, Y, Z, 3) Δ in the box's units.
-        box: where the grid lives.
+        box: of the grid.
         occupied: (X−1, Y−1, Z−1) 1 for cells that count, else 0.
     """
     columns = []
@@ -62,7 +62,7 @@ def bending_energy(displacement: Tensor, box: Box, occupied: Tensor) -> Tensor:
 
     Args:
         displacement: (X, Y, Z, 3) Δ in the box's units.
-        box: where the grid lives.
+        box: of the grid.
         occupied: (X−1, Y−1, Z−1) 1 for cells that count, else 0.
     """
     if min(displacement.shape[:3]) < 3:

@@ -27,7 +27,7 @@ from devrf.ops.compositing import sum_by_ray
 from devrf.rendering.occupancy import Occupancy
 from devrf.scenes.scene import Views
 
-# By how much a channel of a pixel may differ from what the model shows where it was, to be it.
+# A channel of a pixel differs by at most this from the model's render of the same point.
 LIKENESS = 0.15
 # Frames that a pixel is followed back at most; drift adds up, and memory holds so many occupancies.
 FARTHEST = 16
@@ -47,7 +47,7 @@ class StartAlongFlow(Extension):
     """
 
     def __init__(self, init_from: Literal["previous", "flow", "tracks"] = "tracks") -> None:
-        """Say how far pixels are followed.
+        """Choose how far pixels are followed.
 
         Args:
             init_from: ``flow`` one frame back; ``tracks`` back to a frame in which the model shows
@@ -57,19 +57,19 @@ class StartAlongFlow(Extension):
         self._tracks: FlowTracks | None = None
 
     def begin_level(self, context: MotionContext, level: int) -> None:
-        """Forget what the level before has seen."""
+        """Forget the tracks of the level before."""
         self._tracks = None
 
     def changes(self, context: MotionContext, phase: DeformationPhase) -> bool:
         """Whether a phase starts along the flow: at the coarsest level, where there is one."""
         recorded = context.views
-        # What a moving camera sees moves with it.
-        known = recorded.flow is not None and not recorded.by_moving_camera
-        asked = self._init_from != "previous" and known
+        # A moving camera's image moves with it.
+        has_flow = recorded.flow is not None and not recorded.by_moving_camera
+        asked = self._init_from != "previous" and has_flow
         return asked and phase.level == 0
 
     def initialise(self, context: MotionContext, phase: DeformationPhase) -> None:
-        """Fit the frame's displacements to where its pixels are followed back to."""
+        """Fit the frame's displacements to the points to which its pixels are followed back."""
         if not self.changes(context, phase):
             return
         views = context.views
@@ -154,27 +154,27 @@ class FlowTracks:
         valid = views.flow.valid.flatten()[pool.image.long() * self._area + pool.flat.long()]
         valid_pixels = valid.nonzero()[:, 0]
         order = torch.randperm(len(valid_pixels), device=valid.device, generator=generator)
-        chosen = valid_pixels[order[:most]]
-        image = pool.image[chosen].long()
-        flat = pool.flat[chosen].long()
+        sample = valid_pixels[order[:most]]
+        image = pool.image[sample].long()
+        flat = pool.flat[sample].long()
         batch = gather_batch(views, image, flat, torch.ones(3, device=image.device))
         # Of the pixels that are still followed: their numbers in the batch, and where they are.
         number = torch.arange(len(image), device=image.device)
-        place = batch.pixel
+        position = batch.pixel
         ended: list[Tensor] = []
         points: list[Tensor] = []
         for step in range(1, min(frame, self.farthest) + 1):
-            followed, place = self._back(image, place)
+            followed, position = self._back(image, position)
             number = number[followed]
             image = self.previous[image[followed]]
-            point, color, mass = self._look(frame - step, image, place)
+            point, color, mass = self._look(frame - step, image, position)
             difference = (color - batch.color[number]).abs().amax(dim=1)
             matches = (mass > 0.5) & (difference < self.likeness)
             ended.append(number[matches])
             points.append(point[matches])
             number = number[~matches]
             image = image[~matches]
-            place = place[~matches]
+            position = position[~matches]
             if len(number) == 0:
                 break
         index = torch.cat(ended)
@@ -186,24 +186,24 @@ class FlowTracks:
     def _area(self) -> int:
         return self.views.height * self.views.width
 
-    def _back(self, image: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
-        """Which of N places can be followed one frame back (N,) bool, and where to (M, 2).
+    def _back(self, image: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
+        """Whether each of N positions can be followed one frame back, and M positions there (M, 2).
 
         Args:
-            image: (N,) int64, the image of each place.
-            place: (N, 2) x, y in pixels; the flow is that of the pixel it lies in.
+            image: (N,) int64, the image of each position.
+            position: (N, 2) x, y in pixels; the flow is that of the pixel it lies in.
         """
         flow = self.views.flow
         assert flow is not None
-        column, row = place.floor().long().unbind(dim=1)
+        column, row = position.floor().long().unbind(dim=1)
         going = (column >= 0) & (column < self.views.width)
         going &= (row >= 0) & (row < self.views.height) & (self.previous[image] != image)
         at = torch.where(going, image * self._area + row * self.views.width + column, 0)
         going &= flow.valid.flatten()[at]
-        return going, place[going] + flow.vectors.reshape(-1, 2)[at[going]]
+        return going, position[going] + flow.vectors.reshape(-1, 2)[at[going]]
 
-    def _look(self, frame: int, image: Tensor, place: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """What the model shows at places (N, 2) of images (N,) of a frame.
+    def _look(self, frame: int, image: Tensor, position: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The model's render at positions (N, 2) of images (N,) of a frame.
 
         Returns:
             The mean canonical point (N, 3), the colour (N, 3) on white, and Σ w_i (N,).
@@ -213,7 +213,7 @@ class FlowTracks:
         assert deformation is not None
         time = deformation.clock.times[frame]
         seen = render(
-            model.space.rays(self.views.cameras.rays(image, place)),
+            model.space.rays(self.views.cameras.rays(image, position)),
             model.canonical,
             self._occupancy(frame, time),
             model.settings,
@@ -253,7 +253,7 @@ def start_from_tracks(
     Args:
         field: the deformation field.
         frame: the frame to start, from 1 on.
-        tracks: where canonical points are seen at that frame.
+        tracks: pixels of canonical points at that frame.
         cameras: all cameras.
         space: the space that the field lives in.
         steps: optimiser steps of each fit.
@@ -291,7 +291,7 @@ def start_from_tracks(
 def _projected(
     tracks: Tracks, points: Tensor, cameras: Cameras, space: Space, small: float
 ) -> tuple[Tensor, Tensor]:
-    """By how many pixels (N, 2) ``points`` (N, 3) miss those of N tracks, and its slopes (N, 2, 3).
+    """Errors (N, 2) in pixels of ``points`` (N, 3) against N tracks, and their slopes (N, 2, 3).
 
     Slopes are for a unit of ``space`` along each axis, by differences over ``small``.
     """
@@ -305,7 +305,7 @@ def _projected(
 
 
 def _moved(slopes: Tensor, way: Tensor) -> Tensor:
-    """By how many pixels (N, 2) points go on ``way`` (N, 3)."""
+    """Displacements (N, 2) in pixels of points that move by ``way`` (N, 3)."""
     return (slopes * way[:, None]).sum(dim=-1)
 
 
