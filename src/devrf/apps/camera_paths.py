@@ -1,4 +1,4 @@
-"""Where a video's cameras go: around what was captured, before it, or through the captured ones."""
+"""Camera paths of videos: around the scene, before it, or through the captured cameras."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ SAME_WAY = math.sqrt(0.5)
 # The way through the captured cameras passes at most MAX_STOPS of them, and is sampled at POINTS.
 MAX_STOPS = 300
 POINTS = 1000
-# Images are in a film's order if that is at most so many times longer than a short tour. The unit
-# of length is the distance from the cameras to what they look at.
-OF_A_FILM = 2.0
+# Images are in a video's order if that is at most so many times longer than a short tour. The unit
+# of length is the distance from the cameras to the point that they look at.
+OF_A_VIDEO = 2.0
 # Tours are shortened to this length a second, with which a circle takes 4.4 seconds, but keep at
 # least MIN_STOPS.
 PACE = 2.0
@@ -43,10 +43,10 @@ SMOOTH_SECONDS = 0.3
 SMOOTH_STOPS = 1.5
 SMOOTH_MOST = 1 / 12
 
-# A swing leads so far from where it stops, as a share of the time that one camera filmed.
+# A swing leads so far from its stop, as a share of the duration that one camera filmed.
 SWING_SHARE = 0.06
 
-# The cameras of a video, from captured ones, what they look at (3,), and settings.
+# The cameras of a video, from captured ones, the point (3,) that they look at, and settings.
 CapturedPath = Callable[[Cameras, Tensor, VideoSettings], Cameras]
 # The cameras of a video of some settings, around a scene or before it.
 Ring = Callable[[VideoSettings], Cameras]
@@ -94,7 +94,7 @@ def sector(angles: Tensor) -> tuple[float, float]:
 def upward(cameras: Cameras) -> Tensor:
     """The direction (3,) that is up where N cameras were.
 
-    It is perpendicular to the horizontals of their images. The mean of the cameras' own up is not,
+    It is perpendicular to the horizontals of their images. The mean of the cameras' own up is not
     if they look down from one side; that mean counts as far as the horizontals are parallel.
     """
     right = cameras.camera_to_world[:, :, 0]
@@ -122,7 +122,7 @@ def spiral(cameras: Cameras, target: Tensor, settings: VideoSettings) -> Cameras
 def captured(cameras: Cameras, target: Tensor, settings: VideoSettings) -> Cameras:
     """Cameras on a smooth way through the captured ones, at an even pace, looking as they did.
 
-    They pass frames of a film in their order, and photographs on a short tour, which leaves some
+    They pass frames of a video in their order, and photographs on a short tour, which leaves some
     out if the video is too short for all. The distance to ``target`` (3,) is the unit of length.
     """
     cameras = cameras[evenly(len(cameras), MAX_STOPS)]
@@ -144,24 +144,24 @@ def captured(cameras: Cameras, target: Tensor, settings: VideoSettings) -> Camer
 
 
 def in_order(apart: np.ndarray, longest: float) -> list[int]:
-    """The order in which to pass N places, by the distances (N, N) between them.
+    """The order in which to pass N poses, by the distances (N, N) between them.
 
-    It is the order that they have, if that is a film's; else a tour, which leaves places out if it
-    would be longer than ``longest``.
+    It is their own order, if that is a video's; else a tour, which leaves poses out if it would be
+    longer than ``longest``.
     """
     order = tour(apart)
-    if np.diag(apart, 1).sum() <= OF_A_FILM * _length(apart, order):
+    if np.diag(apart, 1).sum() <= OF_A_VIDEO * _length(apart, order):
         return list(range(len(apart)))
     while _length(apart, order) > longest and len(order) > MIN_STOPS:
-        fewer = [place for k, place in enumerate(order) if k % 3 != 1]
+        fewer = [pose for k, pose in enumerate(order) if k % 3 != 1]
         order = [fewer[k] for k in tour(apart[np.ix_(fewer, fewer)])]
     return order
 
 
 def tour(apart: np.ndarray) -> list[int]:
-    """A short way through N places that are (N, N) apart: to the nearest next, then 2-opt.
+    """A short tour of N poses that are (N, N) apart: to the nearest next, then 2-opt.
 
-    A place that has no distance to any other closes the way to a ring; the way is opened there.
+    A pose that has no distance to any other closes the tour to a ring, which is opened there.
     """
     order = [int(apart.sum(axis=1).argmax())]
     while len(order) < len(apart):
@@ -173,7 +173,7 @@ def tour(apart: np.ndarray) -> list[int]:
     while True:
         after = np.roll(ring, -1)
         legs = closed[ring, after]
-        # What two legs are replaced by two others saves, which reverses the way between them.
+        # The length saved by replacing two legs by two others, which reverses the way between them.
         saved = legs[:, None] + legs - closed[np.ix_(ring, ring)] - closed[np.ix_(after, after)]
         np.fill_diagonal(saved, 0.0)
         first, last = sorted(np.unravel_index(saved.argmax(), saved.shape))
@@ -190,7 +190,7 @@ def _length(apart: np.ndarray, order: list[int]) -> float:
 
 
 def _resampled(values: Tensor, places: Tensor, at: Tensor) -> Tensor:
-    """``values`` (N, C) at N ``places`` (N, D), as (M, C) at shares ``at`` (M,) of the way."""
+    """``values`` (N, C) at N ``places`` (N, D), as (M, C) at shares ``at`` (M,) of the path."""
     steps = (places[1:] - places[:-1]).norm(dim=1).clamp(min=1e-12)
     along = torch.cat([steps.new_zeros(1), steps.cumsum(dim=0)])
     columns = [np.interp(at * along[-1], along, column) for column in values.T]
@@ -220,12 +220,12 @@ def _with_one_lens(cameras: Cameras, poses: Tensor) -> Cameras:
     return Cameras(poses, focal, center, cameras.width, cameras.height)
 
 
-# By the names that video.path has for them.
+# By their names in video.path.
 CAMERA_PATHS: dict[str, CapturedPath] = {"orbit": orbit, "spiral": spiral, "captured": captured}
 
 
 def default_path(space: Space, closed: bool = False) -> str:
-    """The way that suits a scene; ``closed``: one that comes back to where it began.
+    """The path that suits a scene; ``closed``: one that comes back to its start.
 
     In an unbounded scene it stays near the captured cameras: nothing else is known.
     """
@@ -235,7 +235,7 @@ def default_path(space: Space, closed: bool = False) -> str:
 
 
 def looked_at(model: Renderable, cameras: Cameras, ahead: Callable[[], float]) -> Tensor:
-    """What captured cameras look at (3,), world units: the middle of the scene.
+    """The point (3,) that captured cameras look at, world units: the middle of the scene.
 
     In a forward-facing scene it is the point ``ahead`` of the middle of the cameras, so far away.
     """
@@ -246,7 +246,7 @@ def looked_at(model: Renderable, cameras: Cameras, ahead: Callable[[], float]) -
 
 
 def focus_distance(renderer: Renderer, cameras: Cameras) -> float:
-    """Median depth along the optical axis, world units, of what the first camera sees at rest."""
+    """Median depth along the optical axis, world units, of the first camera's view at rest."""
     camera = cameras.single(0).to(renderer.device)
     rays = camera.image_rays(0)
     image = renderer.picture(rays, 0.0, 1.0)
@@ -276,22 +276,22 @@ def time_freeze(ring: Ring, stop: float, settings: VideoSettings) -> Shots:
 
 
 def _thirds(stop: float, frames: int) -> tuple[Tensor, int, Tensor]:
-    """Times up to ``stop``, for how many frames time stands still there, and times from there."""
+    """Times up to ``stop``, the number of frames for which time stops, and times from there."""
     third = frames // 3
     before = torch.linspace(0, stop, third + 1)[:-1]
     return before, frames - 2 * third, torch.linspace(stop, 1, third)
 
 
 def swing(cameras: Cameras, seen_at: Sequence[float], settings: VideoSettings) -> Shots:
-    """As time runs, cameras are where one moving camera was, on a smooth way.
+    """Cameras follow one moving camera as time runs, on a smooth path.
 
-    At ``video.time`` it stands still for a third of the frames, and the camera goes to and fro on
-    that way: nowhere else has the scene been seen.
+    Time stands still at ``video.time`` for a third of the frames, and the camera goes to and fro on
+    that path: nobody has seen the scene from elsewhere.
 
     Args:
-        cameras: where it was.
-        seen_at: when, in any order.
-        settings: frames a second, their number, and when time stands still.
+        cameras: its poses.
+        seen_at: their times, in any order.
+        settings: frames a second, their number, and the time that stands still.
     """
     stop = settings.time
     before, around, after = _thirds(stop, settings.frames)
@@ -307,7 +307,7 @@ def swing(cameras: Cameras, seen_at: Sequence[float], settings: VideoSettings) -
 
 # Beside them, videos in which the camera moves while time stands still.
 PRESETS = {"bullet_time": bullet_time, "time_freeze": time_freeze}
-# Of what one moving camera filmed, where it was: :func:`swing`.
+# The path of a monocular video's camera: :func:`swing`.
 SWING = "swing"
-# What video.path may be beside a file.
+# Values of video.path beside a file.
 NAMES = (*CAMERA_PATHS, *PRESETS, SWING)

@@ -35,7 +35,7 @@ ROWS = 96
 
 
 def distance_ahead(cameras: Cameras) -> float:
-    """How far before N cameras the point is that lies nearest to all their optical axes.
+    """The distance from N cameras to the point that lies nearest to all their optical axes.
 
     Axes that meet nowhere give the cameras' extent.
     """
@@ -48,9 +48,9 @@ def distance_ahead(cameras: Cameras) -> float:
 
 
 def frustum_depth(cameras: Cameras) -> float:
-    """How deep the frusta of N cameras are drawn, in world units."""
-    shown = cameras.positions[evenly(len(cameras), MAX_FRUSTA)]
-    apart = torch.cdist(shown, shown).fill_diagonal_(math.inf).amin(dim=1).median()
+    """The depth of the drawn frusta of N cameras, in world units."""
+    positions = cameras.positions[evenly(len(cameras), MAX_FRUSTA)]
+    apart = torch.cdist(positions, positions).fill_diagonal_(math.inf).amin(dim=1).median()
     away = distance_ahead(cameras)
     return float(apart.clamp(MIN_DEPTH * away, MAX_DEPTH * away))
 
@@ -115,8 +115,8 @@ def write_thumbnails(folder: Path, scene: Scene, viewpoints: Viewpoints) -> None
 def _shown(viewpoints: Viewpoints) -> Iterator[tuple[str, int, Sequence[float]]]:
     """The cameras of a page: ``dynamic`` or ``static``, their numbers there, and their times."""
     times = viewpoints.clock.times
-    known = [times[frame] for frame in evenly(len(times), MAX_TIMES)]
+    some_times = [times[frame] for frame in evenly(len(times), MAX_TIMES)]
     for k in evenly(len(viewpoints.dynamic), MAX_FRUSTA):
-        yield "dynamic", k, viewpoints.followed[k : k + 1] or known
+        yield "dynamic", k, viewpoints.followed[k : k + 1] or some_times
     for k in evenly(len(viewpoints.static), MAX_FRUSTA):
         yield "static", k, [0.0]

@@ -79,14 +79,14 @@ class Collection(BaseModel):
     """Scenes that were published together.
 
     Attributes:
-        page: where their authors describe them.
+        page: their authors' description.
         licence: in a few words.
         data: the layout that reads them: ``data=…``.
         learn: overrides with which to learn such a scene.
         url: of an archive, or of a file with ``{file}``; ``{scene}`` is the scene's name.
-        files: what to fetch where ``url`` names a file.
+        files: those to fetch, if ``url`` names a file.
         folder: name of the scene's folder in the archive, where it holds several scenes.
-        scenes: what each shows, by name.
+        scenes: the content of each, by name.
         sha256: checksums of the archives, by scene; for several files, of their list.
     """
 
@@ -112,9 +112,9 @@ class PublishedScene:
     """One scene of a collection.
 
     Attributes:
-        name: what ``scene=…`` calls it.
-        about: what it shows.
-        collection: what holds for all of its collection.
+        name: its name in ``scene=…``.
+        about: its content.
+        collection: the properties of its collection.
     """
 
     name: str
@@ -163,7 +163,7 @@ def published_scene(name: str, file: str | Path | None = None) -> PublishedScene
 
 
 class Record(TypedDict):
-    """What is kept beside a scene: of its archive the SHA-256, of several files that of their list.
+    """The record beside a scene: the SHA-256 of its archive, or of the list of several files.
 
     ``compared``: whether it was compared with a checksum that was known before.
     """
@@ -318,14 +318,14 @@ def _unpacked(scene: PublishedScene, work: Path) -> Path:
     archive = work / "files" / ARCHIVE
     size = archive.stat().st_size
     most = min(max(MOST_EXPANSION * size, SMALL), LARGEST)
-    place = work / "unpacked"
-    shutil.rmtree(place, ignore_errors=True)
+    unpacked = work / "unpacked"
+    shutil.rmtree(unpacked, ignore_errors=True)
     try:
         with zipfile.ZipFile(archive) as packed:
             # A file takes 4 kB of a disk at least. No more of it is unpacked than is said here.
             unpacked_size = sum(max(file.file_size, 2**12) for file in packed.infolist())
             if unpacked_size <= most:
-                packed.extractall(place)  # names that lead elsewhere are written below it, too
+                packed.extractall(unpacked)  # names that lead elsewhere are written below it, too
     except Exception as error:  # of any kind, where an archive is damaged
         if getattr(error, "errno", None) is not None:  # the disk's
             raise
@@ -345,7 +345,7 @@ def _unpacked(scene: PublishedScene, work: Path) -> Path:
     marker = MARKERS[scene.collection.data]
     folders = [
         path.parent
-        for path in sorted(place.rglob(marker))
+        for path in sorted(unpacked.rglob(marker))
         if "__MACOSX" not in path.parts and folder in (None, path.parent.name)
     ]
     if not folders:

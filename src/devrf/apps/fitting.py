@@ -30,7 +30,7 @@ Bytes = Mapping[str, float]
 
 
 def free_bytes(device: torch.device, folder: Path, *, resume: bool) -> Bytes:
-    """What a run in ``folder`` can have; with ``resume`` it replaces the checkpoints there."""
+    """Bytes available to a run in ``folder``; with ``resume`` it replaces the checkpoints there."""
     disk: float = free_disk(folder)
     if resume:
         disk += sum(file.stat().st_size for file in folder.glob("checkpoints/*.ckpt"))
@@ -46,7 +46,7 @@ def needed_bytes(
     *,
     on_gpu: bool,
 ) -> Bytes:
-    """What stages need with ``batch_share`` of each batch; without a GPU in each process."""
+    """Needs of stages with ``batch_share`` of each batch; without a GPU in each process."""
     host = host_bytes(scene, stages, on_host=not on_gpu, batch_share=batch_share)
     return {
         "GPU memory": max(stage.peak(batch_share) for stage in stages),
@@ -61,7 +61,7 @@ def lacking(needed: Bytes, free: Bytes) -> list[str]:
 
 
 def in_words(needed: Bytes, free: Bytes) -> str:
-    """How much is needed of how much is free, of each resource."""
+    """Needed and free bytes of each resource, in words."""
     return ", ".join(f"{gib(needed[name])} of {gib(free[name])} GiB of {name}" for name in free)
 
 
@@ -87,7 +87,7 @@ def least_change(
             values = range(value + 1, MOST_OF_SIZE * value + 1)
         elif isinstance(value, int | float):
             values = range(math.ceil(value) - 1, math.ceil(value) // MOST, -1)
-        place = bisect_left(values, True, key=partial(fits, key))
-        if place < len(values):
-            return key, values[place]
+        index = bisect_left(values, True, key=partial(fits, key))
+        if index < len(values):
+            return key, values[index]
     return None

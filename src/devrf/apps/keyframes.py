@@ -38,7 +38,7 @@ class Keyframe:
         camera_to_world: (3, 4) rigid, OpenGL axes, world units.
         fov: the vertical angle of view in degrees.
         time: the scene's time in [0, 1].
-        seconds: when the video is there, from its beginning.
+        seconds: from the beginning of the video.
     """
 
     camera_to_world: Tensor
@@ -87,8 +87,8 @@ class CameraPath:
         rows = [[frame.seconds, frame.fov, frame.time] for frame in self.keyframes]
         knots, fovs, times = torch.tensor(rows, dtype=torch.float64).T.contiguous()
         seconds = seconds.double().clamp(knots[0], knots[-1])
-        known = torch.cat([poses[:, :, 3], fovs[:, None], _quaternions(poses[:, :, :3])], dim=1)
-        values = hermite(knots, known, seconds)
+        controls = torch.cat([poses[:, :, 3], fovs[:, None], _quaternions(poses[:, :, :3])], dim=1)
+        values = hermite(knots, controls, seconds)
         position = values[:, :3]
         fov = values[:, 3:4]
         wxyz = values[:, 4:]
@@ -254,13 +254,13 @@ def write_path(file: Path, path: CameraPath, height: int, offset: Offset = NO_OF
 
 
 def _path(content: _PathFile, where: object, offset: Offset) -> CameraPath:
-    place, cameras = "keyframes[{}].matrix", list[_PathCamera](content.keyframes)
+    entry, cameras = "keyframes[{}].matrix", list[_PathCamera](content.keyframes)
     if not cameras:
-        place, cameras = "camera_path[{}].camera_to_world", content.camera_path
+        entry, cameras = "camera_path[{}].camera_to_world", content.camera_path
     last = max(len(cameras) - 1, 1)
     numbers = torch.tensor([camera.matrix for camera in cameras], dtype=torch.float64)
     poses = numbers.view(-1, 4, 4)[:, :3]
-    check_poses(poses, lambda k: f"{where}: {place.format(k)}")
+    check_poses(poses, lambda k: f"{where}: {entry.format(k)}")
     keyframes = [
         Keyframe(
             pose,

@@ -17,7 +17,7 @@ PROGRAM, FRAGMENTATION = 600_000_000, 1.3
 
 
 def smaller(scene: Scene, by: float) -> Scene:
-    """What a scene of images smaller by ``by`` needs: corners of the images stand for them."""
+    """A stand-in for a scene of images smaller by ``by``: its images are corners of theirs."""
 
     def corner(of_views: Any) -> Any:
         if not isinstance(of_views, Tensor) or of_views.ndim < 3:
@@ -47,7 +47,7 @@ def host_bytes(
 
 
 def needs_table(scene: Scene, stages: Mapping[str, StageNeeds]) -> list[tuple[str, float]]:
-    """What ``stages`` need, for people: names and bytes."""
+    """Needs of ``stages``, for people: names and bytes."""
     return [
         *((f"GPU, {name} stage", stage.peak()) for name, stage in stages.items()),
         ("host, beside a GPU", host_bytes(scene, stages.values(), on_host=False)),

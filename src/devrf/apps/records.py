@@ -28,7 +28,7 @@ from devrf.system.printed import csv_cell
 
 # Held-out images of the dynamic capture at times that a training view has, and at others.
 OF_TIMES = ("training_times", "novel_times")
-# How iterations were carried out.
+# Figures of the way in which iterations were carried out.
 EXECUTION = ("peak_reserved_gb",)
 
 
@@ -40,8 +40,8 @@ def mean_scores(views: Sequence[HeldOutView]) -> dict[str, float | None]:
     means: dict[str, float | None] = {}
     for name in views[0].scores:
         values = [view.scores[name] for view in views]
-        known = [value for value in values if value is not None and not math.isnan(value)]
-        means[name] = round(fmean(known), 5) if known else None
+        finite = [value for value in values if value is not None and not math.isnan(value)]
+        means[name] = round(fmean(finite), 5) if finite else None
     del means["rest_pose_psnr"]
     return means
 
@@ -53,9 +53,9 @@ def dynamic_scores(views: Sequence[HeldOutView], clock: FrameClock) -> dict[str,
     means over these and how many ``images`` they are, ``training_times`` the same over the others.
     """
     novel = [view for view in views if not clock.knows(view.time)]
-    known = [view for view in views if clock.knows(view.time)]
+    seen_times = [view for view in views if clock.knows(view.time)]
     scores: dict[str, Any] = _with_rest_pose(views)
-    for name, group in zip(OF_TIMES, (known, novel), strict=True):
+    for name, group in zip(OF_TIMES, (seen_times, novel), strict=True):
         if novel and group:
             scores[name] = {**_with_rest_pose(group), "images": len(group)}
     return scores
@@ -143,7 +143,7 @@ def frame_rows(
 
 
 def data_record(scene: Scene) -> dict[str, Any]:
-    """How much data a scene has: kind, frames, views; of held-out images size, number, exposure.
+    """The data of a scene: kind, frames, views; size, number and exposure of held-out images.
 
     The size is the commonest.
     """
@@ -164,7 +164,7 @@ def data_record(scene: Scene) -> dict[str, Any]:
 
 
 def learning_record(metadata: CheckpointMetadata, stages: Sequence[str]) -> dict[str, Any]:
-    """How the ``stages`` were learned: settings, seconds, and the memory that torch held.
+    """The record of the ``stages``: settings, seconds, and the memory that torch held.
 
     ``settings`` are those that decided what was learned, by config key, in all stages;
     ``frame_psnr`` the training PSNR of frames 1, 2, … in dB, where frames were learned singly.
@@ -188,11 +188,11 @@ def learning_record(metadata: CheckpointMetadata, stages: Sequence[str]) -> dict
 
 
 def provenance(size: int, device: torch.device) -> dict[str, Any]:
-    """How numbers were produced, as plain data: versions, device, memory in GiB, UTC date.
+    """The origin of numbers, as plain data: versions, device, memory in GiB, UTC date.
 
     Args:
         size: number of learned values.
-        device: where they were learned.
+        device: the device that they were learned on.
     """
     return {
         "devrf": devrf.__version__,

@@ -1,4 +1,4 @@
-"""What a rehearsal of a run came to: tables, and why it says no where it does."""
+"""Results of a run's rehearsal: tables, and the reasons for a refusal."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ ALL: tuple[CaptureName, ...] = ("static", "dynamic")
 
 @dataclass(frozen=True)
 class Learned:
-    """How well some images that were learned from are rendered; PSNR in dB, means over them.
+    """Scores of some training images: PSNR in dB, means over them.
 
     Attributes:
         psnr: of the renderings.
@@ -55,7 +55,7 @@ class RehearsedStage:
         capture: the part of the scene that it learned from.
         iterations: that were carried out.
         whole: iterations of the stage in the run itself.
-        events: what took place, and how often.
+        events: counts of events, by name.
         planned: the same as its schedule says.
     """
 
@@ -70,8 +70,8 @@ def for_rehearsal(scene: Scene) -> Scene:
     """The scene with small images, and few of them held out."""
 
     def few_held_out(capture: Capture) -> Capture:
-        shown = torch.tensor(evenly(len(capture.test), LOOKED_AT))
-        return replace(capture, test=capture.test[shown])
+        subset = torch.tensor(evenly(len(capture.test), LOOKED_AT))
+        return replace(capture, test=capture.test[subset])
 
     small = reduced(scene, LONGEST)
     if scene.static.test is scene.dynamic.test:  # of a film
@@ -81,7 +81,7 @@ def for_rehearsal(scene: Scene) -> Scene:
 
 
 def learned(model: Renderable, scene: Scene, capture: CaptureName) -> Learned:
-    """How well some of a capture's training images are rendered."""
+    """Scores of some of a capture's training images."""
     train = scene.capture(capture).train
     views = train[torch.tensor(evenly(len(train), LOOKED_AT))]
     renderer = Renderer(model)
@@ -107,8 +107,8 @@ def shortfalls(
     """Why the run itself should not be begun: what a stage did not learn, what did not take place.
 
     Args:
-        stages: what was rehearsed, by name.
-        reached: what was learned of each capture.
+        stages: the rehearsed stages, by name.
+        reached: the scores of each capture.
     """
     reasons: list[str] = []
     for name, stage in stages.items():
@@ -140,7 +140,7 @@ def rehearsal_tables(
     held_out: Mapping[CaptureName, float],
     needs: Sequence[tuple[str, str]],
 ) -> RenderableType:
-    """What was reached, what took place, and what the run itself ``needs``, for people.
+    """Scores, events, and the ``needs`` of the run itself, for people.
 
     ``held_out`` is the PSNR of each capture's held-out images.
     """
@@ -171,7 +171,7 @@ def record(
     reached: Mapping[CaptureName, Learned],
     reasons: Sequence[str],
 ) -> dict[str, Any]:
-    """What ``rehearsal.json`` has beside scores and provenance."""
+    """Entries of ``rehearsal.json`` beside scores and provenance."""
     return {
         "stages": {name: asdict(stage) for name, stage in stages.items()},
         "learned": {capture: asdict(of) for capture, of in reached.items()},

@@ -103,8 +103,8 @@ def videos(
     if held_out is not None:
         images = held_out_images(held_out, settings.frames)
         background = viewpoints.background
-        shown = held_out_pictures(renderer, held_out, images, settings, background)
-        yield video("held_out", shown)
+        pictures = held_out_pictures(renderer, held_out, images, settings, background)
+        yield video("held_out", pictures)
     name = settings.path or default_path(space)
     if name == SWING or (viewpoints.followed and not settings.path and name != "orbit"):
         followed = settings.sized(viewpoints.dynamic)

@@ -98,7 +98,7 @@ class ReportSettings:
 
     @property
     def folder(self) -> Path:
-        """Where the report is written."""
+        """The folder of the report."""
         return Path(self.runs) / "report" if self.into is None else Path(self.into)
 
 
@@ -127,7 +127,7 @@ class ViewerSettings:
 
     @property
     def address(self) -> str:
-        """What to open in a browser."""
+        """The address for a browser."""
         return f"http://{self.host}:{self.port}"
 
     def check_free(self) -> None:

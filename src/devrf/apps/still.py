@@ -43,7 +43,7 @@ class StillSettings(Options):
     half: bool = True
 
     def name(self, moves: bool) -> str:
-        """What the image's file is called, without its suffix: ``still_held_out_t0.5_h800``.
+        """The name of the image's file, without its suffix: ``still_held_out_t0.5_h800``.
 
         It has no time if the scene never ``moves``.
         """

@@ -1,4 +1,4 @@
-"""How long learning will take on this machine, told from a few seconds of it."""
+"""An estimate of the time that learning takes on this machine, from a few seconds of it."""
 
 from __future__ import annotations
 

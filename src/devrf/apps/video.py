@@ -118,8 +118,8 @@ def held_out_pictures(
             at = f" at {float(views.times[image]):.2f}"
             at_time = f" at time {time:.2f}"
         headings = [f"truth{at} {size}", f"rendered{at_time}", DEPTH]
-        shown = [centred(tile, cameras.height, cameras.width) for tile in (truth, color, depth)]
-        picture = image_grid([shown], headings)
+        tiles = [centred(tile, cameras.height, cameras.width) for tile in (truth, color, depth)]
+        picture = image_grid([tiles], headings)
         yield from (picture for _ in frames)
 
 

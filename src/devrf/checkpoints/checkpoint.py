@@ -320,9 +320,9 @@ def metadata_of(path: Path) -> CheckpointMetadata:
     return metadata_in(path, read_description(path))
 
 
-def learned_with(run: Path, chosen: str | Path | None = None) -> dict[str, Any]:
-    """The settings of the ``chosen`` checkpoint, else of a run's latest one; none without one."""
-    path = Path(chosen or latest_checkpoint(run) or "")
+def learned_with(run: Path, checkpoint: str | Path | None = None) -> dict[str, Any]:
+    """The settings of the ``checkpoint``, else of a run's latest one; none without one."""
+    path = Path(checkpoint or latest_checkpoint(run) or "")
     return metadata_of(path).training_config if path.is_file() else {}
 
 

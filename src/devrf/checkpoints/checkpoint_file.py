@@ -69,9 +69,9 @@ def read_checkpoint_file(path: Path) -> dict[str, Any]:
     with safe_open(path, "pt") as file:
         # The library maps the file into memory: a copy does not change with it.
         tensors = {name: file.get_tensor(name).clone() for name in file.keys()}
-    known = all(tensor.dtype in DTYPES for tensor in tensors.values())
-    sums = {name: _sum(tensor, _data(tensor)) for name, tensor in tensors.items() if known}
-    if not known or _digest(metadata["nested"], sums) != metadata["sha256"]:
+    supported = all(tensor.dtype in DTYPES for tensor in tensors.values())
+    sums = {name: _sum(tensor, _data(tensor)) for name, tensor in tensors.items() if supported}
+    if not supported or _digest(metadata["nested"], sums) != metadata["sha256"]:
         raise DevrfError(
             f"{path}: damaged: altered since it was written (its checksum does not match); take a "
             "copy that is whole, or train again"

@@ -42,12 +42,12 @@ def write_contact_sheet(path: Path, views: Sequence[HeldOutView], rows: int = 6)
 
     Times are left out if all are 0.
     """
-    shown = [views[k] for k in evenly(len(views), rows)]
-    near, far = _depth_range(shown)
-    height = min(max(shown[0].truth.shape[0], MIN_HEIGHT), MAX_HEIGHT)
+    selected = [views[k] for k in evenly(len(views), rows)]
+    near, far = _depth_range(selected)
+    height = min(max(selected[0].truth.shape[0], MIN_HEIGHT), MAX_HEIGHT)
     rows_of_tiles = []
     labels = []
-    for view in shown:
+    for view in selected:
         error = error_colors(view.compared, view.truth)
         depth = depth_colors(view.depth, view.opacity, near, far)
         tiles = (view.truth, view.prediction, error, depth)

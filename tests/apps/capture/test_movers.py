@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from devrf.apps.capture.movers import Film
+from devrf.apps.capture.movers import MonocularVideo
 from devrf.scenes.sparse_model import ModelImage, SparseModel
 
 WIDTH = 160
@@ -46,14 +46,14 @@ def filmed(tmp_path):
         lens = {"fl_x": FOCAL, "fl_y": FOCAL, "w": WIDTH, "h": HEIGHT, "cx": 80.0, "cy": 60.0}
         points = np.zeros((0, 3))
         model = SparseModel(Path(), {1: lens}, tuple(images), points, np.zeros(0, np.int64))
-        return Film(tmp_path, [image.name for image in images]), model
+        return MonocularVideo(tmp_path, [image.name for image in images]), model
 
     return film
 
 
 def test_what_leaves_its_epipolar_lines_is_masked(filmed):
     film, model = filmed(patch=True)
-    masks = film.masks_of_movers(model)
+    masks = film.motion_masks(model)
     middle = masks["4.png"]
     assert middle.shape == (HEIGHT, WIDTH) and set(np.unique(middle)) == {0, 255}
     inside = middle[20 + STEP * 4 : 70 + STEP * 4, 50:110]
@@ -63,19 +63,19 @@ def test_what_leaves_its_epipolar_lines_is_masked(filmed):
 
 def test_where_nothing_moves_there_are_no_masks(filmed):
     film, model = filmed(patch=False)
-    assert film.masks_of_movers(model) == {}
+    assert film.motion_masks(model) == {}
 
 
 @pytest.mark.parametrize(("placed", "masked"), [(1, 0), (2, 0), (3, 3)])
 def test_images_too_few_to_compare_are_not_masked(filmed, placed, masked):
     film, model = filmed(patch=True)
     few = replace(model, images=model.images[:placed])
-    assert len(film.masks_of_movers(few)) == masked
+    assert len(film.motion_masks(few)) == masked
 
 
 def test_what_stands_still_tells_which_cameras_are_right(filmed):
     film, model = filmed(patch=True)
-    masks = film.masks_of_movers(model)
+    masks = film.motion_masks(model)
 
     def risen_by(height):
         return height * np.outer([0, 1, 0], [0, 0, 0, 1])
@@ -88,5 +88,5 @@ def test_what_stands_still_tells_which_cameras_are_right(filmed):
             for k, image in enumerate(model.images)
         ),
     )
-    assert film.error_of_still(model, masks) < 0.1
-    assert film.error_of_still(risen, masks) > 1.0
+    assert film.static_error(model, masks) < 0.1
+    assert film.static_error(risen, masks) > 1.0

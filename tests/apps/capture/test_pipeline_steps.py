@@ -22,7 +22,7 @@ from devrf.apps.capture.images import (
     chosen_masks,
     common_size,
     fitted,
-    still_masks,
+    motion_masks,
     write_frames,
 )
 from devrf.apps.capture.pipeline import _model, kept, scene_from_footage
@@ -286,9 +286,9 @@ def test_masks_of_what_moves_are_black_or_white_in_the_images_size(walk, masks, 
     half = np.full((48, 64), 255, np.uint8)
     half[:, 32:] = 90
     cv2.imwrite(str(masks / "walk" / "1.png"), half)
-    footage = Chosen(walk, "static", (1,), still=masks / "walk")
+    footage = Chosen(walk, "static", (1,), motion=masks / "walk")
     written(footage, tmp_path / "images", (32, 24))
-    (mask,) = still_masks(tmp_path / "images", footage).values()
+    (mask,) = motion_masks(tmp_path / "images", footage).values()
     assert mask.shape == (24, 32) and (mask[:, :16] == 255).all() and (mask[:, 16:] == 0).all()
 
 

@@ -1,4 +1,4 @@
-"""Which cameras are taken of those found with and without what moves; COLMAP is stood in for."""
+"""Cameras found with and without moving pixels, and those taken; COLMAP is stood in for."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ def reconstruct(monkeypatch, tmp_path):
             error = 0.5 if mapper == "incremental" else 0.4
             return count and structure._Mapped(mapper, Path(str(len(masked)), mapper), count, error)
 
-        class Film:
+        class MonocularVideo:
             def __init__(self, images, names):
                 assert names == NAMES
 
-            def masks_of_movers(self, model):
+            def motion_masks(self, model):
                 return covering(*movers[model.number])
 
-            def error_of_still(self, model, masks):
+            def static_error(self, model, masks):
                 seen = {still(mask) for mask in masks.values()}
                 judged.append(*seen)
                 return errors[model.number] if judged[-1] else float("inf")
@@ -67,11 +67,11 @@ def reconstruct(monkeypatch, tmp_path):
 
         monkeypatch.setattr(structure, "_match", match)
         monkeypatch.setattr(structure, "_mapped", mapped)
-        monkeypatch.setattr(structure, "Film", Film)
+        monkeypatch.setattr(structure, "MonocularVideo", MonocularVideo)
         monkeypatch.setattr(structure, "_shows_no_depth", lambda base: False)
         monkeypatch.setattr(structure, "read_model", read)
         monkeypatch.setattr(structure, "colmap", _Library)
-        moving = SimpleNamespace(names=NAMES, still=None, path=tmp_path)
+        moving = SimpleNamespace(names=NAMES, motion=None, path=tmp_path)
         settings = CaptureSettings(into=tmp_path, views=[tmp_path])
         folder = structure.reconstruct(tmp_path, tmp_path, moving, [], settings)
         return "/".join(folder.parts), masked, sorted({*judged})
@@ -107,7 +107,7 @@ def test_they_are_not_found_more_than_so_often(reconstruct):
     [
         ([0.1, 0.2], [ALL, ALL], "0/incremental"),  # masks leave too little to find cameras by
         ([0.1, 0.102], [ALL, ALL], "1/global"),  # as good, and closer to its features
-        ([0.2, 0.1], [ALL, (7, 7)], "0/incremental"),  # too few are placed without what moves
+        ([0.2, 0.1], [ALL, (7, 7)], "0/incremental"),  # too few are placed without moving pixels
         ([0.2, 0.1], [ALL, (None, None)], "0/incremental"),  # none are
         ([0.2, 0.1], [ALL, (8, None)], "1/incremental"),
         ([0.1, 0.2], [(5, 5), ALL], "1/global"),  # many more are

@@ -1,4 +1,4 @@
-"""Chosen frames of all footage as image files of one size, their masks, and what moves in them."""
+"""Chosen frames of all footage as image files of one size, their masks, and their motion."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ Size = tuple[int, int]
 
 @dataclass(frozen=True)
 class Chosen:
-    """Which frames of one video become images.
+    """The frames of one video that become images.
 
     Attributes:
         label: the folder of its images: ``static``, ``view1`` …
         positions: positions of its frames, ascending; one may appear twice.
         masks: alpha masks of all its frames; None: the images have no alpha.
-        still: masks of all its frames, black where something moves; None: unknown.
+        motion: masks of all its frames, black where something moves; None: unknown.
     """
 
     path: Path
     label: str
     positions: tuple[int, ...]
     masks: Path | None = None
-    still: Path | None = None
+    motion: Path | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -126,8 +126,8 @@ def alpha_masks_of(
         folder: holds the masks of all footage.
         footage: of photographs the masks are a folder with a file of each one's name; of a video
             a folder of as many images, in the order of their names, or a video of as many frames.
-        count: how many frames it has.
-        key: the setting that gives ``folder``: masks of what moves are laid out in the same way.
+        count: the number of its frames.
+        key: the setting that gives ``folder``: masks of motion are laid out in the same way.
         others: all footage, whose masks these may not be, too.
 
     Raises:
@@ -136,44 +136,44 @@ def alpha_masks_of(
     if not folder.is_dir():
         raise DevrfError(f"{folder}: no such folder of masks; correct {key}, or leave it out")
     nested, plain = _places(folder, footage)
-    place = _masks_at(folder, footage)
-    if place is None:
+    masks = _masks_at(folder, footage)
+    if masks is None:
         raise DevrfError(
             f"{plain}: no such folder, expected the alpha masks of {footage}; add it with an "
             f"image for each {'photograph' if is_folder(footage) else 'frame'}"
         )
     for other in others:
-        if other.resolve() != footage.resolve() and _masks_at(folder, other) == place:
+        if other.resolve() != footage.resolve() and _masks_at(folder, other) == masks:
             apart, _ = _places(folder, other)
             remedy = f"give {nested} and {apart}" if apart != nested else "rename one of them"
-            raise DevrfError(f"{place}: masks of {footage} or of {other}? {remedy}")
+            raise DevrfError(f"{masks}: masks of {footage} or of {other}? {remedy}")
     # The header of a video of masks may be a little off.
-    slack = 0.0 if is_folder(place) else 0.05 * count
+    slack = 0.0 if is_folder(masks) else 0.05 * count
     if is_folder(footage):
         for photograph in listed_images(footage):
-            _of_photograph(place, photograph)
-    elif abs(frame_count(place) - count) > slack:
+            _of_photograph(masks, photograph)
+    elif abs(frame_count(masks) - count) > slack:
         raise DevrfError(
-            f"{place}: {frame_count(place)} alpha masks, but {footage} has {count} frames; "
+            f"{masks}: {frame_count(masks)} alpha masks, but {footage} has {count} frames; "
             "give an image for each frame, in the order of their names"
         )
-    return place
+    return masks
 
 
 def _places(folder: Path, footage: Path) -> tuple[Path, Path]:
-    """Where its masks may be, without a suffix: by the footage's folder and name, or its name."""
+    """Paths its masks may have, without a suffix: by the footage's folder and name, or its name."""
     name = footage.name if is_folder(footage) else footage.stem
     return folder / footage.absolute().parent.name / name, folder / name
 
 
 def _masks_at(folder: Path, footage: Path) -> Path | None:
     """The first folder, or video of a video, at one of these places."""
-    for place in _places(folder, footage):
-        if place.is_dir():
-            return place
-        if not is_folder(footage) and place.parent.is_dir():
-            for path in entries(place.parent):
-                if path.stem == place.name and path.suffix.lower() in VIDEOS:
+    for base in _places(folder, footage):
+        if base.is_dir():
+            return base
+        if not is_folder(footage) and base.parent.is_dir():
+            for path in entries(base.parent):
+                if path.stem == base.name and path.suffix.lower() in VIDEOS:
                     return path
     return None
 
@@ -210,17 +210,17 @@ def _grey(picture: Picture) -> Mask:
     return np.asarray(picture.mean(axis=2).round(), np.uint8)
 
 
-def still_masks(images: Path, footage: Chosen) -> dict[str, Mask]:
-    """By the ``still`` masks of some footage, of each of its images: 0 where it moves, else 255.
+def motion_masks(images: Path, footage: Chosen) -> dict[str, Mask]:
+    """Masks of each image of some footage, by its ``motion``: 0 where it moves, else 255.
 
     Raises:
-        DevrfError: what :func:`chosen_masks` raises.
+        DevrfError: as of :func:`chosen_masks`.
     """
-    assert footage.still is not None
+    assert footage.motion is not None
     _, frame = next(pictures(footage.path))
     height, width = np.asarray(cv2.imread(str(images / footage.names[0]))).shape[:2]
     filmed = (frame.shape[1], frame.shape[0])
-    masks = chosen_masks(footage.still, footage.path, footage.positions, filmed)
+    masks = chosen_masks(footage.motion, footage.path, footage.positions, filmed)
     fit = (fitted(mask, (width, height)) for mask in masks)
     whole = (np.where(mask > HALF, WHITE, 0).astype(np.uint8) for mask in fit)
     return dict(zip(footage.names, whole, strict=True))
@@ -244,17 +244,17 @@ LONGER_SIDE = 320
 _FAR = 25.0
 # The least variance of a pixel, in grey levels squared (compression).
 _LEAST_VARIANCE = 16.0
-# What a pixel shows in at least this share of the pictures is background.
+# A pixel's content in at least this share of the pictures is background.
 _MOST_OF_THE_TIME = 0.5
 # Connected pixels that are a smaller share of the image are noise.
 _SPECK = 5e-4
 
 
 def silhouettes(pictures: Sequence[Picture]) -> list[Mask]:
-    """Where each picture of a camera that stands still differs from what stays, (H, W): 0 or 255.
+    """Masks (H, W) of the foreground, 0 or 255, in each picture of a static camera.
 
     The background is learned from all pictures, at least two (Zivkovic's mixtures of Gaussians,
-    OpenCV's MOG2). What comes to rest for most of the time is background.
+    OpenCV's MOG2). A thing that rests for most of the time is background.
     """
     model = cv2.createBackgroundSubtractorMOG2(len(pictures), _FAR, detectShadows=False)
     model.setVarMin(_LEAST_VARIANCE)
@@ -288,7 +288,7 @@ def box_of_motion(
         names: of each of V ≥ 2 views its T images, relative to the folder.
         poses: (V, 3, 4) camera-to-world, OpenGL axes, world units.
         lenses: of each view its ``fl_x``, ``cx`` … in pixels; distortion is left alone.
-        around: where it is looked for, half as far again.
+        around: the box of the search, which is half as large again.
 
     Raises:
         DevrfError: nothing moves in what two views see.
@@ -319,7 +319,7 @@ def box_of_motion(
             "capture.alpha_masks: subtract needs at least 2 fixed views that see something move at "
             "one time; leave capture.alpha_masks out"
         )
-    log.info("what moves is in %s", box)
+    log.info("moving objects are in %s", box)
     return box
 
 

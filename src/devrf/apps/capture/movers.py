@@ -1,8 +1,8 @@
-"""What moves before a moving camera: optical flow that leaves the epipolar lines of its frames.
+"""Moving objects before a moving camera: optical flow leaves the epipolar lines of its frames.
 
-A point that stands still is seen, in any other frame, on a line that the two cameras alone tell
-(Hartley and Zisserman, *Multiple View Geometry*, chapter 9). How far its optical flow ends from
-that line is an error in pixels, small wherever nothing moves and the cameras are right. Nothing is
+Any other frame shows a static point on a line that the two cameras alone determine (Hartley and
+Zisserman, *Multiple View Geometry*, chapter 9). The distance of its optical flow's end from that
+line is an error in pixels, small wherever nothing moves and the cameras are right. Nothing is
 learned, and no weights are needed.
 """
 
@@ -36,17 +36,17 @@ LONGER_SIDE = 320
 STEPS = (2, 4)
 # Errors below this many pixels are those of the flow itself.
 NOISE = 0.15
-# What moves is off by more than so many times the frame's median error.
+# The error of a moving pixel is more than so many times the frame's median.
 TIMES_MEDIAN = 3.0
 # Root mean square of Sobel's slopes, 8 for a grey level a pixel, below which flow is a guess.
 TEXTURE = 16.0
 # Standard deviation, in pixels, of the neighbourhood in which pixels vote.
 AROUND = 6.0
-# What a frame's vote counts for in the next one.
+# The weight of a frame's vote in the next one.
 MEMORY = 0.9
-# What moves in the votes of so large a share of the frames moves.
+# A pixel moves if so large a share of the frames vote so.
 MOVES = 0.25
-# Features at the rim of what moves see both sides: masks are so much wider, as a share of the
+# Features at the rim of a moving object see both sides: masks are so much wider, as a share of the
 # image's longer side.
 RIM = 0.02
 # Masks that cover less than this share of the frames change no camera.
@@ -55,11 +55,11 @@ LEAST_SHARE = 0.02
 Numbers = npt.NDArray[np.float64]
 
 
-class Film:
+class MonocularVideo:
     """A moving camera's images, and the optical flow between any two, estimated once.
 
     Attributes:
-        textured: where (H, W) each image has texture, at the size that flow is estimated in.
+        textured: masks (H, W) of each image's texture, at the size that flow is estimated in.
     """
 
     def __init__(self, images: Path, names: Sequence[str]) -> None:
@@ -78,32 +78,32 @@ class Film:
         self._estimator = estimator("dis")
         self._estimated = cache(self._estimate)
 
-    def masks_of_movers(self, model: SparseModel) -> dict[str, Mask]:
-        """Where nothing moves, by the cameras of a model: 255, what moves and its rim: 0.
+    def motion_masks(self, model: SparseModel) -> dict[str, Mask]:
+        """Masks of static pixels, by the cameras of a model: 255; moving objects and their rim: 0.
 
         Args:
             model: structure from motion of these images; those it has not placed get no mask.
 
         Returns:
-            (H, W) of each image, of the images' size; none where less moves than is worth masking.
+            (H, W) of each image, of the images' size; none if too little moves to be worth masking.
         """
         shots = self._placed(model)
         rim = 2 * round(RIM * LONGER_SIDE) + 1
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (rim, rim))
-        votes = [shots.votes(k) for k in followed(range(len(shots)), len(shots), "what moves")]
+        votes = [shots.votes(k) for k in followed(range(len(shots)), len(shots), "moving pixels")]
         masks = dict[str, Mask]()
         for number, agreed in zip(shots.numbers, shots.agreed(votes), strict=True):
             moves = cv2.dilate(np.asarray(agreed > MOVES, np.uint8), disc)
-            still = cv2.resize(1 - moves, self._size, interpolation=cv2.INTER_NEAREST)
-            masks[self._names[number]] = np.asarray(255 * still, np.uint8)
+            static = cv2.resize(1 - moves, self._size, interpolation=cv2.INTER_NEAREST)
+            masks[self._names[number]] = np.asarray(255 * static, np.uint8)
         share = float(np.mean([(mask == 0).mean() for mask in masks.values()]))
-        log.info("structure from motion: %.0f %% of the pixels are of what moves", 100 * share)
+        log.info("structure from motion: %.0f %% of the pixels move", 100 * share)
         return masks if share >= LEAST_SHARE else {}
 
-    def error_of_still(self, model: SparseModel, masks: Mapping[str, Mask]) -> float:
-        """By how many pixels flow leaves its epipolar lines where ``masks`` say nothing moves.
+    def static_error(self, model: SparseModel, masks: Mapping[str, Mask]) -> float:
+        """The epipolar error of the flow of static pixels, by ``masks``, in pixels.
 
-        The median over the images that a model has placed of each one's median.
+        It is the median over the images that a model has placed of each one's median.
         """
         shots = self._placed(model)
         medians = list[float]()
@@ -112,15 +112,15 @@ class Film:
             if mask is None:
                 continue
             height, width = self._small[number].shape[:2]
-            still = cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST) > 0
-            of_pairs = [error[still & np.isfinite(error)] for error in shots.errors(k)]
-            known = np.concatenate([*of_pairs, np.empty(0)])
-            if len(known):
-                medians.append(float(np.median(known)))
+            static = cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST) > 0
+            of_pairs = [error[static & np.isfinite(error)] for error in shots.errors(k)]
+            finite = np.concatenate([*of_pairs, np.empty(0)])
+            if len(finite):
+                medians.append(float(np.median(finite)))
         return float(np.median(medians)) if medians else np.inf
 
     def between(self, one: int, other: int) -> tuple[Numbers, Mask]:
-        """Flow (H, W, 2) from one image to another, and where (H, W) the way back agrees."""
+        """Flow (H, W, 2) from one image to another, and whether (H, W) the way back agrees."""
         there = self._estimated(one, other)
         return there.numpy(), consistent(there, self._estimated(other, one)).numpy()
 
@@ -129,24 +129,24 @@ class Film:
         return self._estimator(*pictures)
 
     def _placed(self, model: SparseModel) -> _Shots:
-        place = {image.name: k for k, image in enumerate(model.images)}
-        numbers = [number for number, name in enumerate(self._names) if name in place]
+        index = {image.name: k for k, image in enumerate(model.images)}
+        numbers = [number for number, name in enumerate(self._names) if name in index]
         width = self._small[0].shape[1]
-        cameras = [_Camera(model, place[self._names[number]], width) for number in numbers]
+        cameras = [_Camera(model, index[self._names[number]], width) for number in numbers]
         return _Shots(self, numbers, cameras)
 
 
 @dataclass(frozen=True)
 class _Shots:
-    """The images of a film that a model has placed, by their order.
+    """The images of a video that a model has placed, by their order.
 
     Attributes:
-        film: the film.
-        numbers: which of its images.
+        video: the video.
+        numbers: of its images.
         cameras: of each.
     """
 
-    film: Film
+    video: MonocularVideo
     numbers: list[int]
     cameras: list[_Camera]
 
@@ -154,12 +154,12 @@ class _Shots:
         return len(self.numbers)
 
     def between(self, one: int, other: int) -> tuple[Numbers, Mask]:
-        """As :meth:`Film.between`."""
-        return self.film.between(self.numbers[one], self.numbers[other])
+        """As :meth:`MonocularVideo.between`."""
+        return self.video.between(self.numbers[one], self.numbers[other])
 
     def errors(self, k: int) -> Iterator[Numbers]:
-        """(H, W) of each near image: by how much flow there leaves its lines; NaN: unknown."""
-        textured = self.film.textured[self.numbers[k]]
+        """(H, W) of each near image: the epipolar error of the flow there; NaN: unknown."""
+        textured = self.video.textured[self.numbers[k]]
         for other in (k + step * way for step in STEPS for way in (-1, 1)):
             if 0 <= other < len(self):
                 there, agrees = self.between(k, other)
@@ -168,9 +168,9 @@ class _Shots:
                 yield error
 
     def votes(self, k: int) -> Numbers:
-        """(H, W): the share of what is known around each pixel of image ``k`` that moves."""
-        # A film may be too short to have an image near enough.
-        shares: list[Numbers] = [np.full(self.film.textured[self.numbers[k]].shape, np.nan)]
+        """(H, W): the share of moving pixels among the known ones around each of image ``k``."""
+        # A video may be too short to have an image near enough.
+        shares: list[Numbers] = [np.full(self.video.textured[self.numbers[k]].shape, np.nan)]
         for error in self.errors(k):
             any_known = np.isfinite(error).any()
             usual = max(float(np.nanmedian(error)), NOISE) if any_known else np.inf
@@ -178,22 +178,22 @@ class _Shots:
         with warnings.catch_warnings():  # of pixels that no frame knows
             warnings.simplefilter("ignore", RuntimeWarning)
             error = np.nanmedian(np.stack(shares), axis=0)
-        known = np.isfinite(error)
-        moves = known & (np.where(known, error, 0) > TIMES_MEDIAN)
-        count = cv2.GaussianBlur(known.astype(np.float64), (0, 0), AROUND)
+        finite = np.isfinite(error)
+        moves = finite & (np.where(finite, error, 0) > TIMES_MEDIAN)
+        count = cv2.GaussianBlur(finite.astype(np.float64), (0, 0), AROUND)
         return cv2.GaussianBlur(moves.astype(np.float64), (0, 0), AROUND) / np.maximum(count, 1e-3)
 
     def agreed(self, votes: Sequence[Numbers]) -> list[Numbers]:
         """The mean of all images' votes (H, W) along the flow, of near ones before others.
 
-        What moves along its epipolar lines for a while moved across them before, or will; what was
-        wrong once is outvoted.
+        A thing that moves along its epipolar lines for a while moved across them before, or will;
+        single errors are outvoted.
         """
         share = [vote.copy() for vote in votes]
         count = [np.ones_like(vote) for vote in votes]
         numbers = range(len(votes))
         for order, way in ((numbers, -1), (numbers[::-1], 1)):
-            # Of the frame before in this order: the sum of votes, and of what each counts for.
+            # Sums of the votes, and of their weights, of the frame before in this order.
             total = weight = np.zeros_like(votes[0])
             for k in order:
                 if k != order[0]:
@@ -208,7 +208,7 @@ class _Shots:
 
 
 def _textured(picture: npt.NDArray[Any]) -> Mask:
-    """Where (H, W) a picture has texture: elsewhere its flow is a guess."""
+    """The mask (H, W) of a picture's texture: elsewhere its flow is a guess."""
     grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
     across = cv2.Sobel(grey, cv2.CV_32F, 1, 0)
     down = cv2.Sobel(grey, cv2.CV_32F, 0, 1)
@@ -216,7 +216,7 @@ def _textured(picture: npt.NDArray[Any]) -> Mask:
 
 
 def _at(image: Numbers, flow: Numbers) -> Numbers:
-    """What an image (H, W) shows where flow (H, W, 2) leads."""
+    """The image (H, W), sampled at the ends of flow (H, W, 2)."""
     y, x = np.mgrid[: image.shape[0], : image.shape[1]]
     at = (np.stack([x, y], axis=-1) + flow).astype(np.float32)
     return np.asarray(cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR), np.float64)

@@ -79,11 +79,11 @@ def scene_from_footage(settings: CaptureSettings) -> Path:
             path: alpha_masks_of(folder, path, len(s.times), others=surveys)
             for path, s in surveys.items()
         }
-    still = None
+    motion_masks = None
     if settings.masks is not None:
         folder = Path(settings.masks).expanduser()
-        still = alpha_masks_of(folder, static, len(sharp), "capture.masks", surveys)
-    moving = Chosen(static, "static", tuple(picked), masks.get(static), still)
+        motion_masks = alpha_masks_of(folder, static, len(sharp), "capture.masks", surveys)
+    moving = Chosen(static, "static", tuple(picked), masks.get(static), motion_masks)
     clock = Timeline((), ())
     if views:
         in_view = [surveys[view] for view in views]
@@ -140,9 +140,9 @@ def kept(file: Path, source: Any, kind: type[Kind], make: Callable[[], dict[str,
             stored = json.loads(read_record(file))
             same, result = stored["key"] == key, stored["result"]
             if same:
-                found = validate(kind, result)
+                stored = validate(kind, result)
                 log.info("%s: found before", file.stem)
-                return found
+                return stored
         except (ValueError, LookupError, TypeError, RecursionError, OverflowError):
             raise DevrfError(f"{file}: damaged; remove it, and it is made again") from None
     result = make()
@@ -157,7 +157,7 @@ def _digest(source: Any) -> str:
 
 
 def _stamp(path: Path) -> list[Any]:
-    """What tells one state of a file, or of a folder of files, from another."""
+    """A stamp that differs between two states of a file, or of a folder of files."""
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     states = [(file.name, file.stat()) for file in files if file.is_file()]
     return [str(path.resolve()), *([name, s.st_size, s.st_mtime_ns] for name, s in states)]
@@ -227,7 +227,7 @@ def _model(
     first = {video.names[0]: video.path for video in fixed}
     options = [settings.camera, settings.intrinsics, settings.matching]
     images = [
-        [video.label, _stamp(video.path), video.positions, video.still and _stamp(video.still)]
+        [video.label, _stamp(video.path), video.positions, video.motion and _stamp(video.motion)]
         for video in (moving, *fixed)
     ]
 
@@ -243,14 +243,14 @@ def _model(
 def _around_motion(
     world: World, model: SparseModel, images: Path, fixed: Sequence[Chosen]
 ) -> World:
-    """The world with the box of what moves, where it has a box."""
+    """The world with the box of moving objects, if it has a box."""
     if world.space != "contracted":
         log.warning(
             "capture.alpha_masks=subtract: a forward-facing scene has no box, it changes nothing"
         )
         return world
-    place = {image.name: k for k, image in enumerate(model.images)}
-    first = [place[video.names[0]] for video in fixed]
+    index = {image.name: k for k, image in enumerate(model.images)}
+    first = [index[video.names[0]] for video in fixed]
     lenses = [model.cameras[model.images[k].camera] for k in first]
     around = Box.of([-AROUND] * 3, [AROUND] * 3)
     names = [video.names for video in fixed]
@@ -271,12 +271,12 @@ def _frames(
 
     ``frame_seconds`` are the times of the moving camera's frames, if the scene moved before it.
     """
-    place = {image.name: k for k, image in enumerate(model.images)}
+    index = {image.name: k for k, image in enumerate(model.images)}
     frames = list[dict[str, Any]]()
     test = set[str]()
 
     def add(name: str, camera: str, time: float, held_out: bool) -> None:
-        k = place[camera]
+        k = index[camera]
         path = f"{IMAGES}/{name}"
         lens = model.cameras[model.images[k].camera]
         pose = [*world.poses[k].tolist(), [0.0, 0.0, 0.0, 1.0]]
@@ -285,7 +285,7 @@ def _frames(
             test.add(path)
 
     named = zip(moving.positions, moving.names, strict=True)
-    posed = [(position, name) for position, name in named if name in place]
+    posed = [(position, name) for position, name in named if name in index]
     _, held_out = every_nth(len(posed), settings.holdout)
     first = posed[0][0]
     last = posed[-1][0]

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 import torch
 
-from devrf.apps.capture.images import Chosen, Mask, still_masks
-from devrf.apps.capture.movers import Film
+from devrf.apps.capture.images import Chosen, Mask, motion_masks
+from devrf.apps.capture.movers import MonocularVideo
 from devrf.apps.settings import CaptureSettings
 from devrf.errors import DevrfError
 from devrf.scenes.footage import is_folder
@@ -30,22 +30,22 @@ MOST_TURN = 45.0
 MOST_TURNS = 5.0
 # A model of a smaller share of a moving camera's images is not the scene.
 LEAST_SHARE = 2 / 3
-# A model without what moves is taken if it places so large a share of the images that the first
+# A model without moving pixels is taken if it places so large a share of the images that the first
 # one places.
 FEWER = 0.9
-# Cameras are found so often without what moves, at most, and until masks of it change by less than
-# this share of the pixels: a first pass may follow a thing for a while, which hides that it moves.
+# Cameras are found so often without moving pixels, at most, and until their masks change by less
+# than this share of the pixels: a first pass may follow a moving thing for a while.
 ROUNDS = 3
 STEADY = 0.05
-# Errors of what stands still up to so many times the least are as good.
+# Errors of static pixels up to so many times the least are as good.
 ABOUT = 1.05
-# Where so large a share of the pairs of images shows no depth, that is why no cameras are found.
+# If so large a share of the pairs of images shows no depth, that is why no cameras are found.
 DEPTHLESS = 0.9
 # In the folder of the work: features with their matches, and the models.
 DATA_BASE = "matches.db"
 MODELS = "models"
 
-_FILM = (
+_ADVICE = (
     "film more slowly, with more overlap (neighbouring frames share more than half of what they "
     "show), and with more texture in sight"
 )
@@ -56,7 +56,7 @@ _FLAT = (
 
 
 def pairs(moving: Sequence[str], fixed: Sequence[str], matching: str) -> list[tuple[str, str]]:
-    """Which images are compared: all with all, or those near in the moving camera's order.
+    """Pairs of images to compare: all with all, or those near in the moving camera's order.
 
     Images of the ``fixed`` views are compared with all.
     """
@@ -74,11 +74,11 @@ def reconstruct(
 ) -> Path:
     """Run structure from motion, and write the data base and the models to ``work``.
 
-    The moving camera's images and one of each ``fixed`` view are in the folder ``images``. Where
-    they are all of the scene at rest, COLMAP's incremental mapper finds the cameras. Where one
-    camera films a scene that moves, cameras are found again without what moves
-    (:func:`_without_movers`); where masks are given, or nothing moves, the global mapper is tried,
-    too. Returns the folder of the model, below ``work``.
+    The moving camera's images and one of each ``fixed`` view are in the folder ``images``. If they
+    are all of the scene at rest, COLMAP's incremental mapper finds the cameras. If one camera films
+    a scene that moves, cameras are found again without moving pixels (:func:`_without_movers`); if
+    masks are given, or nothing moves, the global mapper is tried, too. Returns the folder of the
+    model, below ``work``.
 
     Raises:
         DevrfError: nothing could be matched, nothing shows depth, or a given mask does not fit.
@@ -87,12 +87,12 @@ def reconstruct(
     library.set_random_seed(0)
     models = work / MODELS
     shutil.rmtree(models, ignore_errors=True)
-    given = {} if moving.still is None else still_masks(images, moving)
+    given = {} if moving.motion is None else motion_masks(images, moving)
     _match(images, work, moving, fixed, settings, given)
     first = _mapped(images, work, "incremental", models / "first")
     flat = _shows_no_depth(work / DATA_BASE)
     if first is None:
-        why = f"too few matches between its frames to find any camera; {_FILM}"
+        why = f"too few matches between its frames to find any camera; {_ADVICE}"
         raise DevrfError(f"{moving.path}: {_FLAT if flat else why}")
     if not settings.monocular:
         return first.folder
@@ -108,73 +108,75 @@ def reconstruct(
 def _without_movers(
     images: Path, work: Path, moving: Chosen, settings: CaptureSettings, first: _Mapped
 ) -> _Mapped | None:
-    """The cameras that what stands still agrees best with; None where nothing moves.
+    """The cameras with the least epipolar error of static pixels; None if nothing moves.
 
-    The ``first`` cameras and the film's flow tell what moves. Without it cameras are found again,
-    by both of COLMAP's mappers, and tell better what moves: until masks stay as they are, at most
-    ``ROUNDS`` times.
+    The ``first`` cameras and the video's flow give masks of moving pixels. Without these cameras
+    are found again, by both of COLMAP's mappers, and give better masks: until masks stay as they
+    are, at most ``ROUNDS`` times.
     """
-    models = work / MODELS
-    film = Film(images, moving.names)
-    found = [first]
+    folder = work / MODELS
+    video = MonocularVideo(images, moving.names)
+    models = [first]
     used = list[dict[str, Mask]]()
     masks = dict[str, Mask]()
     for number in range(1, ROUNDS + 1):
-        movers = film.masks_of_movers(read_model(found[-1].folder))
+        movers = video.motion_masks(read_model(models[-1].folder))
         if not movers or (masks and _difference(movers, masks) < STEADY):
             break
         masks = masks | movers  # an image that is not placed keeps the mask that it had
-        log.info("structure from motion: again, without what moves (%d)", number)
+        log.info("structure from motion: again, without moving pixels (%d)", number)
         _match(images, work, moving, (), settings, masks)
         tried = [
-            _mapped(images, work, mapper, models / f"{mapper}-{number}")
+            _mapped(images, work, mapper, folder / f"{mapper}-{number}")
             for mapper in ("incremental", "global")
         ]
-        # Where masks leave too little, cameras are those of whole images.
+        # If masks leave too little, cameras are those of whole images.
         placed = [model for model in tried if model and model.images >= FEWER * first.images]
         if not placed:
             break
-        found.append(_largest(placed))
+        models.append(_largest(placed))
         used.append(masks)
     if not masks:
         return None
-    return _agreeing(film, found, used) if used else first
+    return _most_consistent(video, models, used) if used else first
 
 
-def _agreeing(film: Film, found: Sequence[_Mapped], masks: Sequence[dict[str, Mask]]) -> _Mapped:
-    """Of models the one that flow agrees best with where nothing moves by any of the ``masks``.
+def _most_consistent(
+    video: MonocularVideo, mapped: Sequence[_Mapped], masks: Sequence[dict[str, Mask]]
+) -> _Mapped:
+    """The model with the least epipolar error where nothing moves by any of the ``masks``.
 
-    They are compared in the images that all of them place; those that place far fewer than another
-    are out. Of models about as good the one of most images is taken; the first, where the masks
+    Models are compared in the images that all of them place; those that place far fewer than
+    another are out. Among models about as good the largest is taken; the first, if the masks
     together leave nothing.
     """
-    most = max(model.images for model in found)
-    found = [model for model in found if model.images >= FEWER * most]
-    if len(found) == 1:
-        return found[0]
-    models = [read_model(model.folder) for model in found]
+    most = max(model.images for model in mapped)
+    mapped = [model for model in mapped if model.images >= FEWER * most]
+    if len(mapped) == 1:
+        return mapped[0]
+    models = [read_model(model.folder) for model in mapped]
     names = set.intersection(*({image.name for image in model.images} for model in models))
-    still = {
+    static = {
         name: np.minimum.reduce([each[name] for each in masks if name in each])
         for name in sorted(names & {*masks[-1]})  # the last ones have all that were before
     }
-    errors = [film.error_of_still(model, still) for model in models]
+    errors = [video.static_error(model, static) for model in models]
     said = ", then ".join(f"{error:.2f}" for error in errors)
     log.info(
         "structure from motion: median epipolar error of static pixels per reconstruction: %s px",
         said,
     )
     if min(errors) == float("inf"):
-        return found[0]
+        return mapped[0]
     return _largest(
-        [model for model, error in zip(found, errors, strict=True) if error <= ABOUT * min(errors)]
+        [model for model, error in zip(mapped, errors, strict=True) if error <= ABOUT * min(errors)]
     )
 
 
 def _largest(models: Sequence[_Mapped | None]) -> _Mapped:
     """The model with the most images; ties by reprojection error."""
-    known = [model for model in models if model]
-    return max(known, key=lambda model: (model.images, -model.error))
+    successes = [model for model in models if model]
+    return max(successes, key=lambda model: (model.images, -model.error))
 
 
 def _difference(masks: dict[str, Mask], before: dict[str, Mask]) -> float:
@@ -195,8 +197,8 @@ class _Mapped:
 
     Attributes:
         mapper: ``incremental`` or ``global``.
-        folder: where it is.
-        images: how many images it places.
+        folder: of its files.
+        images: the number of images that it places.
         error: mean reprojection error of its points, pixels.
     """
 
@@ -251,10 +253,10 @@ def _shows_no_depth(base: Path) -> bool:
     _, geometries = database.read_two_view_geometries()
     database.close()
     kinds = library.TwoViewGeometryConfiguration
-    # Matches that do not move at all are taken for those of a watermark.
+    # COLMAP takes matches that do not move at all for those of a watermark.
     depthless = [kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC, kinds.WATERMARK]
-    known = [geometry.config for geometry in geometries if len(geometry.inlier_matches)]
-    return sum(kind in depthless for kind in known) > DEPTHLESS * max(len(known), 1)
+    pairs = [geometry.config for geometry in geometries if len(geometry.inlier_matches)]
+    return sum(kind in depthless for kind in pairs) > DEPTHLESS * max(len(pairs), 1)
 
 
 def _written(masks: dict[str, Mask], folder: Path) -> Path:
@@ -268,20 +270,20 @@ def _written(masks: dict[str, Mask], folder: Path) -> Path:
 
 
 def _mapped(images: Path, work: Path, mapper: str, into: Path) -> _Mapped | None:
-    """The largest model that a mapper finds in the data base; None where it finds none."""
+    """The largest model that a mapper finds in the data base; None if it finds none."""
     library = colmap()
     into.mkdir(parents=True)
     base = work / DATA_BASE
     if mapper == "incremental":
         options = library.IncrementalPipelineOptions(random_seed=0, min_model_size=3)
-        found = library.incremental_mapping(base, images, into, options)
+        models = library.incremental_mapping(base, images, into, options)
     else:
         options = library.GlobalPipelineOptions(random_seed=0, min_model_size=3)
-        found = library.global_mapping(base, images, into, options)
-    if not found:
+        models = library.global_mapping(base, images, into, options)
+    if not models:
         log.info("structure from motion: the %s mapper finds no cameras", mapper)
         return None
-    number, model = max(found.items(), key=lambda item: item[1].num_reg_images())
+    number, model = max(models.items(), key=lambda item: item[1].num_reg_images())
     error = float(model.compute_mean_reprojection_error())
     placed = int(model.num_reg_images())
     log.info(
@@ -308,7 +310,7 @@ def checked_model(folder: Path, moving: Chosen, fixed: dict[str, Path]) -> Spars
         raise DevrfError(
             f"{moving.path}: cameras were found for {len(posed)} of {len(moving.names)} frames "
             f"only, it broke from {Path(first).stem} to {Path(last).stem}, which have too few "
-            f"matches with the others; cut the film there, or {_FILM}"
+            f"matches with the others; cut the video there, or {_ADVICE}"
         )
     if len(posed) < len(moving.names):
         log.warning(
@@ -337,8 +339,8 @@ def _longest_gap(names: Sequence[str], placed: set[str]) -> tuple[str, str]:
 
 
 def _check_turns(model: SparseModel, moving: Chosen, posed: Sequence[str]) -> None:
-    place = {image.name: k for k, image in enumerate(model.images)}
-    turns = model.poses[[place[name] for name in posed], :, :3]
+    index = {image.name: k for k, image in enumerate(model.images)}
+    turns = model.poses[[index[name] for name in posed], :, :3]
     trace = (turns[1:] * turns[:-1]).sum(dim=(1, 2))
     degrees = torch.rad2deg(((trace - 1) / 2).clamp(-1, 1).acos())
     worst = int(degrees.argmax())

@@ -38,7 +38,7 @@ Grey = npt.NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Survey:
-    """What was seen of one video.
+    """Measurements of one video.
 
     Attributes:
         size: width and height of its frames in pixels.
@@ -69,8 +69,7 @@ def survey(path: Path, frames: Iterable[tuple[float, Picture]] | None = None) ->
     """Look at all frames of a video, or at all photographs of a folder, or at ``frames`` of it.
 
     Raises:
-        DevrfError: what :func:`devrf.scenes.footage.pictures` raises, or the frames have
-            several sizes.
+        DevrfError: as of :func:`devrf.scenes.footage.pictures`, or the frames have several sizes.
     """
     size: tuple[int, int] | None = None
     times = list[float]()
@@ -99,7 +98,7 @@ def survey(path: Path, frames: Iterable[tuple[float, Picture]] | None = None) ->
 
 
 def sharpness(grey: Grey) -> float:
-    """How sharp an image (H, W) is, from 0 (blurred) to 1, whatever it shows.
+    """Sharpness of an image (H, W), from 0 (blurred) to 1, whatever it shows.
 
     It is the share of the differences between neighbouring pixels that a strong blur takes away:
     large for a sharp image, small for one that is blurred already (Crété et al., "The blur

@@ -1,4 +1,4 @@
-"""What is exported: a mesh that moves, or coloured points of each time; and the settings."""
+"""Exported geometry: a mesh that moves, or coloured points of each time; and the settings."""
 
 from __future__ import annotations
 
@@ -211,14 +211,14 @@ def seen_points(
     filled = len(_seen(renderer, cameras, FIRST, time, background)[0])
     rows = min(round(FIRST * (SPARE * count / max(filled, 1)) ** 0.5), LARGEST)
     points, colors = _seen(renderer, cameras, rows, time, background)
-    chosen = _every(len(points), count)
-    return points[chosen], colors[chosen]
+    subset = _every(len(points), count)
+    return points[subset], colors[subset]
 
 
 def _every(count: int, max_count: int) -> Tensor:
     """At most ``max_count`` of ``count`` positions; on a ring the last is as far from the first."""
-    chosen = min(count, max_count)
-    return torch.arange(chosen) * count // max(chosen, 1)
+    size = min(count, max_count)
+    return torch.arange(size) * count // max(size, 1)
 
 
 def _seen(

@@ -1,4 +1,4 @@
-"""What ``stage=export`` writes for other programs: geometry that moves."""
+"""Files of ``stage=export`` for other programs: geometry that moves."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def export_scene(
     """Write the surface of what was learned, as it moves, or coloured points of each time.
 
     Raises:
-        DevrfError: what is asked for cannot be had of the method, or is empty.
+        DevrfError: the method has no such geometry, or it is empty.
     """
     times = settings.export_times(viewpoints.clock) if model.moves else (0.0,)
     if not _takes_surface(model, settings):

@@ -16,7 +16,7 @@ from devrf.system.files import atomic_write, write_json
 
 FRAME = "world: the axes and the unit of the capture"
 
-# What the file of one time holds: a mesh or points of trimesh.
+# The content of one time's file: a mesh or points of trimesh.
 Drawn = Any
 
 

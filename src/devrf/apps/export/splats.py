@@ -62,7 +62,7 @@ def write_splats(
 
 
 def gaussians(vertices: Tensor, faces: Tensor, colors: Tensor) -> Tensor:
-    """What ``PROPERTIES`` names (V, 17) of a disc on each vertex.
+    """The ``PROPERTIES`` (V, 17) of a disc on each vertex.
 
     Args:
         vertices: (V, 3).

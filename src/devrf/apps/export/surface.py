@@ -39,8 +39,8 @@ def isosurface(
     softplus(v + b) that is v + b, which DeVRF interpolates, too (docs/method.md#density).
 
     Args:
-        field: what is where.
-        device: where it is evaluated.
+        field: the scene's.
+        device: of the field's evaluation.
         outside: (K, 3) points of the fields' space that cameras see through.
         threshold: opacity of one voxel on the surface, in (0, 1).
         side: grid points along the box's longest edge; None: those of the field.
@@ -107,7 +107,7 @@ def _logit(depth: Tensor) -> Tensor:
 
 
 def _reached(empty: npt.NDArray[np.bool_], box: Box, outside: Tensor) -> npt.NDArray[np.bool_]:
-    """Which of the empty cells are connected, face to face, with a point of ``outside``."""
+    """The empty cells that are connected, face to face, with a point of ``outside``."""
     from skimage import measure
 
     labels = measure.label(empty, connectivity=1)
@@ -168,7 +168,7 @@ def _mirrors(space: Space, box: Box) -> bool:
 
 # Vertices whose colour is found at once.
 VERTICES = 2**13
-# Where a ray begins and ends behind the vertex, and how far its samples are apart, in voxels.
+# Begin and end of a ray behind the vertex, and the distance of its samples, in voxels.
 BEFORE = -1.0
 BEHIND = 3.0
 STEP = 0.25

@@ -376,7 +376,7 @@ def _flow(scene: Scene) -> Iterator[Advice]:
 
 
 def _frame_to_frame(views: Views) -> float:
-    """How far parts move between two frames, in pixels: the 99th percentile of a few pairs."""
+    """Motion between two frames, in pixels: the 99th percentile of a few pairs."""
     longest = 0.0
     between = estimator("dis")
     pairs = frame_pairs(views)

@@ -1,4 +1,4 @@
-"""Where a scene's box and cameras are in the world, and which way is up."""
+"""Layout of a scene: its box and cameras in the world, and the upward direction."""
 
 from __future__ import annotations
 

@@ -193,8 +193,8 @@ def draw_cameras(scene: Scene, side: Any, plan: Axes) -> None:
     axes = compass(scene)
     middle = box_middle(scene)
     groups = scene_lines(scene)
-    shown = [(group.ends - middle) @ axes.T for group in groups]
-    for group, ends in zip(groups, shown, strict=True):
+    flat = [(group.ends - middle) @ axes.T for group in groups]
+    for group, ends in zip(groups, flat, strict=True):
         # One curve with a break after each segment.
         path = torch.cat([ends, torch.full_like(ends[:, :1], math.nan)], dim=1).reshape(-1, 3)
         x, y, z = path.T.tolist()
@@ -216,7 +216,7 @@ def draw_cameras(scene: Scene, side: Any, plan: Axes) -> None:
                 ha="center",
                 va="center",
             )
-    points = torch.cat([ends.reshape(-1, 3) for ends in shown])
+    points = torch.cat([ends.reshape(-1, 3) for ends in flat])
     low = points.amin(dim=0).tolist()
     high = points.amax(dim=0).tolist()
     side.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))

@@ -65,10 +65,10 @@ def show(report: RenderableType) -> None:
         log.info("%s", as_text(report))
 
 
-def as_text(shown: RenderableType) -> str:
+def as_text(content: RenderableType) -> str:
     """The report for a log: without colours and trailing spaces, no line wrapped."""
     console = Console(file=io.StringIO(), width=10_000, record=True)
-    console.print(shown)
+    console.print(content)
     return "\n".join(map(str.rstrip, console.export_text().splitlines()))
 
 
@@ -85,7 +85,7 @@ def titled_table(
 
 
 def scene_facts(scene: Scene) -> list[Row]:
-    """What a scene is: space, bounds, times, motion and colours, as rows of a name and text."""
+    """Facts of a scene: space, bounds, times, motion and colours, as rows of a name and text."""
     bounds = scene.bounds
     views = scene.dynamic.train
     unit = "NDC" if scene.kind == "forward" else "world units"
@@ -124,7 +124,7 @@ def _why(reason: str) -> str:
 
 
 def _times(views: Views) -> str:
-    """How many times, from when to when, and whether evenly spaced to a hundredth of a step."""
+    """Number and range of the times, and whether they are even to a hundredth of a step."""
     times = distinct_times(views.times)
     steps = times.diff()
     even = torch.allclose(steps, steps.mean(), rtol=0.01, atol=FrameClock.TOLERANCE)
@@ -163,7 +163,7 @@ def _set_facts(name: str, views: Views, middle: Tensor) -> Row:
 
 
 def flow_facts(views: Views) -> str:
-    """How much optical flow is valid in views that have a frame before them, and how long it is."""
+    """The valid share and the length of the optical flow of views that have a frame before them."""
     if views.flow is None:
         return "none"
     images = [image for image, _ in frame_pairs(views)]

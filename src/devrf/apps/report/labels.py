@@ -1,4 +1,4 @@
-"""Which runs share a row of a table, and the row's label.
+"""Rows of a table: the runs that share one, and its label.
 
 Runs of one scene share a row if they were learned with the same settings but the seed, on the same
 device by the same version, whatever was typed. A label says how its row differs from others of the
@@ -51,7 +51,7 @@ IGNORED = {"objective", "seed", "stage", "method"}
 DEFAULT_EXPERIMENT = "quickstart"
 # Groups whose options are names for many settings, most important first.
 NAMED = ("experiment", "profile", "schedule", "field", "sampling", "loss", "method")
-# What every run records, and how it stands in a label.
+# Records of every run, and their form in a label.
 RECORDED: dict[str, Callable[[Any], str]] = {
     "protocol": str,
     "run.train_views": lambda n: f"{n} view{'s' * (n != 1)}",
@@ -127,7 +127,7 @@ def _distinguishing(
     settings: Mapping[str, pd.Series],
     typed: Sequence[str],
 ) -> pd.DataFrame:
-    """What labels say of the runs: a column for each trait, empty where it tells no rows apart."""
+    """Traits of the runs in labels: a column for each, empty where it distinguishes no rows."""
     recorded = {
         key: runs[key].map(text, na_action="ignore").fillna("")
         for key, text in RECORDED.items()
@@ -142,23 +142,23 @@ def _distinguishing(
         lambda names: min(names, key=lambda name: _rank(name, ABLATIONS.values()))
     )
     said = [key for key in recorded if key in SAID]
-    chosen = ["method"]
+    distinct = ["method"]
     for key in dict.fromkeys([*said, *names, *typed, *settings, *recorded]):
-        known = traits[key].mask(traits[key] == "").groupby(runs["scene"])
-        differs = key in (*said, *typed) and known.nunique().gt(1).any()
+        values = traits[key].mask(traits[key] == "").groupby(runs["scene"])
+        differs = key in (*said, *typed) and values.nunique().gt(1).any()
         # A name is left out only where other names say it.
-        beside = [trait for trait in chosen if key not in names or trait in ("method", *names)]
+        beside = [trait for trait in distinct if key not in names or trait in ("method", *names)]
         rows = [runs["scene"], *(traits[trait] for trait in beside)]
         tells = traits.groupby([*rows, traits[key]]).ngroups > traits.groupby(rows).ngroups
-        # What equal runs call differently, such as an experiment that was typed out, is no name.
+        # Names that equal runs do not share, such as an experiment's that was typed out, are none.
         if (differs or tells) and equal[key].nunique().eq(1).all():
-            chosen.append(key)
-    several = traits.groupby(runs["scene"])[chosen].transform("nunique") > 1
-    return traits[chosen].where(several.assign(method=True), "")
+            distinct.append(key)
+    several = traits.groupby(runs["scene"])[distinct].transform("nunique") > 1
+    return traits[distinct].where(several.assign(method=True), "")
 
 
 def _methods(runs: pd.DataFrame) -> list[str]:
-    """What methods and ablations are called; runs of a scene at rest have no ablation."""
+    """Names of methods and ablations; runs of a scene at rest have no ablation."""
     names = []
     ablations = _options(runs, "ablation")
     for method, ablation, at_rest in zip(runs["method"], ablations, runs["at_rest"], strict=True):

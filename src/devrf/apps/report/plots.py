@@ -173,10 +173,10 @@ def against_views(table: Table) -> Figure | None:
     for axes, column in zip(figure.subplots(1, 2), (PSNR, second), strict=True):
         for k, ((scene, line), group) in enumerate(lines.groupby(["scene", "line"], sort=False)):
             color, dashes = _style(k)
-            known = group.dropna(subset=column.title)
+            rows = group.dropna(subset=column.title)
             label = scene if one_line else f"{scene}: {line}"
             axes.plot(
-                known["views"], known[column.title], dashes, color=color, marker="o", label=label
+                rows["views"], rows[column.title], dashes, color=color, marker="o", label=label
             )
         axes.set(xlabel="dynamic training views", ylabel=column.heading)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -209,9 +209,9 @@ def _points(axes: Axes, table: Table, block: Block) -> None:
 
 
 def _seconds_and_psnr(rows: pd.DataFrame) -> list[tuple[str, float, float]]:
-    """(label, seconds, PSNR) where both are known and a logarithm can show the time."""
-    known = rows["value"][[TIME.title, PSNR.title]].dropna()
-    return list(known[known[TIME.title] > 0].itertuples(name=None))
+    """(label, seconds, PSNR) if both are known and the time is above 0."""
+    scores = rows["value"][[TIME.title, PSNR.title]].dropna()
+    return list(scores[scores[TIME.title] > 0].itertuples(name=None))
 
 
 def _ticks(low: float, high: float) -> list[float]:

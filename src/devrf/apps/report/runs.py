@@ -34,7 +34,7 @@ _Name = Annotated[str, Len(1, LONGEST_NAME)]
 _Text = Annotated[str, Len(0, LONGEST)]
 _Plain = _Text | bool | int | float | Annotated[list[Any], Len(0, LONGEST)] | None
 SAMPLING = "run.settings.ray_stage.model.settings.sampling"
-# What every run has, and of what kind; further columns are what its file holds, by dotted name.
+# Columns of every run, and their kinds; further columns are entries of its file, by dotted name.
 COLUMNS: dict[str, Any] = {
     "folder": _Plain,
     "status": _Plain,
@@ -69,7 +69,7 @@ DEFAULT_PROTOCOL = "two_stage"
 
 @dataclass(frozen=True)
 class Collection:
-    """What was found below a folder.
+    """The runs below a folder.
 
     Attributes:
         runs: a row for each scored run: ``COLUMNS`` and everything in its ``metrics.json``.
@@ -99,24 +99,24 @@ def collect(folder: Path) -> Collection:
     rehearsals = 0
     for walked, inner, _ in os.walk(folder):
         inner[:] = sorted((name for name in inner if not name.startswith(".")), key=_natural)
-        place = Path(walked)
-        rehearsals += (place / REHEARSAL).is_file()
-        name = folder.resolve().name if place == folder else place.relative_to(folder).as_posix()
+        child = Path(walked)
+        rehearsals += (child / REHEARSAL).is_file()
+        name = folder.resolve().name if child == folder else child.relative_to(folder).as_posix()
         for file, status, read in (
-            (place / "failure.json", "failed", _failed),
-            (place / "metrics.json", "finished", _finished),
+            (child / "failure.json", "failed", _failed),
+            (child / "metrics.json", "finished", _finished),
         ):
             if not file.is_file():
                 continue
             try:
-                utf8_path(place)  # or no table could be printed
+                utf8_path(child)  # or no table could be printed
                 record = read(_flat(json.loads(read_record(file))))
             except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
                 skipped.append(shown(SKIPPED % file))
             except DevrfError as error:
                 skipped.append(str(error))
             else:
-                record |= {"folder": shown(name), "path": place, "status": status}
+                record |= {"folder": shown(name), "path": child, "status": status}
                 records[status].append(record)
     if rehearsals:
         skipped.append(f"{rehearsals} of the folders hold a rehearsal, which is no run")

@@ -56,7 +56,7 @@ OF_TIMES = (
     Column("PSNR at training times", "dynamic.training_times.psnr", True, 2),
     Column("PSNR at novel times", "dynamic.novel_times.psnr", True, 2),
 )
-# How a time below so many seconds is written: the unit's seconds, digits, the unit.
+# The form of a time below so many seconds: the unit's seconds, digits, the unit.
 TIMES = (
     (9.95, 1, 1, " s"),
     (99.5, 1, 0, " s"),
@@ -67,12 +67,12 @@ TIMES = (
 
 @dataclass(frozen=True)
 class Published:
-    """What the paper reports, and where.
+    """Results that the paper reports, and their source.
 
     Attributes:
-        hardware: what it was measured on.
-        credit: where it appeared, in words.
-        data: what each scene's data were, by devrf's name of the scene.
+        hardware: of the measurements.
+        credit: the source, in words.
+        data: of each scene, by devrf's name of the scene.
         texts: the cells as printed, indexed by scene and label. The column ``method`` is the
             paper's own name; its "Ours" is DeVRF in the label.
         values: the same cells as numbers, the time in seconds.
@@ -276,7 +276,7 @@ def _average(
 
 
 def _gains(rows: pd.DataFrame, average: pd.DataFrame) -> pd.DataFrame:
-    """What the rows of an average gain over its first: see :class:`Table`."""
+    """Gains of an average's rows over its first: see :class:`Table`."""
     by_scene = rows[rows["label"].isin(average.index)].pivot(index="label", columns="scene")
     psnr = by_scene["PSNR"].reindex(average.index)
     seconds = by_scene["Time"].reindex(average.index)
@@ -316,15 +316,15 @@ def _over_scenes(values: pd.DataFrame, scenes: list[str]) -> pd.DataFrame:
 
 def _scored_again(runs: pd.DataFrame) -> pd.Series:
     """Folders of runs whose checkpoint was scored again later, in another folder."""
-    known = runs[runs["run.checkpoint"].notna()].sort_values(
+    checkpointed = runs[runs["run.checkpoint"].notna()].sort_values(
         "run.date", kind="stable", na_position="first"
     )
-    again = known.loc[known.duplicated("run.checkpoint", keep="last"), "folder"]
+    again = checkpointed.loc[checkpointed.duplicated("run.checkpoint", keep="last"), "folder"]
     return again.sort_index()
 
 
 def _sampled(runs: pd.DataFrame) -> list[str]:
-    """How the methods that choose their samples took them, a sentence for each way."""
+    """Sampling of the methods that can choose it, a sentence for each way."""
     absent = pd.Series(None, runs.index, dtype=object)
     kind = runs.get(SAMPLING, absent)
     hull = runs.get("run.settings.ray_stage.model.settings.hull", absent)
@@ -337,13 +337,13 @@ def _sampled(runs: pd.DataFrame) -> list[str]:
 
 
 def _scored(runs: pd.DataFrame) -> str:
-    """What numbers of other tables are compared with: filter, range, network."""
+    """The form of the scores, for comparison with other tables: filter, range, network."""
     networks = runs.get("run.lpips_network", pd.Series(dtype=object)).dropna().unique()
     perceptual = f" LPIPS is that of {' or '.join(sorted(networks))}, on images in [-1, 1]."
-    known = len(networks) and runs[LPIPS.title].notna().any()
+    has_lpips = len(networks) and runs[LPIPS.title].notna().any()
     return (
         "Images are made smaller by the mean over areas (OpenCV's INTER_AREA); PSNR and SSIM are "
-        f"of colours in [0, 1].{perceptual if known else ''}"
+        f"of colours in [0, 1].{perceptual if has_lpips else ''}"
     )
 
 

@@ -14,7 +14,7 @@ from devrf.system import printed
 
 @dataclass(frozen=True)
 class Style:
-    """How a format escapes text, writes an unmarked, best, second and third cell, and a heading."""
+    """Forms of a format: of text, of an unmarked, best, second and third cell, and of a heading."""
 
     escape: Callable[[str], str]
     marks: tuple[str, str, str, str]
@@ -44,7 +44,7 @@ def _rows(
     body = pd.concat(cells, axis=1, keys=titles, sort=False)
     heads = pd.concat([frame["head"] for frame in frames]).groupby(level=0)
     counts = heads["counts"].agg(lambda sets: set().union(*sets))
-    # How many runs a row's values are means of, where it is more than one.
+    # The number of runs that a row's values are means of, if it is more than one.
     many = counts.map(lambda n: "" if n == {1} else f" (n = {', '.join(map(str, sorted(n)))})")
     names = heads["name"].first() + many
     heading = "Method" if table.runs["method"].nunique() > 1 else ""
@@ -64,7 +64,7 @@ def _marked(frame: pd.DataFrame, style: Style, columns: Sequence[Column]) -> pd.
 
 
 def caption(table: Table) -> str:
-    """What the measured numbers are, and which of them are marked."""
+    """The meaning of the measured numbers, and of their marks."""
     devices = table.runs["run.device"].dropna().unique()
     where = f" on {', '.join(devices)}" if len(devices) else ""
     repeated = bool((table.rows["count"] > 1).any())
@@ -78,7 +78,7 @@ def caption(table: Table) -> str:
 
 
 def reasons(collection: Collection) -> list[str]:
-    """Which runs failed, by their folders, and why, a line each."""
+    """The failed runs, by their folders, and why they failed, a line each."""
     lines: list[str] = []
     for failure in collection.failures.to_dict("records"):
         bug = " (a fault of the program: see its run.log)" * (failure["mistake"] is False)
@@ -106,8 +106,8 @@ def markdown(
         parts.append(f"† {printed.markdown(published().credit)}")
     for block in table.blocks:
         frame = cells_of(table, [block], MARKDOWN).droplevel(0, axis=1)
-        left = len(frame.columns) - len(table.columns)
-        align = ["left"] * left + ["right"] * len(table.columns)
+        labels = len(frame.columns) - len(table.columns)
+        align = ["left"] * labels + ["right"] * len(table.columns)
         cells = frame.to_markdown(index=False, disable_numparse=True, colalign=align)
         parts += [f"## {printed.markdown(block.title)}", cells]
     if len(table.gains):
@@ -183,17 +183,17 @@ def latex(table: Table) -> str:
 def _tables(table: Table, blocks: Sequence[Block], words: str) -> str:
     frame = cells_of(table, blocks, STYLE)
     count = len(table.columns)
-    left = len(frame.columns) - count * len(blocks)
+    labels = len(frame.columns) - count * len(blocks)
     above = [rf"\multicolumn{{{count}}}{{c|}}{{{STYLE.escape(block.title)}}}" for block in blocks]
     above[-1] = above[-1].replace("{c|}", "{c}", 1)  # no rule at the right edge
-    lines = [r"\hline", _line([*[""] * left, *above]), _line(frame.columns.get_level_values(1))]
+    lines = [r"\hline", _line([*[""] * labels, *above]), _line(frame.columns.get_level_values(1))]
     lines.append(r"\hline")
     for first, *cells in frame.itertuples(index=False):
         if any(cells):
             lines.append(_line([first, *cells]))
         else:  # the line above the published rows
             lines += [r"\hline", rf"\multicolumn{{{len(frame.columns)}}}{{l}}{{{first}}} \\"]
-    formats = "|".join(["l" * left, *["c" * count] * len(blocks)])
+    formats = "|".join(["l" * labels, *["c" * count] * len(blocks)])
     begin = r"\scriptsize \setlength{\tabcolsep}{3pt} \begin{tabular}"
     return "\n".join(
         [r"\begin{table*}[t]", r"\centering", rf"\caption{{{words}}}", f"{begin}{{{formats}}}"]

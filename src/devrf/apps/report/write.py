@@ -98,7 +98,7 @@ def _write_videos(table: Table, folder: Path) -> dict[str, str]:
     return links
 
 
-# What each run's video of the held-out views shows from left to right: truth, rendering, depth.
+# Columns of each run's video of the held-out views, from the left: truth, rendering, depth.
 COLUMNS = 3
 TRUTH = 0
 RENDERED = 1
@@ -123,7 +123,7 @@ def scene_video(table: Table, scene: str) -> Iterator[np.ndarray] | None:
 
 
 def _frame_count(path: Path) -> int:
-    """How many frames can be read of a video; a line in the log if there is none."""
+    """The number of readable frames of a video; a line in the log if there is none."""
     try:
         with path.open("rb") as file:
             if file.read(8)[4:] != b"ftyp":  # FFmpeg would follow what a list of files says
@@ -134,24 +134,24 @@ def _frame_count(path: Path) -> int:
         return 0
 
 
-def _pictures(films: Mapping[str, tuple[Path, int]]) -> Iterator[np.ndarray]:
-    times = np.linspace(0, 1, min(count for _, count in films.values()))
-    videos = (
+def _pictures(videos: Mapping[str, tuple[Path, int]]) -> Iterator[np.ndarray]:
+    times = np.linspace(0, 1, min(count for _, count in videos.values()))
+    streams = (
         _frames_at([round(time * (count - 1)) for time in times], path)
-        for path, count in films.values()
+        for path, count in videos.values()
     )
-    for frames in zip(*videos, strict=True):
+    for frames in zip(*streams, strict=True):
         truth = _column(frames[0], TRUTH)
-        shown = (_column(frame, RENDERED).resize(truth.size) for frame in frames)
-        yield _page({"truth": truth, **dict(zip(films, shown, strict=True))})
+        renderings = (_column(frame, RENDERED).resize(truth.size) for frame in frames)
+        yield _page({"truth": truth, **dict(zip(videos, renderings, strict=True))})
 
 
-def _frames_at(places: Iterable[int], path: Path) -> Iterator[np.ndarray]:
-    """A video's frames at increasing ``places``, of which one at a time is in memory."""
+def _frames_at(positions: Iterable[int], path: Path) -> Iterator[np.ndarray]:
+    """A video's frames at increasing ``positions``, of which one at a time is in memory."""
     frames = enumerate(iio.imiter(path))
     at, frame = next(frames)
-    for place in places:
-        while at < place:
+    for position in positions:
+        while at < position:
             at, frame = next(frames)
         yield frame
 
@@ -169,9 +169,9 @@ def _page(tiles: Mapping[str, Image.Image]) -> np.ndarray:
     down = math.ceil(len(tiles) / across)
     page = Image.new("RGB", (across * (width + MARGIN), down * (height + BAND + MARGIN)), "white")
     pen = ImageDraw.Draw(page)
-    for place, (label, tile) in enumerate(tiles.items()):
-        x = place % across * (width + MARGIN)
-        y = place // across * (height + BAND + MARGIN)
+    for number, (label, tile) in enumerate(tiles.items()):
+        x = number % across * (width + MARGIN)
+        y = number // across * (height + BAND + MARGIN)
         font = fitted_font(label, BAND // 2, width)
         pen.text((x + width / 2, y + BAND / 2), label, "black", font, "mm")
         page.paste(tile, (x, y + BAND))

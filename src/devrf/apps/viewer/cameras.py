@@ -65,7 +65,7 @@ def from_browser(
 
 
 def in_browser(keyframe: Keyframe) -> tuple[np.ndarray, np.ndarray, float]:
-    """Where a browser has the camera: unit quaternion wxyz, position, vertical angle in radians."""
+    """A browser's camera: unit quaternion wxyz, position, vertical angle in radians."""
     pose = keyframe.camera_to_world.double().cpu()
     turned = pose[:, :3] * pose.new_tensor(FLIP)
     wxyz = rotation_matrix_to_quaternion(turned[None])[0]

@@ -1,4 +1,4 @@
-"""What is chosen on the page: current time, channel, cameras, crop."""
+"""Controls of the page: current time, channel, cameras, crop."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from devrf.apps.viewer.drawing import Drawing, Shot
 from devrf.geometry.box import Box
 
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
-# How long the whole recording takes at speed 1, in seconds.
+# Duration of the whole recording at speed 1, in seconds.
 DURATION = 5.0
 
 
@@ -59,7 +59,7 @@ def number_of(control: Any) -> float:
 
 
 def choice_of(control: Any) -> Any:
-    """What is chosen of a control's options; the first, where a page has sent something else."""
+    """The chosen option of a control; the first, if a page has sent something else."""
     return control.value if control.value in control.options else control.options[0]
 
 
@@ -117,9 +117,9 @@ class Controls:
 
     def offer(self, drawing: Drawing) -> None:
         """Offer what can be shown of a scene."""
-        chosen = self._channel.value
+        channel = self._channel.value
         self._channel.options = drawing.channels
-        set_value(self._channel, chosen if chosen in drawing.channels else "color")
+        set_value(self._channel, channel if channel in drawing.channels else "color")
         self._rest.visible = drawing.has_rest
         self._timing.visible = not drawing.at_rest
 
@@ -138,7 +138,7 @@ class Controls:
         set_value(self._time, time)
 
     def shot(self, camera: viser.CameraHandle, box: Box, *, with_depth: bool) -> Shot:
-        """What a page's camera is to show; the crop is a part of the ``box``.
+        """The frame to be rendered for a page's camera; the crop is a part of the ``box``.
 
         ``with_depth``: whether something beside frusta is drawn into the scene.
 

@@ -1,4 +1,4 @@
-"""What the page shows, and which of it is rendered next."""
+"""The frames that the page shows, and their order of rendering."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ NEARLY = 0.75
 
 @dataclass(frozen=True)
 class Shot:
-    """What a frame is to show.
+    """A frame to be rendered.
 
     Attributes:
         keyframe: the camera and the scene's time.
@@ -75,7 +75,7 @@ class Drawing:
 
     Attributes:
         renderer: renders the scene; it may be replaced while the scene is learned.
-        channels: what can be shown of it.
+        channels: the names of its channels.
         has_rest: whether it has a rest state beside others.
         at_rest: whether it looks the same at all times.
     """
@@ -94,15 +94,15 @@ class Drawing:
 
     def height_within(self, seconds: float, aspect: float, height: int) -> int:
         """The rows of a frame that takes about ``seconds``, at most ``height``."""
-        left = max(seconds - self._overhead, seconds / 4)
-        rows = (left * self._rays_per_second / aspect) ** 0.5
+        budget = max(seconds - self._overhead, seconds / 4)
+        rows = (budget * self._rays_per_second / aspect) ** 0.5
         return max(min(height, int(rows)), min(height, 16))
 
     def draw(self, shot: Shot, height: int) -> Iterator[Frame | None]:
         """Render a shot: None after each block of rays, then the frame."""
         began = time.perf_counter()
-        shown = shot.keyframe.time
-        times = [0.0, shown] if shot.beside_rest and self.has_rest else [shown]
+        current = shot.keyframe.time
+        times = [0.0, current] if shot.beside_rest and self.has_rest else [current]
         tangent = len(times) * math.tan(math.radians(shot.keyframe.fov) / 2)
         keyframe = replace(shot.keyframe, fov=2 * math.degrees(math.atan(tangent)))
         parts = []

@@ -1,4 +1,4 @@
-"""Which requests a page's server answers: those of the page that it gave out, and no other."""
+"""A page's server answers requests of the page that it gave out, and no others."""
 
 from __future__ import annotations
 

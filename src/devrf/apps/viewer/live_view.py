@@ -26,7 +26,7 @@ class LiveView(Callback):
     no error of the viewer ends it.
 
     Attributes:
-        seconds: what the pictures of the present stage have taken.
+        seconds: of the rendering of the present stage's pictures.
     """
 
     def __init__(self, session: Session, share: float) -> None:

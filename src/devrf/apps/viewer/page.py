@@ -31,7 +31,7 @@ PAGE = "scene.html"
 PICTURES = "pictures"
 # Bytes of a page in which it says what it shows.
 START = 2000
-# What is served.
+# Served paths.
 SERVED = re.compile(r"/(scene\.html|pictures/\w{1,80}/\d{1,9}\.jpg)", re.ASCII)
 # Seconds in which a request has to come, and in which a client has to take 64 KB of the answer.
 PATIENCE = 10.0
@@ -61,7 +61,7 @@ def _source(name: str) -> str:
 
 @cache
 def _policy() -> str:
-    """What a browser lets a page do: a file from somebody else runs no program but devrf's own."""
+    """The page's content security policy: a foreign file runs no program but devrf's own."""
     program = hashlib.sha256(f"\n{_source('scene.js')}\n".encode()).digest()
     own = f"script-src 'sha256-{base64.b64encode(program).decode()}'"
     alone = "frame-ancestors 'none'; form-action 'none'; base-uri 'none'"

@@ -208,8 +208,8 @@ class PathPanel:
             self._line = None
         if len(self.keyframes) < 2:
             return
-        shown = CameraPath(self.keyframes, 1.0, 1.0).sampled(POINTS)
-        points = torch.stack([keyframe.camera_to_world[:, 3] for keyframe in shown]).numpy()
+        keyframes = CameraPath(self.keyframes, 1.0, 1.0).sampled(POINTS)
+        points = torch.stack([keyframe.camera_to_world[:, 3] for keyframe in keyframes]).numpy()
         self._line = self._server.scene.add_line_segments(
             "/video",
             np.stack([points[:-1], points[1:]], axis=1),

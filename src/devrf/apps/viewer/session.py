@@ -39,7 +39,7 @@ class Session:
 
     Attributes:
         scheduler: renders; None before :meth:`present`.
-        frames: how many have been shown.
+        frames: the number of frames that have been shown.
     """
 
     def __init__(

@@ -115,15 +115,15 @@ def _parts(model: DeVRFModel, eyes: Tensor) -> Iterator[tuple[str, Tensor]]:
     sampling = model.at(0.0).picture_settings
     occupied = partial(deformed_occupancy, field, model.occupancy, sampling)
     rest = occupied(GridWarp((), model.box))
-    shown = rest.points_near(field.density.shape, model.box)
+    visible = rest.points_near(field.density.shape, model.box)
     raw = field.density.values[..., 0]
-    yield "density", torch.where(shown, raw, raw.min()).half()
+    yield "density", torch.where(visible, raw, raw.min()).half()
     if not model.space.is_linear:  # rays end in the field's outer faces
-        shown[[0, -1]] = shown[:, [0, -1]] = shown[:, :, [0, -1]] = True
-    yield "rough", _rough(model, shown, eyes.to(shown.device))
-    low, high = field.color.values[shown | ~shown.any()].aminmax(dim=0)
+        visible[[0, -1]] = visible[:, [0, -1]] = visible[:, :, [0, -1]] = True
+    yield "rough", _rough(model, visible, eyes.to(visible.device))
+    low, high = field.color.values[visible | ~visible.any()].aminmax(dim=0)
     high = torch.maximum(high, low + 1e-6)
-    shares = ((field.color.values - low) / (high - low)).clamp(0, 1) * shown[..., None]
+    shares = ((field.color.values - low) / (high - low)).clamp(0, 1) * visible[..., None]
     codes = pad((255 * shares).round().byte(), (0, -len(low) % 4))
     yield "features", torch.cat(torch.split(codes, 4, dim=-1))
     assert isinstance(field.decoder, ColorDecoder)
@@ -145,15 +145,15 @@ def _parts(model: DeVRFModel, eyes: Tensor) -> Iterator[tuple[str, Tensor]]:
             yield f"residual-{k}", ((values / ROUNDED).round() * ROUNDED * near[..., None]).half()
 
 
-def _rough(model: DeVRFModel, shown: Tensor, eyes: Tensor) -> Tensor:
+def _rough(model: DeVRFModel, visible: Tensor, eyes: Tensor) -> Tensor:
     """Colours (X, Y, Z, 3), bytes, as the nearest of the ``eyes`` (K, 3) sees them.
 
-    Of grid points where ``shown`` (X, Y, Z), else 0.
+    Of grid points where ``visible`` (X, Y, Z), else 0.
     """
     field = model.canonical
     points = model.box.grid_points(field.density.shape, eyes)
-    codes = torch.zeros(*field.density.shape, 3, dtype=torch.uint8, device=shown.device)
-    for where in torch.split(shown.nonzero(), CHUNK):
+    codes = torch.zeros(*field.density.shape, 3, dtype=torch.uint8, device=visible.device)
+    for where in torch.split(visible.nonzero(), CHUNK):
         at = where.unbind(dim=1)
         world = model.space.to_world(points[at])
         views = normalize(world - eyes[torch.cdist(world, eyes).argmin(dim=1)], dim=1)
@@ -166,9 +166,9 @@ def _rough(model: DeVRFModel, shown: Tensor, eyes: Tensor) -> Tensor:
 def _seen(
     motion: DeformationField, cell: float, occupied: Callable[[GridWarp], Occupancy]
 ) -> list[Tensor]:
-    """Where something is at any time between two consecutive frames: masks (X, Y, Z).
+    """Occupancy at any time between two consecutive frames: masks (X, Y, Z).
 
-    From the nearest of some times nothing moves by more than a ``cell``, by which they are grown.
+    Nothing moves by more than a ``cell`` from the nearest of some times: masks are grown by one.
     """
     masks = []
     times = motion.clock.times
@@ -201,14 +201,14 @@ def _weights(decoder: ColorDecoder, low: Tensor, high: Tensor) -> Tensor:
         network.output_bias[:, None],
         network.output_weight,
     )
-    # What one input after the other adds to all outputs; of both a multiple of four.
+    # Contributions of one input after the other to all outputs, each number a multiple of four.
     whole = [pad(part, (0, -part.shape[1] % 4, 0, -part.shape[0] % 4)).T for part in parts]
     flat = torch.cat([part.flatten() for part in whole])
     return pad(flat, (0, -len(flat) % (4 * ROW))).view(1, -1, ROW, 4)
 
 
 def _description(model: DeVRFModel, viewpoints: Viewpoints) -> dict[str, Any]:
-    """What the page knows beside its textures."""
+    """The page's data beside its textures."""
     field = model.canonical
     motion = model.deformation
     space = model.space
