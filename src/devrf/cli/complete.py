@@ -1,11 +1,11 @@
-"""What was typed, completed: the command line that Hydra composes.
+"""Completes the typed command line, for Hydra to compose.
 
 * Paths get the quotes that Hydra's grammar needs, and ``~`` is filled in.
 * A run that is named (``ckpt=``, ``hydra.run.dir=``, ``hydra.sweep.dir=``) brings the overrides
-  that it was learned with. What is typed comes after them: only that differs.
-* A scene's folder brings what its files say and nothing else has said: ``data=``, ``facing=``; if
-  one camera filmed it ``experiment=phone``, or for a method that is typed ``protocol=dynamic``;
-  these, too, for ``data.camera=handheld``.
+  that it was learned with. Typed overrides come after them: only these differ.
+* A scene's folder brings settings that its files determine and nothing else sets: ``data=``,
+  ``facing=``; if one camera filmed it ``experiment=phone``, or for a method that is typed
+  ``protocol=dynamic``; these, too, for ``data.camera=handheld``.
 """
 
 from __future__ import annotations
@@ -33,24 +33,13 @@ from devrf.errors import DevrfError
 from devrf.system.override import literal, without_reference
 from devrf.system.process import importing
 
-# Stages that DeVRF's protocol alone has.
+# Stages of DeVRF's protocol alone.
 DEVRF_STAGES = ("canonical", "deformation")
-# What says how a scene is learned: groups, and keys that DeVRF alone has.
-TRAINING_KEYS: tuple[str, ...] = (
-    "method",
-    "profile",
-    "protocol",
-    "comparison",
-    "experiment",
-    "ablation",
-)
-TRAINING_KEYS += ("hparams_search", "data.static_until", "field", "sampling", "loss")
-TRAINING_KEYS += (
-    "canonical",
-    "deformation",
-    "schedule.canonical",
-    "schedule.deformation",
-    "schedule.motion",
+# Training settings of a scene: groups, and keys that DeVRF alone has.
+TRAINING_KEYS = (
+    *("method", "profile", "protocol", "comparison", "experiment", "ablation", "hparams_search"),
+    *("data.static_until", "field", "sampling", "loss", "canonical", "deformation"),
+    *("schedule.canonical", "schedule.deformation", "schedule.motion"),
 )
 ONE_CAMERA = "one moving camera, where method=devrf needs the scene at rest, too"
 # `viewer` is a group, whose choices Hydra wants to be text.
@@ -66,50 +55,44 @@ def completed(arguments: Sequence[str]) -> list[str]:
             options, or a group's choice is null.
     """
     applied_defaults.clear()
-    known, _ = get_args_parser().parse_known_intermixed_args(arguments)
-    flags = [word for word in arguments if word not in known.overrides]
-    texts = [SHORTHAND.get(word.lower(), word) for word in known.overrides]
-    in_sweep = known.multirun or _sweeps(texts, known.config_dir)
+    options, _ = get_args_parser().parse_known_intermixed_args(arguments)
+    flags = [word for word in arguments if word not in options.overrides]
+    texts = [SHORTHAND.get(word.lower(), word) for word in options.overrides]
+    in_sweep = options.multirun or _sweeps(texts, options.config_dir)
     texts = [quoted_path(text, in_sweep) for text in texts]
     try:
         typed = parsed(texts)
     except HydraException:  # reported when Hydra parses them
         return [*flags, *texts]
     for override in typed:
-        options = group_choices().get(override.key_or_group)
-        if options and override.value() is None and not override.is_delete():
+        names = group_choices().get(override.key_or_group)
+        if names and override.value() is None and not override.is_delete():
             line = override.input_line
-            raise DevrfError(f"{line}: choose one of {', '.join(options)}, or leave it out")
+            raise DevrfError(f"{line}: choose one of {', '.join(names)}, or leave it out")
     run = value(typed, "hydra.run.dir")
     if run is not None and serves_page(typed, Path(run)):
         return [*flags, *texts]
-    before = of_named_run(typed, known.multirun)
+    before = of_named_run(typed, options.multirun)
     roots = values(typed, "data.root")
     overrides = parsed([*before, *texts])
-    if (
-        value(overrides, "data.camera") == "handheld"
-        and value(overrides, "stage") not in SCENELESS_STAGES
-    ):
-        chosen = _for_one_camera("data.camera=handheld", overrides, continued=bool(before))
-        if chosen:
-            applied_defaults.append(f"data.camera=handheld: {ONE_CAMERA} ({' '.join(chosen)})")
-        return [*flags, *before, *texts, *chosen]
-    if (
-        not roots
-        or value(overrides, "stage") in SCENELESS_STAGES
-        or any("${" in root for root in roots)
-    ):
+    needs_scene = value(overrides, "stage") not in SCENELESS_STAGES
+    if needs_scene and value(overrides, "data.camera") == "handheld":
+        words = _for_one_camera("data.camera=handheld", overrides, continued=bool(before))
+        if words:
+            applied_defaults.append(f"data.camera=handheld: {ONE_CAMERA} ({' '.join(words)})")
+        return [*flags, *before, *texts, *words]
+    if not (roots and needs_scene) or any("${" in root for root in roots):
         return [*flags, *before, *texts]
     readers: list[str | None] = [*values(overrides, "data")]
-    readers = readers or _of_experiments(overrides, known.config_dir)
-    words = [
+    readers = readers or _of_experiments(overrides, options.config_dir)
+    defaults = [
         _defaults_of_scene(reader, root, overrides, continued=bool(before))
         for reader, root in product(readers, roots)
     ]
-    if any(other != words[0] for other in words):
-        needed = " and ".join(dict.fromkeys(" ".join(other) or "neither" for other in words))
+    if any(words != defaults[0] for words in defaults):
+        needed = " and ".join(dict.fromkeys(" ".join(words) or "neither" for words in defaults))
         raise DevrfError(f"data.root: the scenes need {needed}; sweep over those of each apart")
-    return [*flags, *before, *texts, *words[0]]
+    return [*flags, *before, *texts, *defaults[0]]
 
 
 def quoted_path(argument: str, multirun: bool) -> str:
@@ -120,10 +103,10 @@ def quoted_path(argument: str, multirun: bool) -> str:
     Raises:
         DevrfError: it names a file that no config can hold.
     """
-    found = KEY_VALUE.fullmatch(argument)
-    if not found or found[2] not in PATHS:
+    match = KEY_VALUE.fullmatch(argument)
+    if not match or match[2] not in PATHS:
         return argument
-    start, _, text = found.groups()
+    start, _, text = match.groups()
     if "${" in text:
         if os.path.lexists(path := os.path.expanduser(text)):
             without_reference(Path(path))
@@ -156,7 +139,7 @@ def _sweeps(texts: Sequence[str], config_dir: str | None) -> bool:
 
 @contextmanager
 def _config_loader() -> Iterator[ConfigLoader]:
-    """What composes configs, before Hydra itself has begun."""
+    """A loader that composes configs before Hydra itself has begun."""
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         yield GlobalHydra.instance().config_loader()
 
@@ -177,9 +160,9 @@ def _says_how(override: Override) -> bool:
 def _defaults_of_scene(
     option: str | None, root: str, overrides: Sequence[Override], *, continued: bool
 ) -> list[str]:
-    """What the files of a scene say, which ``data=option`` reads, and no override does.
+    """Settings by the files of a scene, which ``data=option`` reads, that no override sets.
 
-    How it is learned is not said where a run is ``continued``.
+    Training settings are not among them if a run is ``continued``.
 
     Raises:
         DevrfError: ``option`` is None, and no reader knows the layout.
@@ -203,31 +186,28 @@ def _defaults_of_scene(
     video = value(overrides, "data.monocular")
     ordered = value(overrides, "data.times") == "order"
     if video == "True" or (video is None and by_one_camera(option, root, ordered=ordered)):
-        chosen = _for_one_camera(root, overrides, continued=continued)
-        words += chosen
-        why = f"{ONE_CAMERA}; {why}" if chosen and chosen != ["protocol=dynamic"] else why
+        monocular = _for_one_camera(root, overrides, continued=continued)
+        words += monocular
+        why = f"{ONE_CAMERA}; {why}" if monocular and monocular != ["protocol=dynamic"] else why
     scene = Path(root).expanduser().resolve().name
     if value(overrides, "experiment") == "paper" and option in ("inward", "forward"):
         if (config_folder() / f"for_scene/paper_{scene}.yaml").is_file():
-            applied_defaults.append(
-                f"{root}: if it is DeVRF's, data={scene} has what is published for it"
-            )
+            line = f"{root}: if it is DeVRF's, data={scene} has what is published for it"
+            applied_defaults.append(line)
     if words:
         applied_defaults.append(f"{root}: {why} ({' '.join(words)}){remark}")
     return words
 
 
 def _for_one_camera(scene: str, overrides: Sequence[Override], *, continued: bool) -> list[str]:
-    """The overrides by which what one moving camera filmed is learned, where nothing says how.
+    """The overrides for a monocular scene, unless its training settings are typed.
 
-    None where a run is ``continued``; where DeVRF is asked for, the log says what it lacks.
+    There are none if a run is ``continued``; if DeVRF is asked for, the log says what it lacks.
     """
     method = value(overrides, "method")
     if method == "devrf" or value(overrides, "stage") in DEVRF_STAGES:
-        lacks = "one camera filmed it moving, and nothing shows it at rest"
-        applied_defaults.append(
-            f"{scene}: {lacks}; experiment=phone learns more of it than method=devrf"
-        )
+        lacks = f"{scene}: one camera filmed it moving, and nothing shows it at rest"
+        applied_defaults.append(f"{lacks}; experiment=phone learns more of it than method=devrf")
     elif not continued and not any(map(_says_how, overrides)):
         with importing():
             import torch
@@ -252,6 +232,6 @@ def _of_experiments(overrides: Sequence[Override], config_dir: str | None) -> li
         for name in names:
             with suppress(HydraException):  # reported when Hydra composes it
                 words = [f"experiment={name}", *texts]
-                found = loader.compute_defaults_list("config", words, RunMode.RUN)
-                options.append(found.overrides.override_choices.get("data"))
+                defaults = loader.compute_defaults_list("config", words, RunMode.RUN)
+                options.append(defaults.overrides.override_choices.get("data"))
     return [str(option) for option in options if option is not None] or [None]

@@ -22,7 +22,7 @@ PIPELINE = "pipeline"
 SCENELESS_STAGES = ("report", "fetch", "capture", "selfcheck")
 # Stages that learn nothing; the protocol's stages come beside these.
 STEPS = ("prepare", "inspect", "evaluate", "render", "still", "view", "export", *SCENELESS_STAGES)
-# Of these, what uses a checkpoint.
+# Those of them that use a checkpoint.
 OF_A_CHECKPOINT = ("evaluate", "render", "still", "view", "export")
 # Keys whose values are files or folders.
 PATHS = {
@@ -45,8 +45,8 @@ def group_choices() -> Mapping[str, Sequence[str]]:
     names: dict[str, list[str]] = {}
     folder = config_folder()
     for path in sorted(folder.glob("*/**/*.yaml")):
-        place = path.parent.relative_to(folder)
-        names.setdefault(place.as_posix(), []).append(path.stem)
+        group = path.parent.relative_to(folder)
+        names.setdefault(group.as_posix(), []).append(path.stem)
     return names
 
 
@@ -71,14 +71,14 @@ def scene_folder_name(scene: str) -> str:
 
 
 def run_folder(_root_: Any) -> str:
-    """A run's folder; of a report, where it is written.
+    """A run's folder; for a report, the report's.
 
-    It is named after scene and experiment, and what else is chosen beside the usual. Without an
+    It is named after scene and experiment, and the choices that are not the usual ones. Without an
     experiment DeVRF learns as by ``experiment=quickstart``: they are one run.
     """
     stage = _root_.stage
     report = _root_.report
-    chosen = _root_.hydra.runtime.choices
+    options = _root_.hydra.runtime.choices
     if stage in ("fetch", "selfcheck"):
         return f"outputs/{stage}"
     if stage == "capture":
@@ -88,11 +88,11 @@ def run_folder(_root_: Any) -> str:
         # A misspelt folder is not created: the step reports that there is none.
         runs = report.runs if Path(report.runs).is_dir() else "outputs"
         return str(ReportSettings(runs, report.into).folder)
-    parts = [chosen.experiment or "quickstart"]
-    if chosen.ablation not in (None, "full"):
-        parts.append(chosen.ablation)
-    if (chosen.method, chosen.protocol) != ("devrf", "two_stage"):
-        parts += [chosen.method, chosen.protocol]
+    parts = [options.experiment or "quickstart"]
+    if options.ablation not in (None, "full"):
+        parts.append(options.ablation)
+    if (options.method, options.protocol) != ("devrf", "two_stage"):
+        parts += [options.method, options.protocol]
     if _root_.rehearse:
         parts.append("rehearsal")
     return f"outputs/{scene_name(_root_)}/{'-'.join(parts)}"
@@ -138,8 +138,8 @@ def choices() -> dict[str, str | None]:
     """The present job's option of each config group, without Hydra's own; empty outside Hydra."""
     if not HydraConfig.initialized():
         return {}
-    chosen = HydraConfig.get().runtime.choices
-    return {str(k): v for k, v in chosen.items() if not str(k).startswith("hydra/")}
+    options = HydraConfig.get().runtime.choices
+    return {str(k): v for k, v in options.items() if not str(k).startswith("hydra/")}
 
 
 def overrides() -> list[str]:

@@ -38,12 +38,12 @@ ROOT: dict[str, Any] = {
     "decoder_precision": Literal["auto", "float32", "bfloat16"],
     "kernels": Literal["auto", "torch"],
 }
-# What cannot be loaded ends the command with one line; Hydra would log it before.
+# A part that cannot be loaded ends the command with one line; Hydra would log it before.
 logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)
 # Hydra's own keys in a part's config.
 RESERVED = {"_target_", "_partial_", "_convert_", "_recursive_", "_args_"}
-# What pydantic calls a key that does not exist, and a value of a class that no config value has;
-# what a row of settings lacks is left to the part itself.
+# Pydantic's names of a key that does not exist, of a value whose class no config value has, and of
+# a key that a row of settings lacks, which is left to the part itself.
 UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
 BUILT = ("needs_python_object", "is_instance_of")
 LEFT = ("missing", "missing_argument")
@@ -94,12 +94,12 @@ def check_config(config: DictConfig) -> None:
 
 
 def _is_left_to_the_part(issue: Mapping[str, Any]) -> bool:
-    """Whether pydantic objects to what only building tells: a row's keys, what a part becomes."""
+    """Whether only building the part tells if pydantic is right: a row's keys, a part's class."""
     return issue["type"] in LEFT or (issue["type"] in BUILT and _is_part(issue["input"]))
 
 
 def _type_of(raw: Node, resolved: Node, path: str, read: tuple[str, ...]) -> Any:
-    """The type of a node: that of a part has its settings, another what a part reads of it.
+    """The type of a node: a part's has its settings, another's the keys that parts read of it.
 
     A value outside any part counts as read when some part refers to it: ``${loss.search}``.
     """
@@ -120,7 +120,7 @@ def _type_of(raw: Node, resolved: Node, path: str, read: tuple[str, ...]) -> Any
 
 
 def _place(raw: Node, names: Iterable[object]) -> tuple[str, Node]:
-    """The key at which the user sets the value in a place of a config, and what is beside it."""
+    """The key at which the user sets a value of a config, and the mapping that holds it."""
     where = ""
     node = cast(Any, raw)
     beside = raw
@@ -160,7 +160,7 @@ def _parameters(target: str, path: str) -> dict[str, Any]:
     types = {
         "**" if p.kind is p.VAR_KEYWORD else p.name: hints.get(p.name, Any) for p in parameters
     }
-    # Whatever the type, a part takes what it has by itself.
+    # A part takes its own default, whatever the type.
     return types | {p.name: types[p.name] | None for p in parameters if p.default is None}
 
 
@@ -168,13 +168,13 @@ def _is_part(value: object) -> bool:
     return isinstance(value, Mapping) and "_target_" in value
 
 
-def unknown_key(where: str, known: Iterable[object]) -> DevrfError:
+def unknown_key(where: str, keys: Iterable[object]) -> DevrfError:
     """The error for a key that does not exist, with the closest one that does."""
     name = where.rpartition(".")[2]
-    meant = did_you_mean(name, (key for key in known if key != name), where[: -len(name)])
+    meant = did_you_mean(name, (key for key in keys if key != name), where[: -len(name)])
     group = where.removesuffix(f".{name}")
     files = sorted((config_folder() / group).glob("*.yaml"))
-    # As a list: a DictConfig does not "contain" what is required and not given.
+    # As a list: a DictConfig does not "contain" a required key that is not given.
     having = ", ".join(path.stem for path in files if name in list(OmegaConf.load(path)))
     instead = f"it belongs to {group}={having}" if having else "--cfg job shows every key there is"
     return DevrfError(f"{where}: no such key{meant or f'; {instead}'}")
@@ -182,14 +182,14 @@ def unknown_key(where: str, known: Iterable[object]) -> DevrfError:
 
 def check_extras(config: DictConfig) -> None:
     """Refuse by a DevrfError settings for which an extra of devrf is not installed."""
-    # What DeVRF learns a browser draws by itself.
+    # A browser draws DeVRF's scenes by itself.
     served = ("server",) if config.method == "devrf" else ("server", "auto")
     serves = config.stage == "view" and config.viewer.renderer in served
     tensorboard = "TensorBoard" in config.logger.get("_target_", "")
     exports = config.stage == "export" and config.export.format != "html"
     meshes = "skimage trimesh fast_simplification"
     usd = exports and config.export.format == "usd"
-    for chosen, setting, packages, extra, instead in (
+    for is_used, setting, packages, extra, instead in (
         (tensorboard, "logger=tensorboard", "tensorboard", "tensorboard", "logger=csv"),
         (serves, "stage=view", "viser", "viewer", "stage=render"),
         (config.viewer.get("training"), "viewer=true", "viser", "viewer", "viewer=false"),
@@ -197,7 +197,7 @@ def check_extras(config: DictConfig) -> None:
         (usd, "export.format=usd", "pxr", "export", "export.format=gltf"),
     ):
         for package in packages.split():
-            if chosen and find_spec(package) is None:
+            if is_used and find_spec(package) is None:
                 raise DevrfError(
                     f"{setting}: {package} is not installed; run pip install "
                     f'"devrf[{extra}]", or set {instead}'

@@ -55,10 +55,10 @@ class RunContext(ExitStack):
         folder: gets ``checkpoints/<stage>.ckpt``, ``metrics.json``, ``frames.csv``, ``images/`` and
             ``videos/``, next to Hydra's config and log.
         place: the folder as a command names it: relative, where it is below the working folder.
-        command: what this run is learned with, as it was composed.
-        protocol: which data trains which part of the method.
+        command: options and values that this run is learned with, as composed.
+        protocol: the stages, their data, and the parts of the method that they train.
         learning_stages: names of the protocol's stages, in their order.
-        evaluation: what is measured on held-out views.
+        evaluation: the metrics on held-out views.
         strategy: the configured trainer's: its device, rank and number of processes.
         is_rank_zero: whether this process writes files and logs: rank 0, or the only one.
         device: the trainer's.
@@ -67,9 +67,9 @@ class RunContext(ExitStack):
         whole_scene: in a rehearsal, the scene with images of their own size, until what the run
             itself needs has been estimated.
         is_trial: whether ``trainer.fast_dev_run`` asks for a step of each stage, with nothing kept.
-        tried: what the stages of a trial came to, by name.
+        tried: the results of a trial's stages, by name.
         chooses_size: whether the images' size is left to this run.
-        step_began: when the step before ended; of the first step, when the run began.
+        step_began: the end of the step before; of the first step, the begin of the run.
     """
 
     def __init__(self, config: DictConfig, folder: Path) -> None:
@@ -107,9 +107,9 @@ class RunContext(ExitStack):
         data = self.config.data
         if data.get("downscale") == "auto":
             anew = self.config.stage == PIPELINE and not self.config.resume
-            known = {} if anew else learned_with(self.folder, self.config.ckpt)
-            data.downscale = known.get(SIZE, "gpu" if self.device.type == "cuda" else "cpu")
-            self.chooses_size = SIZE not in known
+            settings = {} if anew else learned_with(self.folder, self.config.ckpt)
+            data.downscale = settings.get(SIZE, "gpu" if self.device.type == "cuda" else "cpu")
+            self.chooses_size = SIZE not in settings
         built: SceneDataModule = instantiate(data)
         built.priors = self.config.priors
         built.validation = self.config.objective.startswith(f"{VALIDATION}.")
@@ -150,8 +150,8 @@ class RunContext(ExitStack):
         Raises:
             DevrfError: there is none.
         """
-        if left := tuple(name for name in names if name in self.stages_with_images):
-            return left
+        if learnable := tuple(name for name in names if name in self.stages_with_images):
+            return learnable
         at_rest = f"{self.config.scene} is at rest: all its images show one moment"
         if self.stages_with_images:
             raise DevrfError(f"stage={names[0]}: learns motion, but {at_rest}; use stage=pipeline")
@@ -232,10 +232,10 @@ class RunContext(ExitStack):
             return Path(given)
         for stage in self.learning_stages[::-1] if name is None else (name,):
             path = self.own_checkpoint(stage)
-            left = progress_files(path.parent, stage) if name is None else []
-            for found in [path, *left]:
-                if found.exists():
-                    return found
+            unfinished = progress_files(path.parent, stage) if name is None else []
+            for file in [path, *unfinished]:
+                if file.exists():
+                    return file
         raise DevrfError(f"{path}: no such checkpoint; run stage={stage} first, or give ckpt=PATH")
 
     def load(self, name: str | None = None, scene: Scene | None = None) -> LoadedCheckpoint:

@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 
 
 def evaluate(run: RunContext) -> list[Path]:
-    """Score what was learned on held-out views; return the files: metrics and contact sheets.
+    """Score the learned scene on held-out views; return the files: metrics and contact sheets.
 
     Raises:
         DevrfError: the last stage is not finished, and not named by ``ckpt``.
@@ -84,16 +84,16 @@ def evaluate(run: RunContext) -> list[Path]:
         "checkpoint": digest_of(run.checkpoint(metadata.stage)),
     }
     ran["wall_seconds"]["evaluate"] = run.step_seconds
-    # A report takes metrics.json for what a finished run has reached.
+    # A report takes metrics.json for the scores of a finished run.
     metrics = "metrics.json" if standing is None else "metrics-unfinished.json"
     metrics = REHEARSAL if run.rehearses else metrics
     write_json(run.folder / metrics, {**head, **without_motion, **sections, "run": ran})
-    shown = shown_sections(sections)
-    for name, values in shown.items():
+    summary = shown_sections(sections)
+    for name, values in summary.items():
         log.info("%s: %s", name.replace("_", " "), in_words(values))
     for tracker in run.trackers:
-        tracker.conclude(tracked_scores(sections | shown))
-        tracker.show_table("metrics", [{"section": name, **row} for name, row in shown.items()])
+        tracker.conclude(tracked_scores(sections | summary))
+        tracker.show_table("metrics", [{"section": name, **row} for name, row in summary.items()])
         tracker.show_table("frames", frame_rows(frames))
     written = (metrics, "frames.csv", *(f"images/{capture}.png" for capture in frames))
     return [run.folder / name for name in written]

@@ -1,4 +1,4 @@
-"""The command: what is typed is completed and composed, the config checked, the stage run."""
+"""The command: its line is completed and composed, the config is checked, the stage runs."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ register_config()
 def entry() -> None:
     """Run the application.
 
-    A mistake in the input ends it with one line and status 2, a sweep of which jobs failed with
-    their names and status 3, a signal with one line and 128 plus its number: 130 for Ctrl-C,
-    143 for SIGTERM, 141 for output that nobody reads.
+    A mistake in the input ends it with one line and status 2. A sweep whose jobs failed ends with
+    their names and status 3. A signal ends it with one line and 128 plus its number: 130 for
+    Ctrl-C, 143 for SIGTERM, 141 for output that nobody reads.
     """
     use_utf8()
     # Hydra would print a traceback of its own and exit with 1 if it were not told to raise.

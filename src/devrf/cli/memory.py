@@ -50,16 +50,16 @@ def needs(run: RunContext, config: DictConfig, scene: Scene) -> dict[str, StageN
 def _stages(
     run: RunContext, config: DictConfig, scene: Scene, names: Sequence[str]
 ) -> list[StageNeeds]:
-    """What the stages ``names`` of a configured run need."""
+    """Needs of the stages ``names`` of a configured run."""
     with as_own_errors():
         every = needs(run, config, scene)
     return [every[name] for name in names]
 
 
 def compare(run: RunContext, names: Sequence[str]) -> tuple[str, Advice | None, list[str]]:
-    """What the stages ``names`` need of what there is; where that lacks, the override that helps.
+    """Needs of the stages ``names`` in words; if something lacks, a remedy and its override.
 
-    Where the images' size was left to the run, it is changed at once; with ``schedule.seconds``
+    If the images' size was left to the run, it is changed at once; with ``schedule.seconds``
     the largest batch is.
     """
     scene = run.scene

@@ -63,13 +63,13 @@ def is_user_error(error: BaseException) -> bool:
 
 
 def _cause(error: BaseException) -> BaseException:
-    """The first DevrfError in a chain of causes, else what Hydra failed to build."""
+    """The first DevrfError in a chain of causes, else the error by which Hydra failed to build."""
     cause = error.__cause__
     built = str(error).startswith("Error in call to target")
     if isinstance(error, DevrfError) or cause is None:
         return error
-    found = _cause(cause)
-    return found if isinstance(found, DevrfError) else cause if built else error
+    first = _cause(cause)
+    return first if isinstance(first, DevrfError) else cause if built else error
 
 
 def one_line(error: BaseException) -> str:
@@ -79,10 +79,10 @@ def one_line(error: BaseException) -> str:
         pass
     elif isinstance(error, MissingConfigException) and "/" in str(error.missing_cfg_file):
         group, _, option = str(error.missing_cfg_file).rpartition("/")
-        known = f"; choose one of {', '.join(error.options)}" if error.options else ""
+        names = f"; choose one of {', '.join(error.options)}" if error.options else ""
         more = '; others need pip install "devrf[sweeps]"' if group.startswith("hydra/") else ""
         meant = did_you_mean(option, error.options or (), f"{group}=")
-        text = f"{group}={option}: no such option{known}{more}{meant}"
+        text = f"{group}={option}: no such option{names}{more}{meant}"
     elif isinstance(error, OverrideParseException):
         text = _not_understood(str(error.override))
     elif several := re.match(r"(?s)Ambiguous value for argument '(.*?)'\n1\. ", text):
@@ -102,7 +102,7 @@ def one_line(error: BaseException) -> str:
 
 
 def _of_several(argument: str) -> str:
-    """What to type instead of values with commas between them, which only a sweep has."""
+    """A remedy for values with commas between them, which only a sweep has."""
     key, _, value = argument.partition("=")
     as_text, as_list = to_type(key, value), shlex.quote(f"{key}=[{value}]")
     return (
@@ -111,7 +111,7 @@ def _of_several(argument: str) -> str:
 
 
 def _not_understood(argument: str) -> str:
-    """What to type instead of an argument that Hydra cannot read."""
+    """A remedy for an argument that Hydra cannot read."""
     key, is_set, value = argument.partition("=")
     if is_set and value[:1] == "[" and value[-1:] == "]":
         listed = to_type(key, [item.strip() for item in value[1:-1].split(",")])

@@ -1,4 +1,4 @@
-"""What comes before learning: a scene is fetched, captured, written, inspected; the GPU checked."""
+"""Steps before learning: a scene is fetched, captured, written, inspected; the GPU is checked."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def say_next(*commands: list[str]) -> None:
 
 
 def fetch(run: RunContext) -> None:
-    """Download the scene ``scene=…`` into ``fetch.into``, and say what to do with it."""
+    """Download the scene ``scene=…`` into ``fetch.into``, and say the next commands."""
     settings: FetchSettings = instantiate(run.config.fetch)
     scene = published_scene(run.config.scene, settings.catalogue)
     root = to_type("data.root", fetched(scene, settings, progress=sys.stderr.isatty()))
@@ -84,7 +84,7 @@ def prepare(run: RunContext) -> None:
 
 
 def inspect(run: RunContext) -> None:
-    """Report and draw what the scene holds, what it needs, and what may be wrong with it."""
+    """Report and draw the scene's content, its needs and its likely mistakes."""
     # Only this step draws with matplotlib.
     from devrf.apps.inspection.picture import write_inspection_picture
 

@@ -1,8 +1,8 @@
-"""``rehearse=true``: all that a run does, at sizes for minutes on a CPU, and what it came to.
+"""``rehearse=true``: all that a run does, at sizes for minutes on a CPU, and its results.
 
 The settings are the run's own. Its schedules are scaled, so that every event happens in its order;
-batches, grids, networks and images are smaller (:meth:`~devrf.engine.stage.Stage.rehearsed`). What
-it leaves is no run: it has a folder of its own, ``rehearsal.json`` in place of ``metrics.json``, so
+batches, grids, networks and images are smaller (:meth:`~devrf.engine.stage.Stage.rehearsed`). Its
+result is no run: it has a folder of its own, ``rehearsal.json`` in place of ``metrics.json``, so
 that no report compares it, and checkpoints that no run goes on with. It begins anew each time.
 """
 
@@ -32,13 +32,12 @@ KEY = "rehearse"
 
 
 def begin_anew(run: RunContext, learning: Sequence[str]) -> None:
-    """Remove what an earlier rehearsal has learned in the folder of these stages and later ones.
+    """Remove an earlier rehearsal's checkpoints of these stages and later ones in the folder.
 
     Raises:
         DevrfError: a run's own checkpoints are there.
     """
-    found = sorted((run.folder / "checkpoints").glob("*.ckpt"))
-    for path in found:
+    for path in sorted((run.folder / "checkpoints").glob("*.ckpt")):
         if KEY not in metadata_of(path).training_config:
             raise DevrfError(
                 f"{path}: of a run; a rehearsal needs a folder of its own, hydra.run.dir=FOLDER"
@@ -50,7 +49,7 @@ def begin_anew(run: RunContext, learning: Sequence[str]) -> None:
 
 
 def conclude(run: RunContext) -> None:
-    """Say what each stage came to, and what the run itself needs; write it to the record.
+    """Show each stage's results, and the needs of the run itself; write them to the record.
 
     Raises:
         DevrfError: a stage has learned nothing, or what was planned did not take place.

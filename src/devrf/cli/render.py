@@ -1,4 +1,4 @@
-"""``stage=render``, ``still``, ``view`` and ``export``: what is made of a learned scene."""
+"""``stage=render``, ``still``, ``view`` and ``export``: products of a learned scene."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-# Times whose views stay at hand in the viewer: both ends, the rest state, and where time runs.
+# Times whose views stay at hand in the viewer: both ends, the rest state, and the current ones.
 CACHED = 6
 
 
@@ -57,7 +57,7 @@ def render(run: RunContext) -> list[Path] | None:
         path = run.folder / "videos" / f"{video.name}.mp4"
         pictures = (picture.numpy() for picture in video.pictures)
         write_pictures(path, followed(pictures, video.frames, path.name), video.fps)
-        free_cache(run.device)  # of what a film takes, the C library keeps 0.2 GB
+        free_cache(run.device)  # the C library keeps 0.2 GB of a video's memory
         log.info("video written to %s", path)
         for tracker in run.trackers:
             tracker.show_video(f"videos/{video.name}", path)
@@ -80,19 +80,19 @@ def view(run: RunContext) -> None:
     """Show the run's checkpoint on a page until a signal arrives."""
     settings: ViewerSettings = instantiate(run.config.viewer)
     model, viewpoints = _learned(run)
-    shown: PageServer | Session
+    server: PageServer | Session
     if settings.renderer == "browser" or (settings.renderer == "auto" and drawable(model)):
         _write_with_pictures(run, model, viewpoints)
-        shown = PageServer(settings, run.folder / "export")
+        server = PageServer(settings, run.folder / "export")
     else:
         from devrf.apps.viewer.drawing import Drawing
         from devrf.apps.viewer.session import Session  # an extra
 
         scene = _with_images(run, "its cameras are shown without pictures")
-        shown = Session(settings, viewpoints, scene, run.folder, run.config.ckpt)
+        server = Session(settings, viewpoints, scene, run.folder, run.config.ckpt)
         background = background_value(viewpoints.background)
-        shown.present(Drawing(Renderer(model, times=CACHED), background))
-    serve(shown)
+        server.present(Drawing(Renderer(model, times=CACHED), background))
+    serve(server)
 
 
 def export(run: RunContext) -> None:
@@ -117,7 +117,7 @@ def write_scene_page(run: RunContext) -> None:
 
 
 def _write_with_pictures(run: RunContext, model: Renderable, viewpoints: Viewpoints) -> None:
-    """Write what the page's cameras saw, if the run's images are there, and then the page."""
+    """Write the images of the page's cameras, if the run's images are there, and then the page."""
     folder = run.folder / "export"
     text = _page(run, model, viewpoints)
     scene = _with_images(run, "the cameras on its page are shown without pictures")
@@ -131,9 +131,9 @@ def _page(run: RunContext, model: Renderable, viewpoints: Viewpoints) -> str:
 
 
 def _learned(run: RunContext) -> tuple[Renderable, Viewpoints]:
-    """What was learned, on the trainer's device, and who saw it; another scene is refused.
+    """The learned model, on the trainer's device, and its viewpoints; another scene is refused.
 
-    The scene is read only where other data is typed than what the checkpoint was learned from.
+    The scene is read only if other data is typed than the checkpoint was learned from.
     """
     if (standing := unfinished(run)) is not None:
         log.warning("shown as far as it is learned: %s", standing)
@@ -148,7 +148,7 @@ def _learned(run: RunContext) -> tuple[Renderable, Viewpoints]:
 
 
 def _with_images(run: RunContext, without: str) -> Scene | None:
-    """The run's scene; None, and a line that says what comes ``without``, if it is not there."""
+    """The run's scene; None, and a line in the log that ends with ``without``, if it is missing."""
     try:
         check_scene(path := run.checkpoint(), metadata_of(path), run.scene)
         return run.scene

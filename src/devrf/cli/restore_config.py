@@ -1,8 +1,8 @@
-"""A run that knows itself: a later command begins from what it was learned with.
+"""A later command on a run begins from the settings of its training.
 
-A checkpoint holds the options of config groups that were chosen, by ``/group``, and what was set
+A checkpoint holds the options of config groups that were chosen, by ``/group``, and the values set
 beside them, by config key, as plain values. A later command sets the same, beneath what is typed.
-Text is put in quotes, so nothing that a file says is read as an interpolation or as code.
+Text is put in quotes, so nothing in a file is read as an interpolation or as code.
 """
 
 from __future__ import annotations
@@ -41,22 +41,22 @@ from devrf.system.process import importing
 
 log = logging.getLogger(__name__)
 
-# What says what to do with a run, on which machine, and what to log, not what the run is.
+# Keys that say what to do with a run, on which machine, and what to log, not what the run is.
 OF_A_COMMAND = {"stage", "ckpt", "resume", "memory_check", "objective", "hparams_search"}
 OF_A_COMMAND |= {"hydra", "report", "still", "export", "trainer", "logger", "callbacks"}
 OF_A_COMMAND |= {"viewer", "fetch", "capture", "selfcheck", "scene", "defaults"}
-# Where a command writes, and what it fetches.
+# Paths that a command writes to, and downloads.
 PLACES = {"data.export", "data.flow_cache", "evaluation.download"}
 # Of another method's run these are taken over.
 OF_A_SCENE = {"data", "facing", "seed"}
-# What is set without a section.
+# Keys without a section.
 ALONE = {"seed", "priors", "deterministic", "decoder_precision", "rehearse"}
 # An option's name leads to no other folder than its group's; a key is a path of plain names.
 OPTION = re.compile(r"(?!null$)[\w-]+", re.ASCII | re.IGNORECASE)
 KEY = re.compile(r"/?[\w-]+([./][\w-]+){0,15}", re.ASCII)
 # Text that is more than text.
 CODE = re.compile(rf"\$\{{|^\?\?\?$|{'|'.join(RESERVED)}")
-# What reading a damaged record raises.
+# Errors of reading a damaged record.
 UNREADABLE = (yaml.YAMLError, HydraException, LookupError, TypeError, ValueError, RecursionError)
 
 # Keys of a command, and items of its lists, at most.
@@ -64,21 +64,21 @@ MOST = 1000
 # Options by /group, values by key.
 Command = dict[str, Any]
 
-# What was set that was not typed, and why, until a log is there to say so.
+# Lines on settings that were not typed, and why they apply, until there is a log for them.
 applied_defaults: list[str] = []
 
 
 def present_command(config: DictConfig) -> Command:
-    """What the present command chose and set, but for what says only what to do.
+    """Options and values of the present command, but for those that only say what to do.
 
-    Code that was typed (``_target_``), and what was removed, is not kept. Empty outside Hydra.
+    Typed code (``_target_``) and removed keys are left out. Empty outside Hydra.
     """
     said: Command = {}
-    chosen = choices()
+    options = choices()
     for override in parsed(overrides()):
         key = override.key_or_group
-        if key in chosen:
-            said[f"/{key}"] = chosen[key]
+        if key in options:
+            said[f"/{key}"] = options[key]
         elif not override.is_delete():
             said |= leaves(OmegaConf.select(config, key), key)
     for key in PATHS & {*said}:  # relative to the folder in which they were typed
@@ -88,7 +88,7 @@ def present_command(config: DictConfig) -> Command:
 
 
 def checked(path: Path, command: Mapping[str, Any]) -> Command:
-    """What the file at ``path`` says, if these are names of options and plain values.
+    """The ``command`` in the file at ``path``, if it has names of options and plain values alone.
 
     Raises:
         DevrfError: something else is among them.
@@ -130,7 +130,7 @@ def root(key: str) -> str:
 
 
 def as_typed(command: Mapping[str, Any]) -> list[str]:
-    """It as it may be typed where no shell comes between."""
+    """The command as it may be typed without a shell."""
     said = {k: v if isinstance(v, str) else json.dumps(v) for k, v in command.items()}
     return [f"{key.lstrip('/')}={value}" for key, value in said.items()]
 
@@ -170,13 +170,13 @@ def value(overrides: Sequence[Override], key: str) -> str | None:
 
 
 def log_applied_defaults() -> None:
-    """Say where the settings come from that were not typed."""
+    """Log the origin of settings that were not typed."""
     for line in applied_defaults:
         log.info("%s", line)
 
 
 def of_named_run(typed: Sequence[Override], multirun: bool) -> list[str]:
-    """The overrides that take over what the run was learned with which the command names.
+    """The overrides of the training of the run that the command names.
 
     Raises:
         DevrfError: a checkpoint says what is no option or plain value.
@@ -220,7 +220,7 @@ def of_named_run(typed: Sequence[Override], multirun: bool) -> list[str]:
 
 
 def _beneath(typed: Sequence[Override], command: Command) -> Command:
-    """What stays beneath what is typed.
+    """The part of ``command`` that applies beneath the typed overrides.
 
     Another option of a group begins from its own values. Another method takes over the scene
     and the seed alone.
@@ -237,7 +237,7 @@ def _beneath(typed: Sequence[Override], command: Command) -> Command:
 
 
 def _of_sweep(typed: Sequence[Override], folder: Path) -> list[str]:
-    """What the sweep in ``hydra.sweep.dir`` was started with, unless another is typed.
+    """The overrides of the sweep in ``hydra.sweep.dir``, unless another is typed.
 
     Raises:
         DevrfError: its record holds more than names of options and plain values.
@@ -270,10 +270,10 @@ def _recorded(record: Path) -> list[Override]:
 
 
 def _folder_for(checkpoint: Path) -> Path:
-    """Where what is made of a checkpoint goes.
+    """The folder for products of a checkpoint.
 
-    Into the folder of its run if it is the last of it, else into a folder below that has the
-    checkpoint's name; of a file that stands alone, into ``outputs/<scene>/<name>``.
+    It is the folder of its run if it is the last of it, else a folder below that has the
+    checkpoint's name; of a file that stands alone, ``outputs/<scene>/<name>``.
     """
     from devrf.checkpoints.checkpoint import metadata_of
 

@@ -1,4 +1,4 @@
-"""Where a command that is repeated in the same folder goes on; nothing is done twice.
+"""A command that is repeated in the same folder goes on there; nothing is done twice.
 
 Each checkpoint holds the settings that decided what was learned:
 
@@ -9,8 +9,8 @@ Each checkpoint holds the settings that decided what was learned:
 
 Settings of logging, scoring, rendering, the device and the place of the data may differ.
 
-What a pipeline has scored and rendered is not done again either: a step notes the files it wrote,
-and what it made them with (checkpoint, settings, data, logger, version).
+A pipeline does not score and render again either: a step notes the files it wrote, and what decided
+them (checkpoint, settings, data, logger, version).
 """
 
 from __future__ import annotations
@@ -45,20 +45,20 @@ from devrf.system.override import to_type
 
 log = logging.getLogger(__name__)
 
-# The config group that decides what a step makes, by step; other steps are always done.
+# The config group that decides a step's results, by step; other steps are always done.
 DECIDES = {"evaluate": "evaluation", "render": "video"}
 NOTE = "done.json"  # in the folder of the lock
 NOTES = TypeAdapter(dict[str, list[str]])
-# Settings of a datamodule or a stage that change nothing that is learned.
+# Settings of a datamodule or a stage that do not change the result.
 UNDECISIVE = {"root", "name", "flow_cache", "export", "store"}
 
 
 @dataclass(frozen=True)
 class ResumePoint:
-    """Where a stage begins.
+    """The start of a stage.
 
     Attributes:
-        training_config: the present settings that decide what is learned.
+        training_config: the present settings that decide the result.
         progress: the file to go on from.
         iteration: of that file.
     """
@@ -84,22 +84,22 @@ def deciding_settings(config: DictConfig, stage: str) -> dict[str, Any]:
 
 
 def _values(config: DictConfig, path: str) -> dict[str, Any]:
-    """The plain values below a key; what refers to another key is named by that one."""
-    found: dict[str, Any] = {}
+    """The plain values below a key; a reference to another key is named by that one."""
+    settings: dict[str, Any] = {}
     node: Any = OmegaConf.to_container(OmegaConf.select(config, path), resolve=False)
     for key, raw in node.items():
         reference = REFERENCE.fullmatch(str(raw))
         where = reference[1] if reference else f"{path}.{key}"
         value = OmegaConf.select(config, where)
         if isinstance(value, DictConfig):
-            found |= _values(config, where)
+            settings |= _values(config, where)
         elif key not in UNDECISIVE:
-            found |= leaves(value, where)
-    return found
+            settings |= leaves(value, where)
+    return settings
 
 
 def beginning(run: RunContext, stage: str) -> ResumePoint | None:
-    """Find where ``stage`` begins in the run's folder; None if there is nothing left to learn.
+    """The start of ``stage`` in the run's folder; None if there is nothing left to learn.
 
     Raises:
         DevrfError: a checkpoint there was learned with other settings, has another format, or is
@@ -166,7 +166,7 @@ def remove_progress(folder: Path, stage: str) -> None:
 
 
 def unfinished(run: RunContext) -> str | None:
-    """Where the run's last stage stands, and how to go on; None if there is nothing left of it."""
+    """The progress of the run's last stage, and how to go on; None if it is finished."""
     path = run.checkpoint()
     if (at := read_description(path).get("progress")) is None:
         return None
@@ -184,7 +184,7 @@ def done(run: RunContext, step: str) -> bool:
 
 
 def note_done(run: RunContext, step: str, files: Sequence[Path] | None) -> None:
-    """Note what a step has written, and forget what these files were before."""
+    """Note the files that a step has written, and forget their earlier notes."""
     if step in DECIDES and files:
         names = sorted(path.relative_to(run.folder).as_posix() for path in files)
         others = {k: v for k, v in _notes(run.folder).items() if not {*names} & {*v}}
@@ -192,7 +192,7 @@ def note_done(run: RunContext, step: str, files: Sequence[Path] | None) -> None:
 
 
 def _made_with(run: RunContext, step: str) -> str:
-    """A digest of what decides a step's results."""
+    """A digest of all that decides a step's results."""
     root = run.config.data.get("root")
     keyframes = Path(str(run.config.video.path))
     made = (

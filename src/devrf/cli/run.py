@@ -48,7 +48,7 @@ log = logging.getLogger(__name__)
 Step = Callable[[RunContext], Sequence[Path] | None]
 Names = tuple[str, ...]
 
-# What devrf.cli.config.STEPS names.
+# By the names in devrf.cli.config.STEPS.
 STEPS: dict[str, Step] = {
     step.__name__: step
     for step in (
@@ -62,7 +62,7 @@ AFTER_LEARNING: dict[str, Step] = {
     "page": write_scene_page,
 }
 REHEARSED_STEPS = ("evaluate", "still")
-# What a run's folder may hold that a person looks at first, and what to try next.
+# Results in a run's folder that a person looks at first, and commands to try next.
 RESULTS = ("metrics.json", "images", "videos", "checkpoints")
 NEXT = ("stage=still still.time=0.35 still.height=400", "stage=view")
 
@@ -86,9 +86,9 @@ def plan(stage: str, protocol: Sequence[str]) -> tuple[Names, Names]:
         return tuple(protocol), tuple(AFTER_LEARNING)
     if stage in protocol:
         return (stage,), ()
-    known = [PIPELINE, *protocol, *STEPS]
-    meant = did_you_mean(stage, known, "stage=")
-    expect(stage in STEPS, "stage", f"one of {', '.join(known)}", f"{stage!r}{meant}")
+    names = [PIPELINE, *protocol, *STEPS]
+    meant = did_you_mean(stage, names, "stage=")
+    expect(stage in STEPS, "stage", f"one of {', '.join(names)}", f"{stage!r}{meant}")
     return (), (stage,)
 
 
@@ -128,11 +128,11 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
 
 
 def _prepare_to_learn(run: RunContext, requested: Names, steps: Names) -> None:
-    """Look at scene, memory and what earlier commands left, before anything is learned."""
+    """Check scene, memory and the results of earlier commands, before anything is learned."""
     learning = run.learnable(requested)
     if learning != requested:
-        left = ", ".join(learning + steps)
-        log.info("%s is at rest: %s; no motion is learned", run.config.scene, left)
+        stages = ", ".join(learning + steps)
+        log.info("%s is at rest: %s; no motion is learned", run.config.scene, stages)
     if run.rehearses:
         begin_anew(run, learning)
         return
@@ -197,10 +197,10 @@ def _learn(run: RunContext, learning: Names) -> None:
 def _run_step(run: RunContext, name: str, step: Step) -> None:
     seed_everything(run.config.seed, verbose=False)
     rays = f"schedule.{name}.rays"
-    known = OmegaConf.select(run.config, rays) is not None
-    with shortage_in_words(name, run.device, rays if known else None):
+    has_rays = OmegaConf.select(run.config, rays) is not None
+    with shortage_in_words(name, run.device, rays if has_rays else None):
         files = step(run)
-    # What a step leaves, as a trainer held in circles, would count as the next step's memory.
+    # Leftovers of a step, as a trainer held in circles, would count as the next step's memory.
     free_cache(run.device)
     note_done(run, name, files)
     run.step_began = time.perf_counter()

@@ -31,7 +31,7 @@ log = logging.getLogger(__name__)
 
 # Made in the folder before the config is checked.
 AT_FIRST = {".hydra", PLACE}
-# Where a killed process may have left files that it had begun.
+# Folders in which a killed process may have left files that it had begun.
 BEGUN = (".", "checkpoints", "images", "videos", "logs/*", "export", "export/*", "paths")
 # Why a sweep's job failed.
 FAILURE = "failure.json"
@@ -61,7 +61,7 @@ class FolderLock(Callback):
         except OmegaConfBaseException:
             return  # Hydra will report what is wrong with the config
         with report_user_errors():
-            # Where a report is written by default is a name in the folder of the runs.
+            # A report's default folder is a name in the folder of the runs.
             named = config.stage == "report" and folder == Path(str(config.report.runs)) / "report"
             refuse_links(folder, itself=named)
             make_folder(folder)  # as Hydra does next, with a traceback where it cannot
@@ -81,8 +81,8 @@ class FolderLock(Callback):
                     f"hydra/launcher: no {' and no '.join(missing)} here; type the command where "
                     "SLURM takes jobs, or leave hydra/launcher out"
                 )
-            for place in (folder, *folder.glob("[!.]*/")):
-                refuse_links(place)
+            for path in (folder, *folder.glob("[!.]*/")):
+                refuse_links(path)
             lock_folder(folder, "hydra.sweep.dir")
         FolderLock.sweep = folder
 
@@ -102,7 +102,7 @@ def working_in(folder: Path, config: DictConfig) -> Iterator[None]:
     is_rank_zero = not _is_worker(config)
     if is_rank_zero and config.stage not in UNRECORDED:
         lock_folder(folder, "hydra.sweep.dir" if in_sweep() else "hydra.run.dir")
-        for path in (path for place in BEGUN for path in folder.glob(f"{place}/.partial-*")):
+        for path in (path for part in BEGUN for path in folder.glob(f"{part}/.partial-*")):
             path.unlink(missing_ok=True)
     was_new = is_rank_zero and not in_sweep() and holds_at_most(folder, AT_FIRST)
     try:

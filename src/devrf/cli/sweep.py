@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 
 # The exit status of a sweep with failed jobs.
 JOBS_FAILED = 3
-# What the sweep's folder holds before Hydra starts the first job.
+# Content of the sweep's folder before Hydra starts the first job.
 OF_SWEEP = {"multirun.yaml", PLACE}
 
 

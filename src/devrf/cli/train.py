@@ -26,7 +26,7 @@ from devrf.system.process import Interrupted
 
 log = logging.getLogger(__name__)
 
-# What may end learning before its schedule: keys of the trainer, and their values that do not.
+# Keys of the trainer that may end learning before its schedule, and their values that do not.
 LIMITS: dict[str, Any] = {"max_epochs": 1, "max_steps": -1}
 LIMITS |= dict.fromkeys(("max_time", "limit_train_batches", "overfit_batches"))
 

@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 
 def serves_page(typed: Sequence[Override], run: Path) -> bool:
     """Whether a command asks for the page of a run, and nothing else, and it is up to date."""
-    known = ("stage", "hydra.run.dir")
+    own_keys = ("stage", "hydra.run.dir")
     keys = [override.key_or_group for override in typed]
     return (
         value(typed, "stage") == "view"
         and value(typed, "viewer.renderer") != "server"
-        and all(key in known or key.startswith("viewer.") for key in keys)
+        and all(key in own_keys or key.startswith("viewer.") for key in keys)
         and is_current(run)
     )
 
@@ -42,7 +42,7 @@ def serve_page(config: DictConfig, run: Path) -> None:
     serve(PageServer(instantiate(config.viewer), run / "export"))
 
 
-def serve(shown: PageServer | Session) -> None:
+def serve(server: PageServer | Session) -> None:
     """Serve a page until a signal arrives."""
-    with closing(shown), handle_signals(lambda _: shown.stop()):
-        shown.serve()
+    with closing(server), handle_signals(lambda _: server.stop()):
+        server.serve()
