@@ -1,4 +1,4 @@
-"""The captured cameras as frusta in a scene: how many and how deep, and what they show."""
+"""The captured cameras as frusta in a scene: their number, depth and pictures."""
 
 from __future__ import annotations
 
@@ -64,10 +64,10 @@ def thumbnail(scene: Scene, views: Views, index: int) -> Tensor:
 def described(model: Renderable, viewpoints: Viewpoints) -> Iterator[dict[str, Any]]:
     """The captured cameras in plain numbers, for a page: first those that saw the scene move.
 
-    Of each its ``name``, that of its pictures' folder; ``pose``, camera to world, 12 numbers, row
+    Each has its ``name``, that of its pictures' folder; ``pose``, camera to world, 12 numbers, row
     by row; ``fov``, its vertical angle of view in radians, were the principal point in the middle;
-    ``middle``, how far the image's middle is to the right of it and above, in tangents of angles;
-    ``aspect``, width over height; ``distance`` of what it looks at, world units; ``times`` of
+    ``middle``, the image's middle relative to it, to the right and up, in tangents of angles;
+    ``aspect``, width over height; ``distance`` of its subject, world units; ``times`` of
     frames that it may have seen, :data:`MAX_TIMES` at most.
     """
     target = looked_at(model, viewpoints.static, lambda: distance_ahead(viewpoints.static))
@@ -88,7 +88,7 @@ def described(model: Renderable, viewpoints: Viewpoints) -> Iterator[dict[str, A
 
 
 def write_thumbnails(folder: Path, scene: Scene, viewpoints: Viewpoints) -> None:
-    """Write what the cameras of :func:`described` saw: ``<name>/<index of the time>.jpg``.
+    """Write the pictures of the cameras of :func:`described`: ``<name>/<index of the time>.jpg``.
 
     The whole folder, or nothing; one that was there is replaced.
     """

@@ -1,4 +1,4 @@
-"""Public scenes: where they are published (``catalogue.toml``), and how they are downloaded."""
+"""Public scenes: their sources (``catalogue.toml``) and their download."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ ARCHIVE = "archive"
 # bytes may expand by more.
 MOST_EXPANSION = 20
 SMALL = 2**26
-# Bytes at most of what is downloaded for a scene, and of what it unpacks to; of a catalogue.
+# Most bytes of a scene's download, and of its unpacked files; of a catalogue.
 LARGEST = 2**34
 LARGEST_CATALOGUE = 2**20
 # Seconds that a scene may take, and bytes that have to come in each PERIOD of seconds.

@@ -1,4 +1,4 @@
-"""Whether a machine has what a run needs, and the least change with which it has."""
+"""Whether a run fits into a machine, and the least change with which it does."""
 
 from __future__ import annotations
 

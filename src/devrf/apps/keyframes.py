@@ -203,7 +203,7 @@ def read_path(file: Path, offset: Offset = NO_OFFSET) -> CameraPath:
     for each frame: ``camera_to_world`` (4×4, row by row, OpenGL axes), ``fov`` (vertical, degrees),
     ``aspect``, and ``render_time`` where the scene moves; and ``keyframes`` from which its viewer
     made them. devrf adds ``seconds`` and ``render_time`` to each keyframe and goes through them
-    itself. In a file without these, each camera of ``camera_path`` counts as a keyframe.
+    itself. Each camera of ``camera_path`` counts as a keyframe in a file without these.
 
     Raises:
         DevrfError: there is no such file, or it is no camera path.

@@ -12,7 +12,7 @@ from devrf.engine.needs import StageNeeds, tensor_bytes
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.scenes.scene import Scene
 
-# Python and its libraries on the host; measured, as is what the C library keeps of freed memory.
+# Python and its libraries on the host; measured, as is the freed memory that the C library keeps.
 PROGRAM, FRAGMENTATION = 600_000_000, 1.3
 
 
@@ -40,7 +40,7 @@ def host_bytes(
 ) -> float:
     """Bytes that stages need of the host.
 
-    It trains with ``batch_share`` of each batch (``on_host``), or holds what a GPU learns.
+    The host trains with ``batch_share`` of each batch (``on_host``), or holds a GPU's results.
     """
     held = (FRAGMENTATION * s.peak(batch_share) if on_host else 2 * s.learned for s in stages)
     return PROGRAM + tensor_bytes(scene.captures.values()) + max(held)

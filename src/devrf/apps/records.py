@@ -35,7 +35,7 @@ EXECUTION = ("peak_reserved_gb",)
 def mean_scores(views: Sequence[HeldOutView]) -> dict[str, float | None]:
     """Means of each metric over the held-out images that have it, to five digits; else None.
 
-    Without ``rest_pose_psnr``, which is of the dynamic capture only.
+    ``rest_pose_psnr``, which is of the dynamic capture only, is left out.
     """
     means: dict[str, float | None] = {}
     for name in views[0].scores:
@@ -49,8 +49,8 @@ def mean_scores(views: Sequence[HeldOutView]) -> dict[str, float | None]:
 def dynamic_scores(views: Sequence[HeldOutView], clock: FrameClock) -> dict[str, Any]:
     """Means over held-out images in motion, ``rest_pose_psnr`` among them.
 
-    Where some are at times that no training view has (by its ``clock``), ``novel_times`` has the
-    means over these and how many ``images`` they are, ``training_times`` the same over the others.
+    If some are at times that no training view has (by its ``clock``), ``novel_times`` has the means
+    over these and their number ``images``, ``training_times`` the same over the others.
     """
     novel = [view for view in views if not clock.knows(view.time)]
     seen_times = [view for view in views if clock.knows(view.time)]
@@ -68,9 +68,9 @@ def scores_by_section(
     rest: str | None,
     checkpoint_mb: float,
 ) -> dict[str, Any]:
-    """The sections of ``metrics.json``: mean scores, and what training took.
+    """The sections of ``metrics.json``: mean scores, and figures of training.
 
-    ``static`` and ``dynamic``, as ``frames`` has, stand under the names of their stages, too.
+    Sections ``static`` and ``dynamic`` of ``frames`` stand under the names of their stages, too.
     ``rest`` is the stage that learned the scene at rest. If one stage learned all (None), its
     training stands in the dynamic section, where there is one.
     """

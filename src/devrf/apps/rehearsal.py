@@ -23,9 +23,9 @@ from devrf.scenes.scene import Capture, CaptureName, Scene
 # A rehearsal's images have at most so many pixels a side, and so many of a set are looked at.
 LONGEST = 64
 LOOKED_AT = 6
-# A stage has learned something where it is so much better than a picture of one colour, in dB,
-# and motion where it is so much better than the scene at rest: on images that it learned from,
-# since the few iterations of a rehearsal do not tell what new views will show.
+# A stage has learned something if it is so much better than a picture of one colour, in dB, and
+# motion if it is so much better than the scene at rest. Training images are compared, since the few
+# iterations of a rehearsal do not generalise to new views.
 LEAST_GAIN = 1.0
 LEAST_MOTION = 0.05
 
@@ -74,7 +74,7 @@ def for_rehearsal(scene: Scene) -> Scene:
         return replace(capture, test=capture.test[subset])
 
     small = reduced(scene, LONGEST)
-    if scene.static.test is scene.dynamic.test:  # of a film
+    if scene.static.test is scene.dynamic.test:  # of a monocular video
         static = few_held_out(small.static)
         return replace(small, static=static, dynamic=replace(small.dynamic, test=static.test))
     return replace(small, static=few_held_out(small.static), dynamic=few_held_out(small.dynamic))
@@ -104,7 +104,7 @@ def learned(model: Renderable, scene: Scene, capture: CaptureName) -> Learned:
 def shortfalls(
     stages: Mapping[str, RehearsedStage], reached: Mapping[CaptureName, Learned]
 ) -> list[str]:
-    """Why the run itself should not be begun: what a stage did not learn, what did not take place.
+    """Reasons not to begin the run itself: stages that learned nothing, events that are missing.
 
     Args:
         stages: the rehearsed stages, by name.

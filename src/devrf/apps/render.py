@@ -68,7 +68,7 @@ def videos(
 ) -> Iterator[Video]:
     """The ``held_out`` views over time, if any, and the scene from a moving camera meanwhile.
 
-    With ``video.path`` there is that path alone.
+    If ``video.path`` is given there is that path alone.
     """
     behind = background_value(viewpoints.background)
     static = viewpoints.static

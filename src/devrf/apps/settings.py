@@ -12,7 +12,7 @@ from typing import Literal
 
 from devrf.errors import DevrfError, expect
 
-# The scores of a rehearsal, and what took place in it; of a run they are in metrics.json.
+# The scores and events of a rehearsal; a run's are in metrics.json.
 REHEARSAL = "rehearsal.json"
 # capture.alpha_masks=subtract
 SUBTRACT = "subtract"

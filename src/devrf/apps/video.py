@@ -93,10 +93,10 @@ def held_out_pictures(
 ) -> Iterator[Tensor]:
     """Truth, rendering and depth (H', W', 3) side by side.
 
-    Images of several sizes are at one scale, in places for the widest and the highest.
+    Images of several sizes are at one scale, in tiles for the widest and the highest.
     ``images`` are those of the ``views`` to show, one a frame (:func:`held_out_images`). Where a
-    camera took several, time runs from 0 to 1. Where each is of a place of its own, it is shown at
-    its own time: from there nothing was taken at another.
+    camera took several, time runs from 0 to 1. An image with a pose of its own is shown at its
+    own time.
     """
     rows = max(views.height, READABLE) if settings.height is None else settings.height
     cameras = views.cameras.of_height(rows)
@@ -108,7 +108,7 @@ def held_out_pictures(
     shots = zip(images, times, strict=True)
     for (image, time), frames in groupby(shots):
         color, depth = still(renderer, cameras, time, behind, image)
-        # Resized from its own size, not rendered: it shows what there is to compare with.
+        # Resized from its own size, not rendered: it is the truth to compare with.
         truth = truth_image(views, image, background)
         size = f"({truth.shape[1]}x{truth.shape[0]}{larger})"
         truth = scaled(truth, color.shape[0], color.shape[1])

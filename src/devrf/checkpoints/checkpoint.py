@@ -32,7 +32,7 @@ from devrf.system.plain_data import Line, validate
 from devrf.system.printed import shown
 from devrf.system.stored_class import StoredClass, stored_class
 
-# The stage's attribute that holds the model: what its entries of a state begin with.
+# The stage's attribute that holds the model: the prefix of its entries of a state.
 MODEL = "scene_model."
 # As OWN_REST, of a checkpoint that was given.
 GIVEN_REST = "ckpt"
@@ -192,7 +192,7 @@ class ChecksummedCheckpointIO(CheckpointIO):
 
 
 def save_checkpoint(trainer: Trainer, path: Path, *, weights_only: bool = True) -> None:
-    """Write what the trainer's stage has learned; an earlier file stays until the new is whole.
+    """Write the model of the trainer's stage; an earlier file stays until the new is whole.
 
     ``weights_only=False`` adds all that is needed to go on learning from there. From now on the
     trainer writes and reads files of this format.
@@ -227,7 +227,7 @@ def load_checkpoint(
         model.load_stored_state(state)
         viewpoints = Viewpoints.stored(data.get("viewpoints", {}))
         if viewpoints is not None:
-            # One ray, which goes through all that was read: what does not fit is noticed here.
+            # One ray, which goes through all parts: those that do not fit are noticed here.
             camera = viewpoints.held_out.resized(width=1, height=1)
             Renderer(model).view(camera, index=0, time=1.0, background=1.0)
     except OutOfMemoryError as shortage:
@@ -240,7 +240,7 @@ def load_checkpoint(
 
 
 def unfit(path: Path, error: Exception) -> DevrfError:
-    """The one line that says which parts of a file contradict each other, by what they raised."""
+    """The one line on the parts of a file that contradict each other, by their error."""
     why = f"{type(error).__name__}: {error}"
     if isinstance(error, ValidationError):
         issue = error.errors()[0]

@@ -82,7 +82,7 @@ def read_checkpoint_file(path: Path) -> dict[str, Any]:
 def read_description(path: Path) -> dict[str, Any]:
     """The content of a checkpoint file with None for each tensor; only its header is read.
 
-    Altered bytes are not noticed: what is used further is read by :func:`read_checkpoint_file`.
+    Altered bytes are not noticed: :func:`read_checkpoint_file` reads a file for further use.
 
     Raises:
         DevrfError: the file does not begin as devrf's of this format.

@@ -56,8 +56,8 @@ def file_metadata(path: Path) -> dict[str, str]:
 def latest_checkpoint(run: Path) -> Path | None:
     """The checkpoint of the latest stage in a run's folder, else its furthest progress file.
 
-    By what the files hold: a copy of the folder has other times. What is built on another canonical
-    field than the run's is passed over. None without one.
+    The files' contents decide: a copy of the folder has other times. A checkpoint that builds on
+    another canonical field than the run's is passed over. None without one.
     """
     latest: list[tuple[int, float, Path]] = []
     for path in (run / "checkpoints").glob("*.ckpt"):

@@ -2,7 +2,7 @@
 
 Most of a field's voxels lie in empty space. Their values are not seen, but a deformation field has
 to map empty space to empty space, also between frames. So a smooth grid is kept twice, in half
-precision: thinned out everywhere, and in detail near what is occupied.
+precision: thinned out everywhere, and in detail near occupied space.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def pack(grids: Tensor, keep: Tensor, *, smooth: bool) -> Packed | Tensor:
 def unpack(
     stored: Any, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
 ) -> Any:
-    """The grids that :func:`pack` stored, on ``device``; what is not packed as it is.
+    """The grids that :func:`pack` stored, on ``device``; other values as they are.
 
     Raises:
         RuntimeError | KeyError | ValueError: the parts do not fit together.
@@ -116,8 +116,8 @@ class StoredShape(nn.Module):
     """A module that may be loaded from a state of another resolution.
 
     Attributes:
-        resizable: of the parameters and buffers that take the stored shape, by name, how many axes
-            may be longer or shorter, from the first on.
+        resizable: number of first axes that may be longer or shorter, for parameters and buffers
+            that take the stored shape, by name.
     """
 
     resizable: ClassVar[Mapping[str, int]]

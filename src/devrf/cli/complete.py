@@ -48,7 +48,7 @@ KEY_VALUE = re.compile(r"(\+{0,2}([\w./@-]+)=)(.*)", re.DOTALL)
 
 
 def completed(arguments: Sequence[str]) -> list[str]:
-    """The command line that Hydra composes for what was typed, without the program's name.
+    """The command line for Hydra to compose, by typed arguments, without the program's name.
 
     Raises:
         DevrfError: a scene's folder cannot be recognised, the scenes of a sweep need different
@@ -152,7 +152,7 @@ def _searchpath(config_dir: str | None) -> list[str]:
 
 
 def _says_how(override: Override) -> bool:
-    """Whether an override says how a scene is learned."""
+    """Whether an override is a training setting."""
     key = f"{override.key_or_group}."
     return any(key.startswith(f"{name}.") for name in TRAINING_KEYS)
 

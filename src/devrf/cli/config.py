@@ -99,7 +99,7 @@ def run_folder(_root_: Any) -> str:
 
 
 def job_folder(_root_: Any) -> str:
-    """The folder of a sweep's job: number, scene, and what else is varied: ``0_robot_tv_0.5``."""
+    """The folder of a sweep's job: number, scene, and varied values: ``0_robot_tv_0.5``."""
     hydra = _root_.hydra
     record = Path(hydra.sweep.dir) / "multirun.yaml"  # some searches write none
     typed = OmegaConf.load(record).hydra.overrides.task if record.is_file() else []

@@ -69,7 +69,7 @@ class RunContext(ExitStack):
         is_trial: whether ``trainer.fast_dev_run`` asks for a step of each stage, with nothing kept.
         tried: the results of a trial's stages, by name.
         chooses_size: whether the images' size is left to this run.
-        step_began: the end of the step before; of the first step, the begin of the run.
+        step_began: the end of the step before; of the first step, the start of the run.
     """
 
     def __init__(self, config: DictConfig, folder: Path) -> None:
@@ -123,7 +123,7 @@ class RunContext(ExitStack):
 
     @property
     def scene(self) -> Scene:
-        """The scene; the config then says in numbers by what its images were made smaller."""
+        """The scene; the config then has the factor by which its images were made smaller."""
         scene = self.datamodule.scene
         if self.chooses_size:
             self.config.data.downscale = self.datamodule.downscale
@@ -137,7 +137,7 @@ class RunContext(ExitStack):
 
     @property
     def moves(self) -> bool:
-        """Whether the scene moves; the scene is read, unless what was learned of it says so."""
+        """Whether the scene moves; the scene is read, unless a checkpoint says so."""
         for path in map(self.own_checkpoint, self.learning_stages if self.config.resume else ()):
             moves = metadata_of(path).moves if path.is_file() else None
             if moves is not None:
@@ -162,7 +162,7 @@ class RunContext(ExitStack):
         """The plan of a stage of the protocol, by ``config``, else the run's.
 
         Raises:
-            DevrfError: the method has no such stage, or the protocol asks what it cannot do.
+            DevrfError: the method has no such stage, or cannot learn by the protocol.
         """
         config = self.config if config is None else config
         section = stage_section(config, name)

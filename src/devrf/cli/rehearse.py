@@ -52,7 +52,7 @@ def conclude(run: RunContext) -> None:
     """Show each stage's results, and the needs of the run itself; write them to the record.
 
     Raises:
-        DevrfError: a stage has learned nothing, or what was planned did not take place.
+        DevrfError: a stage has learned nothing, or a planned event did not take place.
     """
     path = run.folder / REHEARSAL
     scores = json.loads(read_record(path))

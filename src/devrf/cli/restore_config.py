@@ -179,7 +179,7 @@ def of_named_run(typed: Sequence[Override], multirun: bool) -> list[str]:
     """The overrides of the training of the run that the command names.
 
     Raises:
-        DevrfError: a checkpoint says what is no option or plain value.
+        DevrfError: a checkpoint's command has more than options and plain values.
     """
     checkpoints = [Path(path) for path in values(typed, "ckpt")]
     folder = value(typed, "hydra.run.dir")

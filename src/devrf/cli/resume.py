@@ -1,6 +1,6 @@
 """A command that is repeated in the same folder goes on there; nothing is done twice.
 
-Each checkpoint holds the settings that decided what was learned:
+Each checkpoint holds the settings that decided its result:
 
 * a finished checkpoint with the present settings: the stage is skipped;
 * a progress file with the present settings: the stage goes on from there;
@@ -69,7 +69,7 @@ class ResumePoint:
 
 
 def deciding_settings(config: DictConfig, stage: str) -> dict[str, Any]:
-    """The settings that decide what a stage learns, by the key at which the user sets them."""
+    """The settings that decide a stage's result, by the key at which the user sets them."""
     settings = {"method": config.method, "seed": config.seed}
     section = stage_section(config, stage)
     # Of a stage of its own the protocol decides nothing.
@@ -206,7 +206,7 @@ def _made_with(run: RunContext, step: str) -> str:
 
 
 def _notes(folder: Path) -> dict[str, list[str]]:
-    """The files that steps have written, by the digest of what decided them."""
+    """The files that steps have written, by the digest of their deciding settings."""
     try:
         return NOTES.validate_json(read_record(folder / PLACE / NOTE))
     except (OSError, ValueError):

@@ -93,7 +93,7 @@ def plan(stage: str, protocol: Sequence[str]) -> tuple[Names, Names]:
 
 
 def run_stage(config: DictConfig, folder: Path) -> float | None:
-    """Do what ``stage=…`` of a composed config asks for, in the run's folder.
+    """Run ``stage=…`` of a composed config in the run's folder.
 
     Returns:
         The objective; None where nothing was scored.
@@ -150,7 +150,7 @@ def _prepare_to_learn(run: RunContext, requested: Names, steps: Names) -> None:
 
 
 def _objective(run: RunContext, steps: Names) -> float | None:
-    """The objective; a pipeline ends with its results, and what to try next."""
+    """The objective; a pipeline ends with its results, and commands to try next."""
     scores = run.folder / "metrics.json"
     try:
         metrics = json.loads(read_record(scores))

@@ -82,7 +82,7 @@ class TensorBoardTracker(TensorBoardLogger):
             self.experiment.add_scalar(name, value, 0)
 
     def close(self, *, failed: bool) -> None:
-        """Write out what is still in memory."""
+        """Write out the rows that are still in memory."""
         if self._experiment is not None:
             self._experiment.close()
 
@@ -96,7 +96,7 @@ LONGEST_NAME = 128
 class WandbTracker(WandbLogger):
     """One wandb run for all stages of a devrf run, found again by the id kept in its folder.
 
-    Offline, nothing leaves the machine: neither the run nor wandb's own telemetry.
+    Nothing leaves the machine offline: neither the run nor wandb's own telemetry.
     """
 
     def __init__(
@@ -111,9 +111,9 @@ class WandbTracker(WandbLogger):
     ) -> None:
         """Name the run; it begins when something is logged first.
 
-        wandb works in ``wandb/`` below the run's folder. By default ``name`` is that of the folder,
+        wandb works in ``wandb/`` below the run's folder. ``name`` is by default that of the folder,
         ``group`` of the one that it lies in: the scene's, or the sweep's of which it is a job.
-        ``entity`` None is the account that is logged in. Offline, ``wandb sync`` sends it later.
+        ``entity`` None is the account that is logged in. ``wandb sync`` sends an offline run later.
         ``WANDB_MODE`` in the environment takes precedence over ``offline``.
         """
         mode = os.environ.get("WANDB_MODE")

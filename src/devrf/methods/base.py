@@ -1,4 +1,4 @@
-"""A method that learns from rays: what :class:`~devrf.methods.ray_stage.RayStage` trains.
+"""A method that learns from rays; :class:`~devrf.methods.ray_stage.RayStage` trains it.
 
 DeVRF has stages of its own (``methods.devrf``), and is a
 :class:`~devrf.rendering.renderable.Renderable` alone.
@@ -31,8 +31,8 @@ class RayTrainable(Renderable):
         priors: data that it uses beside images and backward flow, if a scene has it:
             ``forward_flow``.
         keeps_batches: whether whole batches learn more in a time than more, smaller ones: a time
-            budget then cuts them only where not even a hundred iterations would fit, nor a quarter.
-        random_background: whether it learns before random colours where all images have masks.
+            budget then cuts them only if not even a hundred iterations would fit, nor a quarter.
+        random_background: whether it learns before random colours if all images have masks.
     """
 
     losses: ClassVar[tuple[str, ...]] = ("render",)
@@ -54,12 +54,12 @@ class RayTrainable(Renderable):
             )
 
     def setup(self, scene: Scene) -> None:
-        """Take from a scene what the method needs: bounds, the frames' times, priors.
+        """Take from a scene the method's inputs: bounds, the frames' times, priors.
 
-        Called once, before anything is learned; not for a model that was loaded.
+        It is called once, before training; not for a model that was loaded.
 
         Raises:
-            DevrfError: the scene lacks what the method needs.
+            DevrfError: the scene lacks an input of the method.
         """
 
     def prepare_priors(self, views: Sequence[Views], terms: Collection[str]) -> None:
@@ -98,7 +98,7 @@ class RayTrainable(Renderable):
         Args:
             output: the result of :meth:`forward`.
             batch: the rays and the truth at their pixels.
-            names: of the terms that count: the others need not be computed.
+            names: the terms that count; the others need not be computed.
         """
         return {"render": nn.functional.mse_loss(output.color, batch.color)}
 

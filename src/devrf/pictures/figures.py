@@ -33,5 +33,5 @@ def write_figure(path: Path, figure: Figure) -> None:
     """Write a figure in the format of the path's suffix; letters that its font lacks are boxes."""
     with atomic_write(path) as partial, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=r"Glyph \d+ .* missing from")
-        # For matplotlib a side of 2**16 pixels is too long.
+        # A side of 2**16 pixels is too long for matplotlib.
         figure.savefig(partial, dpi=min(figure.dpi, 20_000 / max(figure.get_size_inches())))

@@ -62,7 +62,7 @@ def write_contact_sheet(path: Path, views: Sequence[HeldOutView], rows: int = 6)
 
 
 def _depth_range(views: Sequence[HeldOutView]) -> tuple[float, float]:
-    """The nearest and furthest depth of what is solid in the views, but for a hundredth each."""
+    """The nearest and furthest depth of solid pixels in the views, but for a hundredth each."""
     order = torch.cat([view.depth[view.opacity > 0.5] for view in views]).sort().values
     if len(order) == 0:
         return 0.0, 1.0

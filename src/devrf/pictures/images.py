@@ -109,7 +109,7 @@ def image_grid(
 ) -> Tensor:
     """A picture (H', W', 3), uint8, of images (H, W, 3) in [0, 1], and fitted text.
 
-    Images of several sizes are in the middle of places for the largest. ``headings`` stand above
+    Images of several sizes are in the middle of tiles for the largest. ``headings`` stand above
     each column, ``labels`` are lines left of each row. ``text`` is its height in pixels; None: a
     twentieth of that of the images, within limits.
     """

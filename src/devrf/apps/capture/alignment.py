@@ -1,4 +1,4 @@
-"""Videos aligned in time: what their clocks differ by, and which frames show one time."""
+"""Videos aligned in time: offsets of their clocks, and frames of the same time."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def timeline(
 
 
 def offsets_found(paths: Sequence[Path], surveys: Sequence[Survey]) -> list[float]:
-    """Seconds that each video began after the first, from what moves in them.
+    """Seconds that each video began after the first, from the motion in them.
 
     Raises:
         DevrfError: nothing moves in a video, or it moves unlike in the first.
@@ -155,7 +155,7 @@ def _sampled(survey: Survey, step: float) -> tuple[Signal, float]:
 
 
 def _correlation(a: Signal, b: Signal, lag: int) -> float:
-    """The correlation of what overlaps of two signals, the second moved by ``lag`` samples."""
+    """The correlation of the overlap of two signals, the second moved by ``lag`` samples."""
     low = max(0, lag)
     high = min(len(a), len(b) + lag)
     a = a[low:high]

@@ -285,9 +285,9 @@ def box_of_motion(
 
     Args:
         images: the folder of images.
-        names: of each of V ≥ 2 views its T images, relative to the folder.
+        names: the T images of each of V ≥ 2 views, relative to the folder.
         poses: (V, 3, 4) camera-to-world, OpenGL axes, world units.
-        lenses: of each view its ``fl_x``, ``cx`` … in pixels; distortion is left alone.
+        lenses: ``fl_x``, ``cx`` … of each view, in pixels; distortion is left alone.
         around: the box of the search, which is half as large again.
 
     Raises:

@@ -1,4 +1,4 @@
-"""A first look at footage: how sharp each frame is, how much moves, which frames are the best."""
+"""A survey of footage: the sharpness of each frame, its motion, and the best frames."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ NOISE = 2.0
 # Below this, an image of a textured scene is blurred so far that few features are left. Sharp
 # photographs have 0.5 and more; strong blur has up to 0.44, as H.264 makes blocks of it.
 BLURRED = 0.45
-# From fewer images there is no structure from motion worth the name.
+# Fewer images do not suffice for structure from motion.
 MIN_IMAGES = 3
 
 Grey = npt.NDArray[np.float32]
@@ -44,7 +44,7 @@ class Survey:
         size: width and height of its frames in pixels.
         times: N times in seconds, the first frame's 0.
         sharpness: N values in [0, 1], see :func:`sharpness`.
-        motion: N values, how much has changed since the frame before (:func:`moved`).
+        motion: N values, the change since the frame before (:func:`moved`).
     """
 
     size: tuple[int, int]

@@ -182,7 +182,7 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
 def halfway(normals: Tensor) -> Tensor:
     """Unit vectors (V, 3) halfway from +z to unit ``normals``: half a turn about each leads there.
 
-    Of −z that is half a turn about x.
+    For −z it is half a turn about x.
     """
     between = normals + torch.eye(3)[2]
     between = torch.where(between.norm(dim=1, keepdim=True) > 1e-3, between, torch.eye(3)[0])
@@ -191,7 +191,7 @@ def halfway(normals: Tensor) -> Tensor:
 
 # Cameras that look at the scene, at most.
 CAMERAS = 24
-# Rows of the first images, which tell what share of their pixels is filled.
+# Rows of the first images, which give the share of filled pixels.
 FIRST = 24
 # Rows of the largest images.
 LARGEST = 2048

@@ -51,8 +51,8 @@ def write_gltf(
     those who give it another material.
 
     Mesh and ``cameras``, one each by name, are in the scene's world; principal points are taken to
-    be the centres. Far from the origin the mesh's node moves it there, since arrays are of float32.
-    Time 0 to 1 takes ``seconds``.
+    be the centres. The mesh's node moves a mesh far from the origin there, since arrays are
+    of float32. Time 0 to 1 takes ``seconds``.
     """
     content = _Content()
     vertices = frame.points(mesh.vertices)
@@ -142,7 +142,7 @@ def linear(colors: Tensor) -> Tensor:
 
 
 class _Content:
-    """The binary part of a file, and what describes it."""
+    """The binary part of a file, and its description."""
 
     def __init__(self) -> None:
         self._bytes = bytearray()

@@ -33,7 +33,7 @@ SINGLE = {
 def export_scene(
     model: Renderable, viewpoints: Viewpoints, settings: ExportSettings, folder: Path
 ) -> None:
-    """Write the surface of what was learned, as it moves, or coloured points of each time.
+    """Write the surface of the learned scene, as it moves, or coloured points of each time.
 
     Raises:
         DevrfError: the method has no such geometry, or it is empty.
@@ -66,7 +66,7 @@ def export_scene(
 
 
 def _takes_surface(model: Renderable, settings: ExportSettings) -> bool:
-    """Whether a surface is exported, not points; refuses what cannot be had of the method."""
+    """Whether a surface is exported, not points; refuses geometry that the method lacks."""
     carries = model.surface() is not None and model.forward_map(0.0) is not None
     has = carries or model.surface_at(0.0) is not None
     wanted = has if settings.content == "auto" else settings.content == "surface"
@@ -127,7 +127,7 @@ def _write_points(
     settings: ExportSettings,
     times: tuple[float, ...],
 ) -> int:
-    """Write what the static cameras see at each time; the points of the time with the most."""
+    """Write the points that static cameras see at each time; return the most points of a time."""
     renderer = Renderer(model, times=1)
     behind = background_value(viewpoints.background)
     max_points = 0

@@ -41,10 +41,10 @@ def write_splats(
 ) -> None:
     """Write ``frame_0000.ply`` and so on, and ``index.json``, in a zip.
 
-    A flat Gaussian lies on each vertex. Far from the origin, positions are relative to the
+    A flat Gaussian lies on each vertex. Positions far from the origin are relative to the
     ``origin`` that the index states, since they are of float32. Files of splats hold no
-    ``cameras``. Other arguments are as for :func:`~devrf.apps.export.gltf.write_gltf`, but for y,
-    which is down.
+    ``cameras``. Other arguments are as for :func:`~devrf.apps.export.gltf.write_gltf`, but y points
+    down.
     """
     frames = []
     with atomic_write(path) as partial, ZipFile(partial, "w", ZIP_DEFLATED) as archive:

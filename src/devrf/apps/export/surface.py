@@ -32,11 +32,11 @@ def isosurface(
 ) -> Mesh:
     """Marching cubes on a field, as if solid wherever no empty way leads from ``outside``.
 
-    Density is learned where images show it: behind a surface it often falls to nothing again. A
-    second surface there would be seen by no camera.
+    Density is learned where images show it: behind a surface it often falls to nothing again. No
+    camera would see a second surface there.
 
-    What is interpolated between grid points is s = log(eᵗ − 1), t the optical depth: of a density
-    softplus(v + b) that is v + b, which DeVRF interpolates, too (docs/method.md#density).
+    s = log(eᵗ − 1), t the optical depth, is interpolated between grid points: for a density
+    softplus(v + b) it is v + b, which DeVRF interpolates, too (docs/method.md#density).
 
     Args:
         field: the scene's.
@@ -168,11 +168,11 @@ def _mirrors(space: Space, box: Box) -> bool:
 
 # Vertices whose colour is found at once.
 VERTICES = 2**13
-# Begin and end of a ray behind the vertex, and the distance of its samples, in voxels.
+# Start and end of a ray behind the vertex, and the distance of its samples, in voxels.
 BEFORE = -1.0
 BEHIND = 3.0
 STEP = 0.25
-# Samples with a smaller share of what is seen are left out.
+# Samples with a smaller weight are left out.
 SIGNIFICANT = 0.01
 # Directions over which colours are averaged, and their largest angle to the normal in degrees.
 DIRECTIONS = 16

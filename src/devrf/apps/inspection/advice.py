@@ -41,7 +41,7 @@ MUCH_MASKED = 0.5
 
 
 class Advice(NamedTuple):
-    """A problem that lowers quality: a file, view or part of the scene, and what to do."""
+    """A problem that lowers quality: a file, view or part of the scene, and a remedy."""
 
     where: str
     problem: str
@@ -77,7 +77,7 @@ def image_sets(scene: Scene) -> dict[str, Views]:
 
 
 def listed(names: Sequence[str], max_names: int = 3) -> str:
-    """The first ``max_names`` names, and how many more there are."""
+    """The first ``max_names`` names, and the number of the others."""
     more = len(names) - max_names
     return ", ".join(names[:max_names]) + (f" and {more} more" if more > 0 else "")
 
@@ -275,7 +275,7 @@ def _alpha(scene: Scene) -> Iterator[Advice]:
 
 def _masks(scene: Scene) -> Iterator[Advice]:
     sets = image_sets(scene).items()
-    # Of images with exposures of their own a half is not scored, and no mask says so.
+    # Half of each image with an exposure of its own is not scored, and no mask says so.
     shares = {n: masked_share(views) or 0.0 for n, views in sets if views.exposure_mask is None}
     if much := {name: share for name, share in shares.items() if share > MUCH_MASKED}:
         yield Advice(

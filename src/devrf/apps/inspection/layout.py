@@ -40,7 +40,7 @@ def box_middle(scene: Scene) -> Tensor:
 def common_up(cameras: Cameras) -> Tensor | None:
     """The direction (3,) most nearly at right angles to all x axes of cameras held level.
 
-    None where they do not agree.
+    None if they do not agree.
     """
     pose = cameras.camera_to_world.double().cpu()
     mean = pose[:, :, 1].mean(dim=0)
@@ -66,7 +66,7 @@ def horizontal_axes(up: Tensor, near: Tensor | None = None) -> tuple[Tensor, Ten
 def widest_gap(scene: Scene) -> float | None:
     """The widest angle in degrees, seen from above, in which no static camera stands.
 
-    360 for a single direction; None where cameras look from one side or most from above, or up is
+    360 for a single direction; None if cameras look from one side or most from above, or up is
     unknown.
     """
     cameras = scene.static.train.cameras

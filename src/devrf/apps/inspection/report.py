@@ -40,7 +40,7 @@ def inspection_text(
 ) -> RenderableType:
     """The report for a terminal; ``requirements`` of a run are rows of a name and an amount.
 
-    ``shortage`` says what this machine has too little of for the run.
+    ``shortage`` names a resource of which this machine has too little for the run.
     """
     advice = [*advice_on(scene), *([] if shortage is None else [shortage])]
     verdict = f"problems found: {len(advice)}" if advice else "no problems found"

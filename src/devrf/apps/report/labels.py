@@ -47,7 +47,7 @@ ABLATIONS = {
 CHOICES = "run.choices."
 SETTINGS = "run.settings."
 IGNORED = {"objective", "seed", "stage", "method"}
-# Without an experiment a run has the config of this one.
+# A run without an experiment has the config of this one.
 DEFAULT_EXPERIMENT = "quickstart"
 # Groups whose options are names for many settings, most important first.
 NAMED = ("experiment", "profile", "schedule", "field", "sampling", "loss", "method")
@@ -134,7 +134,7 @@ def _distinguishing(
         if key in runs
     }
     traits = pd.DataFrame({"method": _methods(runs), **recorded, **names, **settings})
-    # All that tells a run from unequal ones, whatever it is called.
+    # All traits that distinguish a run from unequal ones, whatever its names.
     identity = pd.DataFrame({"method": runs["method"], **recorded, **settings})
     equal = traits.groupby([runs["scene"], pd.Series(_label(identity), runs.index)])
     # Equal runs have one name, that of the ablation that its settings were called by, if any.
@@ -146,7 +146,7 @@ def _distinguishing(
     for key in dict.fromkeys([*said, *names, *typed, *settings, *recorded]):
         values = traits[key].mask(traits[key] == "").groupby(runs["scene"])
         differs = key in (*said, *typed) and values.nunique().gt(1).any()
-        # A name is left out only where other names say it.
+        # A name is left out only if other names imply it.
         beside = [trait for trait in distinct if key not in names or trait in ("method", *names)]
         rows = [runs["scene"], *(traits[trait] for trait in beside)]
         tells = traits.groupby([*rows, traits[key]]).ngroups > traits.groupby(rows).ngroups

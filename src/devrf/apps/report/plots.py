@@ -34,7 +34,7 @@ LEGEND_LINE = 0.19
 MOST_COLUMNS = 8
 PUBLISHED = ", published"
 GREY = "#9a9a9a"
-# Markers of the methods, and how the names of their variants end.
+# Markers of the methods, and the endings of their variants' names.
 NAMES = ("DeVRF", *list(METHODS.values())[1:])
 MARKERS = dict(zip(NAMES, "s^vDPXo*", strict=True))
 VARIANT = r"-2 ?stage$|-dynamic$| \(base\)$| w/ .*$"
@@ -45,7 +45,7 @@ MOST_TICKS = 5
 
 
 class Plot(NamedTuple):
-    """A plot, the name of its files, and what it shows in words."""
+    """A plot, the name of its files, and its caption."""
 
     name: str
     shows: str
@@ -68,7 +68,7 @@ def plots(table: Table) -> list[Plot]:
 
 
 def file_name(text: str) -> str:
-    """Text as the name of a file, without what a file system or a link may refuse."""
+    """Text as the name of a file, without characters that a file system or a link may refuse."""
     return re.sub(r"[^\w.-]+", "_", text).encode()[:200].decode(errors="ignore")
 
 
@@ -95,7 +95,7 @@ def psnr_over_time(table: Table, scene: str) -> Figure | None:
 def psnr_against_seconds(table: Table) -> Figure | None:
     """PSNR against training time, a panel a scene, the paper's rows hollow; None without both.
 
-    Without scenes that were learned in a budget of seconds (:func:`against_budget`).
+    Scenes that were learned in a budget of seconds are left out (:func:`against_budget`).
     """
     both = table.rows[(table.rows[TIME.title] > 0) & table.rows[PSNR.title].notna()]
     limited = table.runs.loc[table.runs["budget"].notna(), "scene"]
@@ -119,8 +119,8 @@ def psnr_against_seconds(table: Table) -> Figure | None:
 def against_budget(table: Table, place: str) -> Figure | None:
     """PSNR, SSIM and LPIPS of a scene against budgets of seconds, a panel each.
 
-    A line a row, with the standard deviation over its runs: methods have colours, their variants
-    dashes. None unless there are several budgets.
+    Each row has a line, with the standard deviation over its runs: methods have colours, their
+    variants dashes. None unless there are several budgets.
     """
     runs = table.runs[table.runs["place"] == place].dropna(subset="budget")
     budgets = sorted(runs["budget"].unique())
@@ -161,7 +161,7 @@ def against_budget(table: Table, place: str) -> Figure | None:
 def against_views(table: Table) -> Figure | None:
     """PSNR, and LPIPS or else SSIM, against the number of dynamic training views.
 
-    A line for each scene and configuration. None unless one was run with several numbers.
+    Each scene and configuration has a line. None unless one was run with several numbers.
     """
     rows = table.rows.dropna(subset="views").sort_values("views")
     lines = rows.groupby(["scene", "line"], sort=False).filter(lambda g: g["views"].nunique() > 1)

@@ -56,12 +56,12 @@ COLUMNS: dict[str, Any] = {
     "run.date": _Text | None,
     "path": _Plain,
 }
-# Of further values that are used, the kinds; the last ones are mappings, and no values.
+# Kinds of further values that are used; the last ones are mappings, and no values.
 OTHERS = ("run.git", "run.devrf", "run.fingerprint", "run.lpips_network", SAMPLING)
 KINDS = COLUMNS | dict.fromkeys(OTHERS, _Text | None)
 KINDS |= {"run.image_size": Annotated[list[int], Len(2, 2)] | None}
 KINDS |= dict.fromkeys(("static", "dynamic", "run", "choices"), dict)
-# The first line of a table: to take many columns of one name apart would take pandas hours.
+# The longest first line of a table: pandas would take hours for many columns of one name.
 HEADER = re.compile(rb'[^"\r\n]{1,1000}\r?\n')
 DEFAULT_METHOD = "devrf"
 DEFAULT_PROTOCOL = "two_stage"
@@ -134,7 +134,7 @@ def number(value: Any) -> float:
 def metric_over_time(path: Path, metric: str) -> pd.Series:
     """A column of a run's ``frames.csv`` by time in [0, 1]: means over the dynamic test views.
 
-    Empty where the run has no such values.
+    It is empty if the run has no such values.
     """
     file = path / "frames.csv"
     if file.is_file():  # a pipe would be waited for

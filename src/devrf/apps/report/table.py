@@ -23,7 +23,7 @@ UNKNOWN = "–"
 class Column:
     """A column of the tables, and the ``key`` of its values in a collection; times in seconds.
 
-    Without ``digits`` a value is a time in the unit that reads best. Values ``of_hardware`` of
+    A value without ``digits`` is a time in the unit that reads best. Values ``of_hardware`` of
     different devices cannot be compared.
     """
 
@@ -51,7 +51,7 @@ GPU = Column("GPU (GB)", "peak_gpu_gb", False, 1, True, "no run is known to have
 TIME = Column("Time", "train_seconds", False, None, True)
 COLUMNS = (PSNR, SSIM, LPIPS, GPU, TIME)
 TITLES = [column.title for column in COLUMNS]
-# Shown where a run was scored at times that no training view has; the paper has no such columns.
+# Shown if a run was scored at times that no training view has; the paper has no such columns.
 OF_TIMES = (
     Column("PSNR at training times", "dynamic.training_times.psnr", True, 2),
     Column("PSNR at novel times", "dynamic.novel_times.psnr", True, 2),
@@ -126,7 +126,7 @@ class Table:
             value.
         blocks: one for each scene, then the average if there is more than one.
         gains: over three scenes or more, if they are alike: PSNR by label as text, its mean and its
-            least, and what it gains over the first row's; seconds as a multiple of that row's.
+            least, and its gain over the first row's; seconds as a multiple of that row's.
         notes: remarks on columns and rows, a sentence each.
     """
 

@@ -93,7 +93,7 @@ PLAIN = Style(str, ("{} ", "{}¹", "{}²", "{}³"))
 def markdown(
     table: Table, figures: Mapping[str, str], videos: Mapping[str, str] | None = None
 ) -> str:
-    """The whole report, with links to ``figures`` and ``videos``, by what they show."""
+    """The whole report, with links to ``figures`` and ``videos``, by their captions."""
     collection = table.collection
     failed = f", {len(collection.failures)} failed" if len(collection.failures) else ""
     count = len(collection.runs)

@@ -77,7 +77,7 @@ def _csv_cell(value: object) -> str:
 
 
 def _write_plots(table: Table, folder: Path) -> dict[str, str]:
-    """Write the plots as PNG and PDF; returns links to the former, by what they show."""
+    """Write the plots as PNG and PDF; returns links to the former, by their captions."""
     links: dict[str, str] = {}
     for plot in plots(table):
         for suffix in (".png", ".pdf"):
@@ -111,7 +111,7 @@ def scene_video(table: Table, scene: str) -> Iterator[np.ndarray] | None:
     """Pictures (H, W, 3) uint8 of the truth and of each row's rendering while time runs.
 
     The first run of a row that has a video stands for it. Pictures have the size of the first
-    row's, and as many frames as the shortest video. None where fewer than two rows have a video.
+    row's, and as many frames as the shortest video. None if fewer than two rows have a video.
     """
     runs = table.runs[table.runs["scene"] == scene]
     videos = dict[str, tuple[Path, int]]()

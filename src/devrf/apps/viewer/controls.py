@@ -20,7 +20,7 @@ DURATION = 5.0
 
 @dataclass(frozen=True)
 class Playback:
-    """The state of the time controls: the time in [0, 1], and how it runs.
+    """The state of the time controls: the time in [0, 1], and its playback.
 
     Attributes:
         loop: whether it restarts at its end; otherwise it stops there.
@@ -49,7 +49,7 @@ class Playback:
 
 
 def set_value(control: Any, value: object) -> None:
-    """Set what a control of the page shows; its type takes it for read-only."""
+    """Set the value of a control of the page; its type takes it for read-only."""
     control.value = value
 
 
@@ -116,7 +116,7 @@ class Controls:
             control.on_update(self._crop_set)
 
     def offer(self, drawing: Drawing) -> None:
-        """Offer what can be shown of a scene."""
+        """Offer the channels of a scene."""
         channel = self._channel.value
         self._channel.options = drawing.channels
         set_value(self._channel, channel if channel in drawing.channels else "color")
@@ -169,7 +169,7 @@ class Controls:
         self._status.content = text
 
     def tell(self, text: str) -> None:
-        """Say at the top of the page what the scene is going through."""
+        """Show the scene's present stage at the top of the page."""
         self._told.content = text
         self._told.visible = True
 
@@ -191,7 +191,7 @@ class Controls:
             self._cropped_by = event.client_id
 
     def _change(self, change: Callable[[Playback], Playback]) -> None:
-        """Change the playback, and the button that says what it does."""
+        """Change the playback, and its button's label."""
         with self._lock:  # the clock and the page change it
             self.playback = change(self.playback)
         playing = self.playback.playing

@@ -28,7 +28,7 @@ SATURATED = 0.02
 # blocks.
 BLOCK_SECONDS = 0.08
 MIN_RAYS = 512
-# In empty space nothing hides what is drawn into the scene.
+# Nothing hides drawings in the scene where space is empty.
 NOWHERE = 1e3
 # A finer frame has at most FINER times the rows of the one before. A frame with more than NEARLY of
 # all rows gets all at once.
@@ -47,7 +47,7 @@ class Shot:
         beside_rest: whether the rest state is shown beside, on the left, from so much farther that
             each half shows the whole width.
         crop: leave out what is outside this box (:class:`~devrf.rendering.renderer.CroppedRays`).
-        with_depth: whether distances are asked for, to hide what is behind the scene.
+        with_depth: whether distances are asked for, to hide drawings behind the scene.
     """
 
     keyframe: Keyframe
@@ -60,7 +60,7 @@ class Shot:
 
 @dataclass(frozen=True)
 class Frame:
-    """A frame (H, W, 3) uint8 on the host, and how long it took.
+    """A frame (H, W, 3) uint8 on the host, and its duration.
 
     ``depth`` (H, W) is along the camera's axis in world units; None if not asked for.
     """
@@ -71,7 +71,7 @@ class Frame:
 
 
 class Drawing:
-    """Draws shots of a learned scene, and knows how fast that goes.
+    """Draws shots of a learned scene, and measures its speed.
 
     Attributes:
         renderer: renders the scene; it may be replaced while the scene is learned.
@@ -213,7 +213,7 @@ class RenderScheduler:
         self._change = threading.Condition()
 
     def ask(self, key: Hashable, shot: Shot) -> None:
-        """Render ``shot`` for the browser ``key``, instead of what it asked for before."""
+        """Render ``shot`` for the browser ``key``, in place of its earlier one."""
         with self._change:
             self._requests[key] = _Request(shot)
             self._change.notify()

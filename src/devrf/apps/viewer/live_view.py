@@ -91,5 +91,5 @@ class LiveView(Callback):
 
 
 def _renderer(stage: Stage) -> Renderer:
-    """Renders what has been learned so far; it has no views of before."""
+    """Renders the present state of the scene; it has no views of before."""
     return Renderer(stage.current_model(), times=2)

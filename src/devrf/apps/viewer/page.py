@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 
 PAGE = "scene.html"
 PICTURES = "pictures"
-# Bytes of a page in which it says what it shows.
+# Bytes at the start of a page with its description.
 START = 2000
 # Served paths.
 SERVED = re.compile(r"/(scene\.html|pictures/\w{1,80}/\d{1,9}\.jpg)", re.ASCII)
@@ -40,7 +40,7 @@ PATIENCE = 10.0
 def is_current(run: Path) -> bool:
     """Whether a run's ``export/`` has the page of its newest checkpoint, and pictures for it.
 
-    With the program of this version of devrf; and the checkpoint is that of a finished stage.
+    It has to have the program of this version of devrf, and the checkpoint of a finished stage.
     """
     folder = run / "export"
     try:

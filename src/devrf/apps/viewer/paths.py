@@ -200,7 +200,7 @@ class PathPanel:
         set_value(self._aspect, min(max(path.aspect, 0.1), 10.0))
 
     def _draw(self) -> None:
-        """Show how many keyframes there are, and the way through them."""
+        """Show the number of keyframes, and the path through them."""
         seconds = self.keyframes[-1].seconds if self.keyframes else 0.0
         self._count.content = f"{len(self.keyframes)} keyframes, {seconds:g} s"
         if self._line is not None:

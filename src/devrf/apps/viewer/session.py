@@ -96,7 +96,7 @@ class Session:
         self.refresh()
 
     def serve(self) -> None:
-        """Render what is asked for until :meth:`stop`, from the calling thread."""
+        """Render requested frames until :meth:`stop`, from the calling thread."""
         log.info("the scene is at %s; Ctrl-C ends the viewer", self.settings.address)
         while not self._stop.is_set():
             with self.surviving():
@@ -213,7 +213,7 @@ class Session:
         self.controls.set_time(keyframe.time)
         wxyz, position, fov = in_browser(keyframe)
         for client in self.server.get_clients().values():
-            # A page may say of its camera what viser does not move.
+            # A page may give its camera values that viser cannot move.
             with self.surviving(), client.atomic():
                 client.camera.position = position
                 client.camera.wxyz = wxyz

@@ -1,4 +1,4 @@
-"""Packs what DeVRF has learned into one HTML file, which a browser draws by itself.
+"""Packs a DeVRF scene into one HTML file, which a browser draws by itself.
 
 ``scene.html`` gets ``scene.js``, ``scene.glsl`` and its textures' contents, gzip in base64:
 
@@ -15,8 +15,8 @@
 ``residual-K``       A_t of frame K, half precision, if colours change
 ==================== ==============================================================================
 
-Values are kept where samples read them, then or at any time; the others take no space, all the
-same. ``description``, JSON, holds boxes, sampling and cameras.
+Values are kept where samples read them, then or at any time; the others are all the same and take
+no space. ``description``, JSON, holds boxes, sampling and cameras.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ from devrf.system.printed import shown
 ROUNDED = 1 / 64
 # Grid points whose colours are found at once.
 CHUNK = 2**16
-# Of a texture's row of weights, four numbers each.
+# Texels in a texture's row of weights, four numbers each.
 ROW = 64
 
 
@@ -72,7 +72,7 @@ def drawable(model: Renderable) -> bool:
 def page(model: Renderable, viewpoints: Viewpoints, name: str, checkpoint: str) -> str:
     """The page of the scene ``name``, with the cameras of ``viewpoints``.
 
-    It says of which ``checkpoint`` it is, by its digest.
+    It names its ``checkpoint`` by the digest.
 
     Raises:
         DevrfError: the page cannot draw the model.
@@ -148,7 +148,7 @@ def _parts(model: DeVRFModel, eyes: Tensor) -> Iterator[tuple[str, Tensor]]:
 def _rough(model: DeVRFModel, visible: Tensor, eyes: Tensor) -> Tensor:
     """Colours (X, Y, Z, 3), bytes, as the nearest of the ``eyes`` (K, 3) sees them.
 
-    Of grid points where ``visible`` (X, Y, Z), else 0.
+    They are 0 at grid points that are not ``visible`` (X, Y, Z).
     """
     field = model.canonical
     points = model.box.grid_points(field.density.shape, eyes)
@@ -177,7 +177,7 @@ def _seen(
         mask = first.mask | second.mask
         near = Occupancy(mask, first.box).points_near(motion.shape, motion.box)
         before, after = (motion.to_canonical[n].to(near.device).float() for n in (k, k + 1))
-        # What moves by more than this comes from where nothing is.
+        # Points that move by more than this come from empty space.
         change = min(float(((after - before).norm(dim=-1) * near).amax()), first.box.diagonal)
         steps = math.ceil(change / (2 * cell))
         for time in torch.linspace(times[k], times[k + 1], steps + 1)[1:-1].tolist():

@@ -21,7 +21,7 @@ from devrf.scenes.scene import Views
 class ActiveFrame:
     """Memory for a frame that is trained; one frame after another uses it.
 
-    The field knows what was learned once that is written back.
+    The field has the result once that is written back.
 
     Attributes:
         store: the displacements of all frames.
@@ -86,7 +86,7 @@ class ActiveFrame:
 
     @torch.no_grad()
     def write_back(self) -> None:
-        """Copy what was learned into the fields; learning may go on."""
+        """Copy the result into the fields; learning may go on."""
         if self.number:
             self.store.write(self.number, self.slices)
             for name, values in self.further.items():
@@ -109,7 +109,7 @@ class ActiveFrame:
 
     @torch.no_grad()
     def load_state(self, state: dict[str, Any], views: Views) -> None:
-        """Restore what :meth:`state` gave; the frame has been checked out."""
+        """Restore the result of :meth:`state`; the frame has been checked out."""
         images = images_of(views, self.number)
         area = views.height * views.width
         for tensor, value in zip(self.slices, state["displacements"], strict=False):

@@ -1,4 +1,4 @@
-"""Sizes of the canonical field (docs/method.md#canonical-field), and what a scene asks of them."""
+"""Sizes of the canonical field (docs/method.md#canonical-field), adapted to a scene."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def fitted_to(
 
 
 def resolved_voxels(scene: Scene, schedule: CanonicalSchedule, box: Box) -> int:
-    """Voxels of the finished grid over ``box``: of ``side``, or what the static views resolve.
+    """Voxels of the finished grid over ``box``: by ``side``, or by the static views' resolution.
 
     See docs/method.md#resolution.
     """

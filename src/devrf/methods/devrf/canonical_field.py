@@ -1,4 +1,4 @@
-"""The canonical field: what the scene looks like at rest, as density and colour grids."""
+"""The canonical field: the scene's look at rest, as density and colour grids."""
 
 from __future__ import annotations
 
@@ -127,8 +127,8 @@ class CanonicalField(nn.Module):
         color: features f (X, Y, Z, C) for the decoder.
         decoder: features and directions → RGB.
         box: B, the field's box, in world units or NDC.
-        voxels: N, about how many voxels the grids have.
-        base_voxels: about how many voxels they have at full resolution.
+        voxels: N, the approximate number of the grids' voxels.
+        base_voxels: the same at full resolution.
         alpha_init: opacity of one base voxel before anything is learned.
         planes: P, in NDC the number of planes along the rays at every resolution, from the box's
             front to its back; None for cubic voxels.

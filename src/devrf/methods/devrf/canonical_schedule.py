@@ -1,4 +1,4 @@
-"""The canonical stage's schedule: a pure map from an iteration to what is learned then."""
+"""The canonical stage's schedule: a pure map from an iteration to its phase."""
 
 from __future__ import annotations
 
@@ -59,11 +59,11 @@ class CanonicalSchedule(Options):
         density_drop: subtracted from raw densities when the grid has grown.
         occupancy_every: iterations between renewals of the occupancy; None: only at growth.
         rays: of a batch.
-        min_views: cells that fewer training views have in the picture are empty from the start.
+        min_views: cells that fewer training views see are empty from the start.
         dense_tv_iterations: so long the total variation smooths untouched voxels, too.
         voxels_per_pixel: grid points for each pixel across. Forward-facing it decides ``side``;
             else the grid is no finer (docs/method.md#resolution).
-        epochs: batches are smaller where all iterations would show each pixel more often.
+        epochs: batches are smaller if all iterations would show each pixel more often.
         view_dependence_start: iteration from which colours depend on the viewing direction. None:
             0; in contracted space half of ``iterations``.
         unbounded_initial_side: of the grid in contracted space. None: as ``upsample_at`` says.

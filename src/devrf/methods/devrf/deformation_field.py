@@ -17,7 +17,7 @@ from devrf.ops.trilinear import Shape
 
 # Far away, in longest edges of a box.
 FAR = 1000.0
-# Points (M, 3) → where they move to, (M, 3).
+# Points (M, 3) → moved points (M, 3).
 Warp = Callable[[Tensor], Tensor]
 
 
@@ -59,14 +59,14 @@ class GridWarp:
     def of_grid(self, box: Box, shape: Shape, device: torch.device) -> Tensor:
         """The points of a grid of ``shape`` over ``box``, moved: (M, 3), as columns in memory.
 
-        As the warp of these points, faster: between two grids along the same axes interpolation is
-        a matrix for each axis. Displacements that are no numbers lead far away.
+        It equals the warp of these points, and is faster: between two grids along the same axes
+        interpolation is a matrix for each axis. Displacements that are no numbers lead far away.
         """
         lines = box.grid_lines(shape, torch.empty(0, device=device))
         points = torch.stack(torch.meshgrid(*lines, indexing="ij"))
         moves = self.displacement
         if moves is not None:
-            # Products of matrices would spread what is no number to all points.
+            # Products of matrices would spread NaN to all points.
             far = FAR * self.box.longest
             moves = moves.nan_to_num(nan=far, posinf=far, neginf=far).permute(3, 0, 1, 2)
             for axis, line in enumerate(lines):
@@ -154,11 +154,11 @@ class DeformationField(FrameField):
         self.frames.resize(self.box.grid_shape(voxels, planes))
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Box and clock as plain numbers; where nothing moves outside, by the name in format 5."""
+        """Box and clock as plain numbers; ``zero_outside_box`` by its name in format 5."""
         outside = {"still_outside": True} if self.zero_outside_box else {}
         return super().get_extra_state() | outside
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`get_extra_state` gave."""
+        """Restore the result of :meth:`get_extra_state`."""
         super().set_extra_state(state)
         self.zero_outside_box = bool(state.get("still_outside"))

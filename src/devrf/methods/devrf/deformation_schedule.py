@@ -27,7 +27,7 @@ VISITS = "visits of frames"
 
 @pydantic.dataclasses.dataclass(frozen=True)
 class Level(Options):
-    """One resolution of the motion grids, and how the frames are learned at it.
+    """One resolution of the motion grids, and the settings of the frames' visits at it.
 
     Attributes:
         side: the motion grids have about side³ voxels, maybe as many as at the level before.
@@ -180,7 +180,7 @@ class DeformationSchedule(Options):
         return {name: count for name, count in counts.items() if count}
 
     def grid(self, level: int) -> tuple[int, int | None]:
-        """About how many voxels the motion grids of a level have, and their planes, if given."""
+        """The approximate voxels of the motion grids of a level, and their planes, if given."""
         side = self.levels[level].side
         finest = self.levels[-1].side
         return side**3, self.planes and round(self.planes * side / finest)

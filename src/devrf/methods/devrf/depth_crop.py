@@ -33,7 +33,7 @@ BEHIND = 0.05
 def crop_to_visible(model: DeVRFModel, scene: Scene, views: Views, pool: PixelPool) -> None:
     """Crop the canonical field in NDC to the depths that show in the static views.
 
-    Sideways it keeps what the learning cameras see at those depths.
+    Sideways it keeps the training cameras' view at those depths.
 
     Args:
         model: the scene at rest as learned so far; its field is changed.
@@ -57,9 +57,9 @@ def crop_to_visible(model: DeVRFModel, scene: Scene, views: Views, pool: PixelPo
 
 @torch.no_grad()
 def crop(field: CanonicalField, box: Box) -> None:
-    """Keep what is in ``box``, a part of the field's own, at the same resolution.
+    """Crop a field with planes to ``box``, a part of its own, at the same resolution.
 
-    Of a field with planes; new parameters result.
+    New parameters result.
     """
     assert field.planes is not None, "only fields with planes are cropped"
     before = field.box
@@ -100,14 +100,14 @@ def seen_along_rays(
 
 
 def visible_depths(depths: Tensor, weights: Tensor, ray: Tensor) -> tuple[float, float]:
-    """The depths between which all but fog and specks is seen.
+    """The depths that hold all but fog and specks.
 
-    Where a ray meets a surface, half of what it sees is before it. While nothing is known, all is
-    fog, and no depth is given up.
+    The surface that a ray meets is at half of its weight. While nothing is known, all is fog, and
+    no depth is given up.
 
     Args:
         depths: (S,) of samples, ascending on each ray.
-        weights: (S,) how much of its ray each is.
+        weights: (S,) of the samples in their rays.
         ray: (S,) int64 their rays, ascending.
     """
     ascending, order = depths.sort()

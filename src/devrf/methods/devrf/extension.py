@@ -56,7 +56,7 @@ class MotionContext:
 
     @property
     def field(self) -> DeformationField:
-        """The deformation field; what the active frame learns may not be written back yet."""
+        """The deformation field; the active frame may not be written back yet."""
         assert self.model.deformation is not None
         return self.model.deformation
 
@@ -91,7 +91,7 @@ class Extension:
         return {}
 
     def begin_level(self, context: MotionContext, level: int) -> None:
-        """Memory of the active frame is ready; give the optimiser what is learned of it."""
+        """Memory of the active frame is ready; give the optimiser its parameters."""
 
     def weight_factor(self, term: str, level: int, share: float) -> float:
         """Factor of the weight of any loss term at ``level``, a ``share`` of a visit being over."""

@@ -1,4 +1,4 @@
-"""Fields of all frames, and where their displacements are kept while a few of them are learned.
+"""Fields of all frames, and the memory of their displacements while a few of them are learned.
 
 All frames together are large (50 × 160³ × 3 single-precision values are 2.5 GB per direction), and
 few are needed at a time: they may be kept on the host, or in half precision. Frames are always
@@ -62,7 +62,7 @@ class FrameField(nn.Module):
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`get_extra_state` gave."""
+        """Restore the result of :meth:`get_extra_state`."""
         self.box = validate(Box, state)
         self.clock = validate(FrameClock, state)
 

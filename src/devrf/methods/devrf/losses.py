@@ -55,7 +55,7 @@ PHOTOMETRIC_TERMS: dict[str, Callable[[Prediction], Tensor]] = {
 
 @dataclass(frozen=True)
 class MotionPrediction(Prediction):
-    """A prediction through the warp of one frame t, with what the motion terms need.
+    """A prediction through the warp of one frame t, with the motion terms' inputs.
 
     Attributes:
         unwarp: canonical points q (M, 3) → q + Δ_f(q, t).
@@ -128,8 +128,8 @@ def induced_flow(
         unwarp_previous: q → q + Δ_f(q, t − 1).
         cameras: all cameras.
         camera: (M,) int64, the camera π that took the earlier frame.
-        pixel: (M, 2) u, where the points are seen now: x, y in pixels.
-        space: the space that the points are in.
+        pixel: (M, 2) u, the points' pixels now: x, y in pixels.
+        space: of the points.
     """
     position, _ = cameras.project(camera, space.to_world(unwarp_previous(canonical)))
     return position - pixel

@@ -1,4 +1,4 @@
-"""DeVRF's model: a canonical voxel field, its occupancy, and how it deforms."""
+"""DeVRF's model: a canonical voxel field, its occupancy, and its deformation."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ class DeVRFModel(Renderable):
 
     @torch.no_grad()
     def stored_state(self) -> dict[str, Any]:
-        """The state with packed grids: in half precision, in detail near what is ever occupied.
+        """The state with packed grids: in half precision, in detail near space ever occupied.
 
         A grid with a value that half precision cannot hold stays as it is.
         """
@@ -202,7 +202,7 @@ class DeVRFModel(Renderable):
         return state
 
     def load_stored_state(self, state: Mapping[str, Any]) -> None:
-        """Take what :meth:`stored_state` gave, or a full state.
+        """Take the result of :meth:`stored_state`, or a full state.
 
         Packed displacements stay in half precision, on the model's device if they fit there. Those
         that are not packed are held as they are, without a copy.

@@ -1,4 +1,4 @@
-"""The deformation stage's loss: which terms count at each level, and how much."""
+"""The deformation stage's loss: its terms and their weights at each level."""
 
 from __future__ import annotations
 

@@ -22,10 +22,10 @@ from devrf.scenes.scene import Views
 # One ray is followed for a block of so many pixels a side: at least, and at most.
 BLOCK = 2
 MOST_BLOCK = 8
-# Images whose rays are made together: on a CPU what its caches hold, on a GPU what keeps it busy.
+# Images whose rays are made together: a CPU's caches hold them, and a GPU is kept busy.
 IMAGES_ON_CPU = 1
 IMAGES_ON_GPU = 16
-# A ray hits what is so many cells away from it, or fewer.
+# A ray hits cells that are at most so many cells away from it.
 HIT_CELLS = 2
 # The fewest rays of a batch, however few pixels there are.
 MIN_RAYS = 64
@@ -41,7 +41,7 @@ def rays_hit_occupied(
 
     Args:
         cameras: all cameras, on the model's device.
-        images: (K,) int64, which of them.
+        images: (K,) int64, their numbers.
         model: gives box, space, near and far.
         occupancy: an upper bound at the time of the images.
     """
@@ -87,8 +87,8 @@ def rays_that_hit(rays: Rays, limits: MarchRange) -> Tensor:
 def block_size(cameras: Cameras, model: Renderable, occupancy: Occupancy) -> int:
     """Pixels a side of a block all of whose rays are within a cell of its middle one.
 
-    A ray that passes near anything stands for its neighbours. Only at the silhouette of the box, if
-    something reaches its faces, a block is lost whose middle ray passes beside it.
+    A ray that passes near anything stands for its neighbours. A block at the silhouette of the box
+    is lost if something reaches the box's faces and the block's middle ray passes beside it.
     """
     if not isinstance(model.space, WorldSpace):
         return BLOCK

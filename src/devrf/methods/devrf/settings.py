@@ -80,11 +80,11 @@ class MotionSettings(Options):
     """Settings of the deformation stage, beside its schedule (docs/method.md#departures).
 
     Attributes:
-        learning_rate: base rate, in ``unit`` per step: how far a voxel moves at most.
+        learning_rate: base rate, in ``unit`` per step: a voxel moves by no more.
         unit: ``world`` for world units; ``box`` for the longest edge of the fields' box.
-        views: of the frame's views a batch shows ``one``, in turn, or ``all``.
+        views: a batch shows ``one`` of the frame's views, in turn, or ``all``.
         pixels: ``all``, or ``occupied``: of the alpha mask, and where rays hit the present field.
-        epochs: batches are smaller where a visit would show each pixel more often.
+        epochs: batches are smaller if a visit would show each pixel more often.
         occupancy_every: iterations between updates of the frame's occupancy.
         store: the memory of the frames while one is learned; ``auto``: the device's if they fit.
         store_half: whether they are kept in half precision; ``auto``: on a GPU.

@@ -22,14 +22,14 @@ from devrf.rendering.output import ColorChange, RenderedImage
 from devrf.rendering.sampling import RenderSettings
 from devrf.system.threads import one_thread
 
-# Rays at once: on a CPU so many that what a chunk costs by itself, 0.8 ms, is little
-# (docs/notebook/costs.md#tiles); on a GPU what keeps it busy and fits.
+# Rays at once: on a CPU so many that the cost of a chunk by itself, 0.8 ms, is small
+# (docs/notebook/costs.md#tiles); a GPU is kept busy, and they fit.
 ON_CPU = 2**14
 ON_GPU = 2**15
 # Points of a grid that are worth several threads.
 MANY = 2**20
-# Samples of unbounded scenes' pictures are so much further apart than while they are learned: what
-# is far away is blurred over many voxels. Their PSNR stays, and a fifth of the time is saved.
+# Samples of unbounded scenes' pictures are so much further apart than in training: far things are
+# blurred over many voxels. Their PSNR stays, and a fifth of the time is saved.
 UNBOUNDED_STEP = 1.5
 
 
@@ -62,13 +62,13 @@ class DeVRFView:
 
     @torch.no_grad()
     def __post_init__(self) -> None:
-        """Blend the time's displacements; find its occupancy, and how far off it is."""
+        """Blend the time's displacements; find its occupancy, and the distances to it."""
         motion = self.motion
         self.at_rest = motion is None or motion.clock.at(self.time).after == 0
         if motion is None or self.at_rest:
             return
         with one_thread() if self.canonical.density.values.numel() < MANY else nullcontext():
-            # As one grid: one look-up a point instead of two.
+            # As one grid: one interpolation a point instead of two.
             moves = motion.warp_at(self.time).displacement
             assert moves is not None
             self._warp = motion.warp_by(moves)

@@ -39,13 +39,13 @@ def render(
         field: the canonical field.
         occupancy: an upper bound, in the space of the rays.
         settings: step length and thresholds.
-        background: (3,) or (R, 3) RGB behind all; the field's own where the space holds infinity.
+        background: (3,) or (R, 3) RGB behind all; the field's own if the space holds infinity.
         warp: x → q = x + Δ_b(x, t); None is the identity.
         precision: of the colour network.
         color_change: q → A_t(q), added to the colours' logits; None: nothing is.
 
     Returns:
-        What the rays see; differentiable in the parameters of field, warp and colour change.
+        The render; differentiable in the parameters of field, warp and colour change.
     """
     with span("sampling"):
         samples = march(rays, march_inputs(field, occupancy, settings, warp))
@@ -99,11 +99,11 @@ def march_inputs(
 def deformed_occupancy(
     field: CanonicalField, occupancy: Occupancy, settings: RenderSettings, warp: GridWarp
 ) -> Occupancy:
-    """The occupancy at a time: the points of the density's grid that move to what is opaque.
+    """The occupancy at a time: the points of the density's grid that move to opaque space.
 
-    That is where samples count: where the opacity is that of a visible sample, there or at the
-    nearest point of the densities; a thin thing may lie between the places that points come from.
-    Grown by one for what is between the points now.
+    Space is opaque if its opacity is that of a visible sample, there or at the nearest point of the
+    densities; a thin thing may lie between the positions that points come from.
+    It is grown by one, for the space between the moved points.
 
     Args:
         field: the canonical field.
@@ -122,8 +122,8 @@ def deformed_occupancy(
 def possible_occupancy(occupancy: Occupancy, warp: GridWarp) -> Occupancy:
     """The occupancy while a frame is learned, of the grid of that at rest.
 
-    Wider than :func:`deformed_occupancy`, since the displacements go on changing: all that may be
-    occupied at rest, grown by one point.
+    It is wider than :func:`deformed_occupancy`, since the displacements go on changing: all that
+    may be occupied at rest, grown by one point.
     """
     x, y, z = occupancy.mask.shape
     rows, _ = points_that_arrive(occupancy, warp, occupancy.box, (x, y, z))
@@ -143,7 +143,7 @@ def points_that_arrive(
         shape: its points along x, y, z.
 
     Returns:
-        Their rows (K,) in the grid, and where they move to, (K, 3).
+        Their rows (K,) in the grid, and their moved positions (K, 3).
     """
     moved = warp.of_grid(box, shape, occupancy.mask.device)
     rows = occupancy.at(moved).nonzero()[:, 0]

@@ -87,7 +87,7 @@ class HyperNeRF(Nerfies):
     """(σ, c) = T(W(x, ω_t), γ_β(w), d) with w = H(x, ω_t); β = 0 is Nerfies exactly.
 
     Attributes:
-        opened: () β, how many octaves of w enter T; stored with the weights.
+        opened: () β, the octaves of w that enter T; stored with the weights.
         slicing: H; or a w for each frame.
     """
 

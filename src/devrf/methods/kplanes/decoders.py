@@ -49,7 +49,7 @@ class HybridDecoder(nn.Module):
         self.color = mlp(FURTHER + self._directions, settings.width, 2, 3, bias=False)
 
     def density(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """σ (S,), and what :meth:`rgb` takes, of features (S, size)."""
+        """σ (S,) and the features for :meth:`rgb`, of features (S, size)."""
         values = self.geometry(features)
         return density_of(values[:, FURTHER]), values[:, :FURTHER]
 

@@ -92,7 +92,7 @@ class KPlanes(DensityColorField):
         return torch.cat([share, time[:, None]], dim=1)
 
     def sigma(self, points: Tensor, time: Tensor, ray: Tensor) -> tuple[Tensor, Tensor]:
-        """σ (S,), and what the decoder colours."""
+        """σ (S,), and the decoder's features for colours."""
         where = self.coordinates(points, time.index_select(0, ray))
         return self.decoder.density(self.planes(where))
 
@@ -140,7 +140,7 @@ class KPlanes(DensityColorField):
     def loss_terms(
         self, output: RenderOutput, batch: RayBatch, names: Collection[str]
     ) -> dict[str, Tensor]:
-        """``render``, and what keeps planes simple and proposals true.
+        """``render``, and terms that keep planes simple and proposals true.
 
         See docs/methods/kplanes.md#losses. ``tv`` and ``change`` are of the field's planes and of
         proposals'. Without proposals their terms are 0.
@@ -169,7 +169,7 @@ class KPlanes(DensityColorField):
 
     @property
     def grid_channels(self) -> Collection[int]:
-        """Of the field's planes, and of proposals'."""
+        """Channels of the field's planes, and of proposals'."""
         s = self.settings
         return (s.channels, *([s.proposal_channels] if s.sampling == "proposals" else []))
 

@@ -1,4 +1,4 @@
-"""Features of space and time on six planes, and what keeps the planes simple."""
+"""Features of space and time on six planes, and terms that keep the planes simple."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from devrf.methods.kplanes.settings import Pairing
 
 # Axes of the planes of space: xy, xz, yz.
 SPACE = ((0, 1), (0, 2), (1, 2))
-# Of the planes with time: zt, yt, xt. Each is paired, as HexPlane has it, with the one of space
+# Axes of the planes with time: zt, yt, xt. Each is paired, as in HexPlane, with the one of space
 # that does not have its axis.
 TIME = ((2, 3), (1, 3), (0, 3))
 
@@ -23,7 +23,7 @@ class SixPlanes(nn.Module):
     """f(x, y, z, t): bilinear values of six planes, multiplied, and joined over scales.
 
     See docs/methods/kplanes.md#planes. Three planes of a scale lie one behind another along the
-    first axis of one grid, so that one look-up serves them.
+    first axis of one grid, so that one interpolation serves them.
 
     Attributes:
         space: for each scale, of N points along x, y and z, a grid (3N, N, 1, C) of the planes of
@@ -78,7 +78,7 @@ class SixPlanes(nn.Module):
         return len(TIME) * sum_of([_step(each, axis=1) for each in steps])
 
     def change(self) -> Tensor:
-        """Σ over planes with time of the mean |1 − P|: 0 of what is at rest."""
+        """Σ over planes with time of the mean |1 − P|: 0 for a scene at rest."""
         return len(TIME) * sum_of([(1 - grid).abs().mean() for grid in self.time])
 
 

@@ -58,7 +58,7 @@ class DeformableField(DensityColorField):
         """
 
     def radiance_parts(self) -> dict[str, Iterable[nn.Parameter]]:
-        """The radiance fields as parts; what takes w is a part of its own."""
+        """The radiance fields as parts; layers that take w are a part of their own."""
         base: list[nn.Parameter] = []
         beside: list[nn.Parameter] = []
         for field in (self.canonical, self.coarse):
@@ -69,7 +69,7 @@ class DeformableField(DensityColorField):
     def sigma(
         self, points: Tensor, time: Tensor, ray: Tensor, field: RadianceField | None = None
     ) -> tuple[Tensor, Tensor]:
-        """σ (S,) where points lead, in T or another ``field``, and what colours come from."""
+        """σ (S,) at deformed points, in T or another ``field``, and the colours' features."""
         canonical, ambient = self.deform(points, time.index_select(0, ray))
         return (field or self.canonical).sigma(canonical, ambient)
 

@@ -61,7 +61,7 @@ def octave_window(opened: Tensor, bands: int) -> Tensor:
     See docs/methods/nerfies.md#window.
 
     Args:
-        opened: () α: how many octaves are open; 0 shuts all, ``bands`` opens all.
+        opened: () α: the number of open octaves; 0 shuts all, ``bands`` opens all.
         bands: octaves.
 
     Returns:
@@ -76,7 +76,7 @@ def linear_by_ray(
 ) -> Tensor:
     """``layer(cat([*values, of_rays[ray]], dim=1))``, whose last part is multiplied once a ray.
 
-    What needs no gradient, as encoded positions, has none computed.
+    No gradient is computed of values that need none, as encoded positions.
 
     Args:
         layer: of as many inputs as all of these have.
@@ -170,7 +170,7 @@ LARGEST = 0.05
 class TimeCodes(nn.Module):
     """A code ω_t for each frame, shared by all cameras; between two frames a mixture of theirs.
 
-    At frames' own times this is what was published; what is between them was never learned
+    The codes at frames' own times are the published ones; those between were never learned
     (docs/methods/nerfies.md#codes).
     """
 
@@ -202,7 +202,7 @@ class ColorBranch(nn.Module):
     def forward(self, trunk: Tensor, viewdirs: Tensor, ray: Tensor) -> Tensor:
         """RGB (S, 3) before its activation.
 
-        Of samples (S, width) of the rays ``ray`` (S,), whose unit directions are (R, 3).
+        Samples (S, width) are of the rays ``ray`` (S,), whose unit directions are (R, 3).
         """
         direction = self.encode(viewdirs)
         hidden = linear_by_ray(self.hidden, [self.feature(trunk)], direction, ray).relu_()
@@ -225,7 +225,7 @@ class RadianceField(nn.Module):
         Args:
             settings: sizes.
             inputs: length of x; a time may be a part of it.
-            ambient: length of what enters the trunk beside γ(x).
+            ambient: length of the trunk's input beside γ(x).
         """
         super().__init__()
         s = self._settings = settings
@@ -255,7 +255,7 @@ class RadianceField(nn.Module):
         return x
 
     def sigma(self, points: Tensor, ambient: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """σ (S,) ≥ 0 per unit of normalised space, and what it came from; arguments likewise."""
+        """σ (S,) ≥ 0 per unit of normalised space, and its hidden features; arguments likewise."""
         with self.reduced():
             x = self.hidden(points, ambient)
             raw = self.density(x)[:, 0]

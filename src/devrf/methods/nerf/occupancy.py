@@ -68,7 +68,7 @@ class LearnedOccupancy(StoredShape):
         """Look at cells again if iteration ``step`` is one to do so.
 
         Args:
-            step: iteration of a stage, from 0; at 0 what another stage saw is forgotten.
+            step: iteration of a stage, from 0; at 0 the results of another stage are forgotten.
             total: iterations of the stage.
             share: share of these before which nothing is left out; None: nothing ever is.
             box: of the cells, in the fields' space.
@@ -138,8 +138,8 @@ class OccupancyFrames(StoredShape):
 
         Args:
             scene: seen from all around, the training images' alpha masks carve them, grown by a
-                cell; static images show frame 0. Where no camera of another frame looks, there is
-                what may be there at rest. Else the field itself has to tell what is empty.
+                cell; static images show frame 0. Space that no camera of another frame sees is as
+                at rest. In other scenes the field itself has to tell what is empty.
             box: in the fields' space.
             side: cells along an edge of a cube of the box's size.
             hull: whether to carve at all.
@@ -204,7 +204,7 @@ class OccupancyFrames(StoredShape):
     def _may_be(
         self, points: Tensor, frames: tuple[Tensor, Tensor], box: Box
     ) -> tuple[Tensor, Tensor | None]:
-        """Whether the masks of frames (S,), and what is learned, leave ``points`` (S, 3) in."""
+        """Whether the masks of frames (S,), and the learned ones, leave ``points`` (S, 3) in."""
         _, x, y, z = self.mask.shape
         nearest = box.to_grid(box.nearest(points), (x, y, z)).round().long()
         cell = (nearest[:, 0] * y + nearest[:, 1]) * z + nearest[:, 2]

@@ -33,7 +33,7 @@ class Placement:
 
     @property
     def unit(self) -> float:
-        """World units that :meth:`euclidean` counts as 1: about as large as what is near."""
+        """World units that :meth:`euclidean` counts as 1: about the size of the near scene."""
         if isinstance(self.space, NormalizedDevice):
             return self.space.near
         return self.space.inner(self.box).longest / 2
@@ -61,7 +61,7 @@ class Placement:
     def within(self, points: Tensor, share: float) -> Tensor:
         """Mask (S,) of normalised points (S, 3) that are near enough to be held smooth.
 
-        In NDC those of the nearest ``share`` of depths, elsewhere all that cameras look at.
+        They are those of the nearest ``share`` of depths in NDC, and elsewhere the whole subject.
         """
         field_points = self.fields(points)
         if isinstance(self.space, NormalizedDevice):

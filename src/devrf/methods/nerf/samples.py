@@ -1,4 +1,4 @@
-"""Samples along rays: where they are drawn, and how they are composited."""
+"""Samples along rays: their drawing, and their compositing."""
 
 from __future__ import annotations
 
@@ -108,8 +108,8 @@ def stratified(near: Tensor, far: Tensor, count: int, *, jitter: bool) -> Tensor
     """Distances (R, count), one in each of as many equal stretches.
 
     Args:
-        near: (R,) where the first stretch begins.
-        far: (R,) where the last one ends.
+        near: (R,) the start of the first stretch.
+        far: (R,) the end of the last one.
         count: the number of stretches.
         jitter: a random position in each stretch; else its middle.
     """
@@ -129,8 +129,8 @@ def importance(
     Args:
         distance: (R, N) of the coarse samples, ascending.
         weight: (R, N) theirs.
-        near: (R,) where the first stretch begins.
-        far: (R,) where the last one ends.
+        near: (R,) the start of the first stretch.
+        far: (R,) the end of the last one.
         count: the number to draw.
         jitter: random numbers; else evenly spread ones.
     """

@@ -1,4 +1,4 @@
-"""The elastic loss: a warp should turn what it moves, not stretch it."""
+"""The elastic loss: a warp should turn things, not stretch them."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def drawn(weight: Tensor, ray: Tensor, rays: Tensor, count: int) -> tuple[Tensor
     Args:
         weight: (S,) w ≥ 0.
         ray: (S,) int64, ascending: the ray of each sample.
-        rays: (K,) int64, which rays.
+        rays: (K,) int64, the rays' numbers.
         count: the number of rays.
 
     Returns:

@@ -34,7 +34,7 @@ class RigidWarp(nn.Module):
     """x′ = e^{[r]} x + G v with (r, v) = W(γ_α(x), ω) (docs/methods/nerfies.md#warp).
 
     Attributes:
-        opened: () α, how many octaves of γ the window lets through; stored with the weights.
+        opened: () α, the octaves of γ that the window lets through; stored with the weights.
     """
 
     opened: Tensor
@@ -124,7 +124,7 @@ class Nerfies(DeformableField):
 
         Args:
             settings: sizes and sampling; None: as published.
-            ambient: length of what enters T beside the position.
+            ambient: length of T's input beside the position.
         """
         settings = settings or NerfiesSettings()
         super().__init__(settings, ambient)

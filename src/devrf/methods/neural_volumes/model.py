@@ -145,7 +145,7 @@ class NeuralVolumes(PlacedModel):
             moment: (R,) int64, the moment of each ray.
             frames: (R,) int64 twice, the frames before and after each ray's time.
             background: (3,) or (R, 3) RGB.
-            jitter: sample at random places, to learn from them.
+            jitter: sample at random positions, to learn from them.
         """
         if len(self.occupancy.mask) == 1:  # one mask for all frames, which excludes nothing
             frames = (torch.zeros_like(moment), torch.zeros_like(moment))

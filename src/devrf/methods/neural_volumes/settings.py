@@ -36,7 +36,7 @@ class NeuralVolumesSettings(MethodSettings):
         warp_scale: displacement for an output of 1 (conv); the cube's edge is 2.
         density_scale: opacity per unit length of a softplus of 1, in the same unit.
         step: between samples, in the same unit.
-        hull: whether what is outside the visual hull of each frame's masks is left out (not in the
+        hull: whether space outside the visual hull of each frame's masks is left out (not in the
             published method); else the whole cube is sampled.
         occupancy_side: the hulls have about side³ cells.
     """

@@ -18,7 +18,7 @@ class Volumes:
 
     Attributes:
         template: (M, 4, T, T, T), axes z, y, x: RGB in [0, 1], and opacity per unit length.
-        warp: (M, 3, W, W, W), axes z, y, x: where in the template a point of the cube is found.
+        warp: (M, 3, W, W, W), axes z, y, x: the template's point for each of the cube.
     """
 
     template: Tensor
@@ -50,7 +50,7 @@ def _sampled(volume: Tensor, points: Tensor) -> Tensor:
 
 
 def added_opacity(amount: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
-    """Each sample's share of what is seen, and each ray's opacity.
+    """Each sample's weight, and each ray's opacity.
 
     A_i = min(1, A_{i−1} + a_i) and w_i = A_i − A_{i−1}: for example a = (0.75, 0.5, 1) on one ray
     gives w = (0.75, 0.25, 0) and A = 1 (docs/methods/neural_volumes.md#rendering).

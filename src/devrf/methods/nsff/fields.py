@@ -1,4 +1,4 @@
-"""NSFF's two trunks, and how their densities are composited in one pass."""
+"""NSFF's two trunks, and the compositing of their densities in one pass."""
 
 from __future__ import annotations
 
@@ -177,7 +177,7 @@ def with_time(points: Tensor, time: Tensor) -> Tensor:
 
 
 class TwoFields(nn.Module):
-    """Both fields, and how their densities join.
+    """Both fields, and the joining of their densities.
 
     Attributes:
         static: the field that is the same at all times.

@@ -85,7 +85,7 @@ def smooth_space(r: Renders) -> Tensor:
 def smooth_time(r: Renders) -> Tensor:
     """½‖X⁺ + X⁻ − 2X‖², twice around a ray's own points, once around those of a neighbouring frame.
 
-    There the flow that led to the neighbour is chained with the one that leads on from it.
+    The flow that led to the neighbour is chained there with the one that leads on from it.
     """
     own = r.output.samples.points
     near = r.near
@@ -193,7 +193,7 @@ def missing_terms(priors: ImagePriors, terms: Collection[str], *, additive: bool
 
     Args:
         priors: of the images that are learned from.
-        terms: names of what counts.
+        terms: names of the terms that count.
         additive: whether densities add.
     """
     reasons = {}

@@ -123,7 +123,7 @@ class NSFF(NeuralField):
     def extra_pixels(
         self, generator: torch.Generator, share: float
     ) -> tuple[Tensor, Tensor] | None:
-        """In the first N₀ iterations, pixels that move."""
+        """Pixels that move, in the first N₀ iterations."""
         moving = None if self._images is None else self._images.moving
         if moving is None or not self.settings.hard_rays or self._step >= self._first:
             return None
@@ -133,7 +133,7 @@ class NSFF(NeuralField):
     def render_rays(
         self, rays: Rays, time: Tensor, background: Tensor, *, jitter: bool = False
     ) -> BlendedOutput:
-        """As for every method, with what the render was made of."""
+        """As for every method, with the parts of the render."""
         if self.settings.sampling == "occupancy":
             samples = self.march(rays, time, jitter=jitter)
         else:
@@ -204,7 +204,7 @@ class NSFF(NeuralField):
 
 
 class FlowingView(RayView):
-    """NSFF at one time: what is dynamic goes where its flows lead, the rest stays."""
+    """NSFF at one time: dynamic points follow their flows, the rest stays."""
 
     def __init__(self, model: NSFF, time: float, *, half: bool) -> None:
         """As for every method."""

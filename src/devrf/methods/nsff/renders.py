@@ -26,7 +26,7 @@ from devrf.rendering.output import RenderOutput
 
 @dataclass(frozen=True, kw_only=True)
 class BlendedOutput(RenderOutput):
-    """A rendering of R rays from S samples, and what it was made of.
+    """A rendering of R rays from S samples, and its parts.
 
     Attributes:
         samples: their points and lengths in normalised space.
@@ -55,7 +55,7 @@ class Warp:
         ray: (K,) int64, theirs.
         moved: (K, 3) f_{i→j}, by which they were displaced last.
         occlusion: (K,) o_{i→j}.
-        points: (K, 3) where they are in frame j.
+        points: (K, 3) their positions in frame j.
         dynamic: the dynamic field there.
         color: (R, 3) RGB.
         weight: (K,) of the dynamic field.
@@ -87,7 +87,7 @@ class Renders:
         batch: R rays, and the truth at their pixels.
         step: the iteration.
         both: render from both neighbouring frames; else from one at random.
-        weighted: weigh rays by how much of them is dynamic: the first N₀ iterations are over.
+        weighted: weigh rays by their dynamic share: the first N₀ iterations are over.
         chains: whether flows are chained by now.
         prior_factor: the decayed factor of the weights of depth and flow priors.
     """
@@ -111,7 +111,7 @@ class Renders:
 
     @cached_property
     def dynamic_share(self) -> Tensor:
-        """(R,) sg(Σ w_d), how much of each ray is dynamic; 1 in the first N₀ iterations."""
+        """(R,) sg(Σ w_d), the dynamic share of each ray; 1 in the first N₀ iterations."""
         if not self.weighted:
             return torch.ones_like(self.batch.time)
         return sum_by_ray(self.output.blend.dynamic, self.output.samples.ray, self.rays).detach()
@@ -241,7 +241,7 @@ class Renders:
         return total + end[:, None] * self.batch.background
 
     def trust(self, warp: Warp) -> Tensor:
-        """Ŵ_{j→i} (R,): how far each ray's render from another frame can be compared.
+        """Ŵ_{j→i} (R,): trust in the comparison of each ray's render from another frame.
 
         1 − Σ sg(w_{j→i}) o_{i→j}, so that the background is trusted; where densities add
         1 − |Σ sg(w_{j→i} − w_i)|. 0 where there is no such frame.

@@ -20,8 +20,8 @@ class Warmup(MethodSettings):
         steps_per_frame: N₀ = steps_per_frame · (number of frames, within the two limits).
         min_frames: fewer frames count as so many.
         max_frames: more frames count as so many.
-        chained_from: after how many times N₀ the term ``chained`` counts.
-        prior_decay: by what depth and flow priors are divided after each N₀.
+        chained_from: multiples of N₀ after which the term ``chained`` counts.
+        prior_decay: divisor of depth and flow priors after each N₀.
     """
 
     key: ClassVar[str] = f"{MethodSettings.key}.warmup"

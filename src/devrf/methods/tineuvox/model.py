@@ -65,7 +65,7 @@ class TiNeuVox(DensityColorField):
         super().set_place(box, space, depths)
         x, y, z = (edge / box.longest for edge in box.size)
         self.grid_box = Box((-x, -y, -z), (x, y, z))
-        # Its full size: how much memory a run needs is estimated before ``setup``.
+        # Its full size: a run's memory is estimated before ``setup``.
         self.grid.resize(self._shape_after(len(self.settings.upsample_at)))
 
     def setup(self, scene: Scene) -> None:
@@ -109,7 +109,7 @@ class TiNeuVox(DensityColorField):
         return self.settings.step * self.box.voxel_size(math.prod(self.grid.shape))
 
     def sigma(self, points: Tensor, time: Tensor, ray: Tensor) -> tuple[Tensor, Tensor]:
-        """σ (S,) and what it came from.
+        """σ (S,) and its hidden features.
 
         It is softplus(raw + log(1/(1 − α_init) − 1)) per :attr:`base_voxel`, in normalised units.
         """
@@ -144,7 +144,7 @@ class TiNeuVox(DensityColorField):
         return terms
 
     def parts(self) -> dict[str, Iterable[nn.Parameter]]:
-        """Voxels with their networks; what displaces; and what both know of the time."""
+        """Voxels with their networks; the deformation; the time network of both."""
         return {
             "canonical": [*self.grid.parameters(), *self.radiance.parameters()],
             "deformation": self.deformation.parameters(),

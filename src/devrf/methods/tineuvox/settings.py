@@ -28,7 +28,7 @@ class TiNeuVoxSettings(OccupancySettings):
         bands: octaves of positions.
         direction_bands: octaves of viewing directions.
         time_bands: octaves of times.
-        feature_bands: octaves of what is looked up.
+        feature_bands: octaves of interpolated features.
         alpha_init: opacity of a voxel of the grown grid in an untrained field.
         step: distance between samples, in voxels of the present grid.
         weight_threshold: samples with a lower weight are not coloured.

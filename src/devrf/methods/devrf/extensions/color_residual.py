@@ -81,13 +81,13 @@ class ColorResidual(Extension):
         residual: float = 1e-3,
         tv: float = 0.002,
     ) -> None:
-        """Say whether and how to learn.
+        """Choose whether and how to learn.
 
         Args:
-            learn: ``never``, ``always``, or ``auto``: where the images say that colours drift
+            learn: ``never``, ``always``, or ``auto``: if the images show that colours drift
                 (docs/method.md#color-drift).
             side: the grid of a frame has about side³ voxels.
-            learning_rate: logits a step: how far a value moves at most.
+            learning_rate: the most logits that a value moves in a step.
             start_level: the first level that learns it, from 1; the last one where there are
                 fewer. The levels before find the motion alone.
             start_level_static_color: the same where ``auto`` finds that colours do not drift, so
@@ -121,7 +121,7 @@ class ColorResidual(Extension):
 
     @property
     def terms(self) -> Mapping[str, MotionTerm]:
-        """``residual``, how large the residuals are."""
+        """``residual``, the size of the residuals."""
         return {"residual": squared_residual}
 
     @property
@@ -148,7 +148,7 @@ class ColorResidual(Extension):
         context.optimizer.add_param_group({"params": [], "lr": rate, "base_lr": rate, "name": NAME})
 
     def _decide(self, views: Views) -> tuple[int | None, bool]:
-        """From which level residuals are learned, None: never; whether colours are to drift."""
+        """The level from which residuals are learned, None: never; whether colours are to drift."""
         if self._learn != "auto":
             return (self._start if self._learn == "always" else None), True
         drift = color_drift(views)
@@ -168,8 +168,8 @@ class ColorResidual(Extension):
     def begin_level(self, context: MotionContext, level: int) -> None:
         """Let the optimiser learn the active frame's residuals (X, Y, Z, 3).
 
-        Within a visit their rate falls as that of the displacements does; from level to level it
-        does not.
+        Their rate falls within a visit as that of the displacements does, but not from level to
+        level.
         """
         assert context.active is not None
         residuals = [grid for name, grid in context.active.further.items() if name == NAME]
@@ -202,7 +202,7 @@ class ColorResidual(Extension):
 
 
 def squared_residual(prediction: MotionPrediction) -> Tensor:
-    """(1/R) Σ_i w_i |A_t(q_i)|²: colours stay what they are at rest; 0 without residuals."""
+    """(1/R) Σ_i w_i |A_t(q_i)|²: colours stay as at rest; 0 without residuals."""
     output = prediction.output
     if output.residual is None:
         return output.color.new_zeros(())

@@ -22,20 +22,20 @@ from devrf.ops.photometric import color_error
 
 log = logging.getLogger(__name__)
 
-# Rounds of the search for where what arrives at a point was one frame before.
+# Rounds of the search for a point's position one frame before.
 ROUNDS = 2
 
 
 class StartFromBest(Extension):
     """Starts each visit from the candidate that shows the frame's images best.
 
-    The candidates are what the frame has already, and what the frame visited before it has: as it
-    is, carried on along its velocity, and along its velocity smoothed. At the coarsest level the
-    frame has a copy of the one before.
+    The candidates are the frame's displacements, and those of the frame visited before it: as they
+    are, carried on along their velocity, and along their velocity smoothed. The frame has a copy of
+    the one before at the coarsest level.
     """
 
     def __init__(self, levels: int = 0, rays: int = 4096) -> None:
-        """Say when candidates are looked at.
+        """Choose the levels at which candidates are compared.
 
         Args:
             levels: so many of the coarsest levels; 0: none.
@@ -120,12 +120,12 @@ def candidates(context: MotionContext, phase: DeformationPhase) -> dict[str, Dir
 def carried(start: Directions, way: Tensor, box: Box) -> Directions:
     """Displacements a frame later than ``start``, if all goes on along ``way``.
 
-    Δ_f' = Δ_f + v, and Δ_b'(x) = Δ_b(x') − v(q), where x' = x − v(q) is where what is at x now was
-    before, and q = x' + Δ_b(x') its canonical point: displacements go with the thing that moves.
+    Δ_f' = Δ_f + v, and Δ_b'(x) = Δ_b(x') − v(q), where x' = x − v(q) is the position before of the
+    point at x, and q = x' + Δ_b(x') its canonical point: displacements move with things.
 
     Args:
         start: (X, Y, Z, 3) Δ_b and Δ_f.
-        way: (X, Y, Z, 3) v, how far each canonical point goes.
+        way: (X, Y, Z, 3) v, the step of each canonical point.
         box: of the grids.
     """
     backward, forward = start

@@ -1,4 +1,4 @@
-"""Priors on a frame's forward slice: how much it stretches what it moves, and how much it bends it.
+"""Priors on a frame's forward slice: its stretching, and its bending.
 
 See docs/method.md#elastic and docs/method.md#bending.
 """
@@ -152,7 +152,7 @@ class Elastic(MotionPrior):
     """Resists stretching; parts may tear off one another (docs/method.md#elastic)."""
 
     def __init__(self, initial_factor: float = 1.0) -> None:
-        """Say how much more it counts at the start of a visit at the coarsest level.
+        """Choose its factor at the start of a visit at the coarsest level.
 
         Args:
             initial_factor: of its weight; it goes to 1 at the visit's end, exponentially.

@@ -43,7 +43,7 @@ SMOOTHNESS = 0.01
 class StartAlongFlow(Extension):
     """Starts each frame of the coarsest level from the one before it, moved along the flow.
 
-    Without flow, or with that of a camera that moves, frames start where the ones before ended.
+    Frames start from the ones before if there is no flow, or only that of a moving camera.
     """
 
     def __init__(self, init_from: Literal["previous", "flow", "tracks"] = "tracks") -> None:
@@ -90,7 +90,7 @@ class StartAlongFlow(Extension):
 
 @dataclass(frozen=True)
 class Tracks:
-    """N canonical points that were seen in an earlier frame, and where they are seen now.
+    """N canonical points that were seen in an earlier frame, and their pixels now.
 
     Attributes:
         canonical: (N, 3) the points q.
@@ -122,8 +122,8 @@ class FlowTracks:
             model: the scene; frames before the one that is asked for have been learned.
             views: the dynamic training views; their flow must be known.
             previous: (N,) int64, for each image the one that its flow leads to.
-            by_color: whether what is met must have the pixel's colour; else each pixel ends one
-                frame back, whatever it meets there.
+            by_color: whether the point that is met must have the pixel's colour; else each pixel
+                ends one frame back, whatever it meets there.
         """
         self.model = model
         self.views = views
@@ -158,7 +158,7 @@ class FlowTracks:
         image = pool.image[sample].long()
         flat = pool.flat[sample].long()
         batch = gather_batch(views, image, flat, torch.ones(3, device=image.device))
-        # Of the pixels that are still followed: their numbers in the batch, and where they are.
+        # Numbers in the batch, and positions, of the pixels that are still followed.
         number = torch.arange(len(image), device=image.device)
         position = batch.pixel
         ended: list[Tensor] = []
@@ -245,17 +245,17 @@ def start_from_tracks(
 ) -> None:
     """Fit a frame's two slices, copied from the frame before, to the tracks.
 
-    First Δ_f, so that the tracked points project onto their pixels, then Δ_b, so that it leads
-    from there back to them; both by the smoothest change that does. Errors are in pixels and
-    robust (Huber), since observed flow has outliers. Projections are taken as linear about where
-    the points are, half of the steps about where the first half has led.
+    Δ_f is fitted first, so that the tracked points project onto their pixels, then Δ_b, so that it
+    leads from there back to them; both by the smoothest change that does. Errors are in pixels and
+    robust (Huber), since observed flow has outliers. Projections are linearised about the points,
+    and halfway through the steps about the points to which the first half has led.
 
     Args:
         field: the deformation field.
         frame: the frame to start, from 1 on.
         tracks: pixels of canonical points at that frame.
         cameras: all cameras.
-        space: the space that the field lives in.
+        space: the field's space.
         steps: optimiser steps of each fit.
     """
     if field.zero_outside_box:
