@@ -60,7 +60,7 @@ def capture(run: RunContext) -> None:
     config.merge_with_dotlist(change)
     seconds = config.schedule.seconds
     if seconds is None:
-        log.info("how long learning takes is tried out for some seconds")
+        log.info("learning is tried out for some seconds, to estimate its duration")
         first, *others = captured.stages_with_images
         stage = captured.plans[first].build()
         later = [captured.plans[name] for name in others]

@@ -47,19 +47,11 @@ class Protocol:
     """An order of stages.
 
     Attributes:
-<<<<<<< HEAD:src/devrf/engine/protocol.py
         name: the choice of ``protocol=``, and the word of tables.
         stages: settings of each :class:`ProtocolStage` by its name, in their order.
         static_share: share of static rays in each batch of a stage that learns from both
             captures.
         freeze: the part of the stages' ``frozen`` that holds: ``true``, all; ``false``, nothing is
-=======
-        name: as in ``protocol=`` and in tables.
-        stages: settings of each :class:`ProtocolStage` by its name, in their order.
-        static_share: share of static rays in each batch of a stage that learns from both
-            captures.
-        freeze: which of the stages' ``frozen`` parts are: ``true``, as given; ``false``, nothing is
->>>>>>> 1d525add (methods, checkpoints: docstrings say the thing itself, locals are nouns):src/devrf/methods/protocol.py
             frozen; ``all``, their parts with all that enters these (of a method whose frozen part
             has inputs that an earlier stage left shut, such as HyperNeRF).
     """
