@@ -144,3 +144,26 @@ def test_too_little_time_is_refused_and_none_changes_nothing(timed) -> None:
             timed(seconds)
     with pytest.raises(DevrfError, match=r"schedule.seconds: expected more than 0, or null, not 0"):
         TimeBudget(0)
+
+
+def test_a_run_that_goes_on_makes_no_trial_and_is_not_refused(fit, rest) -> None:
+    first = TimeBudget(1.0)
+    first.load_state_dict({"pace": [0.01, 0.02], "entering": {"level 1": 0.5}})
+    state = first.state_dict()
+    again = TimeBudget(1.0)
+    again.load_state_dict(state)
+    assert again.state_dict() == state
+    # Its visits would take longer to enter than there is time: they get an iteration each.
+    stage = DeformationStage(rest, SCHEDULE)
+    shares: list[float] = []
+    load = LambdaCallback(
+        setup=lambda trainer, module, stage: again.load_state_dict(state),
+        on_train_batch_end=lambda trainer, stage, *_: shares.append(stage.batch_size.share),
+    )
+    fit(stage, again, load, TrainingRecord())
+    assert stage.is_complete and shares[0] == 1.0
+
+
+def test_a_budget_without_a_clock_is_one_line(fit, rest) -> None:
+    with pytest.raises(DevrfError, match="add devrf.callbacks.TrainingRecord, its clock"):
+        fit(DeformationStage(rest, SCHEDULE), TimeBudget(1.0))

@@ -12,8 +12,8 @@ import torch
 
 from devrf.apps.rehearsal import Learned, RehearsedStage, for_rehearsal, shortfalls
 from devrf.data.datamodule import SceneDataModule
-from devrf.methods import ray_stage
-from devrf.methods.devrf import canonical_stage
+from devrf.methods import ray_plan
+from devrf.methods.devrf import plans
 
 SCENE = ("data.width=32", "data.height=32", "data.static_views=16", "data.frames=4")
 SCENE += ("data.supersample=1", "~callbacks.training_curve")
@@ -24,8 +24,8 @@ PEER = ("experiment=peer_paper", "protocol=joint", "rehearse=true", *SCENE)
 @pytest.fixture(autouse=True)
 def shorter(monkeypatch: pytest.MonkeyPatch) -> None:
     """Half of a rehearsal's iterations, or less: these scenes are small."""
-    monkeypatch.setattr(canonical_stage, "REHEARSED_ITERATIONS", 300)
-    monkeypatch.setattr(ray_stage, "REHEARSED_ITERATIONS", 140)
+    monkeypatch.setattr(plans, "REHEARSED_ITERATIONS", 300)
+    monkeypatch.setattr(ray_plan, "REHEARSED_ITERATIONS", 140)
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def paper(devrf_in: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
     """The folder of a rehearsal of the paper's settings, and what the command said."""
     folder = tmp_path_factory.mktemp("paper")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(canonical_stage, "REHEARSED_ITERATIONS", 300)
+        patch.setattr(plans, "REHEARSED_ITERATIONS", 300)
         return folder, devrf_in(folder, *PAPER)
 
 

@@ -48,6 +48,15 @@ def test_early_stopping_ends_a_stage_which_then_counts_as_complete(
     assert stage.metadata().complete
 
 
+def test_early_stopping_before_the_last_kind_of_phase_is_no_result(canonical, datamodule, trainer):
+    stopping = EarlyStopping("val/psnr", mode="max", patience=1, min_delta=1000.0)
+    fitted = trainer(Previews(times=12), stopping, max_epochs=1, limit_val_batches=1)
+    stage = canonical(search_iterations=6)
+    with pytest.raises(DevrfError, match="iteration 3 of 18 .*, before fine; more patience"):
+        fitted.fit(stage, datamodule=datamodule)
+    assert not stage.is_complete
+
+
 def test_model_checkpoint_keeps_the_best(canonical, datamodule, trainer, tmp_path):
     keeping = ModelCheckpoint(tmp_path, filename="best", monitor="val/psnr", mode="max")
     fitted = trainer(

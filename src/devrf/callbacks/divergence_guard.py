@@ -125,6 +125,8 @@ class DivergenceGuard(Callback):
         phase = pl_module.phase
         if phase is None or (self._good is not None and self._good.phase == phase):
             return
+        if self._steps:  # its schedule was scaled: what it has come to was not looked at yet
+            self.check(pl_module)
         self._snapshot(pl_module)
         if phase.kind != self._kind:
             self._kind = phase.kind
@@ -199,7 +201,9 @@ class DivergenceGuard(Callback):
         scale = stage.position.lr_scale
         for value, stored in zip(_trained(stage), good.values, strict=True):
             value.copy_(stored)
-        stage.position.roll_back(good.iteration, good.iterations_done, self.rate_factor)
+        scaled = good.phase != stage.phase  # iterations are numbered otherwise since then
+        iteration = stage.iteration if scaled else good.iteration
+        stage.position.roll_back(iteration, good.iterations_done, self.rate_factor)
         stage.optimizer.forget()
         stage.refresh()
         stage.position.seed_generator(stage.generator, stage.global_rank)

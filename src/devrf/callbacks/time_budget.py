@@ -15,8 +15,9 @@ its time.
   ``ENOUGH_ITERATIONS`` fit, nor a quarter of the schedule's, they are halved further, as long as
   that saves time.
 * Of several processes rank 0's clock decides.
-* A progress file holds the seconds so far, and the factor: a run that was interrupted goes on with
-  the time that is left. What it learns then is not bit for bit what it would have learned.
+* A progress file holds the seconds so far, the factor and what was measured: a run that was
+  interrupted goes on with the time that is left. What it learns then is not bit for bit what it
+  would have learned.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ from devrf.engine.schedule import (
 from devrf.engine.stage import Stage
 from devrf.errors import DevrfError, expect
 from devrf.system.device import wait
+from devrf.system.plain_data import validate
 
 log = logging.getLogger(__name__)
 
@@ -90,6 +92,26 @@ class TimeBudget(Callback):
         expect(0 < largest_batch <= 1, key, "in (0, 1]", largest_batch)
         self.seconds = seconds
         self.largest_batch = largest_batch
+        self._forget()
+
+    def _forget(self) -> None:
+        self._pace: Pace | None = None
+        self._entering: dict[str, float] = {}  # seconds to enter a phase of a kind
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Forget the stage before."""
+        self._forget()
+
+    def state_dict(self) -> dict[str, Any]:
+        """What was measured."""
+        pace = None if self._pace is None else list(self._pace)
+        return {"pace": pace, "entering": dict(self._entering)}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on with what :meth:`state_dict` gave, without a trial."""
+        if state_dict["pace"] is not None:
+            self._pace = Pace(*validate(tuple[float, float], state_dict["pace"]))
+        self._entering = validate(dict[str, float], state_dict["entering"])
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Begin the trial."""
@@ -97,10 +119,15 @@ class TimeBudget(Callback):
             return
         assert isinstance(pl_module, Stage)
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
-        self._record = next(other for other in callbacks if isinstance(other, TrainingRecord))
+        records = [other for other in callbacks if isinstance(other, TrainingRecord)]
+        if not records:
+            raise DevrfError(
+                "TimeBudget: add devrf.callbacks.TrainingRecord, its clock, to the trainer's "
+                "callbacks"
+            )
+        self._record = records[0]
         self._budget = self.seconds * pl_module.time_share
         self._phases = phases(configured_timeline(pl_module))
-        self._entering: dict[str, float] = {}  # seconds to enter a phase of a kind
         self._phase = pl_module.phase
         self._most_iterations = pl_module.iterations_per_step
         pl_module.iterations_per_step = 1  # whose time is not known yet
@@ -110,9 +137,11 @@ class TimeBudget(Callback):
         self._tried: dict[float, list[float]] = {
             min(most, max(share, pl_module.useful_share)): [] for share in TRIED
         }
-        self._pace: Pace | None = None
         self._next_fit = math.inf  # seconds
-        batch.share = min(self._tried)
+        if self._pace is None:
+            batch.share = min(self._tried)
+        else:  # a run that goes on
+            self._next_fit = self._record.seconds
         self._step_ended = self._record.seconds
 
     def on_train_batch_start(
@@ -219,7 +248,7 @@ class TimeBudget(Callback):
         share = stage.batch_size.share
         if self._next_fit in (0.0, math.inf):  # after a trial, or in another kind of phase
             share = self._share_of_batches(stage, iterations=left / units * configured.total)
-        if self._next_fit == math.inf:  # the trial has just ended
+        if self._next_fit == math.inf:  # the trial has just ended; of a run that goes on, all fits
             least = entering + self._pace.at(share) * sum(phase.cost for phase in later)
             if later and least > self._budget - self._record.seconds:
                 return self._too_short(stage, self._record.seconds + least)

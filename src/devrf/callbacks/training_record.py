@@ -1,4 +1,4 @@
-"""Records the time, iterations and memory of training, and how its iterations were carried out."""
+"""Records the time, iterations and memory of training."""
 
 from __future__ import annotations
 
@@ -26,13 +26,15 @@ class TrainingRecord(Callback):
         self._began = 0.0
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Note the stage."""
+        """Note the stage, and forget the one before."""
         if stage != "fit":
             return
         assert isinstance(pl_module, Stage)
         self._stage = pl_module
         self._device = trainer.strategy.root_device
         self._validating = 0.0
+        self._seconds_before = 0.0
+        self._peaks_before = None
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Stop the clock."""

@@ -55,6 +55,8 @@ from devrf.system.profiling import span
 
 log = logging.getLogger(__name__)
 
+# Why an EarlyStopping callback ends a stage that has learned what it can.
+CONVERGED = {EarlyStoppingReason.PATIENCE_EXHAUSTED, EarlyStoppingReason.STOPPING_THRESHOLD}
 # The loss () and its terms () by name, detached.
 Terms = dict[str, Tensor]
 
@@ -71,9 +73,10 @@ class Stage(LightningModule, ABC):
         capture: the part of the scene that is learned from.
         memory_keys: the config keys of what to lower when memory runs out.
         rate_keys: the config keys of what to lower when training diverges.
-        keeps_batches: whether whole batches learn more in a time than more, smaller ones.
-        useful_share: the part of a batch than which a smaller one takes as long.
-        plan: the class of what is known of the stage before it is built.
+        keeps_batches: whether a budget of time leaves out iterations before it makes batches
+            smaller.
+        useful_share: batches of a smaller share take no less time.
+        plan: the class of the stage's plan.
         iterations_per_step: iterations of a Lightning step at most.
         scene_model: the scene that is learned.
         schedule: the settings of the schedule.
@@ -133,9 +136,10 @@ class Stage(LightningModule, ABC):
     def iterate(self, views: Any) -> Terms:
         """One iteration on training ``views``, from drawing pixels to the optimiser's step."""
 
-    @abstractmethod
     def timeline_of(self, schedule: Any) -> Schedule:
-        """The course of a schedule with the stage's scene."""
+        """The course of a schedule with the stage's scene: by default the schedule itself."""
+        course: Schedule = schedule
+        return course
 
     @property
     @abstractmethod
@@ -472,15 +476,29 @@ class Stage(LightningModule, ABC):
         return {"view": view}
 
     def on_validation_end(self) -> None:
-        """Count the stage as complete where an ``EarlyStopping`` callback ends it."""
-        reasons = (stopping.stopping_reason for stopping in self.trainer.early_stopping_callbacks)
-        if any(reason is not EarlyStoppingReason.NOT_STOPPED for reason in reasons):
+        """Count the stage as complete where an ``EarlyStopping`` callback ends it.
+
+        Only in the last kind of phase, and because its metric no longer improves: else the stage
+        is aborted, and can go on.
+        """
+        if self.trainer.state.fn != TrainerFn.FITTING or self.phase is None:
+            return
+        reasons = {stopping.stopping_reason for stopping in self.trainer.early_stopping_callbacks}
+        reasons.discard(EarlyStoppingReason.NOT_STOPPED)
+        if not reasons:
+            return
+        where = self.describe(self.position.iteration)
+        last = self.timeline.phase(self.timeline.total).kind
+        if not reasons <= {
+            EarlyStoppingReason.PATIENCE_EXHAUSTED,
+            EarlyStoppingReason.STOPPING_THRESHOLD,
+        }:
+            self.abort(f"EarlyStopping has ended it at {where}, as its metric went wrong")
+        elif self.phase.kind != last:
+            self.abort(f"EarlyStopping has ended it at {where}, before {last}; more patience")
+        else:
             self.position.ended_early = True
-            log.info(
-                "%s: EarlyStopping has ended it at %s",
-                self.name,
-                self.describe(self.position.iteration),
-            )
+            log.info("%s: EarlyStopping has ended it at %s", self.name, where)
 
     def test_step(self, index: int, batch_idx: int) -> dict[str, HeldOutView]:
         """Render and score one held-out image; the means over all images are logged.

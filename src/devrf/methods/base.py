@@ -30,8 +30,8 @@ class RayTrainable(Renderable):
         protocols: the names of the protocols that it learns by; None: every one.
         priors: data that it uses beside images and backward flow, if a scene has it:
             ``forward_flow``.
-        keeps_batches: whether whole batches learn more in a time than more, smaller ones: a time
-            budget then cuts them only if not even a hundred iterations would fit, nor a quarter.
+        keeps_batches: whether a budget of time leaves out iterations before it makes batches
+            smaller: it cuts them only where not even a hundred iterations would fit, nor a quarter.
         random_background: whether it learns before random colours if all images have masks.
     """
 

@@ -127,10 +127,6 @@ class RayStage(Stage):
             flats.append(flat)
         return torch.cat(images), torch.cat(flats)
 
-    def timeline_of(self, schedule: RayTimeline) -> RayTimeline:
-        """The schedule itself."""
-        return schedule
-
     @property
     def settings(self) -> RaySchedule:
         """The schedule's settings."""
@@ -184,7 +180,7 @@ class RayStage(Stage):
 
     def enter(self, phase: Phase) -> None:
         """Let grids grow; when the stage begins or goes on, gather the pixels to draw from."""
-        self.events[GROWN] += self.phase is not None
+        self.events[GROWN] += self.phase not in (None, phase)  # of a resumed run not again
         self.phase = phase
         self.scene_model.grow(sum(iteration <= phase.start for iteration in self.schedule.growths))
         for index, group in enumerate(self.scene_model.param_groups()):

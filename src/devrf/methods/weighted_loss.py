@@ -39,6 +39,8 @@ def weighted_sum(
     values: Mapping[str, Tensor], weights: Mapping[str, float]
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Σ weight · value () over ``values`` () by name; and these, detached."""
+    if not values:
+        raise DevrfError("loss: no term counts here; give one of its weights a value above 0")
     total = next(iter(values.values())).new_zeros(())
     for name, value in values.items():
         total = torch.add(total, value, alpha=weights[name])

@@ -28,6 +28,10 @@ PIXELS_PER_PLANE = 4.0
 FEWEST, MOST = 32, 256
 
 
+# The opacity that a shorter search begins with, at most.
+MOST_OPAQUE = 1e-2
+
+
 @dataclass(frozen=True)
 class Architecture(Options):
     """Sizes of the canonical field; the defaults are the paper's, inward-facing.
@@ -60,6 +64,17 @@ class Architecture(Options):
         if space.is_linear:
             return self
         return replace(self, alpha_init=1 - (1 - self.contracted_opacity) ** (1 / side))
+
+    def for_search(self, factor: float) -> Architecture:
+        """The architecture for a search of ``factor`` times the iterations.
+
+        A shorter one begins less faintly. How long a search takes to see anything goes with the
+        reciprocal of the opacity that it begins with: gradients are as faint, and far below Adam's
+        epsilon.
+        """
+        faint = self.search_alpha_init
+        opacity = min(faint / min(factor, 1.0), MOST_OPAQUE)
+        return replace(self, search_alpha_init=max(faint, opacity))
 
     def search_field(self, box: Box, voxels: int) -> CanonicalField:
         """The field of the coarse geometry search: colours straight from three channels."""

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from devrf.data.batch import PixelPool, gather_batch
+from devrf.engine.ddp import broadcast
 from devrf.engine.grid_adam import GridAdam
 from devrf.engine.stage import Stage, Terms
 from devrf.errors import DevrfError
@@ -37,7 +38,7 @@ from devrf.methods.devrf.losses import (
 )
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.pixel_pools import rays_for_epochs, static_pool
-from devrf.methods.devrf.plans import MOST_OPAQUE, CanonicalPlan
+from devrf.methods.devrf.plans import CanonicalPlan
 from devrf.methods.devrf.settings import (
     FINE_LOSS,
     SEARCH_LOSS,
@@ -161,7 +162,8 @@ class CanonicalStage(Stage):
         schedule = self.schedule
         most = None
         if schedule.epochs is not None and not self.objective.searches:
-            most = rays_for_epochs(schedule.epochs, len(self.pool), schedule.iterations)
+            iterations = round(schedule.iterations / self.position.schedule_scale)
+            most = rays_for_epochs(schedule.epochs, len(self.pool), iterations)
         return self.pool.draw(self.batch_size.rays(schedule.rays, most), self.generator)
 
     def _objective(self, kind: str, loss: Mapping[str, float]) -> Objective:
@@ -179,10 +181,6 @@ class CanonicalStage(Stage):
             occupancy_threshold=faint if searches else sampling.occupancy_threshold,
             searches=searches,
         )
-
-    def timeline_of(self, schedule: CanonicalSchedule) -> CanonicalSchedule:
-        """The schedule itself, of search and radiance field."""
-        return schedule
 
     @property
     def objective(self) -> Objective:
@@ -329,7 +327,9 @@ class CanonicalStage(Stage):
         occupancy = self.scene_model.occupancy
         opaque = search.voxel_alpha(self.sampling.step) > self.sampling.occupancy_threshold
         occupancy.replace(dilate(opaque & occupancy.mask, 1))
-        self.scene_model.canonical = self._radiance_field(occupancy, phase).to(self.device)
+        field = self._radiance_field(occupancy, phase).to(self.device)
+        broadcast([*field.parameters()])  # each process has drawn a network of its own
+        self.scene_model.canonical = field
 
     def _radiance_field(self, occupancy: Occupancy, phase: CanonicalPhase) -> CanonicalField:
         """A new radiance field in the tight box around what is occupied, enlarged for motion."""
@@ -358,16 +358,6 @@ class CanonicalStage(Stage):
         if self.schedule.view_dependence_start:
             field.forget_directions()
         return field
-
-    def _begin_less_faintly(self) -> None:
-        """Raise the opacity that a search begins with as it is made shorter (``schedule.seconds``).
-
-        How long a search takes to see anything goes with the reciprocal of that opacity: gradients
-        are as faint, and far below Adam's epsilon.
-        """
-        factor = min(self.position.schedule_scale, 1.0)
-        opacity = min(self.architecture.search_alpha_init / factor, MOST_OPAQUE)
-        self.scene_model.canonical.alpha_init = max(self.architecture.search_alpha_init, opacity)
 
     @torch.no_grad()
     def update_occupancy(self) -> None:
@@ -443,7 +433,8 @@ class CanonicalStage(Stage):
         """At the schedule's iterations renew the occupancy, smooth less, and learn directions."""
         schedule = self.schedule
         if self.objective.searches:
-            self._begin_less_faintly()
+            shorter = self.architecture.for_search(self.position.schedule_scale)
+            self.scene_model.canonical.alpha_init = shorter.search_alpha_init
         groups = self.optimizer.param_groups[:2]
         every = schedule.occupancy_every
         iteration = self.position.iteration

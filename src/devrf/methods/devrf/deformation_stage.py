@@ -174,7 +174,8 @@ class DeformationStage(Stage):
         most = None
         if self.motion.epochs is not None:
             pixels = sum(len(pool) for pool in frame.pools)
-            most = rays_for_epochs(self.motion.epochs, pixels, phase.stop - phase.start)
+            iterations = round((phase.stop - phase.start) / self.position.schedule_scale)
+            most = rays_for_epochs(self.motion.epochs, pixels, iterations)
         pool = frame.pools[self.position.iterations_done % len(frame.pools)]
         return pool.draw(self.batch_size.rays(self.schedule.rays, most), self.generator)
 
@@ -211,6 +212,7 @@ class DeformationStage(Stage):
             raise DevrfError(f"{self.scene.name}: is at rest; the canonical stage is all it takes")
         if self.scene.dynamic.train.by_moving_camera and self.motion_loss.leave_out("flow"):
             log.info("the camera moves, and so does all that it sees: the flow loss is left out")
+        self.phase = None  # no frame is active
         self.context = MotionContext(
             model=self.scene_model,
             datamodule=self.trainer.datamodule,  # type: ignore[attr-defined]

@@ -25,8 +25,6 @@ from devrf.scenes.scene import Scene
 # Measured around a free-standing object: the share of a ray's samples that are occupied, and of
 # these the share whose colour counts once surfaces have formed.
 OCCUPIED, COLOURED = 0.3, 0.25
-# The opacity that a shorter search begins with, at most.
-MOST_OPAQUE = 1e-2
 # A rehearsal of the canonical stage has at most so many iterations, units of a layer, and voxels
 # along an edge; one of the deformation stage so many iterations of a frame, and voxels along an
 # edge, and moves a voxel in a step by so much of the box's longest edge. Both have so many rays.
@@ -67,15 +65,10 @@ class CanonicalPlan(StagePlan):
         return StageNeeds(parts, values)
 
     def rehearsed(self) -> CanonicalPlan:
-        """Grids of few voxels, and a search that begins as much less faint as it is shorter.
-
-        How long the search takes to see anything goes with the reciprocal of the opacity that it
-        begins with: gradients are as faint, and far below Adam's epsilon.
-        """
+        """Grids of few voxels, and a search that begins as much less faint as it is shorter."""
         schedule: CanonicalSchedule = self.settings["schedule"]
         architecture: Architecture = self.settings["architecture"]
         factor = min(1.0, REHEARSED_ITERATIONS / schedule.total)
-        faint = architecture.search_alpha_init
         planes = architecture.planes
         return self.with_settings(
             schedule=replace(
@@ -85,10 +78,9 @@ class CanonicalPlan(StagePlan):
                 rays=min(schedule.rays, REHEARSED_RAYS),
             ),
             architecture=replace(
-                architecture,
+                architecture.for_search(factor),
                 width=min(architecture.width, REHEARSED_WIDTH),
                 planes=planes and min(planes, REHEARSED_SIDE),
-                search_alpha_init=min(faint / factor, MOST_OPAQUE),
             ),
             iterations_per_step=min(self.settings["iterations_per_step"], 10),
         )
