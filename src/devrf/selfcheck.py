@@ -46,7 +46,7 @@ class CheckSkippedError(Exception):
 
 
 class Variant(NamedTuple):
-    """How iterations are carried out: config keys of the same names."""
+    """Settings of iterations: config keys of the same names."""
 
     precision: Precision = "float32"
     deterministic: bool = False

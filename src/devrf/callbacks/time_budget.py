@@ -103,7 +103,7 @@ class TimeBudget(Callback):
         self._forget()
 
     def state_dict(self) -> dict[str, Any]:
-        """What was measured."""
+        """The measurements."""
         pace = None if self._pace is None else list(self._pace)
         return {"pace": pace, "entering": dict(self._entering)}
 

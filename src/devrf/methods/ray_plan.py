@@ -1,4 +1,4 @@
-"""What is known of a stage that learns a method from rays before it is built."""
+"""The plan of a stage that learns a method from rays, before it is built."""
 
 from __future__ import annotations
 

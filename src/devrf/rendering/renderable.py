@@ -1,4 +1,4 @@
-"""What every method is: a scene that can be rendered from any view at any time.
+"""A learned scene of any method, to be rendered from any view at any time.
 
 Everything that shows a learned scene (videos, stills, evaluation) asks for :meth:`Renderable.at`;
 exports also for :meth:`Renderable.surface` and :meth:`Renderable.forward_map`, which a method may
@@ -91,7 +91,7 @@ class Renderable(StoredClass, nn.Module, ABC):
 
     @property
     def size(self) -> int:
-        """How many numbers are learned."""
+        """Number of learned values."""
         return sum(parameter.numel() for parameter in self.parameters())
 
     def stored_state(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What is known of DeVRF's stages before they are built: kernels, iterations, memory, rehearsals.
+"""Plans of DeVRF's stages before they are built: kernels, iterations, memory, rehearsals.
 
 Memory is estimated for fields at their final resolution, about side³ voxels in any box.
 """
