@@ -7,9 +7,11 @@ import re
 from pathlib import Path
 
 import pytest
+import torch
 import trimesh
 
 from devrf import methods
+from devrf.methods.ray_stage import RayStage
 
 PAGE = Path(__file__).parents[2] / "docs" / "extending.md"
 SETTINGS = "ray_stage.model.settings"
@@ -126,6 +128,24 @@ def test_a_method_with_a_stage_of_its_own_needs_nothing_elsewhere(
     assert devrf(*asked, *tiny_data, "stage=still").status == 0
     done = devrf(*asked, *tiny_data, "rehearse=true", "hydra.run.dir=rehearsed")
     assert "rehearsed: every stage learns" in done.out or "rehearse: " in done.err
+
+
+def test_a_networks_first_weights_follow_the_seed(devrf, tiny_data, monkeypatch):
+    first: list[torch.Tensor] = []
+    usual = RayStage.on_train_start
+
+    def noted(stage: RayStage) -> None:
+        weights = [values.detach().flatten() for values in stage.scene_model.parameters()]
+        first.append(torch.cat(weights))
+        usual(stage)
+
+    monkeypatch.setattr(RayStage, "on_train_start", noted)
+    small = ("method=dnerf", "experiment=peer_small", *SMALL["dnerf"], *SHORT, *tiny_data)
+    for number, seed in enumerate((0, 0, 1)):
+        torch.rand(number)  # drawn before the command
+        words = ("protocol=joint", "stage=joint", f"seed={seed}", f"hydra.run.dir=run{number}")
+        assert devrf(*small, *words).status == 0
+    assert torch.equal(first[0], first[1]) and not torch.equal(first[0], first[2])
 
 
 def test_the_method_of_the_documentation_is_learned_and_loaded(

@@ -175,13 +175,13 @@ class RunContext(ExitStack):
         plan.check()
         return plan
 
-    @cached_property
-    def plans(self) -> dict[str, StagePlan]:
-        """The plans of the protocol's stages by name, as they are learned: in a rehearsal small."""
-        plans = {name: self.plan(name) for name in self.learning_stages}
-        if self.rehearses:
-            return {name: plan.rehearsed() for name, plan in plans.items()}
-        return plans
+    def plan_to_learn(self, name: str) -> StagePlan:
+        """The plan of a stage as this run learns it: of a rehearsal small.
+
+        Each call makes parts anew: networks draw their first weights as they are made.
+        """
+        plan = self.plan(name)
+        return plan.rehearsed() if self.rehearses else plan
 
     @cached_property
     def logger(self) -> Any:

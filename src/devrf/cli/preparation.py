@@ -62,8 +62,8 @@ def capture(run: RunContext) -> None:
     if seconds is None:
         log.info("learning is tried out for some seconds, to estimate its duration")
         first, *others = captured.stages_with_images
-        stage = captured.plans[first].build()
-        later = [captured.plans[name] for name in others]
+        stage = captured.plan(first).build()
+        later = [captured.plan(name) for name in others]
         batches = [(plan.iterations(captured.scene), plan.rays) for plan in later]
         trainer = partial(instantiate, config.trainer)
         seconds = seconds_to_learn(stage, batches, captured.datamodule, trainer)

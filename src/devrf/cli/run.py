@@ -111,7 +111,8 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
         with shortage_in_words(config.stage, run.device, None):  # of networks that are too wide
             _check(run, learning, steps)
         if learning:
-            kernels = dict.fromkeys(k for plan in run.plans.values() for k in plan.kernels)
+            plans = map(run.plan_to_learn, run.learning_stages)
+            kernels = dict.fromkeys(kernel for plan in plans for kernel in plan.kernels)
             compiling = compile_ahead([*kernels], run.device)  # while the scene is read
             if run.is_rank_zero:
                 _prepare_to_learn(run, learning, steps)
@@ -216,7 +217,8 @@ def _check(run: RunContext, learning: Names, steps: Names) -> None:
     if not learning and not set(SCENELESS_STAGES).isdisjoint(steps):
         return
     _ = run.datamodule
-    _ = run.plans
+    for name in run.learning_stages:
+        run.plan(name)
     if learning or "evaluate" in steps:
         run.evaluation.check()
         check_objective(config.objective, run.evaluation.metrics)

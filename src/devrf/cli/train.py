@@ -38,7 +38,7 @@ def learn(run: RunContext, name: str) -> None:
         begin = run.strategy.broadcast(beginning(run, name) if run.is_rank_zero else None)
     if begin is None:
         return
-    build = run.plans[name].build
+    build = run.plan_to_learn(name).build
     below = run.protocol[name].builds_on
     if below is None:
         stage = build()

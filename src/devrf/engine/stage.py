@@ -489,10 +489,7 @@ class Stage(LightningModule, ABC):
             return
         where = self.describe(self.position.iteration)
         last = self.timeline.phase(self.timeline.total).kind
-        if not reasons <= {
-            EarlyStoppingReason.PATIENCE_EXHAUSTED,
-            EarlyStoppingReason.STOPPING_THRESHOLD,
-        }:
+        if not reasons <= CONVERGED:
             self.abort(f"EarlyStopping has ended it at {where}, as its metric went wrong")
         elif self.phase.kind != last:
             self.abort(f"EarlyStopping has ended it at {where}, before {last}; more patience")

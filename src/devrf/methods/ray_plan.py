@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -10,7 +10,7 @@ from warp import Kernel
 
 from devrf.engine.needs import LEARNED, StageNeeds, tensor_bytes
 from devrf.engine.plan import StagePlan
-from devrf.engine.protocol import Protocol, ProtocolStage
+from devrf.engine.protocol import ProtocolStage
 from devrf.kernels.ahead import grid_kernels
 from devrf.methods.base import RayTrainable
 from devrf.methods.ray_schedule import RaySchedule
@@ -27,16 +27,15 @@ REHEARSED_CROP = 0.25
 class RayPlan(StagePlan):
     """The plan of a :class:`~devrf.methods.ray_stage.RayStage`."""
 
-    def __init__(
-        self,
-        stage: Callable[..., Any],
-        settings: Mapping[str, Any],
-        protocol: Protocol,
-        name: str,
-    ) -> None:
-        """Add which data trains which parts of the method."""
-        by_protocol = {"step": protocol[name], "static_share": protocol.static_share}
-        super().__init__(stage, {**settings, **by_protocol}, protocol, name)
+    def build(self, **rest: Any) -> Any:
+        """The stage, told which data trains which parts of the method."""
+        share = self.protocol.static_share
+        return super().build(step=self.step, static_share=share, **rest)
+
+    @property
+    def step(self) -> ProtocolStage:
+        """The stage as its protocol has it."""
+        return self.protocol[self.name]
 
     def check(self) -> None:
         """Refuse a protocol that the method cannot learn by."""
@@ -56,8 +55,7 @@ class RayPlan(StagePlan):
     def iterations(self, scene: Scene) -> int:
         """The stage's share of the schedule."""
         schedule: RaySchedule = self.settings["schedule"]
-        step: ProtocolStage = self.settings["step"]
-        return step.share_of(schedule.iterations)
+        return self.step.share_of(schedule.iterations)
 
     def needs(
         self, scene: Scene, images: str, processes: int, rest: StagePlan | None
