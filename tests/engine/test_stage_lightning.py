@@ -6,8 +6,14 @@ import logging
 
 import pytest
 import torch
-from lightning.pytorch.callbacks import EarlyStopping, LearningRateMonitor, ModelCheckpoint
+from lightning.pytorch.callbacks import (
+    DeviceStatsMonitor,
+    EarlyStopping,
+    LearningRateMonitor,
+    ModelCheckpoint,
+)
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from devrf.callbacks import Previews
 from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, load_checkpoint
@@ -111,3 +117,23 @@ def test_tensorboard_takes_the_same_rows(canonical, datamodule, trainer, tmp_pat
     fitted = trainer(max_epochs=1, log_every_n_steps=1, logger=logger)
     fitted.fit(canonical(), datamodule=datamodule)
     assert list(tmp_path.rglob("events.*"))
+
+
+@pytest.mark.parametrize("option", [{"gradient_clip_val": 1.0}, {"accumulate_grad_batches": 2}])
+def test_steps_that_are_not_the_stages_own_are_refused(canonical, datamodule, trainer, option):
+    with pytest.raises(MisconfigurationException, match="manual optimization"):
+        trainer(max_epochs=1, **option).fit(canonical(), datamodule=datamodule)
+
+
+def test_a_limit_of_time_ends_a_stage_before_its_schedule(canonical, datamodule, trainer):
+    stage = canonical()
+    trainer(max_time={"seconds": 0}).fit(stage, datamodule=datamodule)
+    assert stage.iteration == 0 and not stage.is_complete
+
+
+def test_the_devices_figures_are_logged(canonical, datamodule, trainer, tmp_path):
+    logger = CSVLogger(tmp_path, "stats")
+    fitted = trainer(DeviceStatsMonitor(), max_epochs=1, log_every_n_steps=1, logger=logger)
+    fitted.fit(canonical(), datamodule=datamodule)
+    table = (tmp_path / "stats" / "version_0" / "metrics.csv").read_text()
+    assert "DeviceStatsMonitor.on_train_batch_end" in table
