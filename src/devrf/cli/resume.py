@@ -60,12 +60,12 @@ class ResumePoint:
     Attributes:
         training_config: the present settings that decide the result.
         progress: the file to go on from.
-        iteration: of that file.
+        iterations_done: iterations that were carried out by then, by which curves are numbered.
     """
 
     training_config: dict[str, Any]
     progress: Path | None = None
-    iteration: int = 0
+    iterations_done: int = 0
 
 
 def deciding_settings(config: DictConfig, stage: str) -> dict[str, Any]:
@@ -128,9 +128,9 @@ def beginning(run: RunContext, stage: str) -> ResumePoint | None:
             progress.unlink()
             continue
         if _agrees(progress, metadata, training_config):
-            iteration = content["progress"]["iteration"]
-            log.info("%s: goes on at iteration %d", stage, iteration)
-            return ResumePoint(training_config, progress=progress, iteration=iteration)
+            position = content["progress"]
+            log.info("%s: goes on at iteration %d", stage, position["iteration"])
+            return ResumePoint(training_config, progress, position["iterations_done"])
         break
     remove_progress(path.parent, stage)
     return ResumePoint(training_config)

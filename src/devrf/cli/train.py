@@ -81,7 +81,7 @@ def _fit(run: RunContext, stage: Stage, begin: ResumePoint) -> None:
         )
         trainer.strategy.checkpoint_io = ChecksummedCheckpointIO()
         if isinstance(run.logger, ResumableCSVLogger):
-            run.logger.drop_rows_beyond(stage.capture, begin.iteration)
+            run.logger.drop_rows_beyond(stage.capture, begin.iterations_done)
         fit(trainer, stage, run.datamodule, begin.progress)
         strategy = trainer.strategy
         stopping = strategy.reduce_boolean_decision(stop.number is not None, all=False)
