@@ -15,7 +15,7 @@ from lightning import Trainer
 from lightning.pytorch.strategies import Strategy
 from omegaconf import DictConfig, OmegaConf
 
-from devrf.apps.fitting import SIZE
+from devrf.apps.forecast import SIZE
 from devrf.apps.rehearsal import LONGEST, RehearsedStage, for_rehearsal
 from devrf.checkpoints.checkpoint import (
     LoadedCheckpoint,
@@ -158,18 +158,17 @@ class RunContext(ExitStack):
         what = f"protocol={self.protocol.name}: learns from images in motion"
         raise DevrfError(f"{what}, but {at_rest}; use protocol=two_stage")
 
-    def plan(self, name: str, config: DictConfig | None = None) -> StagePlan:
-        """The plan of a stage of the protocol, by ``config``, else the run's.
+    def plan(self, name: str) -> StagePlan:
+        """The plan of a stage of the protocol.
 
         Raises:
             DevrfError: the method has no such stage, or cannot learn by the protocol.
         """
-        config = self.config if config is None else config
-        section = stage_section(config, name)
-        if section not in config:
-            does = f"method={config.method} does not learn by protocol={self.protocol.name}"
+        section = stage_section(self.config, name)
+        if section not in self.config:
+            does = f"method={self.config.method} does not learn by protocol={self.protocol.name}"
             raise DevrfError(f"protocol: {does}; it has no stage {name!r}")
-        stage: partial[Stage] = instantiate(config[section], _partial_=True, _convert_="all")
+        stage: partial[Stage] = instantiate(self.config[section], _partial_=True, _convert_="all")
         kind: type[StagePlan] = stage.func.plan  # type: ignore[attr-defined]
         plan = kind(stage.func, stage.keywords, self.protocol, name)
         plan.check()

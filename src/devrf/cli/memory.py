@@ -6,19 +6,10 @@ import logging
 from collections.abc import Sequence
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
-from devrf.apps.fitting import (
-    SIZE,
-    Bytes,
-    free_bytes,
-    in_words,
-    lacking,
-    least_change,
-    needed_bytes,
-)
+from devrf.apps.forecast import SIZE, Forecast, free_bytes, needed_bytes, needs_table
 from devrf.apps.inspection.advice import Advice
-from devrf.apps.needs import smaller
 from devrf.callbacks.time_budget import BATCHES, LEAST_BATCH
 from devrf.cli.context import RunContext
 from devrf.cli.messages import as_own_errors
@@ -31,82 +22,69 @@ log = logging.getLogger(__name__)
 LARGEST_BATCH = "callbacks.time_budget.largest_batch"
 
 
-def needs(run: RunContext, config: DictConfig, scene: Scene) -> dict[str, StageNeeds]:
-    """Memory that each stage of a configured run needs; several processes share a batch."""
-    processes = int(getattr(run.strategy, "world_size", 1))
-    images = SIZE if "downscale" in config.data else "data.frames"
+def table_of_needs(run: RunContext, scene: Scene) -> list[tuple[str, str]]:
+    """What the run's stages need of a scene, for people: names and amounts."""
     # A scene at rest that the protocol has no stage for can be looked at all the same.
     names = run.stages_with_images or run.learning_stages
-    found: dict[str, StageNeeds] = {}
-    with torch.device("meta"):
-        plans = {name: run.plan(name, config) for name in run.learning_stages}
-    for name in names:
-        below = run.protocol[name].builds_on
-        rest = None if below is None else plans[below]
-        found[name] = plans[name].needs(scene, images, processes, rest)
-    return found
+    return needs_table(scene, _needs(run, scene, names), _images(run))
 
 
-def _stages(
-    run: RunContext, config: DictConfig, scene: Scene, names: Sequence[str]
-) -> list[StageNeeds]:
-    """Needs of the stages ``names`` of a configured run."""
-    with as_own_errors():
-        every = needs(run, config, scene)
-    return [every[name] for name in names]
-
-
-def compare(run: RunContext, names: Sequence[str]) -> tuple[str, Advice | None, list[str]]:
-    """Needs of the stages ``names`` in words; if something lacks, a remedy and its override.
+def forecast(run: RunContext, names: Sequence[str]) -> tuple[str, Advice | None]:
+    """Needs of the stages ``names`` in words, and a remedy if something lacks.
 
     If the images' size was left to the run, it is changed at once; with ``schedule.seconds``
     the largest batch is.
     """
     scene = run.scene
-    by = run.datamodule.downscale
+    with as_own_errors():
+        stages = _needs(run, scene, names).values()
     processes = int(getattr(run.strategy, "num_processes", 1))
     free = free_bytes(run.device, run.folder, resume=run.config.resume)
     on_gpu = run.device.type == "cuda"
+
+    def with_batches(share: float) -> Forecast:
+        needs = [stage.with_batches(share) for stage in stages]
+        return Forecast(needed_bytes(scene, needs, _images(run), processes, on_gpu=on_gpu), free)
+
     budget = run.config.schedule.seconds is not None
-    most = OmegaConf.select(run.config, LARGEST_BATCH) if budget else 1.0
-    least = most / 2 if on_gpu else most  # a GPU says that it has no more memory, and half is drawn
-    stages = _stages(run, run.config, scene, names)
-
-    def with_share(batch_share: float) -> Bytes:
-        return needed_bytes(scene, stages, processes, batch_share, on_gpu=on_gpu)
-
-    def with_change(key: str, value: int, batch_share: float = least) -> Bytes:
-        config = run.config.copy()
-        OmegaConf.update(config, key, value)
-        less = smaller(scene, value / by) if key == SIZE else scene
-        changed = _stages(run, config, less, names)
-        return needed_bytes(less, changed, processes, batch_share, on_gpu=on_gpu)
-
-    whole = with_share(most)
-    line = f"needs about {in_words(whole, free)}"
-    if budget and lacking(whole, free):
+    largest = OmegaConf.select(run.config, LARGEST_BATCH) if budget else 1.0
+    whole = with_batches(largest)
+    line = f"needs about {whole}"
+    if budget and whole.shortage:
         # Images that may be made smaller are, before batches teach little.
         smallest = LEAST_BATCH if run.chooses_size else BATCHES[-1]
-        shares = (share for share in BATCHES if smallest <= share < most)
-        share = next((s for s in shares if not lacking(with_share(s), free)), None)
-        if share is not None:
-            OmegaConf.update(run.config, LARGEST_BATCH, share)
-            return f"{line}: batches have at most {share:.2g} of their rays", None, []
-    lacks = lacking(with_share(least), free)
-    if not lacks:
-        return line + "; batches will be halved" * bool(lacking(whole, free)), None, []
-    parts = max(stages, key=StageNeeds.peak).parts
-    present = {key: OmegaConf.select(run.config, key) for key in parts} | {SIZE: by}
-    change = least_change(parts, present, lambda *one: not lacking(with_change(*one), free))
-    problem = f"the run {line}; it would end for lack of {lacks[0]}"
-    if change is None:
-        remedy = "lower several keys, or free some of it"
-        return line, Advice(max(parts, key=parts.__getitem__), problem, remedy), []
-    key, value = change
-    if key == SIZE and run.chooses_size:
-        log.info("%s=auto: %d, as %s", key, value, problem)
-        run.config.data.downscale = value
+        for share in (share for share in BATCHES if smallest <= share < largest):
+            if not with_batches(share).shortage:
+                OmegaConf.update(run.config, LARGEST_BATCH, share)
+                return f"{line}: batches have at most {share:.2g} of their rays", None
+    # A GPU says that it has no more memory, and half is drawn.
+    least = with_batches(largest / 2) if on_gpu else whole
+    if least.shortage is None:
+        return line + "; batches will be halved" * bool(whole.shortage), None
+    problem = f"the run {line}; it would end for lack of {least.shortage}"
+    if run.chooses_size and (factor := least.downscale(run.datamodule.downscale)):
+        log.info("%s=auto: %d, as %s", SIZE, factor, problem)
+        run.config.data.downscale = factor
         del run.datamodule  # the images are read again
-        return compare(run, names)
-    then = in_words(with_change(key, value, most), {lacks[0]: free[lacks[0]]})
-    return line, Advice(key, problem, f"give {key}={value} ({then})"), [f"{key}={value}"]
+        return forecast(run, names)
+    key = least.key(least.shortage)
+    change = "raise it (auto: as far as is needed)" if key == SIZE else "lower it"
+    return line, Advice(key, problem, f"{change}, or free some {least.shortage}")
+
+
+def _images(run: RunContext) -> str:
+    """The key of the images' size, or of their number."""
+    return SIZE if "downscale" in run.config.data else "data.frames"
+
+
+def _needs(run: RunContext, scene: Scene, names: Sequence[str]) -> dict[str, StageNeeds]:
+    """Memory that stages need, by name; several processes share a batch."""
+    processes = int(getattr(run.strategy, "world_size", 1))
+    with torch.device("meta"):
+        plans = {name: run.plan(name) for name in run.learning_stages}
+    needs: dict[str, StageNeeds] = {}
+    for name in names:
+        below = run.protocol[name].builds_on
+        rest = None if below is None else plans[below]
+        needs[name] = plans[name].needs(scene, _images(run), processes, rest)
+    return needs

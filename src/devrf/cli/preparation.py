@@ -9,19 +9,18 @@ from pathlib import Path
 
 from hydra import compose
 from hydra.utils import instantiate
-from rich.filesize import decimal
 
 from devrf.apps.capture.pipeline import scene_from_footage
 from devrf.apps.fetch import FetchSettings, fetched, published_scene
-from devrf.apps.inspection.advice import image_sets
+from devrf.apps.forecast import SIZE
+from devrf.apps.inspection.advice import Advice, image_sets
 from devrf.apps.inspection.report import inspection_text, show
-from devrf.apps.needs import needs_table
 from devrf.apps.settings import CaptureSettings
 from devrf.apps.trial import seconds_to_learn
 from devrf.cli.complete import completed
 from devrf.cli.config import command_line
 from devrf.cli.context import RunContext
-from devrf.cli.memory import compare, needs
+from devrf.cli.memory import forecast, table_of_needs
 from devrf.cli.restore_config import log_applied_defaults
 from devrf.engine.ddp import ManualDDP
 from devrf.errors import DevrfError
@@ -55,9 +54,11 @@ def capture(run: RunContext) -> None:
     config = compose("config", completed([f"data.root={literal(folder)}"]))
     log_applied_defaults()
     captured = RunContext(config, run.folder)
-    inspect(captured)
-    _, _, change = compare(captured, captured.stages_with_images)
-    config.merge_with_dotlist(change)
+    shortage = _inspect(captured)
+    command = [to_type("data.root", folder)]
+    if shortage is not None:  # nothing can be tried out
+        say_next(command + [f"{SIZE}=auto"] * (shortage.where == SIZE))
+        return
     seconds = config.schedule.seconds
     if seconds is None:
         log.info("learning is tried out for some seconds, to estimate its duration")
@@ -69,7 +70,7 @@ def capture(run: RunContext) -> None:
         seconds = seconds_to_learn(stage, batches, captured.datamodule, trainer)
     if seconds is not None:
         log.info("learning takes %s on this machine", duration(seconds))
-    say_next([to_type("data.root", folder), *change])
+    say_next(command)
 
 
 def prepare(run: RunContext) -> None:
@@ -85,19 +86,22 @@ def prepare(run: RunContext) -> None:
 
 def inspect(run: RunContext) -> None:
     """Report and draw the scene's content, its needs and its likely mistakes."""
+    _inspect(run)
+
+
+def _inspect(run: RunContext) -> Advice | None:
+    """Inspect a scene; return what to do where this machine has too little for the run."""
     # Only this step draws with matplotlib.
     from devrf.apps.inspection.picture import write_inspection_picture
 
     count = len({name for views in image_sets(run.scene).values() for name in views.names})
     log.info("looks at %d images: cameras, masks, times, and what a run will need", count)
-    _, shortage, _ = compare(run, run.stages_with_images or run.learning_stages)
-    table = needs_table(run.scene, needs(run, run.config, run.scene))
-    rows = [(name, decimal(round(size))) for name, size in table]
-    report = inspection_text(run.scene, rows, shortage)
-    show(report)
+    _, shortage = forecast(run, run.stages_with_images or run.learning_stages)
+    show(inspection_text(run.scene, table_of_needs(run, run.scene), shortage))
     path = run.folder / "images" / "inspect.png"
     write_inspection_picture(path, run.scene)
     log.info("picture written to %s", path)
+    return shortage
 
 
 def report(run: RunContext) -> None:

@@ -12,16 +12,13 @@ import json
 import logging
 from collections.abc import Sequence
 
-from rich.filesize import decimal
-
 from devrf.apps.inspection.report import show
-from devrf.apps.needs import needs_table
 from devrf.apps.rehearsal import learned, record, rehearsal_tables, shortfalls
 from devrf.apps.settings import REHEARSAL
 from devrf.checkpoints.checkpoint import metadata_of
 from devrf.checkpoints.progress import progress_files
 from devrf.cli.context import RunContext
-from devrf.cli.memory import needs
+from devrf.cli.memory import table_of_needs
 from devrf.errors import DevrfError
 from devrf.system.files import read_record, write_json
 
@@ -61,8 +58,7 @@ def conclude(run: RunContext) -> None:
     reached = {capture: learned(model, run.scene, capture) for capture in captures}
     held_out = {capture: scores[capture]["psnr"] for capture in captures}
     assert run.whole_scene is not None
-    table = needs_table(run.whole_scene, needs(run, run.config, run.whole_scene))
-    rows = [(name, decimal(round(size))) for name, size in table]
+    rows = table_of_needs(run, run.whole_scene)
     show(rehearsal_tables(run.rehearsed, reached, held_out, rows))
     reasons = shortfalls(run.rehearsed, reached)
     write_json(path, {**scores, "rehearsal": record(run.rehearsed, reached, reasons)})

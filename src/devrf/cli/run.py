@@ -23,7 +23,7 @@ from devrf.apps.viewer.page import PAGE
 from devrf.cli.config import OF_A_CHECKPOINT, PIPELINE, SCENELESS_STAGES, in_sweep
 from devrf.cli.context import RunContext
 from devrf.cli.evaluate import evaluate
-from devrf.cli.memory import compare
+from devrf.cli.memory import forecast
 from devrf.cli.messages import as_own_errors
 from devrf.cli.preparation import capture, fetch, inspect, prepare, report, say_next, selfcheck
 from devrf.cli.rehearse import begin_anew, conclude
@@ -140,7 +140,7 @@ def _prepare_to_learn(run: RunContext, requested: Names, steps: Names) -> None:
     resume = run.config.resume
     names = [name for name in learning if not (resume and run.own_checkpoint(name).is_file())]
     looks = names and run.config.memory_check
-    needed, shortage, _ = compare(run, names) if looks else (None, None, [])
+    needed, shortage = forecast(run, names) if looks else (None, None)
     if shortage is not None:
         raise DevrfError(f"{shortage}, or try all the same with memory_check=false")
     if not resume and not run.is_trial:

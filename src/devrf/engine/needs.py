@@ -23,16 +23,16 @@ class StageNeeds:
     Attributes:
         parts: on the device that trains, by the config key that changes them most: the batch by
             that of its rays.
-        learned: the values of the fields.
+        learned: the values of the fields, by the key that changes their number most.
     """
 
     parts: Mapping[str, float]
-    learned: float
+    learned: Mapping[str, float]
 
-    def peak(self, batch_share: float = 1.0) -> float:
-        """Bytes on the device, with ``batch_share`` of each batch."""
-        batch = sum(size for key, size in self.parts.items() if key.endswith(".rays"))
-        return sum(self.parts.values()) - batch * (1 - batch_share)
+    def with_batches(self, share: float) -> StageNeeds:
+        """The needs with a ``share`` of each batch."""
+        parts = {k: s * (share if k.endswith(".rays") else 1) for k, s in self.parts.items()}
+        return StageNeeds(parts, self.learned)
 
 
 def tensor_bytes(value: object) -> int:

@@ -75,7 +75,7 @@ class StagePlan:
             processes: the number of processes that share a batch.
             rest: the plan of the stage that it builds on, if any.
         """
-        return StageNeeds({images: tensor_bytes(scene.captures.values())}, 0)
+        return StageNeeds({images: tensor_bytes(scene.captures.values())}, {images: 0})
 
     def rehearsed(self) -> StagePlan:
         """The plan made to fit into seconds on a CPU.

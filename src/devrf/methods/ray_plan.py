@@ -64,13 +64,14 @@ class RayPlan(StagePlan):
         schedule: RaySchedule = self.settings["schedule"]
         rays = max(schedule.rays, schedule.rays_without_hull or 0) / processes
         learned = tensor_bytes(self.model.parameters())
+        width = "ray_stage.model.settings.width"
         parts = {
             images: float(tensor_bytes(scene.captures.values())),
-            "ray_stage.model.settings.width": LEARNED * learned,
+            width: LEARNED * learned,
             # Three values are kept for each output of each layer, for 128 samples of a ray.
             "ray_stage.schedule.rays": rays * 128 * 12 * self.model.sample_outputs,
         }
-        return StageNeeds(parts, learned)
+        return StageNeeds(parts, {width: learned})
 
     def rehearsed(self) -> RayPlan:
         """Small networks and batches; rates at which networks learn in hundreds of iterations."""

@@ -62,7 +62,7 @@ class CanonicalPlan(StagePlan):
             grid: LEARNED * values,
             "schedule.canonical.rays": self.rays * ray / processes,
         }
-        return StageNeeds(parts, values)
+        return StageNeeds(parts, {grid: values})
 
     def rehearsed(self) -> CanonicalPlan:
         """Grids of few voxels, and a search that begins as much less faint as it is shorter."""
@@ -117,7 +117,7 @@ class DeformationPlan(StagePlan):
             side: frame * (on_device + LEARNED),
             "schedule.deformation.rays": self.rays * COLOURED * ray / processes,
         }
-        return StageNeeds(parts, values + frames * frame)
+        return StageNeeds(parts, {grid: values, side: frames * frame})
 
     def rehearsed(self) -> DeformationPlan:
         """Few iterations of each frame, in which voxels move as far, on motion grids of few."""
