@@ -44,8 +44,8 @@ def test_a_shortage_names_its_largest_key_and_the_size_that_suffices() -> None:
     def of(memory: float, disk: float = 9.0) -> Forecast:
         return Forecast(needed, {"host memory": memory, "disk": disk})
 
-    assert of(174).shortage is None and of(174, 8).shortage == "disk"
-    assert of(173).shortage == "host memory"
+    assert of(174).shortage() is None and of(174, 8).shortage() == "disk"
+    assert of(173).shortage() == "host memory"
     assert of(173).key("host memory") == forecast.SIZE and of(173, 8).key("disk") == "side"
     # By 3 images take 44.4 bytes, by 16, the most, 1.6.
     assert of(119).downscale(2) == 3 and of(118).downscale(2) == 4

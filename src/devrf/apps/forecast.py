@@ -38,16 +38,11 @@ class Forecast:
     needed: Mapping[str, Parts]
     free: Mapping[str, float]
 
-    @property
-    def shortage(self) -> str | None:
-        """The first resource of which there is too little; None if all suffice."""
-        return self._shortage(1)
-
-    def _shortage(self, downscale: float) -> str | None:
+    def shortage(self, downscale: float = 1.0) -> str | None:
+        """The first resource of which there is too little, if any, with images so much smaller."""
         images = 1 - 1 / downscale**2
         for name, free in self.free.items():
-            parts = self.needed[name]
-            if _total(parts) - images * parts.get(SIZE, 0.0) > free:
+            if _total(self.needed[name]) - images * self.needed[name].get(SIZE, 0.0) > free:
                 return name
         return None
 
@@ -59,7 +54,7 @@ class Forecast:
     def downscale(self, present: int) -> int | None:
         """The least factor above ``present`` by which images are small enough, if any."""
         factors = range(present + 1, MAX_DOWNSCALE * present + 1)
-        return next((f for f in factors if self._shortage(f / present) is None), None)
+        return next((f for f in factors if self.shortage(f / present) is None), None)
 
     def __str__(self) -> str:
         """Needed and free amounts, in words."""

@@ -85,16 +85,12 @@ class CaptureSettings:
             )
 
 
-PublishedScenes = Literal["matching", "all", "none"]
-
-
 @dataclass(frozen=True)
 class ReportSettings:
     """Settings of ``stage=report``; ``conf/report/default.yaml`` says what each does."""
 
     runs: str | Path = "outputs"
     into: str | Path | None = None
-    published: PublishedScenes = "matching"
 
     @property
     def folder(self) -> Path:

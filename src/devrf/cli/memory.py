@@ -50,26 +50,27 @@ def forecast(run: RunContext, names: Sequence[str]) -> tuple[str, Advice | None]
     largest = OmegaConf.select(run.config, LARGEST_BATCH) if budget else 1.0
     whole = with_batches(largest)
     line = f"needs about {whole}"
-    if budget and whole.shortage:
+    if budget and whole.shortage():
         # Images that may be made smaller are, before batches teach little.
         smallest = LEAST_BATCH if run.chooses_size else BATCHES[-1]
         for share in (share for share in BATCHES if smallest <= share < largest):
-            if not with_batches(share).shortage:
+            if not with_batches(share).shortage():
                 OmegaConf.update(run.config, LARGEST_BATCH, share)
                 return f"{line}: batches have at most {share:.2g} of their rays", None
     # A GPU says that it has no more memory, and half is drawn.
     least = with_batches(largest / 2) if on_gpu else whole
-    if least.shortage is None:
-        return line + "; batches will be halved" * bool(whole.shortage), None
-    problem = f"the run {line}; it would end for lack of {least.shortage}"
+    lacking = least.shortage()
+    if lacking is None:
+        return line + "; batches will be halved" * bool(whole.shortage()), None
+    problem = f"the run {line}; it would end for lack of {lacking}"
     if run.chooses_size and (factor := least.downscale(run.datamodule.downscale)):
         log.info("%s=auto: %d, as %s", SIZE, factor, problem)
         run.config.data.downscale = factor
         del run.datamodule  # the images are read again
         return forecast(run, names)
-    key = least.key(least.shortage)
+    key = least.key(lacking)
     change = "raise it (auto: as far as is needed)" if key == SIZE else "lower it"
-    return line, Advice(key, problem, f"{change}, or free some {least.shortage}")
+    return line, Advice(key, problem, f"{change}, or free some {lacking}")
 
 
 def _images(run: RunContext) -> str:

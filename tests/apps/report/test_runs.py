@@ -84,7 +84,7 @@ STRANGE = {
     "run.git": [5],
     "further": ["x" * 10**6, HUGE, {"a" * 10**6: 1}],
 }
-STRANGE["run"] += [{"settings": {"ray_stage.model.settings.sampling": []}}, {"checkpoint": [1]}]
+STRANGE["run"] += [{"checkpoint": [1]}]
 
 
 @pytest.mark.parametrize(

@@ -10,13 +10,18 @@ from devrf.apps.report.table import GPU, LPIPS, PSNR, TIME, TITLES, published, r
 FULL = "Ours w/ c2f, tv, cycle, flow"
 
 
-def texts(rows):
-    """The cells of each row, by label."""
-    return {label: list(cells) for label, cells in rows["text"].T.items()}
+def texts(block):
+    """The texts of each row, by name."""
+    return {name: [cell.text for cell in cells] for name, cells in block.cells.T.items()}
 
 
-def ranks(rows, column):
-    return list(rows["rank", column.title])
+def ranks(block, column):
+    return [cell.rank for cell in block.cells[column.heading]]
+
+
+def paper(block):
+    """The names of the paper's rows."""
+    return [name for name in block.cells.index if name.startswith("†")]
 
 
 @pytest.mark.parametrize(
@@ -39,21 +44,25 @@ def test_seeds_are_averaged_with_their_spread_where_all_have_a_value(table, ran)
     for seed, (psnr, seconds, lpips) in enumerate(rows):
         scores = {"psnr": psnr, "lpips": lpips}
         ran(str(seed), scores=scores, seconds=(140, seconds), seed=seed)
-    ((cells),) = texts(table().blocks[0].measured).values()
-    assert cells == ["30.00 ± 1.00", "0.950 ± 0.000", "–", "–", "5.0 ± 1.0 min"]
+    ((name, cells),) = texts(table().blocks[0]).items()
+    assert name == f"{FULL} (n = 3)" and cells == [
+        "30.00 ± 1.00",
+        "0.950 ± 0.000",
+        "–",
+        "–",
+        "5.0 ± 1.0 min",
+    ]
 
 
 def test_novel_times_have_a_column_where_a_run_has_them(table, ran):
     ran("one", scene="lego", scores={"novel_times": {"psnr": 25.5}})
     ran("other", scene="lego", ablation="base")
-    found = table()
-    titles = [column.title for column in found.columns]
-    assert titles == ["PSNR", "PSNR at novel times", "SSIM", "LPIPS", "GPU (GB)", "Time"]
-    (block,) = found.blocks
-    assert texts(block.measured)[FULL][1] == "25.50"
-    assert [cells[1] for label, cells in texts(block.measured).items() if label != FULL] == ["–"]
+    (block,) = table().blocks
+    headings = ["PSNR ↑", "PSNR at novel times ↑", "SSIM ↑", "LPIPS ↓", "GPU (GB) ↓", "Time ↓"]
+    assert list(block.cells) == headings
+    assert texts(block).pop(FULL)[1] == "25.50"
     # The paper has no such column.
-    assert {cells[1] for cells in texts(block.published).values()} == {"–"}
+    assert {cells[1] for name, cells in texts(block).items() if name != FULL} == {"–"}
 
 
 @pytest.mark.parametrize(
@@ -76,35 +85,20 @@ def test_a_block_by_hand(table, ran):
     ran("1", ablation="c2f", scores={"psnr": 23.98, "ssim": 0.932}, seconds=(17, 60), gpu=(2.5, 2))
     ran("2", ablation="full", scores={"psnr": 29.42, "ssim": 0.977, "lpips": 0.1}, gpu=(1.0, 2.0))
     (block,) = table().blocks
-    assert block.title == "robot" and block.published.empty
-    assert texts(block.measured) == {
+    assert block.title == "robot"
+    assert texts(block) == {
         "Ours (base)": ["20.07", "0.834", "0.2000", "2.0", "30 s"],
         "Ours w/ c2f": ["23.98", "0.932", "–", "2.5", "77 s"],
         FULL: ["29.42", "0.977", "0.1000", "2.0", "30 s"],
     }
-    assert ranks(block.measured, PSNR) == [3, 2, 1]
-    assert ranks(block.measured, LPIPS) == [2, 0, 1]
-    assert ranks(block.measured, GPU) == [1, 2, 1]
-    assert ranks(block.measured, TIME) == [1, 2, 1]
+    assert ranks(block, PSNR) == [3, 2, 1]
+    assert ranks(block, LPIPS) == [2, 0, 1]
+    assert ranks(block, GPU) == [1, 2, 1]
+    assert ranks(block, TIME) == [1, 2, 1]
     ran("3", ablation="c2f_tv", device="another processor")
     found = table()
     # Of several devices nothing is ranked that depends on them.
-    assert not any(ranks(found.blocks[0].measured, TIME)) and "of one device" in found.notes[0]
-
-
-def test_it_says_which_methods_took_their_samples_how(table, ran):
-    key = "ray_stage.model.settings"
-    for name, own in (
-        ("dnerf", {f"{key}.sampling": "occupancy", f"{key}.hull": True}),
-        ("hypernerf", {f"{key}.sampling": "hierarchical", f"{key}.hull": True}),
-        ("neural_volumes", {f"{key}.hull": True}),
-    ):
-        ran(name, method=name, protocol="joint", settings=own)
-    assert [note for note in table().notes if "Samples" in note] == [
-        "Samples by occupancy within hulls of alpha masks: D-NeRF.",
-        "Samples by hierarchical: HyperNeRF.",
-        "Samples by even steps within hulls of alpha masks: Neural Volumes.",
-    ]
+    assert not any(ranks(found.blocks[0], TIME)) and "of one device" in found.notes[0]
 
 
 def test_it_says_what_scores_are_measured_with(table, ran):
@@ -119,19 +113,16 @@ def test_it_says_what_scores_are_measured_with(table, ran):
 def test_the_average_is_over_scenes_that_a_configuration_was_run_on(table, ran):
     for scene, psnr in (("robot", 30.0), ("flower", 33.0)):
         ran(f"{scene}_full", scene, scores={"psnr": psnr})
-        ran(f"{scene}_base_0", scene, ablation="base", scores={"psnr": psnr - 10}, seed=0)
+        ran(f"{scene}_a_base_0", scene, ablation="base", scores={"psnr": psnr - 10}, seed=0)
     ran("robot_base_1", ablation="base", scores={"psnr": 22.0}, seed=1)
     ran("robot_c2f", ablation="c2f")
     *scenes, average = table().blocks
     assert [block.title for block in scenes] == ["flower", "robot"]
-    assert average.title == "average over 2 scenes" and average.published.empty
+    assert average.title == "average over 2 scenes"
     # Base: (23 + (20 + 22) / 2) / 2 = 22. c2f was run on the robot alone.
-    assert {label: cells[0] for label, cells in texts(average.measured).items()} == {
-        "Ours (base)": "22.00",
-        FULL: "31.50",
-    }
-    assert list(average.measured["head", "counts"]) == [{1, 2}, {1}]
-    assert ranks(average.measured, PSNR) == [2, 1]
+    psnr = {name: cells[0] for name, cells in texts(average).items()}
+    assert psnr == {"Ours (base) (n = 1, 2)": "22.00", FULL: "31.50"}
+    assert ranks(average, PSNR) == [2, 1]
     # There is none over scenes that are not alike.
     ran("small", "bush", image_size=[24, 24])
     assert [block.title for block in table().blocks] == ["flower", "robot", "bush"]
@@ -143,7 +134,7 @@ def test_gains_are_over_three_scenes_or_more_and_name_the_worst(table, ran):
         ran(f"{scene}_base", scene, ablation="base", scores={"psnr": base}, seconds=(10, 20))
         ran(f"{scene}_full", scene, scores={"psnr": full}, seconds=(10, 50))
     # (1 − 0.5 + 2) / 3 = 0.83; twice the time in each.
-    assert table().gains.to_numpy().tolist() == [
+    assert table().gains.reset_index().to_numpy().tolist() == [
         ["Ours (base)", "30.00", "27.00", "+0.00", "+0.00 (bush)", "1.00×"],
         [FULL, "30.83", "29.00", "+0.83", "-0.50 (flower)", "2.00×"],
     ]
@@ -160,16 +151,19 @@ def test_published_rows_stand_below_runs_of_the_same_scene_and_data(table, ran):
     found = table()
     lego, at_rest, robot, kuka, daisy = found.blocks
     assert (lego.title, at_rest.title) == ("lego", "lego (at rest)")
-    assert len(lego.published) == 17
-    assert all(block.published.empty for block in (at_rest, robot, kuka, daisy))
+    assert len(paper(lego)) == 17
+    assert not any(map(paper, (at_rest, robot, kuka, daisy)))
     assert "than the paper's rows, which are left out: kuka, daisy." in found.notes[-1]
     first = ["5.958", "0.369", "0.8314", "19.4", "22.4hrs"]
-    assert texts(lego.published)["Neural Volumes"] == first
-    assert all(block.published.empty for block in table("none").blocks)
-    everything = table("all").blocks[5:]
-    others = ["floating_robot", "daisy, published", "glove", "kuka, published", "pig_toy"]
-    assert [block.title for block in everything] == others
-    assert everything[0].measured.empty and len(everything[4].published) == 9
+    assert texts(lego)["† Neural Volumes"] == first
+
+
+def test_rows_of_one_name_stay_apart_and_a_note_says_in_what_they_differ(table, ran):
+    for k, (psnr, device) in enumerate(((20.0, "CPU"), (22.0, "CPU"), (30.0, "GPU"))):
+        ran(str(k), scores={"psnr": psnr}, seed=k, device=device)
+    found = table()
+    assert list(found.rows["PSNR"]) == [21.0, 30.0] and len(found.rows.index.unique()) == 1
+    assert f"robot: the rows called {FULL} differ in run.device (CPU; GPU)." in found.notes
 
 
 def test_runs_scored_at_rest_only_are_named_and_not_tabulated(table, ran):

@@ -2,46 +2,37 @@
 
 from __future__ import annotations
 
-import math
 import re
-from itertools import pairwise
+from textwrap import fill
 from typing import NamedTuple
 
 import matplotlib as mpl
 import pandas as pd
 from matplotlib.artist import Artist
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import LogFormatter, MaxNLocator, NullFormatter, ScalarFormatter
 
 from devrf.apps.report.labels import METHODS
-from devrf.apps.report.runs import DEFAULT_METHOD, metric_over_time
-from devrf.apps.report.table import LPIPS, PSNR, SSIM, TIME, Block, Table
+from devrf.apps.report.runs import metric_over_time
+from devrf.apps.report.table import LPIPS, PSNR, SSIM, TIME, Table, published
 from devrf.pictures.figures import STYLE
 
-# The palette of Okabe and Ito, distinguishable with colour-blindness; then each time the colour
-# furthest in CIELAB from those before, from white and from grey. Other dashes every eight colours.
-COLORS = (
-    "#0072B2 #D55E00 #009E73 #CC79A7 #E69F00 #56B4E9 #000000 #8C6D31 "
-    "#4B0096 #96D21E #FF0069 #69001E #D200A5 #A587FF #0F3C00 #4B1E5A "
-    "#00E178 #FFB496 #B4C369 #1E870F #D25A5A #006969 #5AD2D2 #D2001E"
-).split()
+# The palette of Okabe and Ito, distinguishable with colour-blindness; other dashes, or points, each
+# eight rows.
+COLORS = "#0072B2 #D55E00 #009E73 #CC79A7 #E69F00 #56B4E9 #000000 #8C6D31".split()
 DASHES = ("-", "--", ":", "-.")
-ALIKE = 8
 POINTS = "osD^"
-# Inches of a line of the legend: the figure grows by it, so that curves keep their room.
+# Inches of a line of the legend: the figure grows by it, so that curves keep their room. Letters in
+# a line: no more are as wide as a panel.
 LEGEND_LINE = 0.19
-MOST_COLUMNS = 8
+LEGEND_WIDTH = 60
 PUBLISHED = ", published"
 GREY = "#9a9a9a"
 # Markers of the methods, and the endings of their variants' names.
 NAMES = ("DeVRF", *list(METHODS.values())[1:])
 MARKERS = dict(zip(NAMES, "s^vDPXo*", strict=True))
 VARIANT = r"-2 ?stage$|-dynamic$| \(base\)$| w/ .*$"
-# Seconds to label on an axis: the first of these multiples for which there is room.
-UNITS = (0.01, 0.1, 1, 10, 60, 600, 3600, 36000, 360000, math.inf)
-MULTIPLES = ((1, 1.5, 2, 3, 4, 6), (1, 2, 3, 4, 6), (1, 2, 5), (1, 3), (1,))
-MOST_TICKS = 5
+SECONDS = "training time (s)"
 
 
 class Plot(NamedTuple):
@@ -77,7 +68,8 @@ def psnr_over_time(table: Table, scene: str) -> Figure | None:
     """PSNR of one scene's held-out images over time, a mean curve a row; None without frames."""
     figure = Figure(figsize=(6.4, 3.6), layout="constrained")
     axes = figure.subplots()
-    for label, runs in table.runs[table.runs["scene"] == scene].groupby("label", sort=False):
+    rows = table.runs[table.runs["scene"] == scene].groupby(["label", "identity"], sort=False)
+    for (label, _), runs in rows:
         curves = [metric_over_time(path, "psnr") for path in runs["path"]]
         curve = pd.concat(curves, axis=1, join="inner").mean(axis=1)
         if len(curve):
@@ -97,20 +89,30 @@ def psnr_against_seconds(table: Table) -> Figure | None:
 
     Scenes that were learned in a budget of seconds are left out (:func:`against_budget`).
     """
-    both = table.rows[(table.rows[TIME.title] > 0) & table.rows[PSNR.title].notna()]
-    limited = table.runs.loc[table.runs["budget"].notna(), "scene"]
-    scenes = both.index.get_level_values("scene").difference(limited)
-    blocks = [block for block in table.blocks if block.title in scenes]
-    if not blocks:
+    limited = table.runs.loc[table.runs["budget"].notna(), "scene"].unique()
+    rows = _seconds_and_psnr(table.rows.drop(limited, level="scene", errors="ignore"))
+    scenes = rows.index.unique("scene")
+    if rows.empty:
         return None
-    across = min(3, len(blocks))
-    down = -(-len(blocks) // across)
+    across = min(3, len(scenes))
+    down = -(-len(scenes) // across)
     figure = Figure(figsize=(1.2 + 3.2 * across, 0.9 + 2.9 * down), layout="constrained")
-    panels = list(figure.subplots(down, across, squeeze=False).flat)
-    for axes, block in zip(panels, blocks, strict=False):
-        _points(axes, table, block)
-    for axes in panels[len(blocks) :]:
-        axes.remove()
+    for k, scene in enumerate(scenes):
+        axes = figure.add_subplot(down, across, k + 1)
+        for label, seconds, psnr in rows.loc[scene].itertuples(name=None):
+            color, dashes = _look(table, label)
+            mark = POINTS[DASHES.index(dashes)]
+            axes.plot(seconds, psnr, mark, color=color, markersize=6, label=label)
+        paper = _seconds_and_psnr(
+            published().values.loc[[scene] if scene in table.published else []]
+        )
+        for (_, label), seconds, psnr in paper.itertuples(name=None):
+            method = re.sub(VARIANT, "", label)
+            (point,) = axes.plot(seconds, psnr, MARKERS[method], label=f"{method}{PUBLISHED}")
+            point.set(color=GREY, markerfacecolor="none")
+        axes.set(title=scene, xscale="log", xlabel=SECONDS, ylabel=f"{PSNR.title} (dB)")
+        axes.xaxis.set_major_formatter(LogFormatter())
+        axes.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
     _legend(figure)
     return figure
 
@@ -119,8 +121,8 @@ def psnr_against_seconds(table: Table) -> Figure | None:
 def against_budget(table: Table, place: str) -> Figure | None:
     """PSNR, SSIM and LPIPS of a scene against budgets of seconds, a panel each.
 
-    Each row has a line, with the standard deviation over its runs: methods have colours, their
-    variants dashes. None unless there are several budgets.
+    Each row has a line, with the standard deviation over its runs. None unless there are several
+    budgets.
     """
     runs = table.runs[table.runs["place"] == place].dropna(subset="budget")
     budgets = sorted(runs["budget"].unique())
@@ -128,31 +130,19 @@ def against_budget(table: Table, place: str) -> Figure | None:
         return None
     columns = [column for column in (PSNR, SSIM, LPIPS) if runs[column.title].notna().any()]
     figure = Figure(figsize=(0.8 + 3.3 * len(columns), 4.0), layout="constrained")
-    methods = list(runs["method"].unique())
-    labels = runs.groupby("method")["label"].unique()
-    for axes, column in zip(
-        figure.subplots(1, len(columns), squeeze=False)[0], columns, strict=True
-    ):
-        for (method, label), row in runs.groupby(["method", "label"], sort=False):
-            values = row.groupby("budget")[column.title]
-            means = values.mean()
-            spread = values.std().fillna(0.0)
-            dashes = DASHES[list(labels[method]).index(label) % len(DASHES)]
+    panels = figure.subplots(1, len(columns), squeeze=False)[0]
+    for axes, column in zip(panels, columns, strict=True):
+        for label, row in runs.groupby("label", sort=False):
+            values = row.groupby("budget")[column.title].agg(["mean", "std"])
+            color, dashes = _look(table, label)
+            look = {"color": color, "linestyle": dashes, "marker": "o", "capsize": 2}
             axes.errorbar(
-                means.index,
-                means,
-                spread,
-                color=COLORS[methods.index(method)],
-                linestyle=dashes,
-                linewidth=2.8 if method == DEFAULT_METHOD else 1.4,
-                marker="o",
-                capsize=2,
-                label=label,
+                values.index, values["mean"], values["std"].fillna(0), label=label, **look
             )
-        axes.set(title=place, xscale="log", xlabel="training time", ylabel=column.heading)
-        axes.xaxis.set_major_locator(FixedLocator(budgets))
-        axes.xaxis.set_minor_locator(NullLocator())
-        axes.xaxis.set_major_formatter(_time)
+        axes.set(title=place, xscale="log", xlabel=SECONDS, ylabel=column.heading)
+        axes.set_xticks(budgets)
+        axes.xaxis.set_major_formatter(ScalarFormatter())
+        axes.xaxis.set_minor_formatter(NullFormatter())
     _legend(figure)
     return figure
 
@@ -184,53 +174,9 @@ def against_views(table: Table) -> Figure | None:
     return figure
 
 
-def _points(axes: Axes, table: Table, block: Block) -> None:
-    """One scene's panel."""
-    for label, seconds, psnr in _seconds_and_psnr(block.measured):
-        color, dashes = _look(table, label)
-        mark = POINTS[DASHES.index(dashes)]
-        axes.plot(seconds, psnr, mark, color=color, markersize=6, label=label)
-    for label, seconds, psnr in _seconds_and_psnr(block.published):
-        method = re.sub(VARIANT, "", label)
-        axes.plot(
-            seconds,
-            psnr,
-            MARKERS[method],
-            color=GREY,
-            markerfacecolor="none",
-            label=f"{method}{PUBLISHED}",
-        )
-    axes.set(title=block.title, xscale="log", xlabel="training time", ylabel=f"{PSNR.title} (dB)")
-    low, high = axes.get_xlim()
-    low, high = axes.set_xlim(low / 1.5, high * 1.5)
-    axes.xaxis.set_major_locator(FixedLocator(_ticks(low, high)))
-    axes.xaxis.set_minor_locator(NullLocator())
-    axes.xaxis.set_major_formatter(_time)
-
-
-def _seconds_and_psnr(rows: pd.DataFrame) -> list[tuple[str, float, float]]:
-    """(label, seconds, PSNR) if both are known and the time is above 0."""
-    scores = rows["value"][[TIME.title, PSNR.title]].dropna()
-    return list(scores[scores[TIME.title] > 0].itertuples(name=None))
-
-
-def _ticks(low: float, high: float) -> list[float]:
-    """Round times in seconds between two times."""
-    for multiples in MULTIPLES:
-        # No 50 s beside 1 min.
-        times = [m * u for u, above in pairwise(UNITS) for m in multiples if 1.5 * m * u <= above]
-        ticks = [time for time in times if low <= time <= high]
-        if len(ticks) <= MOST_TICKS:
-            break
-    return ticks
-
-
-def _time(seconds: float, position: float) -> str:
-    """The label of a tick."""
-    for unit, size in (("h", 3600), ("min", 60)):
-        if seconds >= size:
-            return f"{seconds / size:g} {unit}"
-    return f"{seconds:g} s"
+def _seconds_and_psnr(rows: pd.DataFrame) -> pd.DataFrame:
+    """The rows of which both are known and the time is above 0."""
+    return rows.loc[rows[TIME.title] > 0, [TIME.title, PSNR.title]].dropna()
 
 
 def _look(table: Table, label: str) -> tuple[str, str]:
@@ -239,24 +185,17 @@ def _look(table: Table, label: str) -> tuple[str, str]:
 
 
 def _style(k: int) -> tuple[str, str]:
-    return COLORS[k % len(COLORS)], DASHES[k // ALIKE % len(DASHES)]
+    return COLORS[k % len(COLORS)], DASHES[k // len(COLORS) % len(DASHES)]
 
 
 def _legend(figure: Figure) -> None:
-    """One legend for all panels, ours first; the figure grows by it, so that nothing is cut off."""
+    """One legend for all panels, ours first; the figure grows by its lines."""
     handles: dict[str, Artist] = {}
     for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
-    handles = dict(sorted(handles.items(), key=lambda entry: entry[0].endswith(PUBLISHED)))
-    for columns in range(min(len(handles), MOST_COLUMNS), 0, -1):
-        legend = figure.legend(
-            list(handles.values()), list(handles), loc="outside lower center", ncols=columns
-        )
-        needed = legend.get_window_extent().width / figure.dpi
-        if needed <= figure.get_figwidth() or columns == 1:
-            figure.set_figwidth(max(needed, figure.get_figwidth()))
-            lines = -(-len(handles) // columns)
-            figure.set_figheight(figure.get_figheight() + (lines - 1) * LEGEND_LINE)
-            return
-        legend.remove()
+    names = sorted(handles, key=lambda label: label.endswith(PUBLISHED))
+    texts = [fill(name, LEGEND_WIDTH) for name in names]
+    figure.legend([handles[name] for name in names], texts, loc="outside lower center")
+    lines = "\n".join(texts).count("\n")
+    figure.set_figheight(figure.get_figheight() + lines * LEGEND_LINE)

@@ -33,7 +33,6 @@ LARGEST = 1e9
 _Name = Annotated[str, Len(1, LONGEST_NAME)]
 _Text = Annotated[str, Len(0, LONGEST)]
 _Plain = _Text | bool | int | float | Annotated[list[Any], Len(0, LONGEST)] | None
-SAMPLING = "run.settings.ray_stage.model.settings.sampling"
 # Columns of every run, and their kinds; further columns are entries of its file, by dotted name.
 COLUMNS: dict[str, Any] = {
     "folder": _Plain,
@@ -57,7 +56,7 @@ COLUMNS: dict[str, Any] = {
     "path": _Plain,
 }
 # Kinds of further values that are used; the last ones are mappings, and no values.
-OTHERS = ("run.git", "run.devrf", "run.fingerprint", "run.lpips_network", SAMPLING)
+OTHERS = ("run.git", "run.devrf", "run.fingerprint", "run.lpips_network")
 KINDS = COLUMNS | dict.fromkeys(OTHERS, _Text | None)
 KINDS |= {"run.image_size": Annotated[list[int], Len(2, 2)] | None}
 KINDS |= dict.fromkeys(("static", "dynamic", "run", "choices"), dict)

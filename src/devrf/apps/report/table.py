@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
-from typing import Any
+from itertools import repeat
+from operator import add
+from typing import Any, NamedTuple
 
 import pandas as pd
 
-from devrf.apps.report.labels import labelled
-from devrf.apps.report.runs import SAMPLING, Collection, number
-from devrf.apps.settings import PublishedScenes
+from devrf.apps.report.labels import identity_columns, labelled
+from devrf.apps.report.runs import Collection, number
 
 UNKNOWN = "–"
+# Keys that a note names of those in which rows of one name differ.
+MOST_DIFFERENCES = 3
 
 
 @dataclass(frozen=True)
@@ -99,19 +102,23 @@ def published() -> Published:
     return Published(**data["source"], data=described, texts=texts, values=values)
 
 
+class Cell(NamedTuple):
+    """A value as text, and its rank: 1, 2, 3 for the best, else 0."""
+
+    text: str
+    rank: int = 0
+
+
 @dataclass(frozen=True)
 class Block:
     """The rows of one scene, or of an average over scenes.
 
-    Both frames are indexed by label. Their columns have two levels: ``head`` has ``name``,
-    ``protocol`` and ``counts`` (a set of numbers of runs averaged); ``value`` (NaN where unknown),
-    ``text`` and ``rank`` (1, 2, 3 for the best, else 0) have the title of each column.
-    Published rows are not ranked.
+    ``cells`` has a :class:`Cell` by the row's name and the column's heading: measured rows, then
+    the paper's, whose names have a † and whose cells have no rank.
     """
 
     title: str
-    measured: pd.DataFrame
-    published: pd.DataFrame
+    cells: pd.DataFrame
 
 
 @dataclass(frozen=True)
@@ -121,9 +128,9 @@ class Table:
     Attributes:
         runs: the labelled runs whose dynamic capture was scored, or of a scene at rest the static
             one.
-        rows: means over runs, indexed by scene and label: ``name``, ``protocol``, ``line``,
-            ``views``, ``count`` and each column's title; NaN unless all runs of the row have the
-            value.
+        rows: means over runs, indexed by scene and label: ``line``, ``views``, ``count`` and each
+            column's title; NaN unless all runs of the row have the value.
+        published: the scenes whose data are those of the paper's rows.
         blocks: one for each scene, then the average if there is more than one.
         gains: over three scenes or more, if they are alike: PSNR by label as text, its mean and its
             least, and its gain over the first row's; seconds as a multiple of that row's.
@@ -131,21 +138,16 @@ class Table:
     """
 
     collection: Collection
-    columns: tuple[Column, ...]
     runs: pd.DataFrame
     rows: pd.DataFrame
+    published: frozenset[str]
     blocks: tuple[Block, ...]
     gains: pd.DataFrame
     notes: tuple[str, ...]
 
-    @property
-    def shows_published(self) -> bool:
-        """Whether any row is the paper's."""
-        return any(len(block.published) for block in self.blocks)
 
-
-def tabulate(collection: Collection, published_scenes: PublishedScenes = "matching") -> Table:
-    """The tables of a collection, beside the paper's rows of the same data, of all, or of none."""
+def tabulate(collection: Collection) -> Table:
+    """The tables of a collection, beside the paper's rows of the same data."""
     scored = _values(collection.runs, PSNR).notna()
     again = _scored_again(collection.runs[scored])
     runs = labelled(collection.runs[scored].drop(index=again.index))
@@ -154,44 +156,36 @@ def tabulate(collection: Collection, published_scenes: PublishedScenes = "matchi
     titles = [column.title for column in columns]
     for column in columns:
         runs[column.title] = _values(runs, column)
-    groups = runs.groupby(["scene", "label"], sort=False)
-    described = ["name", "protocol", "line", "views", "kind"]
-    heads = groups[described].first().assign(count=groups.size())
+    groups = runs.groupby(["scene", "label", "identity"], sort=False)
+    heads = groups[["line", "views", "kind"]].first().assign(count=groups.size())
     complete = groups[titles].count().eq(heads["count"], axis=0)
-    rows = heads.join(groups[titles].mean().where(complete))
-    spread = groups[titles].std().where(complete)
+    rows = heads.join(groups[titles].mean().where(complete)).droplevel("identity")
+    rows["counts"] = [{count} for count in rows["count"]]
+    spread = groups[titles].std().where(complete).droplevel("identity")
 
-    ours = list(runs["scene"].unique())
+    scenes = list(runs["scene"].unique())
     same = {run["scene"] for run in runs.to_dict("records") if _is_of_published_data(run)}
-    # The paper's scenes by title: they stand below runs of the same data, else alone.
-    theirs = {s if s in same or s not in ours else f"{s}, published": s for s in published().data}
-    if published_scenes != "all":
-        theirs = {scene: scene for scene in same if published_scenes == "matching"}
     blocks: list[Block] = []
-    for scene in dict.fromkeys([*ours, *theirs]):
-        measured = _cells(
-            _of(rows, [scene]).assign(counts=lambda row: row["count"].map(lambda n: {n})),
-            _of(spread, [scene]),
-            columns,
-            runs.loc[runs["scene"] == scene, "run.device"],
-        )
-        paper = [theirs[scene]] if scene in theirs else []
-        blocks.append(Block(scene, measured, _published(paper, columns)))
+    for scene in scenes:
+        devices = runs.loc[runs["scene"] == scene, "run.device"]
+        cells = [_cells(rows.loc[scene], spread.loc[scene], columns, devices)]
+        if scene in same:
+            cells.append(_published_cells(scene, columns))
+        blocks.append(Block(scene, pd.concat(cells)))
     gains = pd.DataFrame()
-    if len(ours) > 1:
-        title = f"average over {len(ours)} scenes"
-        paper = ours if set(ours) <= set(theirs) else []
-        average = Block(title, _average(runs, rows, ours, columns), _published(paper, columns))
-        blocks += [average] if len(average.measured) else []
-        if len(average.measured) > 1 and len(ours) > 2:
-            gains = _gains(rows.reset_index(), average.measured)
+    average = _average(rows, scenes, titles)
+    if len(scenes) > 1 and len(average):
+        devices = runs.loc[runs["label"].isin(average.index), "run.device"]
+        measured = _cells(average, average[titles] * math.nan, columns, devices)
+        blocks.append(Block(f"average over {len(scenes)} scenes", measured))
+        if len(average) > 1 and len(scenes) > 2:
+            gains = _gains(rows.reset_index(), average)
     notes = _notes(runs, collection.runs.loc[~scored, "folder"], again)
-    left_out = [scene for scene in ours if scene in published().data and scene not in theirs]
-    if left_out and published_scenes == "matching":
+    if left_out := [scene for scene in scenes if scene in published().data and scene not in same]:
         notes.append(
             f"Of other data than the paper's rows, which are left out: {', '.join(left_out)}."
         )
-    return Table(collection, columns, runs, rows, tuple(blocks), gains, tuple(notes))
+    return Table(collection, runs, rows, frozenset(same), tuple(blocks), gains, tuple(notes))
 
 
 def _is_of_published_data(run: Mapping[str, Any]) -> bool:
@@ -237,81 +231,56 @@ def ranked(values: pd.Series, column: Column) -> pd.Series:
     return ranks.where((ranks <= 3) & (texts.nunique() > 1), 0).astype(int)
 
 
-def _of(frame: pd.DataFrame, scenes: list[str]) -> pd.DataFrame:
-    """The rows of some scenes, by label."""
-    return frame[frame.index.get_level_values("scene").isin(scenes)].droplevel("scene")
-
-
 def _cells(
-    rows: pd.DataFrame,
-    spread: pd.DataFrame,
-    columns: Sequence[Column],
-    devices: pd.Series | None,
+    rows: pd.DataFrame, spread: pd.DataFrame, columns: Sequence[Column], devices: pd.Series
 ) -> pd.DataFrame:
-    """A block's rows; memory and time are ranked only if all ``devices`` agree, None ranks none."""
-    titles = [column.title for column in columns]
-    texts = rows[titles].astype(object)
-    ranks = pd.DataFrame(0, rows.index, titles)
+    """A block's measured rows; memory and time have ranks only if all ``devices`` agree."""
+    cells = {}
     for column in columns:
-        both = zip(rows[column.title], spread[column.title], strict=True)
-        texts[column.title] = [shown(value, column, deviation) for value, deviation in both]
-        if devices is not None and (devices.nunique(dropna=False) == 1 or not column.of_hardware):
-            ranks[column.title] = ranked(rows[column.title], column)
-    heads = rows[["name", "protocol", "counts"]]
-    parts = {"head": heads, "value": rows[titles], "text": texts, "rank": ranks}
-    return pd.concat(parts, axis=1)
+        values = rows[column.title]
+        is_ranked = devices.nunique(dropna=False) == 1 or not column.of_hardware
+        ranks = ranked(values, column) if is_ranked else [0] * len(rows)
+        texts = map(shown, values, repeat(column), spread[column.title])
+        cells[column.heading] = list(map(Cell, texts, ranks))
+    # The number of runs that a row's values are means of, if it is more than one.
+    counts = [", ".join(map(str, sorted(n))) for n in rows["counts"]]
+    many = ["" if n == "1" else f" (n = {n})" for n in counts]
+    return pd.DataFrame(cells, index=map(add, rows.index, many))
 
 
-def _average(
-    runs: pd.DataFrame, rows: pd.DataFrame, scenes: list[str], columns: Sequence[Column]
-) -> pd.DataFrame:
-    """Means over all scenes, if these are alike, of rows that every scene has; without spread."""
-    groups = rows.groupby("label", sort=False)
-    titles = [column.title for column in columns]
-    means = _over_scenes(rows[titles], scenes).join(groups[["name", "protocol"]].first())
-    alike = (groups.size() == len(scenes)) & (groups["kind"].nunique() == 1)
-    means = means.assign(counts=groups["count"].agg(set))[alike]
-    devices = runs.loc[runs["label"].isin(means.index), "run.device"]
-    return _cells(means, means[titles] * math.nan, columns, devices)
+def _published_cells(scene: str, columns: Sequence[Column]) -> pd.DataFrame:
+    """The paper's rows of a scene, as printed."""
+    texts = published().texts.loc[scene]
+    cells = texts.reindex(columns=[column.title for column in columns], fill_value=UNKNOWN)
+    cells.columns = [column.heading for column in columns]
+    return cells.map(Cell).rename(index="† {}".format)
+
+
+def _average(rows: pd.DataFrame, scenes: list[str], titles: list[str]) -> pd.DataFrame:
+    """Means over all scenes, if these are alike, of rows that every scene has."""
+    groups = rows.reset_index().groupby("label", sort=False)
+    # Nor of a name that several rows of a scene have.
+    alike = (groups["scene"].nunique() == len(scenes)) & (groups.size() == len(scenes))
+    alike &= groups["kind"].nunique() == 1
+    means = groups[titles].agg(lambda values: values.mean(skipna=False))[alike]
+    return means.assign(counts=groups["count"].agg(set)[alike])
 
 
 def _gains(rows: pd.DataFrame, average: pd.DataFrame) -> pd.DataFrame:
     """Gains of an average's rows over its first: see :class:`Table`."""
     by_scene = rows[rows["label"].isin(average.index)].pivot(index="label", columns="scene")
-    psnr = by_scene["PSNR"].reindex(average.index)
-    seconds = by_scene["Time"].reindex(average.index)
+    psnr, seconds = (by_scene[title].reindex(average.index) for title in ("PSNR", "Time"))
     gain = psnr - psnr.iloc[0]
-    first = average["head", "name"].iloc[0]
     least = zip(gain.min(axis=1), gain.idxmin(axis=1), strict=True)
     return pd.DataFrame(
         {
-            "": average["head", "name"],
             "PSNR": psnr.mean(axis=1).map("{:.2f}".format),
             "PSNR, least": psnr.min(axis=1).map("{:.2f}".format),
-            f"gain over {first}": gain.mean(axis=1).map("{:+.2f}".format),
+            "gain over the first": gain.mean(axis=1).map("{:+.2f}".format),
             "gain, least": [f"{value:+.2f} ({scene})" for value, scene in least],
             "time": seconds.div(seconds.iloc[0]).mean(axis=1).map("{:.2f}×".format),
         }
     )
-
-
-def _published(scenes: list[str], columns: Sequence[Column]) -> pd.DataFrame:
-    """The paper's rows of a scene, or their means over several; empty for no scene."""
-    values = _over_scenes(_of(published().values, scenes), scenes).dropna()
-    values = values.reindex(columns=[column.title for column in columns])
-    rows = values.assign(name=values.index, protocol="", counts=[{1} for _ in values.index])
-    cells = _cells(rows, values * math.nan, columns, devices=None)
-    if len(scenes) == 1:
-        cells["text"] = _of(published().texts[TITLES], scenes).reindex(
-            columns=values.columns, fill_value=UNKNOWN
-        )
-    return cells
-
-
-def _over_scenes(values: pd.DataFrame, scenes: list[str]) -> pd.DataFrame:
-    """Means by label; NaN unless every scene has the value."""
-    groups = values.groupby("label", sort=False)
-    return groups.mean().where(groups.count() == len(scenes))
 
 
 def _scored_again(runs: pd.DataFrame) -> pd.Series:
@@ -321,19 +290,6 @@ def _scored_again(runs: pd.DataFrame) -> pd.Series:
     )
     again = checkpointed.loc[checkpointed.duplicated("run.checkpoint", keep="last"), "folder"]
     return again.sort_index()
-
-
-def _sampled(runs: pd.DataFrame) -> list[str]:
-    """Sampling of the methods that can choose it, a sentence for each way."""
-    absent = pd.Series(None, runs.index, dtype=object)
-    kind = runs.get(SAMPLING, absent)
-    hull = runs.get("run.settings.ray_stage.model.settings.hull", absent)
-    # A hull of alpha masks counts with samples by occupancy only; Neural Volumes' always are.
-    carved = hull.eq(True) & kind.fillna("occupancy").eq("occupancy")
-    way = kind.where(kind.notna() | hull.isna(), "even steps")
-    way = way.where(~carved, way.astype(str) + " within hulls of alpha masks")
-    names = runs["name"].groupby(way, sort=False).unique()
-    return [f"Samples by {kind}: {', '.join(methods)}." for kind, methods in names.items()]
 
 
 def _scored(runs: pd.DataFrame) -> str:
@@ -347,6 +303,17 @@ def _scored(runs: pd.DataFrame) -> str:
     )
 
 
+def _differences(runs: pd.DataFrame) -> Iterator[str]:
+    """The values in which rows of one name differ, in the rows' order."""
+    for (scene, label), same in runs.groupby(["scene", "label"], sort=False):
+        rows = same.drop_duplicates("identity").reindex(columns=identity_columns(runs)).map(str)
+        varied = [key for key in rows if rows[key].nunique() > 1]
+        texts = [f"{key} ({'; '.join(rows[key])})" for key in varied[:MOST_DIFFERENCES]]
+        texts += ["others"] * (len(varied) > MOST_DIFFERENCES)
+        if texts:
+            yield f"{scene}: the rows called {label} differ in {', '.join(texts)}."
+
+
 def _notes(runs: pd.DataFrame, at_rest: pd.Series, again: pd.Series) -> list[str]:
     notes = [
         f"No run has {column.title}: {column.why_missing}."
@@ -355,7 +322,7 @@ def _notes(runs: pd.DataFrame, at_rest: pd.Series, again: pd.Series) -> list[str
     ]
     if runs["run.device"].nunique(dropna=False) > 1:
         notes.append("Memory and time are marked only among rows of one device.")
-    notes += _sampled(runs)
+    notes += _differences(runs)
     notes += [_scored(runs)] if len(runs) else []
     for why, folders in (
         ("Scored at rest only, and therefore not in the tables", at_rest),

@@ -10,7 +10,7 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 import pandas as pd
-from PIL import Image, ImageDraw
+import torch
 
 from devrf.apps.report.plots import file_name, plots
 from devrf.apps.report.runs import SKIPPED, collect
@@ -19,7 +19,8 @@ from devrf.apps.report.text import latex, markdown, plain
 from devrf.apps.settings import ReportSettings
 from devrf.errors import DevrfError
 from devrf.pictures.figures import write_figure
-from devrf.pictures.video_file import fitted_font, write_pictures
+from devrf.pictures.images import image_grid, scaled
+from devrf.pictures.video_file import write_pictures
 from devrf.system.files import refuse_links, write_text
 from devrf.system.printed import csv_cell
 
@@ -48,7 +49,7 @@ def write_report(settings: ReportSettings) -> str:
             "that were scored (stage=pipeline or stage=evaluate)"
         )
     refuse_links(folder, itself=settings.into is None)
-    table = tabulate(collection, settings.published)
+    table = tabulate(collection)
     figures = _write_plots(table, folder)
     videos = _write_videos(table, folder)
     write_text(folder / "report.md", markdown(table, figures, videos))
@@ -98,20 +99,16 @@ def _write_videos(table: Table, folder: Path) -> dict[str, str]:
     return links
 
 
-# Columns of each run's video of the held-out views, from the left: truth, rendering, depth.
+# Columns of each run's video of the held-out views: truth, rendering, depth.
 COLUMNS = 3
-TRUTH = 0
-RENDERED = 1
-# Pixels above each picture for its label, and between pictures.
-BAND = 22
-MARGIN = 4
 
 
 def scene_video(table: Table, scene: str) -> Iterator[np.ndarray] | None:
     """Pictures (H, W, 3) uint8 of the truth and of each row's rendering while time runs.
 
     The first run of a row that has a video stands for it. Pictures have the size of the first
-    row's, and as many frames as the shortest video. None if fewer than two rows have a video.
+    row's truth. There are as many pictures as frames in
+    the shortest video. None if fewer than two rows have a video.
     """
     runs = table.runs[table.runs["scene"] == scene]
     videos = dict[str, tuple[Path, int]]()
@@ -140,10 +137,15 @@ def _pictures(videos: Mapping[str, tuple[Path, int]]) -> Iterator[np.ndarray]:
         _frames_at([round(time * (count - 1)) for time in times], path)
         for path, count in videos.values()
     )
+    across = math.ceil(math.sqrt(1 + len(videos)))
     for frames in zip(*streams, strict=True):
-        truth = _column(frames[0], TRUTH)
-        renderings = (_column(frame, RENDERED).resize(truth.size) for frame in frames)
-        yield _page({"truth": truth, **dict(zip(videos, renderings, strict=True))})
+        columns = [torch.from_numpy(frame).tensor_split(COLUMNS, dim=1) for frame in frames]
+        truth = columns[0][0]
+        tiles = [truth, *(scaled(rendering, *truth.shape[:2]) for _, rendering, _ in columns)]
+        tiles += [torch.full_like(truth, 255)] * (-len(tiles) % across)
+        names = ["truth", *videos, *[""] * len(tiles)]
+        rows = (slice(k, k + across) for k in range(0, len(tiles), across))
+        yield torch.cat([image_grid([tiles[row]], names[row]) for row in rows]).numpy()
 
 
 def _frames_at(positions: Iterable[int], path: Path) -> Iterator[np.ndarray]:
@@ -154,25 +156,3 @@ def _frames_at(positions: Iterable[int], path: Path) -> Iterator[np.ndarray]:
         while at < position:
             at, frame = next(frames)
         yield frame
-
-
-def _column(picture: np.ndarray, column: int) -> Image.Image:
-    """A column of a video's frame."""
-    width = picture.shape[1] / COLUMNS
-    return Image.fromarray(picture[:, round(column * width) : round((column + 1) * width)])
-
-
-def _page(tiles: Mapping[str, Image.Image]) -> np.ndarray:
-    """Tiles in a nearly square grid, the label above each."""
-    width, height = next(iter(tiles.values())).size
-    across = math.ceil(math.sqrt(len(tiles) * (height + BAND) / width))
-    down = math.ceil(len(tiles) / across)
-    page = Image.new("RGB", (across * (width + MARGIN), down * (height + BAND + MARGIN)), "white")
-    pen = ImageDraw.Draw(page)
-    for number, (label, tile) in enumerate(tiles.items()):
-        x = number % across * (width + MARGIN)
-        y = number // across * (height + BAND + MARGIN)
-        font = fitted_font(label, BAND // 2, width)
-        pen.text((x + width / 2, y + BAND / 2), label, "black", font, "mm")
-        page.paste(tile, (x, y + BAND))
-    return np.asarray(page)
