@@ -45,10 +45,17 @@ def test_psnr_against_seconds_has_a_panel_a_scene_and_the_published_rows(table, 
 
 
 def test_metrics_against_views_need_several_numbers_of_them(table, ran):
-    ran("1", train_views=1, scores={"psnr": 20.0, "ssim": 0.8})
+    def ran_with(views, psnr, ssim):
+        typed = {
+            "settings": {"data.train_views": views},
+            "overrides": [f"data.train_views={views}"],
+        }
+        ran(str(views), train_views=views, scores={"psnr": psnr, "ssim": ssim}, **typed)
+
+    ran_with(1, 20.0, 0.8)
     ran("base", ablation="base", train_views=1)
     assert against_views(table()) is None
-    ran("3", train_views=3, scores={"psnr": 26.0, "ssim": 0.9})
+    ran_with(3, 26.0, 0.9)
     psnr, ssim = against_views(table()).axes
     assert curves(psnr) == {"robot": [(1, 20), (3, 26)]}
     assert curves(ssim) == {"robot": [(1, 0.8), (3, 0.9)]}

@@ -42,7 +42,6 @@ GROUPS = ("method", "profile", "schedule", "field", "sampling", "loss")
 # Settings that say which scene it is, and those that its title says.
 OF_TITLE = {"data.root", "data.name", "data.shape", "data.scene_seed", "priors", "schedule.seconds"}
 NOT_LEARNED = {"objective", "seed", "stage", "method"}
-VIEWS = "data.train_views"
 # What runs that share a row have in common beside their settings.
 RECORDED = (
     *("method", "run.train_views", "run.frames", "run.image_size", "run.test_frames"),
@@ -56,9 +55,8 @@ def labelled(runs: pd.DataFrame) -> pd.DataFrame:
     Runs of a scene at rest count as runs of another scene than that in motion. So do runs that were
     learned in a limited time (``budget`` in seconds, NaN without a limit), or without priors.
     ``place`` is the scene with its priors, without its budget. Further columns are ``label``, the
-    row's name; ``line``, the name without the number of views; ``views``, the number of dynamic
-    training views (NaN where unknown); ``identity``, the same for runs that share a row; ``kind``,
-    the same for runs of alike scenes.
+    row's name; ``views``, the number of dynamic training views (NaN where unknown); ``identity``,
+    the same for runs that share a row; ``kind``, the same for runs of alike scenes.
     """
     absent = pd.Series(None, runs.index, dtype=object)
     bare = runs.get(f"{SETTINGS}priors", absent).eq("none")
@@ -73,7 +71,6 @@ def labelled(runs: pd.DataFrame) -> pd.DataFrame:
         place=place,
         budget=budget,
         label=[row_name(run) for run in records],
-        line=[row_name(run, without=VIEWS) for run in records],
         views=runs.get("run.train_views", absent).map(number).astype(float),
         identity=_as_text(runs, identity_columns(runs)),
         kind=_as_text(runs, ["at_rest", "run.kind", "run.image_size", f"{SETTINGS}priors"]),
@@ -83,8 +80,8 @@ def labelled(runs: pd.DataFrame) -> pd.DataFrame:
     return runs.sort_values(["by_scene", "by_method"], kind="stable")
 
 
-def row_name(run: Mapping[str, Any], without: str | None = None) -> str:
-    """A run's name by method and ablation, protocol, experiment and typed settings, but one."""
+def row_name(run: Mapping[str, Any]) -> str:
+    """A run's name by method and ablation, protocol, experiment and typed settings."""
     method = run["method"]
     ablation = _option(run, "ablation")
     parts = [METHODS.get(method, method)]
@@ -99,7 +96,7 @@ def row_name(run: Mapping[str, Any], without: str | None = None) -> str:
         key, _, value = text.lstrip("+").partition("=")
         setting = run.get(SETTINGS + key, float("nan"))
         is_setting = setting == setting and key not in NOT_LEARNED  # null is None, absent is NaN
-        if key not in {without, *OF_TITLE} and (is_setting or key in GROUPS and value != method):
+        if key not in OF_TITLE and (is_setting or key in GROUPS and value != method):
             parts.append(f"{key}={value}")
     name = shown("; ".join(filter(None, parts)))
     return name if len(name) <= LONGEST_NAME else f"{name[:LONGEST_NAME]}..."

@@ -33,6 +33,7 @@ NAMES = ("DeVRF", *list(METHODS.values())[1:])
 MARKERS = dict(zip(NAMES, "s^vDPXo*", strict=True))
 VARIANT = r"-2 ?stage$|-dynamic$| \(base\)$| w/ .*$"
 SECONDS = "training time (s)"
+VIEWS = r"; data\.train_views=\d+"
 
 
 class Plot(NamedTuple):
@@ -154,7 +155,10 @@ def against_views(table: Table) -> Figure | None:
     Each scene and configuration has a line. None unless one was run with several numbers.
     """
     rows = table.rows.dropna(subset="views").sort_values("views")
-    lines = rows.groupby(["scene", "line"], sort=False).filter(lambda g: g["views"].nunique() > 1)
+    # A row's name but for the number of views, where it was typed.
+    names = [re.sub(VIEWS, "", label) for _, label in rows.index]
+    lines = rows.assign(line=names).groupby(["scene", "line"], sort=False)
+    lines = lines.filter(lambda line: line["views"].nunique() > 1)
     if lines.empty:
         return None
     one_line = lines["line"].nunique() == 1

@@ -128,8 +128,8 @@ class Table:
     Attributes:
         runs: the labelled runs whose dynamic capture was scored, or of a scene at rest the static
             one.
-        rows: means over runs, indexed by scene and label: ``line``, ``views``, ``count`` and each
-            column's title; NaN unless all runs of the row have the value.
+        rows: means over runs, indexed by scene and label: ``views``, ``count`` and each column's
+            title; NaN unless all runs of the row have the value.
         published: the scenes whose data are those of the paper's rows.
         blocks: one for each scene, then the average if there is more than one.
         gains: over three scenes or more, if they are alike: PSNR by label as text, its mean and its
@@ -157,10 +157,9 @@ def tabulate(collection: Collection) -> Table:
     for column in columns:
         runs[column.title] = _values(runs, column)
     groups = runs.groupby(["scene", "label", "identity"], sort=False)
-    heads = groups[["line", "views", "kind"]].first().assign(count=groups.size())
+    heads = groups[["views", "kind"]].first().assign(count=groups.size())
     complete = groups[titles].count().eq(heads["count"], axis=0)
     rows = heads.join(groups[titles].mean().where(complete)).droplevel("identity")
-    rows["counts"] = [{count} for count in rows["count"]]
     spread = groups[titles].std().where(complete).droplevel("identity")
 
     scenes = list(runs["scene"].unique())
@@ -243,8 +242,7 @@ def _cells(
         texts = map(shown, values, repeat(column), spread[column.title])
         cells[column.heading] = list(map(Cell, texts, ranks))
     # The number of runs that a row's values are means of, if it is more than one.
-    counts = [", ".join(map(str, sorted(n))) for n in rows["counts"]]
-    many = ["" if n == "1" else f" (n = {n})" for n in counts]
+    many = [f" (n = {count})" * (count > 1) for count in rows["count"]]
     return pd.DataFrame(cells, index=map(add, rows.index, many))
 
 
@@ -263,7 +261,7 @@ def _average(rows: pd.DataFrame, scenes: list[str], titles: list[str]) -> pd.Dat
     alike = (groups["scene"].nunique() == len(scenes)) & (groups.size() == len(scenes))
     alike &= groups["kind"].nunique() == 1
     means = groups[titles].agg(lambda values: values.mean(skipna=False))[alike]
-    return means.assign(counts=groups["count"].agg(set)[alike])
+    return means.assign(count=1)
 
 
 def _gains(rows: pd.DataFrame, average: pd.DataFrame) -> pd.DataFrame:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import repeat
 from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
 import pandas as pd
-import torch
+from PIL import Image, ImageDraw
 
 from devrf.apps.report.plots import file_name, plots
 from devrf.apps.report.runs import SKIPPED, collect
@@ -19,8 +20,7 @@ from devrf.apps.report.text import latex, markdown, plain
 from devrf.apps.settings import ReportSettings
 from devrf.errors import DevrfError
 from devrf.pictures.figures import write_figure
-from devrf.pictures.images import image_grid, scaled
-from devrf.pictures.video_file import write_pictures
+from devrf.pictures.video_file import fitted_font, write_pictures
 from devrf.system.files import refuse_links, write_text
 from devrf.system.printed import csv_cell
 
@@ -28,6 +28,13 @@ log = logging.getLogger(__name__)
 
 # Pictures a second of the videos that show rows side by side.
 FPS = 10
+# Columns of each run's video of the held-out views, from the left: truth, rendering, depth.
+COLUMNS = 3
+TRUTH = 0
+RENDERED = 1
+# Pixels above each picture for its label, and between pictures.
+BAND = 22
+MARGIN = 4
 
 
 def write_report(settings: ReportSettings) -> str:
@@ -88,35 +95,22 @@ def _write_plots(table: Table, folder: Path) -> dict[str, str]:
 
 
 def _write_videos(table: Table, folder: Path) -> dict[str, str]:
-    """Write a video of all rows for each scene that has several; links as of the plots."""
-    links: dict[str, str] = {}
-    for scene in table.runs["scene"].unique():
-        pictures = scene_video(table, scene)
-        if pictures is not None:
-            name = f"{file_name(f'side_by_side_{scene}')}.mp4"
-            write_pictures(folder / "videos" / name, pictures, FPS)
-            links[f"{scene}: truth and renderings side by side"] = f"videos/{name}"
-    return links
+    """Write a video of all rows for each scene; returns links as of the plots.
 
-
-# Columns of each run's video of the held-out views: truth, rendering, depth.
-COLUMNS = 3
-
-
-def scene_video(table: Table, scene: str) -> Iterator[np.ndarray] | None:
-    """Pictures (H, W, 3) uint8 of the truth and of each row's rendering while time runs.
-
-    The first run of a row that has a video stands for it. Pictures have the size of the first
-    row's truth. There are as many pictures as frames in
-    the shortest video. None if fewer than two rows have a video.
+    The first run of a name that has a video stands for it; a scene needs two of them.
     """
-    runs = table.runs[table.runs["scene"] == scene]
-    videos = dict[str, tuple[Path, int]]()
-    for label, folder in zip(runs["label"], runs["path"], strict=True):
-        path = Path(folder) / "videos" / "held_out.mp4"
-        if label not in videos and path.is_file() and (count := _frame_count(path)):
-            videos[label] = path, count
-    return _pictures(videos) if len(videos) > 1 else None
+    links: dict[str, str] = {}
+    for scene, runs in table.runs.groupby("scene", sort=False):
+        videos = dict[str, tuple[Path, int]]()
+        for label, run in zip(runs["label"], runs["path"], strict=True):
+            path = Path(run) / "videos" / "held_out.mp4"
+            if label not in videos and path.is_file() and (count := _frame_count(path)):
+                videos[label] = path, count
+        if len(videos) > 1:
+            link = f"videos/{file_name(f'side_by_side_{scene}')}.mp4"
+            write_pictures(folder / link, _pictures(videos), FPS)
+            links[f"{scene}: truth and renderings side by side"] = link
+    return links
 
 
 def _frame_count(path: Path) -> int:
@@ -132,27 +126,44 @@ def _frame_count(path: Path) -> int:
 
 
 def _pictures(videos: Mapping[str, tuple[Path, int]]) -> Iterator[np.ndarray]:
+    """Pictures (H, W, 3) uint8 of the truth and of each row's rendering while time runs.
+
+    They have the size of the first row's truth. There are as many as frames in the shortest video.
+    """
     times = np.linspace(0, 1, min(count for _, count in videos.values()))
     streams = (
         _frames_at([round(time * (count - 1)) for time in times], path)
         for path, count in videos.values()
     )
-    across = math.ceil(math.sqrt(1 + len(videos)))
     for frames in zip(*streams, strict=True):
-        columns = [torch.from_numpy(frame).tensor_split(COLUMNS, dim=1) for frame in frames]
-        truth = columns[0][0]
-        tiles = [truth, *(scaled(rendering, *truth.shape[:2]) for _, rendering, _ in columns)]
-        tiles += [torch.full_like(truth, 255)] * (-len(tiles) % across)
-        names = ["truth", *videos, *[""] * len(tiles)]
-        rows = (slice(k, k + across) for k in range(0, len(tiles), across))
-        yield torch.cat([image_grid([tiles[row]], names[row]) for row in rows]).numpy()
+        truth = _column(frames[0], TRUTH)
+        renderings = (_column(frame, RENDERED).resize(truth.size) for frame in frames)
+        yield _page({"truth": truth, **dict(zip(videos, renderings, strict=True))})
 
 
-def _frames_at(positions: Iterable[int], path: Path) -> Iterator[np.ndarray]:
+def _frames_at(positions: Sequence[int], path: Path) -> Iterator[np.ndarray]:
     """A video's frames at increasing ``positions``, of which one at a time is in memory."""
-    frames = enumerate(iio.imiter(path))
-    at, frame = next(frames)
-    for position in positions:
-        while at < position:
-            at, frame = next(frames)
-        yield frame
+    for k, frame in enumerate(iio.imiter(path)):
+        yield from repeat(frame, positions.count(k))
+
+
+def _column(picture: np.ndarray, column: int) -> Image.Image:
+    """A column of a video's frame."""
+    width = picture.shape[1] / COLUMNS
+    return Image.fromarray(picture[:, round(column * width) : round((column + 1) * width)])
+
+
+def _page(tiles: Mapping[str, Image.Image]) -> np.ndarray:
+    """Tiles in a nearly square grid, the label above each."""
+    width, height = next(iter(tiles.values())).size
+    across = math.ceil(math.sqrt(len(tiles) * (height + BAND) / width))
+    down = math.ceil(len(tiles) / across)
+    page = Image.new("RGB", (across * (width + MARGIN), down * (height + BAND + MARGIN)), "white")
+    pen = ImageDraw.Draw(page)
+    for number, (label, tile) in enumerate(tiles.items()):
+        x = number % across * (width + MARGIN)
+        y = number // across * (height + BAND + MARGIN)
+        font = fitted_font(label, BAND // 2, width)
+        pen.text((x + width / 2, y + BAND / 2), label, "black", font, "mm")
+        page.paste(tile, (x, y + BAND))
+    return np.asarray(page)
