@@ -115,6 +115,16 @@ def test_one_file_that_plays(of_run, tmp_path):
     assert 100 < len(mesh.faces) <= 200
 
 
+def test_nothing_is_exported_through_a_link(of_run, tmp_path):
+    """A folder from somebody else may have links among its files."""
+    (tmp_path / "out").mkdir()
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "out" / "points").symlink_to(tmp_path / "mine")
+    outcome = of_run("stage=export", "export.into=out", "export.format=ply")
+    assert outcome.status == 2 and "points: a link or a pipe; remove it" in outcome.err
+    assert not [*(tmp_path / "mine").iterdir()]
+
+
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [

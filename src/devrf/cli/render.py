@@ -30,7 +30,7 @@ from devrf.pictures.video_file import write_pictures
 from devrf.rendering.renderable import Renderable
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
-from devrf.system.files import write_text
+from devrf.system.files import refuse_links, write_text
 from devrf.system.memory import free_cache
 from devrf.system.progress import followed
 
@@ -100,6 +100,7 @@ def export(run: RunContext) -> None:
     settings: ExportSettings = instantiate(run.config.export, _convert_="all")
     model, viewpoints = _learned(run)
     folder = run.folder / "export" if settings.into is None else Path(settings.into)
+    refuse_links(folder)
     if settings.format == "html":
         write_text(folder / PAGE, _page(run, model, viewpoints))
         log.info("the scene, for any browser, written to %s", folder / PAGE)
