@@ -40,6 +40,7 @@ memory_check: true
 priors: all
 ckpt: null
 scene: robot
+outputs: outputs
 method: devrf
 objective: dynamic.psnr
 decoder_precision: auto

@@ -244,6 +244,8 @@ def test_the_command_line_overrides_the_ablation_and_that_the_experiment(compose
         (["stage=report", "report.runs=no such folder"], "outputs/report"),
     ],
 )
+        (["outputs=/runs"], "/runs/robot/quickstart"),
+        (["outputs=/runs", "stage=report"], "/runs/report"),
 def test_where_a_run_lives_is_told_from_scene_experiment_and_ablation(composed, overrides, folder):
     composed(*overrides)
     assert HydraConfig.get().run.dir == folder

@@ -29,7 +29,7 @@ PATHS = {
     *("data.root", "data.export", "data.flow_cache", "ckpt", "fetch.into", "export.into"),
     *("capture.static", "capture.into", "capture.masks", "capture.alpha_masks", "video.path"),
     *("report.runs", "report.into", "fetch.catalogue", "evaluation.lpips_weights"),
-    *("hydra.run.dir", "hydra.sweep.dir"),
+    *("outputs", "hydra.run.dir", "hydra.sweep.dir"),
 }
 
 
@@ -79,14 +79,15 @@ def run_folder(_root_: Any) -> str:
     stage = _root_.stage
     report = _root_.report
     options = _root_.hydra.runtime.choices
+    outputs = _root_.outputs
     if stage in ("fetch", "selfcheck"):
-        return f"outputs/{stage}"
+        return f"{outputs}/{stage}"
     if stage == "capture":
         into = Path(str(_root_.capture.into or "scene"))
-        return f"outputs/{scene_folder_name(into.name)}/capture"
+        return f"{outputs}/{scene_folder_name(into.name)}/capture"
     if stage == "report":
         # A misspelt folder is not created: the step reports that there is none.
-        runs = report.runs if Path(report.runs).is_dir() else "outputs"
+        runs = report.runs if Path(report.runs).is_dir() else outputs
         return str(ReportSettings(runs, report.into).folder)
     parts = [options.experiment or "quickstart"]
     if options.ablation not in (None, "full"):
@@ -95,7 +96,7 @@ def run_folder(_root_: Any) -> str:
         parts += [options.method, options.protocol]
     if _root_.rehearse:
         parts.append("rehearsal")
-    return f"outputs/{scene_name(_root_)}/{'-'.join(parts)}"
+    return f"{outputs}/{scene_name(_root_)}/{'-'.join(parts)}"
 
 
 def job_folder(_root_: Any) -> str:

@@ -35,6 +35,7 @@ ROOT: dict[str, Any] = {
     "ckpt": str | Path | None,
     "objective": str,
     "scene": str | None,
+    "outputs": str | Path,
     "decoder_precision": Literal["auto", "float32", "bfloat16"],
     "kernels": Literal["auto", "torch"],
 }

@@ -215,7 +215,8 @@ def of_named_run(typed: Sequence[Override], multirun: bool) -> list[str]:
         return put if values(typed, "hparams_search") else [*put, "hydra.sweeper.params=null"]
     put.append("hydra.mode=RUN")
     if folder is None and value(typed, "stage") in OF_A_CHECKPOINT:
-        put.append(f"hydra.run.dir={literal(str(_folder_for(checkpoints[0])))}")
+        there = _folder_for(checkpoints[0], value(typed, "outputs"))
+        put.append(f"hydra.run.dir={literal(str(there))}")
     return put
 
 
@@ -269,15 +270,15 @@ def _recorded(record: Path) -> list[Override]:
     raise DevrfError(f"{record}: not the record of a sweep; type the sweep again")
 
 
-def _folder_for(checkpoint: Path) -> Path:
+def _folder_for(checkpoint: Path, outputs: str | None) -> Path:
     """The folder for products of a checkpoint.
 
     It is the folder of its run if it is the last of it, else a folder below that has the
-    checkpoint's name; of a file that stands alone, ``outputs/<scene>/<name>``.
+    checkpoint's name; of a file that stands alone, ``<outputs>/<scene>/<name>``.
     """
     from devrf.checkpoints.checkpoint import metadata_of
 
-    run = Path("outputs") / scene_folder_name(metadata_of(checkpoint).scene)
+    run = Path(outputs or "outputs") / scene_folder_name(metadata_of(checkpoint).scene)
     if checkpoint.parent.name == "checkpoints":
         run = checkpoint.parent.parent
         if latest_checkpoint(run) == checkpoint:

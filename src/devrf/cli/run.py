@@ -166,7 +166,9 @@ def _objective(run: RunContext, steps: Names) -> float | None:
         further = [[to_type("hydra.run.dir", run.place), *words.split()] for words in NEXT]
         if metrics.get("at_rest"):
             further[0].remove("still.time=0.35")
-        say_next(*further, ["stage=report"])
+        where = run.config.outputs
+        elsewhere = [] if where == "outputs" else [to_type("outputs", where)]
+        say_next(*further, ["stage=report", *elsewhere])
     return best
 
 
