@@ -25,6 +25,17 @@ MISTAKES = {
         ["for_scene=paper_lgo"],
         "did you mean for_scene=paper_lego?",
     ),
+    "option with dashes": (["--seed=1"], "--seed=1: no such option; write seed=1, or --help"),
+    "template's group": (["debug=default"], "debug=default: no such group; rehearse=true takes"),
+    "misspelt logger among several": (["logger=[csv,wand]"], "did you mean logger=wandb?"),
+    "key of a logger": (
+        ["logger.offline=true"],
+        "logger.offline: no such key; it is logger.wandb",
+    ),
+    "no argument of wandb": (
+        ["logger=wandb", "+logger.wandb.nots=mine"],
+        "logger.wandb.nots: wandb.init takes no such argument; did you mean logger.wandb.notes?",
+    ),
     "no choice of a group": (["method=null"], "method=null: choose one of devrf, dnerf, "),
     "key of other scenes": (
         ["data=inward", "data.root=scene", "data.scene_seed=3"],

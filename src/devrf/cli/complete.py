@@ -42,8 +42,9 @@ TRAINING_KEYS = (
     *("schedule.canonical", "schedule.deformation", "schedule.motion"),
 )
 ONE_CAMERA = "one moving camera, where method=devrf needs the scene at rest, too"
-# `viewer` is a group, whose choices Hydra wants to be text.
+# `viewer` is a group, whose choices Hydra wants to be text; so it does of these.
 SHORTHAND = {f"viewer={value}": f"viewer.training={value}" for value in ("true", "false")}
+SHORTHAND |= {f"{group}=null": f"~{group}" for group in ("logger", "callbacks")}
 KEY_VALUE = re.compile(r"(\+{0,2}([\w./@-]+)=)(.*)", re.DOTALL)
 
 
@@ -52,10 +53,13 @@ def completed(arguments: Sequence[str]) -> list[str]:
 
     Raises:
         DevrfError: a scene's folder cannot be recognised, the scenes of a sweep need different
-            options, or a group's choice is null.
+            options, a group's choice is null, or a word is another framework's.
     """
     applied_defaults.clear()
-    options, _ = get_args_parser().parse_known_intermixed_args(arguments)
+    options, unknown = get_args_parser().parse_known_intermixed_args(arguments)
+    for word in unknown:
+        meant = word.lstrip("-") if "=" in word else "KEY=VALUE, without dashes"
+        raise DevrfError(f"{word}: no such option; write {meant}, or --help for what there is")
     flags = [word for word in arguments if word not in options.overrides]
     texts = [SHORTHAND.get(word.lower(), word) for word in options.overrides]
     in_sweep = options.multirun or _sweeps(texts, options.config_dir)
@@ -69,6 +73,11 @@ def completed(arguments: Sequence[str]) -> list[str]:
         if names and override.value() is None and not override.is_delete():
             line = override.input_line
             raise DevrfError(f"{line}: choose one of {', '.join(names)}, or leave it out")
+        if override.key_or_group == "debug":
+            raise DevrfError(
+                f"{override.input_line}: no such group; rehearse=true takes every step in minutes, "
+                "trainer.fast_dev_run=true a step of each stage"
+            )
     run = value(typed, "hydra.run.dir")
     if run is not None and serves_page(typed, Path(run)):
         return [*flags, *texts]

@@ -6,7 +6,7 @@ import inspect
 import json
 import logging
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import is_dataclass
 from functools import reduce
@@ -175,10 +175,26 @@ def unknown_key(where: str, keys: Iterable[object]) -> DevrfError:
     meant = did_you_mean(name, (key for key in keys if key != name), where[: -len(name)])
     group = where.removesuffix(f".{name}")
     files = sorted((config_folder() / group).glob("*.yaml"))
-    # As a list: a DictConfig does not "contain" a required key that is not given.
-    having = ", ".join(path.stem for path in files if name in list(OmegaConf.load(path)))
-    instead = f"it belongs to {group}={having}" if having else "--cfg job shows every key there is"
+    having: list[str] = []
+    deeper: list[str] = []
+    for path in files:
+        # As plain data: a DictConfig does not "contain" a required key that is not given.
+        settings: Any = OmegaConf.to_container(OmegaConf.load(path))
+        flat = set(_below(settings))
+        having += [path.stem] * (key in flat)
+        deeper += [f"{group}.{other}" for other in flat if other.partition(".")[2] == key]
+    instead = f"it belongs to {group}={', '.join(having)}" if having else ""
+    instead = instead or f"it is {' or '.join(dict.fromkeys(deeper))}" * bool(deeper)
+    instead = instead or "--cfg job shows every key there is"
     return DevrfError(f"{where}: no such key{meant or f'; {instead}'}")
+
+
+def _below(node: Node, path: str = "") -> Iterator[str]:
+    """The keys below a node, with dots between them."""
+    for name, value in node.items():
+        yield f"{path}{name}"
+        if isinstance(value, Mapping):
+            yield from _below(value, f"{path}{name}.")
 
 
 def check_extras(config: DictConfig) -> None:

@@ -79,9 +79,10 @@ def one_line(error: BaseException) -> str:
         pass
     elif isinstance(error, MissingConfigException) and "/" in str(error.missing_cfg_file):
         group, _, option = str(error.missing_cfg_file).rpartition("/")
-        names = f"; choose one of {', '.join(error.options)}" if error.options else ""
+        options = error.options or group_choices().get(group, ())  # of a list Hydra gives none
+        names = f"; choose one of {', '.join(options)}" if options else ""
         more = '; others need pip install "devrf[sweeps]"' if group.startswith("hydra/") else ""
-        meant = did_you_mean(option, error.options or (), f"{group}=")
+        meant = did_you_mean(option, options, f"{group}=")
         text = f"{group}={option}: no such option{names}{more}{meant}"
     elif isinstance(error, OverrideParseException):
         text = _not_understood(str(error.override))
