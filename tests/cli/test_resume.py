@@ -37,7 +37,7 @@ def test_what_decides_nothing_may_change(again):
         "evaluation.metrics=[]",
         "callbacks.checkpoint.share=0.5",
         "trainer.log_every_n_steps=2",
-        "logger.name=curves",
+        "logger.csv.name=curves",
         "data.export=elsewhere",
     )
     assert outcome.status == 0

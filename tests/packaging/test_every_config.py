@@ -126,8 +126,10 @@ def test_it_composes_and_builds(composed, scene, choice):
     check_config(config)
     build_stages(config)
     if is_new(config.trainer, config.logger, config.callbacks):
-        callbacks = list(instantiate(config.callbacks).values())
-        instantiate(config.trainer, logger=instantiate(config.logger), callbacks=callbacks)
+        callbacks, loggers = (
+            list(instantiate(part).values()) for part in (config.callbacks, config.logger)
+        )
+        instantiate(config.trainer, logger=loggers, callbacks=callbacks)
     if is_new(config.video):
         assert instantiate(config.video).frames > 0
 
@@ -242,10 +244,10 @@ def test_the_command_line_overrides_the_ablation_and_that_the_experiment(compose
         (["ablation=base", "protocol=joint"], "outputs/robot/quickstart-base-devrf-joint"),
         (["stage=report", "report.into=there"], "there"),
         (["stage=report", "report.runs=no such folder"], "outputs/report"),
-    ],
-)
         (["outputs=/runs"], "/runs/robot/quickstart"),
         (["outputs=/runs", "stage=report"], "/runs/report"),
+    ],
+)
 def test_where_a_run_lives_is_told_from_scene_experiment_and_ablation(composed, overrides, folder):
     composed(*overrides)
     assert HydraConfig.get().run.dir == folder

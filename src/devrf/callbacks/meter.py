@@ -1,4 +1,4 @@
-"""Figures of a stage beside its losses: rates, speed, resolution, memory."""
+"""Figures of a stage beside its losses: rates, speed, sizes, memory."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from devrf.system.memory import peak_host_memory
 
 
 class Meter(Callback):
-    """Adds learning rates, speed, frame, resolution and memory to each row that is logged."""
+    """Adds rates, speed, frame, parameters, resolution and memory to each row that is logged."""
 
     def __init__(self) -> None:
         self._last = (0.0, 0)
@@ -36,12 +36,16 @@ class Meter(Callback):
         done = pl_module.position.iterations_done
         since, before = self._last
         self._last = (now, done)
-        values: dict[str, float] = {"iterations_per_second": (done - before) / (now - since)}
+        groups = pl_module.optimizer.param_groups
+        values: dict[str, float] = {
+            "iterations_per_second": (done - before) / (now - since),
+            "parameters": sum(value.numel() for group in groups for value in group["params"]),
+        }
         if (peak := peak_host_memory()) is not None:
             values["peak_host_gb"] = peak
         if pl_module.resolution:
             values["voxels"] = math.prod(pl_module.resolution)
-        for group in pl_module.optimizer.param_groups:
+        for group in groups:
             values[f"lr/{group['name']}"] = group["lr"]
         if pl_module.phase is not None and pl_module.phase.frame is not None:
             values["frame"] = pl_module.phase.frame

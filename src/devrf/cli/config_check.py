@@ -173,7 +173,7 @@ def unknown_key(where: str, keys: Iterable[object]) -> DevrfError:
     """The error for a key that does not exist, with the closest one that does."""
     name = where.rpartition(".")[2]
     meant = did_you_mean(name, (key for key in keys if key != name), where[: -len(name)])
-    group = where.removesuffix(f".{name}")
+    group, _, key = where.partition(".")
     files = sorted((config_folder() / group).glob("*.yaml"))
     having: list[str] = []
     deeper: list[str] = []
@@ -202,7 +202,7 @@ def check_extras(config: DictConfig) -> None:
     # A browser draws DeVRF's scenes by itself.
     served = ("server",) if config.method == "devrf" else ("server", "auto")
     serves = config.stage == "view" and config.viewer.renderer in served
-    tensorboard = "TensorBoard" in config.logger.get("_target_", "")
+    tensorboard = "tensorboard" in (config.get("logger") or ())
     exports = config.stage == "export" and config.export.format != "html"
     meshes = "skimage trimesh fast_simplification"
     usd = exports and config.export.format == "usd"

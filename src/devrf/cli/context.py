@@ -12,10 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 from hydra.utils import instantiate
 from lightning import Trainer
+from lightning.pytorch.loggers import Logger
 from lightning.pytorch.strategies import Strategy
 from omegaconf import DictConfig, OmegaConf
 
+import devrf
 from devrf.apps.forecast import SIZE
+from devrf.apps.records import git_revision
 from devrf.apps.rehearsal import LONGEST, RehearsedStage, for_rehearsal
 from devrf.checkpoints.checkpoint import (
     LoadedCheckpoint,
@@ -26,7 +29,7 @@ from devrf.checkpoints.checkpoint import (
 )
 from devrf.checkpoints.file_metadata import OWN_REST, digest_of
 from devrf.checkpoints.progress import progress_files
-from devrf.cli.config import PIPELINE, scene_name, stage_section
+from devrf.cli.config import PIPELINE, choices, overrides, scene_name, stage_section
 from devrf.cli.restore_config import present_command
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.ddp import ManualDDP
@@ -183,24 +186,28 @@ class RunContext(ExitStack):
         return plan.rehearsed() if self.rehearses else plan
 
     @cached_property
-    def logger(self) -> Any:
-        """The logger of all steps; False in a trial, in a rehearsal, in processes but rank 0.
+    def loggers(self) -> list[Logger]:
+        """The loggers of all steps; none in a trial, in a rehearsal, in processes but rank 0.
 
-        Giving a tracker the config begins its run: use it once the config has been checked.
+        Giving a tracker the config begins its run: use them once the config has been checked.
         """
         if not self.is_rank_zero or self.is_trial or self.rehearses:
-            return False
-        logger = instantiate(self.config.logger)
-        for tracker in trackers([logger]):
+            return []
+        built = instantiate(self.config.get("logger"), _convert_="all") or {}
+        loggers: list[Logger] = [*filter(None, built.values())]
+        for tracker in trackers(loggers):
             self.push(lambda error, *_, ends=tracker: ends.close(failed=error is not None))
-            settings: Any = OmegaConf.to_container(self.config, resolve=True)
-            tracker.log_hyperparams(settings)
-        return logger
+        settings: Any = OmegaConf.to_container(self.config, resolve=True)
+        settings |= {"choices": choices(), "overrides": overrides()}
+        settings |= {"devrf": devrf.__version__, "git": git_revision()}
+        for logger in loggers:
+            logger.log_hyperparams(settings)
+        return loggers
 
     @property
     def trackers(self) -> list[Tracker]:
-        """The logger, if it takes images, videos and tables."""
-        return trackers([self.logger])
+        """The loggers that take images, videos and tables."""
+        return trackers(self.loggers)
 
     @cached_property
     def page(self) -> Session:

@@ -24,7 +24,7 @@ from devrf.cli.context import RunContext
 from devrf.cli.restore_config import as_typed
 from devrf.cli.resume import unfinished
 from devrf.errors import DevrfError
-from devrf.evaluation.objective import VALIDATION
+from devrf.evaluation.objective import VALIDATION, objective
 from devrf.evaluation.scoring import score_held_out
 from devrf.pictures.held_out import write_contact_sheet
 from devrf.scenes.scene import Views
@@ -91,8 +91,10 @@ def evaluate(run: RunContext) -> list[Path]:
     summary = shown_sections(sections)
     for name, values in summary.items():
         log.info("%s: %s", name.replace("_", " "), in_words(values))
+    best = objective(run.config.objective, sections)
+    numbers = tracked_scores(sections | summary) | ({} if best is None else {"objective": best})
     for tracker in run.trackers:
-        tracker.conclude(tracked_scores(sections | summary))
+        tracker.conclude(numbers)
         tracker.show_table("metrics", [{"section": name, **row} for name, row in summary.items()])
         tracker.show_table("frames", frame_rows(frames))
     written = (metrics, "frames.csv", *(f"images/{capture}.png" for capture in frames))

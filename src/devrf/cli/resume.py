@@ -10,7 +10,7 @@ Each checkpoint holds the settings that decided its result:
 Settings of logging, scoring, rendering, the device and the place of the data may differ.
 
 A pipeline does not score and render again either: a step notes the files it wrote, and what decided
-them (checkpoint, settings, data, logger, version).
+them (checkpoint, settings, data, loggers, version).
 """
 
 from __future__ import annotations
@@ -195,8 +195,9 @@ def _made_with(run: RunContext, step: str) -> str:
     """A digest of all that decides a step's results."""
     root = run.config.data.get("root")
     keyframes = Path(str(run.config.video.path))
+    loggers = run.config.get("logger") or {}
     made = (
-        *(step, digest_of(run.checkpoint()), devrf.__version__, run.config.logger._target_),
+        *(step, digest_of(run.checkpoint()), devrf.__version__, sorted(loggers)),
         *(_values(run.config, "data"), root and Path(root).resolve()),
         _values(run.config, DECIDES[step]),
         step == "evaluate" and run.datamodule.validation,

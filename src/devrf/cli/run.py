@@ -219,6 +219,7 @@ def _check(run: RunContext, learning: Names, steps: Names) -> None:
     if not learning and not set(SCENELESS_STAGES).isdisjoint(steps):
         return
     _ = run.datamodule
+    instantiate(config.get("logger"), _convert_="all")  # which writes nothing
     for name in run.learning_stages:
         run.plan(name)
     if learning or "evaluate" in steps:

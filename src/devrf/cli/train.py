@@ -75,13 +75,14 @@ def _fit(run: RunContext, stage: Stage, begin: ResumePoint) -> None:
         trainer: Trainer = instantiate(
             run.config.trainer,
             callbacks=[*callbacks, stop],
-            logger=run.logger,
+            logger=run.loggers,
             default_root_dir=str(run.folder),
             enable_checkpointing=any(isinstance(hook, ModelCheckpoint) for hook in callbacks),
         )
         trainer.strategy.checkpoint_io = ChecksummedCheckpointIO()
-        if isinstance(run.logger, ResumableCSVLogger):
-            run.logger.drop_rows_beyond(stage.capture, begin.iterations_done)
+        for logger in run.loggers:
+            if isinstance(logger, ResumableCSVLogger):
+                logger.drop_rows_beyond(stage.capture, begin.iterations_done)
         fit(trainer, stage, run.datamodule, begin.progress)
         strategy = trainer.strategy
         stopping = strategy.reduce_boolean_decision(stop.number is not None, all=False)

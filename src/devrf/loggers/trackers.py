@@ -5,14 +5,15 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
+from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal, Protocol, cast, runtime_checkable
 
 from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 from tabulate import tabulate
 from torch import Tensor
 
-from devrf.errors import DevrfError
+from devrf.errors import DevrfError, did_you_mean
 from devrf.pictures.images import to_bytes
 
 if TYPE_CHECKING:
@@ -24,9 +25,6 @@ Row = Mapping[str, str | float | None]
 @runtime_checkable
 class Tracker(Protocol):
     """A logger that also shows pictures, videos and tables, of one run across its stages."""
-
-    def log_hyperparams(self, params: dict[str, Any]) -> None:
-        """Keep the run's composed config."""
 
     def show_image(self, name: str, image: Tensor, step: int | None = None) -> None:
         """Show an image (H, W, 3), in [0, 1] or uint8, as of a stage's iteration ``step``."""
@@ -57,7 +55,7 @@ class TensorBoardTracker(TensorBoardLogger):
         super().__init__(save_dir=save_dir, name=name, version="", default_hp_metric=False)
 
     def log_hyperparams(self, params: dict[str, Any], *args: Any, **kwargs: Any) -> None:  # type: ignore[override]
-        """Log the config as text, too: TensorBoard's own table of settings needs metrics."""
+        """Log the config as text; the table HPARAMS has it beside the final numbers."""
         super().log_hyperparams(params, *args, **kwargs)
         if params:
             self.experiment.add_text("config", f"```json\n{json.dumps(params, indent=2)}\n```")
@@ -77,9 +75,8 @@ class TensorBoardTracker(TensorBoardLogger):
         self.experiment.add_text(name, table)
 
     def conclude(self, values: Mapping[str, float]) -> None:
-        """Log each number once."""
-        for name, value in values.items():
-            self.experiment.add_scalar(name, value, 0)
+        """Log each number once, in the table HPARAMS beside the config, too."""
+        super().log_hyperparams(self.hparams, dict(values), step=0)
 
     def close(self, *, failed: bool) -> None:
         """Write out the rows that are still in memory."""
@@ -91,6 +88,8 @@ class TensorBoardTracker(TensorBoardLogger):
 OFFLINE = ("offline", "dryrun", "disabled")
 # The longest name that wandb takes.
 LONGEST_NAME = 128
+# Set by `wandb agent` for the runs that it starts.
+SWEEP = "WANDB_SWEEP_ID"
 
 
 class WandbTracker(WandbLogger):
@@ -102,40 +101,61 @@ class WandbTracker(WandbLogger):
     def __init__(
         self,
         save_dir: str | Path,
-        project: str = "devrf",
+        *,
+        offline: bool = True,
+        log_model: bool | Literal["all"] = False,
+        project: str | None = None,
         name: str | None = None,
         group: str | None = None,
-        tags: Sequence[str] = (),
-        entity: str | None = None,
-        offline: bool = True,
+        tags: Sequence[str | None] = (),
+        id: str | None = None,
+        resume: bool | Literal["allow", "must", "never", "auto"] | None = None,
+        dir: str | Path | None = None,
+        **init: Any,
     ) -> None:
         """Name the run; it begins when something is logged first.
 
-        wandb works in ``wandb/`` below the run's folder. ``name`` is by default that of the folder,
-        ``group`` of the one that it lies in: the scene's, or the sweep's of which it is a job.
-        ``entity`` None is the account that is logged in. ``wandb sync`` sends an offline run later.
-        ``WANDB_MODE`` in the environment takes precedence over ``offline``.
+        Each None is left to wandb's variable in the environment, else it is: the project
+        ``devrf``; the name of the run's folder ``save_dir``, and as group of the one that it lies
+        in, the scene's or the sweep's; the id kept in the folder; ``allow``; the folder itself,
+        for ``wandb/``. ``WANDB_MODE`` takes precedence over ``offline``; a trial of ``wandb agent``
+        is sent without it. ``WANDB_TAGS`` come beside ``tags``. ``log_model`` keeps the checkpoints
+        of a run that ended well as an artifact. ``init`` is whatever else ``wandb.init`` takes.
+
+        Raises:
+            DevrfError: it takes no such argument.
         """
-        mode = os.environ.get("WANDB_MODE")
-        folder = Path(save_dir).resolve()
-        if offline if not mode else mode in OFFLINE:
+        self._folder = Path(save_dir).resolve()
+        self._id_file = self._folder / "wandb" / "run_id"
+        kept = self._id_file.read_text().strip() if self._id_file.is_file() else None
+        mode = "offline" if offline and SWEEP not in os.environ else "online"
+        settings = init | {
+            key: value if value is not None or os.environ.get(variable) else usual
+            for key, value, variable, usual in (
+                ("project", project, "WANDB_PROJECT", "devrf"),
+                ("name", name, "WANDB_NAME", self._folder.name[:LONGEST_NAME]),
+                ("group", group, "WANDB_RUN_GROUP", self._folder.parent.name[:LONGEST_NAME]),
+                ("id", id, "WANDB_RUN_ID", kept),
+                ("resume", resume, "WANDB_RESUME", "allow"),
+                ("dir", dir, "WANDB_DIR", self._folder),
+                # Not as Lightning's `offline`, which changes WANDB_MODE.
+                ("mode", init.get("mode"), "WANDB_MODE", mode),
+            )
+        }
+        labels = [*tags, *os.environ.get("WANDB_TAGS", "").split(",")]
+        settings["tags"] = list(dict.fromkeys(filter(None, labels)))
+        if (settings["mode"] or os.environ["WANDB_MODE"]) in OFFLINE:
             # Read when wandb is first imported. It reports on itself even when offline.
             os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
-        super().__init__(
-            name=(name or folder.name)[:LONGEST_NAME],
-            save_dir=save_dir,
-            project=project,
-            group=(group or folder.parent.name)[:LONGEST_NAME],
-            tags=list(tags),
-            entity=entity,
-            # Not as Lightning's `offline`, which changes WANDB_MODE.
-            mode=None if mode else "offline" if offline else "online",
-        )
+        import wandb
+
+        known = {*signature(wandb.init).parameters, *signature(WandbLogger.__init__).parameters}
+        for key in settings.keys() - known:
+            meant = did_you_mean(key, known, "logger.wandb.")
+            raise DevrfError(f"logger.wandb.{key}: wandb.init takes no such argument{meant}")
+        super().__init__(save_dir=settings.pop("dir"), log_model=log_model, **settings)
         # wandb ignores it and warns where it is given.
         self._wandb_init.pop("anonymous", None)
-        self._id_file = Path(save_dir) / "wandb" / "run_id"
-        if self._id_file.is_file():
-            self._id = self._wandb_init["id"] = self._id_file.read_text().strip()
 
     @property
     def experiment(self) -> Run:
@@ -151,9 +171,11 @@ class WandbTracker(WandbLogger):
             run = cast("Run", super().experiment)
         except wandb.errors.Error as error:
             raise DevrfError(
-                f"logger: wandb cannot begin a run ({error}); leave logger.offline=true, or log "
-                "in with `wandb login`"
-            ) from None
+                f"logger.wandb: wandb cannot begin a run ({error}); leave "
+                "logger.wandb.offline=true, or log in with `wandb login`"
+            ) from error
+        except (TypeError, ValueError) as error:
+            raise DevrfError(f"logger.wandb: wandb.init refuses its settings ({error})") from error
         if not begun and self._experiment is not None:
             self._id_file.parent.mkdir(exist_ok=True)
             self._id_file.write_text(f"{run.id}\n")
@@ -178,6 +200,15 @@ class WandbTracker(WandbLogger):
 
     def close(self, *, failed: bool) -> None:
         """Finish the run, so that the next job of a sweep begins its own."""
-        if self._experiment is not None:
-            self.experiment.finish(exit_code=int(failed))
-            self._experiment = None
+        if self._experiment is None:
+            return
+        files = sorted((self._folder / "checkpoints").glob("*.ckpt"))
+        if self._log_model and files and not failed:
+            from wandb import Artifact
+
+            artifact = Artifact(self._checkpoint_name or f"model-{self.experiment.id}", "model")
+            for path in files:
+                artifact.add_file(str(path))
+            self.experiment.log_artifact(artifact)
+        self.experiment.finish(exit_code=int(failed))
+        self._experiment = None
