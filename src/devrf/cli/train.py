@@ -5,16 +5,25 @@ from __future__ import annotations
 import logging
 import math
 import signal
+import traceback
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 from hydra.utils import instantiate
-from lightning import Trainer
+from lightning import Callback, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 from omegaconf import OmegaConf
 
 from devrf.apps.records import in_words
 from devrf.apps.rehearsal import RehearsedStage
-from devrf.callbacks import PeriodicCheckpoint, StopOnSignal, TrainingRecord
+from devrf.callbacks import (
+    GridUpscaling,
+    LearningRateDecay,
+    PeriodicCheckpoint,
+    StopOnSignal,
+    TrainingRecord,
+)
 from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, save_checkpoint
 from devrf.cli.context import RunContext
 from devrf.cli.resume import ResumePoint, beginning, remove_progress
@@ -61,7 +70,11 @@ def _fit(run: RunContext, stage: Stage, begin: ResumePoint) -> None:
         _ = run.scene  # errors in it come before a logger writes files
     stage.provenance.training_config = begin.training_config
     # The clock stops before curves are drawn.
-    configured = instantiate(run.config.callbacks) or {}
+    configured: dict[str, Callback | None] = (
+        instantiate(run.config.callbacks, _convert_="all")
+        if "callbacks" in run.config
+        else {"grid_upscaling": GridUpscaling(), "learning_rate_decay": LearningRateDecay()}
+    )
     callbacks = [TrainingRecord(), *filter(None, configured.values())]
     saving = next((hook for hook in callbacks if isinstance(hook, PeriodicCheckpoint)), None)
     if saving is None:  # no periodic files, but still one at a signal
@@ -83,7 +96,8 @@ def _fit(run: RunContext, stage: Stage, begin: ResumePoint) -> None:
         for logger in run.loggers:
             if isinstance(logger, ResumableCSVLogger):
                 logger.drop_rows_beyond(stage.capture, begin.iterations_done)
-        fit(trainer, stage, run.datamodule, begin.progress)
+        with _named(configured):
+            fit(trainer, stage, run.datamodule, begin.progress)
         strategy = trainer.strategy
         stopping = strategy.reduce_boolean_decision(stop.number is not None, all=False)
         finished = stage.is_complete
@@ -113,6 +127,31 @@ def _fit(run: RunContext, stage: Stage, begin: ResumePoint) -> None:
         limits = [f"trainer.{k}={asked[k]}" for k, v in LIMITS.items() if asked.get(k, v) != v]
         ended = f"learning has ended at {where}; the same command without it goes on"
         raise DevrfError(f"{', '.join(limits) or 'callbacks'}: {ended}")
+
+
+@contextmanager
+def _named(callbacks: Mapping[str, Callback | None]) -> Iterator[None]:
+    """Say it if an error comes from a callback that is not devrf's; the log has its traceback.
+
+    Raises:
+        DevrfError: naming the callback's key, its method and the error.
+    """
+    own = {
+        id(callback): f"callbacks.{name}: {type(callback).__qualname__}"
+        for name, callback in callbacks.items()
+        if not type(callback).__module__.startswith("devrf.")
+    }
+    try:
+        yield
+    except DevrfError:
+        raise
+    except Exception as error:
+        for frame, _ in traceback.walk_tb(error.__traceback__):
+            if callback := own.get(id(frame.f_locals.get("self"))):
+                log.error("a callback failed", exc_info=error)
+                said = f"{type(error).__name__}: {error}"
+                raise DevrfError(f"{callback}.{frame.f_code.co_name} failed ({said})") from error
+        raise
 
 
 def _save_final(run: RunContext, trainer: Trainer, stage: Stage) -> None:
