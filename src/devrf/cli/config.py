@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 from collections.abc import Mapping, Sequence
@@ -74,12 +75,13 @@ def run_folder(_root_: Any) -> str:
     """A run's folder; for a report, the report's.
 
     It is named after scene and experiment, and the choices that are not the usual ones. Without an
-    experiment DeVRF learns as by ``experiment=quickstart``: they are one run.
+    experiment DeVRF learns as by ``experiment=quickstart``: they are one run. Each trial of
+    ``wandb agent`` is one of its own, named after sweep and trial.
     """
     stage = _root_.stage
+    outputs = _root_.outputs
     report = _root_.report
     options = _root_.hydra.runtime.choices
-    outputs = _root_.outputs
     if stage in ("fetch", "selfcheck"):
         return f"{outputs}/{stage}"
     if stage == "capture":
@@ -89,6 +91,9 @@ def run_folder(_root_: Any) -> str:
         # A misspelt folder is not created: the step reports that there is none.
         runs = report.runs if Path(report.runs).is_dir() else outputs
         return str(ReportSettings(runs, report.into).folder)
+    trial = [os.environ.get(name) for name in ("WANDB_SWEEP_ID", "WANDB_RUN_ID")]
+    if all(trial):
+        return "/".join([outputs, "sweeps", *map(str, trial)])
     parts = [options.experiment or "quickstart"]
     if options.ablation not in (None, "full"):
         parts.append(options.ablation)
