@@ -132,7 +132,10 @@ class PeriodicCheckpoint(Callback):
         for guard in callbacks:
             if isinstance(guard, DivergenceGuard):
                 guard.check(stage)  # rolls back first: a diverged state is never written
-        if not trainer.is_global_zero or trainer.fast_dev_run:  # type: ignore[attr-defined]
+        if not trainer.is_global_zero:
+            self.saved = stage.iteration  # by rank 0
+            return
+        if trainer.fast_dev_run:  # type: ignore[attr-defined]
             return
         began = time.monotonic()
         path = progress_file(self.folder, stage.name, stage.iteration)

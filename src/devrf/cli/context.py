@@ -32,7 +32,7 @@ from devrf.checkpoints.progress import progress_files
 from devrf.cli.config import PIPELINE, choices, overrides, scene_name, stage_section
 from devrf.cli.restore_config import present_command
 from devrf.data.datamodule import SceneDataModule
-from devrf.engine.ddp import ManualDDP
+from devrf.engine.ddp import check_strategy
 from devrf.engine.plan import StagePlan
 from devrf.engine.protocol import Protocol
 from devrf.engine.stage import Stage
@@ -277,8 +277,5 @@ def _strategy(config: DictConfig) -> Strategy:
         if getattr(trainer, key) not in (None, usual):
             own = "stages take optimiser steps of their own"
             raise DevrfError(f"trainer.{key}: {own}; leave it out: {instead}")
-    if trainer.world_size > 1 and not isinstance(trainer.strategy, ManualDDP):
-        raise DevrfError(
-            f"trainer.devices: {trainer.world_size} processes need trainer=ddp; give both"
-        )
+    check_strategy(trainer)
     return trainer.strategy

@@ -7,10 +7,8 @@ import logging
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
@@ -24,15 +22,14 @@ from devrf.cli.config import OF_A_CHECKPOINT, PIPELINE, SCENELESS_STAGES, in_swe
 from devrf.cli.context import RunContext
 from devrf.cli.evaluate import evaluate
 from devrf.cli.memory import forecast
-from devrf.cli.messages import as_own_errors
 from devrf.cli.preparation import capture, fetch, inspect, prepare, report, say_next, selfcheck
+from devrf.cli.processes import connected
 from devrf.cli.rehearse import begin_anew, conclude
 from devrf.cli.render import export, render, still, view, write_scene_page
 from devrf.cli.resume import done, note_done, unfinished
 from devrf.cli.run_folder import archive_previous
 from devrf.cli.train import learn
-from devrf.engine.ddp import ManualDDP
-from devrf.engine.workers import launch_workers
+from devrf.engine.ddp import world_size
 from devrf.errors import DevrfError, did_you_mean, expect
 from devrf.evaluation.objective import check_objective, objective
 from devrf.kernels import runtime
@@ -111,14 +108,8 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
         with shortage_in_words(config.stage, run.device, None):  # of networks that are too wide
             _check(run, learning, steps)
         if learning:
-            plans = map(run.plan_to_learn, run.learning_stages)
-            kernels = dict.fromkeys(kernel for plan in plans for kernel in plan.kernels)
-            compiling = compile_ahead([*kernels], run.device)  # while the scene is read
-            if run.is_rank_zero:
-                _prepare_to_learn(run, learning, steps)
-            if config.schedule.seconds is not None:  # which are of learning alone
-                compiling.join()
-            _learn(run, learning)
+            with connected(run.strategy, folder):
+                _learn(run, learning, steps)
         for name in steps if run.is_rank_zero or not learning else ():
             if not (learning and done(run, name)):
                 _run_step(run, name, AFTER_LEARNING.get(name) or STEPS[name])
@@ -172,29 +163,26 @@ def _objective(run: RunContext, steps: Names) -> float | None:
     return best
 
 
-def learn_beside(config: dict[str, Any], folder: Path) -> None:
-    """Learn the stages of ``stage=…`` in another process than rank 0; the config is checked."""
-    run = RunContext(OmegaConf.create(config), folder)
-    _learn(run, plan(run.config.stage, run.learning_stages)[0])
-
-
-def _learn(run: RunContext, learning: Names) -> None:
-    """Learn stages, together with the other processes where the trainer asks for them."""
+def _learn(run: RunContext, learning: Names, steps: Names) -> None:
+    """Learn stages, together with the other processes where there are any."""
     strategy = run.strategy
-    together: AbstractContextManager[None] = nullcontext()
-    if isinstance(strategy, ManualDDP):
-        if run.is_rank_zero:
-            _ = run.scene  # its errors are reported once, and its estimated flow is stored
-        plain = OmegaConf.to_container(run.config, resolve=True)
-        together = launch_workers(strategy, learn_beside, (plain, run.folder))
-    with together, as_own_errors():
-        # Rank 0 has made it. Checkpoints that a later stage or a resumed one needs are read by all.
-        there = (run.folder / PLACE).is_dir()
-        if not strategy.reduce_boolean_decision(there):
-            shared = "give hydra.run.dir=FOLDER in a file system that all nodes share"
-            raise DevrfError(f"{run.folder}: not there on every node; {shared}")
-        for name in run.learnable(learning):
-            _run_step(run, name, partial(learn, name=name))
+    plans = map(run.plan_to_learn, run.learning_stages)
+    kernels = dict.fromkeys(kernel for plan in plans for kernel in plan.kernels)
+    compiling = compile_ahead([*kernels], run.device)  # while the scene is read
+    if run.is_rank_zero:
+        _prepare_to_learn(run, learning, steps)
+        if world_size() > 1:
+            _ = run.scene  # whose estimated flow is stored then
+    strategy.barrier("the scene is read")
+    if run.config.schedule.seconds is not None:  # which are of learning alone
+        compiling.join()
+    # Rank 0 has made it. Checkpoints that a later stage or a resumed one needs are read by all.
+    there = (run.folder / PLACE).is_dir()
+    if not strategy.reduce_boolean_decision(there):
+        shared = "give hydra.run.dir=FOLDER in a file system that all nodes share"
+        raise DevrfError(f"{run.folder}: not there on every node; {shared}")
+    for name in run.learnable(learning):
+        _run_step(run, name, partial(learn, name=name))
 
 
 def _run_step(run: RunContext, name: str, step: Step) -> None:

@@ -74,7 +74,7 @@ def check_strategy(trainer: Trainer) -> None:
     """
     if trainer.world_size > 1 and not isinstance(trainer.strategy, ManualDDP):
         raise DevrfError(
-            f"trainer: {trainer.world_size} processes need trainer=ddp (the strategy "
+            f"trainer.devices: {trainer.world_size} processes need trainer=ddp (the strategy "
             "devrf.engine.ddp.ManualDDP)"
         )
 

@@ -4,27 +4,29 @@ from __future__ import annotations
 
 import csv
 import json
-import multiprocessing
 import os
 import socket
 import subprocess
 import sys
 from pathlib import Path
 
+import psutil
 import pytest
-from torch.multiprocessing import ProcessRaisedException
+from lightning import Trainer
 
 import devrf as package
-from devrf.engine import workers
+from devrf.cli.processes import connected
+from devrf.engine.ddp import ManualDDP
+from devrf.errors import DevrfError
 
 TWO = ("trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2")
 # Callbacks for both processes, in a module that both can import.
 MODULE = '''
-import hashlib, json, os, signal
+import hashlib, json, os, signal, time
 from pathlib import Path
 import torch
 from lightning import Callback
-from devrf.callbacks import TrainingCurve
+from devrf.callbacks import TrainingCurve, periodic_checkpoint
 from devrf.errors import DevrfError
 
 
@@ -49,6 +51,18 @@ class Curve(TrainingCurve):
     def setup(self, trainer, pl_module, stage):
         super().setup(trainer, pl_module, stage)
         self.folder = self.folder / str(trainer.global_rank)
+
+
+class Stop(Callback):
+    """Interrupts the command in the second step, once."""
+
+    def on_train_start(self, trainer, stage):
+        periodic_checkpoint.AGREE_EVERY = 2
+
+    def on_train_batch_end(self, trainer, stage, outputs, batch, batch_idx):
+        if trainer.global_rank == 0 and batch_idx == 1:
+            os.kill(os.getppid(), signal.SIGINT)
+            time.sleep(2)
 
 
 class Trip(Callback):
@@ -94,27 +108,38 @@ def learning(tiny, often):
 
 
 @pytest.fixture(scope="module")
-def pair(devrf_in, learning, tmp_path_factory, modules):
-    """The folder of a run in two processes, left after 4 iterations, and how it went on."""
+def commands(warm_with, modules):
+    """Commands, in processes of their own that find the module."""
+    with warm_with(modules) as warm:
+        yield warm
+
+
+@pytest.fixture(scope="module")
+def pair(commands, learning, tmp_path_factory):
+    """The folder of a run in two processes, interrupted, and how it ended and went on."""
     folder = tmp_path_factory.mktemp("pair")
     arguments = (*learning(folder), "trainer.devices=2")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(modules))
-        first = devrf_in(folder, *arguments, "stage=canonical", "trainer.max_steps=4")
-        ended = "trainer.max_steps=4: learning has ended at iteration 4 of 6 of the canonical stage"
-        assert (first.status, first.err.count(ended)) == (2, 1), first.err
-        assert (folder / "run" / "checkpoints" / "canonical-progress-4.ckpt").is_file()
-        done = devrf_in(folder, *arguments)
-    return folder, done
+    stop = "+callbacks.stop._target_=witnesses.Stop"
+    interrupted = commands(folder, *arguments, "stage=canonical", stop)
+    assert (folder / "run" / "checkpoints" / "canonical-progress-3.ckpt").is_file(), interrupted.out
+    return folder, interrupted, commands(folder, *arguments)
+
+
+def test_an_interrupted_command_ends_its_processes(pair):
+    folder, interrupted, _ = pair
+    line = "devrf: interrupted at iteration 3 of 6 of the canonical stage; run the same command"
+    assert (interrupted.status, interrupted.out.count(line)) == (130, 2), interrupted.out
+    running = [process.info["cmdline"] or [] for process in psutil.process_iter(["cmdline"])]
+    assert not [words for words in running if str(folder) in " ".join(words)]
 
 
 def test_it_goes_on_ends_well_and_one_process_speaks(pair):
-    folder, done = pair
-    assert (done.status, done.err) == (0, "")
+    folder, _, done = pair
+    assert done.status == 0, done.out
     said = done.out.splitlines()
     assert len([line for line in said if line.startswith("canonical: seconds")]) == 1
-    assert len(said) == len(set(said))
-    assert "canonical: goes on at iteration 4" in done.out
+    assert len(said) == len(set(said)) and not any(line.startswith("devrf:") for line in said)
+    assert "canonical: goes on at iteration 3" in done.out
     left = {path.name for path in (folder / "run" / "checkpoints").glob("*.ckpt")}
     assert left == {"canonical.ckpt", "deformation.ckpt"}
 
@@ -139,14 +164,6 @@ def test_both_processes_come_to_the_same_by_rays_of_their_own(pair, capture):
     assert first["seed"] != second["seed"]
 
 
-def test_the_result_is_that_of_one_process_with_as_many_rays(pair, trained):
-    folders = (trained[0], pair[0] / "run")
-    one, two = (json.loads((folder / "metrics.json").read_text()) for folder in folders)
-    for stage in ("canonical", "deformation"):
-        assert two[stage]["iterations"] == one[stage]["iterations"]
-        assert two[stage]["psnr"] == pytest.approx(one[stage]["psnr"], abs=0.5)
-
-
 def test_one_process_records(pair):
     folder = pair[0] / "run"
     with (folder / "logs" / "pipeline" / "metrics.csv").open(newline="") as file:
@@ -155,6 +172,8 @@ def test_one_process_records(pair):
         steps = [row["step"] for row in rows if row[f"{capture}/loss"]]
         assert steps and len(steps) == len(set(steps))
     assert not [path for path in folder.rglob("*") if "partial" in path.name]
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert [metrics[stage]["iterations"] for stage in ("canonical", "deformation")] == [6, 12]
 
 
 @pytest.mark.parametrize(
@@ -164,23 +183,30 @@ def test_one_process_records(pair):
         ("killed", "trainer.devices: the process of rank 1 ended by SIGKILL; was"),
     ],
 )
-def test_a_failure_of_one_process_ends_both_with_its_line(
-    devrf, tiny, modules, monkeypatch, how, line
-):
-    monkeypatch.syspath_prepend(str(modules))
+def test_a_failure_of_one_process_ends_both_with_its_line(commands, tiny, tmp_path, how, line):
     arguments = (*(word for word in tiny if word != "trainer=cpu"), *TWO, "stage=canonical")
     trip = ("_target_=witnesses.Trip", f"how={how}")
-    outcome = devrf(*arguments, *(f"+callbacks.trip.{word}" for word in trip))
+    # A folder that is another whenever the command line is composed.
+    arguments += ("hydra.run.dir=${now:%f}", *(f"+callbacks.trip.{word}" for word in trip))
+    outcome = commands(tmp_path, *arguments)
+    assert outcome.status == 2 and "Traceback" not in outcome.out
+    lines = [said for said in outcome.out.splitlines() if said.startswith("devrf: ")]
+    (said,) = (said for said in lines if "interrupted" not in said)
+    assert said.startswith(f"devrf: {line}")
+
+
+def test_where_none_can_be_started_the_line_says_what_to_type(devrf, tmp_path):
+    outcome = devrf("-m", *TWO, "seed=0,1")
     assert outcome.status == 2 and outcome.err.count("\n") == 1
-    assert outcome.err.startswith(f"devrf: {line}")
-    assert not multiprocessing.active_children()
-    assert not {"LOCAL_RANK", "MASTER_PORT"} & set(os.environ)
-
-
-def test_a_fault_of_another_process_keeps_its_traceback():
-    said = "Traceback …\n  File witnesses.py\nZeroDivisionError: ours\n"
-    kept = workers._failure(ProcessRaisedException(said, 0, 1))
-    assert isinstance(kept, RuntimeError) and str(kept) == said
+    each = "type a command for each, as python -m devrf trainer=ddp seed=1"
+    assert outcome.err.startswith("devrf: trainer=ddp: ") and outcome.err.endswith(f"{each}\n")
+    assert not list(tmp_path.iterdir())
+    for nodes, line in ((1, each), (2, "several machines need torchrun")):
+        trainer = Trainer(
+            accelerator="cpu", devices=2, num_nodes=nodes, strategy=ManualDDP(), logger=False
+        )
+        with pytest.raises(DevrfError, match=line), connected(trainer.strategy, tmp_path):
+            pass
 
 
 def test_two_nodes_of_torchrun_learn_what_two_processes_of_one_command_learn(
@@ -220,7 +246,7 @@ def test_two_nodes_of_torchrun_learn_what_two_processes_of_one_command_learn(
     assert fields == fields[:1] * 4
 
 
-def test_tasks_of_slurm_without_a_common_folder_end_with_a_line_each(warm, tiny, tmp_path):
+def test_tasks_of_slurm_without_a_common_folder_end_with_a_line_each(commands, tiny, tmp_path):
     # What srun sets in the tasks of two nodes.
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -232,7 +258,7 @@ def test_tasks_of_slurm_without_a_common_folder_end_with_a_line_each(warm, tiny,
     command = (*(word for word in tiny if word != "trainer=cpu"), "trainer=ddp")
     command += ("trainer.accelerator=cpu", "trainer.devices=1", "trainer.num_nodes=2")
     folders = [tmp_path / "first", tmp_path / "second"]
-    ended = warm.together(folders, *command, "hydra.run.dir=run", environment=tasks)
+    ended = commands.together(folders, *command, "hydra.run.dir=run", environment=tasks)
     for folder, outcome in zip(folders, ended, strict=True):
         assert outcome.status == 2 and outcome.err.count("\n") == 1
         assert outcome.err.startswith(f"devrf: {folder / 'run'}: not there on every node; give")
