@@ -12,7 +12,7 @@ import torch
 
 from devrf.apps import forecast
 from devrf.apps.forecast import Forecast, needed_bytes
-from devrf.engine.needs import StageNeeds, tensor_bytes
+from devrf.engine.needs import SIZE, StageNeeds, tensor_bytes
 from devrf.scenes import image_folders
 from devrf.scenes.scene import Scene
 
@@ -23,30 +23,30 @@ NEEDS = re.compile(
 
 
 def test_what_is_needed_by_hand(tiny_scene: Scene) -> None:
-    parts = {"images": 50, "grid": 100, "schedule.rays": 800}
+    parts = {SIZE: 50, "grid": 100, "schedule.rays": 800}
     stage = StageNeeds(parts, {"grid": 40}).with_batches(0.5)
     assert stage.parts == {**parts, "schedule.rays": 400}
     moving = tiny_scene.dynamic.train
     assert moving.flow is not None
     assert tensor_bytes(moving.flow) == (2 * 4 + 1) * len(moving) * 24 * 18
     captures = tensor_bytes(tiny_scene.captures.values())
-    on_gpu = needed_bytes(tiny_scene, [stage], "images", 2, on_gpu=True)
-    host = {"grid": 80, "images": captures, "": forecast.PROGRAM}
+    on_gpu = needed_bytes(tiny_scene, [stage], 2, on_gpu=True)
+    host = {"grid": 80, SIZE: captures, "": forecast.PROGRAM}
     assert on_gpu == {"GPU memory": stage.parts, "host memory": host, "disk": {"grid": 400}}
-    on_host = needed_bytes(tiny_scene, [stage], "images", 2, on_gpu=False)["host memory"]
+    on_host = needed_bytes(tiny_scene, [stage], 2, on_gpu=False)["host memory"]
     assert sum(on_host.values()) == 2 * (forecast.PROGRAM + captures + 1.3 * 550)
 
 
 def test_a_shortage_names_its_largest_key_and_the_size_that_suffices() -> None:
     """100 bytes of images made smaller by 2, and 64 of a grid."""
-    needed = {"host memory": {"": 10.0, "side": 64.0, forecast.SIZE: 100.0}, "disk": {"side": 9.0}}
+    needed = {"host memory": {"": 10.0, "side": 64.0, SIZE: 100.0}, "disk": {"side": 9.0}}
 
     def of(memory: float, disk: float = 9.0) -> Forecast:
         return Forecast(needed, {"host memory": memory, "disk": disk})
 
     assert of(174).shortage() is None and of(174, 8).shortage() == "disk"
     assert of(173).shortage() == "host memory"
-    assert of(173).key("host memory") == forecast.SIZE and of(173, 8).key("disk") == "side"
+    assert of(173).key("host memory") == SIZE and of(173, 8).key("disk") == "side"
     # By 3 images take 44.4 bytes, by 16, the most, 1.6.
     assert of(119).downscale(2) == 3 and of(118).downscale(2) == 4
     assert of(76).downscale(2) == 15 and of(75).downscale(2) is None

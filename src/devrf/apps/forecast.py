@@ -9,13 +9,11 @@ from pathlib import Path
 import torch
 from rich.filesize import decimal
 
-from devrf.engine.needs import StageNeeds, tensor_bytes
+from devrf.engine.needs import SIZE, StageNeeds, tensor_bytes
 from devrf.scenes.scene import Scene
 from devrf.system.files import free_disk
 from devrf.system.memory import free_host_memory, free_memory, gib, own_memory
 
-# The key by which images are made smaller.
-SIZE = "data.downscale"
 # A checkpoint, and three progress files at once, each with values and Adam's two means.
 FILES = 10
 # Python and its libraries on the host; measured, as is the freed memory that the C library keeps.
@@ -74,13 +72,10 @@ def free_bytes(device: torch.device, folder: Path, *, resume: bool) -> dict[str,
 
 
 def needed_bytes(
-    scene: Scene, stages: Sequence[StageNeeds], images: str, processes: int, *, on_gpu: bool
+    scene: Scene, stages: Sequence[StageNeeds], processes: int, *, on_gpu: bool
 ) -> dict[str, Parts]:
-    """Needs of stages by resource; ``processes`` train on the host, unless on GPUs.
-
-    ``images`` is the config key of their size or number.
-    """
-    host = _host(scene, stages, images, trains=not on_gpu)
+    """Needs of stages by resource; ``processes`` train on the host, unless on GPUs."""
+    host = _host(scene, stages, trains=not on_gpu)
     return {
         "GPU memory": max((stage.parts for stage in stages), key=_total),
         "host memory": _times(1 if on_gpu else processes, host),
@@ -88,26 +83,24 @@ def needed_bytes(
     }
 
 
-def needs_table(
-    scene: Scene, stages: Mapping[str, StageNeeds], images: str
-) -> list[tuple[str, str]]:
+def needs_table(scene: Scene, stages: Mapping[str, StageNeeds]) -> list[tuple[str, str]]:
     """Needs of ``stages``, for people: names and amounts."""
     needs = [*stages.values()]
     rows = [
         *((f"GPU, {name} stage", stage.parts) for name, stage in stages.items()),
-        ("host, beside a GPU", _host(scene, needs, images, trains=False)),
-        ("host, without a GPU", _host(scene, needs, images, trains=True)),
+        ("host, beside a GPU", _host(scene, needs, trains=False)),
+        ("host, without a GPU", _host(scene, needs, trains=True)),
         ("checkpoint", max((stage.learned for stage in needs), key=_total)),
     ]
     return [(name, decimal(round(_total(parts)))) for name, parts in rows]
 
 
-def _host(scene: Scene, stages: Sequence[StageNeeds], images: str, *, trains: bool) -> Parts:
+def _host(scene: Scene, stages: Sequence[StageNeeds], *, trains: bool) -> Parts:
     """Needs of the host, which ``trains`` the stages or holds a GPU's results."""
     held = [_times(FRAGMENTATION, s.parts) if trains else _times(2, s.learned) for s in stages]
     parts = max(held, key=_total)
     captures = tensor_bytes(scene.captures.values())
-    return {**parts, images: parts.get(images, 0.0) + captures, "": PROGRAM}
+    return {**parts, SIZE: parts.get(SIZE, 0.0) + captures, "": PROGRAM}
 
 
 def _times(factor: float, parts: Parts) -> Parts:

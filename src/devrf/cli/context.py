@@ -17,7 +17,6 @@ from lightning.pytorch.strategies import Strategy
 from omegaconf import DictConfig, OmegaConf
 
 import devrf
-from devrf.apps.forecast import SIZE
 from devrf.apps.records import git_revision
 from devrf.apps.rehearsal import LONGEST, RehearsedStage, for_rehearsal
 from devrf.checkpoints.checkpoint import (
@@ -33,6 +32,7 @@ from devrf.cli.config import PIPELINE, choices, overrides, scene_name, stage_sec
 from devrf.cli.restore_config import present_command
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.ddp import check_strategy
+from devrf.engine.needs import SIZE
 from devrf.engine.plan import StagePlan
 from devrf.engine.protocol import Protocol
 from devrf.engine.stage import Stage

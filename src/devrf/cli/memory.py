@@ -8,12 +8,12 @@ from collections.abc import Sequence
 import torch
 from omegaconf import OmegaConf
 
-from devrf.apps.forecast import SIZE, Forecast, free_bytes, needed_bytes, needs_table
+from devrf.apps.forecast import Forecast, free_bytes, needed_bytes, needs_table
 from devrf.apps.inspection.advice import Advice
 from devrf.callbacks.time_budget import BATCHES, LEAST_BATCH
 from devrf.cli.context import RunContext
 from devrf.cli.messages import as_own_errors
-from devrf.engine.needs import StageNeeds
+from devrf.engine.needs import SIZE, StageNeeds
 from devrf.scenes.scene import Scene
 
 log = logging.getLogger(__name__)
@@ -26,7 +26,7 @@ def table_of_needs(run: RunContext, scene: Scene) -> list[tuple[str, str]]:
     """What the run's stages need of a scene, for people: names and amounts."""
     # A scene at rest that the protocol has no stage for can be looked at all the same.
     names = run.stages_with_images or run.learning_stages
-    return needs_table(scene, _needs(run, scene, names), _images(run))
+    return needs_table(scene, _needs(run, scene, names))
 
 
 def forecast(run: RunContext, names: Sequence[str]) -> tuple[str, Advice | None]:
@@ -44,7 +44,7 @@ def forecast(run: RunContext, names: Sequence[str]) -> tuple[str, Advice | None]
 
     def with_batches(share: float) -> Forecast:
         needs = [stage.with_batches(share) for stage in stages]
-        return Forecast(needed_bytes(scene, needs, _images(run), processes, on_gpu=on_gpu), free)
+        return Forecast(needed_bytes(scene, needs, processes, on_gpu=on_gpu), free)
 
     budget = run.config.schedule.seconds is not None
     largest = OmegaConf.select(run.config, LARGEST_BATCH) if budget else 1.0
@@ -70,12 +70,9 @@ def forecast(run: RunContext, names: Sequence[str]) -> tuple[str, Advice | None]
         return forecast(run, names)
     key = least.key(lacking)
     change = "raise it (auto: as far as is needed)" if key == SIZE else "lower it"
+    if key == SIZE and "downscale" not in run.config.data:
+        key, change = "data.frames", "lower it"
     return line, Advice(key, problem, f"{change}, or free some {lacking}")
-
-
-def _images(run: RunContext) -> str:
-    """The key of the images' size, or of their number."""
-    return SIZE if "downscale" in run.config.data else "data.frames"
 
 
 def _needs(run: RunContext, scene: Scene, names: Sequence[str]) -> dict[str, StageNeeds]:
@@ -87,5 +84,5 @@ def _needs(run: RunContext, scene: Scene, names: Sequence[str]) -> dict[str, Sta
     for name in names:
         below = run.protocol[name].builds_on
         rest = None if below is None else plans[below]
-        needs[name] = plans[name].needs(scene, _images(run), processes, rest)
+        needs[name] = plans[name].needs(scene, rest).with_batches(1 / processes)
     return needs

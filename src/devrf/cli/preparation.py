@@ -12,7 +12,6 @@ from hydra.utils import instantiate
 
 from devrf.apps.capture.pipeline import scene_from_footage
 from devrf.apps.fetch import FetchSettings, fetched, published_scene
-from devrf.apps.forecast import SIZE
 from devrf.apps.inspection.advice import Advice, image_sets
 from devrf.apps.inspection.report import inspection_text, show
 from devrf.apps.settings import CaptureSettings
@@ -23,6 +22,7 @@ from devrf.cli.context import RunContext
 from devrf.cli.memory import forecast, table_of_needs
 from devrf.cli.restore_config import log_applied_defaults
 from devrf.engine.ddp import ManualDDP
+from devrf.engine.needs import SIZE
 from devrf.errors import DevrfError
 from devrf.scenes.export import export
 from devrf.system.files import write_json

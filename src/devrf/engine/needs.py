@@ -12,6 +12,8 @@ from dataclasses import dataclass, fields, is_dataclass
 
 from torch import Tensor
 
+# The key by which images are made smaller.
+SIZE = "data.downscale"
 # Values, gradients, Adam's two means, and the copy that a rollback returns to.
 LEARNED = 5
 

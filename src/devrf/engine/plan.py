@@ -7,7 +7,7 @@ from typing import Any, Self
 
 from warp import Kernel
 
-from devrf.engine.needs import StageNeeds, tensor_bytes
+from devrf.engine.needs import SIZE, StageNeeds, tensor_bytes
 from devrf.engine.protocol import Protocol
 from devrf.errors import expect
 from devrf.scenes.scene import Scene
@@ -64,18 +64,14 @@ class StagePlan:
         total: int = self.settings["schedule"].total
         return total
 
-    def needs(
-        self, scene: Scene, images: str, processes: int, rest: StagePlan | None
-    ) -> StageNeeds:
+    def needs(self, scene: Scene, rest: StagePlan | None) -> StageNeeds:
         """Memory that the stage needs; if it does not say, that of the images.
 
         Args:
             scene: the scene that is learned.
-            images: the config key that changes the images' size.
-            processes: the number of processes that share a batch.
             rest: the plan of the stage that it builds on, if any.
         """
-        return StageNeeds({images: tensor_bytes(scene.captures.values())}, {images: 0})
+        return StageNeeds({SIZE: tensor_bytes(scene.captures.values())}, {SIZE: 0})
 
     def rehearsed(self) -> StagePlan:
         """The plan made to fit into seconds on a CPU.

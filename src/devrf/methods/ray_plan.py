@@ -8,7 +8,7 @@ from typing import Any
 
 from warp import Kernel
 
-from devrf.engine.needs import LEARNED, StageNeeds, tensor_bytes
+from devrf.engine.needs import LEARNED, SIZE, StageNeeds, tensor_bytes
 from devrf.engine.plan import StagePlan
 from devrf.engine.protocol import ProtocolStage
 from devrf.kernels.ahead import grid_kernels
@@ -57,16 +57,14 @@ class RayPlan(StagePlan):
         schedule: RaySchedule = self.settings["schedule"]
         return self.step.share_of(schedule.iterations)
 
-    def needs(
-        self, scene: Scene, images: str, processes: int, rest: StagePlan | None
-    ) -> StageNeeds:
+    def needs(self, scene: Scene, rest: StagePlan | None) -> StageNeeds:
         """Images, the whole of the model, and a batch."""
         schedule: RaySchedule = self.settings["schedule"]
-        rays = max(schedule.rays, schedule.rays_without_hull or 0) / processes
+        rays = max(schedule.rays, schedule.rays_without_hull or 0)
         learned = tensor_bytes(self.model.parameters())
         width = "ray_stage.model.settings.width"
         parts = {
-            images: float(tensor_bytes(scene.captures.values())),
+            SIZE: float(tensor_bytes(scene.captures.values())),
             width: LEARNED * learned,
             # Three values are kept for each output of each layer, for 128 samples of a ray.
             "ray_stage.schedule.rays": rays * 128 * 12 * self.model.sample_outputs,

@@ -11,7 +11,7 @@ from typing import Any
 
 from warp import Kernel
 
-from devrf.engine.needs import LEARNED, StageNeeds, tensor_bytes
+from devrf.engine.needs import LEARNED, SIZE, StageNeeds, tensor_bytes
 from devrf.engine.plan import StagePlan
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.kernels.ahead import grid_kernels, march_kernels
@@ -52,15 +52,13 @@ class CanonicalPlan(StagePlan):
         schedule: CanonicalSchedule = self.settings["schedule"]
         return schedule.in_space(scene.space).total
 
-    def needs(
-        self, scene: Scene, images: str, processes: int, rest: StagePlan | None
-    ) -> StageNeeds:
+    def needs(self, scene: Scene, rest: StagePlan | None) -> StageNeeds:
         """Images, grids and a batch."""
         grid, values, ray = _field(self.settings, scene)
         parts = {
-            images: tensor_bytes(scene.static.train),
+            SIZE: tensor_bytes(scene.static.train),
             grid: LEARNED * values,
-            "schedule.canonical.rays": self.rays * ray / processes,
+            "schedule.canonical.rays": self.rays * ray,
         }
         return StageNeeds(parts, {grid: values})
 
@@ -100,9 +98,7 @@ class DeformationPlan(StagePlan):
         schedule: DeformationSchedule = self.settings["schedule"]
         return schedule.total(len(scene.clock))
 
-    def needs(
-        self, scene: Scene, images: str, processes: int, rest: StagePlan | None
-    ) -> StageNeeds:
+    def needs(self, scene: Scene, rest: StagePlan | None) -> StageNeeds:
         """Images, the frozen field, the motion grids, and a batch."""
         assert rest is not None, "it builds on the canonical stage"
         schedule: DeformationSchedule = self.settings["schedule"]
@@ -112,10 +108,10 @@ class DeformationPlan(StagePlan):
         on_device = 1 if self.settings["motion"].store == "host" else frames
         side = f"schedule.deformation.levels.{len(schedule.levels)}.side"
         parts = {
-            images: tensor_bytes(scene.dynamic.train),
+            SIZE: tensor_bytes(scene.dynamic.train),
             grid: values,
             side: frame * (on_device + LEARNED),
-            "schedule.deformation.rays": self.rays * COLOURED * ray / processes,
+            "schedule.deformation.rays": self.rays * COLOURED * ray,
         }
         return StageNeeds(parts, {grid: values, side: frames * frame})
 
