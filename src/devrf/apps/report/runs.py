@@ -33,33 +33,24 @@ LARGEST = 1e9
 _Name = Annotated[str, Len(1, LONGEST_NAME)]
 _Text = Annotated[str, Len(0, LONGEST)]
 _Plain = _Text | bool | int | float | Annotated[list[Any], Len(0, LONGEST)] | None
-# Columns of every run, and their kinds; further columns are entries of its file, by dotted name.
-COLUMNS: dict[str, Any] = {
-    "folder": _Plain,
-    "status": _Plain,
-    "scene": _Name,
-    "method": _Name,
-    "protocol": _Name,
-    "at_rest": bool,
+# Columns of every run; further columns are entries of its file, by dotted name.
+COLUMNS = (
+    *("folder", "status", "scene", "method", "protocol", "at_rest", "error", "mistake"),
+    *("train_seconds", "peak_gpu_gb", "dynamic.psnr", "dynamic.ssim", "dynamic.lpips"),
+    *("run.device", "run.overrides", "run.seed", "run.checkpoint", "run.date", "path"),
+)
+# Kinds of values that a report builds on; the last ones are mappings, and no values.
+KINDS: dict[str, Any] = {
+    **dict.fromkeys(("scene", "method", "protocol"), _Name),
+    **dict.fromkeys(("at_rest", "mistake"), bool),
     "error": _Text,
-    "mistake": bool,
-    "train_seconds": _Plain,
-    "peak_gpu_gb": _Plain,
     "dynamic.psnr": int | float | None,
-    "dynamic.ssim": _Plain,
-    "dynamic.lpips": _Plain,
-    "run.device": _Text | None,
     "run.overrides": list[_Text] | None,
-    "run.seed": _Plain,
-    "run.checkpoint": _Text | None,
-    "run.date": _Text | None,
-    "path": _Plain,
+    "run.image_size": Annotated[list[int], Len(2, 2)] | None,
+    **dict.fromkeys(("run.device", "run.checkpoint", "run.date", "run.git"), _Text | None),
+    **dict.fromkeys(("run.devrf", "run.fingerprint", "run.lpips_network"), _Text | None),
+    **dict.fromkeys(("static", "dynamic", "run", "choices"), dict),
 }
-# Kinds of further values that are used; the last ones are mappings, and no values.
-OTHERS = ("run.git", "run.devrf", "run.fingerprint", "run.lpips_network")
-KINDS = COLUMNS | dict.fromkeys(OTHERS, _Text | None)
-KINDS |= {"run.image_size": Annotated[list[int], Len(2, 2)] | None}
-KINDS |= dict.fromkeys(("static", "dynamic", "run", "choices"), dict)
 # The longest first line of a table: pandas would take hours for many columns of one name.
 HEADER = re.compile(rb'[^"\r\n]{1,1000}\r?\n')
 DEFAULT_METHOD = "devrf"
