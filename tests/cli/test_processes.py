@@ -15,7 +15,7 @@ import pytest
 from lightning import Trainer
 
 import devrf as package
-from devrf.cli.processes import connected
+from devrf.cli.processes import run_in_each, starts_processes
 from devrf.engine.ddp import ManualDDP
 from devrf.errors import DevrfError
 
@@ -195,18 +195,22 @@ def test_a_failure_of_one_process_ends_both_with_its_line(commands, tiny, tmp_pa
     assert said.startswith(f"devrf: {line}")
 
 
-def test_where_none_can_be_started_the_line_says_what_to_type(devrf, tmp_path):
-    outcome = devrf("-m", *TWO, "seed=0,1")
-    assert outcome.status == 2 and outcome.err.count("\n") == 1
-    each = "type a command for each, as python -m devrf trainer=ddp seed=1"
-    assert outcome.err.startswith("devrf: trainer=ddp: ") and outcome.err.endswith(f"{each}\n")
-    assert not list(tmp_path.iterdir())
-    for nodes, line in ((1, each), (2, "several machines need torchrun")):
+def test_a_sweeps_job_learns_in_processes_of_its_own(commands, learning, tmp_path):
+    arguments = (*learning(tmp_path), "trainer.devices=2", "stage=canonical", "seed=5")
+    outcome = commands(tmp_path, "-m", *arguments, "hydra.sweep.dir=sweep")
+    assert outcome.status == 0, outcome.out
+    assert (tmp_path / "sweep" / "0_robot" / "checkpoints" / "canonical.ckpt").is_file()
+    assert len([*tmp_path.glob("static-*.json")]) == 2
+
+
+def test_where_none_can_be_started_a_line_says_so(tmp_path):
+    for nodes, line in ((1, "needs the command line"), (2, "several machines need torchrun")):
         trainer = Trainer(
             accelerator="cpu", devices=2, num_nodes=nodes, strategy=ManualDDP(), logger=False
         )
-        with pytest.raises(DevrfError, match=line), connected(trainer.strategy, tmp_path):
-            pass
+        assert starts_processes(trainer.strategy)
+        with pytest.raises(DevrfError, match=line):
+            run_in_each(trainer.strategy, tmp_path)
 
 
 def test_two_nodes_of_torchrun_learn_what_two_processes_of_one_command_learn(

@@ -10,9 +10,9 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NoReturn
 
 import torch
+from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.strategies import Strategy
 from torch import distributed
@@ -22,7 +22,6 @@ from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
 
 from devrf.cli.config import in_sweep
 from devrf.cli.messages import FULL_ERRORS, is_user_error
-from devrf.cli.run_folder import ONE_COMMAND_EACH
 from devrf.engine.ddp import ManualDDP
 from devrf.errors import DevrfError
 from devrf.system.folder_lock import release_folder
@@ -33,32 +32,24 @@ GRACE = 10.0
 
 
 @contextmanager
-def connected(strategy: Strategy, folder: Path) -> Iterator[None]:
-    """Within the block the processes are connected, if the trainer asks for several.
-
-    Where no launcher has started any, this one starts all, and ends with them instead.
+def connected(strategy: Strategy) -> Iterator[None]:
+    """Within the block the processes that a launcher has started are connected, if there are any.
 
     Raises:
-        DevrfError: they are others than the trainer asks for, or they cannot be started.
-        SystemExit: this process has started all, and they have ended.
+        DevrfError: they are others than the trainer asks for.
     """
     if not isinstance(strategy, ManualDDP):
         yield
         return
     environment = strategy.cluster_environment
     assert environment is not None
-    if not environment.creates_processes_externally:
-        if strategy.num_nodes > 1:
-            raise DevrfError("trainer.num_nodes: several machines need torchrun, or SLURM's srun")
-        if not HydraConfig.initialized() or in_sweep():
-            raise DevrfError(ONE_COMMAND_EACH)
-        _run_in_each(strategy.num_processes, folder)
     try:
         environment.validate_settings(strategy.num_processes, strategy.num_nodes)
     except (RuntimeError, ValueError) as error:
         raise DevrfError(f"trainer.devices: {error}") from None
     if not strategy.is_global_zero:
-        _log_nothing()
+        logging.disable(logging.CRITICAL)  # rank 0 logs the same
+        warnings.simplefilter("ignore")
     strategy.setup_environment()
     try:
         yield
@@ -70,30 +61,59 @@ def connected(strategy: Strategy, folder: Path) -> Iterator[None]:
     distributed.destroy_process_group()
 
 
-def _run_in_each(count: int, folder: Path) -> NoReturn:
-    """Run this command line in ``count`` processes of torchrun's; end with the first failure."""
-    words = sys.argv[1:]
-    if any(word.startswith("hydra.run.dir=") for word in words):  # with ${now:}, each has its own
-        words.append(f"hydra.run.dir={literal(str(folder))}")
-    _log_nothing()
-    release_folder(folder)
+def starts_processes(strategy: Strategy) -> bool:
+    """Whether several processes are to learn, and no launcher has started them."""
+    if not isinstance(strategy, ManualDDP):
+        return False
+    environment = strategy.cluster_environment
+    return environment is None or not environment.creates_processes_externally
+
+
+def run_in_each(strategy: Strategy, folder: Path) -> None:
+    """Run the present job in processes of torchrun's, each from the command line on.
+
+    Raises:
+        DevrfError: they cannot be started, one was killed, or those of a sweep's job have failed.
+        SystemExit: they have failed, or a signal has ended them.
+    """
+    assert isinstance(strategy, ManualDDP)
+    if strategy.num_nodes > 1:
+        raise DevrfError("trainer.num_nodes: several machines need torchrun, or SLURM's srun")
+    if not HydraConfig.initialized():
+        raise DevrfError("trainer=ddp: needs the command line, python -m devrf trainer=ddp")
+    count = strategy.num_processes
     os.environ["HYDRA_FULL_ERROR"] = str(int(FULL_ERRORS))
     os.environ.setdefault("OMP_NUM_THREADS", str(max(torch.get_num_threads() // count, 1)))
-    started = ("--standalone", f"--nproc-per-node={count}", "-m", "devrf", *words)
+    release_folder(folder)
+    logging.disable(logging.CRITICAL)  # rank 0 logs the same
+    started = ("--standalone", f"--nproc-per-node={count}", "-m", "devrf", *_words(folder))
     try:
         torchrun.run(torchrun.parse_args(started))  # type: ignore[no-untyped-call]
     except SignalException as stop:
         sys.exit(128 + stop.sigval)
     except ChildFailedError as error:
         rank, failure = error.get_first_failure()
+        if failure.exitcode >= 0 and not in_sweep():
+            sys.exit(failure.exitcode)
+        ended = f"ended with status {failure.exitcode}, and says why"
         if failure.exitcode < 0:
-            ended = f"the process of rank {rank} ended by {failure.signal_name()}"
-            raise DevrfError(f"trainer.devices: {ended}; was memory short?") from None
-        sys.exit(failure.exitcode)
-    sys.exit()
+            ended = f"ended by {failure.signal_name()}; was memory short?"
+        raise DevrfError(f"trainer.devices: the process of rank {rank} {ended}") from None
+    finally:
+        logging.disable(logging.NOTSET)
 
 
-def _log_nothing() -> None:
-    """Log nothing more in this process: rank 0 logs the same."""
-    logging.disable(logging.CRITICAL)
-    warnings.simplefilter("ignore")
+def _words(folder: Path) -> list[str]:
+    """The command line of the present job alone, in its folder."""
+    words = sys.argv[1:]
+    if in_sweep():
+        options, _ = get_args_parser().parse_known_intermixed_args(words)
+        jobs_own = HydraConfig.get().overrides
+        found = [word for word in jobs_own.hydra if word.startswith("hydra.searchpath=")]
+        flags = {*words} - {*options.overrides, "-m", "--multirun"}
+        words = [word for word in words if word in flags]
+        words += [*found, *jobs_own.task, "hydra.mode=RUN"]
+    elif not any(word.startswith("hydra.run.dir=") for word in words):
+        return words
+    # With ${now:} each process would have another folder.
+    return [*words, f"hydra.run.dir={literal(str(folder))}"]

@@ -23,7 +23,7 @@ from devrf.cli.context import RunContext
 from devrf.cli.evaluate import evaluate
 from devrf.cli.memory import forecast
 from devrf.cli.preparation import capture, fetch, inspect, prepare, report, say_next, selfcheck
-from devrf.cli.processes import connected
+from devrf.cli.processes import connected, run_in_each, starts_processes
 from devrf.cli.rehearse import begin_anew, conclude
 from devrf.cli.render import export, render, still, view, write_scene_page
 from devrf.cli.resume import done, note_done, unfinished
@@ -107,8 +107,11 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
             steps = REHEARSED_STEPS
         with shortage_in_words(config.stage, run.device, None):  # of networks that are too wide
             _check(run, learning, steps)
+        if learning and starts_processes(run.strategy):
+            run_in_each(run.strategy, folder)
+            return _objective(run, ()) if in_sweep() and "evaluate" in steps else None
         if learning:
-            with connected(run.strategy, folder):
+            with connected(run.strategy):
                 _learn(run, learning, steps)
         for name in steps if run.is_rank_zero or not learning else ():
             if not (learning and done(run, name)):

@@ -37,10 +37,6 @@ BEGUN = (".", "checkpoints", "images", "videos", "logs/*", "export", "export/*",
 FAILURE = "failure.json"
 # Stages that leave .hydra alone: they look at other runs, or are none.
 UNRECORDED = ("report", "fetch", "view")
-ONE_COMMAND_EACH = (
-    "trainer=ddp: learns one run, without -m; type a command for each, as "
-    "python -m devrf trainer=ddp seed=1"
-)
 # Environment variables in which torchrun and SLURM number the processes that they start.
 RANKS = ("RANK", "SLURM_PROCID")
 
@@ -76,14 +72,11 @@ class FolderLock(Callback):
                 lock_folder(folder, "hydra.run.dir")
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Lock the folder of a sweep; each job locks its own. Refuse what cannot start."""
+        """Lock the folder of a sweep; each job locks its own. Refuse SLURM where there is none."""
         folder = Path(config.hydra.sweep.dir)
         with report_user_errors():
             missing = [name for name in ("srun", "sbatch") if shutil.which(name) is None]
-            by_slurm = config.hydra.launcher._target_.endswith(".SlurmLauncher")
-            if config.trainer.get("strategy") and not by_slurm:  # whose tasks are the processes
-                raise DevrfError(ONE_COMMAND_EACH)
-            if by_slurm and missing:
+            if config.hydra.launcher._target_.endswith(".SlurmLauncher") and missing:
                 raise DevrfError(
                     f"hydra/launcher: no {' and no '.join(missing)} here; type the command where "
                     "SLURM takes jobs, or leave hydra/launcher out"
