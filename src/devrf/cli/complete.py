@@ -76,7 +76,7 @@ def completed(arguments: Sequence[str]) -> list[str]:
         if override.key_or_group == "debug":
             raise DevrfError(
                 f"{override.input_line}: no such group; rehearse=true takes every step in minutes, "
-                "trainer.fast_dev_run=true a step of each stage"
+                "+trainer.fast_dev_run=true a step of each stage"
             )
     run = value(typed, "hydra.run.dir")
     if run is not None and serves_page(typed, Path(run)):

@@ -79,9 +79,11 @@ def one_line(error: BaseException) -> str:
         pass
     elif isinstance(error, MissingConfigException) and "/" in str(error.missing_cfg_file):
         group, _, option = str(error.missing_cfg_file).rpartition("/")
-        options = error.options or group_choices().get(group, ())  # of a list Hydra gives none
+        of_hydra = group.startswith("hydra/")
+        # Hydra gives none for a list of options.
+        options = error.options or ([] if of_hydra else group_choices().get(group, []))
         names = f"; choose one of {', '.join(options)}" if options else ""
-        more = '; others need pip install "devrf[sweeps]"' if group.startswith("hydra/") else ""
+        more = '; others need pip install "devrf[sweeps]"' if of_hydra else ""
         meant = did_you_mean(option, options, f"{group}=")
         text = f"{group}={option}: no such option{names}{more}{meant}"
     elif isinstance(error, OverrideParseException):
