@@ -45,7 +45,7 @@ FACING = (
     "data.supersample=1",
 )
 SHORT = (
-    "field=small_inward",
+    "field.planes=null",
     "field.width=16",
     "schedule.canonical.iterations=6",
     "schedule.canonical.side=16",

@@ -47,7 +47,7 @@ MISTAKES = {
     ),
     "appended unknown root key": (["+sede=3"], "sede: no such key; did you mean seed?"),
     "forward-facing field of an inward-facing scene": (
-        ["field=small_forward", "stage=canonical"],
+        ["field.planes=48", "stage=canonical"],
         "field.planes=48: planes are of forward-facing scenes, and this scene is not",
     ),
     "missing root": (["data=inward"], "data.root: required; give data.root=PATH"),
@@ -174,7 +174,7 @@ def test_results_of_an_earlier_run_survive_a_mistake(devrf, tmp_path, tiny, trai
     checkpoint.parent.mkdir(parents=True)
     shutil.copy(trained[0] / "checkpoints" / "canonical.ckpt", checkpoint)
     before = checkpoint.read_bytes()
-    anew = ("stage=canonical", "resume=false", "field=small_forward")
+    anew = ("stage=canonical", "resume=false", "field.planes=48")
     assert devrf(*tiny, "hydra.run.dir=run", *anew).status == 2
     assert checkpoint.read_bytes() == before
 

@@ -117,7 +117,7 @@ def test_a_motion_learned_on_a_checkpoint_knows_the_whole_of_it(devrf, run, tmp_
     assert devrf(*again).status == 0
     learned = read_checkpoint_file(tmp_path / "other" / "checkpoints" / "deformation.ckpt")
     first = read_checkpoint_file(base)["devrf"]
-    assert first["command"]["/field"] == "small_inward" and first["command"]["data.width"] == 24
+    assert first["command"]["field.width"] == 16 and first["command"]["data.width"] == 24
     assert learned["devrf"]["command"] == {**first["command"], "seed": 3}
 
 
@@ -144,12 +144,12 @@ def test_what_a_checkpoint_keeps_of_a_command_is_plain(devrf, tiny, tmp_path, mo
 
 def test_checkpoints_of_a_sweep_share_what_they_have_in_common(learned_by, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    one = learned_by({"field": "small_inward"}, {"data.frames": 5, "seed": 5})
-    other = learned_by({"field": "small_inward"}, {"data.frames": 5, "seed": 4}, name="other.ckpt")
+    one = learned_by({"facing": "forward"}, {"data.frames": 5, "seed": 5})
+    other = learned_by({"facing": "forward"}, {"data.frames": 5, "seed": 4}, name="other.ckpt")
     found = composed(["-m", "stage=still", f"ckpt='{one},{other}'"])
     assert found.hydra.sweeper.params is None
     words = completed(["-m", "stage=still", f"ckpt={one},{other}"])
-    assert words[:2] == ["-m", "field=small_inward"]
+    assert words[:2] == ["-m", "facing=forward"]
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         found = compose("config", [word for word in words[1:] if "ckpt=" not in word])
     assert (found.data.frames, found.seed) == (5, 0)

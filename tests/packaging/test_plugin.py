@@ -66,12 +66,13 @@ def test_groups_of_the_same_names_are_another_programs_own(tmp_path: Path) -> No
 
 
 def test_a_program_that_names_the_folder_has_devrfs_groups(tmp_path: Path) -> None:
-    app = "defaults:\n  - _self_\n  - data@scene: inward\n  - schedule: paper_inward\n"
-    app += f"  - loss: best_inward\n  - local: mine\n{RUN}\n"
+    app = "defaults:\n  - _self_\n  - data@scene: inward\n  - schedule@devrf: best_inward\n"
+    app += f"  - local: mine\n{RUN}\n"
     app = app.replace("run: {", f'searchpath: ["file://{config_folder()}"], run: {{')
     files = {"app.yaml": app, "local/mine.yaml": "name: theirs\n"}
     config = run(tmp_path, files, "scene.root=/scenes/suzanne")
     assert config["scene"]["_target_"] == "devrf.data.recorded.InwardFacingDataModule"
-    assert config["schedule"]["canonical"]["side"] == 160
-    assert config["loss"]["deformation"]["elastic"] == 0.05
+    assert config["devrf"]["schedule"]["canonical"]["search_side"] == 48
+    assert config["devrf"]["loss"]["deformation"]["elastic"] == 0.05
+    assert {*config} == {"scene", "devrf", "local"}
     assert config["local"] == {"name": "theirs"}

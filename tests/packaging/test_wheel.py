@@ -112,7 +112,7 @@ def test_an_installed_devrf_learns_a_scene_from_any_folder(environment, tmp_path
 
 def test_another_program_names_the_installed_groups(environment, tmp_path):
     (tmp_path / "app.yaml").write_text(
-        "defaults: [_self_, loss: best_inward]\nhydra: {searchpath: ['pkg://devrf.conf']}\n"
+        "defaults: [_self_, schedule: best_inward]\nhydra: {searchpath: ['pkg://devrf.conf']}\n"
     )
     script = (
         "from hydra import compose, initialize_config_dir as folder\n"

@@ -112,7 +112,7 @@ def fitted_to(
         if planes is not None:
             raise DevrfError(
                 f"field.planes={planes}: planes are of forward-facing scenes, and this scene is "
-                "not: give field=inward or field=small_inward"
+                "not: give facing=inward, or field.planes=null"
             )
         schedule = schedule.in_space(space)
         return schedule, architecture.in_space(space, schedule.side)
