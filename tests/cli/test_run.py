@@ -71,7 +71,7 @@ def test_a_run_says_how_it_came_about(trained):
     ran = found["run"]
     assert set(ran["execution"]) == {"canonical", "deformation"}
     assert ran["parameters"] > 1000 and ran["device"] and ran["torch"]
-    assert ran["choices"]["data"] == "procedural" and ran["choices"]["ablation"] == "full"
+    assert ran["choices"]["data"] == "procedural" and ran["choices"]["ablation"] is None
     assert ran["choices"]["experiment"] is None and "hydra/launcher" not in ran["choices"]
     assert "data.frames=3" in ran["overrides"]
     assert (ran["seed"], ran["train_views"], ran["test_frames"], ran["frames"]) == (0, 2, 3, 3)

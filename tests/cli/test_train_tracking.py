@@ -99,11 +99,11 @@ def test_wandb_holds_config_and_name(watched):
     tracked = watched.runs[0]
     assert tracked.config["data"]["shape"] == "robot"
     assert tracked.config["schedule"]["deformation"]["levels"]["2"]["side"] == 8
-    assert tracked.config["choices"]["field"] == "small_inward"
+    assert tracked.config["choices"]["data"] == "procedural"
     assert "data.frames=3" in tracked.config["overrides"]
     assert {"devrf", "git"} <= {*tracked.config}
     assert (tracked.run.project, tracked.run.display_name) == ("devrf", "run")
-    assert list(tracked.run.tags) == ["procedural", "full"]
+    assert list(tracked.run.tags) == ["procedural"]
 
 
 def test_several_loggers_have_the_same_rows(watched):

@@ -27,6 +27,7 @@ from devrf.errors import DevrfError, did_you_mean
 ROOT: dict[str, Any] = {
     "stage": str,
     "method": str,
+    "facing": Literal["inward", "forward"],
     "seed": Annotated[int, Ge(0), Lt(2**32)],
     "rehearse": bool,
     "resume": bool,

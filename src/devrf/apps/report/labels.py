@@ -83,12 +83,12 @@ def labelled(runs: pd.DataFrame) -> pd.DataFrame:
 def row_name(run: Mapping[str, Any]) -> str:
     """A run's name by method and ablation, protocol, experiment and typed settings."""
     method = run["method"]
-    ablation = _option(run, "ablation")
+    ablation = _option(run, "ablation") or "full"
     parts = [METHODS.get(method, method)]
     if run["at_rest"] is not True:  # there are no ablations of a scene at rest
         if method == DEFAULT_METHOD and ablation in ABLATIONS:
             parts = [ABLATIONS[ablation]]
-        elif ablation not in ("", "full"):
+        elif ablation != "full":
             parts = [f"{parts[0]} ({ablation})"]
     usual = (DEFAULT_PROTOCOL, DEFAULT_EXPERIMENT) if method == DEFAULT_METHOD else ()
     parts += [p for p in (run["protocol"], _option(run, "experiment")) if p not in usual]
