@@ -39,8 +39,8 @@ TOGETHER = ("schedule", "facing", "video", "trainer")
 COLUMNS = [cycle(f"{group}={name}" for name in NAMES[group]) for group in TOGETHER]
 ROWS = [" ".join(map(next, COLUMNS)) for _ in range(max(len(NAMES[group]) for group in TOGETHER))]
 # Other tests compose these, or a choice in another group does.
-OTHERS = ("data", "method", "comparison", "protocol", "profile", "for_scene", "source")
-OTHERS += ("paper_scene", *(group for group in NAMES if group.startswith("hydra/")))
+OTHERS = ("data", "method", "comparison", "protocol", "profile", "for_scene")
+OTHERS += tuple(group for group in NAMES if group.startswith("hydra/"))
 ALONE = [group for group in NAMES if group not in (*TOGETHER, *OTHERS)]
 ALONE = [f"{group}={name}" for group in ALONE for name in NAMES[group] if name != "default"]
 
@@ -56,6 +56,10 @@ def chain(group, name):
     own = [base for base in bases if "/" not in base and base != "_self_"]
     inherited = [file for base in own for file in chain(group, base)]
     return [name, *inherited] if content else inherited
+
+
+def test_every_file_sets_or_chooses_something():
+    assert not [path for path in config_folder().rglob("*.yaml") if not OmegaConf.load(path)]
 
 
 @pytest.mark.parametrize("group", NAMES)
