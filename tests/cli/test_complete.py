@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 from devrf.cli.complete import completed
 from devrf.cli.config import PATHS
 from devrf.cli.restore_config import applied_defaults
+from devrf.errors import DevrfError
 from devrf.scenes.export import export
 from devrf.scenes.procedural import ProceduralForwardScene, ProceduralScene
 
@@ -116,14 +117,11 @@ def scenes(tmp_path_factory) -> Path:
         ("data.root=phone data.space=world", "data=nerfstudio"),
         ("data=colmap data.root=gone data.space=ndc", "facing=forward"),
         ("experiment=comparison_table data.root=phone", "data=nerfstudio facing=forward"),
-        # One camera that moves: a method that can learn from it alone.
-        ("data.root=hook", "data=inward experiment=phone"),
-        ("stage=inspect data=inward data.root=hook schedule.seconds=60", "experiment=phone"),
-        ("data.root=walk", "data=nerfstudio experiment=phone"),
         ("data.root=stop", "data=nerfstudio"),
-        ("data.root=video", "data=forward experiment=phone"),
-        ("data.root=vrig", "data=nerfies experiment=phone"),
         ("data.root=pose", "data=nerfies"),
+        # One camera that moves: what learns it is typed, or it is not learned.
+        ("data.root=hook experiment=phone", "data=inward"),
+        ("stage=inspect data.root=hook schedule.seconds=60", "data=inward"),
         ("data.root=hook field.channels=3", "data=inward"),
         ("data.root=hook loss.canonical.tv=1", "data=inward"),
         ("data.root=hook data.static_until=0.3", "data=inward"),
@@ -141,7 +139,6 @@ def test_what_the_files_of_a_scene_say_comes_after_what_was_typed(
     scenes, monkeypatch, typed, by_files
 ):
     monkeypatch.chdir(scenes)
-    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     assert completed(typed.split()) == [*typed.split(), *by_files.split()]
 
 
@@ -160,16 +157,16 @@ def test_what_the_files_say_is_said_in_one_line(devrf, scenes, short):
     assert done.out.splitlines().count(line) == 1
 
 
-def test_one_moving_camera_is_learned_as_published_where_there_is_a_gpu(scenes, monkeypatch):
-    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
-    root = f"data.root={scenes}/hook"
-    assert completed([root])[1:] == ["data=inward", "experiment=phone_gpu"]
-    assert completed([root, "trainer=cpu"])[2:] == ["data=inward", "experiment=phone"]
-
-
-def test_devrf_on_one_moving_camera_is_told_what_learns_more(scenes):
-    completed([f"data.root={scenes}/hook", "stage=canonical"])
-    assert applied_defaults[0].endswith("; experiment=phone learns more of it than method=devrf")
+@pytest.mark.parametrize("scene", ["hook", "walk", "video", "vrig"])
+def test_what_learns_one_moving_camera_is_named_and_not_chosen(scenes, scene):
+    lacks = "one moving camera, and nothing at rest, which method=devrf needs"
+    line = f"{lacks}; give experiment=phone, on a GPU experiment=phone_gpu"
+    with pytest.raises(DevrfError, match=f"{scene}: {line}$"):
+        completed([f"data.root={scenes}/{scene}"])
+    completed([f"data.root={scenes}/{scene}", "stage=inspect"])
+    assert applied_defaults[0].endswith(line)
+    completed([f"data.root={scenes}/{scene}", "method=devrf"])
+    assert applied_defaults[0].endswith(f"{lacks}; experiment=phone learns more of it")
 
 
 @pytest.mark.parametrize(

@@ -16,9 +16,8 @@ from layouts import write_scene
 
 
 @pytest.fixture
-def mill(tmp_path, monkeypatch) -> None:
+def mill(tmp_path) -> None:
     """A folder ``mill`` in DyCheck's layout: one camera, elsewhere at each of three times."""
-    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     sizes = {"width": 24, "height": 20, "static_views": 16, "static_test_views": 3}
     scene = ProceduralScene(shape="robot", train_views=2, frames=3, supersample=1, **sizes)()
     # The moving camera stands where one fixed view does, then where the next one does.
@@ -29,7 +28,7 @@ def mill(tmp_path, monkeypatch) -> None:
     )
 
 
-def test_a_capture_needs_no_flag_beside_its_folder(devrf, mill, tmp_path) -> None:
+def test_a_capture_by_one_camera_needs_one_word_beside_its_folder(devrf, mill, tmp_path) -> None:
     small = (
         "ray_stage.model.settings.side=12",
         "ray_stage.schedule.iterations=4",
@@ -37,12 +36,14 @@ def test_a_capture_needs_no_flag_beside_its_folder(devrf, mill, tmp_path) -> Non
         "video.frames=1",
         "video.height=24",
     )
-    run = devrf("data.root=mill", "schedule.seconds=null", *small, "evaluation.metrics=[]")
+    refused = devrf("data.root=mill")
+    assert refused.status == 2 and refused.err.count("\n") == 1
+    assert "which method=devrf needs; give experiment=phone" in refused.err
+    assert not (tmp_path / "outputs").exists()
+    phone = ("data.root=mill", "experiment=phone", "schedule.seconds=null")
+    run = devrf(*phone, *small, "evaluation.metrics=[]")
     assert (run.status, run.err) == (0, "")
-    why = (
-        "one moving camera, where method=devrf needs the scene at rest, too; the layout of DyCheck"
-    )
-    assert f"mill: {why} (data=dycheck experiment=phone)" in run.out
+    assert "mill: the layout of DyCheck (data=dycheck)" in run.out
     (folder,) = (tmp_path / "outputs/mill").iterdir()
     metrics = json.loads((folder / "metrics.json").read_text())
     assert metrics["method"] == "tineuvox" and metrics["protocol"] == "dynamic"
@@ -51,22 +52,18 @@ def test_a_capture_needs_no_flag_beside_its_folder(devrf, mill, tmp_path) -> Non
 @pytest.mark.parametrize(
     ("typed", "said"),
     [
-        ((), "where method=devrf needs the scene at rest, too (experiment=phone)"),
-        (("method=dnerf", "profile=dnerf_small"), "the scene at rest, too (protocol=dynamic)"),
-        (("method=devrf",), "experiment=phone learns more of it than method=devrf"),
+        ((), "which method=devrf needs; give experiment=phone"),
+        (("method=dnerf", "profile=dnerf_small"), "one camera (protocol=dynamic)"),
+        (("method=devrf",), "which method=devrf needs; experiment=phone learns more of it"),
     ],
 )
-def test_an_embedded_film_by_hand_is_learned_as_others_are(
-    devrf, tiny_facing, monkeypatch, typed, said
-) -> None:
-    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+def test_an_embedded_film_by_hand_is_learned_as_others_are(devrf, tiny_facing, typed, said) -> None:
     outcome = devrf(*tiny_facing, "data.camera=handheld", *typed, "stage=inspect")
     assert (outcome.status, outcome.err) == (0, "")
     assert "data.camera=handheld: one" in outcome.out and said in outcome.out
 
 
-def test_a_video_in_llffs_layout_is_learned_as_one(devrf, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+def test_a_video_in_llffs_layout_is_learned_as_one(devrf, tmp_path) -> None:
     small = {"static_views": 8, "frames": 3, "width": 24, "height": 18, "supersample": 1}
     export(ProceduralForwardScene(**small)(), tmp_path / "video")
     for folder in dynamic_folders(tmp_path / "video"):
@@ -76,11 +73,10 @@ def test_a_video_in_llffs_layout_is_learned_as_one(devrf, tmp_path, monkeypatch)
     words = ("data=forward", "data.root=video", "data.monocular=true", "data.downscale=4")
     film = devrf(*words, "stage=inspect")
     assert (film.status, film.err) == (0, "")
-    assert "scene at rest, too; its cameras (experiment=phone)" in film.out
+    assert "video: one moving camera" in film.out
 
 
-def test_frames_in_the_order_of_their_names_are_a_film(devrf, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+def test_frames_in_the_order_of_their_names_are_a_film(devrf, tmp_path) -> None:
     small = {"frames": 9, "width": 24, "height": 18, "supersample": 1}
     export(ProceduralForwardScene(camera="handheld", **small)(), tmp_path / "posed")
     file = tmp_path / "posed" / "transforms.json"
@@ -92,12 +88,12 @@ def test_frames_in_the_order_of_their_names_are_a_film(devrf, tmp_path, monkeypa
     file.write_text(json.dumps(kept | {"frames": frames}))
     outcome = devrf("data.root=posed", "data.times=order", "stage=inspect")
     assert (outcome.status, outcome.err) == (0, "")
-    assert "(data=nerfstudio experiment=phone)" in outcome.out
+    assert "posed: one moving camera" in outcome.out
     (tmp_path / "two").mkdir()
     file.parent.rename(tmp_path / "two" / "static")  # and a film: DeVRF has what it needs
     shutil.copytree(tmp_path / "two" / "static", tmp_path / "two" / "dynamic")
     outcome = devrf("data.root=two", "data.times=order", "stage=inspect")
-    assert outcome.status == 0 and "(data=nerfstudio)" in outcome.out
+    assert outcome.status == 0 and "one moving camera" not in outcome.out
 
 
 def test_devrf_learns_such_a_capture_where_it_is_chosen(devrf, short, mill, tmp_path) -> None:
@@ -129,7 +125,10 @@ def test_a_capture_ends_with_the_command_that_learns_it(
     # Structure from motion, and ten seconds of learning, are tested where they are written.
     monkeypatch.setattr(preparation, "scene_from_footage", lambda settings: folder)
     monkeypatch.setattr(preparation, "seconds_to_learn", lambda *arguments: 30.0)
-    done = devrf("stage=capture", "capture.views=[film.mp4]", "capture.into=there")
+    views, typed = (
+        ("[a.mp4,b.mp4]", "") if layout == "nerfstudio" else ("[a.mp4]", " experiment=phone")
+    )
+    done = devrf("stage=capture", f"capture.views={views}", "capture.into=there", "trainer=cpu")
     assert (done.status, done.err) == (0, "")
     assert f"(data={layout}" in done.out and said in done.out
-    assert done.out.rstrip().endswith(f"next:\n  python -m devrf data.root={folder}")
+    assert done.out.rstrip().endswith(f"next:\n  python -m devrf data.root={folder}{typed}")

@@ -4,8 +4,8 @@
 * A run that is named (``ckpt=``, ``hydra.run.dir=``, ``hydra.sweep.dir=``) brings the overrides
   that it was learned with. Typed overrides come after them: only these differ.
 * A scene's folder brings settings that its files determine and nothing else sets: ``data=``,
-  ``facing=``; if one camera filmed it ``experiment=phone``, or for a method that is typed
-  ``protocol=dynamic``; these, too, for ``data.camera=handheld``.
+  ``facing=``; if one camera filmed it, or ``data.camera=handheld``, ``protocol=dynamic`` for a
+  method that is typed. Where none is, DeVRF cannot learn such a scene, and the run is refused.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf.errors import OmegaConfBaseException
 
-from devrf.cli.config import PATHS, SCENELESS_STAGES, config_folder, group_choices
+from devrf.cli.config import PATHS, SCENELESS_STAGES, STEPS, config_folder, group_choices
 from devrf.cli.restore_config import applied_defaults, of_named_run, parsed, value, values
 from devrf.cli.view import serves_page
 from devrf.errors import DevrfError
@@ -41,7 +41,6 @@ TRAINING_KEYS = (
     *("data.static_until", "field", "sampling", "loss", "canonical", "deformation"),
     *("schedule.canonical", "schedule.deformation", "schedule.motion"),
 )
-ONE_CAMERA = "one moving camera, where method=devrf needs the scene at rest, too"
 # `viewer` is a group, whose choices Hydra wants to be text; so it does of these.
 SHORTHAND = {f"viewer={value}": f"viewer.training={value}" for value in ("true", "false")}
 SHORTHAND |= {f"{group}=null": f"~{group}" for group in ("logger", "callbacks")}
@@ -53,7 +52,8 @@ def completed(arguments: Sequence[str]) -> list[str]:
 
     Raises:
         DevrfError: a scene's folder cannot be recognised, the scenes of a sweep need different
-            options, a group's choice is null, or a word is another framework's.
+            options, a scene is none for DeVRF, a group's choice is null, or a word is another
+            framework's.
     """
     applied_defaults.clear()
     options, unknown = get_args_parser().parse_known_intermixed_args(arguments)
@@ -88,7 +88,7 @@ def completed(arguments: Sequence[str]) -> list[str]:
     if needs_scene and value(overrides, "data.camera") == "handheld":
         words = _for_one_camera("data.camera=handheld", overrides, continued=bool(before))
         if words:
-            applied_defaults.append(f"data.camera=handheld: {ONE_CAMERA} ({' '.join(words)})")
+            applied_defaults.append(f"data.camera=handheld: one camera ({' '.join(words)})")
         return [*flags, *before, *texts, *words]
     if not (roots and needs_scene) or any("${" in root for root in roots):
         return [*flags, *before, *texts]
@@ -174,7 +174,8 @@ def _defaults_of_scene(
     Training settings are not among them if a run is ``continued``.
 
     Raises:
-        DevrfError: ``option`` is None, and no reader knows the layout.
+        DevrfError: ``option`` is None, and no reader knows the layout; or DeVRF, which nothing
+            typed replaces, cannot learn the scene.
     """
     with importing():  # they load torch
         from devrf.data.kind import by_one_camera, faces_forward
@@ -195,9 +196,7 @@ def _defaults_of_scene(
     video = value(overrides, "data.monocular")
     ordered = value(overrides, "data.times") == "order"
     if video == "True" or (video is None and by_one_camera(option, root, ordered=ordered)):
-        monocular = _for_one_camera(root, overrides, continued=continued)
-        words += monocular
-        why = f"{ONE_CAMERA}; {why}" if monocular and monocular != ["protocol=dynamic"] else why
+        words += _for_one_camera(root, overrides, continued=continued)
     scene = Path(root).expanduser().resolve().name
     if value(overrides, "experiment") == "paper" and option in ("inward", "forward"):
         if (config_folder() / f"for_scene/paper_{scene}.yaml").is_file():
@@ -209,21 +208,22 @@ def _defaults_of_scene(
 
 
 def _for_one_camera(scene: str, overrides: Sequence[Override], *, continued: bool) -> list[str]:
-    """The overrides for a monocular scene, unless its training settings are typed.
+    """The protocol for a monocular scene, by which a typed method learns it.
 
-    There are none if a run is ``continued``; if DeVRF is asked for, the log says what it lacks.
+    There is none if a run is ``continued``; if DeVRF is asked for, the log says what it lacks.
+
+    Raises:
+        DevrfError: the run would learn it by DeVRF, though no training setting is typed.
     """
-    method = value(overrides, "method")
-    if method == "devrf" or value(overrides, "stage") in DEVRF_STAGES:
-        lacks = f"{scene}: one camera filmed it moving, and nothing shows it at rest"
-        applied_defaults.append(f"{lacks}; experiment=phone learns more of it than method=devrf")
+    method, stage = value(overrides, "method"), value(overrides, "stage")
+    lacks = f"{scene}: one moving camera, and nothing at rest, which method=devrf needs"
+    if method == "devrf" or stage in DEVRF_STAGES:
+        applied_defaults.append(f"{lacks}; experiment=phone learns more of it")
     elif not continued and not any(map(_says_how, overrides)):
-        with importing():
-            import torch
-
-        on_cpu = "cpu" in (value(overrides, "trainer"), value(overrides, "trainer.accelerator"))
-        on_gpu = torch.cuda.is_available() and not on_cpu
-        return [f"experiment={'phone_gpu' if on_gpu else 'phone'}"]
+        line = f"{lacks}; give experiment=phone, on a GPU experiment=phone_gpu"
+        if stage not in STEPS:
+            raise DevrfError(line)
+        applied_defaults.append(line)
     elif method and not any(values(overrides, key) for key in ("protocol", "comparison")):
         return ["protocol=dynamic"]
     return []

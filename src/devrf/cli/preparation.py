@@ -51,11 +51,14 @@ def capture(run: RunContext) -> None:
     """Make a scene of the footage ``capture.…``, and report on it as ``stage=inspect`` does."""
     settings: CaptureSettings = instantiate(run.config.capture, _convert_="all")
     folder = scene_from_footage(settings)
-    config = compose("config", completed([f"data.root={literal(folder)}"]))
+    phone = "experiment=phone_gpu" if run.device.type == "cuda" else "experiment=phone"
+    how = [phone] if settings.monocular else []
+    read = completed([f"data.root={literal(folder)}", "stage=inspect"])
+    config = compose("config", [*read, *how])
     log_applied_defaults()
     captured = RunContext(config, run.folder)
     shortage = _inspect(captured)
-    command = [to_type("data.root", folder)]
+    command = [to_type("data.root", folder), *how]
     if shortage is not None:  # nothing can be tried out
         say_next(command + [f"{SIZE}=auto"] * (shortage.where == SIZE))
         return
