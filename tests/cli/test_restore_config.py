@@ -273,6 +273,12 @@ def test_a_checkpoint_names_no_class_but_a_method_s(
     assert not list(tmp_path.rglob("PWNED"))
 
 
+def recorded(*task: object) -> dict:
+    """The record of a sweep of ``task``."""
+    basic = "hydra._internal.core_plugins.basic_sweeper.BasicSweeper"
+    return {"hydra": {"sweeper": {"_target_": basic}, "overrides": {"task": task}}}
+
+
 RECORDS = {
     "an interpolation": ["+aa=_tar", "+bb=get_", "canonical.x='${oc.env:HOME}'"],
     "a path as an option": ["data=../../evil,inward"],
@@ -290,7 +296,7 @@ RECORDS = {
 @pytest.mark.parametrize("task", RECORDS.values(), ids=list(RECORDS))
 def test_the_record_of_a_sweep_chooses_no_code(tmp_path, task):
     record = tmp_path / "multirun.yaml"
-    record.write_text(json.dumps({"hydra": {"overrides": {"task": ["seed=0,1", *task]}}}))
+    record.write_text(json.dumps(recorded("seed=0,1", *task)))
     with pytest.raises(DevrfError, match=f"^{record}: "):
         completed(["stage=inspect", f"hydra.sweep.dir={tmp_path}"])
 
@@ -320,8 +326,7 @@ def test_a_sweep_goes_on_with_all_kinds_of_values(tmp_path, monkeypatch):
     task = ["experiment=quickstart,cpu_small", "schedule.canonical.upsample_at=[1],[2,3]", "seed=2"]
     of_the_command = ["trainer=cpu", "data.flow_cache=/elsewhere", "stage=inspect"]
     typed = [*task, "+data.name='a, b'", *of_the_command]
-    record = {"hydra": {"overrides": {"task": typed}}}
-    (tmp_path / "multirun.yaml").write_text(json.dumps(record))
+    (tmp_path / "multirun.yaml").write_text(json.dumps(recorded(*typed)))
     typed = [f"hydra.sweep.dir={tmp_path}", "stage=inspect"]
     assert completed(typed) == [*task, "+data.name='a, b'", "hydra.mode=MULTIRUN", *typed]
     # Of a group, or a key, that is typed nothing is taken over.

@@ -121,14 +121,32 @@ def test_jobs_in_processes_of_their_own(python, tmp_path, tiny):
 @installed("hydra_optuna_sweeper")
 def test_a_search_maximises_the_objective(devrf, tmp_path, tiny):
     folder = ("hydra.sweep.dir=sweep", "video.frames=1", "evaluation.metrics=[]")
-    assert devrf("-m", *tiny, *SEARCH, *folder).status == 0
+    typed = "schedule.motion.learning_rate=interval(0.001, 0.002)"
+    assert devrf("-m", *tiny, *SEARCH, *folder, typed).status == 0
     found = [json.loads(path.read_text()) for path in tmp_path.glob("sweep/*/metrics.json")]
-    assert len(list(tmp_path.glob("sweep/[01]_robot_cycle_*"))) == len(found) == 2
+    runs = sorted(tmp_path.glob("sweep/[01]_robot_cycle_*_learning_rate_0.001*"))
+    assert len(runs) == len(found) == 2
     best = max(found, key=lambda metrics: metrics["deformation"]["psnr"])
     said = yaml.safe_load((tmp_path / "sweep" / "optimization_results.yaml").read_text())
     assert said["best_value"] == best["deformation"]["psnr"]
     for name, value in said["best_params"].items():
         assert f"{name}={value}" in best["run"]["overrides"]
+    # A search is a sweep: later commands do their stage in each of its runs.
+    record = (tmp_path / "sweep" / "multirun.yaml").read_bytes()
+    outcome = devrf("stage=still", "still.height=20", "hydra.sweep.dir=sweep")
+    assert (outcome.status, outcome.err) == (0, "")
+    assert all(list(run.glob("images/still*.png")) for run in runs)
+    assert (tmp_path / "sweep" / "multirun.yaml").read_bytes() == record
+    report = devrf("stage=report", "hydra.sweep.dir=sweep")
+    assert (report.status, report.err) == (0, "") and "written to sweep/report" in report.out
+    assert {path.name for path in tmp_path.iterdir()} == {"sweep"}
+
+
+def test_a_folder_without_the_record_of_a_sweep_is_refused(devrf, tmp_path):
+    outcome = devrf("stage=still", "hydra.sweep.dir=elsewhere")
+    said = "no multirun.yaml in elsewhere; name the folder of a sweep, or type one (-m)"
+    assert (outcome.status, outcome.err) == (2, f"devrf: hydra.sweep.dir: {said}\n")
+    assert not list(tmp_path.iterdir())
 
 
 @installed("hydra_optuna_sweeper")

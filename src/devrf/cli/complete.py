@@ -27,7 +27,14 @@ from hydra.types import RunMode
 from omegaconf.errors import OmegaConfBaseException
 
 from devrf.cli.config import PATHS, SCENELESS_STAGES, STEPS, config_folder, group_choices
-from devrf.cli.restore_config import applied_defaults, of_named_run, parsed, value, values
+from devrf.cli.restore_config import (
+    applied_defaults,
+    of_named_run,
+    parsed,
+    searched_runs,
+    value,
+    values,
+)
 from devrf.cli.view import serves_page
 from devrf.errors import DevrfError
 from devrf.system.override import literal, without_reference
@@ -45,6 +52,22 @@ TRAINING_KEYS = (
 SHORTHAND = {f"viewer={value}": f"viewer.training={value}" for value in ("true", "false")}
 SHORTHAND |= {f"{group}=null": f"~{group}" for group in ("logger", "callbacks")}
 KEY_VALUE = re.compile(r"(\+{0,2}([\w./@-]+)=)(.*)", re.DOTALL)
+
+
+def commands(arguments: Sequence[str]) -> list[list[str]]:
+    """The commands that typed arguments stand for: on the folder of a search, one for each run.
+
+    Raises:
+        DevrfError: no run of the search has learned anything.
+    """
+    named = [word for word in arguments if word.startswith("hydra.sweep.dir=")]
+    runs: list[Path] = []
+    if named:
+        options, _ = get_args_parser().parse_known_intermixed_args(arguments)
+        with suppress(HydraException):  # reported when Hydra parses them
+            runs = searched_runs(parsed(quoted_path(word, False) for word in options.overrides))
+    others = [word for word in arguments if word not in (*named, "-m", "--multirun")]
+    return [[*others, f"hydra.run.dir={literal(str(run))}"] for run in runs] or [[*arguments]]
 
 
 def completed(arguments: Sequence[str]) -> list[str]:

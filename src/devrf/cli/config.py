@@ -19,6 +19,8 @@ from devrf.apps.settings import ReportSettings
 from devrf.system.override import to_type
 
 PIPELINE = "pipeline"
+# A sweep's config, with what was typed: in its folder.
+SWEEP_RECORD = "multirun.yaml"
 # Stages for which the run's scene need not be right.
 SCENELESS_STAGES = ("report", "fetch", "capture", "selfcheck")
 # Stages that learn nothing; the protocol's stages come beside these.
@@ -107,15 +109,17 @@ def run_folder(_root_: Any) -> str:
 def job_folder(_root_: Any) -> str:
     """The folder of a sweep's job: number, scene, and varied values: ``0_robot_tv_0.5``."""
     hydra = _root_.hydra
-    record = Path(hydra.sweep.dir) / "multirun.yaml"  # some searches write none
-    typed = OmegaConf.load(record).hydra.overrides.task if record.is_file() else []
-    varied = dict.fromkeys(hydra.sweeper.get("params") or (), True)
-    for override in OverridesParser.create().parse_overrides(list(typed)):
-        varied[override.get_key_element()] = override.is_sweep_override()
+    typed = OmegaConf.load(Path(hydra.sweep.dir) / SWEEP_RECORD).hydra.overrides.task
+    parsed = OverridesParser.create().parse_overrides(list(typed))
+    # What the sweeper chooses, whichever it is, is all that is not the same in each job.
+    varied = {word.get_key_element(): word.is_sweep_override() for word in parsed}
     varied |= dict.fromkeys(("data", "data.root", "data.name", "data.shape"), False)
     pairs = [override.partition("=") for override in hydra.overrides.task]
-    words = [f"{key.rpartition('.')[2]}_{value}" for key, _, value in pairs if varied.get(key)]
-    return scene_folder_name("_".join([str(hydra.job.num), scene_name(_root_), *words]))[:150]
+    words = [f"{key.rpartition('.')[2]}_{v}" for key, _, v in pairs if varied.get(key, True)]
+    name = "_".join([str(hydra.job.num), scene_name(_root_), *words])
+    # Of a search's numbers, four digits.
+    name = re.sub(r"\d*\.\d{5,}(e-?\d+)?", lambda number: f"{float(number[0]):.4g}", name)
+    return scene_folder_name(name)[:150]
 
 
 def register_config() -> None:

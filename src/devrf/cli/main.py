@@ -11,7 +11,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 import devrf
-from devrf.cli.complete import completed
+from devrf.cli.complete import commands, completed
 from devrf.cli.config import config_folder, in_sweep, overrides, register_config
 from devrf.cli.config_check import check_config, check_extras
 from devrf.cli.messages import report_user_errors
@@ -54,8 +54,9 @@ def entry() -> None:
             without_reference(Path.cwd())
             for word in sys.argv[1:]:
                 utf8_path(Path(word))
-            sys.argv[1:] = completed(sys.argv[1:])
-            main()
+            for command in commands(sys.argv[1:]):
+                sys.argv[1:] = completed(command)
+                main()
     # A KeyboardInterrupt is raised by another library's handler of Ctrl-C.
     except (Interrupted, KeyboardInterrupt) as stop:
         print(f"devrf: {getattr(stop, 'message', 'interrupted')}", file=sys.stderr)

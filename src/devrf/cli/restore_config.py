@@ -26,6 +26,8 @@ from devrf.checkpoints.file_metadata import latest_checkpoint
 from devrf.cli.config import (
     OF_A_CHECKPOINT,
     PATHS,
+    SCENELESS_STAGES,
+    SWEEP_RECORD,
     choices,
     group_choices,
     leaves,
@@ -51,6 +53,8 @@ PLACES = {"data.export", "data.flow_cache", "evaluation.download"}
 OF_A_SCENE = {"data", "facing", "seed"}
 # Keys without a section.
 ALONE = {"seed", "priors", "deterministic", "decoder_precision", "rehearse"}
+# Groups that choose another sweep than that of a folder.
+SWEEPERS = ("hparams_search", "hydra/sweeper")
 # An option's name leads to no other folder than its group's; a key is a path of plain names.
 OPTION = re.compile(r"(?!null$)[\w-]+", re.ASCII | re.IGNORECASE)
 KEY = re.compile(r"/?[\w-]+([./][\w-]+){0,15}", re.ASCII)
@@ -185,7 +189,7 @@ def of_named_run(typed: Sequence[Override], multirun: bool) -> list[str]:
     folder = value(typed, "hydra.run.dir")
     sweep = value(typed, "hydra.sweep.dir")
     if value(typed, "stage") == "report":
-        return []
+        return [] if sweep is None else [f"report.runs={literal(sweep)}"]
     if not checkpoints and sweep is not None:
         return _of_sweep(typed, Path(sweep))
     if not checkpoints and (folder is None or multirun):
@@ -243,11 +247,11 @@ def _of_sweep(typed: Sequence[Override], folder: Path) -> list[str]:
     Raises:
         DevrfError: its record holds more than names of options and plain values.
     """
-    record = folder / "multirun.yaml"
+    record = folder / SWEEP_RECORD
     if any(override.is_sweep_override() for override in typed) or not record.is_file():
         return []
     lines: dict[str, str] = {}
-    for override in _recorded(record):
+    for override in _recorded(record)[1]:
         key = override.get_key_element().lstrip("+")
         if _of_a_command(key) or override.is_delete():
             continue
@@ -260,13 +264,35 @@ def _of_sweep(typed: Sequence[Override], folder: Path) -> list[str]:
     return [*kept, "hydra.mode=MULTIRUN"]
 
 
-def _recorded(record: Path) -> list[Override]:
-    """The overrides of a sweep, from its ``multirun.yaml``."""
+def searched_runs(typed: Sequence[Override]) -> list[Path]:
+    """The learned runs of the search in ``hydra.sweep.dir``, in the order of their numbers.
+
+    There are none if another kind of sweep is there, or one is typed.
+
+    Raises:
+        DevrfError: the search has no learned run.
+    """
+    folder = Path(value(typed, "hydra.sweep.dir") or "")
+    of_a_sweep = any(o.is_sweep_override() or o.key_or_group in SWEEPERS for o in typed)
+    record = folder / SWEEP_RECORD
+    if of_a_sweep or value(typed, "stage") in SCENELESS_STAGES or not record.is_file():
+        return []
+    if _recorded(record)[0].endswith(".BasicSweeper"):
+        return []  # it knows its jobs before they have begun
+    runs = [path for path in folder.glob("[0-9]*_*/") if latest_checkpoint(path)]
+    if not runs:
+        raise DevrfError(f"{folder}: a search without a learned run; type the search again")
+    return sorted(runs, key=lambda path: int(re.split(r"\D", path.name)[0]))
+
+
+def _recorded(record: Path) -> tuple[str, list[Override]]:
+    """The class of a sweep's sweeper, and the sweep's overrides, from its ``multirun.yaml``."""
     with suppress(*UNREADABLE):
         text = read_record(record, 200 * MOST).decode()  # YAML takes ten seconds for this
         # Hydra writes no aliases, which may unfold without end.
         if not any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
-            return parsed(yaml.safe_load(text)["hydra"]["overrides"]["task"])
+            hydra = yaml.safe_load(text)["hydra"]
+            return str(hydra["sweeper"]["_target_"]), parsed(hydra["overrides"]["task"])
     raise DevrfError(f"{record}: not the record of a sweep; type the sweep again")
 
 

@@ -12,10 +12,10 @@ from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
-from omegaconf import DictConfig, read_write
+from omegaconf import DictConfig, OmegaConf, read_write
 from omegaconf.errors import OmegaConfBaseException
 
-from devrf.cli.config import in_sweep
+from devrf.cli.config import SWEEP_RECORD, in_sweep
 from devrf.cli.messages import is_user_error, report_user_errors
 from devrf.errors import DevrfError
 from devrf.system.files import (
@@ -61,6 +61,12 @@ class FolderLock(Callback):
         except OmegaConfBaseException:
             return  # Hydra will report what is wrong with the config
         with report_user_errors():
+            typed = [word.partition("=")[0] for word in config.hydra.overrides.hydra]
+            if "hydra.sweep.dir" in typed and config.stage != "report":
+                raise DevrfError(
+                    f"hydra.sweep.dir: no {SWEEP_RECORD} in {config.hydra.sweep.dir}; name the "
+                    "folder of a sweep, or type one (-m)"
+                )
             # A report's default folder is a name in the folder of the runs.
             named = config.stage == "report" and folder == Path(str(config.report.runs)) / "report"
             refuse_links(folder, itself=named)
@@ -72,7 +78,10 @@ class FolderLock(Callback):
                 lock_folder(folder, "hydra.run.dir")
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Lock the folder of a sweep; each job locks its own. Refuse SLURM where there is none."""
+        """Lock the folder of a sweep, and write its record; each job locks its own folder.
+
+        Hydra's own sweeper writes the same record, others write none.
+        """
         folder = Path(config.hydra.sweep.dir)
         with report_user_errors():
             missing = [name for name in ("srun", "sbatch") if shutil.which(name) is None]
@@ -84,6 +93,7 @@ class FolderLock(Callback):
             for path in (folder, *folder.glob("[!.]*/")):
                 refuse_links(path)
             lock_folder(folder, "hydra.sweep.dir")
+            OmegaConf.save(config, folder / SWEEP_RECORD)
         FolderLock.sweep = folder
 
 

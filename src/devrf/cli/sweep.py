@@ -16,7 +16,7 @@ from hydra.experimental.callback import Callback
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
-from devrf.cli.config import choices, overrides, scene_name
+from devrf.cli.config import SWEEP_RECORD, choices, overrides, scene_name
 from devrf.cli.messages import is_user_error, one_line
 from devrf.cli.run_folder import FAILURE, FolderLock
 from devrf.errors import DevrfError
@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 # The exit status of a sweep with failed jobs.
 JOBS_FAILED = 3
 # Content of the sweep's folder before Hydra starts the first job.
-OF_SWEEP = {"multirun.yaml", PLACE}
+OF_SWEEP = {SWEEP_RECORD, PLACE}
 
 
 @contextmanager
