@@ -34,6 +34,7 @@ def forwarding(**anything: object) -> None:
 BASE = f"""
 stage: pipeline
 seed: 0
+deterministic: false
 rehearse: false
 resume: true
 memory_check: true
@@ -71,6 +72,12 @@ def importable(monkeypatch, request):
 
 def test_a_sound_config_passes():
     check_config(config())
+
+
+def test_a_value_may_be_typed_over_a_reference(composed):
+    made = composed("deformation.flow_mean=samples", "trainer.deterministic=true")
+    made.deformation.loss = {"render": 1.0}
+    check_config(made)
 
 
 def test_a_part_may_take_anything():

@@ -33,6 +33,17 @@ MISTAKES = {
         "logger.wandb.nots: wandb.init takes no such argument; did you mean logger.wandb.notes?",
     ),
     "no choice of a group": (["method=null"], "method=null: choose one of devrf, dnerf, "),
+    "an option that is no name": (["data=false"], "data=false: choose one of colmap, "),
+    "several values outside a sweep": (["seed=1,2"], "for argument 'seed=1,2' 1. To use it as "),
+    "two things at once": (["-m", "--cfg", "job"], "Only one of --run, --multirun, --cfg, "),
+    "a job's config that is not there": (
+        ["--experimental-rerun", "no.pickle"],
+        "--experimental-rerun: no.pickle: no such file",
+    ),
+    "what the run gives the trainer": (
+        ["+trainer.default_root_dir=here"],
+        "trainer.default_root_dir: a run sets it itself; leave it out: hydra.run.dir=FOLDER",
+    ),
     "key of other scenes": (
         ["data=inward", "data.root=scene", "data.scene_seed=3"],
         "data.scene_seed: no such key; it belongs to data=procedural, procedural_forward",
@@ -104,6 +115,7 @@ VALUES = {
         ["schedule.extensions.bending=1"],
         "schedule.extensions.bending: expected a section with _target_, not 1",
     ),
+    "a value over a reference": (["trainer.deterministic=3"], "trainer.deterministic: expected a "),
     "part that is not there": (["data._target_=devrf.nothing"], "data._target_: cannot load"),
 }
 

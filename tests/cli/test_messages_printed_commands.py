@@ -161,15 +161,6 @@ def test_a_value_that_is_not_understood_is_printed_as_it_may_be_typed(devrf, typ
     assert OmegaConf.select(OmegaConf.create(composed.out), key) == read
 
 
-def test_values_with_commas_are_printed_as_text_and_as_a_list(devrf):
-    outcome = devrf("data=procedural", "data.name=2,b c")
-    assert outcome.status == 2 and outcome.err.count("\n") == 1
-    begin = "devrf: data.name=2,b c: several values; write "
-    (found,) = re.findall(f"{begin}(.*) as text, (.*) as a list, or -m to sweep", outcome.err)
-    read = [PARSER.parse_override(*shlex.split(word)).value() for word in found]
-    assert read == ["2,b c", [2, "b c"]]
-
-
 def test_a_command_that_goes_on_names_the_present_run(devrf, tmp_path):
     place = tmp_path / "it's, a (1)"
     command = command_line("stage=view", to_type("hydra.run.dir", place))

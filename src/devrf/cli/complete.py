@@ -83,6 +83,9 @@ def completed(arguments: Sequence[str]) -> list[str]:
     for word in unknown:
         meant = word.lstrip("-") if "=" in word else "KEY=VALUE, without dashes"
         raise DevrfError(f"{word}: no such option; write {meant}, or --help for what there is")
+    rerun = options.experimental_rerun
+    if rerun is not None and not Path(rerun).is_file():
+        raise DevrfError(f"--experimental-rerun: {rerun}: no such file; give a job's config.pickle")
     flags = [word for word in arguments if word not in options.overrides]
     texts = [SHORTHAND.get(word.lower(), word) for word in options.overrides]
     in_sweep = options.multirun or _sweeps(texts, options.config_dir)
@@ -93,7 +96,8 @@ def completed(arguments: Sequence[str]) -> list[str]:
         return [*flags, *texts]
     for override in typed:
         names = group_choices().get(override.key_or_group)
-        if names and override.value() is None and not override.is_delete():
+        one = not override.is_delete() and not override.is_sweep_override()
+        if names and one and not isinstance(override.value(), str | list):
             line = override.input_line
             raise DevrfError(f"{line}: choose one of {', '.join(names)}, or leave it out")
         if override.key_or_group == "debug":

@@ -18,6 +18,8 @@ from omegaconf import DictConfig, OmegaConf
 from devrf.apps.settings import ReportSettings
 from devrf.system.override import to_type
 
+# A value that is another key's.
+REFERENCE = re.compile(r"\$\{([\w.]+)\}")
 PIPELINE = "pipeline"
 # A sweep's config, with what was typed: in its folder.
 SWEEP_RECORD = "multirun.yaml"
@@ -165,6 +167,19 @@ def in_sweep() -> bool:
 def stage_section(config: DictConfig, stage: str) -> str:
     """The section of the config that says how a stage is built: its own, or of any ray stage."""
     return stage if stage in config else "ray_stage"
+
+
+def set_at(config: DictConfig, names: Sequence[Any]) -> str:
+    """The key at which the user sets a value: a reference on the way leads to another one.
+
+    Names that a section does not have are passed over: of an item of a list, of a type.
+    """
+    node: Any = config
+    for name in names:
+        if isinstance(node, DictConfig) and name in node:
+            raw: Any = node._get_node(name)
+            node = raw._maybe_dereference_node()
+    return str(node._get_full_key(None))
 
 
 def leaves(value: Any, key: str) -> dict[str, Any]:

@@ -1,4 +1,11 @@
-"""A composed config against the signatures of its ``_target_``, before anything is built."""
+"""A composed config against the signatures of its ``_target_``, before anything is built.
+
+Each part, a section with ``_target_``, is checked for itself: the keys that its class or function
+takes, by name and type. The types are those by which settings check themselves when they are built
+from Python (:mod:`devrf.system.options`), so that each is written once. A key outside the parts
+belongs to the root (``ROOT``), is read by a part (``${loss.search}``), or is in ``conf/``: typing
+over a part's ``${...}`` leaves one unread.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +13,7 @@ import inspect
 import json
 import logging
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import is_dataclass
 from functools import reduce
@@ -17,18 +24,19 @@ from typing import Annotated, Any, Literal, cast, get_type_hints
 
 from annotated_types import Ge, Lt
 from hydra.utils import get_object
-from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from typing_extensions import TypedDict
 
-from devrf.cli.config import config_folder
+from devrf.cli.config import REFERENCE, config_folder, set_at
 from devrf.errors import DevrfError, did_you_mean
 
-# Keys outside the parts.
+# Keys of the root.
 ROOT: dict[str, Any] = {
     "stage": str,
     "method": str,
     "facing": Literal["inward", "forward"],
     "seed": Annotated[int, Ge(0), Lt(2**32)],
+    "deterministic": bool | Literal["warn"],
     "rehearse": bool,
     "resume": bool,
     "memory_check": bool,
@@ -49,9 +57,9 @@ RESERVED = {"_target_", "_partial_", "_convert_", "_recursive_", "_args_"}
 UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
 BUILT = ("needs_python_object", "is_instance_of")
 LEFT = ("missing", "missing_argument")
-REFERENCE = re.compile(r"\$\{([\w.]+)\}")
 
 Node = Mapping[Any, Any]
+Names = tuple[Any, ...]
 
 
 def check_config(config: DictConfig) -> None:
@@ -63,78 +71,69 @@ def check_config(config: DictConfig) -> None:
         DevrfError: naming the key at fault and what was expected.
     """
     # Imported here: --help is answered before it has loaded.
-    from pydantic import TypeAdapter, ValidationError
-
     from devrf.system.options import expectation
 
-    raw: Any = OmegaConf.to_container(config)
-    text = json.dumps(raw, default=str, ensure_ascii=False)
-    for key in sorted(OmegaConf.missing_keys(config)) if MISSING in text else ():
+    for key in sorted(OmegaConf.missing_keys(config)):
         value = "PATH" if key.endswith("root") else "VALUE"
         raise DevrfError(f"{key}: required; give {key}={value}")
+    raw: Any = OmegaConf.to_container(config)
     resolved: Any = OmegaConf.to_container(config, resolve=True)
-    read = tuple(f"{key}." for key in REFERENCE.findall(text))
     # A key that is missing is wrong in its type, too.
-    content = json.dumps(dict.fromkeys(ROOT) | resolved, default=str)
-    try:
-        TypeAdapter(_type_of(raw, resolved, "", read)).validate_json(content, strict=True)
-    except ValidationError as error:
-        issues = [issue for issue in error.errors() if not _is_left_to_the_part(issue)]
-        for issue in sorted(issues, key=lambda issue: issue["type"] not in UNKNOWN):
-            where, beside = _place(raw, issue["loc"])
-            if issue["type"] in UNKNOWN:
-                lacking = [other["loc"][-1] for other in error.errors() if other["type"] in LEFT]
-                raise unknown_key(where, [*beside, *lacking]) from None
-            alike = [other["msg"] for other in issues if _place(raw, other["loc"])[0] == where]
-            value = issue["input"]
-            said = expectation(alike, repr(value))
-            choices = re.findall("'([^']+)'", said.rpartition(", not ")[0])
-            meant = did_you_mean(value, choices, f"{where}=")
-            if issue["type"] in BUILT:
-                said = f"expected a section with _target_, not {value!r}"
-            raise DevrfError(f"{where}: {said}{meant}") from None
+    issues = _issues(dict.fromkeys(ROOT) | resolved, ROOT | {"**": Any}, ())
+    read = tuple(f"{key}." for key in REFERENCE.findall(json.dumps(raw, default=str)))
+    unread = []
+    for names, value in _walk(raw):
+        key = ".".join(names)
+        if _is_part(value):
+            part = reduce(getitem, names, resolved)
+            issues += _issues(part, _settings(part, key), names)
+        elif key not in ROOT and not f"{key}.".startswith(read) and not any(_options_with(names)):
+            unread.append(names)
+    for names in [names for names, issue in issues if issue["type"] in UNKNOWN] + unread:
+        lacking = [other[-1] for other, issue in issues if issue["type"] in LEFT]
+        raise unknown_key(config, names, lacking)
+    places = [set_at(config, names) or names[0] for names, _ in issues]
+    for where, (_, issue) in zip(places, issues, strict=True):
+        value = issue["input"]
+        # Whether it is right, only building the part tells: a row's keys, a part's class.
+        if issue["type"] in LEFT or (issue["type"] in BUILT and _is_part(value)):
+            continue
+        alike = [issue["msg"] for at, (_, issue) in zip(places, issues, strict=True) if at == where]
+        said = expectation(alike, repr(value))
+        choices = re.findall("'([^']+)'", said.rpartition(", not ")[0])
+        if issue["type"] in BUILT:
+            said = f"expected a section with _target_, not {value!r}"
+        raise DevrfError(f"{where}: {said}{did_you_mean(value, choices, f'{where}=')}")
 
 
-def _is_left_to_the_part(issue: Mapping[str, Any]) -> bool:
-    """Whether only building the part tells if pydantic is right: a row's keys, a part's class."""
-    return issue["type"] in LEFT or (issue["type"] in BUILT and _is_part(issue["input"]))
+def _issues(values: Node, types: Mapping[str, Any], names: Names) -> list[tuple[Names, Any]]:
+    """Pydantic's errors of the section at ``names``, each with the names that lead to it."""
+    from pydantic import TypeAdapter, ValidationError
 
-
-def _type_of(raw: Node, resolved: Node, path: str, read: tuple[str, ...]) -> Any:
-    """The type of a node: a part's has its settings, another's the keys that parts read of it.
-
-    A value outside any part counts as read when some part refers to it: ``${loss.search}``.
-    """
-    hints = _settings(resolved, path) if _is_part(raw) else {} if path else dict(ROOT)
-    for key, value in raw.items():
-        where = f"{path}{key}."
-        if _is_part(raw) and key not in hints:
-            hints |= {key: Any} if "**" in hints else {}
-        elif isinstance(value, Mapping) and (_is_part(value) or not _is_part(raw)):
-            hints[key] = _type_of(value, resolved[key], where, read)
-        elif _is_part(resolved[key]):
-            hints[key] = Any  # checked in its own place
-        elif key not in hints and (value is None or where.startswith(read)):
+    hints = {key: hint for key, hint in types.items() if key != "**"}
+    for key, value in values.items():
+        # A part is checked in its own place.
+        if _is_part(value) or (key not in types and "**" in types):
             hints[key] = Any
-    made = cast(Any, TypedDict)(path, hints, total=False)
-    made.__pydantic_config__ = {"extra": "forbid", "arbitrary_types_allowed": True}
-    return made
+    kind = cast(Any, TypedDict)("Section", hints, total=False)
+    kind.__pydantic_config__ = {"extra": "forbid", "arbitrary_types_allowed": True}
+    try:
+        TypeAdapter(kind).validate_json(json.dumps(values, default=str), strict=True)
+    except ValidationError as error:
+        return [(names + issue["loc"], issue) for issue in error.errors()]
+    return []
 
 
-def _place(raw: Node, names: Iterable[object]) -> tuple[str, Node]:
-    """The key at which the user sets a value of a config, and the mapping that holds it."""
-    where = ""
-    node = cast(Any, raw)
-    beside = raw
-    for name in map(str, names):  # some name one of several types
-        if isinstance(node, Mapping) and name in node:
-            beside = node
-            node = node[name]
-            where = f"{where}.{name}".lstrip(".")
-            if isinstance(node, str) and (reference := REFERENCE.fullmatch(node)):
-                where = reference[1]
-                node = reduce(getitem, where.split("."), raw)
-    return where, beside
+def _walk(node: Node, names: Names = (), inside: bool = False) -> Iterator[tuple[Names, Any]]:
+    """The parts, and the values that no part holds, each with the names that lead to it."""
+    if _is_part(node):
+        inside = True
+        yield names, node
+    for key, value in node.items():
+        if isinstance(value, Mapping):
+            yield from _walk(value, (*names, key), inside)
+        elif value is not None and not inside:
+            yield (*names, key), value
 
 
 def _settings(part: Node, path: str) -> dict[str, Any]:
@@ -153,7 +152,7 @@ def _parameters(target: str, path: str) -> dict[str, Any]:
         part = get_object(target)
         parameters = inspect.signature(part).parameters.values()
     except Exception as error:
-        raise DevrfError(f"{path}_target_: cannot load {target!r} ({error})") from None
+        raise DevrfError(f"{path}._target_: cannot load {target!r} ({error})") from None
     # A dataclass may inherit fields whose types only its base's module knows.
     own_init = inspect.isclass(part) and not is_dataclass(part)
     hints: dict[str, Any] = {}
@@ -170,32 +169,45 @@ def _is_part(value: object) -> bool:
     return isinstance(value, Mapping) and "_target_" in value
 
 
-def unknown_key(where: str, keys: Iterable[object]) -> DevrfError:
-    """The error for a key that does not exist, with the closest one that does."""
-    name = where.rpartition(".")[2]
-    meant = did_you_mean(name, (key for key in keys if key != name), where[: -len(name)])
-    group, _, key = where.partition(".")
-    files = sorted((config_folder() / group).glob("*.yaml"))
-    having: list[str] = []
-    deeper: list[str] = []
-    for path in files:
-        # As plain data: a DictConfig does not "contain" a required key that is not given.
-        settings: Any = OmegaConf.to_container(OmegaConf.load(path))
-        flat = set(_below(settings))
-        having += [path.stem] * (key in flat)
-        deeper += [f"{group}.{other}" for other in flat if other.partition(".")[2] == key]
-    instead = f"it belongs to {group}={', '.join(having)}" if having else ""
-    instead = instead or f"it is {' or '.join(dict.fromkeys(deeper))}" * bool(deeper)
-    instead = instead or "--cfg job shows every key there is"
+def unknown_key(config: DictConfig, names: Names, others: Iterable[object] = ()) -> DevrfError:
+    """The error for a key that does not exist, with the closest one that does.
+
+    Args:
+        config: the config, or one in which the key is missing.
+        names: those that lead to the key.
+        others: names that its section might have, beside those that it has.
+    """
+    section, name = set_at(config, names[:-1]), str(names[-1])
+    where = f"{section}.{name}".lstrip(".")
+    there = OmegaConf.select(config, section) if section else config
+    known = {*there, *others} - {name} if isinstance(there, DictConfig) else others
+    meant = did_you_mean(name, sorted(map(str, known)), where[: -len(name)])
+    instead = "--cfg job shows every key there is"
+    path = where.split(".")
+    if having := ", ".join(_options_with(path)):
+        instead = f"it belongs to {path[0]}={having}"
+    elif deeper := " or ".join(dict.fromkeys(_deeper(path))):
+        instead = f"it is {deeper}"
     return DevrfError(f"{where}: no such key{meant or f'; {instead}'}")
 
 
-def _below(node: Node, path: str = "") -> Iterator[str]:
-    """The keys below a node, with dots between them."""
-    for name, value in node.items():
-        yield f"{path}{name}"
-        if isinstance(value, Mapping):
-            yield from _below(value, f"{path}{name}.")
+def _options_with(names: Sequence[str]) -> Iterator[str]:
+    """The options of the group ``names[0]`` whose files have the key."""
+    for file in sorted((config_folder() / names[0]).glob("*.yaml")):
+        node: Any = OmegaConf.to_container(OmegaConf.load(file))
+        for name in names[1:]:
+            node = node.get(name, ...) if isinstance(node, Mapping) else ...
+        if node is not ...:
+            yield file.stem
+
+
+def _deeper(names: Sequence[str]) -> Iterator[str]:
+    """The keys of a group that are called so, a section further down: ``logger.wandb.offline``."""
+    for file in sorted((config_folder() / names[0]).glob("*.yaml")):
+        settings: Any = OmegaConf.to_container(OmegaConf.load(file))
+        for section, node in settings.items():
+            if isinstance(node, Mapping) and names[1:] == [key for key in node if key in names[1:]]:
+                yield ".".join([names[0], section, *names[1:]])
 
 
 def check_extras(config: DictConfig) -> None:

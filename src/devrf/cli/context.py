@@ -47,6 +47,14 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+# Keys of the trainer that a run sets itself, and what chooses their values.
+OF_THE_RUN = {
+    "logger": "logger=NAME chooses it",
+    "callbacks": "+callbacks.NAME._target_=CLASS adds one",
+    "default_root_dir": "hydra.run.dir=FOLDER is the run's folder",
+    "enable_checkpointing": "a ModelCheckpoint among callbacks turns it on",
+}
+
 
 class RunContext(ExitStack):
     """A composed config, the run's folder, and parts that are built when first used.
@@ -265,9 +273,12 @@ def _strategy(config: DictConfig) -> Strategy:
     """The configured trainer's strategy.
 
     Raises:
-        DevrfError: several processes without ``trainer=ddp``, or what only Lightning's own
-            optimiser steps have.
+        DevrfError: several processes without ``trainer=ddp``, what only Lightning's own optimiser
+            steps have, or what a run gives the trainer itself.
     """
+    for key, instead in OF_THE_RUN.items():
+        if key in config.trainer:
+            raise DevrfError(f"trainer.{key}: a run sets it itself; leave it out: {instead}")
     trainer: Trainer = instantiate(config.trainer, logger=False)
     rays = "schedule.canonical.rays, schedule.deformation.rays or ray_stage.schedule.rays"
     for key, usual, instead in (

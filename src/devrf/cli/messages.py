@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import os
-import re
-import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from traceback import walk_tb
 
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from devrf.cli.config import group_choices, known_stages
 from devrf.cli.config_check import unknown_key
@@ -59,7 +58,14 @@ def is_user_error(error: BaseException) -> bool:
         return error.errno in REFUSED
     # Another error in a constructor of devrf is a fault of the program.
     ours = "Error in call to target 'devrf." in str(error)
-    return isinstance(error, HydraException | OmegaConfBaseException) and not ours
+    by_library = isinstance(error, HydraException | OmegaConfBaseException)
+    return (by_library and not ours) or _of_hydras_options(error)
+
+
+def _of_hydras_options(error: BaseException) -> bool:
+    """Whether Hydra refuses a command's options, for which it has no class of error."""
+    modules = [""] + [frame.f_globals["__name__"] for frame, _ in walk_tb(error.__traceback__)]
+    return isinstance(error, ValueError) and modules[-1].startswith("hydra._internal.")
 
 
 def _cause(error: BaseException) -> BaseException:
@@ -74,8 +80,9 @@ def _cause(error: BaseException) -> BaseException:
 
 def one_line(error: BaseException) -> str:
     """The error's message on one line that begins with the key or file at fault."""
-    text = str(_cause(error))
-    if isinstance(_cause(error), DevrfError):
+    cause = _cause(error)
+    text = str(cause)
+    if isinstance(cause, DevrfError):
         pass
     elif isinstance(error, MissingConfigException) and "/" in str(error.missing_cfg_file):
         group, _, option = str(error.missing_cfg_file).rpartition("/")
@@ -88,29 +95,24 @@ def one_line(error: BaseException) -> str:
         text = f"{group}={option}: no such option{names}{more}{meant}"
     elif isinstance(error, OverrideParseException):
         text = _not_understood(str(error.override))
-    elif several := re.match(r"(?s)Ambiguous value for argument '(.*?)'\n1\. ", text):
-        text = _of_several(several[1])
     elif isinstance(error, OSError) and not isinstance(error, HydraException):
         text = f"{error.filename or 'output'}: {error.strerror}"
-    elif unknown := re.match(r"Could not override '([^']+)'", text):
+    elif isinstance(error.__cause__, ConfigKeyError | ConfigAttributeError):
         # OmegaConf keeps the mapping that does not have the key.
-        near = getattr(error.__cause__, "parent_node", None)
-        text = str(unknown_key(unknown[1], near or ()))
-    else:  # without the lines that OmegaConf adds on its types
-        text = re.sub(r"(?m)^\s*(full_key:|object_type=|reference_type=).*$", "", text)
-        if key := re.search(r"^\s*full_key: (\S+)$", str(error), re.MULTILINE):
-            text = f"{key[1]}: {text}"
+        root = error.__cause__.parent_node._get_root()
+        text = str(unknown_key(root, tuple(str(error.__cause__.full_key).split("."))))
+    else:
+        # Both libraries write the key, and OmegaConf its types, on lines below.
+        key = str(error).partition("full_key: ")[2].split("\n")[0]
+        text = text.partition("full_key: ")[0]
+        deeper = cause.__cause__
+        while deeper is not None:
+            reason = str(deeper).partition("full_key: ")[0].strip()
+            text += f": {reason}" if reason not in text else ""
+            deeper = deeper.__cause__
+        text = f"{key}: {text}" if key else text
     # Spaces within a line stay: names may have several in a row.
     return shown(" ".join(filter(None, map(str.strip, text.splitlines()))))
-
-
-def _of_several(argument: str) -> str:
-    """A remedy for values with commas between them, which only a sweep has."""
-    key, _, value = argument.partition("=")
-    as_text, as_list = to_type(key, value), shlex.quote(f"{key}=[{value}]")
-    return (
-        f"{argument}: several values; write {as_text} as text, {as_list} as a list, or -m to sweep"
-    )
 
 
 def _not_understood(argument: str) -> str:

@@ -35,8 +35,7 @@ from devrf.checkpoints.checkpoint import (
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file, read_description
 from devrf.checkpoints.file_metadata import OWN_REST, digest_of
 from devrf.checkpoints.progress import progress_files
-from devrf.cli.config import command_line, leaves, stage_section
-from devrf.cli.config_check import REFERENCE
+from devrf.cli.config import REFERENCE, command_line, leaves, stage_section
 from devrf.cli.context import RunContext
 from devrf.errors import DevrfError
 from devrf.system.files import read_record, write_json
