@@ -26,7 +26,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.cli import run as command
 from devrf.cli.complete import completed
-from devrf.cli.config import config_folder, register_config
+from devrf.cli.config import config_folder
 from devrf.cli.config_check import check_config
 from devrf.cli.context import RunContext
 from devrf.cli.run_folder import working_in
@@ -51,7 +51,6 @@ def open_run(overrides: Sequence[str]) -> RunContext:
         DevrfError: a setting is unknown or invalid, or asks for several processes.
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    register_config()
     typed = completed(overrides)
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         config = compose("config", overrides=typed, return_hydra_config=True)

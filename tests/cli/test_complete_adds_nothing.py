@@ -7,7 +7,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from devrf.cli.complete import completed
-from devrf.cli.config import config_folder, group_choices, register_config
+from devrf.cli.config import config_folder, group_choices
 
 NAMES = group_choices()
 EMBEDDED = {"procedural", "flower", "procedural_forward"}
@@ -26,7 +26,6 @@ def test_the_command_line_adds_nothing_to_what_is_typed(data):
     [("procedural", "quickstart"), ("forward", "paper"), ("colmap", "phone")],
 )
 def test_python_and_the_command_line_compose_the_same(devrf, data, experiment):
-    register_config()
     scene = [f"data={data}", *([] if data in EMBEDDED else ["data.root=scene"])]
     typed = [*scene, f"experiment={experiment}"]
     with initialize_config_dir(str(config_folder()), version_base="1.3"):

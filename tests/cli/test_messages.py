@@ -287,7 +287,7 @@ def test_a_torchvision_for_another_torch_is_one_line(python, tmp_path, monkeypat
 
 
 def test_a_fault_of_the_program_keeps_its_traceback(devrf, monkeypatch):
-    monkeypatch.setattr("devrf.cli.main.check_extras", lambda config: 1 / 0)
+    monkeypatch.setattr("devrf.cli.run.check_extras", lambda config: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         devrf("stage=prepare")
 

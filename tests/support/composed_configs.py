@@ -12,7 +12,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, open_dict
 
-from devrf.cli.config import config_folder, register_config
+from devrf.cli.config import config_folder
 
 Composed = Callable[..., DictConfig]
 
@@ -31,7 +31,6 @@ def whole_config(*overrides: str) -> DictConfig:
 @pytest.fixture
 def composed(tmp_path: Path) -> Iterator[Composed]:
     """``composed(*overrides)``: the config of a run in a folder of the test's own."""
-    register_config()
     hydra = HydraConfig.instance()
     before = hydra.cfg
 

@@ -124,10 +124,15 @@ def job_folder(_root_: Any) -> str:
     return scene_folder_name(name)[:150]
 
 
-def register_config() -> None:
-    """Make the names of folders known to Hydra, ``${devrf.run_folder:}``."""
-    for word in (run_folder, job_folder):
-        OmegaConf.register_new_resolver(f"devrf.{word.__name__}", word, replace=True)
+def output_dir() -> str:
+    """The present job's folder; outside Hydra ``outputs``, until ``run_stage`` is given one."""
+    config: Any = HydraConfig.instance().cfg or DictConfig({})
+    return str(OmegaConf.select(config, "hydra.runtime.output_dir", default="outputs"))
+
+
+# For ``${devrf.run_folder:}`` in a config.
+for _word in (run_folder, job_folder, output_dir):
+    OmegaConf.register_new_resolver(f"devrf.{_word.__name__}", _word, replace=True)
 
 
 def command_line(*words: str) -> str:

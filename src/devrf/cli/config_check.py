@@ -38,6 +38,7 @@ ROOT: dict[str, Any] = {
     "seed": Annotated[int, Ge(0), Lt(2**32)],
     "deterministic": bool | Literal["warn"],
     "rehearse": bool,
+    "output_dir": str | Path,
     "resume": bool,
     "memory_check": bool,
     "priors": Literal["all", "none"],

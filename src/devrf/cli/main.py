@@ -12,13 +12,13 @@ from omegaconf import DictConfig
 
 import devrf
 from devrf.cli.complete import commands, completed
-from devrf.cli.config import config_folder, in_sweep, overrides, register_config
-from devrf.cli.config_check import check_config, check_extras
+from devrf.cli.config import config_folder, in_sweep, overrides
 from devrf.cli.messages import report_user_errors
 from devrf.cli.restore_config import log_applied_defaults, parsed
 from devrf.cli.run_folder import working_in
 from devrf.cli.sweep import naming_failures, record_failure
 from devrf.cli.view import serve_page, serves_page
+from devrf.errors import expect
 from devrf.system.files import utf8_path
 from devrf.system.override import without_reference
 from devrf.system.process import (
@@ -30,8 +30,6 @@ from devrf.system.process import (
     tune_for_cpu,
     use_utf8,
 )
-
-register_config()
 
 
 @quiet_if_unread()
@@ -72,10 +70,9 @@ def run(config: DictConfig) -> float | None:
         if serves_page(parsed(overrides()), folder):
             serve_page(config, folder)
             return None
-        # The check loads the parts that the config names, torch among them.
+        chosen = f"{folder}, which hydra.run.dir=FOLDER chooses"
+        expect(config.output_dir == str(folder), "output_dir", chosen, config.output_dir)
         with importing():
-            check_config(config)
-            check_extras(config)
             # Imported here: --help and a misspelt key are answered before torch has loaded.
             from devrf.cli.run import run_stage
 

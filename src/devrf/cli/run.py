@@ -19,6 +19,7 @@ from devrf.apps.render import camera_path
 from devrf.apps.settings import ViewerSettings
 from devrf.apps.viewer.page import PAGE
 from devrf.cli.config import OF_A_CHECKPOINT, PIPELINE, SCENELESS_STAGES, in_sweep
+from devrf.cli.config_check import check_config, check_extras
 from devrf.cli.context import RunContext
 from devrf.cli.evaluate import evaluate
 from devrf.cli.memory import forecast
@@ -27,7 +28,7 @@ from devrf.cli.processes import connected, run_in_each, starts_processes
 from devrf.cli.rehearse import begin_anew, conclude
 from devrf.cli.render import export, render, still, view, write_scene_page
 from devrf.cli.resume import done, note_done, unfinished
-from devrf.cli.run_folder import archive_previous
+from devrf.cli.run_folder import archive_previous, working_in
 from devrf.cli.train import learn
 from devrf.engine.ddp import world_size
 from devrf.errors import DevrfError, did_you_mean, expect
@@ -38,6 +39,7 @@ from devrf.system.files import read_record
 from devrf.system.folder_lock import PLACE
 from devrf.system.memory import free_cache, shortage_in_words
 from devrf.system.override import to_type
+from devrf.system.process import importing
 
 log = logging.getLogger(__name__)
 
@@ -98,28 +100,40 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
     Raises:
         DevrfError: the input is wrong.
     """
-    runtime.choose(config.kernels, deterministic=config.deterministic)
-    with RunContext(config, folder) as run:
-        learning, steps = plan(config.stage, run.learning_stages)
-        if learning and run.is_trial:
-            steps = ()  # nothing of it is worth a score or a video
-        elif learning and run.rehearses:
-            steps = REHEARSED_STEPS
-        with shortage_in_words(config.stage, run.device, None):  # of networks that are too wide
-            _check(run, learning, steps)
-        if learning and starts_processes(run.strategy):
-            run_in_each(run.strategy, folder)
-            return _objective(run, ()) if in_sweep() and "evaluate" in steps else None
-        if learning:
-            with connected(run.strategy):
-                _learn(run, learning, steps)
-        for name in steps if run.is_rank_zero or not learning else ():
-            if not (learning and done(run, name)):
-                _run_step(run, name, AFTER_LEARNING.get(name) or STEPS[name])
-        if learning and run.rehearses and run.is_rank_zero:
-            conclude(run)
-        scored = "evaluate" in steps and run.is_rank_zero and not run.rehearses
-        return _objective(run, steps) if scored and unfinished(run) is None else None
+    folder = folder.absolute()
+    with working_in(folder, config):
+        config.output_dir = str(folder)
+        with importing():  # the parts that the config names
+            check_config(config)
+            check_extras(config)
+        runtime.choose(config.kernels, deterministic=config.deterministic)
+        with RunContext(config, folder) as run:
+            return _run_plan(run)
+
+
+def _run_plan(run: RunContext) -> float | None:
+    """Take the steps that ``stage=…`` asks for; return the objective, if it was scored."""
+    config = run.config
+    learning, steps = plan(config.stage, run.learning_stages)
+    if learning and run.is_trial:
+        steps = ()  # nothing of it is worth a score or a video
+    elif learning and run.rehearses:
+        steps = REHEARSED_STEPS
+    with shortage_in_words(config.stage, run.device, None):  # of networks that are too wide
+        _check(run, learning, steps)
+    if learning and starts_processes(run.strategy):
+        run_in_each(run.strategy, run.folder)
+        return _objective(run, ()) if in_sweep() and "evaluate" in steps else None
+    if learning:
+        with connected(run.strategy):
+            _learn(run, learning, steps)
+    for name in steps if run.is_rank_zero or not learning else ():
+        if not (learning and done(run, name)):
+            _run_step(run, name, AFTER_LEARNING.get(name) or STEPS[name])
+    if learning and run.rehearses and run.is_rank_zero:
+        conclude(run)
+    scored = "evaluate" in steps and run.is_rank_zero and not run.rehearses
+    return _objective(run, steps) if scored and unfinished(run) is None else None
 
 
 def _prepare_to_learn(run: RunContext, requested: Names, steps: Names) -> None:
