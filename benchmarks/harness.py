@@ -51,7 +51,7 @@ def open_run(overrides: Sequence[str]) -> RunContext:
         DevrfError: a setting is unknown or invalid, or asks for several processes.
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    typed = completed(overrides)
+    typed = completed(overrides).words
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         config = compose("config", overrides=typed, return_hydra_config=True)
     HydraConfig.instance().set_config(config)

@@ -12,7 +12,6 @@ from omegaconf import OmegaConf
 
 from devrf.cli.complete import completed
 from devrf.cli.config import PATHS
-from devrf.cli.restore_config import applied_defaults
 from devrf.errors import DevrfError
 from devrf.scenes.export import export
 from devrf.scenes.procedural import ProceduralForwardScene, ProceduralScene
@@ -25,21 +24,21 @@ PARSER = OverridesParser.create()
     "path", ["/my scenes/fox [1]", "München (2)", "a=b", 'a "b"', "2026", "a,b", "x, y"]
 )
 def test_a_path_is_taken_as_it_is_typed(key, path):
-    argument = completed(["data=inward", f"{key}={path}"])[-1]
+    argument = completed(["data=inward", f"{key}={path}"]).words[-1]
     assert PARSER.parse_override(argument).value() == path
 
 
 def test_the_home_folder_is_filled_in(monkeypatch):
     monkeypatch.setenv("HOME", "/home/ä b")
-    several = completed(["-m", "data=inward", "data.root=~/a,~/b"])[-1]
+    several = completed(["-m", "data=inward", "data.root=~/a,~/b"]).words[-1]
     read = [path.text for path in PARSER.parse_override(several).value().list]
     assert read == ["/home/ä b/a", "/home/ä b/b"]
 
 
 def test_the_rest_is_left_to_hydra():
     for argument in ("report.runs=/a/b c", "ckpt=null", "seed=1,2", "--help", "x=["):
-        assert completed([argument]) == [argument]
-    assert completed(["viewer=True"]) == ["viewer.training=true"]
+        assert completed([argument]).words == [argument]
+    assert completed(["viewer=True"]).words == ["viewer.training=true"]
 
 
 def test_the_keys_of_paths_exist(devrf):
@@ -139,7 +138,7 @@ def test_what_the_files_of_a_scene_say_comes_after_what_was_typed(
     scenes, monkeypatch, typed, by_files
 ):
     monkeypatch.chdir(scenes)
-    assert completed(typed.split()) == [*typed.split(), *by_files.split()]
+    assert completed(typed.split()).words == [*typed.split(), *by_files.split()]
 
 
 @pytest.mark.parametrize("place", ["--config-dir {}", "hydra.searchpath=[file://{}]"])
@@ -148,7 +147,7 @@ def test_an_experiment_in_a_folder_of_ones_own_chooses_the_reader(scenes, tmp_pa
     chosen = "# @package _global_\ndefaults: [override /data: nerfstudio]\n"
     (tmp_path / "experiment" / "mine.yaml").write_text(chosen)
     typed = [*place.format(tmp_path).split(), "experiment=mine", f"data.root={scenes}/walker"]
-    assert completed(typed) == typed
+    assert completed(typed).words == typed
 
 
 def test_what_the_files_say_is_said_in_one_line(devrf, scenes, short):
@@ -163,10 +162,10 @@ def test_what_learns_one_moving_camera_is_named_and_not_chosen(scenes, scene):
     line = f"{lacks}; give experiment=phone, on a GPU experiment=phone_gpu"
     with pytest.raises(DevrfError, match=f"{scene}: {line}$"):
         completed([f"data.root={scenes}/{scene}"])
-    completed([f"data.root={scenes}/{scene}", "stage=inspect"])
-    assert applied_defaults[0].endswith(line)
-    completed([f"data.root={scenes}/{scene}", "method=devrf"])
-    assert applied_defaults[0].endswith(f"{lacks}; experiment=phone learns more of it")
+    remarks = completed([f"data.root={scenes}/{scene}", "stage=inspect"]).remarks
+    assert remarks[0].endswith(line)
+    remarks = completed([f"data.root={scenes}/{scene}", "method=devrf"]).remarks
+    assert remarks[0].endswith(f"{lacks}; experiment=phone learns more of it")
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ def test_the_command_line_adds_nothing_to_what_is_typed(data):
     scene = [f"data={data}", *([] if data in EMBEDDED else ["data.root=scene"])]
     for experiment in NAMES["experiment"]:
         typed = [*scene, f"experiment={experiment}"]
-        assert completed(typed) == typed
+        assert completed(typed).words == typed
 
 
 @pytest.mark.parametrize(

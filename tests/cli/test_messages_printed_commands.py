@@ -140,7 +140,7 @@ def test_the_words_of_another_way_do_too(devrf, tmp_path, name):
 def test_a_folder_without_its_key_is_named_with_it(devrf, tmp_path, name):
     (tmp_path / "in" / name).mkdir(parents=True)
     (word,) = shlex.split(devrf(f"in/{name}").err.partition("did you mean ")[2].rstrip("?\n"))
-    assert value(parsed(completed(["data=inward", word])), "data.root") == f"in/{name}"
+    assert value(parsed(completed(["data=inward", word]).words), "data.root") == f"in/{name}"
 
 
 @pytest.mark.parametrize(
@@ -192,10 +192,10 @@ def test_a_comma_belongs_to_the_name_but_in_a_sweep(tmp_path, monkeypatch):
     for folder in ("a,b", "a", "b"):
         put(Path(folder, SCENE))
     for typed in ("data.root=a,b", "data.root='a,b'", f"data.root={tmp_path}/a,b"):
-        (root, *_) = completed([typed])
+        (root, *_) = completed([typed]).words
         assert str(PARSER.parse_override(root).value()).endswith("a,b")
     for typed in ("-m", "experiment=ablation_table", "hydra.mode=MULTIRUN"):
-        words = [word for word in completed([typed, "data.root=a,b"]) if "=" in word]
+        words = [word for word in completed([typed, "data.root=a,b"]).words if "=" in word]
         assert values(parsed(words), "data.root") == ["a", "b"]
 
 

@@ -59,7 +59,7 @@ def config(folder: Path) -> DictConfig:
 
 def composed(typed: list[str]) -> DictConfig:
     """What Hydra composes of what was typed, completed."""
-    words = [word for word in completed(typed) if word != "-m"]
+    words = [word for word in completed(typed).words if word != "-m"]
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         return compose("config", words, return_hydra_config=True)
 
@@ -148,7 +148,7 @@ def test_checkpoints_of_a_sweep_share_what_they_have_in_common(learned_by, monke
     other = learned_by({"facing": "forward"}, {"data.frames": 5, "seed": 4}, name="other.ckpt")
     found = composed(["-m", "stage=still", f"ckpt='{one},{other}'"])
     assert found.hydra.sweeper.params is None
-    words = completed(["-m", "stage=still", f"ckpt={one},{other}"])
+    words = completed(["-m", "stage=still", f"ckpt={one},{other}"]).words
     assert words[:2] == ["-m", "facing=forward"]
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         found = compose("config", [word for word in words[1:] if "ckpt=" not in word])
@@ -328,10 +328,10 @@ def test_a_sweep_goes_on_with_all_kinds_of_values(tmp_path, monkeypatch):
     typed = [*task, "+data.name='a, b'", *of_the_command]
     (tmp_path / "multirun.yaml").write_text(json.dumps(recorded(*typed)))
     typed = [f"hydra.sweep.dir={tmp_path}", "stage=inspect"]
-    assert completed(typed) == [*task, "+data.name='a, b'", "hydra.mode=MULTIRUN", *typed]
+    assert completed(typed).words == [*task, "+data.name='a, b'", "hydra.mode=MULTIRUN", *typed]
     # Of a group, or a key, that is typed nothing is taken over.
     other = [*typed, "experiment=paper", "seed=3"]
-    assert completed(other) == [task[1], "+data.name='a, b'", "hydra.mode=MULTIRUN", *other]
+    assert completed(other).words == [task[1], "+data.name='a, b'", "hydra.mode=MULTIRUN", *other]
 
 
 WRITTEN = ["run.log", ".hydra", ".devrf", ".hydra/config.yaml", ".devrf/process.txt"]

@@ -154,7 +154,7 @@ def test_commands_compose(batch, composed, tmp_path, monkeypatch):
     (tmp_path / "scene" / "transforms_train.json").touch()  # so that a layout is recognised
     for words in batch:
         assert words.get("stage", "stage=pipeline").partition("=")[2] in known_stages()
-    words = [word for words in batch for word in completed(list(words.values()))]
+    words = [word for words in batch for word in completed(list(words.values())).words]
     check_config(composed(*dict.fromkeys(words)))
 
 

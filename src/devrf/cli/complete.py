@@ -12,23 +12,23 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from itertools import product
 from pathlib import Path
 
 from hydra import initialize_config_dir
 from hydra._internal.utils import get_args_parser
-from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.types import Override, ValueType
 from hydra.errors import HydraException
 from hydra.types import RunMode
+from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from devrf.cli.config import PATHS, SCENELESS_STAGES, STEPS, config_folder, group_choices
 from devrf.cli.restore_config import (
-    applied_defaults,
+    Applied,
     of_named_run,
     parsed,
     searched_runs,
@@ -70,15 +70,16 @@ def commands(arguments: Sequence[str]) -> list[list[str]]:
     return [[*others, f"hydra.run.dir={literal(str(run))}"] for run in runs] or [[*arguments]]
 
 
-def completed(arguments: Sequence[str]) -> list[str]:
+def completed(arguments: Sequence[str]) -> Applied:
     """The command line for Hydra to compose, by typed arguments, without the program's name.
+
+    The remarks say where settings are from that were not typed.
 
     Raises:
         DevrfError: a scene's folder cannot be recognised, the scenes of a sweep need different
             options, a scene is none for DeVRF, a group's choice is null, or a word is another
             framework's.
     """
-    applied_defaults.clear()
     options, unknown = get_args_parser().parse_known_intermixed_args(arguments)
     for word in unknown:
         meant = word.lstrip("-") if "=" in word else "KEY=VALUE, without dashes"
@@ -93,7 +94,7 @@ def completed(arguments: Sequence[str]) -> list[str]:
     try:
         typed = parsed(texts)
     except HydraException:  # reported when Hydra parses them
-        return [*flags, *texts]
+        return Applied([*flags, *texts])
     for override in typed:
         names = group_choices().get(override.key_or_group)
         one = not override.is_delete() and not override.is_sweep_override()
@@ -107,28 +108,42 @@ def completed(arguments: Sequence[str]) -> list[str]:
             )
     run = value(typed, "hydra.run.dir")
     if run is not None and serves_page(typed, Path(run)):
-        return [*flags, *texts]
+        return Applied([*flags, *texts])
     before = of_named_run(typed, options.multirun)
+    overrides = parsed([*before.words, *texts])
+    by_scene = _of_scenes(typed, overrides, options.config_dir, continued=bool(before.words))
+    words = [*flags, *before.words, *texts, *by_scene.words]
+    return Applied(words, before.remarks + by_scene.remarks)
+
+
+def _of_scenes(
+    typed: Sequence[Override],
+    overrides: Sequence[Override],
+    config_dir: str | None,
+    *,
+    continued: bool,
+) -> Applied:
+    """Settings by the scenes that the overrides name, which are the typed ones and a run's."""
+    if value(overrides, "stage") in SCENELESS_STAGES:
+        return Applied()
+    if value(overrides, "data.camera") == "handheld":
+        found = _for_one_camera("data.camera=handheld", overrides, continued=continued)
+        line = f"data.camera=handheld: one camera ({' '.join(found.words)})"
+        return Applied(found.words, found.remarks + [line] * bool(found.words))
     roots = values(typed, "data.root")
-    overrides = parsed([*before, *texts])
-    needs_scene = value(overrides, "stage") not in SCENELESS_STAGES
-    if needs_scene and value(overrides, "data.camera") == "handheld":
-        words = _for_one_camera("data.camera=handheld", overrides, continued=bool(before))
-        if words:
-            applied_defaults.append(f"data.camera=handheld: one camera ({' '.join(words)})")
-        return [*flags, *before, *texts, *words]
-    if not (roots and needs_scene) or any("${" in root for root in roots):
-        return [*flags, *before, *texts]
+    if any("${" in root for root in roots):
+        return Applied()
     readers: list[str | None] = [*values(overrides, "data")]
-    readers = readers or _of_experiments(overrides, options.config_dir)
-    defaults = [
-        _defaults_of_scene(reader, root, overrides, continued=bool(before))
+    readers = readers or (_of_experiments(overrides, config_dir) if roots else [])
+    scenes = [
+        _defaults_of_scene(reader, root, overrides, continued=continued)
         for reader, root in product(readers, roots)
     ]
-    if any(words != defaults[0] for words in defaults):
-        needed = " and ".join(dict.fromkeys(" ".join(words) or "neither" for words in defaults))
+    if any(scene.words != scenes[0].words for scene in scenes):
+        needed = " and ".join(dict.fromkeys(" ".join(s.words) or "neither" for s in scenes))
         raise DevrfError(f"data.root: the scenes need {needed}; sweep over those of each apart")
-    return [*flags, *before, *texts, *defaults[0]]
+    remarks = [line for scene in scenes for line in scene.remarks]
+    return Applied(scenes[0].words if scenes else [], remarks)
 
 
 def quoted_path(argument: str, multirun: bool) -> str:
@@ -164,27 +179,26 @@ def _sweeps(texts: Sequence[str], config_dir: str | None) -> bool:
     paths = {text for text in texts if (word := KEY_VALUE.fullmatch(text)) and word[2] in PATHS}
     if not any("," in path for path in paths):
         return False
-    with _config_loader() as loader, suppress(HydraException, OmegaConfBaseException):
-        others = [*(text for text in texts if text not in paths), *_searchpath(config_dir)]
-        config = loader.load_configuration(
-            "config", others, RunMode.MULTIRUN, validate_sweep_overrides=False
+    config = _composed([text for text in texts if text not in paths], config_dir)
+    return config is not None and config.hydra.mode == RunMode.MULTIRUN
+
+
+def _composed(words: Sequence[str], config_dir: str | None) -> DictConfig | None:
+    """The config of a command before Hydra itself has begun; None if Hydra will refuse it."""
+    folder = [] if config_dir is None else [literal(f"file://{os.path.abspath(config_dir)}")]
+    searched = [f"hydra.searchpath=[{path}]" for path in folder]
+    with (
+        suppress(HydraException, OmegaConfBaseException),
+        initialize_config_dir(str(config_folder()), version_base="1.3"),
+    ):
+        return (
+            GlobalHydra.instance()
+            .config_loader()
+            .load_configuration(
+                "config", [*words, *searched], RunMode.MULTIRUN, validate_sweep_overrides=False
+            )
         )
-        return bool(config.hydra.mode == RunMode.MULTIRUN)
-    return False
-
-
-@contextmanager
-def _config_loader() -> Iterator[ConfigLoader]:
-    """A loader that composes configs before Hydra itself has begun."""
-    with initialize_config_dir(str(config_folder()), version_base="1.3"):
-        yield GlobalHydra.instance().config_loader()
-
-
-def _searchpath(config_dir: str | None) -> list[str]:
-    """The override that has the effect of ``--config-dir``."""
-    if config_dir is None:
-        return []
-    return [f"hydra.searchpath=[{literal(f'file://{os.path.abspath(config_dir)}')}]"]
+    return None
 
 
 def _says_how(override: Override) -> bool:
@@ -195,7 +209,7 @@ def _says_how(override: Override) -> bool:
 
 def _defaults_of_scene(
     option: str | None, root: str, overrides: Sequence[Override], *, continued: bool
-) -> list[str]:
+) -> Applied:
     """Settings by the files of a scene, which ``data=option`` reads, that no override sets.
 
     Training settings are not among them if a run is ``continued``.
@@ -209,6 +223,7 @@ def _defaults_of_scene(
         from devrf.scenes.formats import recognise
 
     words = []
+    remarks = []
     why = "its cameras"
     remark = ""
     if option is None:
@@ -223,21 +238,23 @@ def _defaults_of_scene(
     video = value(overrides, "data.monocular")
     ordered = value(overrides, "data.times") == "order"
     if video == "True" or (video is None and by_one_camera(option, root, ordered=ordered)):
-        words += _for_one_camera(root, overrides, continued=continued)
+        monocular = _for_one_camera(root, overrides, continued=continued)
+        words += monocular.words
+        remarks += monocular.remarks
     scene = Path(root).expanduser().resolve().name
     if value(overrides, "experiment") == "paper" and option in ("inward", "forward"):
         if (config_folder() / f"for_scene/paper_{scene}.yaml").is_file():
             line = f"{root}: if it is DeVRF's, data={scene} has what is published for it"
-            applied_defaults.append(line)
+            remarks.append(line)
     if words:
-        applied_defaults.append(f"{root}: {why} ({' '.join(words)}){remark}")
-    return words
+        remarks.append(f"{root}: {why} ({' '.join(words)}){remark}")
+    return Applied(words, remarks)
 
 
-def _for_one_camera(scene: str, overrides: Sequence[Override], *, continued: bool) -> list[str]:
+def _for_one_camera(scene: str, overrides: Sequence[Override], *, continued: bool) -> Applied:
     """The protocol for a monocular scene, by which a typed method learns it.
 
-    There is none if a run is ``continued``; if DeVRF is asked for, the log says what it lacks.
+    There is none if a run is ``continued``; if DeVRF is asked for, a line says what it lacks.
 
     Raises:
         DevrfError: the run would learn it by DeVRF, though no training setting is typed.
@@ -245,29 +262,22 @@ def _for_one_camera(scene: str, overrides: Sequence[Override], *, continued: boo
     method, stage = value(overrides, "method"), value(overrides, "stage")
     lacks = f"{scene}: one moving camera, and nothing at rest, which method=devrf needs"
     if method == "devrf" or stage in DEVRF_STAGES:
-        applied_defaults.append(f"{lacks}; experiment=phone learns more of it")
-    elif not continued and not any(map(_says_how, overrides)):
+        return Applied([], [f"{lacks}; experiment=phone learns more of it"])
+    if not continued and not any(map(_says_how, overrides)):
         line = f"{lacks}; give experiment=phone, on a GPU experiment=phone_gpu"
         if stage not in STEPS:
             raise DevrfError(line)
-        applied_defaults.append(line)
-    elif method and not any(values(overrides, key) for key in ("protocol", "comparison")):
-        return ["protocol=dynamic"]
-    return []
+        return Applied([], [line])
+    if method and not any(values(overrides, key) for key in ("protocol", "comparison")):
+        return Applied(["protocol=dynamic"])
+    return Applied()
 
 
 def _of_experiments(overrides: Sequence[Override], config_dir: str | None) -> list[str | None]:
     """The options of ``data`` that experiments choose, which may lie in other folders; or None."""
+    searched = [str(o.input_line) for o in overrides if o.key_or_group == "hydra.searchpath"]
     names = values(overrides, "experiment")
-    if not names:
-        return [None]
-    texts = [str(o.input_line) for o in overrides if o.key_or_group == "hydra.searchpath"]
-    texts += _searchpath(config_dir)
-    options: list[str | list[str] | None] = []
-    with _config_loader() as loader:
-        for name in names:
-            with suppress(HydraException):  # reported when Hydra composes it
-                words = [f"experiment={name}", *texts]
-                defaults = loader.compute_defaults_list("config", words, RunMode.RUN)
-                options.append(defaults.overrides.override_choices.get("data"))
-    return [str(option) for option in options if option is not None] or [None]
+    configs = [_composed([f"experiment={name}", *searched], config_dir) for name in names]
+    # Where an experiment does not choose, the scene is embedded, and has no folder.
+    of_folders = [config for config in configs if config is not None and "root" in [*config.data]]
+    return [str(config.hydra.runtime.choices.data) for config in of_folders] or [None]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -187,10 +187,16 @@ def set_at(config: DictConfig, names: Sequence[Any]) -> str:
     return str(node._get_full_key(None))
 
 
-def leaves(value: Any, key: str) -> dict[str, Any]:
-    """The plain values at and below a key of a config, by their keys, resolved."""
-    if not isinstance(value, DictConfig):
-        listed = OmegaConf.is_config(value)
-        return {key: OmegaConf.to_container(value, resolve=True) if listed else value}
-    below = [leaves(item, f"{key}.{name!s}") for name, item in value.items()]
-    return {name: plain for part in below for name, plain in part.items()}
+def leaves(config: DictConfig, key: str) -> dict[tuple[str, ...], Any]:
+    """The plain values at and below a key, resolved, by the names that lead to them."""
+    value = OmegaConf.select(config, key)
+    plain = OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
+    return dict(_flat(plain, tuple(key.split("."))))
+
+
+def _flat(value: Any, names: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
+    if not isinstance(value, Mapping):
+        yield names, value
+        return
+    for name, below in value.items():
+        yield from _flat(below, (*names, str(name)))

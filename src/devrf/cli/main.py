@@ -1,7 +1,16 @@
-"""The command: its line is completed and composed, the config is checked, the stage runs."""
+"""The command: typed words become a checked config, and the stage runs.
+
+1. :func:`commands`: on the folder of a search, a command stands for one on each of its runs.
+2. :func:`completed`: beneath the typed words go those that the named run was learned with, behind
+   them what the scene's files say. All are Hydra's overrides, and come with the lines that say why.
+3. Hydra composes them, for each job.
+4. :func:`~devrf.cli.run.run_stage` checks the config against the signatures of its parts, builds
+   these, and takes the steps; checkpoints get the options and the resolved values of step 2.
+"""
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 from pathlib import Path
@@ -14,7 +23,7 @@ import devrf
 from devrf.cli.complete import commands, completed
 from devrf.cli.config import config_folder, in_sweep, overrides
 from devrf.cli.messages import report_user_errors
-from devrf.cli.restore_config import log_applied_defaults, parsed
+from devrf.cli.restore_config import parsed
 from devrf.cli.run_folder import working_in
 from devrf.cli.sweep import naming_failures, record_failure
 from devrf.cli.view import serve_page, serves_page
@@ -30,6 +39,11 @@ from devrf.system.process import (
     tune_for_cpu,
     use_utf8,
 )
+
+log = logging.getLogger(__name__)
+
+# Where settings of the present command are from that were not typed, until there is a log.
+remarks: list[str] = []
 
 
 @quiet_if_unread()
@@ -53,7 +67,9 @@ def entry() -> None:
             for word in sys.argv[1:]:
                 utf8_path(Path(word))
             for command in commands(sys.argv[1:]):
-                sys.argv[1:] = completed(command)
+                applied = completed(command)
+                sys.argv[1:] = applied.words
+                remarks[:] = applied.remarks
                 main()
     # A KeyboardInterrupt is raised by another library's handler of Ctrl-C.
     except (Interrupted, KeyboardInterrupt) as stop:
@@ -66,7 +82,8 @@ def run(config: DictConfig) -> float | None:
     folder = Path(HydraConfig.get().runtime.output_dir)
     guard = record_failure(config, folder) if in_sweep() else report_user_errors()
     with guard, working_in(folder, config):
-        log_applied_defaults()
+        for line in remarks:
+            log.info("%s", line)
         if serves_page(parsed(overrides()), folder):
             serve_page(config, folder)
             return None

@@ -20,7 +20,6 @@ from devrf.cli.complete import completed
 from devrf.cli.config import command_line
 from devrf.cli.context import RunContext
 from devrf.cli.memory import forecast, table_of_needs
-from devrf.cli.restore_config import log_applied_defaults
 from devrf.engine.ddp import ManualDDP
 from devrf.engine.needs import SIZE
 from devrf.errors import DevrfError
@@ -53,9 +52,10 @@ def capture(run: RunContext) -> None:
     folder = scene_from_footage(settings)
     phone = "experiment=phone_gpu" if run.device.type == "cuda" else "experiment=phone"
     how = [phone] if settings.monocular else []
-    read = completed([f"data.root={literal(folder)}", "stage=inspect"])
-    config = compose("config", [*read, *how])
-    log_applied_defaults()
+    applied = completed([f"data.root={literal(folder)}", "stage=inspect"])
+    for line in applied.remarks:
+        log.info("%s", line)
+    config = compose("config", [*applied.words, *how])
     captured = RunContext(config, run.folder)
     shortage = _inspect(captured)
     command = [to_type("data.root", folder), *how]

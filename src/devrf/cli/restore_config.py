@@ -1,18 +1,20 @@
 """A later command on a run begins from the settings of its training.
 
 A checkpoint holds the options of config groups that were chosen, by ``/group``, and the values set
-beside them, by config key, as plain values. A later command sets the same, beneath what is typed.
-Text is put in quotes, so nothing in a file is read as an interpolation or as code.
+beside them, by config key, resolved; a sweep's ``multirun.yaml`` holds what was typed. A later
+command sets the same, beneath what is typed, by Hydra's own overrides. :func:`taken` alone says
+which of a file's keys these are: names of options, and plain values; text is put in quotes, so that
+nothing in a file is read as an interpolation or as code.
 """
 
 from __future__ import annotations
 
 import json
-import logging
 import re
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +22,7 @@ import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from devrf.checkpoints.file_metadata import latest_checkpoint
 from devrf.cli.config import (
@@ -40,8 +42,6 @@ from devrf.system.files import read_record
 from devrf.system.override import literal, to_type
 from devrf.system.printed import is_shown
 from devrf.system.process import importing
-
-log = logging.getLogger(__name__)
 
 # Keys that say what to do with a run, on which machine, and what to log, not what the run is.
 OF_A_COMMAND = {"stage", "ckpt", "resume", "memory_check", "objective", "hparams_search"}
@@ -68,8 +68,13 @@ MOST = 1000
 # Options by /group, values by key.
 Command = dict[str, Any]
 
-# Lines on settings that were not typed, and why they apply, until there is a log for them.
-applied_defaults: list[str] = []
+
+@dataclass(frozen=True)
+class Applied:
+    """Overrides that were not typed, and lines that say why they apply."""
+
+    words: list[str] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
 
 
 def present_command(config: DictConfig) -> Command:
@@ -84,38 +89,56 @@ def present_command(config: DictConfig) -> Command:
         if key in options:
             said[f"/{key}"] = options[key]
         elif not override.is_delete():
-            said |= leaves(OmegaConf.select(config, key), key)
+            said |= {".".join(names): value for names, value in leaves(config, key).items()}
     for key in PATHS & {*said}:  # relative to the folder in which they were typed
         if isinstance(said[key], str) and (path := Path(said[key])).exists():
             said[key] = str(path.absolute())
-    return {key: value for key, value in said.items() if _is_known(key, value)}
+    return {key: value for key, value in said.items() if _is_known(key, [value])}
 
 
-def checked(path: Path, command: Mapping[str, Any]) -> Command:
-    """The ``command`` in the file at ``path``, if it has names of options and plain values alone.
+def taken(source: Path, stored: Mapping[str, list[Any]], typed: Sequence[Override]) -> list[str]:
+    """The keys of a file's settings that apply beneath the typed overrides.
+
+    Another option of a group begins from its own values; another method takes over the scene and
+    the seed alone.
+
+    Args:
+        source: the file, which somebody else may have written.
+        stored: the values of each key, by ``/group`` or config key; of a sweep all of them.
+        typed: the overrides of the present command.
 
     Raises:
-        DevrfError: something else is among them.
+        DevrfError: something else than a name of an option or a plain value is among them.
     """
-    _check_length(path, command.values())
-    for key, value in command.items():
-        if not _is_known(key, value):
-            said = f"{key}={value}"[:80]
-            raise DevrfError(f"{path}: {said!r} is no option or setting of a learned run")
-    return {**command}
+    _check_length(source, stored.values())
+    for key, texts in stored.items():
+        if not _is_known(key, texts):
+            said = f"{key}={', '.join(map(str, texts))}"[:80]
+            raise DevrfError(f"{source}: {said!r} is no option or setting of a learned run")
+    keys = {override.key_or_group for override in typed}
+    other = tuple(f"{k}." for k in keys if [value(typed, k)] != stored.get(f"/{k}"))
+    another = value(typed, "method") not in (None, *stored.get("/method", ["devrf"]))
+    return [
+        key
+        for key in stored
+        if key.lstrip("/") not in keys and not key.startswith(other)
+        if not another or root(key) in OF_A_SCENE
+    ]
 
 
-def _is_known(key: str, value: object) -> bool:
-    """Whether a run may have been learned with it: an option by name, or a plain value by key."""
-    if not KEY.fullmatch(key) or _of_a_command(key):
+def _is_known(key: str, values: list[Any]) -> bool:
+    """Whether a run may have been learned with it: options by name, or plain values by key."""
+    if not KEY.fullmatch(key) or _of_a_command(key) or RESERVED & {*key.split(".")}:
         return False
     if key.startswith("/"):
-        return isinstance(value, str) and OPTION.fullmatch(value) is not None
-    return ("." in key or key in ALONE) and _is_plain(value)
+        return all(isinstance(name, str) and OPTION.fullmatch(name) for name in values)
+    return ("." in key or key in ALONE) and _is_plain(values)
 
 
 def _is_plain(value: object, depth: int = 8) -> bool:
     """Whether a value is data: no code, nothing that refers to something else or is missing."""
+    if isinstance(value, dict):
+        value = [*value.keys(), *value.values()]
     if isinstance(value, list):
         return depth > 0 and all(_is_plain(item, depth - 1) for item in value)
     if isinstance(value, str):
@@ -124,8 +147,8 @@ def _is_plain(value: object, depth: int = 8) -> bool:
 
 
 def _of_a_command(key: str) -> bool:
-    """Whether a key or group says only what to do, or builds a part."""
-    return root(key) in OF_A_COMMAND or key in PLACES or bool(RESERVED & {*key.split(".")})
+    """Whether a key or group says only what to do."""
+    return root(key) in OF_A_COMMAND or key in PLACES
 
 
 def root(key: str) -> str:
@@ -161,10 +184,15 @@ def values(overrides: Sequence[Override], key: str) -> list[str]:
     """The last value of ``key``, of a sweep all of them; none where there is none."""
     for override in reversed(overrides):
         if override.key_or_group == key and not override.is_delete():
-            if override.is_choice_sweep():
-                return [str(getattr(v, "text", v)) for v in override.sweep_iterator()]
-            return [] if override.value() is None else [str(override.value())]
+            return [str(value) for value in _each(override) if value is not None]
     return []
+
+
+def _each(override: Override) -> list[Any]:
+    """The value of an override; of a sweep over choices each, of another sweep none."""
+    if override.is_choice_sweep():
+        return [getattr(value, "text", value) for value in override.sweep_iterator()]
+    return [] if override.is_sweep_override() else [override.value()]
 
 
 def value(overrides: Sequence[Override], key: str) -> str | None:
@@ -173,13 +201,7 @@ def value(overrides: Sequence[Override], key: str) -> str | None:
     return texts[0] if len(texts) == 1 else None
 
 
-def log_applied_defaults() -> None:
-    """Log the origin of settings that were not typed."""
-    for line in applied_defaults:
-        log.info("%s", line)
-
-
-def of_named_run(typed: Sequence[Override], multirun: bool) -> list[str]:
+def of_named_run(typed: Sequence[Override], multirun: bool) -> Applied:
     """The overrides of the training of the run that the command names.
 
     Raises:
@@ -189,59 +211,47 @@ def of_named_run(typed: Sequence[Override], multirun: bool) -> list[str]:
     folder = value(typed, "hydra.run.dir")
     sweep = value(typed, "hydra.sweep.dir")
     if value(typed, "stage") == "report":
-        return [] if sweep is None else [f"report.runs={literal(sweep)}"]
+        return Applied([] if sweep is None else [f"report.runs={literal(sweep)}"])
     if not checkpoints and sweep is not None:
         return _of_sweep(typed, Path(sweep))
     if not checkpoints and (folder is None or multirun):
-        return []
+        return Applied()
     with importing():  # it loads torch
         from devrf.checkpoints.checkpoint import metadata_of
 
     if not checkpoints and (last := latest_checkpoint(Path(str(folder)))):
         checkpoints = [last]
     if not checkpoints or not all(path.is_file() for path in checkpoints):
-        return []  # a file that is missing is reported by the step that loads it
-    commands = [checked(path, metadata_of(path).command) for path in checkpoints]
-    shared = {k: v for k, v in commands[0].items() if all(c.get(k, ...) == v for c in commands)}
-    command = _beneath(typed, shared)
-    words = [to_type(key.lstrip("/"), setting) for key, setting in command.items()]
-    said = f"as it was learned, with {' '.join(words)}"
-    if {} in commands:
-        said = "does not say how it was learned; what is typed and the defaults apply"
-    if command or {} in commands:
-        applied_defaults.append(f"{', '.join(map(str, checkpoints))}: {said}")
+        return Applied()  # a file that is missing is reported by the step that loads it
+    commands = [metadata_of(path).command for path in checkpoints]
+    kept = [
+        taken(path, {key: [setting] for key, setting in command.items()}, typed)
+        for path, command in zip(checkpoints, commands, strict=True)
+    ]
+    first = commands[0]
+    shared = {k: first[k] for k in kept[0] if all(c.get(k, ...) == first[k] for c in commands)}
+    remarks = []
+    if shared or {} in commands:
+        words = [to_type(key.lstrip("/"), setting) for key, setting in shared.items()]
+        unknown = "does not say how it was learned; what is typed and the defaults apply"
+        said = unknown if {} in commands else f"as it was learned, with {' '.join(words)}"
+        remarks = [f"{', '.join(map(str, checkpoints))}: {said}"]
     put = [
         f"{key[1:]}={setting}" if key[0] == "/" else f"++{key}={literal(setting)}"
-        for key, setting in command.items()
+        for key, setting in shared.items()
     ]
     if multirun:
         # The sweep is the one that is typed, not that of an experiment.
-        return put if values(typed, "hparams_search") else [*put, "hydra.sweeper.params=null"]
+        put += [] if values(typed, "hparams_search") else ["hydra.sweeper.params=null"]
+        return Applied(put, remarks)
     put.append("hydra.mode=RUN")
     if folder is None and value(typed, "stage") in OF_A_CHECKPOINT:
         there = _folder_for(checkpoints[0], value(typed, "outputs"))
         put.append(f"hydra.run.dir={literal(str(there))}")
-    return put
+    return Applied(put, remarks)
 
 
-def _beneath(typed: Sequence[Override], command: Command) -> Command:
-    """The part of ``command`` that applies beneath the typed overrides.
-
-    Another option of a group begins from its own values. Another method takes over the scene
-    and the seed alone.
-    """
-    keys = {override.key_or_group for override in typed}
-    other = tuple(f"{k}." for k in keys if value(typed, k) != command.get(f"/{k}"))
-    another = value(typed, "method") not in (None, command.get("/method", "devrf"))
-    return {
-        key: setting
-        for key, setting in command.items()
-        if key.lstrip("/") not in keys and not key.startswith(other)
-        if not another or root(key) in OF_A_SCENE
-    }
-
-
-def _of_sweep(typed: Sequence[Override], folder: Path) -> list[str]:
+def _of_sweep(typed: Sequence[Override], folder: Path) -> Applied:
     """The overrides of the sweep in ``hydra.sweep.dir``, unless another is typed.
 
     Raises:
@@ -249,19 +259,19 @@ def _of_sweep(typed: Sequence[Override], folder: Path) -> list[str]:
     """
     record = folder / SWEEP_RECORD
     if any(override.is_sweep_override() for override in typed) or not record.is_file():
-        return []
-    lines: dict[str, str] = {}
-    for override in _recorded(record)[1]:
-        key = override.get_key_element().lstrip("+")
-        if _of_a_command(key) or override.is_delete():
-            continue
-        key = f"/{key}" if key in group_choices() else key
-        for text in values([override], override.key_or_group):
-            checked(record, {key: text})
-        lines[key] = str(override.input_line)
-    kept = [lines[key] for key in _beneath(typed, lines)]
-    applied_defaults.append(f"{folder}: the sweep goes on, with {shlex.join(kept)}")
-    return [*kept, "hydra.mode=MULTIRUN"]
+        return Applied()
+    stored = {
+        f"/{key}" if key in group_choices() else key: override
+        for override in _recorded(record)[1]
+        for key in [override.get_key_element().lstrip("+")]
+        if not override.is_delete() and not _of_a_command(key)
+    }
+    keys = taken(record, {key: _each(override) for key, override in stored.items()}, typed)
+    kept = [str(stored[key].input_line) for key in keys]
+    return Applied(
+        [*kept, "hydra.mode=MULTIRUN"],
+        [f"{folder}: the sweep goes on, with {shlex.join(kept)}"],
+    )
 
 
 def searched_runs(typed: Sequence[Override]) -> list[Path]:

@@ -35,7 +35,7 @@ from devrf.checkpoints.checkpoint import (
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file, read_description
 from devrf.checkpoints.file_metadata import OWN_REST, digest_of
 from devrf.checkpoints.progress import progress_files
-from devrf.cli.config import REFERENCE, command_line, leaves, stage_section
+from devrf.cli.config import command_line, leaves, set_at, stage_section
 from devrf.cli.context import RunContext
 from devrf.errors import DevrfError
 from devrf.system.files import read_record, write_json
@@ -83,18 +83,9 @@ def deciding_settings(config: DictConfig, stage: str) -> dict[str, Any]:
 
 
 def _values(config: DictConfig, path: str) -> dict[str, Any]:
-    """The plain values below a key; a reference to another key is named by that one."""
-    settings: dict[str, Any] = {}
-    node: Any = OmegaConf.to_container(OmegaConf.select(config, path), resolve=False)
-    for key, raw in node.items():
-        reference = REFERENCE.fullmatch(str(raw))
-        where = reference[1] if reference else f"{path}.{key}"
-        value = OmegaConf.select(config, where)
-        if isinstance(value, DictConfig):
-            settings |= _values(config, where)
-        elif key not in UNDECISIVE:
-            settings |= leaves(value, where)
-    return settings
+    """The deciding values below a key, by the keys at which the user sets them."""
+    values = leaves(config, path).items()
+    return {set_at(config, names): v for names, v in values if names[-1] not in UNDECISIVE}
 
 
 def beginning(run: RunContext, stage: str) -> ResumePoint | None:
