@@ -17,10 +17,12 @@ def test_what_is_composed_is_resolved_built_and_run(tiny, tmp_path):
     assert not HydraConfig.initialized()
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         config = compose("config", [*tiny, "stage=canonical"])
+        tracked = compose("config", ["logger=[csv,wandb]"])
     resolved = OmegaConf.to_container(config, resolve=True)
     assert resolved["output_dir"] == "outputs"
     assert instantiate(config.callbacks).checkpoint.folder.as_posix() == "outputs/checkpoints"
-    assert str(instantiate(config.logger).save_dir) == "outputs"
+    loggers = instantiate(tracked.logger)
+    assert str(loggers.csv.save_dir) == str(loggers.wandb.save_dir) == "outputs"
     assert run_stage(config, tmp_path / "run") is None
     assert (tmp_path / "run/checkpoints/canonical.ckpt").is_file()
     assert (tmp_path / "run/logs/canonical/metrics.csv").is_file()

@@ -130,8 +130,13 @@ def output_dir() -> str:
     return str(OmegaConf.select(config, "hydra.runtime.output_dir", default="outputs"))
 
 
+def choice(group: str) -> str | None:
+    """The present job's option of a config group; None where there is none, and outside Hydra."""
+    return choices().get(group)
+
+
 # For ``${devrf.run_folder:}`` in a config.
-for _word in (run_folder, job_folder, output_dir):
+for _word in (run_folder, job_folder, output_dir, choice):
     OmegaConf.register_new_resolver(f"devrf.{_word.__name__}", _word, replace=True)
 
 
