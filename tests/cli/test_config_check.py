@@ -35,6 +35,7 @@ BASE = f"""
 stage: pipeline
 seed: 0
 deterministic: false
+output_dir: outputs
 rehearse: false
 resume: true
 memory_check: true

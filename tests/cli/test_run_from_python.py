@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
@@ -22,7 +24,8 @@ def test_what_is_composed_is_resolved_built_and_run(tiny, tmp_path):
     assert resolved["output_dir"] == "outputs"
     assert instantiate(config.callbacks).checkpoint.folder.as_posix() == "outputs/checkpoints"
     loggers = instantiate(tracked.logger)
-    assert str(loggers.csv.save_dir) == str(loggers.wandb.save_dir) == "outputs"
+    assert str(loggers.csv.save_dir) == "outputs"
+    assert str(loggers.wandb.save_dir) == str(Path("outputs").resolve())
     assert run_stage(config, tmp_path / "run") is None
     assert (tmp_path / "run/checkpoints/canonical.ckpt").is_file()
     assert (tmp_path / "run/logs/canonical/metrics.csv").is_file()
