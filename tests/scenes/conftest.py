@@ -250,7 +250,7 @@ def balls_are_where_they_project() -> Callable[..., None]:
     return check
 
 
-LISTED = ("nerfstudio", "nerfies", "dycheck")
+LISTED = ("nerfstudio", "nerfies", "dycheck", "panoptic", "easyvolcap")
 
 
 @pytest.fixture

@@ -22,6 +22,8 @@ LAYOUTS = {
     "two captures of nerfstudio": ("nerfstudio", ["static/transforms.json"]),
     "Nerfies": ("nerfies", ["dataset.json", "metadata.json", "scene.json"]),
     "DyCheck": ("dycheck", ["splits/train.json", "splits/val.json", "dataset.json", "scene.json"]),
+    "Dynamic 3D Gaussians": ("panoptic", ["train_meta.json", "test_meta.json", "ims/0/0.jpg"]),
+    "EasyVolcap": ("easyvolcap", ["intri.yml", "extri.yml", "images/00/000000.jpg"]),
     "Neural 3D Video": ("neural_3d_video", ["poses_bounds.npy", "cam00.mp4", "cam01.mp4"]),
     "Neural 3D Video, of a camera": ("neural_3d_video", ["poses_bounds.npy", "cam00.MOV"]),
     "Neural 3D Video, frames": ("neural_3d_video", ["poses_bounds.npy", "cam00/0.png"]),
@@ -60,12 +62,12 @@ def test_what_each_layout_lacks_is_said_in_one_line(tmp_path: Path) -> None:
     line = str(caught.value)
     assert line.startswith(f"{root}: no known layout") and len(line.splitlines()) == 1
     for part in (
-        "Nerfies: no dataset.json;",
-        "DeVRF: no static/transforms_train.json",
-        "D-NeRF, NeRF-synthetic: no transforms_train.json",
-        "instant-ngp: no transforms.json",
-        "COLMAP: no sparse/0/cameras.bin",
-        "LLFF: no poses_bounds.npy",
+        "Nerfies: dataset.json;",
+        "DeVRF: static/transforms_train.json",
+        "D-NeRF, NeRF-synthetic: transforms_train.json",
+        "instant-ngp: transforms.json",
+        "COLMAP: sparse/0/cameras.bin",
+        "LLFF: poses_bounds.npy",
         "set data.root to the scene's folder",
     ):
         assert part in line

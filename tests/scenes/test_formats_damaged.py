@@ -113,6 +113,8 @@ LAYOUTS: dict[str, tuple[dict[str, Any], int]] = {
     "colmap": ({}, 5),
     "colmap_binary": ({}, 10),
     "dycheck": ({}, 5),
+    "panoptic": ({"masks": "alpha"}, 5),
+    "easyvolcap": ({}, 5),
     "neural_3d_video": ({}, 5),
 }
 INPUTS = int(os.environ.get("DEVRF_FUZZ_INPUTS", "60"))

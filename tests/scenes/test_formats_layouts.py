@@ -12,7 +12,7 @@ from devrf.data.recorded import READERS
 def test_the_layouts_say_the_same(tiny_scene, write_layout, tmp_path):
     """The same rays, times and pixels."""
     given = tiny_scene.dynamic.train
-    for choice in ("inward", "nerfstudio", "nerfies", "dycheck"):
+    for choice in ("inward", "nerfstudio", "nerfies", "dycheck", "panoptic", "easyvolcap"):
         write_layout(choice, tmp_path / choice)
         train = READERS[choice](tmp_path / choice).read().dynamic.train
         moving = ["static" not in Path(name).stem for name in train.names]

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import imageio.v3 as iio
 import numpy as np
 import torch
@@ -147,7 +148,76 @@ def write_dycheck(scene: Scene, root: Path) -> None:
         put_json(root / f"splits/{split}.json", {"frame_names": names, "time_ids": ids})
 
 
+def opencv_matrices(cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
+    """World-to-camera (N, 4, 4) and intrinsics (N, 3, 3), float64, as OpenCV has them."""
+    to_camera = np.tile(np.eye(4), (len(cameras), 1, 1))
+    k = np.tile(np.eye(3), (len(cameras), 1, 1))
+    for row, pose in enumerate(cameras.camera_to_world.double().numpy()):
+        turn = (pose[:, :3] * [1, -1, -1]).T
+        to_camera[row, :3] = np.column_stack([turn, -turn @ pose[:, 3]])
+    k[:, [0, 1], [0, 1]] = cameras.focal.numpy()
+    k[:, :2, 2] = cameras.center.numpy()
+    return to_camera, k
+
+
+def write_panoptic(scene: Scene, root: Path) -> None:
+    """The dynamic images as Dynamic 3D Gaussians lists them: time by time, masks in ``seg/``."""
+    for split, views in (("train", scene.dynamic.train), ("test", scene.dynamic.test)):
+        to_camera, k = opencv_matrices(views.cameras)
+        moments = views.times.unique().tolist()
+        taken = [(views.times == time).nonzero()[:, 0].tolist() for time in moments]
+        names = [f"{split}{int(views.view[i])}/{i:06d}.png" for i in range(len(views))]
+        for name, pixels in zip(names, views.pixels.numpy(), strict=True):
+            for part, image in (("ims", pixels), ("seg", pixels[..., -1])):
+                (root / part / name).parent.mkdir(parents=True, exist_ok=True)
+                iio.imwrite(root / part / name, image)
+        listed = {
+            "w": views.width,
+            "h": views.height,
+            "fn": [[names[i] for i in rows] for rows in taken],
+            "k": [[k[i].tolist() for i in rows] for rows in taken],
+            "w2c": [[to_camera[i].tolist() for i in rows] for rows in taken],
+            "cam_id": [[int(views.view[i]) for i in rows] for rows in taken],
+        }
+        put_json(root / f"{split}_meta.json", listed)
+
+
+def write_easyvolcap(scene: Scene, root: Path) -> None:
+    """The dynamic images as EasyVolcap has them, by camera; the held-out one is the last."""
+    root.mkdir(parents=True)
+    intrinsics = cv2.FileStorage(str(root / "intri.yml"), cv2.FILE_STORAGE_WRITE)
+    extrinsics = cv2.FileStorage(str(root / "extri.yml"), cv2.FILE_STORAGE_WRITE)
+    views = [
+        capture[capture.view == number]
+        for capture in (scene.dynamic.train, scene.dynamic.test)
+        for number in capture.view.unique().tolist()
+    ]
+    names = [f"{camera:02d}" for camera in range(len(views))]
+    for file in (intrinsics, extrinsics):
+        file.startWriteStruct("names", cv2.FILE_NODE_SEQ)
+        for name in names:
+            file.write("", name)
+        file.endWriteStruct()
+    for name, of_camera in zip(names, views, strict=True):
+        to_camera, k = opencv_matrices(of_camera.cameras[:1])
+        intrinsics.write(f"K_{name}", k[0])
+        intrinsics.write(f"W_{name}", of_camera.width)
+        intrinsics.write(f"H_{name}", float(of_camera.height))
+        intrinsics.write(f"D_{name}", np.zeros((5, 1)))
+        extrinsics.write(f"R_{name}", cv2.Rodrigues(to_camera[0, :3, :3])[0])
+        extrinsics.write(f"Rot_{name}", to_camera[0, :3, :3])
+        extrinsics.write(f"T_{name}", to_camera[0, :3, 3:])
+        for part in ("images", "masks"):
+            (root / part / name).mkdir(parents=True)
+        for frame, pixels in enumerate(of_camera.pixels.numpy()):
+            iio.imwrite(root / "images" / name / f"{frame:06d}.png", pixels)
+            iio.imwrite(root / "masks" / name / f"{frame:06d}.png", pixels[..., -1])
+    intrinsics.release()
+    extrinsics.release()
+
+
 def write_scene(choice: str, scene: Scene, root: Path) -> None:
     """Write an inward-facing scene as ``data=CHOICE`` reads it."""
     writers = {"nerfstudio": write_nerfstudio, "nerfies": write_nerfies, "dycheck": write_dycheck}
+    writers |= {"panoptic": write_panoptic, "easyvolcap": write_easyvolcap}
     writers[choice](scene, root)

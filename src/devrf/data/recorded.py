@@ -16,10 +16,12 @@ from devrf.scenes.formats import check_choice
 from devrf.scenes.formats.blender import BlenderReader
 from devrf.scenes.formats.colmap import ColmapReader
 from devrf.scenes.formats.dycheck import DycheckReader
+from devrf.scenes.formats.easyvolcap import EasyVolcapReader
 from devrf.scenes.formats.llff import LlffReader
 from devrf.scenes.formats.nerfies import NerfiesReader
 from devrf.scenes.formats.nerfstudio import NerfstudioReader
 from devrf.scenes.formats.neural_3d_video import Neural3DVideoReader
+from devrf.scenes.formats.panoptic import PanopticReader
 from devrf.scenes.reader import SceneReader
 from devrf.scenes.scene import Scene
 
@@ -34,6 +36,8 @@ READERS: dict[str, type[SceneReader]] = {
     "colmap": ColmapReader,
     "neural_3d_video": Neural3DVideoReader,
     "dycheck": DycheckReader,
+    "panoptic": PanopticReader,
+    "easyvolcap": EasyVolcapReader,
 }
 
 

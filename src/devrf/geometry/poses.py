@@ -39,6 +39,21 @@ def relative_to(frame: Tensor, poses: Tensor) -> Tensor:
     return turned
 
 
+def from_opencv(world_to_camera: Tensor) -> Tensor:
+    """Camera-to-world poses, OpenGL axes, of OpenCV's rigid world-to-camera transforms.
+
+    Args:
+        world_to_camera: (..., 3, 4) or (..., 4, 4), whose last row is not read.
+
+    Returns:
+        (..., 3, 4).
+    """
+    turned = world_to_camera[..., :3, :3].mT
+    # OpenCV's y points down and its z ahead; ours point up and back.
+    axes = turned * turned.new_tensor([1, -1, -1])
+    return torch.cat([axes, -(turned @ world_to_camera[..., :3, 3:])], dim=-1)
+
+
 def rigid_motion(points: Tensor, rotation: Tensor, velocity: Tensor) -> Tensor:
     """x′ = e^{[r]} x + G v: the exponential of se(3), a motion along a screw.
 

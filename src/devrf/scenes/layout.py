@@ -17,6 +17,7 @@ from devrf.scenes.splits import (
     Split,
     at_one_moment,
     at_times,
+    distinct_poses,
     distinct_times,
     evenly_spread,
     first_views,
@@ -26,11 +27,13 @@ from devrf.scenes.splits import (
     standing,
     static_split,
 )
-from devrf.scenes.transforms import SceneBounds, Transforms
+from devrf.scenes.transforms import TIME_TOLERANCE, SceneBounds, Transforms
 from devrf.scenes.validation import scene_error
 
 log = logging.getLogger(__name__)
 
+# The least number of images at time 0 that make a static set.
+SEVERAL = 3
 # A capture's training images, and its held-out ones.
 Pair = tuple[Transforms, Transforms]
 
@@ -167,6 +170,57 @@ def without_static_set(train: Split, test: Split, static_until: float) -> Layout
         len(test.index),
     )
     return Layout(early, early_test, train, test)
+
+
+def with_static_times(train: Transforms, test: Transforms, static_until: float | None) -> Layout:
+    """The layout of images of all times, of which those at rest are told by their times.
+
+    Several at time 0 are the static set; or else all up to ``static_until`` count as static. None:
+    0 if there are several at time 0, else 1. DevrfError if no image shows motion.
+    """
+    if one_moment(train, test):
+        return one_capture(train, test, 1.0)
+    times = _times(train)
+    at_zero = times <= TIME_TOLERANCE
+    if static_until is None:
+        static_until = 0.0 if int(at_zero.sum()) >= SEVERAL else 1.0
+    if static_until > 0 or not bool(at_zero.any()):
+        return one_capture(train, test, static_until)
+    static = at_zero.nonzero()[:, 0].tolist()
+    static_test = (_times(test) <= TIME_TOLERANCE).nonzero()[:, 0].tolist()
+    moving = dynamic_images(train)
+    moving_test = dynamic_images(test)
+    if not moving or not moving_test:
+        raise scene_error(
+            train.file,
+            f"{len(moving)} images to learn motion from and {len(moving_test)} held out; expected "
+            "one of each above time 0: correct the times, or train_filenames and test_filenames",
+        )
+    static_test_source = test
+    if not static_test:
+        log.warning("no held-out image at time 0: the static scene is tested on one in training")
+        static_test = static[:1]
+        static_test_source = train
+    log.info("%d images at time 0 are the static set of %d", len(static), len(times))
+    static_pair = (train[static], static_test_source[static_test])
+    return two_captures(static_pair, (train[moving], test[moving_test]))
+
+
+def dynamic_images(transforms: Transforms) -> list[int]:
+    """The images at later times, and those at time 0 by cameras that also have later ones.
+
+    Other images at time 0 do not show motion, and their many cameras would hide that the others are
+    fixed.
+    """
+    later = _times(transforms) > TIME_TOLERANCE
+    camera = distinct_poses(transforms.poses)
+    images: list[int] = (later | torch.isin(camera, camera[later])).nonzero()[:, 0].tolist()
+    return images
+
+
+def _times(transforms: Transforms) -> Tensor:
+    assert transforms.times is not None  # else the scene is static
+    return torch.tensor(transforms.times)
 
 
 def fewer(layout: Layout, train_views: int | None, frames: int | None) -> Layout:

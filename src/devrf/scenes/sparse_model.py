@@ -19,7 +19,7 @@ from torch.nn.functional import normalize
 
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
-from devrf.geometry.poses import average_pose, relative_to
+from devrf.geometry.poses import average_pose, from_opencv, relative_to
 from devrf.scenes.bounds import LEAST_COSINE, nearest_point
 from devrf.scenes.files import decoding, entries
 from devrf.scenes.lens import CameraKeys, Intrinsics, intrinsics_of
@@ -83,11 +83,7 @@ class SparseModel:
     @cached_property
     def poses(self) -> Tensor:
         """(N, 3, 4) float64 camera-to-world, OpenGL axes, world units."""
-        to_camera = torch.from_numpy(np.stack([image.to_camera for image in self.images]))
-        turned = to_camera[:, :, :3].mT
-        # COLMAP's y points down and its z ahead; ours point up and back.
-        axes = turned * turned.new_tensor([1, -1, -1])
-        return torch.cat([axes, -(turned @ to_camera[:, :, 3:])], dim=2)
+        return from_opencv(torch.from_numpy(np.stack([i.to_camera for i in self.images])))
 
     @property
     def intrinsics(self) -> list[Intrinsics]:

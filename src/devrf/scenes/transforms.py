@@ -19,6 +19,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from torch import Tensor
 
 from devrf.geometry.offset import NO_OFFSET, Offset, offset_of, subtracted
+from devrf.geometry.poses import from_opencv
 from devrf.scenes.files import (
     MOST_IMAGES,
     Name,
@@ -159,6 +160,61 @@ class Transforms:
             times=self.times and tuple(self.times[i] for i in index),
             masks=self.masks and tuple(self.masks[i] for i in index),
         )
+
+
+@dataclass(frozen=True)
+class Shot:
+    """An image as a list of another program has it.
+
+    Attributes:
+        image: the file, relative to the scene's folder.
+        world_to_camera: (3, 4) or (4, 4) float64, OpenCV axes, world units.
+        intrinsics: of its camera.
+        time: in [0, 1].
+        mask: a grey image, relative to the scene's folder, black where the background is.
+    """
+
+    image: str
+    world_to_camera: Tensor
+    intrinsics: Intrinsics
+    time: float
+    mask: str | None = None
+
+
+def posed_images(
+    file: Path,
+    shots: Sequence[Shot],
+    finder: ImageFinder,
+    missing: Missing,
+    offset: Offset | None = None,
+) -> Transforms:
+    """The images that ``file`` lists as ``shots``; the ``offset`` is their own if it is None.
+
+    DevrfError if an image or a mask is missing, or a pose is no rigid transform.
+    """
+    root = finder.root
+    names = [shot.image for shot in shots]
+    present = present_images(names, file, finder, missing, relative_to=root)
+    kept = [shots[row] for row in present]
+    poses = from_opencv(torch.stack([shot.world_to_camera for shot in kept]))
+    check_poses(poses, lambda row: f"{file}: the camera of {kept[row].image}")
+    offset = offset_of(poses) if offset is None else offset
+    masks = None
+    if all(shot.mask is not None for shot in kept):
+        wanted = [str(shot.mask) for shot in kept]
+        found = present_images(wanted, file, finder, "error", relative_to=root)
+        masks = tuple(found.values())
+    return Transforms(
+        file,
+        tuple(shot.intrinsics for shot in kept),
+        tuple(present.values()),
+        subtracted(poses, offset).float(),
+        tuple(shot.time for shot in kept),
+        masks,
+        cut_out=masks is not None,
+        skipped=len(shots) - len(kept),
+        offset=offset,
+    )
 
 
 class TransformsFiles:

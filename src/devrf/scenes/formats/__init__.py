@@ -49,6 +49,8 @@ COLMAP = KnownLayout("colmap", "COLMAP", tuple(f"sparse/0/{part}.bin" for part i
 LAYOUTS = (
     KnownLayout("dycheck", "DyCheck", ("splits/train.json", "scene.json")),
     KnownLayout("nerfies", "Nerfies", ("dataset.json", "scene.json")),
+    KnownLayout("panoptic", "Dynamic 3D Gaussians", ("train_meta.json", "test_meta.json")),
+    KnownLayout("easyvolcap", "EasyVolcap", ("intri.yml", "extri.yml")),
     KnownLayout("inward", "DeVRF", ("static/transforms_train.json",)),
     KnownLayout("forward", "DeVRF forward", ("static/poses_bounds.npy",)),
     KnownLayout("nerfstudio", "nerfstudio", ("static/transforms.json",)),
@@ -138,12 +140,13 @@ def _of_no_layout(folder: Path) -> DevrfError:
     # A layout is left out if another one lacks only some of the same files.
     missing = {layout.name: layout.missing(folder) for layout in LAYOUTS}
     lacks = [
-        f"{name}: no {files[0]}"
+        f"{name}: {files[0]}"
         for name, files in missing.items()
         if not any({*fewer} < {*files} for fewer in missing.values())
     ]
     return scene_error(
-        folder, f"no known layout ({'; '.join(lacks)}); set data.root to the scene's folder"
+        folder,
+        f"no known layout (expected {'; '.join(lacks)}); set data.root to the scene's folder",
     )
 
 

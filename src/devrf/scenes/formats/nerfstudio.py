@@ -2,30 +2,30 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from dataclasses import KW_ONLY, replace
 from pathlib import Path
 from typing import ClassVar, Literal
 
-import torch
 from pydantic.dataclasses import dataclass
-from torch import Tensor
 
 from devrf.scenes.image_folders import Downscale
-from devrf.scenes.layout import Layout, fewer, one_capture, static_alone, two_captures
+from devrf.scenes.layout import (
+    Layout,
+    dynamic_images,
+    fewer,
+    static_alone,
+    two_captures,
+    with_static_times,
+)
 from devrf.scenes.masks import Masks
 from devrf.scenes.reader import EstimatedFlow, PosedReader, Time
-from devrf.scenes.splits import distinct_poses, one_moment, parted
-from devrf.scenes.transforms import TIME_TOLERANCE, Transforms, TransformsFiles
+from devrf.scenes.splits import parted
+from devrf.scenes.transforms import Transforms, TransformsFiles
 from devrf.scenes.validation import scene_error
 from devrf.system.options import Count, Several, abbreviated
 
-log = logging.getLogger(__name__)
-
 FILE = "transforms.json"
-# The least number of images at time 0 that make a static set.
-_SEVERAL = 3
 
 
 @dataclass(frozen=True)
@@ -72,9 +72,9 @@ class NerfstudioReader(PosedReader):
         files = TransformsFiles(folder, self.missing, self.masks)
         if os.path.isfile(folder / FILE):
             train, test, validation = self._splits(files, folder / FILE)
-            layout = _one_file(train, test, self.static_until)
+            layout = with_static_times(train, test, self.static_until)
             if layout.static_train.transforms is not layout.dynamic_train.transforms:
-                validation = validation[_dynamic_images(validation)]
+                validation = validation[dynamic_images(validation)]
         else:
             static = folder / "static" / FILE
             moving = folder / "dynamic" / FILE
@@ -128,50 +128,3 @@ class NerfstudioReader(PosedReader):
             )
         validation = val if self.validation else ()
         return transforms[sorted(train)], transforms[sorted(test)], transforms[sorted(validation)]
-
-
-def _one_file(train: Transforms, test: Transforms, static_until: float | None) -> Layout:
-    """The layout of a file of static and dynamic images."""
-    if one_moment(train, test):
-        return one_capture(train, test, 1.0)
-    times = _times(train)
-    at_zero = times <= TIME_TOLERANCE
-    if static_until is None:
-        static_until = 0.0 if int(at_zero.sum()) >= _SEVERAL else 1.0
-    if static_until > 0 or not bool(at_zero.any()):
-        return one_capture(train, test, static_until)
-    static = at_zero.nonzero()[:, 0].tolist()
-    static_test = (_times(test) <= TIME_TOLERANCE).nonzero()[:, 0].tolist()
-    moving = _dynamic_images(train)
-    moving_test = _dynamic_images(test)
-    if not moving or not moving_test:
-        raise scene_error(
-            train.file,
-            f"{len(moving)} images to learn motion from and {len(moving_test)} held out; expected "
-            "one of each above time 0: correct the times, or train_filenames and test_filenames",
-        )
-    static_test_source = test
-    if not static_test:
-        log.warning("no held-out image at time 0: the static scene is tested on one in training")
-        static_test = static[:1]
-        static_test_source = train
-    log.info("%d images at time 0 are the static set of %d", len(static), len(times))
-    static_pair = (train[static], static_test_source[static_test])
-    return two_captures(static_pair, (train[moving], test[moving_test]))
-
-
-def _dynamic_images(transforms: Transforms) -> list[int]:
-    """The images at later times, and those at time 0 by cameras that also have later ones.
-
-    Other images at time 0 do not show motion, and their many cameras would hide that the others are
-    fixed.
-    """
-    later = _times(transforms) > TIME_TOLERANCE
-    camera = distinct_poses(transforms.poses)
-    images: list[int] = (later | torch.isin(camera, camera[later])).nonzero()[:, 0].tolist()
-    return images
-
-
-def _times(transforms: Transforms) -> Tensor:
-    assert transforms.times is not None  # else the scene is static
-    return torch.tensor(transforms.times)
