@@ -13,15 +13,18 @@ import torch
 from torch import Tensor
 
 from devrf.geometry.box import Box
+from devrf.geometry.cameras import Cameras
 from devrf.geometry.rays import Rays
 from devrf.kernels.adam import GRAIN_OF_VOXELS, adam_step, add_total_variation_gradient
 from devrf.kernels.march import march
 from devrf.kernels.runtime import GRAIN_OF_RAYS, choose, is_supported
+from devrf.kernels.splatting import BAND, splat
 from devrf.kernels.trilinear import interpolate
-from devrf.ops import adam, trilinear
+from devrf.ops import adam, splatting, trilinear
 from devrf.ops import march as definition
 from devrf.ops.adam import AdamRule
 from devrf.ops.march import MarchInputs, MarchRange
+from devrf.ops.splatting import Gaussians
 from devrf.rendering.occupancy import Occupancy
 
 BOX = Box((-1.0, -0.5, 0.0), (1.0, 1.5, 1.0))
@@ -110,6 +113,19 @@ def scene(rng: torch.Generator, count: int = 500) -> tuple[Rays, MarchInputs]:
     return Rays(2 * origins, directions, directions), inputs
 
 
+# Three bands high.
+CAMERA = Cameras.looking_at(
+    torch.tensor([[3.0, 1.0, 0.0]]), torch.zeros(1, 3), focal=20.0, width=10, height=2 * BAND + 5
+)
+
+
+def gaussians(points: Tensor) -> Gaussians:
+    """Gaussians in so many places."""
+    sizes = 0.1 + 0.05 * points.cos()
+    turns = torch.cat([points, points.sin()], dim=1)[:, :4]
+    return Gaussians(points, sizes, turns, points[:, 0].sigmoid(), points.sigmoid())
+
+
 def test_kernels_take_single_precision_where_they_run() -> None:
     assert is_supported(torch.zeros(1)) and is_supported(torch.zeros(0, 3))
     for other in (torch.float64, torch.float16, torch.bfloat16, torch.int32):
@@ -127,8 +143,9 @@ def everything(given: tuple[Rays, MarchInputs], points: Tensor, grid: Tensor) ->
     """What all functions of the kernels give."""
     rays, inputs = given
     samples = march(rays, inputs)
+    image = splat(gaussians(points), CAMERA, 0.1)
     interpolated = interpolate(grid, points, BOX)
-    return [*vars(samples).values(), interpolated, *optimised(grid)]
+    return [*vars(samples).values(), *vars(image).values(), interpolated, *optimised(grid)]
 
 
 def optimised(grid: Tensor) -> list[Tensor]:
@@ -148,8 +165,9 @@ def by_definition(given: tuple[Rays, MarchInputs], points: Tensor, grid: Tensor)
     smoothed = torch.zeros_like(grid)
     adam.add_total_variation_gradient(grid, smoothed, 0.5)
     samples = definition.march(rays, inputs)
+    image = splatting.splat(gaussians(points), CAMERA, 0.1)
     interpolated = trilinear.interpolate(grid, points, BOX)
-    return [*vars(samples).values(), interpolated, smoothed, *stepped]
+    return [*vars(samples).values(), *vars(image).values(), interpolated, smoothed, *stepped]
 
 
 def test_without_kernels_everything_is_the_definition_to_the_bit(
@@ -188,6 +206,7 @@ def with_gradients(given: tuple[Rays, MarchInputs], points: Tensor, grid: Tensor
     samples = march(rays, inputs)
     loss = (samples.canonical**2).sum() + (samples.weight**2).sum()
     loss = loss + (samples.transmittance**2).sum() + (interpolate(grid, points, BOX) ** 2).sum()
+    loss = loss + (splat(gaussians(points), CAMERA, 0.1).color ** 2).sum()
     loss.backward()
     # Once more, added to the gradients that are there.
     (march(rays, inputs).weight.sum() + interpolate(grid, points, BOX).sum()).backward()

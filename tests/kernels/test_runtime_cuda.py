@@ -62,6 +62,8 @@ def test_all_are_found() -> None:
     names |= {f"adam.{one}_{n}" for one in steps for n in CHANNELS}
     names |= {f"march.march_kernel_{n}" for n in SPACES}
     names |= {"march.enter_kernel", "march.adjoint_kernel", "march.keep_significant_kernel"}
+    splatting = ("project", "list", "composite", "composite_adjoint", "project_adjoint")
+    names |= {f"splatting.{one}_kernel" for one in splatting}
     assert set(every_kernel()) == names
 
 

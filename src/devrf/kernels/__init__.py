@@ -8,6 +8,7 @@ definition in :mod:`devrf.ops` for tensors that kernels do not support
 |---|---|
 | ``march`` | ``march``: samples, warped and composited |
 | ``trilinear`` | ``interpolate``: values of a grid between its points |
+| ``splatting`` | ``splat``: a picture of 3D Gaussians |
 | ``adam`` | ``adam_step``, ``add_total_variation_gradient``: a step of the optimiser |
 | ``grid`` | shared by the kernels: grids, and the cell that holds a point |
 | ``runtime`` | tensors that kernels support, and launches |

@@ -10,7 +10,7 @@ from threading import Thread
 import torch
 import warp as wp
 
-from devrf.kernels import adam, march, trilinear
+from devrf.kernels import adam, march, splatting, trilinear
 from devrf.kernels.runtime import compiling, is_supported
 
 log = logging.getLogger(__name__)
@@ -37,6 +37,12 @@ def grid_kernels(channels: Collection[int]) -> list[wp.Kernel]:
         kernels += [trilinear.add_kernel(count), adam.total_variation_kernel(count)]
         kernels.append(adam.adam_kernel(count))
     return kernels
+
+
+def splatting_kernels() -> list[wp.Kernel]:
+    """The kernels of a picture of Gaussians and its adjoint."""
+    kernels = [splatting.project_kernel, splatting.list_kernel, splatting.composite_kernel]
+    return [*kernels, splatting.composite_adjoint_kernel, splatting.project_adjoint_kernel]
 
 
 def compile_ahead(kernels: Sequence[wp.Kernel], device: torch.device) -> Thread:

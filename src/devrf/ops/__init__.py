@@ -9,6 +9,7 @@ compute where those do not run.
 | ``trilinear`` | ``interpolate``: values of a grid between its points; ``resample`` |
 | ``compositing`` | ``composite``: weights; ``sum_by_ray``; ``mean_distance``: depths |
 | ``color_network`` | ``decode``: features and directions → RGB |
+| ``splatting`` | ``splat``: a picture of 3D Gaussians |
 | ``photometric`` | the terms that compare rays with images |
 | ``adam`` | ``adam_step``: one step on one tensor; ``add_total_variation_gradient`` |
 """
