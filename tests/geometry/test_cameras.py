@@ -86,6 +86,15 @@ def test_resizing_scales_each_axis_by_its_own_factor(scattered, rng):
     torch.testing.assert_close(same.directions, scattered.rays(camera, pixels).directions)
 
 
+def test_rows_of_a_raster_have_its_rays(scattered):
+    band = scattered.rows(2, 5)
+    width = scattered.width
+    assert (band.width, band.height) == (width, 3)
+    ours, theirs = band.image_rays(1), scattered.image_rays(1)[2 * width : 5 * width]
+    torch.testing.assert_close(ours.directions, theirs.directions)
+    assert torch.equal(ours.origins, theirs.origins)
+
+
 def test_looking_at_puts_the_target_in_the_middle_and_up_above(rng):
     positions, targets = torch.randn(6, 3, generator=rng) * 3, torch.randn(6, 3, generator=rng)
     cameras = Cameras.looking_at(positions, targets, focal=20.0, width=12, height=8)

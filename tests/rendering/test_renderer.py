@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from devrf.geometry.box import Box
+from devrf.geometry.cameras import Cameras
 from devrf.geometry.contraction import ContractedSpace
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import WORLD
@@ -141,6 +142,30 @@ class Walls:
             hit = (distance >= NEAR) & (distance <= FAR)
             color[hit], depth[hit] = paint, distance[hit]
         return RenderedImage(color, depth, (depth > 0).float())
+
+
+class Frames:
+    """Images alone: each pixel has the colour of its focal length and the background."""
+
+    device = CPU
+    at_rest = False
+
+    def at(self, time, *, half=False):
+        return self
+
+    def image(self, camera, background, crop):
+        assert len(camera) == 1 and crop == Walls.box
+        pixels = camera.width * camera.height
+        color = (camera.focal[0, 0] * background).expand(pixels, 3)
+        return RenderedImage(color, torch.ones(pixels), torch.ones(pixels))
+
+
+def test_a_method_without_rays_renders_whole_images():
+    positions = torch.tensor([[3.0, 0, 0], [0, 3.0, 0]])
+    cameras = Cameras.looking_at(positions, torch.zeros(2, 3), focal=1.0, width=4, height=3)
+    cameras.focal[1] = 5.0
+    seen = Renderer(Frames()).view(cameras, 1, 0.5, 0.1, Walls.box)
+    assert seen.color.shape == (12, 3) and torch.equal(seen.color, torch.full((12, 3), 0.5))
 
 
 def along(x):

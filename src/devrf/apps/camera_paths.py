@@ -248,12 +248,12 @@ def looked_at(model: Renderable, cameras: Cameras, ahead: Callable[[], float]) -
 def focus_distance(renderer: Renderer, cameras: Cameras) -> float:
     """Median depth along the optical axis, world units, of the first camera's view at rest."""
     camera = cameras.single(0).to(renderer.device)
-    rays = camera.image_rays(0)
-    image = renderer.picture(rays, 0.0, 1.0)
+    image = renderer.view(camera, 0, 0.0, 1.0)
     solid = (image.opacity > 0.5).nonzero()[:, 0]
     if len(solid) == 0:
         return float(cameras.positions.norm(dim=1).mean()) + 1.0
-    points = points_at_depth(renderer.model.space, rays[solid], image.depth[solid])
+    rays = camera.image_rays(0)[solid]
+    points = points_at_depth(renderer.model.space, rays, image.depth[solid])
     _, depth = camera.project_into(0, points)
     return float(depth.median())
 

@@ -234,6 +234,11 @@ class Cameras:
         """The same cameras with images ``height`` pixels high and as wide as they were for it."""
         return self.resized(max(1, round(self.width * height / self.height)), height)
 
+    def rows(self, first: int, last: int) -> Cameras:
+        """The same cameras with the rows ``first`` … ``last`` − 1 of the raster alone."""
+        center = self.center - self.center.new_tensor([0.0, float(first)])
+        return replace(self, center=center, height=last - first)
+
     def to(self, device: torch.device | str) -> Cameras:
         """The same cameras on ``device``."""
         return replace(

@@ -117,9 +117,10 @@ def rotations(quaternions: Tensor) -> Tensor:
     rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
     rows += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
     rows += [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
-    return torch.stack(rows, dim=1).unflatten(1, (3, 3))
+    return torch.stack(rows, dim=1).view(-1, 3, 3)
 
 
 def _transmittances(alpha: Tensor) -> Tensor:
     """T_i (P, N + 1) before each of opacities (P, N), and behind the last."""
-    return pad(1 - alpha, (1, 0), value=1.0).cumprod(dim=1)
+    before: Tensor = pad(1 - alpha, (1, 0), value=1.0)
+    return before.cumprod(dim=1)

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from devrf.geometry.box import Box
 from devrf.geometry.space import Space
-from devrf.rendering.view import SurfaceField, View
+from devrf.rendering.view import ImageView, SurfaceField, View
 from devrf.system.stored_class import StoredClass
 
 
@@ -49,7 +49,7 @@ class Renderable(StoredClass, nn.Module, ABC):
         return cls(**config)
 
     @abstractmethod
-    def at(self, time: float, *, half: bool = False) -> View:
+    def at(self, time: float, *, half: bool = False) -> View | ImageView:
         """The scene at ``time`` in [0, 1], ready to be looked at from anywhere.
 
         Args:

@@ -20,7 +20,7 @@ from devrf.geometry.rays import Rays
 from devrf.geometry.space import Space, WorldSpace
 from devrf.rendering.output import RenderedImage
 from devrf.rendering.renderable import Renderable
-from devrf.rendering.view import MovingView
+from devrf.rendering.view import ImageView, MovingView
 from devrf.system.memory import free_cache, is_oom
 
 log = logging.getLogger(__name__)
@@ -39,7 +39,7 @@ class Renderer:
     Views of the last few times are cached: a change of the model does not show at these times.
 
     Attributes:
-        at: time in [0, 1] → the :class:`~devrf.rendering.view.View` of that time, cached.
+        at: time in [0, 1] → the view of that time (:mod:`devrf.rendering.view`), cached.
     """
 
     def __init__(self, model: Renderable, *, times: int = 4, half: bool = False) -> None:
@@ -55,7 +55,7 @@ class Renderer:
     def picture(
         self, rays: Rays, time: float, background: float | Tensor, crop: Box | None = None
     ) -> RenderedImage:
-        """Render R rays at ``time``.
+        """Render R rays at ``time``; of a method that renders rays.
 
         Args:
             rays: R rays in world space, on any device.
@@ -63,9 +63,8 @@ class Renderer:
             background: grey level, or RGB (3,).
             crop: only the part of the scene in this box is rendered (:class:`CroppedRays`).
         """
-        view = self.at(time)
-        if not isinstance(background, Tensor):
-            background = torch.full((3,), background, device=self.device)
+        view, background = self.at(time), self._color(background)
+        assert not isinstance(view, ImageView)
         rays, space = rays.to(self.device), self.model.space
         cropped = crop and CroppedRays.of(rays, crop, space, self.model.depth_limits[0])
         field_rays = cropped.rays if cropped else space.rays(rays)
@@ -76,6 +75,7 @@ class Renderer:
         image = RenderedImage.joined(in_chunks(rendered, len(field_rays), view.chunk, self.device))
         return cropped.completed(image, background) if cropped else image
 
+    @torch.no_grad()
     def view(
         self,
         cameras: Cameras,
@@ -85,8 +85,17 @@ class Renderer:
         crop: Box | None = None,
     ) -> RenderedImage:
         """All H·W pixels of camera ``index`` at ``time``, in row-major order."""
-        rays = cameras[[index]].to(self.device).image_rays(0)
-        return self.picture(rays, time, background, crop)
+        camera = cameras[[index]].to(self.device)
+        view = self.at(time)
+        if isinstance(view, ImageView):
+            return view.image(camera, self._color(background), crop)
+        return self.picture(camera.image_rays(0), time, background, crop)
+
+    def _color(self, background: float | Tensor) -> Tensor:
+        """The RGB (3,) of a background."""
+        if isinstance(background, Tensor):
+            return background
+        return torch.full((3,), background, device=self.device)
 
     @torch.no_grad()
     def induced_flow(

@@ -13,7 +13,7 @@ from devrf.rendering.output import RenderedImage
 
 
 class View(Protocol):
-    """A scene at one time, ready to be rendered from anywhere."""
+    """A scene at one time, ready to be rendered along any rays."""
 
     @property
     def chunk(self) -> int:
@@ -25,6 +25,24 @@ class View(Protocol):
 
     def render(self, rays: Rays, background: Tensor) -> RenderedImage:
         """Render R rays in the fields' space without gradients, before a background (3,) RGB."""
+
+
+@runtime_checkable
+class ImageView(Protocol):
+    """A scene at one time, ready to be rendered as whole images, of a method without rays."""
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the scene is in its canonical state, as at time 0."""
+
+    def image(self, camera: Cameras, background: Tensor, crop: Box | None) -> RenderedImage:
+        """Render all H·W pixels of one camera, in row-major order, without gradients.
+
+        Args:
+            camera: one camera, world units.
+            background: (3,) RGB.
+            crop: only the part of the scene in this box is rendered; None: all of it.
+        """
 
 
 @runtime_checkable

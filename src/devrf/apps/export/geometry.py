@@ -228,10 +228,11 @@ def _seen(
     points = []
     colors = []
     for camera in range(len(cameras)):
-        rays = cameras.single(camera).of_height(rows).image_rays(0)
-        image = renderer.picture(rays, time, background)
+        shown = cameras.single(camera).of_height(rows)
+        image = renderer.view(shown, 0, time, background)
         solid = (image.opacity > SOLID).nonzero()[:, 0]
-        ends = points_at_depth(renderer.model.space, rays[solid], image.depth[solid])
+        rays = shown.image_rays(0)[solid]
+        ends = points_at_depth(renderer.model.space, rays, image.depth[solid])
         points.append(ends.float().cpu())
         colors.append(image.color[solid].clamp(0, 1).float().cpu())
     return torch.cat(points), torch.cat(colors)

@@ -132,18 +132,18 @@ class Drawing:
     def _blocks(
         self, shot: Shot, camera: Cameras, time: float
     ) -> Iterator[tuple[RenderedImage, Tensor]]:
-        """Consecutive pixels in row-major order, with the motion (K, 2) where it is shown."""
-        rays = camera.image_rays(0)
-        pixels = camera.pixel_grid()
+        """Consecutive rows of pixels, with the motion (K, 2) where it is shown."""
         crop = shot.crop or self.renderer.reach(camera.positions[0])
         later = time + STEP if time + STEP <= 1 else time - STEP
         size = max(MIN_RAYS, int(BLOCK_SECONDS * self._rays_per_second))
-        for first in range(0, len(rays), size):
-            block = slice(first, first + size)
-            image = self.renderer.picture(rays[block], time, self._background, crop)
+        rows = math.ceil(size / camera.width)
+        for first in range(0, camera.height, rows):
+            band = camera.rows(first, min(first + rows, camera.height))
+            image = self.renderer.view(band, 0, time, self._background, crop)
             vectors = torch.zeros_like(image.color[:, :2])
             if shot.channel == "motion":
-                flow = self.renderer.induced_flow(rays[block], pixels[block], camera, time, later)
+                rays, pixels = band.image_rays(0), band.pixel_grid()
+                flow = self.renderer.induced_flow(rays, pixels, band, time, later)
                 assert flow is not None  # the channel is offered where there is motion
                 vectors = flow[0] * (1 if later > time else -1)
             yield image, vectors
