@@ -34,7 +34,7 @@ PATHS = {
     *("data.root", "data.export", "data.flow_cache", "ckpt", "fetch.into", "export.into"),
     *("capture.static", "capture.into", "capture.masks", "capture.alpha_masks", "video.path"),
     *("report.runs", "report.into", "fetch.catalogue", "evaluation.lpips_weights"),
-    *("outputs", "hydra.run.dir", "hydra.sweep.dir"),
+    *("evaluation.predictions", "outputs", "hydra.run.dir", "hydra.sweep.dir"),
 }
 
 
@@ -75,6 +75,11 @@ def scene_folder_name(scene: str) -> str:
     return re.sub(r"[^\w.-]+", "_", scene).lstrip(".") or "scene"
 
 
+def foreign_program(config: Any) -> str:
+    """The name of the program whose pictures are scored: given, or that of their folder."""
+    return str(config.evaluation.program or Path(config.evaluation.predictions).resolve().name)
+
+
 def run_folder(_root_: Any) -> str:
     """A run's folder; for a report, the report's.
 
@@ -98,6 +103,9 @@ def run_folder(_root_: Any) -> str:
     trial = [os.environ.get(name) for name in ("WANDB_SWEEP_ID", "WANDB_RUN_ID")]
     if all(trial):
         return "/".join([outputs, "sweeps", *map(str, trial)])
+    if stage == "evaluate" and _root_.evaluation.predictions is not None:
+        program = scene_folder_name(foreign_program(_root_))
+        return f"{outputs}/{scene_name(_root_)}/{program}-pictures"
     parts = [options.experiment or "quickstart"]
     if options.ablation not in (None, "full"):
         parts.append(options.ablation)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from devrf.apps.records import (
@@ -19,14 +20,17 @@ from devrf.apps.records import (
 )
 from devrf.apps.settings import REHEARSAL
 from devrf.checkpoints.file_metadata import digest_of
-from devrf.cli.config import choices
+from devrf.cli.config import choices, foreign_program, overrides
 from devrf.cli.context import RunContext
 from devrf.cli.restore_config import as_typed
 from devrf.cli.resume import unfinished
 from devrf.errors import DevrfError
+from devrf.evaluation.held_out import HeldOutView
 from devrf.evaluation.objective import VALIDATION, objective
+from devrf.evaluation.predictions import picture_name, read_predictions
 from devrf.evaluation.scoring import score_held_out
 from devrf.pictures.held_out import write_contact_sheet
+from devrf.pictures.images import write_image
 from devrf.scenes.scene import Views
 from devrf.system.files import write_json
 from devrf.system.override import to_type
@@ -34,12 +38,15 @@ from devrf.system.override import to_type
 log = logging.getLogger(__name__)
 
 
-def evaluate(run: RunContext) -> list[Path]:
+def evaluate(run: RunContext) -> list[Path] | None:
     """Score the learned scene on held-out views; return the files: metrics and contact sheets.
 
     Raises:
         DevrfError: the last stage is not finished, and not named by ``ckpt``.
     """
+    if run.evaluation.predictions is not None:
+        _evaluate_predictions(run)
+        return None
     standing = unfinished(run)
     if standing is not None and run.config.ckpt is None:
         given = to_type("ckpt", run.checkpoint())
@@ -61,15 +68,11 @@ def evaluate(run: RunContext) -> list[Path]:
             sets[VALIDATION] = scene.dynamic.validation
     frames = score_held_out(model, sets, scene.background, suite)
     validated = frames.pop(VALIDATION, [])
-    for capture, scored in frames.items():
-        sheet = write_contact_sheet(run.folder / "images" / f"{capture}.png", scored)
-        for tracker in run.trackers:
-            tracker.show_image(f"held_out/{capture}", sheet)
+    _write_scores(run, frames, sets)
     size = round(run.checkpoint(metadata.stage).stat().st_size / 1e6, 3)
     sections = scores_by_section(frames, scene.clock, metadata, rest, size)
     if validated:
         sections[VALIDATION] = {**mean_scores(validated), "images": len(validated)}
-    write_frames(run.folder / "frames.csv", frames)
     protocol = metadata.protocol or run.protocol.name
     head = {"scene": scene.name, "method": model.name, "protocol": protocol}
     without_motion = {} if scene.moves else {"at_rest": True}
@@ -99,3 +102,46 @@ def evaluate(run: RunContext) -> list[Path]:
         tracker.show_table("frames", frame_rows(frames))
     written = (metrics, "frames.csv", *(f"images/{capture}.png" for capture in frames))
     return [run.folder / name for name in written]
+
+
+def _write_scores(
+    run: RunContext, frames: Mapping[str, Sequence[HeldOutView]], sets: Mapping[str, Views]
+) -> None:
+    """Write a table of all images, contact sheets, and the pictures if they are asked for."""
+    for capture, scored in frames.items():
+        for index, view in enumerate(scored if run.evaluation.pictures else ()):
+            name = picture_name(sets[capture], index)
+            write_image(run.folder / "images" / "held_out" / capture / name, view.prediction)
+        sheet = write_contact_sheet(run.folder / "images" / f"{capture}.png", scored)
+        for tracker in run.trackers:
+            tracker.show_image(f"held_out/{capture}", sheet)
+    write_frames(run.folder / "frames.csv", frames)
+
+
+def _evaluate_predictions(run: RunContext) -> None:
+    """Score another program's pictures as a run's are; nothing is learned or loaded."""
+    scene = run.scene
+    sets: dict[str, Views] = {"static": scene.static.test}
+    if scene.moves:
+        sets["dynamic"] = scene.dynamic.test
+    program = foreign_program(run.config)
+    folder = Path(run.config.evaluation.predictions)
+    pictures = read_predictions(folder, program, sets, scene.background)
+    suite = run.evaluation.suite(run.device)
+    frames = score_held_out(pictures, pictures.sets, scene.background, suite)
+    sections = {name: {**mean_scores(v), "images": len(v)} for name, v in frames.items()}
+    _write_scores(run, frames, pictures.sets)
+    name = f"{program} (pictures)"
+    head = {"scene": scene.name, "method": name, "protocol": run.protocol.name}
+    ran = {
+        **provenance(0, run.device),
+        "choices": choices(),
+        "overrides": overrides(),
+        "predictions": str(folder.resolve()),
+        **data_record(scene),
+        "lpips_network": run.evaluation.lpips_network,
+    }
+    without_motion = {} if scene.moves else {"at_rest": True}
+    write_json(run.folder / "metrics.json", {**head, **without_motion, **sections, "run": ran})
+    for section, values in sections.items():
+        log.info("%s, %s: %s", name, section, in_words(values))

@@ -132,7 +132,8 @@ def _run_plan(run: RunContext) -> float | None:
             _run_step(run, name, AFTER_LEARNING.get(name) or STEPS[name])
     if learning and run.rehearses and run.is_rank_zero:
         conclude(run)
-    scored = "evaluate" in steps and run.is_rank_zero and not run.rehearses
+    foreign = config.evaluation.predictions is not None
+    scored = "evaluate" in steps and run.is_rank_zero and not (run.rehearses or foreign)
     return _objective(run, steps) if scored and unfinished(run) is None else None
 
 

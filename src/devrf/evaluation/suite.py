@@ -98,16 +98,28 @@ MEASURES: dict[str, Callable[[MetricInput], float | None]] = {
     "depth_error": _depth_error,
     "flow_error": lambda inputs: flow_error(inputs.renderer, inputs.views, inputs.index),
 }
+# Those of a learned field, which pictures alone do not have.
+OF_FIELDS = ("depth_error", "flow_error")
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The choice of metrics, names of :data:`MEASURES`; see ``conf/evaluation/default.yaml``."""
+    """The choice of metrics, names of :data:`MEASURES`; see ``conf/evaluation/default.yaml``.
+
+    Attributes:
+        predictions: a folder of another program's pictures, which are scored in place of a run's
+            (:mod:`devrf.evaluation.predictions`); None: the run is scored.
+        program: the name of that program; None: the folder's.
+        pictures: whether the pictures that are scored are written as PNG, too.
+    """
 
     metrics: Sequence[str] = tuple(MEASURES)
     lpips_network: Network = "vgg"
     lpips_weights: str | Path | None = None
     download: bool = False
+    predictions: str | Path | None = None
+    program: str | None = None
+    pictures: bool = False
 
     def check(self) -> None:
         """Check that the metrics and the file of weights exist.
@@ -133,7 +145,9 @@ class Evaluation:
         lpips = None
         if any(name.startswith("lpips") for name in self.metrics):
             lpips = load_lpips(self.lpips_network, self.lpips_weights, self.download)
-        return MetricSuite(tuple(self.metrics), lpips.to(device) if lpips else None)
+        left_out = OF_FIELDS if self.predictions is not None else ()
+        metrics = tuple(name for name in self.metrics if name not in left_out)
+        return MetricSuite(metrics, lpips.to(device) if lpips else None)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,338 @@
+"""Another program's pictures of a scene's held-out views, to be scored as a method's are.
+
+They lie in a folder, or are a film with an image for each held-out one in their order. A scene
+with two sets of held-out views has a folder or a film for each, ``static`` and ``dynamic``; those
+that are not there are not scored. In a folder the images are told by
+
+* ``predictions.json``: ``{"images": [{"file": "a.png", "image": "r_003.png"}, …]}``, or in place of
+  ``image`` ``"view"`` and ``"time"``;
+* else the names of the held-out images;
+* else view and time in their own names: ``view0_time0.250.png``;
+* else their order, if there are as many: ``00000.png``, ``00001.png``, …
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from pydantic import BaseModel, Field
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from devrf.evaluation.held_out import background_value, truth_image
+from devrf.geometry.box import Box
+from devrf.geometry.cameras import Cameras
+from devrf.geometry.space import WORLD
+from devrf.rendering.output import RenderedImage
+from devrf.rendering.renderable import Renderable
+from devrf.scenes.files import MOST_IMAGES, Name, Number, inside, read_json
+from devrf.scenes.footage import VIDEOS, footage_header, frames_at
+from devrf.scenes.image_folders import listed_images
+from devrf.scenes.images import decode, read_header
+from devrf.scenes.scene import Background, Views
+from devrf.scenes.validation import scene_error
+from devrf.system.options import abbreviated
+
+log = logging.getLogger(__name__)
+
+LIST = "predictions.json"
+# A view's number and a time in [0, 1].
+_PLACED = re.compile(r"view(\d{1,6})_time(\d+(?:\.\d+)?)")
+# Largest difference of a stated time from the image's.
+SAME_TIME = 1e-3
+# Pictures have changed places if this share of their errors is left when each is compared with the
+# image that it is most like, or less.
+IN_ANOTHER_ORDER = 0.5
+# Pixels of the sides of pictures when they are told apart.
+SMALL = 32
+
+Picture = npt.NDArray[np.uint8]
+
+
+class Listed(BaseModel):
+    """An entry of ``predictions.json``.
+
+    Attributes:
+        file: the picture, relative to the folder.
+        image: the name of the held-out image; None: ``view`` and ``time`` say which it is.
+        view: the number of the held-out camera, from 0 on.
+        time: in [0, 1].
+    """
+
+    file: Name
+    image: Name | None = None
+    view: Annotated[int, Field(ge=0, strict=True)] | None = None
+    time: Number | None = None
+
+
+class PredictionsFile(BaseModel):
+    """The content of ``predictions.json``."""
+
+    images: Annotated[list[Listed], Field(fail_fast=True, min_length=1, max_length=MOST_IMAGES)]
+
+
+class Pictures(Renderable):
+    """Pictures by another program in place of a learned scene: what it shows from held-out cameras.
+
+    Attributes:
+        sets: the held-out views that there are pictures of, by the name of their set.
+    """
+
+    def __init__(self, program: str, sets: Mapping[str, Views]) -> None:
+        """No pictures yet of ``sets`` by a ``program``."""
+        super().__init__()
+        self.__dict__["name"] = program
+        self.space = WORLD
+        self.sets = dict(sets)
+        # By the pose of a camera: times and pictures (H, W, 3) in [0, 1].
+        self._shots: dict[tuple[float, ...], list[tuple[float, Tensor]]] = {}
+
+    def add(self, views: Views, index: int, picture: Tensor) -> None:
+        """Take a ``picture`` (H, W, 3) in [0, 1] of a held-out image."""
+        pose = _pose(views.cameras, index)
+        self._shots.setdefault(pose, []).append((float(views.times[index]), picture))
+
+    def config(self) -> dict[str, Any]:
+        """None: no checkpoint holds pictures."""
+        return {}
+
+    @property
+    def device(self) -> torch.device:
+        """The host."""
+        return torch.device("cpu")
+
+    @property
+    def moves(self) -> bool:
+        """Whether some camera has pictures at several times."""
+        return any(len(shots) > 1 for shots in self._shots.values())
+
+    def at(self, time: float, *, half: bool = False) -> PicturesAt:
+        """The pictures of the nearest time that a camera has one of."""
+        return PicturesAt(self._shots, time)
+
+
+@dataclass(frozen=True)
+class PicturesAt:
+    """The pictures of one time (an :class:`~devrf.rendering.view.ImageView`)."""
+
+    shots: Mapping[tuple[float, ...], Sequence[tuple[float, Tensor]]]
+    time: float
+    # There is no canonical scene to compare with.
+    at_rest: bool = True
+
+    def image(self, camera: Cameras, background: Tensor, crop: Box | None) -> RenderedImage:
+        """The picture by a held-out camera, resized to its number of pixels; without depth."""
+        _, picture = min(self.shots[_pose(camera, 0)], key=lambda shot: abs(shot[0] - self.time))
+        size = (camera.height, camera.width)
+        if picture.shape[:2] != size:
+            picture = interpolate(picture.permute(2, 0, 1)[None], size, mode="bilinear")[0]
+            picture = picture.permute(1, 2, 0)
+        flat = picture.reshape(-1, 3)
+        nothing = torch.zeros(len(flat))
+        return RenderedImage(color=flat, depth=nothing, opacity=nothing)
+
+
+def _pose(cameras: Cameras, index: int) -> tuple[float, ...]:
+    return tuple(cameras.camera_to_world[index].flatten().tolist())
+
+
+def picture_name(views: Views, index: int) -> str:
+    """A name by which :func:`read_predictions` knows the picture of a held-out image."""
+    number = sorted({*views.view.tolist()}).index(int(views.view[index]))
+    return f"view{number}_time{float(views.times[index]):.4f}.png"
+
+
+def read_predictions(
+    path: Path, program: str, sets: Mapping[str, Views], background: Background
+) -> Pictures:
+    """The pictures of ``sets`` of held-out views in a folder, or in films (see above).
+
+    Raises:
+        DevrfError: a picture is missing, of another size than its image, or most like another
+            image.
+    """
+    if not os.path.exists(path):
+        raise scene_error(path, "no such folder; evaluation.predictions is that of the pictures")
+    places = {name: place for name in sets if (place := _place_of(path, name, sets))}
+    if not places:
+        folders = " or ".join(f"{name}/" for name in sets)
+        raise scene_error(path, f"has no folder or film {folders}; add one for each set of views")
+    pictures = Pictures(program, {name: sets[name] for name in places})
+    for name, place in places.items():
+        views = sets[name]
+        found = _film(place, views) if os.path.isfile(place) else _folder(place, views)
+        behind = background_value(background)
+        ready = [_on_background(found(k), behind) for k in range(len(views))]
+        _check_order(ready, views, background, place)
+        for k, picture in enumerate(ready):
+            pictures.add(views, k, picture)
+    return pictures
+
+
+def _place_of(path: Path, name: str, sets: Mapping[str, Views]) -> Path | None:
+    """The folder or the film of a set; None: there is none."""
+    candidates = [path / name, *(path / f"{name}{suffix}" for suffix in VIDEOS)]
+    present = [place for place in candidates if os.path.exists(place)]
+    if present:
+        return present[0]
+    apart = any(os.path.exists(path / other) for other in sets)
+    # Pictures of one kind are of the scene in motion, if it moves.
+    return None if apart or name != [*sets][-1] else path
+
+
+def _film(film: Path, views: Views) -> Callable[[int], Picture]:
+    """The frames of a film, one for each image in their order."""
+    count = footage_header(film).frames
+    frames = dict(frames_at(film, range(min(count, len(views)))))
+    if len(frames) != len(views) or count > len(views):
+        raise scene_error(
+            film,
+            f"has {count} frames, but {len(views)} images are held out; one for each is needed",
+        )
+    return lambda index: _sized(frames[index], views, index, f"{film}: frame {index}")
+
+
+def _folder(folder: Path, views: Views) -> Callable[[int], Picture]:
+    """The pictures in a folder, one for each image."""
+    files = _listed(folder, views) if os.path.isfile(folder / LIST) else _named(folder, views)
+    lacking = [index for index in range(len(views)) if index not in files]
+    if lacking:
+        raise scene_error(
+            folder,
+            f"has no picture of {_in_words(views, lacking[0])}; {len(lacking)} of {len(views)} are "
+            "missing: add them",
+        )
+
+    def picture(index: int) -> Picture:
+        file = files[index]
+        return _sized(decode(file, read_header(file), "RGBA"), views, index, file)
+
+    return picture
+
+
+def _listed(folder: Path, views: Views) -> dict[int, Path]:
+    """The pictures that ``predictions.json`` lists, by the image that they show."""
+    file = folder / LIST
+    files: dict[int, Path] = {}
+    for entry in read_json(file, PredictionsFile, "it lists the pictures; add it").images:
+        path = inside(folder, folder, entry.file, file)
+        if not os.path.isfile(path):
+            raise scene_error(path, f"no such picture, but {LIST} lists it; add it")
+        if entry.image is not None:
+            meant = [k for k, name in enumerate(views.names) if _same(name, entry.image)]
+        elif entry.view is not None and entry.time is not None:
+            meant = _at(views, entry.view, entry.time)
+        else:
+            raise scene_error(
+                file, f"{abbreviated(entry.file)} has neither image nor view and time"
+            )
+        if len(meant) != 1 or meant[0] in files:
+            what = "several of the held-out images" if meant else "none of the held-out images"
+            raise scene_error(file, f"{abbreviated(entry.file)} is a picture of {what}; correct it")
+        files[meant[0]] = path
+    return files
+
+
+def _named(folder: Path, views: Views) -> dict[int, Path]:
+    """The pictures in a folder by the image that their names say, or by their order."""
+    images = listed_images(folder)
+    by_name = {
+        k: path for path in images for k, name in enumerate(views.names) if _same(name, path.stem)
+    }
+    placed = [(path, match) for path in images if (match := _PLACED.fullmatch(path.stem))]
+    by_place = {
+        k: path for path, match in placed for k in _at(views, int(match[1]), float(match[2]))
+    }
+    best = max((by_name, by_place), key=len)
+    if not best and len(images) == len(views):
+        log.info("%s: %d pictures are taken in the order of their names", folder, len(images))
+        return dict(enumerate(images))
+    if not best:
+        raise scene_error(
+            folder,
+            f"has {len(images)} pictures, but {len(views)} images are held out; call them as those "
+            f"({Path(views.names[0]).stem}.png), view0_time0.250.png, or list them in {LIST}",
+        )
+    return best
+
+
+def _same(name: str, other: str) -> bool:
+    """Whether two names are of one image, whatever their folders and suffixes."""
+    return Path(name).stem == Path(other).stem or name == other
+
+
+def _at(views: Views, view: int, time: float) -> list[int]:
+    """The images of a camera at a time."""
+    numbers = sorted({*views.view.tolist()})
+    if view >= len(numbers):
+        return []
+    near = (views.view == numbers[view]) & ((views.times - time).abs() < SAME_TIME)
+    found: list[int] = near.nonzero()[:, 0].tolist()
+    return found
+
+
+def _in_words(views: Views, index: int) -> str:
+    return f"{views.names[index]} (time {float(views.times[index]):.3g})"
+
+
+def _sized(picture: Picture, views: Views, index: int, where: object) -> Picture:
+    """The picture, if it has the size of its image."""
+    camera = views.cameras.single(index)
+    height, width = picture.shape[:2]
+    if (width, height) != (camera.width, camera.height):
+        raise scene_error(
+            where,
+            f"{width}x{height} px, but {_in_words(views, index)} has {camera.width}x"
+            f"{camera.height}; render it at that size, or read the scene with another "
+            "data.downscale",
+        )
+    return picture
+
+
+def _on_background(picture: Picture, behind: float) -> Tensor:
+    """A picture (H, W, 3) in [0, 1]; one with an alpha channel is put on a grey level."""
+    color = torch.from_numpy(picture.copy()).float() / 255
+    if color.shape[2] == 3:
+        return color
+    return behind + color[..., 3:] * (color[..., :3] - behind)
+
+
+def _check_order(
+    pictures: Sequence[Tensor], views: Views, background: Background, place: Path
+) -> None:
+    """DevrfError if pictures have changed places: some, in another order, show one another's image.
+
+    Those of a motion that was not learned, or lags behind, look like other images, too; but several
+    like one, or one like an image that another picture shows well.
+    """
+    truths = torch.stack([_small(truth_image(views, k, background)) for k in range(len(views))])
+    shown = torch.stack([_small(picture) for picture in pictures])
+    errors = torch.cdist(shown, truths).square()
+    least, nearest = errors.min(dim=1)
+    moved = (nearest != torch.arange(len(views))).nonzero()[:, 0]
+    if not len(moved) or nearest[moved].sort().values.tolist() != moved.tolist():
+        return
+    said = errors.diagonal()[moved]
+    if float(least[moved].sum()) < IN_ANOTHER_ORDER * float(said.sum()):
+        first = int(moved[0])
+        raise scene_error(
+            place,
+            f"the picture of {_in_words(views, first)} shows "
+            f"{_in_words(views, int(nearest[first]))}: {len(moved)} are in another order; name "
+            "them as the held-out images",
+        )
+
+
+def _small(picture: Tensor) -> Tensor:
+    """A small version (SMALL · SMALL · 3,) of a picture (H, W, 3)."""
+    small = interpolate(picture.permute(2, 0, 1)[None], (SMALL, SMALL), mode="area")
+    return small.flatten()

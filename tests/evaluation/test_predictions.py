@@ -1,0 +1,127 @@
+"""Pictures of other programs: which held-out image each is of, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+
+from devrf.errors import DevrfError
+from devrf.evaluation.held_out import score, truth_image
+from devrf.evaluation.predictions import picture_name, read_predictions
+from devrf.evaluation.scoring import score_held_out
+from devrf.pictures.images import to_bytes, write_image
+from devrf.pictures.video_file import write_pictures
+from devrf.rendering.renderer import Renderer
+
+
+@pytest.fixture
+def sets(tiny_scene):
+    return {"static": tiny_scene.static.test, "dynamic": tiny_scene.dynamic.test}
+
+
+@pytest.fixture
+def folder(tmp_path, sets) -> Path:
+    """The truth itself, a little darker, under the names that devrf gives."""
+    for name, views in sets.items():
+        for index in range(len(views)):
+            dark = truth_image(views, index, "white") * 0.97
+            write_image(tmp_path / name / picture_name(views, index), dark)
+    return tmp_path
+
+
+def refused(folder: Path, sets) -> str:
+    with pytest.raises(DevrfError) as caught:
+        read_predictions(folder, "Other", sets, "white")
+    line = str(caught.value)
+    assert len(line.splitlines()) == 1 and line.startswith(str(folder))
+    return line
+
+
+def test_own_pictures_score_as_the_model_does(learned, sets, tmp_path):
+    """Up to what eight bits of a colour round."""
+    model = learned[0].scene_model
+    for name, views in sets.items():
+        for index in range(len(views)):
+            time = 0.0 if name == "static" else None
+            view = score(Renderer(model), views, index, "white", time=time)
+            write_image(tmp_path / name / picture_name(views, index), view.prediction)
+    own = score_held_out(model, sets, "white")
+    again = score_held_out(read_predictions(tmp_path, "Other", sets, "white"), sets, "white")
+    for name in sets:
+        for first, second in zip(own[name], again[name], strict=True):
+            assert (first.name, first.time) == (second.name, second.time)
+            assert second.psnr == pytest.approx(first.psnr, abs=0.02)
+            assert second.ssim == pytest.approx(first.ssim, abs=1e-3)
+
+
+def test_every_way_to_say_which_image_it_is(folder, sets, tmp_path):
+    views = sets["dynamic"]
+    expected = [to_bytes(truth_image(views, k, "white") * 0.97).numpy() for k in range(len(views))]
+    names = [picture_name(views, k) for k in range(len(views))]
+    assert names == ["view0_time0.0000.png", "view0_time0.5000.png", "view0_time1.0000.png"]
+    here = folder / "dynamic"
+
+    def found() -> list[np.ndarray]:
+        scored = score_held_out(read_predictions(folder, "Other", sets, "white"), sets, "white")
+        return [to_bytes(view.prediction).numpy() for view in scored["dynamic"]]
+
+    def equal() -> bool:
+        return all(np.array_equal(a, b) for a, b in zip(found(), expected, strict=True))
+
+    assert equal()
+    for k, name in enumerate(names):  # in their order
+        (here / name).rename(here / f"{k:05d}.png")
+    assert equal()
+    for k, image in enumerate(views.names):  # by the images' names
+        (here / f"{k:05d}.png").rename(here / f"{Path(image).stem}.png")
+    assert equal()
+    entries = [
+        {"file": f"{Path(views.names[0]).stem}.png", "image": views.names[0]},
+        *({"file": f"{Path(views.names[k]).stem}.png", "view": 0, "time": k / 2} for k in (1, 2)),
+    ]
+    (here / "predictions.json").write_text(json.dumps({"images": entries}))
+    assert equal()
+
+
+def test_a_film_and_alpha(folder, sets):
+    views = sets["dynamic"]
+    for file in (folder / "dynamic").iterdir():
+        file.unlink()
+    (folder / "dynamic").rmdir()
+    frames = [to_bytes(truth_image(views, k, "white")).numpy() for k in range(len(views))]
+    write_pictures(folder / "dynamic.mp4", iter(frames), 10)
+    for index in range(len(sets["static"])):
+        pixels = sets["static"].single(index).pixels[0].numpy()
+        iio.imwrite(folder / "static" / picture_name(sets["static"], index), pixels)
+    scored = score_held_out(read_predictions(folder, "Other", sets, "white"), sets, "white")
+    assert min(view.psnr for view in scored["dynamic"]) > 20  # H.264 halves the colours' size
+    assert min(view.psnr for view in scored["static"]) > 60  # RGBA is put on the background
+
+
+def test_what_does_not_fit_is_said_in_one_line(folder, sets):
+    here = folder / "dynamic"
+    first, second, third = sorted(here.iterdir())
+    whole = iio.imread(first)
+    iio.imwrite(first, whole[::2])
+    assert "24x9 px, but " in refused(folder, sets) and "has 24x18" in refused(folder, sets)
+    iio.imwrite(first, whole)
+    second.rename(folder / "away.png")
+    assert "has no picture of " in (line := refused(folder, sets)) and "(time 0.5)" in line
+    third.rename(second)
+    (folder / "away.png").rename(third)
+    assert "2 are in another order" in refused(folder, sets)
+    assert "no such folder" in refused(folder / "nowhere", sets)
+    (here / "predictions.json").write_text(json.dumps({"images": [{"file": "../../x.png"}]}))
+    assert "leads outside" in refused(folder, sets)
+
+
+def test_a_motion_that_was_not_learned_is_no_other_order(folder, sets):
+    """All pictures look like the first image."""
+    first, *others = sorted((folder / "dynamic").iterdir())
+    for other in others:
+        other.write_bytes(first.read_bytes())
+    assert read_predictions(folder, "Other", sets, "white").moves
