@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 import math
-from zipfile import ZipFile
 
 import numpy as np
 import pytest
 import torch
+from pxr import Gf, Usd, UsdGeom, UsdVol
 
 from devrf.apps.export.geometry import ExportSettings, MovingMesh, UpFrame, carried
-from devrf.apps.export.splats import write_splats
+from devrf.apps.export.splats import write_splats, write_usd_splats
 from devrf.apps.export.surface import surface_of
 
 HEADER = (
@@ -25,10 +25,9 @@ HEADER = (
 )
 
 
-def read(path, number):
+def read(folder, number):
     """The numbers (V, 17) of a frame."""
-    with ZipFile(path) as archive:
-        content = archive.read(f"frame_{number:04d}.ply")
+    content = (folder / f"frame{number:04d}.ply").read_bytes()
     header, end, values = content.partition(b"end_header\n")
     rows = np.frombuffer(values, "<f4").reshape(-1, 17)
     assert (header + end).decode() == HEADER.format(len(rows))
@@ -42,9 +41,9 @@ def test_a_triangle_by_hand(tmp_path):
     colors = torch.tensor([[0.5, 1.0, 0.0]]).expand(3, 3)
     vertices = torch.stack([corners, lifted])
     mesh = MovingMesh((0.0, 1.0), vertices, torch.tensor([[0, 1, 2]]), colors)
-    path = tmp_path / "splats.zip"
+    path = tmp_path / "splats"
     write_splats(path, mesh, {}, UpFrame(torch.eye(3), 1.0, "y"), 3.0)
-    first = read(path, 0)
+    first = read(path, 1)
     assert first[:, :3].tolist() == [[0, 0, 0], [2, 0, 0], [0, -2, 0]]  # y is down
     np.testing.assert_array_equal(first[:, 3:6], [[0, 0, -1]] * 3)
     # Y_0 = 0.28209479; a third of 2 is a square of the edge 0.8165, of which 0.65; logit(0.95).
@@ -52,23 +51,24 @@ def test_a_triangle_by_hand(tmp_path):
     np.testing.assert_allclose(first[:, 9], 2.944439, rtol=1e-5)
     np.testing.assert_allclose(np.exp(first[:, 10:13]), [[0.530723, 0.530723, 0.0530723]] * 3, 1e-5)
     np.testing.assert_array_equal(first[:, 13:], [[0, 1, 0, 0]] * 3)  # +z turned to -z
-    np.testing.assert_allclose(read(path, 1)[:, 2], -1)
-    with ZipFile(path) as archive:
-        index = json.loads(archive.read("index.json"))
-    assert index["frames"][1] == {"file": "frame_0001.ply", "time": 1.0, "seconds": 3.0}
+    np.testing.assert_allclose(read(path, 2)[:, 2], -1)
+    index = json.loads((path / "index.json").read_text())
+    assert index["frames"][1] == {"file": "frame0002.ply", "time": 1.0, "seconds": 3.0}
     assert "origin" not in index
     far = UpFrame(torch.eye(3), 2.0, "y", (500_000.0, 5_600_000.0, 200.0))
-    write_splats(path, mesh, {}, far, 3.0)
-    with ZipFile(path) as archive:
-        assert json.loads(archive.read("index.json"))["origin"] == [1_000_000, -11_200_000, -400]
+    one = MovingMesh((0.0,), vertices[:1], mesh.faces, colors)
+    write_splats(path, one, {}, far, 3.0)
+    index = json.loads((path / "index.json").read_text())
+    assert index["origin"] == [1_000_000, -11_200_000, -400]
+    assert [file.name for file in path.glob("*.ply")] == ["frame0001.ply"]
 
 
 def test_gaussians_go_with_the_field_and_lie_in_the_surface(moving_ball, around, tmp_path):
     surface = surface_of(moving_ball, moving_ball.surface(), around, ExportSettings(faces=800))
     mesh = carried(surface, moving_ball, (0.0, 1.0))
-    path = tmp_path / "splats.zip"
+    path = tmp_path / "splats"
     write_splats(path, mesh, {}, UpFrame.of(around, "auto", 1.0), 3.0)
-    rest, moved = read(path, 0), read(path, 1)
+    rest, moved = read(path, 1), read(path, 2)
     assert np.linalg.norm(rest[:, :3], axis=1) == pytest.approx(0.5, abs=0.02)
     # The ball grows by a fifth and moves by 0.4 along x.
     np.testing.assert_allclose(moved[:, :3], 1.2 * rest[:, :3] + [0.4, 0, 0], atol=1e-4)
@@ -77,3 +77,30 @@ def test_gaussians_go_with_the_field_and_lie_in_the_surface(moving_ball, around,
     turned = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
     np.testing.assert_allclose(turned, rest[:, 3:6], atol=1e-5)
     assert ((turned * rest[:, :3]).sum(axis=1) / 0.5).min() > math.cos(math.radians(25))
+
+
+def test_usd_holds_the_same_gaussians_at_each_time(moving_ball, around, tmp_path):
+    surface = surface_of(moving_ball, moving_ball.surface(), around, ExportSettings(faces=300))
+    mesh = carried(surface, moving_ball, (0.0, 0.5, 1.0))
+    frame = UpFrame.of(around, "auto", 1.0)
+    path = tmp_path / "splats.usdc"
+    write_usd_splats(path, mesh, {"front": around.single(0)}, frame, 2.0)
+    stage = Usd.Stage.Open(str(path))
+    field = UsdVol.ParticleField3DGaussianSplat(stage.GetPrimAtPath("/scene/splats"))
+    assert field.GetPositionsAttr().GetTimeSamples() == [0, 24, 48]
+    write_splats(tmp_path / "splats", mesh, {}, frame, 2.0)
+    for number, code in enumerate((0, 24, 48), start=1):
+        rows = read(tmp_path / "splats", number)
+        points = np.array(field.GetPositionsAttr().Get(code))
+        np.testing.assert_allclose(points * [1, -1, -1], rows[:, :3], atol=1e-6)
+        scales = np.array(field.GetScalesAttr().Get(code))
+        np.testing.assert_allclose(scales, np.exp(rows[:, 10:13]), rtol=1e-5)
+        # +z turned by the quaternion leads away from the ball's middle: out of the surface.
+        turns = field.GetOrientationsAttr().Get(code)
+        normals = np.array([turn.Transform(Gf.Vec3f(0, 0, 1)) for turn in turns])
+        np.testing.assert_allclose(normals * [1, -1, -1], rows[:, 3:6], atol=1e-5)
+    np.testing.assert_allclose(np.array(field.GetOpacitiesAttr().Get()), 0.95, rtol=1e-6)
+    factors = np.array(field.GetRadianceSphericalHarmonicsCoefficientsAttr().Get())
+    np.testing.assert_allclose(factors, rows[:, 6:9], atol=1e-6)
+    assert field.GetRadianceSphericalHarmonicsDegreeAttr().Get() == 0
+    assert stage.GetPrimAtPath("/scene/cameras/front").IsA(UsdGeom.Camera)

@@ -35,7 +35,7 @@ class ExportSettings(Options):
     key: ClassVar[str] = "export"
 
     format: Format = "gltf"
-    content: Literal["auto", "surface", "points"] = "auto"
+    content: Literal["auto", "surface", "points", "splats"] = "auto"
     threshold: Annotated[float, Gt(0), Lt(1)] = 0.1
     side: Annotated[int, Ge(2), Le(1024)] | None = None
     faces: Annotated[int, Ge(4)] = 20_000

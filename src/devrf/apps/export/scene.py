@@ -9,7 +9,7 @@ from pathlib import Path
 from devrf.apps.export.geometry import ExportSettings, MovingMesh, UpFrame, carried, seen_points
 from devrf.apps.export.gltf import write_gltf
 from devrf.apps.export.sequence import Drawn, mesh_files, point_file, write_sequence
-from devrf.apps.export.splats import write_splats
+from devrf.apps.export.splats import write_splats, write_usd_splats
 from devrf.apps.export.surface import surface_of
 from devrf.apps.export.usd import write_usd
 from devrf.checkpoints.checkpoint import Viewpoints
@@ -22,11 +22,12 @@ from devrf.system.progress import followed
 
 log = logging.getLogger(__name__)
 
-# Formats that have one file for all times.
+# Formats that move one mesh: the name of what is written, and how.
 SINGLE = {
     "gltf": ("scene.glb", write_gltf),
     "usd": ("scene.usdc", write_usd),
-    "splats": ("splats.zip", write_splats),
+    "splats": ("splats", write_splats),
+    "usd_splats": ("splats.usdc", write_usd_splats),
 }
 
 
@@ -69,7 +70,12 @@ def _takes_surface(model: Renderable, settings: ExportSettings) -> bool:
     """Whether a surface is exported, not points; refuses geometry that the method lacks."""
     carries = model.surface() is not None and model.forward_map(0.0) is not None
     has = carries or model.surface_at(0.0) is not None
-    wanted = has if settings.content == "auto" else settings.content == "surface"
+    wanted = has if settings.content == "auto" else settings.content != "points"
+    if settings.content == "splats" and settings.format not in ("splats", "usd"):
+        raise DevrfError(
+            f"export.content: splats are written as splats or usd, not as {settings.format}; give "
+            "export.format=splats"
+        )
     if wanted and not has:
         raise DevrfError(
             f"export.content: method={model.name} has no surface; give export.content=points "
@@ -98,7 +104,8 @@ def _write_mesh(
         drawn = mesh_files(mesh, viewpoints.offset)
         write_sequence(path, settings.format, mesh.times, drawn, "surface", settings.seconds)
         return path
-    name, write = SINGLE[settings.format]
+    as_splats = settings.format == "usd" and settings.content == "splats"
+    name, write = SINGLE["usd_splats" if as_splats else settings.format]
     frame = UpFrame.of(viewpoints.static, settings.up, settings.metres, viewpoints.offset)
     write(folder / name, mesh, _named_cameras(viewpoints), frame, settings.seconds)
     return folder / name

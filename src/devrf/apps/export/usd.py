@@ -1,8 +1,10 @@
-"""USD: a mesh whose points have time samples, and the cameras that saw it, in one .usdc file."""
+"""USD: what moves by time samples, and the cameras that saw it, in one .usdc file."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,25 +19,69 @@ RATE = 24.0
 FILM = 20.955
 
 
+class SceneFile:
+    """A stage of USD with y up, in metres, that plays once.
+
+    Attributes:
+        stage: pxr's.
+        codes: the time code of each time.
+    """
+
+    def __init__(self, times: Sequence[float], frame: UpFrame, seconds: float) -> None:
+        """A stage without content.
+
+        Args:
+            times: in [0, 1], ascending.
+            frame: of what it will hold.
+            seconds: duration of time 0 to 1.
+        """
+        from pxr import Usd, UsdGeom  # an extra
+
+        self.stage: Any = Usd.Stage.CreateInMemory()
+        self.codes = [time * seconds * RATE for time in times]
+        self._frame = frame
+        UsdGeom.SetStageUpAxis(self.stage, UsdGeom.Tokens.y)
+        UsdGeom.SetStageMetersPerUnit(self.stage, 1.0)
+        self.stage.SetTimeCodesPerSecond(RATE)
+        self.stage.SetFramesPerSecond(RATE)
+        self.stage.SetStartTimeCode(self.codes[0])
+        self.stage.SetEndTimeCode(self.codes[-1])
+        root = UsdGeom.Xform.Define(self.stage, "/scene")
+        self.stage.SetDefaultPrim(root.GetPrim())
+
+    def move_to_origin(self, shape: Any) -> None:
+        """Move a shape, whose points are of float32, to where the scene's world has its origin."""
+        from pxr import Gf
+
+        if any(self._frame.offset):
+            shape.AddTranslateOp().Set(Gf.Vec3d(self._frame.origin))
+
+    def write(self, path: Path, cameras: Mapping[str, Cameras]) -> None:
+        """Write the stage, with the ``cameras`` by their names."""
+        from pxr import Gf, Sdf, UsdGeom
+
+        for name, camera in cameras.items():
+            lens = UsdGeom.Camera.Define(self.stage, Sdf.Path(f"/scene/cameras/{name}"))
+            fx, fy = camera.focal[0].tolist()
+            focal = FILM * fx / camera.width
+            lens.CreateHorizontalApertureAttr(FILM)
+            lens.CreateVerticalApertureAttr(focal * camera.height / fy)
+            lens.CreateFocalLengthAttr(focal)
+            # Gf multiplies rows from the left.
+            lens.AddTransformOp().Set(Gf.Matrix4d(self._frame.pose(camera).T.tolist()))
+        with atomic_write(path) as partial:
+            self.stage.GetRootLayer().Export(str(partial))
+
+
 def write_usd(
-    path: Path, mesh: MovingMesh, cameras: dict[str, Cameras], frame: UpFrame, seconds: float
+    path: Path, mesh: MovingMesh, cameras: Mapping[str, Cameras], frame: UpFrame, seconds: float
 ) -> None:
     """Write a .usdc file; arguments as for :func:`~devrf.apps.export.gltf.write_gltf`."""
-    from pxr import Gf, Sdf, Usd, UsdGeom, Vt  # an extra
+    from pxr import UsdGeom, Vt
 
-    stage = Usd.Stage.CreateInMemory()
-    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
-    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    stage.SetTimeCodesPerSecond(RATE)
-    stage.SetFramesPerSecond(RATE)
-    codes = [time * seconds * RATE for time in mesh.times]
-    stage.SetStartTimeCode(codes[0])
-    stage.SetEndTimeCode(codes[-1])
-    root = UsdGeom.Xform.Define(stage, "/scene")
-    stage.SetDefaultPrim(root.GetPrim())
-    shape = UsdGeom.Mesh.Define(stage, "/scene/mesh")
-    if any(frame.offset):
-        shape.AddTranslateOp().Set(Gf.Vec3d(frame.origin))
+    file = SceneFile(mesh.times, frame, seconds)
+    shape = UsdGeom.Mesh.Define(file.stage, "/scene/mesh")
+    file.move_to_origin(shape)
     shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     shape.CreateDoubleSidedAttr(True)
     shape.CreateFaceVertexCountsAttr(Vt.IntArray([3] * len(mesh.faces)))
@@ -47,20 +93,10 @@ def write_usd(
     extent = shape.CreateExtentAttr()
     normals = shape.CreateNormalsAttr()
     shape.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-    for code, vertices in zip(codes, frame.points(mesh.vertices), strict=True):
+    for code, vertices in zip(file.codes, frame.points(mesh.vertices), strict=True):
         placed = Vt.Vec3fArray.FromNumpy(vertices.contiguous().numpy())
         points.Set(placed, code)
         turned = vertex_normals(vertices, mesh.faces)
         normals.Set(Vt.Vec3fArray.FromNumpy(turned.contiguous().numpy()), code)
         extent.Set(UsdGeom.PointBased.ComputeExtent(placed), code)
-    for name, camera in cameras.items():
-        lens = UsdGeom.Camera.Define(stage, Sdf.Path(f"/scene/cameras/{name}"))
-        fx, fy = camera.focal[0].tolist()
-        focal = FILM * fx / camera.width
-        lens.CreateHorizontalApertureAttr(FILM)
-        lens.CreateVerticalApertureAttr(focal * camera.height / fy)
-        lens.CreateFocalLengthAttr(focal)
-        # Gf multiplies rows from the left.
-        lens.AddTransformOp().Set(Gf.Matrix4d(frame.pose(camera).T.tolist()))
-    with atomic_write(path) as partial:
-        stage.GetRootLayer().Export(str(partial))
+    file.write(path, cameras)
