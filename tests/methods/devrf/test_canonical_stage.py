@@ -19,6 +19,7 @@ from devrf.methods.devrf.canonical_field import ColorDecoder
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.free_space import possibly_occupied, view_count, view_count_weight
+from recorder import Entry, recording
 
 SMALL = Architecture(channels=4, width=16, frequencies=2)
 CARVED = CanonicalSchedule(
@@ -46,6 +47,18 @@ class Watch(Callback):
         self.loss.append(float(outputs["loss"]))
         decoder = type(pl_module.scene_model.canonical.decoder).__name__
         self.seen.append((pl_module.phase.kind, pl_module.resolution, decoder))
+
+
+def test_an_iteration_asks_little_of_the_device(canonical, datamodule, trainer):
+    iterations: list[list[Entry]] = []
+    stage = canonical()
+    stage.__class__ = recording(CanonicalStage, iterations)
+    trainer(max_epochs=1).fit(stage, datamodule=datamodule)
+    entries = iterations[-1]
+    assert len(entries) <= 162
+    assert sum(entry.waits for entry in entries) == 3
+    # Nothing but sizes of samples and the numbers of the step differs from the one before.
+    assert [entry.name for entry in iterations[-2]] == [entry.name for entry in entries]
 
 
 def test_the_color_network_learns_in_the_chosen_precision(datamodule, trainer, monkeypatch):

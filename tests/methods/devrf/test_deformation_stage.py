@@ -19,6 +19,7 @@ from devrf.methods.devrf.extensions.tracks import StartAlongFlow
 from devrf.methods.devrf.settings import MotionSettings
 from devrf.ops.adam import add_total_variation_gradient
 from devrf.rendering.renderer import Renderer
+from recorder import Entry, recording
 
 SHORT = DeformationSchedule(levels=(Level(4, 20), Level(8, 10)), rays=256)
 TINY = DeformationSchedule(levels=(Level(4, 4), Level(6, 2)), rays=64)
@@ -37,6 +38,17 @@ def test_two_steps_move_the_first_frame_only(rest, datamodule, trainer):
         assert not frames[0].any() and not frames[2].any()
     for name, value in stage.scene_model.canonical.named_parameters():
         assert torch.equal(value, before[name])
+
+
+def test_an_iteration_asks_little_of_the_device(rest, fit):
+    iterations: list[list[Entry]] = []
+    schedule = DeformationSchedule(levels=(Level(4, 4),), rays=64)
+    fit(recording(DeformationStage, iterations)(rest, schedule))
+    entries = iterations[-1]
+    assert len(entries) <= 249
+    assert sum(entry.waits for entry in entries) == 4
+    # Nothing but sizes of samples and the numbers of the step differs from the one before.
+    assert [entry.name for entry in iterations[-2]] == [entry.name for entry in entries]
 
 
 def test_a_scene_at_rest_has_no_motion_to_learn(rest, tiny_scene, serve, trainer):
