@@ -114,7 +114,7 @@ def clear_rays(rays: Rays, limits: MarchRange, moving: MarchInputs | None = None
 
 def assert_same(ours: Samples, theirs: Samples, weights: float = 1e-5) -> None:
     """Exactly the same samples, at the same places, of the same weights to ``weights``."""
-    assert torch.equal(ours.ray, theirs.ray)
+    assert torch.equal(ours.ray, theirs.ray) and torch.equal(ours.stop, theirs.stop)
     for name in ("distance", "points", "canonical"):
         one, other = getattr(ours, name), getattr(theirs, name)
         torch.testing.assert_close(one.double(), other, atol=2e-5, rtol=1e-5)

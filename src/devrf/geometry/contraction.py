@@ -9,6 +9,7 @@ to c + h (1 + b − b/m) u/m: its direction stays, and infinity is on the faces 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -159,6 +160,12 @@ class ContractedRays(Rays):
         The fields' box holds all of space, so its corners do not matter.
         """
         return self._own(near), self._own(far)
+
+    def longest(
+        self, low: Sequence[float], high: Sequence[float], near: float, far: float
+    ) -> float:
+        """The most of exit − entry of :meth:`crossing`; the host waits for it."""
+        return float((self._own(far) - self._own(near)).amax()) if len(self) else 0.0
 
     @property
     def pace(self) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Self
@@ -66,6 +67,12 @@ class Rays:
         entry = torch.minimum(to_low, to_high).amax(dim=-1)
         leave = torch.maximum(to_low, to_high).amin(dim=-1)
         return entry.clamp(min=near), leave.clamp(max=far)
+
+    def longest(
+        self, low: Sequence[float], high: Sequence[float], near: float, far: float
+    ) -> float:
+        """A bound of exit − entry of :meth:`crossing`, for directions of at least unit length."""
+        return max(min(far - near, math.dist(low, high)), 0.0)
 
     @property
     def pace(self) -> float:

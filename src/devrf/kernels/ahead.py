@@ -23,8 +23,8 @@ THREADS = {"cpu": 1, "cuda": 256}
 
 def march_kernels() -> list[wp.Kernel]:
     """The kernels of the march and its adjoints."""
-    kernels = [march.enter_kernel, march.march_kernel(False), march.keep_significant_kernel]
-    kernels += [march.adjoint_kernel, trilinear.add_kernel(1), adam.total_variation_kernel(1)]
+    kernels = [march.march_kernel(False), march.keep_significant_kernel, march.adjoint_kernel]
+    kernels += [march.scatter_kernel, adam.total_variation_kernel(1)]
     # The last one is for contracted space.
     return [*kernels, adam.adam_kernel(1), march.march_kernel(True)]
 

@@ -101,6 +101,22 @@ def interpolate_cell(values: wp.array(dtype=Any), grid: Grid, row: int, f: wp.ve
 
 
 @wp.func
+def add_cell(result: wp.array(dtype=Any), grid: Grid, row: int, f: wp.vec3, value: Any):
+    """The adjoint of :func:`interpolate_cell`: weight · ``value`` is added to a cell's corners."""
+    next_y = grid.next_y
+    next_z = grid.next_z
+    part = value * (1.0 - f[0])
+    for _ in range(2):  # the corners with the lower x, then those with the higher
+        wp.atomic_add(result, row, part * ((1.0 - f[1]) * (1.0 - f[2])))
+        wp.atomic_add(result, row + next_y, part * (f[1] * (1.0 - f[2])))
+        if grid.z > 1:
+            wp.atomic_add(result, row + next_z, part * ((1.0 - f[1]) * f[2]))
+            wp.atomic_add(result, row + next_y + next_z, part * (f[1] * f[2]))
+        row += grid.next_x
+        part = value * f[0]
+
+
+@wp.func
 def slope(values: wp.array(dtype=Any), factor: Any, grid: Grid, row: int, f: wp.vec3):
     """∂/∂ position of the scalar product of :func:`interpolate_cell`'s value and ``factor``.
 

@@ -17,7 +17,16 @@ from torch.autograd.function import once_differentiable
 
 from devrf.geometry.contraction import INFINITY, ContractedRays, ContractedSpace
 from devrf.geometry.rays import PARALLEL, Rays
-from devrf.kernels.grid import Grid, cell, coordinates, grid_over, inside, interpolate_cell, slope
+from devrf.kernels.grid import (
+    Grid,
+    add_cell,
+    cell,
+    coordinates,
+    grid_over,
+    inside,
+    interpolate_cell,
+    slope,
+)
 from devrf.kernels.runtime import (
     GRAIN_OF_RAYS,
     cached_kernel,
@@ -26,7 +35,6 @@ from devrf.kernels.runtime import (
     launch,
     row_type,
 )
-from devrf.kernels.trilinear import add_to_grid
 from devrf.ops import march as definition
 from devrf.ops.compositing import LEAST_MASS
 from devrf.ops.march import EXIT, STOP, MarchInputs, Samples
@@ -66,80 +74,89 @@ class _March(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         device = density.device
         geometry = _geometry(rays, inputs)
+        limits = inputs.range
+        # Room for all of a ray's samples, as the host knows it: the number of visible ones is
+        # known afterwards. Memory that is not written to costs a CPU nothing.
+        longest = rays.longest(limits.box.low, limits.box.high, limits.near, limits.far)
+        room = 2 + int(longest / limits.step * (1 + 1e-5))
         lines = empty_structs(Ray, len(rays), device)
-        counts = torch.empty(len(rays), dtype=torch.int32, device=device)
+        visible = empty_structs(VisibleSample, len(rays) * room, device)
+        visible_start = torch.empty(len(rays), dtype=torch.int32, device=device)
+        visible_count = torch.empty_like(visible_start)
+        significant_count = torch.empty_like(visible_start)
+        transmittance = torch.empty(len(rays), device=device)
         # Straight rays have no course: their origins stand in for it.
         course = rays.course if isinstance(rays, ContractedRays) else rays.origins
-        arguments = [each.contiguous() for each in (rays.origins, rays.directions, course)]
-        arguments = [geometry, *arguments, inputs.range.near, inputs.range.far, lines, counts]
-        launch(enter_kernel, len(rays), arguments, device)
-
-        # Room for all of a ray's samples: the number of visible ones is known afterwards.
-        visible_start, length = _starts(counts)
-        visible = empty_structs(VisibleSample, length, device)
-        visible_count = torch.empty_like(counts)
-        significant_count = torch.empty_like(counts)
-        transmittance = torch.empty(len(rays), device=device)
         # Without displacements the kernel gets an array that it does not read.
         moves = density.new_empty(0, 3) if displacement is None else displacement.contiguous()
-        arguments = [geometry, lines, inputs.range.distances.cells.flatten()]
-        arguments += [density.contiguous(), moves, int(device.type == "cpu"), visible_start]
-        arguments += [visible, visible_count, significant_count, transmittance]
+        arguments = [each.contiguous() for each in (rays.origins, rays.directions, course)]
+        arguments = [
+            geometry,
+            *arguments,
+            limits.near,
+            limits.far,
+            limits.distances.cells.flatten(),
+        ]
+        arguments += [density.contiguous(), moves, room, int(device.type == "cpu"), lines]
+        arguments += [visible_start, visible, visible_count, significant_count, transmittance]
         kernel = march_kernel(isinstance(rays, ContractedRays))
         launch(kernel, len(rays), arguments, device, grain=GRAIN_OF_RAYS)
 
-        start, length = _starts(significant_count)
+        stop = significant_count.cumsum(0)
+        length = int(stop[-1]) if len(rays) else 0
         ray = torch.empty(length, dtype=torch.int64, device=device)
         distance = torch.empty(length, device=device)
         points = torch.empty(length, 3, device=device)
         canonical = torch.empty(length, 3, device=device)
         weight = torch.empty(length, device=device)
         depth = torch.empty(len(rays), device=device)
-        arguments = [geometry, lines, visible_start, visible, visible_count, start]
+        arguments = [
+            geometry,
+            lines,
+            visible_start,
+            visible,
+            visible_count,
+            significant_count,
+            stop,
+        ]
         arguments += [ray, distance, points, canonical, weight, depth]
         launch(keep_significant_kernel, len(rays), arguments, device)
 
         fixed = displacement is None or not displacement.requires_grad
-        ctx.mark_non_differentiable(ray, distance, points, depth, *([canonical] if fixed else []))
-        stop = start + significant_count
+        given = [ray, distance, points, depth, stop]
+        ctx.mark_non_differentiable(*given, *([canonical] if fixed else []))
+        ctx.set_materialize_grads(False)
         ctx.save_for_backward(
             density, displacement, visible_start, visible_count, stop, transmittance
         )
         ctx.geometry, ctx.lines, ctx.visible = geometry, lines, visible
-        ctx.inputs, ctx.kept = inputs, kept
-        return ray, distance, points, canonical, weight, transmittance, depth
+        ctx.kept = kept
+        return ray, distance, points, canonical, weight, transmittance, depth, stop
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         density, displacement, visible_start, visible_count, stop, transmittance = ctx.saved_tensors
-        inputs, device = ctx.inputs, density.device
-        given = [stop, *(each.contiguous() for each in gradients[3:6]), transmittance]
-        start, length = _starts(visible_count)
-        raw = torch.empty(length, 1, device=device)
-        moved = torch.empty(length, 3, device=device)
-        points = torch.empty(length, 3, device=device)
-        canonical = torch.empty(length, 3, device=device)
-        arguments = [ctx.geometry, ctx.lines, density.contiguous()]
-        arguments += [visible_start, ctx.visible, visible_count]
-        arguments += [*given, start, raw, moved, points, canonical]
+        device = density.device
+        # A kernel does not read an array of nothing.
+        given = [
+            density.new_empty((0, 3) if k == 0 else 0) if each is None else each.contiguous()
+            for k, each in enumerate(gradients[3:6])
+        ]
+        slopes = empty_structs(SampleSlope, ctx.visible.shape[0], device)
+        of_rays = [ctx.geometry, ctx.lines, visible_start, ctx.visible, visible_count]
+        arguments = [*of_rays, density.contiguous(), stop, *given, transmittance, slopes]
         launch(adjoint_kernel, len(visible_count), arguments, device, grain=GRAIN_OF_RAYS)
 
         of_density = of_displacement = None
+        into = [density.new_empty(0, 1), density.new_empty(0, 3)]
         if ctx.needs_input_grad[0]:
             of_density = torch.zeros_like(density) if ctx.kept is None else None
-            into = ctx.kept if of_density is None else of_density
-            add_to_grid(into, canonical, raw, inputs.range.box)
+            into[0] = ctx.kept if of_density is None else of_density
         if ctx.needs_input_grad[1]:
-            of_displacement = torch.zeros_like(displacement)
-            add_to_grid(of_displacement, points, moved, inputs.motion_box)
+            into[1] = of_displacement = torch.zeros_like(displacement)
+        launch(scatter_kernel, len(visible_count), [*of_rays, slopes, *into], device, grain=None)
         return of_density, of_displacement, None, None, None
-
-
-def _starts(counts: Tensor) -> tuple[Tensor, int]:
-    """First sample (R,) int64 of each ray, if samples lie one after another; and their number."""
-    stops = counts.cumsum(0)
-    return stops - counts, int(stops[-1]) if len(stops) else 0
 
 
 def _geometry(rays: Rays, inputs: MarchInputs) -> Geometry:
@@ -241,6 +258,14 @@ class VisibleSample:
     canonical: wp.vec3
     tau: float
     weight: float
+
+
+@wp.struct
+class SampleSlope:
+    """The gradient of a visible sample's raw density, and that of its displacement."""
+
+    raw: float
+    moved: wp.vec3
 
 
 @wp.struct
@@ -346,27 +371,20 @@ def opacity(tau: float):
     return 1.0 - wp.exp(-tau)
 
 
-@wp.kernel(module="unique", enable_backward=False)
-def enter_kernel(
-    first: int,
+@wp.func
+def entering(
     geometry: Geometry,
-    origins: wp.array(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3),
-    courses: wp.array(dtype=wp.vec3),
+    origin: wp.vec3,
+    direction: wp.vec3,
+    course: wp.vec3,
     near: float,
     far: float,
-    rays: wp.array(dtype=Ray),
-    counts: wp.array(dtype=int),
 ):
-    """Rays, and how many samples each has to its exit, in empty space or not.
-
-    Their entries and counts are those of ``steps_through``.
-    """
-    number = first + wp.tid()
+    """A ray, with entry and count as of ``steps_through``: samples in empty space or not."""
     ray = Ray()
-    ray.origin = origins[number]
-    ray.direction = directions[number]
-    ray.course = courses[number]
+    ray.origin = origin
+    ray.direction = direction
+    ray.course = course
     ray.entry = near
     leave = far
     cells = float(0.0)
@@ -395,8 +413,7 @@ def enter_kernel(
     ray.count = 0
     if leave >= ray.entry:
         ray.count = 1 + int(wp.floor((leave - ray.entry) / geometry.step + wp.static(EXIT)))
-    rays[number] = ray
-    counts[number] = ray.count
+    return ray
 
 
 @cached_kernel
@@ -408,29 +425,37 @@ def march_kernel(contracted: bool) -> wp.Kernel:
     def march(
         first: int,
         geometry: Geometry,
-        rays: wp.array(dtype=Ray),
+        origins: wp.array(dtype=wp.vec3),
+        directions: wp.array(dtype=wp.vec3),
+        courses: wp.array(dtype=wp.vec3),
+        near: float,
+        far: float,
         distances: wp.array(dtype=wp.uint8),
         density: wp.array(dtype=Density),
         displacements: wp.array(dtype=wp.vec3),
+        room: int,
         in_order: int,
-        visible_start: wp.array(dtype=wp.int64),
+        rays: wp.array(dtype=Ray),
+        visible_start: wp.array(dtype=int),
         visible: wp.array(dtype=VisibleSample),
         visible_count: wp.array(dtype=int),
         significant_count: wp.array(dtype=int),
         transmittance: wp.array(dtype=float),
     ):
-        """τ_i and w_i = T_i α_i of each ray's visible samples, and T_end.
+        """Rays, τ_i and w_i = T_i α_i of each ray's visible samples, and T_end.
 
         On a CPU a part of a launch follows its rays ``in_order``, one after another in one thread:
         each ray's samples begin where those of the ray before end, close together in memory. Else
-        each ray has its own room.
+        each ray has its own ``room``.
         """
         number = first + wp.tid()
-        ray = rays[number]
-        start = int(visible_start[number])
+        ray = entering(geometry, origins[number], directions[number], courses[number], near, far)
+        ray.count = wp.min(ray.count, room)
+        rays[number] = ray
+        start = number * room
         if in_order == 1 and number > first:
-            start = int(visible_start[number - 1]) + visible_count[number - 1]
-            visible_start[number] = wp.int64(start)
+            start = visible_start[number - 1] + visible_count[number - 1]
+        visible_start[number] = start
         count = int(0)
         significant = int(0)
         remaining = float(1.0)
@@ -472,10 +497,11 @@ def keep_significant_kernel(
     first: int,
     geometry: Geometry,
     rays: wp.array(dtype=Ray),
-    visible_start: wp.array(dtype=wp.int64),
+    visible_start: wp.array(dtype=int),
     visible: wp.array(dtype=VisibleSample),
     visible_count: wp.array(dtype=int),
-    starts: wp.array(dtype=wp.int64),
+    significant_count: wp.array(dtype=int),
+    stops: wp.array(dtype=wp.int64),
     result_ray: wp.array(dtype=wp.int64),
     result_distance: wp.array(dtype=float),
     result_points: wp.array(dtype=wp.vec3),
@@ -483,15 +509,15 @@ def keep_significant_kernel(
     result_weight: wp.array(dtype=float),
     result_depth: wp.array(dtype=float),
 ):
-    """The visible samples of enough weight, without gaps, each ray's from its start; its depth."""
+    """The visible samples of enough weight, without gaps, each ray's up to its stop; its depth."""
     number = first + wp.tid()
     count = visible_count[number]
     result_depth[number] = 0.0
     if count == 0:
         return
     ray = rays[number]
-    start = int(visible_start[number])
-    into = int(starts[number])
+    start = visible_start[number]
+    into = int(stops[number]) - significant_count[number]
     mass = float(0.0)
     reached = float(0.0)
     for k in range(count):
@@ -513,24 +539,20 @@ def adjoint_kernel(
     first: int,
     geometry: Geometry,
     rays: wp.array(dtype=Ray),
-    density: wp.array(dtype=Density),
-    visible_start: wp.array(dtype=wp.int64),
+    visible_start: wp.array(dtype=int),
     visible: wp.array(dtype=VisibleSample),
     visible_count: wp.array(dtype=int),
+    density: wp.array(dtype=Density),
     significant_stop: wp.array(dtype=wp.int64),
     given_canonical: wp.array(dtype=wp.vec3),
     given_weight: wp.array(dtype=float),
     given_transmittance: wp.array(dtype=float),
     transmittance: wp.array(dtype=float),
-    result_start: wp.array(dtype=wp.int64),
-    result_raw: wp.array(dtype=Density),
-    result_moved: wp.array(dtype=wp.vec3),
-    result_points: wp.array(dtype=wp.vec3),
-    result_canonical: wp.array(dtype=wp.vec3),
+    slopes: wp.array(dtype=SampleSlope),
 ):
-    """Gradients of raw densities and displacements from those of the march's results.
+    """∂L/∂v and ∂L/∂Δ of visible samples from the gradients of the march's results.
 
-    ∂L/∂v and ∂L/∂Δ of visible samples, and their positions, lie without gaps.
+    Those of results that have none are empty arrays.
 
     Back to front ∂L/∂τ_i = ∂L/∂w_i T_i exp(−τ_i) − Σ_{j>i} ∂L/∂w_j w_j − ∂L/∂T_end T_end.
     """
@@ -539,22 +561,25 @@ def adjoint_kernel(
     if count == 0:
         return
     ray = rays[number]
-    start = int(visible_start[number])
+    start = visible_start[number]
     significant = int(significant_stop[number])
     after = transmittance[number]
-    behind = given_transmittance[number] * after
+    behind = float(0.0)
+    if given_transmittance.shape[0] > 0:
+        behind = given_transmittance[number] * after
     for back in range(count):
         sample = visible[start + count - 1 - back]
-        into = int(result_start[number]) + count - 1 - back
         tau = sample.tau
         weight = sample.weight
         slope_of_tau = -behind
         slope_of_canonical = wp.vec3()
         if weight >= geometry.threshold:
             significant -= 1
-            slope_of_tau += given_weight[significant] * after
-            behind += given_weight[significant] * weight
-            slope_of_canonical = given_canonical[significant]
+            if given_weight.shape[0] > 0:
+                slope_of_tau += given_weight[significant] * after
+                behind += given_weight[significant] * weight
+            if given_canonical.shape[0] > 0:
+                slope_of_canonical = given_canonical[significant]
         # T_i, from T_i exp(−τ_i) or from w_i = T_i α_i, whichever is not a small number's ratio.
         if tau < 1.0:
             after *= wp.exp(tau)
@@ -562,14 +587,43 @@ def adjoint_kernel(
             after = weight / opacity(tau)
         # ∂τ/∂v = δ · sigmoid(v + b), and sigmoid = 1 − exp(−softplus).
         slope_of_raw = slope_of_tau * geometry.delta * opacity(tau / geometry.delta)
-        result_raw[into] = Density(slope_of_raw)
-        result_canonical[into] = sample.canonical
+        result = SampleSlope()
+        result.raw = slope_of_raw
         if geometry.moves == 1:
-            point = position(geometry, ray, sample.distance)
             row, fraction = cell(geometry.density, sample.canonical)
             change = slope(density, Density(slope_of_raw), geometry.density, row, fraction)
             slope_of_canonical += wp.cw_mul(change, inside(geometry.density, sample.canonical))
             if geometry.zero_outside_box == 1:
+                point = position(geometry, ray, sample.distance)
                 slope_of_canonical *= wp.min(inside(geometry.motion, point))
-            result_points[into] = point
-            result_moved[into] = slope_of_canonical
+            result.moved = slope_of_canonical
+        slopes[start + count - 1 - back] = result
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def scatter_kernel(
+    first: int,
+    geometry: Geometry,
+    rays: wp.array(dtype=Ray),
+    visible_start: wp.array(dtype=int),
+    visible: wp.array(dtype=VisibleSample),
+    visible_count: wp.array(dtype=int),
+    slopes: wp.array(dtype=SampleSlope),
+    of_density: wp.array(dtype=Density),
+    of_displacement: wp.array(dtype=wp.vec3),
+):
+    """The visible samples' gradients added to those of the grids that have one.
+
+    On a CPU in one thread, in the order of the rays.
+    """
+    number = first + wp.tid()
+    start = visible_start[number]
+    for place in range(start, start + visible_count[number]):
+        sample = visible[place]
+        if of_density.shape[0] > 0:
+            row, fraction = cell(geometry.density, sample.canonical)
+            add_cell(of_density, geometry.density, row, fraction, Density(slopes[place].raw))
+        if of_displacement.shape[0] > 0:
+            point = position(geometry, rays[number], sample.distance)
+            row, fraction = cell(geometry.motion, point)
+            add_cell(of_displacement, geometry.motion, row, fraction, slopes[place].moved)

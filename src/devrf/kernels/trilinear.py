@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from devrf.geometry.box import Box
-from devrf.kernels.grid import Grid, cell, grid_over, inside, interpolate_cell, slope
+from devrf.kernels.grid import Grid, add_cell, cell, grid_over, inside, interpolate_cell, slope
 from devrf.kernels.runtime import cached_kernel, is_supported, launch, row_type
 from devrf.ops import trilinear as definition
 from devrf.ops.trilinear import shape_of
@@ -144,17 +144,7 @@ def add_kernel(channels: int) -> wp.Kernel:
         result: wp.array(dtype=row_of),
     ):
         sample = first + wp.tid()
-        row, f = cell(grid, points[sample])
-        next_y = grid.next_y
-        next_z = grid.next_z
-        part = values[sample] * (1.0 - f[0])
-        for _ in range(2):  # the corners with the lower x, then those with the higher
-            wp.atomic_add(result, row, part * ((1.0 - f[1]) * (1.0 - f[2])))
-            wp.atomic_add(result, row + next_y, part * (f[1] * (1.0 - f[2])))
-            if grid.z > 1:
-                wp.atomic_add(result, row + next_z, part * ((1.0 - f[1]) * f[2]))
-                wp.atomic_add(result, row + next_y + next_z, part * (f[1] * f[2]))
-            row += grid.next_x
-            part = values[sample] * f[0]
+        row, fraction = cell(grid, points[sample])
+        add_cell(result, grid, row, fraction, values[sample])
 
     return add_to_grid

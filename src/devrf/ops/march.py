@@ -13,7 +13,7 @@ from torch.nn.functional import softplus
 
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
-from devrf.ops.compositing import composite, mean_distance, transmittances
+from devrf.ops.compositing import composite, firsts, mean_distance, transmittances
 from devrf.ops.trilinear import interpolate, shape_of
 
 # A ray ends where its transmittance is less: samples behind are invisible.
@@ -103,6 +103,7 @@ class Samples:
         transmittance: (R,) T_end, behind the last sample of each ray.
         depth: (R,) Σ w_i z_i / Σ w_i over a ray's samples at distances z, 0 without any; it has no
             gradient.
+        stop: (R,) int64, the number of samples of each ray and of those before it.
     """
 
     ray: Tensor
@@ -112,6 +113,7 @@ class Samples:
     weight: Tensor
     transmittance: Tensor
     depth: Tensor
+    stop: Tensor
 
 
 def march(rays: Rays, inputs: MarchInputs) -> Samples:
@@ -148,6 +150,7 @@ def march(rays: Rays, inputs: MarchInputs) -> Samples:
         weight=weight[significant],
         transmittance=transmittance,
         depth=depth,
+        stop=firsts(ray[kept], len(rays))[1:],
     )
 
 

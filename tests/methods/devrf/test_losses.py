@@ -26,6 +26,7 @@ from devrf.methods.devrf.losses import (
     induced_flow,
 )
 from devrf.methods.weighted_loss import counted_weights
+from devrf.ops.compositing import firsts
 from devrf.ops.march import Samples
 from devrf.ops.photometric import distortion
 from devrf.rendering.output import VoxelOutput
@@ -65,7 +66,13 @@ def prediction() -> Prediction:
         depth=torch.zeros(3),
         transmittance=left,
         samples=Samples(
-            RAY, torch.ones(3), torch.zeros(3, 3), torch.zeros(3, 3), weight, left, torch.zeros(3)
+            RAY,
+            torch.ones(3),
+            *torch.zeros(2, 3, 3),
+            weight,
+            left,
+            torch.zeros(3),
+            torch.tensor([2, 2, 3]),
         ),
         sample_color=sample_color,
     )
@@ -156,7 +163,16 @@ def seen(
         color=torch.zeros(len(none), 3),
         depth=none,
         transmittance=none,
-        samples=Samples(ray, torch.zeros(len(ray)), points, canonical, weight, none, none),
+        samples=Samples(
+            ray,
+            torch.zeros(len(ray)),
+            points,
+            canonical,
+            weight,
+            none,
+            none,
+            firsts(ray, len(none))[1:],
+        ),
         sample_color=torch.zeros(len(ray), 3),
     )
 
