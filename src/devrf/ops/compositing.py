@@ -34,6 +34,22 @@ def composite(depth: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
     return before * -torch.expm1(-depth), end
 
 
+def composite_colors(
+    weight: Tensor, color: Tensor, ray: Tensor, transmittance: Tensor, background: Tensor
+) -> Tensor:
+    """Ĉ = Σ w_i c_i + T_end · C_background (R, 3).
+
+    Args:
+        weight: (S,) w of the samples.
+        color: (S, 3) c of the samples.
+        ray: (S,) int64, their rays.
+        transmittance: (R,) T_end.
+        background: (3,) or (R, 3).
+    """
+    image = sum_by_ray(weight[:, None] * color, ray, len(transmittance))
+    return image + transmittance[:, None] * background
+
+
 def transmittances(depth: Tensor, ray: Tensor, rays: int) -> Tensor:
     """Transmittance T_i (S,) before each sample; arguments as for :func:`composite`."""
     passed = sums_before(running_sum(depth), firsts(ray, rays), ray)

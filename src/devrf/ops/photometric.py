@@ -9,6 +9,8 @@ from devrf.ops.compositing import firsts, running_sum, sums_before
 
 # A transmittance is at least so far from 0 and 1 in the entropy.
 NEAREST = 1e-6
+# The terms that DeVRF's stages weigh; a kernel has them together.
+TERMS = ("render", "per_sample_color", "entropy", "alpha_mask")
 
 
 def color_error(image: Tensor, truth: Tensor) -> Tensor:

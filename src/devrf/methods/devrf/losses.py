@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal, TypeVar
 
+import torch
 from torch import Tensor
 
 from devrf.data.batch import RayBatch
@@ -13,9 +14,12 @@ from devrf.errors import expect
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import WORLD, Space
+from devrf.kernels.photometric import photometric
+from devrf.kernels.runtime import is_supported
 from devrf.methods.devrf.deformation_field import Warp
 from devrf.methods.weighted_loss import visibility, weighted_sum
 from devrf.ops.photometric import (
+    TERMS,
     alpha_mask_error,
     background_entropy,
     color_error,
@@ -174,5 +178,20 @@ def batch_loss(
     weights: Mapping[str, float],
 ) -> Weighted:
     """Σ weight · term () over ``weights``; each term's value and the visibility, detached."""
-    total, values = weighted_sum({name: terms[name](prediction) for name in weights}, weights)
-    return total, values | visibility(prediction.output.transmittance, prediction.batch.alpha)
+    output, batch = prediction.output, prediction.batch
+    # A kernel has the terms that compare rays with images together.
+    together = {
+        name: weight
+        for name, weight in weights.items()
+        if name in TERMS and terms[name] is PHOTOMETRIC_TERMS[name] and is_supported(output.color)
+    }
+    others = {name: terms[name](prediction) for name in weights if name not in together}
+    if not together:
+        total, values = weighted_sum(others, weights)
+        return total, values | visibility(output.transmittance, batch.alpha)
+    total, values = photometric(
+        output.color, output.sample_color, output.samples, batch.color, batch.alpha, together
+    )
+    for name, value in others.items():
+        total = torch.add(total, value, alpha=weights[name])
+    return total, values | {name: value.detach() for name, value in others.items()}

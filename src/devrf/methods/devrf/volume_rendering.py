@@ -10,10 +10,10 @@ from torch import Tensor
 
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
+from devrf.kernels.compositing import composite_colors
 from devrf.kernels.march import march
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.deformation_field import GridWarp
-from devrf.ops.compositing import sum_by_ray
 from devrf.ops.march import MarchInputs, MarchRange
 from devrf.ops.trilinear import Shape
 from devrf.rendering.occupancy import Occupancy, dilate
@@ -57,8 +57,7 @@ def render(
             every = torch.arange(len(rays), device=ends.device)
             background = field.rgb(ends, rays.viewdirs, every, precision)
     with span("compositing"):
-        image = sum_by_ray(samples.weight[:, None] * color, samples.ray, len(rays))
-        image = image + samples.transmittance[:, None] * background
+        image = composite_colors(samples, color, background)
     return VoxelOutput(
         color=image,
         depth=samples.depth,

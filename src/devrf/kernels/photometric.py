@@ -1,0 +1,158 @@
+"""The photometric terms of a batch, weighted, and their gradients; a thread looks at one ray.
+
+See docs/method.md#photometric-losses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from devrf.kernels.compositing import first_of
+from devrf.kernels.runtime import launch, row_type
+from devrf.ops.march import Samples
+from devrf.ops.photometric import NEAREST, TERMS
+
+# A ray's part of Σ weight · term, of each term, and its opacity and alpha.
+Part = row_type(len(TERMS) + 3)
+
+
+def photometric(
+    image: Tensor,
+    color: Tensor,
+    samples: Samples,
+    truth: Tensor,
+    alpha: Tensor | None,
+    weights: Mapping[str, float],
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Σ weight · term () by kernels, and by name the values () of the terms, without gradients.
+
+    With them the rays' mean ``opacity`` and, of alpha masks, their ``coverage``.
+
+    Args:
+        image: (R, 3) Ĉ.
+        color: (K, 3) c of the samples.
+        samples: of the R rays.
+        truth: (R, 3) C.
+        alpha: (R,) A, or None.
+        weights: of some of the terms of :mod:`devrf.ops.photometric`.
+    """
+    factors = tuple(weights.get(name, 0.0) for name in TERMS)
+    end, weight = samples.transmittance, samples.weight.detach()
+    given = (samples.stop, weight, truth, alpha, factors)
+    total, parts = _Photometric.apply(image, color, end, *given)  # type: ignore[no-untyped-call]
+    values = dict(zip((*TERMS, "opacity", "coverage"), parts.unbind(), strict=True))
+    named = [*weights, "opacity"] + ["coverage"] * (alpha is not None)
+    return total, {name: values[name] for name in named}
+
+
+class _Photometric(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        image: Tensor,
+        color: Tensor,
+        end: Tensor,
+        stop: Tensor,
+        weight: Tensor,
+        truth: Tensor,
+        alpha: Tensor | None,
+        factors: tuple[float, ...],
+    ) -> tuple[Tensor, Tensor]:
+        mask = end.new_empty(0) if alpha is None else alpha.contiguous()
+        given = [image, color, end, stop, weight, truth, mask]
+        given = [each.contiguous() for each in given]
+        ctx.save_for_backward(*given)
+        ctx.factors = wp.vec4(*factors)
+        parts = torch.empty(len(end), len(TERMS) + 3, device=end.device)
+        launch(photometric_kernel, len(end), [ctx.factors, *given, parts], end.device)
+        means = parts.mean(dim=0)
+        total, values = means[0], means[1:]
+        ctx.mark_non_differentiable(values)
+        ctx.set_materialize_grads(False)
+        return total, values
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor, *_: None) -> tuple[Tensor | None, ...]:
+        given = ctx.saved_tensors
+        of_image, of_color, of_end = (torch.empty_like(each) for each in given[:3])
+        results = [of_image, of_color, of_end]
+        inputs = [gradient.view(1), ctx.factors, *given, *results]
+        launch(adjoint_kernel, len(of_end), inputs, of_end.device)
+        # Nothing is added to the gradient of colours that this loss does not know.
+        return of_image, of_color if ctx.factors[1] > 0 else None, of_end, *(None,) * 5
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def photometric_kernel(
+    first: int,
+    factors: wp.vec4,
+    image: wp.array(dtype=wp.vec3),
+    color: wp.array(dtype=wp.vec3),
+    transmittance: wp.array(dtype=float),
+    stops: wp.array(dtype=wp.int64),
+    weight: wp.array(dtype=float),
+    truth: wp.array(dtype=wp.vec3),
+    alpha: wp.array(dtype=float),
+    result: wp.array(dtype=Part),
+):
+    """A ray's part of each term that counts, and of their weighted sum."""
+    ray = first + wp.tid()
+    end = transmittance[ray]
+    missed = image[ray] - truth[ray]
+    by_sample = float(0.0)
+    if factors[1] > 0.0:
+        for k in range(first_of(stops, ray), int(stops[ray])):
+            apart = color[k] - truth[ray]
+            by_sample += weight[k] * wp.dot(apart, apart)
+    p = wp.clamp(end, wp.static(NEAREST), wp.static(1.0 - NEAREST))
+    part = Part()
+    part[1] = wp.dot(missed, missed) / 3.0
+    part[2] = by_sample
+    part[3] = -(p * wp.log(p) + (1.0 - p) * wp.log(1.0 - p))
+    part[5] = 1.0 - end
+    if alpha.shape[0] > 0:
+        beside = end - (1.0 - alpha[ray])
+        part[4] = beside * beside
+        part[6] = alpha[ray]
+    for term in range(4):
+        part[0] += factors[term] * part[1 + term]
+    result[ray] = part
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def adjoint_kernel(
+    first: int,
+    given: wp.array(dtype=float),
+    factors: wp.vec4,
+    image: wp.array(dtype=wp.vec3),
+    color: wp.array(dtype=wp.vec3),
+    transmittance: wp.array(dtype=float),
+    stops: wp.array(dtype=wp.int64),
+    weight: wp.array(dtype=float),
+    truth: wp.array(dtype=wp.vec3),
+    alpha: wp.array(dtype=float),
+    of_image: wp.array(dtype=wp.vec3),
+    of_color: wp.array(dtype=wp.vec3),
+    of_transmittance: wp.array(dtype=float),
+):
+    """The gradients of image, colours and transmittance from that of the weighted sum."""
+    ray = first + wp.tid()
+    g = given[0] / float(transmittance.shape[0])
+    end = transmittance[ray]
+    of_image[ray] = (g * factors[0] * 2.0 / 3.0) * (image[ray] - truth[ray])
+    if factors[1] > 0.0:
+        for k in range(first_of(stops, ray), int(stops[ray])):
+            of_color[k] = (g * factors[1] * 2.0 * weight[k]) * (color[k] - truth[ray])
+    slope = float(0.0)
+    if end >= wp.static(NEAREST) and end <= wp.static(1.0 - NEAREST):
+        slope = factors[2] * (wp.log(1.0 - end) - wp.log(end))
+    if alpha.shape[0] > 0:
+        slope += factors[3] * 2.0 * (end - (1.0 - alpha[ray]))
+    of_transmittance[ray] = g * slope
