@@ -73,7 +73,7 @@ def test_rays_belong_to_the_cameras_of_their_images():
     data = views()
     batch = gather_batch(data, IMAGE, FLAT, torch.zeros(3))
     expected = data.cameras.rays(IMAGE, batch.pixel)
-    assert torch.equal(batch.rays.directions, expected.directions)
+    torch.testing.assert_close(batch.rays.directions, expected.directions)
     # ((1.5 − 2)/7, −(2.5 − 1.5)/6, −1) for image 1.
     ray = torch.nn.functional.normalize(torch.tensor([-0.5 / 7, -1 / 6, -1.0]), dim=0)
     torch.testing.assert_close(batch.rays.directions[0], ray)
@@ -94,6 +94,29 @@ def test_images_without_alpha_or_flow():
     batch = gather_batch(views(channels=3, flow=False), IMAGE, FLAT, torch.zeros(3))
     assert batch.alpha is None and batch.flow is None and batch.flow_valid is None
     torch.testing.assert_close(batch.color[0], torch.tensor([121 / 255, 0.0, 1.0]))
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+@pytest.mark.parametrize("flow", [False, True])
+def test_a_kernel_looks_up_what_the_definition_does(
+    channels: int, flow: bool, rng: torch.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown = views(channels, flow)
+    poses = Cameras.looking_at(
+        torch.randn(2, 3, generator=rng), torch.zeros(2, 3), focal=4.0, width=WIDTH, height=HEIGHT
+    )
+    cameras = replace(shown.cameras, camera_to_world=poses.camera_to_world)
+    shown = replace(shown, cameras=cameras)
+    image = torch.randint(2, (50,), generator=rng)
+    flat = torch.randint(WIDTH * HEIGHT, (50,), generator=rng)
+    behind = torch.rand(50, 3, generator=rng)
+    ours = gather_batch(shown, image, flat, behind)
+    monkeypatch.setattr("devrf.kernels.runtime._chosen", "torch")
+    theirs = gather_batch(shown, image, flat, behind)
+    for name in ("color", "alpha", "time", "frame", "image", "pixel", "flow", "flow_valid"):
+        torch.testing.assert_close(getattr(ours, name), getattr(theirs, name))
+    for name in ("origins", "directions", "viewdirs"):
+        torch.testing.assert_close(getattr(ours.rays, name), getattr(theirs.rays, name))
 
 
 def test_flow_that_is_not_valid_may_be_anything() -> None:
