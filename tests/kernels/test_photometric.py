@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from devrf.kernels.photometric import photometric
+from devrf.ops.compositing import composite_colors
 from devrf.ops.photometric import (
     alpha_mask_error,
     background_entropy,
@@ -25,15 +26,16 @@ def test_terms_and_gradients_are_those_of_the_definitions(
     ray = torch.randint(2, 290, (4000,), generator=rng).sort().values
     samples = samples_of(ray, 300, rng)
     samples.transmittance[:4] = torch.tensor([0.0, 1.0, 1e-7, 0.5])
-    image, truth = torch.rand(2, 300, 3, generator=rng)
+    truth, background = torch.rand(2, 300, 3, generator=rng)
     color = torch.rand(len(ray), 3, generator=rng)
     alpha = torch.rand(300, generator=rng) if masked else None
     end = samples.transmittance
-    learned = [image, color, end]
+    learned = [samples.weight, color, end, background]
     for tensor in learned:
         tensor.requires_grad_()
+    image = composite_colors(samples.weight, color, ray, end, background)
     weights = {name: WEIGHTS[name] for name in names}
-    total, values = photometric(image, color, samples, truth, alpha, weights)
+    total, values = photometric(samples, color, background, image, truth, alpha, weights)
     terms = {
         "render": color_error(image, truth),
         "per_sample_color": per_sample_color(samples.weight, color, ray, truth),

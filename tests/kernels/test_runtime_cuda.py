@@ -19,6 +19,8 @@ from devrf.kernels.runtime import is_supported
 CHANNELS = (1, 3, 12)
 # Whether it is contracted.
 SPACES = (False, True)
+# Whether images have an alpha mask.
+ALPHAS = (False, True)
 # Of generations of GPUs from Ampere to Blackwell.
 ARCHITECTURES = (80, 90, 120)
 
@@ -38,7 +40,9 @@ def every_kernel() -> dict[str, wp.Kernel]:
                 signature = inspect.signature(value)
                 if signature.return_annotation in (wp.Kernel, "wp.Kernel"):
                     (what,) = signature.parameters
-                    choices = {"channels": CHANNELS, "contracted": SPACES}[what]
+                    choices = {"channels": CHANNELS, "contracted": SPACES, "has_alpha": ALPHAS}[
+                        what
+                    ]
                     found |= {f"{info.name}.{name}_{one}": value(one) for one in choices}
     return found
 
@@ -61,7 +65,13 @@ def test_all_are_found() -> None:
     steps = ("adam_kernel", "total_variation_kernel")
     names |= {f"adam.{one}_{n}" for one in steps for n in CHANNELS}
     names |= {f"march.march_kernel_{n}" for n in SPACES}
-    names |= {"march.enter_kernel", "march.adjoint_kernel", "march.keep_significant_kernel"}
+    march = ("adjoint_kernel", "keep_significant_kernel", "scatter_kernel")
+    names |= {f"march.{one}" for one in march}
+    names |= {"compositing.composite_kernel", "compositing.adjoint_kernel"}
+    names |= {"photometric.photometric_kernel", "photometric.loss_adjoint_kernel"}
+    motion = ("cycle", "cycle_adjoint", "flow", "flow_adjoint")
+    names |= {f"motion.{one}_kernel" for one in motion}
+    names |= {f"pixels.look_up_kernel_{n}" for n in ALPHAS}
     splatting = ("project", "list", "composite", "composite_adjoint", "project_adjoint")
     names |= {f"splatting.{one}_kernel" for one in splatting}
     assert set(every_kernel()) == names

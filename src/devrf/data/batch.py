@@ -219,7 +219,7 @@ def gather_batch(
 def _looked_up(views: Views, image: Tensor, flat: Tensor, background: Tensor) -> tuple[Any, ...]:
     """Centres, rays, colours, alphas, times, frames, flow and where it is valid, of pixels."""
     assert views.frames is not None, "views of a scene know their frames"
-    flow = views.flow and (views.flow.vectors, views.flow.valid)
+    flow = None if views.flow is None else (views.flow.vectors, views.flow.valid)
     read = [views.pixels, views.cameras.camera_to_world, views.cameras.focal, *(flow or ())]
     compact = all(each.is_contiguous() for each in read)
     if compact and views.pixels[..., 0].numel() < 2**31 and is_supported(views.cameras.focal):

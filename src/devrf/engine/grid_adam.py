@@ -117,6 +117,11 @@ class GridAdam(torch.optim.Optimizer):
         fused = learned[0].device.type in FUSED
         # Filled there: to copy a number to a GPU waits for it.
         counts_on = learned[0].device if fused else "cpu"
+        steps = [state["steps"] - 1.0 for state in states]
+        if len(set(steps)) == 1:
+            counts = list(torch.full((len(steps),), steps[0], device=counts_on).unbind())
+        else:
+            counts = [torch.full((), step, device=counts_on) for step in steps]
         beta1, beta2 = group["betas"]
         adam(
             list(learned),
@@ -124,7 +129,7 @@ class GridAdam(torch.optim.Optimizer):
             [state["mean"] for state in states],
             [state["square"] for state in states],
             max_exp_avg_sqs=[],
-            state_steps=[torch.full((), s["steps"] - 1.0, device=counts_on) for s in states],
+            state_steps=counts,
             fused=fused,
             amsgrad=False,
             beta1=beta1,

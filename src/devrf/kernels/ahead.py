@@ -10,7 +10,7 @@ from threading import Thread
 import torch
 import warp as wp
 
-from devrf.kernels import adam, compositing, march, photometric, pixels, splatting, trilinear
+from devrf.kernels import adam, compositing, march, motion, photometric, pixels, splatting, trilinear
 from devrf.kernels.runtime import compiling, is_supported
 
 log = logging.getLogger(__name__)
@@ -25,8 +25,14 @@ def march_kernels() -> list[wp.Kernel]:
     """The kernels of the march and its adjoints."""
     kernels = [march.march_kernel(False), march.keep_significant_kernel, march.adjoint_kernel]
     kernels += [march.scatter_kernel, compositing.composite_kernel, compositing.adjoint_kernel]
-    kernels += [photometric.photometric_kernel, photometric.adjoint_kernel]
-    kernels += [pixels.look_up_kernel(4), adam.total_variation_kernel(1)]
+    kernels += [photometric.photometric_kernel, photometric.loss_adjoint_kernel]
+    kernels += [motion.cycle_kernel, motion.cycle_adjoint_kernel]
+    kernels += [
+        motion.flow_kernel,
+        motion.flow_adjoint_kernel,
+        pixels.look_up_kernel(True),
+        adam.total_variation_kernel(1),
+    ]
     # The last one is for contracted space.
     return [*kernels, adam.adam_kernel(1), march.march_kernel(True)]
 

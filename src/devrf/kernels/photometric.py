@@ -13,7 +13,7 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from devrf.kernels.compositing import first_of
+from devrf.kernels.compositing import behind, first_of
 from devrf.kernels.runtime import launch, row_type
 from devrf.ops.march import Samples
 from devrf.ops.photometric import NEAREST, TERMS
@@ -23,29 +23,32 @@ Part = row_type(len(TERMS) + 3)
 
 
 def photometric(
-    image: Tensor,
-    color: Tensor,
     samples: Samples,
+    color: Tensor,
+    background: Tensor,
+    image: Tensor,
     truth: Tensor,
     alpha: Tensor | None,
     weights: Mapping[str, float],
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Σ weight · term () by kernels, and by name the values () of the terms, without gradients.
 
-    With them the rays' mean ``opacity`` and, of alpha masks, their ``coverage``.
+    With them the rays' mean ``opacity`` and, of alpha masks, their ``coverage``. The gradients are
+    those of samples, their colours and the background: Ĉ's own graph is not taken.
 
     Args:
-        image: (R, 3) Ĉ.
-        color: (K, 3) c of the samples.
         samples: of the R rays.
+        color: (K, 3) c of the samples.
+        background: (3,) or (R, 3).
+        image: (R, 3) Ĉ, composited of these.
         truth: (R, 3) C.
         alpha: (R,) A, or None.
         weights: of some of the terms of :mod:`devrf.ops.photometric`.
     """
     factors = tuple(weights.get(name, 0.0) for name in TERMS)
-    end, weight = samples.transmittance, samples.weight.detach()
-    given = (samples.stop, weight, truth, alpha, factors)
-    total, parts = _Photometric.apply(image, color, end, *given)  # type: ignore[no-untyped-call]
+    learned = (samples.weight, color, samples.transmittance, background)
+    given = (image.detach(), samples.stop, truth, alpha, factors)
+    total, parts = _Photometric.apply(*learned, *given)  # type: ignore[no-untyped-call]
     values = dict(zip((*TERMS, "opacity", "coverage"), parts.unbind(), strict=True))
     named = [*weights, "opacity"] + ["coverage"] * (alpha is not None)
     return total, {name: values[name] for name in named}
@@ -55,17 +58,18 @@ class _Photometric(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        image: Tensor,
+        weight: Tensor,
         color: Tensor,
         end: Tensor,
+        background: Tensor,
+        image: Tensor,
         stop: Tensor,
-        weight: Tensor,
         truth: Tensor,
         alpha: Tensor | None,
         factors: tuple[float, ...],
     ) -> tuple[Tensor, Tensor]:
         mask = end.new_empty(0) if alpha is None else alpha.contiguous()
-        given = [image, color, end, stop, weight, truth, mask]
+        given = [weight, color, end, background.view(-1, 3), image, stop, truth, mask]
         given = [each.contiguous() for each in given]
         ctx.save_for_backward(*given)
         ctx.factors = wp.vec4(*factors)
@@ -81,23 +85,24 @@ class _Photometric(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor, *_: None) -> tuple[Tensor | None, ...]:
         given = ctx.saved_tensors
-        of_image, of_color, of_end = (torch.empty_like(each) for each in given[:3])
-        results = [of_image, of_color, of_end]
-        inputs = [gradient.view(1), ctx.factors, *given, *results]
-        launch(adjoint_kernel, len(of_end), inputs, of_end.device)
-        # Nothing is added to the gradient of colours that this loss does not know.
-        return of_image, of_color if ctx.factors[1] > 0 else None, of_end, *(None,) * 5
+        results = [torch.empty_like(each) for each in given[:3]]
+        of_background = torch.empty_like(given[3]) if ctx.needs_input_grad[3] else None
+        behind = gradient.new_empty(0, 3) if of_background is None else of_background
+        inputs = [ctx.factors, *given, gradient.view(1), *results, behind]
+        launch(loss_adjoint_kernel, len(given[2]), inputs, gradient.device)
+        return *results, of_background, *(None,) * 5
 
 
 @wp.kernel(module="unique", enable_backward=False)
 def photometric_kernel(
     first: int,
     factors: wp.vec4,
-    image: wp.array(dtype=wp.vec3),
+    weight: wp.array(dtype=float),
     color: wp.array(dtype=wp.vec3),
     transmittance: wp.array(dtype=float),
+    background: wp.array(dtype=wp.vec3),
+    image: wp.array(dtype=wp.vec3),
     stops: wp.array(dtype=wp.int64),
-    weight: wp.array(dtype=float),
     truth: wp.array(dtype=wp.vec3),
     alpha: wp.array(dtype=float),
     result: wp.array(dtype=Part),
@@ -127,32 +132,37 @@ def photometric_kernel(
 
 
 @wp.kernel(module="unique", enable_backward=False)
-def adjoint_kernel(
+def loss_adjoint_kernel(
     first: int,
-    given: wp.array(dtype=float),
     factors: wp.vec4,
-    image: wp.array(dtype=wp.vec3),
+    weight: wp.array(dtype=float),
     color: wp.array(dtype=wp.vec3),
     transmittance: wp.array(dtype=float),
+    background: wp.array(dtype=wp.vec3),
+    image: wp.array(dtype=wp.vec3),
     stops: wp.array(dtype=wp.int64),
-    weight: wp.array(dtype=float),
     truth: wp.array(dtype=wp.vec3),
     alpha: wp.array(dtype=float),
-    of_image: wp.array(dtype=wp.vec3),
+    given: wp.array(dtype=float),
+    of_weight: wp.array(dtype=float),
     of_color: wp.array(dtype=wp.vec3),
     of_transmittance: wp.array(dtype=float),
+    of_background: wp.array(dtype=wp.vec3),
 ):
-    """The gradients of image, colours and transmittance from that of the weighted sum."""
+    """The gradients of what the image is composited of, from that of the weighted sum."""
     ray = first + wp.tid()
     g = given[0] / float(transmittance.shape[0])
     end = transmittance[ray]
-    of_image[ray] = (g * factors[0] * 2.0 / 3.0) * (image[ray] - truth[ray])
-    if factors[1] > 0.0:
-        for k in range(first_of(stops, ray), int(stops[ray])):
-            of_color[k] = (g * factors[1] * 2.0 * weight[k]) * (color[k] - truth[ray])
+    of_image = (g * factors[0] * 2.0 / 3.0) * (image[ray] - truth[ray])
+    by_sample = g * factors[1] * 2.0
+    for k in range(first_of(stops, ray), int(stops[ray])):
+        of_weight[k] = wp.dot(of_image, color[k])
+        of_color[k] = weight[k] * (of_image + by_sample * (color[k] - truth[ray]))
+    if of_background.shape[0] > 0:
+        of_background[ray] = end * of_image
     slope = float(0.0)
     if end >= wp.static(NEAREST) and end <= wp.static(1.0 - NEAREST):
         slope = factors[2] * (wp.log(1.0 - end) - wp.log(end))
     if alpha.shape[0] > 0:
         slope += factors[3] * 2.0 * (end - (1.0 - alpha[ray]))
-    of_transmittance[ray] = g * slope
+    of_transmittance[ray] = g * slope + wp.dot(of_image, behind(background, ray))

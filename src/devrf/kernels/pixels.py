@@ -37,9 +37,9 @@ def look_up(
         Centres (R, 2), origins and directions of rays, colours (R, 3), alphas, times, frames (R,);
         then flow (R, 2), 0 where it is not valid, and valid (R,). Empty: what images lack.
     """
-    count, device, channels = len(image), image.device, pixels.shape[3]
+    count, device, has_alpha = len(image), image.device, pixels.shape[3] == 4
     vectors, valid = flow or (background.new_empty(0, 2), valid_nowhere(device))
-    alphas, flows = count * (channels == 4), count * (flow is not None)
+    alphas, flows = count * has_alpha, count * (flow is not None)
     results = [
         *(torch.empty(count, size, device=device) for size in (2, 3, 3, 3)),
         *(torch.empty(size, device=device) for size in (alphas, count)),
@@ -50,7 +50,7 @@ def look_up(
     inputs = [pixels.shape[1], pixels.shape[2], pixels, cameras.camera_to_world, cameras.focal]
     inputs += [cameras.center, *of_images, vectors, valid.flatten(), image, flat]
     inputs += [background.contiguous().view(-1, 3), *results]
-    launch(look_up_kernel(channels), count, inputs, device)
+    launch(look_up_kernel(has_alpha), count, inputs, device)
     return tuple(results)
 
 
@@ -60,9 +60,9 @@ def valid_nowhere(device: torch.device) -> Tensor:
 
 
 @cached_kernel
-def look_up_kernel(channels: int) -> wp.Kernel:
-    """Pixels of 3 or of 4 channels."""
-    bytes_of = row_type(channels, wp.uint8)
+def look_up_kernel(has_alpha: bool) -> wp.Kernel:
+    """Pixels of 4 channels, or of 3."""
+    bytes_of = row_type(3 + has_alpha, wp.uint8)
 
     @wp.kernel(module="unique", enable_backward=False)
     def look_up(
@@ -115,8 +115,8 @@ def look_up_kernel(channels: int) -> wp.Kernel:
         color = wp.vec3()
         for channel in range(3):
             color[channel] = float(pixels[row][channel]) / 255.0
-        if wp.static(channels == 4):
-            alpha = float(pixels[row][wp.static(channels - 1)]) / 255.0
+        if wp.static(has_alpha):
+            alpha = float(pixels[row][wp.static(2 + has_alpha)]) / 255.0
             behind = background[wp.min(number, background.shape[0] - 1)]
             color = behind + alpha * (color - behind)
             result_alpha[number] = alpha

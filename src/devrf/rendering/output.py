@@ -69,9 +69,11 @@ class VoxelOutput(RenderOutput):
     Attributes:
         samples: their positions x_i at the rays' time and q_i in canonical space, and weights w_i.
         sample_color: (K, 3) their colours c_i.
+        background: (3,) or (R, 3), behind all.
         residual: (K, 3) A_t(q_i) in logits; None without one.
     """
 
     samples: Samples
     sample_color: Tensor
+    background: Tensor
     residual: Tensor | None = None

@@ -75,6 +75,7 @@ def prediction() -> Prediction:
             torch.tensor([2, 2, 3]),
         ),
         sample_color=sample_color,
+        background=torch.zeros(3),
     )
     batch = batch_of(
         Rays(*[torch.zeros(3, 3)] * 3),
@@ -174,6 +175,7 @@ def seen(
             firsts(ray, len(none))[1:],
         ),
         sample_color=torch.zeros(len(ray), 3),
+        background=torch.zeros(3),
     )
 
 

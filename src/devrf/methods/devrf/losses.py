@@ -13,10 +13,12 @@ from devrf.data.batch import RayBatch
 from devrf.errors import expect
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
-from devrf.geometry.space import WORLD, Space
+from devrf.geometry.ndc import NormalizedDevice
+from devrf.geometry.space import WORLD, Space, WorldSpace
+from devrf.kernels.motion import cycle_error, flow_error
 from devrf.kernels.photometric import photometric
 from devrf.kernels.runtime import is_supported
-from devrf.methods.devrf.deformation_field import Warp
+from devrf.methods.devrf.deformation_field import GridWarp, Warp
 from devrf.methods.weighted_loss import visibility, weighted_sum
 from devrf.ops.photometric import (
     TERMS,
@@ -84,8 +86,15 @@ class MotionPrediction(Prediction):
 
 def cycle(prediction: MotionPrediction) -> Tensor:
     """L_cycle = mean_i ½ |x_i − (q_i + Δ_f(q_i, t))|² (docs/method.md#cycle)."""
-    samples = prediction.output.samples
-    missed = samples.points - prediction.unwarp(samples.canonical)
+    samples, unwarp = prediction.output.samples, prediction.unwarp
+    if (
+        isinstance(unwarp, GridWarp)
+        and unwarp.displacement is not None
+        and is_supported(samples.weight)
+    ):
+        outside = unwarp.zero_outside_box
+        return cycle_error(samples, unwarp.displacement, unwarp.box, zero_outside_box=outside)
+    missed = samples.points - unwarp(samples.canonical)
     error = 0.5 * missed.square().sum(dim=1)
     return error.mean() if len(error) else error.sum()
 
@@ -100,6 +109,23 @@ def flow(prediction: MotionPrediction) -> Tensor:
     valid = batch.flow_valid
     if batch.flow is None or valid is None:
         return samples.weight.new_zeros(())
+    unwarp, space = prediction.unwarp_previous, prediction.space
+    straight = isinstance(space, WorldSpace | NormalizedDevice)
+    if isinstance(unwarp, GridWarp) and straight and is_supported(samples.weight):
+        return flow_error(
+            samples,
+            unwarp.displacement,
+            unwarp.box,
+            zero_outside_box=unwarp.zero_outside_box,
+            cameras=prediction.cameras,
+            previous=prediction.previous_image,
+            image=batch.image,
+            pixel=batch.pixel,
+            flow=batch.flow,
+            valid=valid,
+            ndc=space if isinstance(space, NormalizedDevice) else None,
+            by_ray=prediction.flow_mean == "rays",
+        )
     # The gradient of index_select takes half the time of that of indexing.
     valid_samples = valid.index_select(0, samples.ray).nonzero()[:, 0]
     ray = samples.ray.index_select(0, valid_samples)
@@ -189,9 +215,8 @@ def batch_loss(
     if not together:
         total, values = weighted_sum(others, weights)
         return total, values | visibility(output.transmittance, batch.alpha)
-    total, values = photometric(
-        output.color, output.sample_color, output.samples, batch.color, batch.alpha, together
-    )
+    made_of = (output.samples, output.sample_color, output.background)
+    total, values = photometric(*made_of, output.color, batch.color, batch.alpha, together)
     for name, value in others.items():
         total = torch.add(total, value, alpha=weights[name])
     return total, values | {name: value.detach() for name, value in others.items()}

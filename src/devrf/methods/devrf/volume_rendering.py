@@ -64,6 +64,7 @@ def render(
         transmittance=samples.transmittance,
         samples=samples,
         sample_color=color,
+        background=background,
         residual=residual,
     )
 

@@ -1,0 +1,328 @@
+"""The cycle and the flow loss through a grid of displacements, and their gradients.
+
+See docs/method.md#motion-losses; ``devrf.methods.devrf.losses`` has the definitions. A thread looks
+at one sample.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from devrf.geometry.box import Box
+from devrf.geometry.cameras import Cameras
+from devrf.geometry.ndc import BEFORE_INFINITY, NormalizedDevice
+from devrf.kernels.grid import cell, grid_over, inside, slope
+from devrf.kernels.march import Geometry, warped
+from devrf.kernels.pixels import Axis, Xy
+from devrf.kernels.runtime import launch
+from devrf.kernels.trilinear import add_to_grid
+from devrf.ops.march import Samples
+from devrf.ops.trilinear import Shape, shape_of
+
+
+def cycle_error(
+    samples: Samples, displacement: Tensor, box: Box, *, zero_outside_box: bool
+) -> Tensor:
+    """mean_i ½ |x_i − (q_i + Δ(q_i))|² () of Δ (X, Y, Z, 3) over ``box``."""
+    geometry = motion_of(box, shape_of(displacement), zero_outside_box)
+    error: Tensor = _Cycle.apply(  # type: ignore[no-untyped-call]
+        samples.canonical, displacement, samples.points, geometry, box
+    )
+    return error
+
+
+def flow_error(
+    samples: Samples,
+    displacement: Tensor | None,
+    box: Box,
+    *,
+    zero_outside_box: bool,
+    cameras: Cameras,
+    previous: Tensor,
+    image: Tensor,
+    pixel: Tensor,
+    flow: Tensor,
+    valid: Tensor,
+    ndc: NormalizedDevice | None,
+    by_ray: bool,
+) -> Tensor:
+    """(1/M) Σ_i w_i m_i |π(q_i + Δ(q_i)) − u − φ|₁ (), M as of ``losses.flow``.
+
+    Args:
+        samples: of R rays, in world space or ``ndc``.
+        displacement: (X, Y, Z, 3) Δ, which gets no gradient; None: nothing moves.
+        box: of the displacements.
+        zero_outside_box: whether Δ is 0 outside.
+        cameras: with π.
+        previous: (N,) int64, the image whose camera is π, of each image.
+        image: (R,) int64, the image of each ray.
+        pixel: (R, 2) u.
+        flow: (R, 2) φ.
+        valid: (R,) bool m.
+        ndc: the samples' space; None: the world.
+        by_ray: whether M is the number of valid rays, or twice that of their samples.
+    """
+    shape = None if displacement is None else shape_of(displacement)
+    moves = samples.weight.new_empty(0, 3) if displacement is None else displacement.detach()
+    slopes = wp.vec3() if ndc is None else wp.vec3(*ndc.slopes, ndc.near)
+    given = [motion_of(box, shape, zero_outside_box), slopes, int(by_ray), samples.ray, moves]
+    given += [cameras.camera_to_world, cameras.focal, cameras.center]
+    given += [previous, image, pixel, flow, valid]
+    error: Tensor = _Flow.apply(samples.canonical, samples.weight, *given)  # type: ignore[no-untyped-call]
+    return error
+
+
+class _Cycle(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, canonical: Tensor, displacement: Tensor, points: Tensor, geometry: Any, box: Box
+    ) -> Tensor:
+        ctx.save_for_backward(points, canonical, displacement)
+        ctx.geometry, ctx.box = geometry, box
+        errors = torch.empty(len(points), device=points.device)
+        inputs = [geometry, points, canonical, displacement, errors]
+        launch(cycle_kernel, len(points), inputs, points.device)
+        return errors.mean() if len(errors) else errors.sum()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        points, canonical, displacement = ctx.saved_tensors
+        of_canonical, moved = torch.empty_like(points), torch.empty_like(points)
+        inputs = [ctx.geometry, points, canonical, displacement, gradient.view(1)]
+        launch(cycle_adjoint_kernel, len(points), [*inputs, of_canonical, moved], points.device)
+        of_displacement = torch.zeros_like(displacement)
+        add_to_grid(of_displacement, canonical, moved, ctx.box)
+        return of_canonical, of_displacement, None, None, None
+
+
+class _Flow(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, canonical: Tensor, weight: Tensor, geometry: Any, ndc: Any, by_ray: int, *of: Any
+    ) -> Tensor:
+        parts = torch.empty(len(weight), 2, device=weight.device)
+        inputs = [geometry, ndc, canonical, weight, *of]
+        launch(flow_kernel, len(weight), [*inputs, parts], weight.device)
+        total, count = parts.sum(dim=0)
+        valid = of[-1]
+        count = (valid.sum().float() if by_ray else count).clamp(min=1)
+        ctx.save_for_backward(canonical, weight, count.view(1), *of)
+        ctx.geometry, ctx.ndc = geometry, ndc
+        return total / count
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        canonical, weight, count, *of = ctx.saved_tensors
+        results = [torch.empty_like(canonical), torch.empty_like(weight)]
+        inputs = [ctx.geometry, ctx.ndc, canonical, weight, *of, gradient.view(1), count]
+        launch(flow_adjoint_kernel, len(weight), [*inputs, *results], weight.device)
+        return *results, *(None,) * (3 + len(of))
+
+
+@lru_cache(maxsize=64)
+def motion_of(box: Box, shape: Shape | None, zero_outside_box: bool) -> Geometry:
+    """The part of a march's geometry that is of displacements; without a ``shape``, none."""
+    geometry = Geometry()
+    if shape is not None:
+        geometry.moves = 1
+        geometry.motion = grid_over(box, shape)
+        geometry.zero_outside_box = int(zero_outside_box)
+    return geometry
+
+
+@wp.func
+def follows(geometry: Geometry, point: wp.vec3):
+    """Whether a point moves with the displacements around it."""
+    if geometry.moves == 0:
+        return False
+    return geometry.zero_outside_box == 0 or wp.min(inside(geometry.motion, point)) > 0.0
+
+
+@wp.func
+def slope_of_warped(
+    geometry: Geometry, displacements: wp.array(dtype=wp.vec3), point: wp.vec3, given: wp.vec3
+):
+    """The gradient of a point x from that of its warped place, ``given``."""
+    if not follows(geometry, point):
+        return given
+    row, fraction = cell(geometry.motion, point)
+    change = slope(displacements, given, geometry.motion, row, fraction)
+    return given + wp.cw_mul(change, inside(geometry.motion, point))
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def cycle_kernel(
+    first: int,
+    geometry: Geometry,
+    points: wp.array(dtype=wp.vec3),
+    canonical: wp.array(dtype=wp.vec3),
+    displacements: wp.array(dtype=wp.vec3),
+    error: wp.array(dtype=float),
+):
+    """½ |x − (q + Δ(q))|² of each sample."""
+    sample = first + wp.tid()
+    missed = points[sample] - warped(geometry, displacements, canonical[sample])
+    error[sample] = 0.5 * wp.dot(missed, missed)
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def cycle_adjoint_kernel(
+    first: int,
+    geometry: Geometry,
+    points: wp.array(dtype=wp.vec3),
+    canonical: wp.array(dtype=wp.vec3),
+    displacements: wp.array(dtype=wp.vec3),
+    gradient: wp.array(dtype=float),
+    of_canonical: wp.array(dtype=wp.vec3),
+    of_moved: wp.array(dtype=wp.vec3),
+):
+    """The gradients of q and of Δ(q) from that of the mean error."""
+    sample = first + wp.tid()
+    q = canonical[sample]
+    missed = warped(geometry, displacements, q) - points[sample]
+    given = missed * (gradient[0] / float(points.shape[0]))
+    of_canonical[sample] = slope_of_warped(geometry, displacements, q, given)
+    of_moved[sample] = wp.where(follows(geometry, q), given, wp.vec3())
+
+
+@wp.func
+def depth_in_world(ndc: wp.vec3, point: wp.vec3):
+    """z of a point of NDC in the reference camera's axes."""
+    gap = point[2] - 1.0
+    if gap == 0.0:
+        gap = -wp.static(BEFORE_INFINITY)
+    return 2.0 * ndc[2] / gap
+
+
+@wp.func
+def seen_by(ndc: wp.vec3, poses: wp.array(dtype=Axis), camera: int, point: wp.vec3):
+    """A point in the axes of a camera: x right, y up, z backward."""
+    world = point
+    if ndc[2] > 0.0:
+        depth = depth_in_world(ndc, point)
+        world = wp.vec3(-point[0] * depth / ndc[0], -point[1] * depth / ndc[1], depth)
+    local = wp.vec3()
+    for axis in range(3):
+        pose = poses[3 * camera + axis]
+        local += wp.vec3(pose[0], pose[1], pose[2]) * (world[axis] - pose[3])
+    return local
+
+
+@wp.func
+def slope_of_seen(
+    ndc: wp.vec3, poses: wp.array(dtype=Axis), camera: int, point: wp.vec3, given: wp.vec3
+):
+    """The gradient of a point from that of its place in the axes of a camera."""
+    world = wp.vec3()
+    for axis in range(3):
+        pose = poses[3 * camera + axis]
+        world[axis] = wp.dot(wp.vec3(pose[0], pose[1], pose[2]), given)
+    if ndc[2] == 0.0:
+        return world
+    depth = depth_in_world(ndc, point)
+    x = -world[0] / ndc[0]
+    y = -world[1] / ndc[1]
+    along = point[0] * x + point[1] * y + world[2]
+    squeezed = -depth * depth / (2.0 * ndc[2])
+    if point[2] == 1.0:
+        squeezed = 0.0
+    return wp.vec3(x * depth, y * depth, along * squeezed)
+
+
+@wp.func
+def away(local: wp.vec3):
+    """The depth of a point in a camera's axes, apart from 0, and whether it is that itself."""
+    if wp.abs(local[2]) < 1.0e-8:
+        return 1.0e-8, 0.0
+    return -local[2], 1.0
+
+
+@wp.func
+def missed_by(local: wp.vec3, focal: Xy, center: Xy, pixel: Xy, flow: Xy):
+    """π − u − φ in pixels."""
+    depth, _ = away(local)
+    return Xy(local[0] / depth * focal[0], -local[1] / depth * focal[1]) + center - pixel - flow
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def flow_kernel(
+    first: int,
+    geometry: Geometry,
+    ndc: wp.vec3,
+    canonical: wp.array(dtype=wp.vec3),
+    weight: wp.array(dtype=float),
+    rays: wp.array(dtype=wp.int64),
+    displacements: wp.array(dtype=wp.vec3),
+    poses: wp.array(dtype=Axis),
+    focals: wp.array(dtype=Xy),
+    centers: wp.array(dtype=Xy),
+    previous: wp.array(dtype=wp.int64),
+    images: wp.array(dtype=wp.int64),
+    pixels: wp.array(dtype=Xy),
+    flows: wp.array(dtype=Xy),
+    valid: wp.array(dtype=wp.bool),
+    part: wp.array(dtype=Xy),
+):
+    """w |π − u − φ|₁ of each sample, and 2; 0 and 0 where the flow of its ray is not valid."""
+    sample = first + wp.tid()
+    ray = int(rays[sample])
+    part[sample] = Xy(0.0, 0.0)
+    if valid[ray]:
+        camera = int(previous[int(images[ray])])
+        moved = warped(geometry, displacements, canonical[sample])
+        local = seen_by(ndc, poses, camera, moved)
+        missed = missed_by(local, focals[camera], centers[camera], pixels[ray], flows[ray])
+        part[sample] = Xy(weight[sample] * (wp.abs(missed[0]) + wp.abs(missed[1])), 2.0)
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def flow_adjoint_kernel(
+    first: int,
+    geometry: Geometry,
+    ndc: wp.vec3,
+    canonical: wp.array(dtype=wp.vec3),
+    weight: wp.array(dtype=float),
+    rays: wp.array(dtype=wp.int64),
+    displacements: wp.array(dtype=wp.vec3),
+    poses: wp.array(dtype=Axis),
+    focals: wp.array(dtype=Xy),
+    centers: wp.array(dtype=Xy),
+    previous: wp.array(dtype=wp.int64),
+    images: wp.array(dtype=wp.int64),
+    pixels: wp.array(dtype=Xy),
+    flows: wp.array(dtype=Xy),
+    valid: wp.array(dtype=wp.bool),
+    gradient: wp.array(dtype=float),
+    count: wp.array(dtype=float),
+    of_canonical: wp.array(dtype=wp.vec3),
+    of_weight: wp.array(dtype=float),
+):
+    """The gradients of q and of w from that of the mean error."""
+    sample = first + wp.tid()
+    ray = int(rays[sample])
+    of_canonical[sample] = wp.vec3()
+    of_weight[sample] = 0.0
+    if valid[ray]:
+        camera = int(previous[int(images[ray])])
+        q = canonical[sample]
+        moved = warped(geometry, displacements, q)
+        local = seen_by(ndc, poses, camera, moved)
+        focal = focals[camera]
+        missed = missed_by(local, focal, centers[camera], pixels[ray], flows[ray])
+        given = gradient[0] / count[0]
+        of_weight[sample] = given * (wp.abs(missed[0]) + wp.abs(missed[1]))
+        given *= weight[sample]
+        depth, itself = away(local)
+        x = given * wp.where(missed[0] == 0.0, 0.0, wp.sign(missed[0])) * focal[0] / depth
+        y = -given * wp.where(missed[1] == 0.0, 0.0, wp.sign(missed[1])) * focal[1] / depth
+        z = itself * (x * local[0] + y * local[1]) / depth
+        of_moved = slope_of_seen(ndc, poses, camera, moved, wp.vec3(x, y, z))
+        of_canonical[sample] = slope_of_warped(geometry, displacements, q, of_moved)
