@@ -10,7 +10,16 @@ from threading import Thread
 import torch
 import warp as wp
 
-from devrf.kernels import adam, compositing, march, motion, photometric, pixels, splatting, trilinear
+from devrf.kernels import (
+    adam,
+    compositing,
+    march,
+    motion,
+    photometric,
+    pixels,
+    splatting,
+    trilinear,
+)
 from devrf.kernels.runtime import compiling, is_supported
 
 log = logging.getLogger(__name__)

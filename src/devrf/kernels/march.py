@@ -87,7 +87,7 @@ class _March(torch.autograd.Function):
         transmittance = torch.empty(len(rays), device=device)
         # Straight rays have no course: their origins stand in for it.
         course = rays.course if isinstance(rays, ContractedRays) else rays.origins
-        # Without displacements the kernel gets an array that it does not read.
+        # Without displacements kernels get an array that they do not read.
         moves = density.new_empty(0, 3) if displacement is None else displacement.contiguous()
         arguments = [each.contiguous() for each in (rays.origins, rays.directions, course)]
         arguments = [
@@ -126,9 +126,7 @@ class _March(torch.autograd.Function):
         given = [ray, distance, points, depth, stop]
         ctx.mark_non_differentiable(*given, *([canonical] if fixed else []))
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(
-            density, displacement, visible_start, visible_count, stop, transmittance
-        )
+        ctx.save_for_backward(density, moves, visible_start, visible_count, stop, transmittance)
         ctx.geometry, ctx.lines, ctx.visible = geometry, lines, visible
         ctx.kept = kept
         return ray, distance, points, canonical, weight, transmittance, depth, stop
@@ -136,16 +134,17 @@ class _March(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        density, displacement, visible_start, visible_count, stop, transmittance = ctx.saved_tensors
+        density, moves, visible_start, visible_count, stop, transmittance = ctx.saved_tensors
         device = density.device
         # A kernel does not read an array of nothing.
         given = [
             density.new_empty((0, 3) if k == 0 else 0) if each is None else each.contiguous()
             for k, each in enumerate(gradients[3:6])
         ]
-        slopes = empty_structs(SampleSlope, ctx.visible.shape[0], device)
+        # The gradients take the place of the samples: they are not needed again.
+        assert ctx.visible is not None, "a march has one backward pass"
         of_rays = [ctx.geometry, ctx.lines, visible_start, ctx.visible, visible_count]
-        arguments = [*of_rays, density.contiguous(), stop, *given, transmittance, slopes]
+        arguments = [*of_rays, density.contiguous(), stop, *given, transmittance]
         launch(adjoint_kernel, len(visible_count), arguments, device, grain=GRAIN_OF_RAYS)
 
         of_density = of_displacement = None
@@ -154,8 +153,10 @@ class _March(torch.autograd.Function):
             of_density = torch.zeros_like(density) if ctx.kept is None else None
             into[0] = ctx.kept if of_density is None else of_density
         if ctx.needs_input_grad[1]:
-            into[1] = of_displacement = torch.zeros_like(displacement)
-        launch(scatter_kernel, len(visible_count), [*of_rays, slopes, *into], device, grain=None)
+            into[1] = of_displacement = torch.zeros_like(moves)
+        arguments = [*of_rays, moves, *into]
+        launch(scatter_kernel, len(visible_count), arguments, device, grain=None)
+        ctx.visible = None
         return of_density, of_displacement, None, None, None
 
 
@@ -258,14 +259,6 @@ class VisibleSample:
     canonical: wp.vec3
     tau: float
     weight: float
-
-
-@wp.struct
-class SampleSlope:
-    """The gradient of a visible sample's raw density, and that of its displacement."""
-
-    raw: float
-    moved: wp.vec3
 
 
 @wp.struct
@@ -548,11 +541,11 @@ def adjoint_kernel(
     given_weight: wp.array(dtype=float),
     given_transmittance: wp.array(dtype=float),
     transmittance: wp.array(dtype=float),
-    slopes: wp.array(dtype=SampleSlope),
 ):
     """∂L/∂v and ∂L/∂Δ of visible samples from the gradients of the march's results.
 
-    Those of results that have none are empty arrays.
+    They take the place of τ and, where there are displacements, of q. The gradients of results that
+    have none are empty arrays.
 
     Back to front ∂L/∂τ_i = ∂L/∂w_i T_i exp(−τ_i) − Σ_{j>i} ∂L/∂w_j w_j − ∂L/∂T_end T_end.
     """
@@ -587,8 +580,7 @@ def adjoint_kernel(
             after = weight / opacity(tau)
         # ∂τ/∂v = δ · sigmoid(v + b), and sigmoid = 1 − exp(−softplus).
         slope_of_raw = slope_of_tau * geometry.delta * opacity(tau / geometry.delta)
-        result = SampleSlope()
-        result.raw = slope_of_raw
+        sample.tau = slope_of_raw
         if geometry.moves == 1:
             row, fraction = cell(geometry.density, sample.canonical)
             change = slope(density, Density(slope_of_raw), geometry.density, row, fraction)
@@ -596,8 +588,8 @@ def adjoint_kernel(
             if geometry.zero_outside_box == 1:
                 point = position(geometry, ray, sample.distance)
                 slope_of_canonical *= wp.min(inside(geometry.motion, point))
-            result.moved = slope_of_canonical
-        slopes[start + count - 1 - back] = result
+            sample.canonical = slope_of_canonical
+        visible[start + count - 1 - back] = sample
 
 
 @wp.kernel(module="unique", enable_backward=False)
@@ -608,11 +600,11 @@ def scatter_kernel(
     visible_start: wp.array(dtype=int),
     visible: wp.array(dtype=VisibleSample),
     visible_count: wp.array(dtype=int),
-    slopes: wp.array(dtype=SampleSlope),
+    displacements: wp.array(dtype=wp.vec3),
     of_density: wp.array(dtype=Density),
     of_displacement: wp.array(dtype=wp.vec3),
 ):
-    """The visible samples' gradients added to those of the grids that have one.
+    """The gradients that :func:`adjoint_kernel` left, added to those of the grids that have one.
 
     On a CPU in one thread, in the order of the rays.
     """
@@ -620,10 +612,11 @@ def scatter_kernel(
     start = visible_start[number]
     for place in range(start, start + visible_count[number]):
         sample = visible[place]
+        point = position(geometry, rays[number], sample.distance)
         if of_density.shape[0] > 0:
-            row, fraction = cell(geometry.density, sample.canonical)
-            add_cell(of_density, geometry.density, row, fraction, Density(slopes[place].raw))
+            canonical = warped(geometry, displacements, point)
+            row, fraction = cell(geometry.density, canonical)
+            add_cell(of_density, geometry.density, row, fraction, Density(sample.tau))
         if of_displacement.shape[0] > 0:
-            point = position(geometry, rays[number], sample.distance)
             row, fraction = cell(geometry.motion, point)
-            add_cell(of_displacement, geometry.motion, row, fraction, slopes[place].moved)
+            add_cell(of_displacement, geometry.motion, row, fraction, sample.canonical)
