@@ -26,6 +26,8 @@ from devrf.system.options import Count, Options, Share
 Format = Literal["gltf", "html", "ply", "obj", "splats", "usd"]
 Up = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
 Factor = Annotated[float, Ge(1e-9), Le(1e9)]
+# What moves farther, in diagonals of the surface, is a moving part of it.
+MOVED = 0.01
 
 
 @pydantic.dataclasses.dataclass(frozen=True)
@@ -36,6 +38,7 @@ class ExportSettings(Options):
 
     format: Format = "gltf"
     content: Literal["auto", "surface", "points", "splats"] = "auto"
+    part: Literal["all", "moving", "still"] = "all"
     threshold: Annotated[float, Gt(0), Lt(1)] = 0.1
     side: Annotated[int, Ge(2), Le(1024)] | None = None
     faces: Annotated[int, Ge(4)] = 20_000
@@ -152,6 +155,29 @@ class MovingMesh:
     vertices: Tensor
     faces: Tensor
     colors: Tensor
+
+    def part(self, *, moving: bool) -> MovingMesh:
+        """The faces that move, or those that stay, with their vertices; at least one.
+
+        A vertex moves that leaves its first place by more than :data:`MOVED` diagonals of the mesh
+        there, a face of which a vertex moves.
+
+        Raises:
+            DevrfError: there is none.
+        """
+        first = self.vertices[0]
+        diagonal = (first.amax(dim=0) - first.amin(dim=0)).norm()
+        farthest = (self.vertices - first).norm(dim=2).amax(dim=0)
+        moves = (farthest > MOVED * diagonal)[self.faces].any(dim=1)
+        faces = self.faces[moves if moving else ~moves]
+        if len(faces) == 0:
+            which = "nothing" if moving else "everything"
+            raise DevrfError(
+                f"export.part: {which} moves by more than {MOVED:.0%} of the surface's size at "
+                "export's times; give export.part=all, or other export.times"
+            )
+        kept, numbers = faces.unique(return_inverse=True)  # type: ignore[no-untyped-call]
+        return MovingMesh(self.times, self.vertices[:, kept], numbers, self.colors[kept])
 
 
 def carried(surface: Surface, model: Renderable, times: Sequence[float]) -> MovingMesh:

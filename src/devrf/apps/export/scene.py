@@ -58,6 +58,8 @@ def export_scene(
         assert field is not None
         surface = surface_of(model, field, viewpoints.static, settings)
         mesh = carried(surface, model, times)
+        if settings.part != "all":
+            mesh = mesh.part(moving=settings.part == "moving")
         path = _write_mesh(folder, mesh, viewpoints, settings)
         faces = len(mesh.faces)
         vertices = mesh.vertices.shape[1]
@@ -80,6 +82,11 @@ def _takes_surface(model: Renderable, settings: ExportSettings) -> bool:
         raise DevrfError(
             f"export.content: method={model.name} has no surface; give export.content=points "
             "export.format=ply"
+        )
+    if settings.part != "all" and not (wanted and carries):
+        raise DevrfError(
+            f"export.part: only a surface that is carried through time has a {settings.part} part; "
+            "give export.part=all"
         )
     if wanted and not carries and settings.format in SINGLE:
         raise DevrfError(
