@@ -163,6 +163,22 @@ def test_what_is_replaced_or_forgotten_starts_afresh() -> None:
     assert new.item() == pytest.approx(0.0, abs=1e-7)
 
 
+def test_rows_that_stay_keep_their_moments_and_new_ones_have_none() -> None:
+    old = torch.zeros(3, 2, requires_grad=True)
+    optimizer = GridAdam([old], lr=0.1)
+    slopes = torch.tensor([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
+    run(optimizer, old, [slopes] * 2)
+    mean, square = (optimizer.state[old][name] for name in ("mean", "square"))
+    new = old.detach()[[2, 0, 0]].clone().requires_grad_()
+    optimizer.replace(0, [new], source=torch.tensor([2, 0, -1]))
+    assert old not in optimizer.state and optimizer.state[new]["steps"] == 2
+    for name, before in (("mean", mean), ("square", square)):
+        after = optimizer.state[new][name]
+        assert torch.equal(after[:2], before[[2, 0]]) and not after[2].any()
+    run(optimizer, new, [slopes])
+    assert optimizer.state[new]["steps"] == 3
+
+
 def test_the_rate_may_be_set_by_the_closure() -> None:
     parameter = torch.zeros(1, 1, 1, 1, requires_grad=True)
     optimizer = GridAdam([parameter], lr=0.5)

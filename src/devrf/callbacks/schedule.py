@@ -33,9 +33,13 @@ class LearningRateDecay(Callback):
     def on_before_optimizer_step(
         self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer
     ) -> None:
-        """Set ``lr`` to ``base_lr`` times the iteration's factor and the stage's ``lr_scale``."""
+        """Set ``lr`` to ``base_lr`` times the iteration's factor and the stage's ``lr_scale``.
+
+        The factor has the power ``decay`` of a group that has one.
+        """
         stage = cast(Scheduled, pl_module)
         position = stage.position
-        factor = stage.timeline.learning_rate_factor(position.iteration) * position.lr_scale
+        factor = stage.timeline.learning_rate_factor(position.iteration)
         for group in optimizer.param_groups:
-            group["lr"] = group["base_lr"] * factor
+            decayed = factor ** group.get("decay", 1.0)
+            group["lr"] = group["base_lr"] * decayed * position.lr_scale

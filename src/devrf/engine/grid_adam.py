@@ -194,17 +194,32 @@ class GridAdam(torch.optim.Optimizer):
                     if not parameter.shape == state["mean"].shape == state["square"].shape:
                         raise ValueError("moments of another shape than what is learned")
 
-    def replace(self, group: int, parameters: Sequence[Tensor], **settings: Any) -> None:
+    def replace(
+        self,
+        group: int,
+        parameters: Sequence[Tensor],
+        source: Tensor | None = None,
+        **settings: Any,
+    ) -> None:
         """Give a group other parameters, such as a resized grid, with zero moments.
 
         Args:
             group: its index.
             parameters: the new parameters.
+            source: (M,) int64, the rows of the old parameters whose moments the M rows of the new
+                ones take over; −1: none.
             settings: further settings of the group; ``per_voxel_lr`` and ``rows`` are None unless
                 given.
         """
-        for old in self.param_groups[group]["params"]:
-            self.state.pop(old, None)
+        states = [self.state.pop(old, None) for old in self.param_groups[group]["params"]]
+        if source is not None:
+            for state, new in zip(states, parameters, strict=True):
+                if state:
+                    fresh = (source < 0).view(-1, *[1] * (new.ndim - 1))
+                    for moment in ("mean", "square"):
+                        rows = state[moment].index_select(0, source.clamp(min=0))
+                        state[moment] = rows.masked_fill(fresh, 0.0)
+                    self.state[new] = state
         self.param_groups[group]["params"] = list(parameters)
         self.param_groups[group].update({"per_voxel_lr": None, "rows": None, **settings})
         self.make_gradients()
