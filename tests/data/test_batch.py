@@ -14,6 +14,7 @@ from devrf.data.batch import (
     all_pixels,
     concatenated,
     gather_batch,
+    gather_image,
     pixel_positions,
     wanted_pixels,
 )
@@ -55,6 +56,25 @@ IMAGE, FLAT = torch.tensor([1, 0]), torch.tensor([9, 3])
 
 def test_pixel_positions_are_x_then_y():
     assert pixel_positions(FLAT, WIDTH).tolist() == [[1.5, 2.5], [3.5, 0.5]]
+
+
+def test_an_image_is_composited_cut_to_rows_and_shrunk():
+    seen = replace(views(), valid_mask=torch.ones(2, HEIGHT, WIDTH, dtype=torch.bool))
+    seen.valid_mask[1, 2, 3] = False
+    background = torch.tensor([1.0, 0.0, 0.0])
+    batch = gather_image(seen, 1, background, rows=(1, 3), shrink=2)
+    assert (batch.camera.width, batch.camera.height, batch.time) == (2, 1, 1.0)
+    assert batch.camera.focal.tolist() == [[3.5, 3.0]]
+    assert batch.camera.center.tolist() == [[1.0, 0.25]]  # (2, 1.5 - 1) / 2
+    # Columns 0 and 1 of rows 1 and 2: 115.5 on average, a fifth of it before red.
+    assert batch.color[0].tolist() == pytest.approx([0.2 * 115.5 / 255 + 0.8, 0.0, 0.2])
+    assert batch.alpha.tolist() == pytest.approx([0.2, 0.2])
+    assert batch.valid.tolist() == [True, False]
+    whole = gather_image(views(3), 0, background, rows=(0, HEIGHT))
+    assert whole.alpha is None and whole.valid is None
+    assert whole.color[:, 0].tolist() == pytest.approx(
+        [(10 * row + column) / 255 for row in range(HEIGHT) for column in range(WIDTH)]
+    )
 
 
 def test_a_batch_holds_the_right_pixels_with_their_flow():

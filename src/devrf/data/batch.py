@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from devrf.geometry.cameras import Cameras
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import WORLD, Space
 from devrf.kernels.pixels import look_up
@@ -117,6 +118,19 @@ class FrameSortedPixels:
             inside = down[:, :, None] & across[:, None]
             middle = wanted_pixels(views, images, inside.flatten(1))
             pool = middle if len(middle) else pool
+        return FrameSortedPixels._sorted(views, pool)
+
+    @staticmethod
+    def of_images(views: Views) -> FrameSortedPixels:
+        """The first pixel of each image, to draw images."""
+        assert views.frames is not None
+        images = torch.arange(len(views), dtype=torch.int32, device=views.frames.device)
+        pool = PixelPool(torch.stack([images, torch.zeros_like(images)]))
+        return FrameSortedPixels._sorted(views, pool)
+
+    @staticmethod
+    def _sorted(views: Views, pool: PixelPool) -> FrameSortedPixels:
+        assert views.frames is not None
         frame = views.frames[pool.image.long()]
         order = frame.argsort(stable=True)
         _, counts = torch.unique(frame, return_counts=True)
@@ -240,6 +254,75 @@ def _looked_up(views: Views, image: Tensor, flat: Tensor, background: Tensor) ->
         vectors = torch.where(valid[:, None], flow[0].flatten(0, 2)[index], 0.0)
     rays = views.cameras.rays(image, pixel)
     return pixel, rays, color, alpha, views.times[image], views.frames[image], vectors, valid
+
+
+@dataclass(frozen=True)
+class ImageBatch:
+    """An image, or some rows of one, with the truth at its P pixels, in row-major order.
+
+    Attributes:
+        camera: one camera, whose raster it is.
+        color: (P, 3) RGB in [0, 1], composited on ``background``.
+        alpha: (P,) alpha in [0, 1], or None for images without one.
+        valid: (P,) bool, the pixels that count; None: all.
+        background: (3,) RGB behind the alpha mask.
+        time: of the image, in [0, 1].
+        image: its number among the views it was drawn from; those of several captures are numbered
+            through.
+    """
+
+    camera: Cameras
+    color: Tensor
+    alpha: Tensor | None
+    valid: Tensor | None
+    background: Tensor
+    time: float
+    image: int
+
+
+def gather_image(
+    views: Views, image: int, background: Tensor, rows: tuple[int, int], shrink: int = 1
+) -> ImageBatch:
+    """Some rows of an image, with the truth there.
+
+    Args:
+        views: images and cameras.
+        image: the number of the image.
+        background: (3,) RGB in [0, 1] that colours are composited on.
+        rows: the first of the image's rows, and the one after the last.
+        shrink: pixels along each edge of the squares whose means become pixels.
+    """
+    view = views.single(image)
+    first, last = rows
+    pixels = view.pixels[0, first:last].float() / 255
+    color, alpha = pixels[..., :3], pixels[..., 3:]
+    if view.has_alpha:
+        color = background + alpha * (color - background)
+    planes = [color, alpha]
+    if view.valid_mask is not None:
+        planes.append(view.valid_mask[0, first:last, :, None].float())
+    means = torch.cat(planes, dim=2).permute(2, 0, 1)
+    if shrink > 1:
+        means = torch.nn.functional.avg_pool2d(means, shrink)
+    camera = view.cameras.rows(first, last)
+    height, width = means.shape[1:]
+    camera = replace(
+        camera,
+        focal=camera.focal / shrink,
+        center=camera.center / shrink,
+        width=width,
+        height=height,
+    )
+    flat = means.flatten(1)
+    return ImageBatch(
+        camera=camera,
+        color=flat[:3].t().contiguous(),
+        alpha=flat[3] if view.has_alpha else None,
+        valid=None if view.valid_mask is None else flat[-1] == 1,
+        background=background,
+        time=float(view.times[0]),
+        image=image,
+    )
 
 
 class BackgroundColor:

@@ -1,6 +1,7 @@
-"""A method that learns from rays; :class:`~devrf.methods.ray_stage.RayStage` trains it.
+"""A method that learns from rays or from images.
 
-DeVRF has stages of its own (``methods.devrf``), and is a
+:class:`~devrf.methods.ray_stage.RayStage` and :class:`~devrf.methods.image_stage.ImageStage` train
+it. DeVRF has stages of its own (``methods.devrf``), and is a
 :class:`~devrf.rendering.renderable.Renderable` alone.
 """
 
@@ -9,21 +10,25 @@ from __future__ import annotations
 import fnmatch
 from abc import abstractmethod
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import torch
 from torch import Tensor, nn
+from warp import Kernel
 
-from devrf.data.batch import RayBatch
+from devrf.data.batch import ImageBatch, RayBatch
 from devrf.engine.protocol import ProtocolStage
 from devrf.errors import DevrfError
+from devrf.kernels.ahead import grid_kernels
 from devrf.rendering.output import RenderOutput
 from devrf.rendering.renderable import Renderable
 from devrf.scenes.scene import Scene, Views
 
+Batch = TypeVar("Batch", RayBatch, ImageBatch)
 
-class RayTrainable(Renderable):
-    """A method that renders a batch of rays and computes its losses.
+
+class Trainable(Renderable, Generic[Batch]):
+    """A method that renders a batch and computes its losses.
 
     Attributes:
         losses: the names of its loss terms.
@@ -85,11 +90,14 @@ class RayTrainable(Renderable):
         return None
 
     @abstractmethod
-    def forward(self, batch: RayBatch) -> RenderOutput:
-        """Render a batch of R rays, each at its own time; differentiable in the parameters."""
+    def forward(self, batch: Batch) -> RenderOutput:
+        """Render a batch: R rays, each at its own time, or the R pixels of an image.
+
+        It is differentiable in the parameters.
+        """
 
     def loss_terms(
-        self, output: RenderOutput, batch: RayBatch, names: Collection[str]
+        self, output: RenderOutput, batch: Batch, names: Collection[str]
     ) -> dict[str, Tensor]:
         """Unweighted loss terms () by name; may render again.
 
@@ -97,7 +105,7 @@ class RayTrainable(Renderable):
 
         Args:
             output: the result of :meth:`forward`.
-            batch: the rays and the truth at their pixels.
+            batch: the rays or pixels, and the truth there.
             names: the terms that count; the others need not be computed.
         """
         return {"render": nn.functional.mse_loss(output.color, batch.color)}
@@ -109,7 +117,8 @@ class RayTrainable(Renderable):
     def param_groups(self) -> list[dict[str, Any]]:
         """Groups for an optimiser: ``name`` and ``params`` of each part that is not frozen.
 
-        A method may add ``rate`` to a group: a factor of the configured learning rate.
+        A method may add ``rate`` to a group, a factor of the configured learning rate, and
+        ``decay``, the power that the schedule's factor of it has; 0: the rate stays.
         """
         parts = {n: [p for p in group if p.requires_grad] for n, group in self.parts().items()}
         return [{"name": name, "params": free} for name, free in parts.items() if free]
@@ -138,7 +147,7 @@ class RayTrainable(Renderable):
         """Called when a stage of a protocol begins: keeps its frozen parts as they are."""
         self.freeze(step.frozen)
 
-    def rehearsed(self, factor: float) -> RayTrainable:
+    def rehearsed(self, factor: float) -> Trainable[Batch]:
         """The method, not set up yet, at a size for seconds on a CPU and ``factor`` times as long.
 
         Nothing is left out: its way of sampling and its losses are the same.
@@ -161,16 +170,27 @@ class RayTrainable(Renderable):
         """Iterations, ascending, of a stage of ``total`` at which grids grow."""
         return ()
 
-    def grow(self, count: int) -> None:
+    def grow(self, count: int) -> Mapping[str, Tensor] | None:
         """Give grids the size that they have after ``count`` growths, unless they are as large.
 
         A grid that grows becomes another parameter, whose optimiser begins without moments.
+
+        Returns:
+            by the names of groups of parameters (:meth:`param_groups`) whose rows have come and
+            gone, the rows (M,) int64 of the old parameters that the M rows of the new ones were,
+            −1 for new ones: these alone begin without moments. None: there are no such groups.
         """
+        return None
 
     @property
     def grid_channels(self) -> Collection[int]:
         """Channels of its grids, for whose numbers kernels are compiled before it learns."""
         return ()
+
+    @property
+    def kernels(self) -> Sequence[Kernel]:
+        """Kernels that it launches, which are compiled before it learns."""
+        return grid_kernels(self.grid_channels)
 
     @property
     def sample_outputs(self) -> int:
@@ -181,3 +201,16 @@ class RayTrainable(Renderable):
     def has_hull(self) -> bool:
         """Whether the scene's alpha masks tell which space rays need not be sampled in."""
         return False
+
+
+class RayTrainable(Trainable[RayBatch]):
+    """A method that renders rays, and learns from random ones of all images."""
+
+
+class ImageTrainable(Trainable[ImageBatch]):
+    """A method that renders whole images, and learns from one at a time."""
+
+    @property
+    def sample_outputs(self) -> int:
+        """0: rays have no samples."""
+        return 0

@@ -11,8 +11,7 @@ from warp import Kernel
 from devrf.engine.needs import LEARNED, SIZE, StageNeeds, tensor_bytes
 from devrf.engine.plan import StagePlan
 from devrf.engine.protocol import ProtocolStage
-from devrf.kernels.ahead import grid_kernels
-from devrf.methods.base import RayTrainable
+from devrf.methods.base import Trainable
 from devrf.methods.ray_schedule import RaySchedule
 from devrf.scenes.scene import Scene
 
@@ -25,7 +24,7 @@ REHEARSED_CROP = 0.25
 
 
 class RayPlan(StagePlan):
-    """The plan of a :class:`~devrf.methods.ray_stage.RayStage`."""
+    """The plan of a :class:`~devrf.methods.ray_stage.RayStage`, or of one of images."""
 
     def build(self, **rest: Any) -> Any:
         """The stage, told which data trains which parts of the method."""
@@ -42,15 +41,15 @@ class RayPlan(StagePlan):
         self.model.check_protocol(self.protocol.name)
 
     @property
-    def model(self) -> RayTrainable:
+    def model(self) -> Trainable[Any]:
         """The method, not set up."""
-        model: RayTrainable = self.settings["model"]
+        model: Trainable[Any] = self.settings["model"]
         return model
 
     @property
     def kernels(self) -> Sequence[Kernel]:
-        """Look-ups and steps of the method's grids."""
-        return grid_kernels(self.model.grid_channels)
+        """The method's."""
+        return self.model.kernels
 
     def iterations(self, scene: Scene) -> int:
         """The stage's share of the schedule."""

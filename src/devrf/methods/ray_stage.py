@@ -9,11 +9,13 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import mse_loss
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import (
     BackgroundColor,
     FrameSortedPixels,
+    ImageBatch,
     RayBatch,
     concatenated,
     gather_batch,
@@ -23,7 +25,7 @@ from devrf.engine.grid_adam import GridAdam
 from devrf.engine.protocol import ProtocolStage
 from devrf.engine.schedule import Phase, configured_timeline
 from devrf.engine.stage import Stage, Terms
-from devrf.methods.base import RayTrainable
+from devrf.methods.base import Trainable
 from devrf.methods.ray_plan import RayPlan
 from devrf.methods.ray_schedule import GROWN, RaySchedule, RayTimeline
 from devrf.methods.weighted_loss import counted_weights, visibility, weighted_sum
@@ -33,7 +35,7 @@ from devrf.system.profiling import span
 
 
 class RayStage(Stage):
-    """Learns a :class:`~devrf.methods.base.RayTrainable` from random rays of all its images.
+    """Learns a method from random rays of all its images.
 
     A batch's rays have times of their own. Of a stage that learns from both captures a fixed share
     of each batch is static, whatever the numbers of images.
@@ -42,12 +44,12 @@ class RayStage(Stage):
     rate_keys = "ray_stage.schedule.learning_rate or the weights of ray_stage.loss"
     memory_keys = ("ray_stage.schedule.rays",)
     plan = RayPlan
-    scene_model: RayTrainable
+    scene_model: Trainable[Any]
     schedule: RayTimeline
 
     def __init__(
         self,
-        model: RayTrainable,
+        model: Trainable[Any],
         schedule: RaySchedule,
         loss: Mapping[str, float],
         step: ProtocolStage,
@@ -87,16 +89,22 @@ class RayStage(Stage):
     def iterate(self, views: Views | tuple[Views, ...]) -> Terms:
         """Learn the method from one batch."""
         with span("batch"):
-            image, flat = self.draw()
-            background = self.background(image, self.generator)
-            batch = self._gather(views, image, flat, background)
+            batch = self.draw_batch(views)
         output = self.scene_model(batch)
         with span("losses"):
             values = self.scene_model.loss_terms(output, batch, self.weights)
             loss, terms = weighted_sum(values, self.weights)
             terms |= visibility(output.transmittance, batch.alpha)
+            if "render" not in terms:  # what the curves' PSNR is of
+                terms["render"] = mse_loss(output.color.detach(), batch.color)
         self.step(loss)
         return {"loss": loss.detach(), **terms}
+
+    def draw_batch(self, views: Views | tuple[Views, ...]) -> RayBatch | ImageBatch:
+        """A batch of the training views."""
+        image, flat = self.draw()
+        background = self.background(image, self.generator)
+        return self._gather(views, image, flat, background)
 
     def draw(self) -> tuple[Tensor, Tensor]:
         """Random pixels: their images (R,), numbered through, and places there (R,), int64.
@@ -114,7 +122,7 @@ class RayStage(Stage):
         offset = 0
         times_left = self._times_to_draw
         for pool, count in zip(pools, counts, strict=True):
-            frames = self._shown_frames(pool)
+            frames = self.shown_frames(pool)
             image, flat = pool.draw(count, frames, self.generator, times=times_left)
             images.append(image + offset)
             flats.append(flat)
@@ -182,13 +190,14 @@ class RayStage(Stage):
         """Let grids grow; when the stage begins or goes on, gather the pixels to draw from."""
         self.events[GROWN] += self.phase not in (None, phase)  # of a resumed run not again
         self.phase = phase
-        self.scene_model.grow(sum(iteration <= phase.start for iteration in self.schedule.growths))
+        grown = sum(iteration <= phase.start for iteration in self.schedule.growths)
+        sources = self.scene_model.grow(grown) or {}
         for index, group in enumerate(self.scene_model.param_groups()):
             present = self.optimizer.param_groups[index]["params"]
             parameters = group.pop("params")
             group.pop("rate", None)
             if any(new is not old for new, old in zip(parameters, present, strict=True)):
-                self.optimizer.replace(index, parameters, **group)
+                self.optimizer.replace(index, parameters, sources.get(group["name"]), **group)
         if self.pools:
             return
         fewer = self.settings.rays_without_hull
@@ -197,10 +206,14 @@ class RayStage(Stage):
         views = [self.training_views(images) for images in self.images]
         if self.scene_model.random_background and all(view_set.has_alpha for view_set in views):
             self.background = BackgroundColor("random")
-        self.pools = [FrameSortedPixels.of(view_set) for view_set in views]
+        self.pools = [self.pool_of(view_set) for view_set in views]
         if self.settings.centre_crop:
             self._centres = [FrameSortedPixels.of(view_set, centre=True) for view_set in views]
         self.scene_model.prepare_priors(views, self.weights)
+
+    def pool_of(self, views: Views) -> FrameSortedPixels:
+        """The pixels that batches are drawn from."""
+        return FrameSortedPixels.of(views)
 
     def prepare(self) -> None:
         """Let the model follow the schedule, whose configured iterations it knows."""
@@ -217,7 +230,7 @@ class RayStage(Stage):
         whole = self.settings.times_per_batch
         return None if whole is None else max(1, round(whole * self.batch_size.share))
 
-    def _shown_frames(self, pool: FrameSortedPixels) -> int:
+    def shown_frames(self, pool: FrameSortedPixels) -> int:
         """Number of frames that the curriculum shows by now."""
         share = self.settings.curriculum * self.schedule.total
         iteration = self.position.iteration
