@@ -10,6 +10,7 @@ compute where those do not run.
 | ``compositing`` | ``composite``: weights; ``composite_colors``; ``mean_distance``: depths |
 | ``color_network`` | ``decode``: features and directions → RGB |
 | ``splatting`` | ``splat``: a picture of 3D Gaussians |
+| ``spherical_harmonics`` | ``spherical_harmonics`` of directions |
 | ``photometric`` | the terms that compare rays with images |
 | ``adam`` | ``adam_step``: one step on one tensor; ``add_total_variation_gradient`` |
 """

@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 import torch
-from scipy.special import sph_harm_y
 from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
@@ -18,12 +17,7 @@ from devrf.data.datamodule import SceneDataModule
 from devrf.engine.protocol import ProtocolStage
 from devrf.errors import DevrfError
 from devrf.geometry.rays import Rays
-from devrf.methods.kplanes.decoders import (
-    ExplicitDecoder,
-    HybridDecoder,
-    density_of,
-    spherical_harmonics,
-)
+from devrf.methods.kplanes.decoders import ExplicitDecoder, HybridDecoder, density_of
 from devrf.methods.kplanes.model import KPlanes
 from devrf.methods.kplanes.planes import SPACE, TIME, SixPlanes
 from devrf.methods.kplanes.proposals import drawn_edges, histogram_error, intervals
@@ -108,24 +102,6 @@ def test_a_density_and_its_gradient() -> None:
     torch.testing.assert_close(density, expected)
     density.sum().backward()
     torch.testing.assert_close(raw.grad, expected)
-
-
-def test_directions_are_spherical_harmonics() -> None:
-    torch.manual_seed(0)
-    directions = torch.nn.functional.normalize(torch.randn(20, 3), dim=1)
-    x, y, z = directions.double().unbind(1)
-    theta = z.acos().numpy()
-    phi = torch.atan2(y, x).numpy()
-    found = spherical_harmonics(directions)
-    column = 0
-    for degree in range(4):
-        for order in range(-degree, degree + 1):
-            value = sph_harm_y(degree, abs(order), theta, phi)
-            real = value.imag if order < 0 else value.real
-            scale = math.sqrt(2) if order else 1.0
-            expected = torch.from_numpy(scale * real).float()
-            torch.testing.assert_close(found[:, column], expected, atol=1e-5, rtol=0)
-            column += 1
 
 
 def test_without_harmonics_colors_are_the_same_from_all_sides() -> None:
