@@ -53,6 +53,7 @@ CHOICES = [f"data={name}" for name in ("procedural", "procedural_forward", "inwa
 CHOICES += ["data=nerfstudio", "data=nerfies", "data=neural_3d_video"]
 CHOICES += ["logger=wandb", "method=nerfies", "method=nsff", "method=hypernerf"]
 CHOICES += ["method=dnerf", "method=neural_volumes", "method=tineuvox", "method=kplanes"]
+CHOICES += ["method=gaussians"]
 
 
 def shell(file: Path) -> str:

@@ -6,6 +6,8 @@ HyperNeRF those of their validation rig ("vrig"), of D-NeRF and NSFF the release
 
 from __future__ import annotations
 
+import math
+
 import pytest
 from hydra.utils import get_class, instantiate
 from omegaconf import OmegaConf
@@ -95,6 +97,24 @@ PUBLISHED = {
             "render": 1, "tv": 1e-4, "smooth": 0.01, "smooth_proposals": 0.001, "change": 1e-4,
             "histogram": 1, "distortion": 0,
         },
+    },
+    "gaussians": {
+        "settings": {
+            "width": 256, "depth": 8, "bands": 10, "time_bands": 10, "still": 3000 / 40_000,
+            "harmonics": 3, "harmonics_every": 1000 / 40_000, "densify_from": 500 / 40_000,
+            "densify_until": 15_000 / 40_000, "densify_every": 100 / 40_000,
+            "densify_above": 2e-4, "prune_below": 0.005, "reset_every": 3000 / 40_000,
+            "means_rate": pytest.approx(1.6e-4 / 8e-4), "scales_rate": 1e-3 / 8e-4,
+            "quaternions_rate": 1e-3 / 8e-4, "opacity_rate": pytest.approx(0.05 / 8e-4),
+            "color_rate": 2.5e-3 / 8e-4, "harmonics_rate": 2.5e-3 / 8e-4 / 20,
+            # A hundredth, while the network's rate falls to 1.6e-6 / 8e-4.
+            "means_decay": pytest.approx(math.log(100) / math.log(500), rel=1e-3),
+        },
+        "schedule": {
+            "iterations": 40_000, "learning_rate": 8e-4, "final_learning_rate": 1.6e-6,
+            "eps": 1e-15,
+        },
+        "loss": {"l1": 0.8, "ssim": 0.2},
     },
     "neural_volumes": {
         # Images of 512 x 334 pixels in 512 x 384; seven convolutions.

@@ -18,7 +18,9 @@ from devrf.methods.ray_schedule import RaySchedule, RayTimeline
 from devrf.methods.ray_stage import RayStage
 from devrf.scenes.scene import Views
 
+# What happens in the course of a stage.
 WHOLE = "images of whole size"
+MOVING = "moving images shown"
 
 
 class ImagePlan(RayPlan):
@@ -63,6 +65,7 @@ class ImageStage(RayStage):
         rest: LoadedCheckpoint | None = None,
         half_size: float = 0.0,
         moving_share: float | None = None,
+        static_first: float = 0.0,
     ) -> None:
         """Build the stage.
 
@@ -76,10 +79,12 @@ class ImageStage(RayStage):
             half_size: share of the stage in which images have half of their width and height.
             moving_share: share of moving images in a stage of both captures; None: as
                 ``static_share`` says.
+            static_first: share of such a stage in which all images are static.
         """
-        for name, share in (("half_size", half_size), ("moving_share", moving_share)):
+        shares = {"half_size": half_size, "moving_share": moving_share}
+        for name, share in {**shares, "static_first": static_first}.items():
             expect(share is None or 0 <= share < 1, f"ray_stage.{name}", "in [0, 1)", share)
-        self.half_size = half_size
+        self.half_size, self.static_first = half_size, static_first
         static = static_share if moving_share is None else 1 - moving_share
         super().__init__(model, schedule, loss, step, static, rest)
 
@@ -89,21 +94,26 @@ class ImageStage(RayStage):
 
     def _with_method(self) -> RayTimeline:
         timeline = super()._with_method()
-        whole = round(self.half_size * timeline.total)
-        changes = {WHOLE: whole} if whole else {}
-        return replace(timeline, milestones={**timeline.milestones, **changes})
+        changes = {WHOLE: self.half_size}
+        if self.capture == "both":
+            changes[MOVING] = self.static_first
+        at = {name: round(share * timeline.total) for name, share in changes.items() if share}
+        return replace(timeline, milestones={**timeline.milestones, **at})
 
     def draw_batch(self, views: Views | tuple[Views, ...]) -> ImageBatch:
         """A random image, or some of its rows."""
         sets = views if isinstance(views, tuple) else (views,)
         draw: Any = {"generator": self.generator, "device": self.generator.device}
-        number = int(torch.rand((), **draw) > self.static_share) if len(sets) > 1 else 0
+        iteration, milestones = self.position.iteration, self.schedule.milestones
+        number = 0
+        if len(sets) > 1 and iteration >= milestones.get(MOVING, 0):
+            number = int(torch.rand((), **draw) > self.static_share)
         drawn, pool = sets[number], self.pools[number]
         chosen, _ = pool.draw(1, self.shown_frames(pool), self.generator)
         background = self.background(chosen, self.generator).view(-1, 3)[0]
         image = int(chosen)
         width, height = drawn.cameras.size_of(image)
-        shrink = 2 if self.position.iteration < self.schedule.milestones.get(WHOLE, 0) else 1
+        shrink = 2 if iteration < milestones.get(WHOLE, 0) else 1
         rows = min(max(self.batch_size.rays(self._rays) // width, shrink), height)
         first = 0
         if rows < height:

@@ -1,0 +1,289 @@
+"""Deformable 3D Gaussians (Yang et al., CVPR 2024): a cloud, and a network that moves it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import normalize
+from warp import Kernel
+
+from devrf.data.batch import ImageBatch
+from devrf.engine.protocol import ProtocolStage
+from devrf.errors import DevrfError
+from devrf.geometry.box import Box
+from devrf.geometry.cameras import Cameras
+from devrf.geometry.clock import FrameClock
+from devrf.geometry.space import WORLD, WorldSpace
+from devrf.kernels.ahead import splatting_kernels
+from devrf.kernels.splatting import splat
+from devrf.methods.base import ImageTrainable
+from devrf.methods.gaussians.cloud import Cloud, first_points
+from devrf.methods.gaussians.settings import GaussiansSettings
+from devrf.methods.nerf.networks import SinusoidalEncoding, Trunk
+from devrf.metrics.image import ssim_map
+from devrf.ops.compositing import LEAST_MASS
+from devrf.ops.spherical_harmonics import spherical_harmonics
+from devrf.ops.splatting import LOW_PASS, Gaussians
+from devrf.rendering.output import RenderedImage, RenderOutput
+from devrf.scenes.scene import Scene
+from devrf.system.plain_data import validate
+
+# The least depth of a Gaussian's mean, as a share of the scene's near limit.
+NEAREST = 0.1
+# Standard deviation of the weights of the network's last layer at first: nothing moves.
+STILL = 1e-3
+
+
+class DeformableGaussians(ImageTrainable):
+    """Gaussians at rest, of which a network tells how each has moved at a time.
+
+    See docs/methods/gaussians.md.
+
+    Attributes:
+        cloud: the Gaussians at rest.
+        box: what held them at first.
+        extent: the unit of lengths in the settings, world units.
+        focal: the longest focal length in pixels that was learned from.
+        degree: of the harmonics that are used now.
+        moves_now: whether the network is asked.
+    """
+
+    name: ClassVar[str] = "gaussians"
+    losses: ClassVar[tuple[str, ...]] = ("l1", "ssim")
+    random_background: ClassVar[bool] = True
+
+    def __init__(self, settings: GaussiansSettings | None = None) -> None:
+        """Build the network, and a cloud of one; of published sizes if no settings are given."""
+        super().__init__()
+        self.settings = s = settings or GaussiansSettings()
+        self.cloud = Cloud(s.harmonics)
+        self.encode = SinusoidalEncoding(3, s.bands)
+        self.encode_time = SinusoidalEncoding(1, s.time_bands)
+        inputs = self.encode.size + self.encode_time.size
+        self.trunk = Trunk(inputs, s.width, s.depth, skip=4)
+        self.last = nn.Linear(s.width, 10)
+        nn.init.normal_(self.last.weight, std=STILL)
+        nn.init.zeros_(self.last.bias)
+        self.space = WORLD
+        self._place(Box((-1.0,) * 3, (1.0,) * 3), (0.1, 1.0), (0.0, 1.0), 1.0, 1.0)
+
+    def _place(
+        self,
+        box: Box,
+        limits: tuple[float, float],
+        times: Sequence[float],
+        extent: float,
+        focal: float,
+    ) -> None:
+        self.box, self.depth_limits, self.clock = box, limits, FrameClock(tuple(times))
+        self.extent, self.focal = extent, focal
+        self.degree = self.settings.harmonics
+        self.moves_now = True
+
+    def setup(self, scene: Scene) -> None:
+        """Take bounds and times; begin the cloud.
+
+        Raises:
+            DevrfError: the scene is not in world space.
+        """
+        if not isinstance(scene.space, WorldSpace):
+            raise DevrfError(
+                f"method: gaussians needs a scene in world space, and {scene.name} is unbounded or "
+                "seen from one side; give data.space=world, or use another method"
+            )
+        bounds = scene.bounds
+        cameras = scene.static.train.cameras
+        middle = cameras.positions.mean(dim=0)
+        extent = 1.1 * float((cameras.positions - middle).norm(dim=1).max())
+        extent = max(extent, bounds.whole.longest / 2)
+        focal = max(float(c.train.cameras.focal.max()) for c in scene.captures.values())
+        limits = (bounds.near, bounds.far)
+        self._place(bounds.whole, limits, scene.clock.times, extent, focal)
+        self.cloud.begin(*first_points(scene, self.settings), self.settings.start_opacity)
+
+    def config(self) -> dict[str, Any]:
+        """Settings, place and times, and the units of lengths."""
+        return {
+            "settings": asdict(self.settings),
+            "box": [list(self.box.low), list(self.box.high)],
+            "limits": list(self.depth_limits),
+            "times": list(self.clock.times),
+            "extent": self.extent,
+            "focal": self.focal,
+        }
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> DeformableGaussians:
+        """A network of the same size in the same place, and a cloud of one."""
+        model = cls(validate(GaussiansSettings, config["settings"]))
+        low, high = config["box"]
+        model._place(
+            validate(Box, {"low": low, "high": high}),
+            validate(tuple[float, float], config["limits"]),
+            validate(FrameClock, config).times,
+            validate(float, config["extent"]),
+            validate(float, config["focal"]),
+        )
+        return model
+
+    def moved(self, time: float) -> tuple[Tensor, Tensor, Tensor] | None:
+        """δ of means (N, 3), quaternions (N, 4) and logarithms of scales (N, 3); None at rest.
+
+        They grow from 0 at time 0 to the network's at the first frame after it.
+        """
+        begun = min(1.0, time * (len(self.clock) - 1))
+        if begun == 0 or not self.moves_now:
+            return None
+        means = self.cloud.means.detach()
+        place = (means - means.new_tensor(self.box.middle)) * (2 / self.box.longest)
+        encoded = self.encode_time(means.new_full((1, 1), time)).expand(len(means), -1)
+        values = self.trunk(torch.cat([self.encode(place), encoded], dim=1))
+        mean, quaternion, scale = (begun * self.last(values)).split([3, 4, 3], dim=1)
+        return mean, quaternion, scale
+
+    def gaussians(self, time: float, eye: Tensor) -> Gaussians:
+        """The cloud at a time, as it looks from a point (3,)."""
+        moves = self.moved(time)
+        count = (self.degree + 1) ** 2
+        basis = self.cloud.means.new_ones(len(self.cloud), 1)
+        if count > 1:
+            means = self.cloud.means if moves is None else self.cloud.means + moves[0]
+            basis = spherical_harmonics(normalize(means.detach() - eye, dim=1))[:, :count]
+        return self.cloud.gaussians(moves, basis)
+
+    def forward(self, batch: ImageBatch) -> RenderOutput:
+        """Render an image; while the cloud learns, note where it lacks detail."""
+        camera = batch.camera
+        gaussians = self.gaussians(batch.time, camera.positions[0])
+        shift = None
+        if self.cloud.means.requires_grad and torch.is_grad_enabled():
+            shift = torch.zeros_like(gaussians.means[:, :2], requires_grad=True)
+            half = shift.new_tensor([camera.width / 2, camera.height / 2])
+            shift.register_hook(  # type: ignore[no-untyped-call]
+                lambda slopes: self.cloud.note(slopes * half)
+            )
+        image = splat(gaussians, camera, NEAREST * self.depth_limits[0], shift)
+        color = image.color + image.transmittance[:, None] * batch.background
+        depth = image.depth / (1 - image.transmittance).clamp(min=LEAST_MASS)
+        return RenderOutput(color=color, depth=depth, transmittance=image.transmittance)
+
+    def loss_terms(
+        self, output: RenderOutput, batch: ImageBatch, names: Collection[str]
+    ) -> dict[str, Tensor]:
+        """``l1``, the mean absolute error; ``ssim``, 1 − SSIM."""
+        truth = batch.color
+        if batch.valid is not None:
+            truth = torch.where(batch.valid[:, None], truth, output.color)
+        terms = {"l1": (output.color - truth).abs().mean()}
+        if "ssim" in names:
+            shape = (batch.camera.height, batch.camera.width, 3)
+            terms["ssim"] = 1 - ssim_map(output.color.view(shape), truth.view(shape)).mean()
+        return {name: term for name, term in terms.items() if name in names}
+
+    def parts(self) -> dict[str, Iterable[nn.Parameter]]:
+        """The cloud; the network that moves it."""
+        motion = [*self.trunk.parameters(), *self.last.parameters()]
+        return {"canonical": self.cloud.parameters(), "deformation": motion}
+
+    def param_groups(self) -> list[dict[str, Any]]:
+        """A group for each part of the cloud; the network."""
+        s = self.settings
+        rates = {name: getattr(s, f"{name}_rate") for name in Cloud.parts}
+        rates["means"] *= self.extent
+        groups: list[dict[str, Any]] = []
+        for group in super().param_groups():
+            if group["name"] != "canonical":
+                groups.append(group)
+                continue
+            for name, rate in rates.items():
+                decay = 1.0 if s.all_decay else s.means_decay if name == "means" else 0.0
+                own = {"name": name, "params": [getattr(self.cloud, name)]}
+                groups.append({**own, "rate": rate, "decay": decay})
+        return groups
+
+    def begin_stage(self, step: ProtocolStage) -> None:
+        """Freeze parts; a cloud that learns begins to count its growths."""
+        super().begin_stage(step)
+        self.cloud.grown.zero_()
+
+    def growths(self, total: int) -> Sequence[int]:
+        """As the settings say, if the cloud learns."""
+        s = self.settings
+        if not self.cloud.means.requires_grad:
+            return ()
+        count = math.floor((s.densify_until - s.densify_from) / s.densify_every + 1e-6) + 1
+        return [round((s.densify_from + k * s.densify_every) * total) for k in range(count)]
+
+    def grow(self, count: int) -> Mapping[str, Tensor] | None:
+        """Prune, clone and split, once for each count."""
+        s = self.settings
+        if count <= int(self.cloud.grown):
+            return None
+        every = round(s.reset_every / s.densify_every)
+        return self.cloud.grow(s, self.extent, reset=every > 0 and count % every == 0)
+
+    def milestones(self, total: int) -> dict[str, int]:
+        """The iteration from which something moves."""
+        return {"motion begun": round(self.settings.still * total)} if self.settings.still else {}
+
+    def on_iteration(self, step: int, total: int) -> None:
+        """Let the cloud move, and let harmonics of one more degree count, in time."""
+        s = self.settings
+        self.moves_now = step >= s.still * total
+        if self.cloud.means.requires_grad:
+            self.degree = s.harmonics
+            if s.harmonics_every:
+                self.degree = min(s.harmonics, int(step / (s.harmonics_every * total)))
+
+    def rehearsed(self, factor: float) -> DeformableGaussians:
+        """A small cloud and a small network."""
+        return type(self)(self.settings.rehearsed(factor))
+
+    @property
+    def kernels(self) -> Sequence[Kernel]:
+        """Those of splatting."""
+        return splatting_kernels()
+
+    def at(self, time: float, *, half: bool = False) -> GaussiansView:
+        """The scene at ``time``."""
+        return GaussiansView(self, time)
+
+
+@dataclass(frozen=True)
+class GaussiansView:
+    """Gaussians at one time."""
+
+    model: DeformableGaussians
+    time: float
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether it is time 0."""
+        return self.model.clock.at(self.time).after == 0
+
+    @torch.no_grad()
+    def image(self, camera: Cameras, background: Tensor, crop: Box | None) -> RenderedImage:
+        """The picture; of a longer lens than was learned from, Gaussians are no thinner there."""
+        model = self.model
+        gaussians = model.gaussians(self.time, camera.positions[0])
+        if crop is not None:
+            keep = crop.contains(gaussians.means)
+            gaussians = Gaussians(*(value[keep] for value in vars(gaussians).values()))
+        focal = float(camera.focal.max())
+        if focal > model.focal:
+            # What LOW_PASS was in the pictures that were learned from, and is not here.
+            depth = (gaussians.means - camera.positions[0]) @ camera.forwards[0]
+            hidden = LOW_PASS * (1 / model.focal**2 - 1 / focal**2)
+            wide = gaussians.scales.square() + hidden * depth.square()[:, None]
+            gaussians = replace(gaussians, scales=wide.sqrt())
+        image = splat(gaussians, camera, NEAREST * model.depth_limits[0])
+        opacity = 1 - image.transmittance
+        color = image.color + image.transmittance[:, None] * background
+        offset = (camera.pixel_grid() - camera.center[0]) / camera.focal[0]
+        slant = (1 + offset.square().sum(dim=1)).sqrt()  # of a ray, to the camera's axis
+        return RenderedImage(color, slant * image.depth / opacity.clamp(min=LEAST_MASS), opacity)

@@ -1,0 +1,174 @@
+"""Deformable Gaussians: what moves and when, views, checkpoints, resume, and that they learn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+
+from devrf.checkpoints.checkpoint import LoadedCheckpoint
+from devrf.data.batch import ImageBatch
+from devrf.data.datamodule import SceneDataModule
+from devrf.engine.protocol import ProtocolStage
+from devrf.errors import DevrfError
+from devrf.geometry.box import Box
+from devrf.geometry.cameras import Cameras
+from devrf.methods.gaussians.cloud import Cloud
+from devrf.methods.gaussians.model import DeformableGaussians
+from devrf.methods.gaussians.settings import GaussiansSettings
+from devrf.methods.image_stage import ImageStage
+from devrf.methods.ray_schedule import RaySchedule
+from devrf.rendering.renderer import Renderer
+from devrf.scenes.scene import Scene
+
+TINY = GaussiansSettings(
+    start_points=150, hull_side=16, start_opacity=0.5, start_size=0.7, max_points=220, harmonics=1,
+    harmonics_every=0.5, width=16, depth=2, bands=2, time_bands=2, still=0.0, means_rate=0.1,
+    densify_from=0.25, densify_until=0.75, densify_every=0.25, densify_above=0.0, densify_share=0.2,
+    split_above=0.0, prune_below=0.02, reset_every=0.0, all_decay=True,
+)  # fmt: skip
+STATIC = ProtocolStage("canonical", "static")
+MOTION = ProtocolStage("deformation", "dynamic", frozen=["canonical"], builds_on="canonical")
+
+
+def stage(
+    step: ProtocolStage | None = None,
+    rest: LoadedCheckpoint | None = None,
+    settings: GaussiansSettings = TINY,
+    iterations: int = 8,
+) -> ImageStage:
+    rates = {"learning_rate": 6e-3, "final_learning_rate": 6e-4, "betas": (0.9, 0.99), "eps": 1e-15}
+    schedule = RaySchedule(iterations=iterations, rays=10_000, iterations_per_step=2, **rates)
+    step = step or ProtocolStage("joint", "both")
+    model = DeformableGaussians(settings)
+    return ImageStage(model, schedule, {"l1": 1.0, "ssim": 0.2}, step, rest=rest, half_size=0.25)
+
+
+def test_nothing_moves_at_time_0_and_a_frame_later_all_does() -> None:
+    model = DeformableGaussians(TINY)
+    model.clock = type(model.clock)((0.0, 0.5, 1.0))
+    with torch.no_grad():
+        model.last.bias.copy_(torch.arange(10.0))
+    assert model.moved(0.0) is None
+    full, half = model.moved(0.5), model.moved(0.25)
+    assert full is not None and half is not None
+    expected = [[[0.0, 1, 2]], [[3.0, 4, 5, 6]], [[7.0, 8, 9]]]
+    for move, begun, value in zip(full, half, expected, strict=True):
+        torch.testing.assert_close(move, torch.tensor(value), atol=0.05, rtol=0)
+        torch.testing.assert_close(begun, 0.5 * move, atol=0.05, rtol=0)
+
+
+def test_a_view_is_the_splatted_cloud_before_its_background() -> None:
+    model = DeformableGaussians(replace(TINY, harmonics=0))
+    model.depth_limits = (1.0, 9.0)
+    model.cloud.begin(
+        torch.tensor([[0.0, 0.0, 0.0], [0.6, 0.0, 0.0]]),
+        torch.tensor([[1.0, 0.5, 0.0], [0.0, 0.0, 1.0]]),
+        torch.tensor([1e-4, 1e-4]),
+        0.8,
+    )
+    eye = torch.tensor([[0.0, -4.0, 0.0]])
+    camera = Cameras.looking_at(eye, torch.zeros(1, 3), focal=20.0, width=9, height=5)
+    model.focal = 20.0
+    renderer = Renderer(model)
+    image = renderer.view(camera, 0, 0.0, 0.5)
+    pixel = image.color.view(5, 9, 3)
+    # The first lies in the middle of the middle pixel, the second three pixels to the right.
+    assert pixel[2, 4].tolist() == pytest.approx([0.8 + 0.1, 0.4 + 0.1, 0.1])
+    assert pixel[2, 7].tolist() == pytest.approx([0.1, 0.1, 0.9])
+    depth = image.depth.view(5, 9)
+    assert depth[2, 4].item() == pytest.approx(4.0)
+    assert depth[2, 7].item() == pytest.approx((16 + 0.36) ** 0.5)  # along the ray
+    assert image.opacity.view(5, 9)[2, 4].item() == pytest.approx(0.8)
+    cropped = renderer.view(camera, 0, 0.0, 0.5, Box((0.3, -1.0, -1.0), (1.0, 1.0, 1.0)))
+    opacity = cropped.opacity.view(5, 9)
+    assert opacity[2, 4] == 0 and opacity[2, 7].item() == pytest.approx(0.8)
+
+
+def test_a_longer_lens_shows_gaussians_as_wide() -> None:
+    model = DeformableGaussians(replace(TINY, harmonics=0))
+    model.cloud.begin(torch.zeros(1, 3), torch.ones(1, 3), torch.tensor([1e-4]), 0.8)
+    model.focal = 20.0
+    eye = torch.tensor([[0.0, -4.0, 0.0]])
+    camera = Cameras.looking_at(eye, torch.zeros(1, 3), focal=20.0, width=9, height=9)
+    near = Renderer(model).view(camera, 0, 0.0, 0.0).opacity.view(9, 9)
+    large = Renderer(model).view(camera.resized(27, 27), 0, 0.0, 0.0).opacity.view(27, 27)
+    torch.testing.assert_close(large[1::3, 1::3], near, atol=1e-3, rtol=0)
+
+
+def test_a_stopped_run_goes_on_to_the_same_cloud(stopped_and_resumed: Callable[..., Any]) -> None:
+    whole, stopped, resumed = stopped_and_resumed(stage, at=6)
+    cloud = resumed.scene_model.cloud
+    assert len(cloud) == len(whole.scene_model.cloud) > 150
+    assert int(cloud.grown) == 3 and resumed.scene_model.degree == 1
+    state = resumed.optimizer.state[cloud.means]
+    assert state["mean"].shape == cloud.means.shape
+
+
+def test_a_checkpoint_shows_what_was_learned(
+    fit: Callable[..., ImageStage],
+    stored: Callable[[ImageStage], LoadedCheckpoint],
+    tiny_scene: Scene,
+) -> None:
+    learned = fit(stage())
+    model = stored(learned).model
+    cameras = tiny_scene.dynamic.test.cameras
+    for time in (0.0, 0.7):
+        ours, theirs = (
+            Renderer(m).view(cameras, 0, time, 1.0) for m in (learned.scene_model, model)
+        )
+        assert torch.equal(ours.color, theirs.color) and torch.equal(ours.depth, theirs.depth)
+    assert model.at(0.0).at_rest and not model.at(1.0).at_rest
+
+
+def test_in_two_stages_the_cloud_stays_while_motion_is_learned(
+    fit: Callable[..., ImageStage],
+) -> None:
+    first = fit(stage(STATIC))
+    cloud = first.scene_model.cloud
+    assert len(cloud) > 150 and first.events["grids grown"] == 3
+    before = {name: getattr(cloud, name).detach().clone() for name in Cloud.parts}
+    second = fit(stage(MOTION, first.result()))
+    model = second.scene_model
+    assert [group["name"] for group in second.optimizer.param_groups] == ["deformation"]
+    assert all(torch.equal(getattr(model.cloud, name), value) for name, value in before.items())
+    assert model.last.bias.any() and second.events["grids grown"] == 0 and model.degree == 1
+
+
+def test_the_loss_falls(fit: Callable[..., ImageStage]) -> None:
+    errors = []
+
+    for iterations in (2, 40):
+        learned = fit(stage(iterations=iterations))
+        views = learned.training_views("dynamic")
+        image = Renderer(learned.scene_model).view(views.cameras, 0, float(views.times[0]), 1.0)
+        alpha = views.pixels[0].float().flatten(0, 1)[:, 3:] / 255
+        truth = 1 + alpha * (views.pixels[0].float().flatten(0, 1)[:, :3] / 255 - 1)
+        errors.append(float((image.color - truth).abs().mean()))
+    assert errors[1] < 0.6 * errors[0]
+
+
+def test_pixels_that_are_not_valid_do_not_count(fit: Callable[..., ImageStage]) -> None:
+    model = fit(stage(iterations=2)).scene_model
+    camera = Cameras.looking_at(
+        torch.tensor([[4.0, 0.0, 0.5]]), torch.zeros(1, 3), focal=20.0, width=12, height=12
+    )
+    batch = ImageBatch(
+        camera, torch.ones(144, 3), None, torch.zeros(144, dtype=torch.bool), torch.zeros(3), 1.0, 0
+    )
+    terms = model.loss_terms(model(batch), batch, ("l1", "ssim"))
+    assert terms["l1"] == 0 and terms["ssim"].item() == pytest.approx(0, abs=1e-5)
+    seen = model.loss_terms(model(batch), replace(batch, valid=None), ("l1",))
+    assert set(seen) == {"l1"} and seen["l1"] > 0
+
+
+def test_what_is_not_in_world_space_is_refused(
+    fit: Callable[..., ImageStage], serve: Callable[[Scene], SceneDataModule], tiny_toy: Scene
+) -> None:
+    with pytest.raises(
+        DevrfError, match="gaussians needs a scene in world space, and .* use another"
+    ):
+        fit(stage(), data=serve(tiny_toy))
