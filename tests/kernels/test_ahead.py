@@ -11,12 +11,14 @@ from devrf.engine.protocol import Protocol
 from devrf.engine.stage import Stage
 from devrf.geometry.box import Box
 from devrf.kernels.adam import adam_kernel, adam_step
-from devrf.kernels.ahead import compile_ahead, grid_kernels
+from devrf.kernels.ahead import compile_ahead, grid_kernels, splatting_kernels
 from devrf.kernels.march import march_kernel
 from devrf.kernels.trilinear import add_kernel, interpolate, interpolate_kernel, slope_kernel
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.dnerf.model import DNeRF
+from devrf.methods.gaussians.model import DeformableGaussians
+from devrf.methods.image_stage import ImageStage
 from devrf.methods.kplanes.model import KPlanes
 from devrf.methods.kplanes.settings import KPlanesSettings
 from devrf.methods.ray_stage import RayStage
@@ -55,5 +57,6 @@ def test_methods_with_grids_say_which_kernels_they_take() -> None:
     voxels = kernels(RayStage, model=TiNeuVox(TiNeuVoxSettings(side=8, channels=9)))
     assert interpolate_kernel(9) in voxels and march_kernel(False) not in voxels
     assert kernels(RayStage, model=DNeRF()) == []
+    assert kernels(ImageStage, model=DeformableGaussians()) == splatting_kernels()
     stage = kernels(CanonicalStage, architecture=Architecture(channels=11))
     assert {march_kernel(False), interpolate_kernel(3), interpolate_kernel(11)} <= set(stage)

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from warp import Kernel
 
 from devrf.data.batch import ImageBatch, RayBatch
+from devrf.engine.needs import tensor_bytes
 from devrf.engine.protocol import ProtocolStage
 from devrf.errors import DevrfError
 from devrf.kernels.ahead import grid_kernels
@@ -196,6 +197,11 @@ class Trainable(Renderable, Generic[Batch]):
     def sample_outputs(self) -> int:
         """Numbers that all layers give for one sample of a ray, to estimate memory by."""
         return sum(layer.out_features for layer in self.modules() if isinstance(layer, nn.Linear))
+
+    @property
+    def most_bytes(self) -> int:
+        """Bytes of its parameters, of those that grow at their largest."""
+        return tensor_bytes(self.parameters())
 
     @property
     def has_hull(self) -> bool:

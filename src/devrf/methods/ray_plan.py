@@ -60,7 +60,7 @@ class RayPlan(StagePlan):
         """Images, the whole of the model, and a batch."""
         schedule: RaySchedule = self.settings["schedule"]
         rays = max(schedule.rays, schedule.rays_without_hull or 0)
-        learned = tensor_bytes(self.model.parameters())
+        learned = self.model.most_bytes
         width = "ray_stage.model.settings.width"
         parts = {
             SIZE: float(tensor_bytes(scene.captures.values())),

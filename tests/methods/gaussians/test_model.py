@@ -165,6 +165,13 @@ def test_pixels_that_are_not_valid_do_not_count(fit: Callable[..., ImageStage]) 
     assert set(seen) == {"l1"} and seen["l1"] > 0
 
 
+def test_memory_is_that_of_as_many_as_there_may_be() -> None:
+    model = DeformableGaussians(replace(TINY, max_points=1001))
+    network = sum(p.numel() for p in (*model.trunk.parameters(), *model.last.parameters()))
+    # 3 + 3 + 4 + 1 numbers, and the colours of four harmonics; and the one that is there.
+    assert model.most_bytes == 4 * (network + 1002 * (11 + 3 * 4))
+
+
 def test_what_is_not_in_world_space_is_refused(
     fit: Callable[..., ImageStage], serve: Callable[[Scene], SceneDataModule], tiny_toy: Scene
 ) -> None:

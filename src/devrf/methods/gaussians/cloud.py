@@ -91,21 +91,26 @@ class Cloud(StoredShape):
 
         ``basis`` (N, K) are the harmonics of the directions to them.
         """
-        means, scales = self.means, self.scales.exp()
-        quaternions = normalize(self.quaternions, dim=1)
+        parts: tuple[Tensor, Tensor, Tensor] = (
+            self.means,
+            normalize(self.quaternions, dim=1),
+            self.scales,
+        )
         if moves is not None:
-            means, quaternions = means + moves[0], quaternions + moves[1]
-            scales = (self.scales + moves[2]).exp()
+            parts = (parts[0] + moves[0], parts[1] + moves[1], parts[2] + moves[2])
+        means, quaternions, scales = parts
         color: Tensor = GREY + FACTORS[0] * self.color
         if basis.shape[1] > 1:
             used = self.harmonics[:, : basis.shape[1] - 1]
             color = color + (basis[:, 1:, None] * used).sum(dim=1)
-        return Gaussians(means, scales, quaternions, self.opacity.sigmoid(), color.clamp(min=0))
+        opacity, color = self.opacity.sigmoid(), color.clamp(min=0)
+        return Gaussians(means, scales.exp(), quaternions, opacity, color)
 
     def note(self, slopes: Tensor) -> None:
         """Count slopes of the centres (N, 2), per half of the image, of those that were seen."""
         length = slopes.norm(dim=1)
-        self.seen += torch.stack([length, (length > 0).to(length)], dim=1)
+        shown = (length > 0) & length.isfinite()
+        self.seen += torch.stack([length.where(shown, 0.0), shown.to(length)], dim=1)
 
     @torch.no_grad()
     def grow(self, settings: GaussiansSettings, extent: float, *, reset: bool) -> dict[str, Tensor]:

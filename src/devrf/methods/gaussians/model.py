@@ -13,6 +13,7 @@ from torch.nn.functional import normalize
 from warp import Kernel
 
 from devrf.data.batch import ImageBatch
+from devrf.engine.needs import tensor_bytes
 from devrf.engine.protocol import ProtocolStage
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
@@ -243,6 +244,12 @@ class DeformableGaussians(ImageTrainable):
     def rehearsed(self, factor: float) -> DeformableGaussians:
         """A small cloud and a small network."""
         return type(self)(self.settings.rehearsed(factor))
+
+    @property
+    def most_bytes(self) -> int:
+        """Of as many Gaussians as there may be."""
+        of_one = tensor_bytes(self.cloud.parameters()) // len(self.cloud)
+        return super().most_bytes + of_one * self.settings.max_points
 
     @property
     def kernels(self) -> Sequence[Kernel]:
