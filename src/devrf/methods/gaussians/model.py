@@ -229,17 +229,18 @@ class DeformableGaussians(ImageTrainable):
         return self.cloud.grow(s, self.extent, reset=every > 0 and count % every == 0)
 
     def milestones(self, total: int) -> dict[str, int]:
-        """The iteration from which something moves."""
-        return {"motion begun": round(self.settings.still * total)} if self.settings.still else {}
+        """The iteration from which something moves, where the cloud learns, too."""
+        still = round(self.settings.still * total)
+        return {"motion begun": still} if still and self.cloud.means.requires_grad else {}
 
     def on_iteration(self, step: int, total: int) -> None:
         """Let the cloud move, and let harmonics of one more degree count, in time."""
         s = self.settings
+        if not self.cloud.means.requires_grad:
+            return
         self.moves_now = step >= s.still * total
-        if self.cloud.means.requires_grad:
-            self.degree = s.harmonics
-            if s.harmonics_every:
-                self.degree = min(s.harmonics, int(step / (s.harmonics_every * total)))
+        if s.harmonics_every:
+            self.degree = min(s.harmonics, int(step / (s.harmonics_every * total)))
 
     def rehearsed(self, factor: float) -> DeformableGaussians:
         """A small cloud and a small network."""
