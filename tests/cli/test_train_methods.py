@@ -25,6 +25,7 @@ SMALL = {
     "nsff": (*NARROW, f"{SETTINGS}.depth=2", f"{SETTINGS}.samples=8"),
     "tineuvox": (f"{SETTINGS}.width=8", f"{SETTINGS}.side=8", HULL),
     "kplanes": (*NARROW, HULL, f"{SETTINGS}.resolution=4", f"{SETTINGS}.channels=2"),
+    "gaussians": (f"{SETTINGS}.width=8", f"{SETTINGS}.hull_side=16"),
     "neural_volumes": (
         f"{SETTINGS}.code=4",
         f"{SETTINGS}.encoder_views=2",
@@ -52,6 +53,7 @@ SHORT = ("ray_stage.schedule.iterations=4", "ray_stage.schedule.rays=64", *FILM)
         ("neural_volumes", "dynamic", "tiny_data"),
         ("tineuvox", "two_stage", "tiny_data"),
         ("kplanes", "joint", "tiny_data"),
+        ("gaussians", "two_stage", "tiny_data"),
         ("tineuvox", "dynamic", "tiny_facing"),
     ],
 )

@@ -24,6 +24,7 @@ METHODS = {
     "neural_volumes": "Neural Volumes",
     "tineuvox": "TiNeuVox",
     "kplanes": "K-Planes",
+    "gaussians": "Gaussians",
 }
 # As the paper's tables call them.
 ABLATIONS = {
