@@ -58,7 +58,11 @@ def picture(how: object, tensors: list[Tensor], camera: Cameras = CAMERA) -> Spl
 
 
 def compared(
-    tensors: list[Tensor], rng: torch.Generator, camera: Cameras = CAMERA, tolerance: float = 1e-5
+    tensors: list[Tensor],
+    rng: torch.Generator,
+    camera: Cameras = CAMERA,
+    tolerance: float = 1e-5,
+    of_slopes: float = 2e-5,
 ) -> tuple[SplatImage, list[Tensor]]:
     """The picture and the gradients of a random linear function; both are the definition's."""
     pixels = camera.width * camera.height
@@ -78,7 +82,7 @@ def compared(
         scale = other.abs().max().clamp(min=1e-6) if len(other) else 1.0
         error = f"gradient of {name}"
         torch.testing.assert_close(
-            one.double() / scale, other / scale, atol=2e-5, rtol=0, msg=error
+            one.double() / scale, other / scale, atol=of_slopes, rtol=0, msg=error
         )
     return ours, slopes
 
@@ -120,6 +124,14 @@ def test_one_that_fills_a_wide_picture(rng: torch.Generator) -> None:
     tensors = cloud(3, rng, spread=0.05, size=0.5)
     image, _ = compared(tensors, rng, camera, tolerance=3e-5)
     assert (image.transmittance.view(44, 400) < 0.9).sum(dim=1).max() > 200
+
+
+def test_needles(rng: torch.Generator) -> None:
+    # Hundreds of pixels long, and thinner than one.
+    tensors = cloud(20, rng)
+    tensors[1] = torch.tensor([[6.0, 1e-3, 1e-3]]).repeat(20, 1)
+    image, _ = compared(tensors, rng, tolerance=5e-4, of_slopes=2e-3)
+    assert (image.transmittance < 0.9).sum() > 100
 
 
 def test_one_pixel_and_nothing_to_see(rng: torch.Generator) -> None:

@@ -242,7 +242,9 @@ def project_kernel(
     xx = wp.dot(axis_x, axis_x) + wp.static(LOW_PASS)
     xy = wp.dot(axis_x, axis_y)
     yy = wp.dot(axis_y, axis_y) + wp.static(LOW_PASS)
-    determinant = xx * yy - xy * xy
+    # xx yy − xy², without the difference of two large numbers that a needle has.
+    determinant = wp.length_sq(wp.cross(axis_x, axis_y))
+    determinant += wp.static(LOW_PASS) * (xx + yy - wp.static(LOW_PASS))
     splat.xx = yy / determinant
     splat.xy = -xy / determinant
     splat.yy = xx / determinant

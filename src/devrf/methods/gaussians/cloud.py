@@ -181,7 +181,7 @@ def first_points(scene: Scene, settings: GaussiansSettings) -> tuple[Tensor, Ten
 def hull_surface(views: Views, box: Box, side: int) -> Tensor:
     """Points (N, 3) of a grid over the box on the surface of the visual hull, a little moved."""
     shape = box.grid_shape(side**3)
-    hull = visual_hull(views, box, shape)
+    hull = visual_hull(views, box, shape, whole_in_view=True)
     outside = pad(~hull, (1,) * 6, value=True)
     near = torch.zeros_like(outside)
     for axis in range(3):

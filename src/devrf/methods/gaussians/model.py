@@ -34,7 +34,8 @@ from devrf.rendering.output import RenderedImage, RenderOutput
 from devrf.scenes.scene import Scene
 from devrf.system.plain_data import validate
 
-# The least depth of a Gaussian's mean, as a share of the scene's near limit.
+# The least depth of a Gaussian's mean in pictures, as a share of the scene's near limit; it is that
+# limit while they are learned: before each lens they would explain its picture, and spoil others.
 NEAREST = 0.1
 # Standard deviation of the weights of the network's last layer at first: nothing moves.
 STILL = 1e-3
@@ -168,7 +169,7 @@ class DeformableGaussians(ImageTrainable):
             shift.register_hook(  # type: ignore[no-untyped-call]
                 lambda slopes: self.cloud.note(slopes * half)
             )
-        image = splat(gaussians, camera, NEAREST * self.depth_limits[0], shift)
+        image = splat(gaussians, camera, self.depth_limits[0], shift)
         color = image.color + image.transmittance[:, None] * batch.background
         depth = image.depth / (1 - image.transmittance).clamp(min=LEAST_MASS)
         return RenderOutput(color=color, depth=depth, transmittance=image.transmittance)
