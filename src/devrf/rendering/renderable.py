@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from devrf.geometry.box import Box
 from devrf.geometry.space import Space
+from devrf.ops.splatting import Gaussians
 from devrf.rendering.view import ImageView, SurfaceField, View
 from devrf.system.stored_class import StoredClass
 
@@ -69,6 +70,13 @@ class Renderable(StoredClass, nn.Module, ABC):
         """The scene at ``time`` as a field of which a surface can be taken; None: there is none.
 
         Of a method whose surface is not carried through time by :meth:`forward_map`.
+        """
+        return None
+
+    def gaussians_at(self, time: float) -> Gaussians | None:
+        """The scene at ``time`` as Gaussians, as many at each time; None: it is none of Gaussians.
+
+        Their colours are those that are the same from everywhere.
         """
         return None
 

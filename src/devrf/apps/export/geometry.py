@@ -62,6 +62,11 @@ class ExportSettings(Options):
         ascending = "ascending times from 0 to 1"
         expect(rising, "export.times", ascending, list(self.times))
 
+    @property
+    def as_splats(self) -> bool:
+        """Whether Gaussians are asked for."""
+        return self.format == "splats" or (self.format == "usd" and self.content == "splats")
+
     def export_times(self, clock: FrameClock) -> tuple[float, ...]:
         """The times to export, of a scene whose training frames have the clock's times."""
         if self.times is not None:

@@ -9,11 +9,11 @@ from pathlib import Path
 from devrf.apps.export.geometry import ExportSettings, MovingMesh, UpFrame, carried, seen_points
 from devrf.apps.export.gltf import write_gltf
 from devrf.apps.export.sequence import Drawn, mesh_files, point_file, write_sequence
-from devrf.apps.export.splats import write_splats, write_usd_splats
+from devrf.apps.export.splats import MovingGaussians, write_splats, write_usd_splats
 from devrf.apps.export.surface import surface_of
 from devrf.apps.export.usd import write_usd
 from devrf.checkpoints.checkpoint import Viewpoints
-from devrf.errors import DevrfError
+from devrf.errors import DevrfError, expect
 from devrf.evaluation.held_out import background_value
 from devrf.geometry.cameras import Cameras
 from devrf.rendering.renderable import Renderable
@@ -23,12 +23,9 @@ from devrf.system.progress import followed
 log = logging.getLogger(__name__)
 
 # Formats that move one mesh: the name of what is written, and how.
-SINGLE = {
-    "gltf": ("scene.glb", write_gltf),
-    "usd": ("scene.usdc", write_usd),
-    "splats": ("splats", write_splats),
-    "usd_splats": ("splats.usdc", write_usd_splats),
-}
+SINGLE = {"gltf": ("scene.glb", write_gltf), "usd": ("scene.usdc", write_usd)}
+# Formats of Gaussians.
+SPLATS = {"splats": ("splats", write_splats), "usd": ("splats.usdc", write_usd_splats)}
 
 
 def export_scene(
@@ -40,7 +37,15 @@ def export_scene(
         DevrfError: the method has no such geometry, or it is empty.
     """
     times = settings.export_times(viewpoints.clock) if model.moves else (0.0,)
-    if not _takes_surface(model, settings):
+    own = MovingGaussians.of_model(model, times) if settings.as_splats else None
+    if own is not None:
+        expect(
+            settings.part == "all", "export.part", "all of a method's own Gaussians", settings.part
+        )
+        path = _write_splats(folder, own, viewpoints, settings)
+        count = len(own.of_time[0].means)
+        log.info("%d Gaussians at %d times written to %s", count, len(times), path)
+    elif not _takes_surface(model, settings):
         path = folder / "points"
         max_points = _write_points(path, model, viewpoints, settings, times)
         log.info(
@@ -88,7 +93,7 @@ def _takes_surface(model: Renderable, settings: ExportSettings) -> bool:
             f"export.part: only a surface that is carried through time has a {settings.part} part; "
             "give export.part=all"
         )
-    if wanted and not carries and settings.format in SINGLE:
+    if wanted and not carries and settings.format in (*SINGLE, *SPLATS):
         raise DevrfError(
             f"export.format: method={model.name} has a mesh of its own at each time, and "
             f"{settings.format} moves one; give export.format=ply or obj"
@@ -106,15 +111,26 @@ def _write_mesh(
     folder: Path, mesh: MovingMesh, viewpoints: Viewpoints, settings: ExportSettings
 ) -> Path:
     """Write in the wanted format; the file, or the folder of files."""
+    if settings.as_splats:
+        return _write_splats(folder, MovingGaussians.on_surface(mesh), viewpoints, settings)
     if settings.format not in SINGLE:
         path = folder / settings.format
         drawn = mesh_files(mesh, viewpoints.offset)
         write_sequence(path, settings.format, mesh.times, drawn, "surface", settings.seconds)
         return path
-    as_splats = settings.format == "usd" and settings.content == "splats"
-    name, write = SINGLE["usd_splats" if as_splats else settings.format]
+    name, write = SINGLE[settings.format]
     frame = UpFrame.of(viewpoints.static, settings.up, settings.metres, viewpoints.offset)
     write(folder / name, mesh, _named_cameras(viewpoints), frame, settings.seconds)
+    return folder / name
+
+
+def _write_splats(
+    folder: Path, moving: MovingGaussians, viewpoints: Viewpoints, settings: ExportSettings
+) -> Path:
+    """Write Gaussians; the file, or the folder of files."""
+    name, write = SPLATS[settings.format]
+    frame = UpFrame.of(viewpoints.static, settings.up, settings.metres, viewpoints.offset)
+    write(folder / name, moving, _named_cameras(viewpoints), frame, settings.seconds)
     return folder / name
 
 

@@ -1,8 +1,8 @@
-"""A moving surface as 3D Gaussians, for viewers of splats: a PLY file a time, or USD."""
+"""3D Gaussians for viewers of splats, a method's own or on a moving surface: PLY files, or USD."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,10 +11,13 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize, pad
 
 from devrf.apps.export.geometry import MovingMesh, UpFrame, halfway, vertex_normals
 from devrf.apps.export.usd import SceneFile
 from devrf.geometry.cameras import Cameras
+from devrf.ops.splatting import Gaussians, rotations
+from devrf.rendering.renderable import Renderable
 from devrf.system.files import atomic_write, write_json
 
 # The properties of a Gaussian, in the order of 3D Gaussian Splatting's files.
@@ -31,38 +34,51 @@ OPACITY = 0.95
 # of the surface; through the surface, in those across.
 WIDTH = 0.65
 THICKNESS = 0.1
+# Opacities and scales are not nearer to 0 or 1 in a file.
+LEAST = 1e-6
 # Files of splats have y down and z ahead.
 DOWN = (1.0, -1.0, -1.0)
 
 
 @dataclass(frozen=True)
-class Gaussians:
-    """N Gaussians at one time.
+class MovingGaussians:
+    """Gaussians at T times, in the scene's world.
 
     Attributes:
-        points: (N, 3) means.
-        normals: (N, 3) unit vectors; zero where there is no surface.
-        factors: (N, 3) of the spherical harmonic of degree 0, for RGB.
-        opacity: (N,) in (0, 1).
-        scales: (N, 3) standard deviations along their axes, in the unit of the points.
-        turns: (N, 4) unit quaternions w, x, y, z, which turn the axes of the points to theirs.
+        times: ascending, in [0, 1].
+        of_time: (T,) as many at each time, the same one in each place; on the host.
     """
 
-    points: Tensor
-    normals: Tensor
-    factors: Tensor
-    opacity: Tensor
-    scales: Tensor
-    turns: Tensor
+    times: tuple[float, ...]
+    of_time: tuple[Gaussians, ...]
 
-    def ply(self) -> bytes:
-        """A PLY file of 3D Gaussian Splatting, binary, little endian."""
-        lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(self.points)}"]
-        lines += [f"property float {name}" for name in PROPERTIES]
-        opacity = self.opacity.logit()[:, None]
-        columns = (self.points, self.normals, self.factors, opacity, self.scales.log(), self.turns)
-        values: npt.NDArray[np.float32] = torch.cat(columns, dim=1).numpy().astype("<f4")
-        return "\n".join([*lines, "end_header", ""]).encode() + values.tobytes()
+    @classmethod
+    def of_model(cls, model: Renderable, times: Sequence[float]) -> MovingGaussians | None:
+        """Those of a method of Gaussians; None for another."""
+        found = [model.gaussians_at(time) for time in times]
+        known = [_on_host(gaussians) for gaussians in found if gaussians is not None]
+        return cls(tuple(times), tuple(known)) if known else None
+
+    @classmethod
+    def on_surface(cls, mesh: MovingMesh) -> MovingGaussians:
+        """A flat one on each vertex, as wide as its share of the surface."""
+        return cls(mesh.times, tuple(discs(v, mesh.faces, mesh.colors) for v in mesh.vertices))
+
+    def placed(self, frame: UpFrame, axes: tuple[float, ...]) -> Iterator[Gaussians]:
+        """The Gaussians of each time in a frame, whose ``axes`` are turned round where −1."""
+        turn = torch.diag(torch.tensor(axes)) @ frame.rotation
+        for gaussians in self.of_time:
+            yield Gaussians(
+                means=frame.points(gaussians.means) * torch.tensor(axes),
+                scales=frame.metres * gaussians.scales,
+                quaternions=quaternions(turn @ rotations(gaussians.quaternions)),
+                opacity=gaussians.opacity,
+                color=gaussians.color,
+            )
+
+
+def _on_host(gaussians: Gaussians) -> Gaussians:
+    return Gaussians(**{name: value.float().cpu() for name, value in vars(gaussians).items()})
 
 
 def discs(vertices: Tensor, faces: Tensor, colors: Tensor) -> Gaussians:
@@ -73,30 +89,68 @@ def discs(vertices: Tensor, faces: Tensor, colors: Tensor) -> Gaussians:
         faces: (F, 3) int64, counter-clockwise from outside.
         colors: (V, 3) RGB in [0, 1], sRGB.
     """
-    normals = vertex_normals(vertices, faces)
     a, b, c = vertices[faces].unbind(dim=1)
     third = torch.linalg.cross(b - a, c - a).norm(dim=1) / 6
     share = torch.zeros(len(vertices)).index_add_(0, faces.flatten(), third.repeat_interleave(3))
     across = WIDTH * share.clamp(min=1e-12).sqrt()
     return Gaussians(
-        points=vertices,
-        normals=normals,
-        factors=(colors - 0.5) / HARMONIC,
-        opacity=torch.full_like(across, OPACITY),
+        means=vertices,
         scales=torch.stack([across, across, THICKNESS * across], dim=1),
-        turns=torch.nn.functional.pad(halfway(normals), (1, 0)),  # half turns
+        quaternions=pad(halfway(vertex_normals(vertices, faces)), (1, 0)),  # half turns
+        opacity=torch.full_like(across, OPACITY),
+        color=colors,
     )
 
 
-def _moving(mesh: MovingMesh, frame: UpFrame, axes: tuple[float, ...]) -> Iterator[Gaussians]:
-    """The discs of a mesh at each of its times; ``axes`` of the frame may be turned round."""
-    for vertices in mesh.vertices:
-        points = frame.points(vertices) * vertices.new_tensor(axes)
-        yield discs(points, mesh.faces, mesh.colors)
+def quaternions(matrices: Tensor) -> Tensor:
+    """Unit quaternions (N, 4), w first, of rotations (N, 3, 3)."""
+    # Of 4 q qᵀ, all of whose rows are multiples of q: the one with the largest entry.
+    m = matrices
+    trace = m.diagonal(dim1=1, dim2=2)
+    signs = m.new_tensor([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+    squares = 1 + trace @ signs.T
+    x, y, z = m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]
+    xy, xz, yz = m[:, 1, 0] + m[:, 0, 1], m[:, 0, 2] + m[:, 2, 0], m[:, 2, 1] + m[:, 1, 2]
+    rows = torch.stack(
+        [
+            torch.stack([squares[:, 0], x, y, z], dim=1),
+            torch.stack([x, squares[:, 1], xy, xz], dim=1),
+            torch.stack([y, xy, squares[:, 2], yz], dim=1),
+            torch.stack([z, xz, yz, squares[:, 3]], dim=1),
+        ],
+        dim=1,
+    )
+    largest = squares.argmax(dim=1)
+    return normalize(rows[torch.arange(len(m)), largest], dim=1)
+
+
+def ply(gaussians: Gaussians) -> bytes:
+    """A PLY file of 3D Gaussian Splatting, binary, little endian."""
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(gaussians.means)}"]
+    lines += [f"property float {name}" for name in PROPERTIES]
+    columns = (
+        gaussians.means,
+        torch.zeros_like(gaussians.means),  # the format's normals, which nothing reads
+        _factors(gaussians),
+        gaussians.opacity.clamp(LEAST, 1 - LEAST).logit()[:, None],
+        gaussians.scales.clamp(min=LEAST).log(),
+        gaussians.quaternions,
+    )
+    values: npt.NDArray[np.float32] = torch.cat(columns, dim=1).numpy().astype("<f4")
+    return "\n".join([*lines, "end_header", ""]).encode() + values.tobytes()
+
+
+def _factors(gaussians: Gaussians) -> Tensor:
+    """(N, 3) factors of the harmonic of degree 0."""
+    return (gaussians.color - 0.5) / HARMONIC
 
 
 def write_splats(
-    folder: Path, mesh: MovingMesh, cameras: Mapping[str, Cameras], frame: UpFrame, seconds: float
+    folder: Path,
+    moving: MovingGaussians,
+    cameras: Mapping[str, Cameras],
+    frame: UpFrame,
+    seconds: float,
 ) -> None:
     """Write ``frame0001.ply`` and so on, as viewers import a sequence, and ``index.json`` last.
 
@@ -106,11 +160,11 @@ def write_splats(
     sequence there are removed.
     """
     frames = []
-    for number, splats in enumerate(_moving(mesh, frame, DOWN), start=1):
+    for number, splats in enumerate(moving.placed(frame, DOWN), start=1):
         name = f"frame{number:04d}.ply"
-        time = mesh.times[number - 1]
+        time = moving.times[number - 1]
         with atomic_write(folder / name) as partial:
-            partial.write_bytes(splats.ply())
+            partial.write_bytes(ply(splats))
         frames.append({"file": name, "time": time, "seconds": time * seconds})
     index: dict[str, Any] = {"content": "splats", "frame": "y down, metres", "frames": frames}
     if any(frame.offset):
@@ -122,7 +176,11 @@ def write_splats(
 
 
 def write_usd_splats(
-    path: Path, mesh: MovingMesh, cameras: Mapping[str, Cameras], frame: UpFrame, seconds: float
+    path: Path,
+    moving: MovingGaussians,
+    cameras: Mapping[str, Cameras],
+    frame: UpFrame,
+    seconds: float,
 ) -> None:
     """Write one .usdc file: a ``ParticleField3DGaussianSplat`` with time samples, and the cameras.
 
@@ -130,21 +188,21 @@ def write_usd_splats(
     """
     from pxr import UsdVol, Vt  # an extra
 
-    file = SceneFile(mesh.times, frame, seconds)
+    file = SceneFile(moving.times, frame, seconds)
     field = UsdVol.ParticleField3DGaussianSplat.Define(file.stage, "/scene/splats")
     file.move_to_origin(field)
     field.CreateRadianceSphericalHarmonicsDegreeAttr(0)
-    for code, splats in zip(file.codes, _moving(mesh, frame, (1.0, 1.0, 1.0)), strict=True):
-        turns = splats.turns[:, [1, 2, 3, 0]]  # as they lie in a quaternion's memory
-        extent = torch.stack([splats.points.amin(dim=0), splats.points.amax(dim=0)])
+    for code, splats in zip(file.codes, moving.placed(frame, (1.0, 1.0, 1.0)), strict=True):
+        turns = splats.quaternions[:, [1, 2, 3, 0]]  # as they lie in a quaternion's memory
+        extent = torch.stack([splats.means.amin(dim=0), splats.means.amax(dim=0)])
         for attribute, kind, values in (
-            (field.CreatePositionsAttr(), Vt.Vec3fArray, splats.points),
+            (field.CreatePositionsAttr(), Vt.Vec3fArray, splats.means),
             (field.CreateScalesAttr(), Vt.Vec3fArray, splats.scales),
             (field.CreateOrientationsAttr(), Vt.QuatfArray, turns),
             (field.CreateExtentAttr(), Vt.Vec3fArray, extent),
         ):
             attribute.Set(kind.FromNumpy(values.contiguous().numpy()), code)
-    factors = Vt.Vec3fArray.FromNumpy(splats.factors.contiguous().numpy())
+    factors = Vt.Vec3fArray.FromNumpy(_factors(splats).contiguous().numpy())
     field.CreateRadianceSphericalHarmonicsCoefficientsAttr(factors)
     field.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(splats.opacity.numpy()))
     file.write(path, cameras)

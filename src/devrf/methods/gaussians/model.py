@@ -158,6 +158,11 @@ class DeformableGaussians(ImageTrainable):
             basis = spherical_harmonics(normalize(means.detach() - eye, dim=1))[:, :count]
         return self.cloud.gaussians(moves, basis)
 
+    @torch.no_grad()
+    def gaussians_at(self, time: float) -> Gaussians:
+        """The cloud at a time, its colours those of the harmonic of degree 0."""
+        return self.cloud.gaussians(self.moved(time), self.cloud.means.new_ones(len(self.cloud), 1))
+
     def forward(self, batch: ImageBatch) -> RenderOutput:
         """Render an image; while the cloud learns, note where it lacks detail."""
         camera = batch.camera
