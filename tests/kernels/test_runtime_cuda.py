@@ -67,10 +67,8 @@ def test_all_are_found() -> None:
     names |= {f"march.march_kernel_{n}" for n in SPACES}
     march = ("adjoint_kernel", "keep_significant_kernel", "scatter_kernel")
     names |= {f"march.{one}" for one in march}
-    names |= {"compositing.composite_kernel", "compositing.adjoint_kernel"}
-    names |= {"photometric.photometric_kernel", "photometric.loss_adjoint_kernel"}
-    motion = ("cycle", "cycle_adjoint", "flow", "flow_adjoint")
-    names |= {f"motion.{one}_kernel" for one in motion}
+    names |= {"compositing.composite_kernel", "photometric.photometric_kernel"}
+    names |= {"motion.cycle_kernel", "motion.flow_kernel"}
     names |= {f"pixels.look_up_kernel_{n}" for n in ALPHAS}
     splatting = ("project", "list", "composite", "composite_adjoint", "project_adjoint")
     names |= {f"splatting.{one}_kernel" for one in splatting}

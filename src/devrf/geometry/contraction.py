@@ -164,8 +164,9 @@ class ContractedRays(Rays):
     def longest(
         self, low: Sequence[float], high: Sequence[float], near: float, far: float
     ) -> float:
-        """The most of exit − entry of :meth:`crossing`; the host waits for it."""
-        return float((self._own(far) - self._own(near)).amax()) if len(self) else 0.0
+        """From the one face of contracted space to the other; the host waits for it."""
+        _, pace, stretch = self.course.unbind(-1)
+        return float((2 * (1 + stretch) / pace).amax()) if len(self) else 0.0
 
     @property
     def pace(self) -> float:

@@ -33,15 +33,9 @@ THREADS = {"cpu": 1, "cuda": 256}
 def march_kernels() -> list[wp.Kernel]:
     """The kernels of the march and its adjoints."""
     kernels = [march.march_kernel(False), march.keep_significant_kernel, march.adjoint_kernel]
-    kernels += [march.scatter_kernel, compositing.composite_kernel, compositing.adjoint_kernel]
-    kernels += [photometric.photometric_kernel, photometric.loss_adjoint_kernel]
-    kernels += [motion.cycle_kernel, motion.cycle_adjoint_kernel]
-    kernels += [
-        motion.flow_kernel,
-        motion.flow_adjoint_kernel,
-        pixels.look_up_kernel(True),
-        adam.total_variation_kernel(1),
-    ]
+    kernels += [march.scatter_kernel, pixels.look_up_kernel(True), compositing.composite_kernel]
+    kernels += [photometric.photometric_kernel, motion.cycle_kernel, motion.flow_kernel]
+    kernels.append(adam.total_variation_kernel(1))
     # The last one is for contracted space.
     return [*kernels, adam.adam_kernel(1), march.march_kernel(True)]
 

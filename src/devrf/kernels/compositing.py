@@ -1,6 +1,7 @@
-"""Colours of rays from those of their samples, and the adjoint; a thread follows one ray.
+"""Colours of rays from those of their samples; a thread follows one ray.
 
-See docs/method.md#compositing.
+See docs/method.md#compositing. The loss that is learned from has its own gradient
+(:mod:`devrf.kernels.photometric`); that of colours is for other terms.
 """
 
 from __future__ import annotations
@@ -22,33 +23,41 @@ def composite_colors(samples: Samples, color: Tensor, background: Tensor) -> Ten
     weight, end = samples.weight, samples.transmittance
     if not is_supported(color):
         return definition.composite_colors(weight, color, samples.ray, end, background)
-    image: Tensor = _Composite.apply(weight, color, end, background, samples.stop)  # type: ignore[no-untyped-call]
+    image: Tensor = _Composite.apply(  # type: ignore[no-untyped-call]
+        weight, color, end, background, samples.ray, samples.stop
+    )
     return image
 
 
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, weight: Tensor, color: Tensor, end: Tensor, background: Tensor, stop: Tensor
+        ctx: Any,
+        weight: Tensor,
+        color: Tensor,
+        end: Tensor,
+        background: Tensor,
+        ray: Tensor,
+        stop: Tensor,
     ) -> Tensor:
         behind = background.contiguous().view(-1, 3)
-        given = [stop, weight.contiguous(), color.contiguous(), end.contiguous(), behind]
-        ctx.save_for_backward(*given)
+        ctx.save_for_backward(weight, color, end, background, ray)
         image = torch.empty(len(end), 3, device=color.device)
-        launch(composite_kernel, len(end), [*given, image], color.device)
+        inputs = [stop, weight.contiguous(), color.contiguous(), end.contiguous(), behind, image]
+        launch(composite_kernel, len(end), inputs, color.device)
         return image
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        given = ctx.saved_tensors
-        results = [torch.empty_like(each) for each in given[1:4]]
-        # One background for all rays is never learned.
-        of_background = torch.empty_like(given[4]) if ctx.needs_input_grad[3] else None
-        behind = gradient.new_empty(0, 3) if of_background is None else of_background
-        inputs = [*given, gradient.contiguous(), *results, behind]
-        launch(adjoint_kernel, len(gradient), inputs, gradient.device)
-        return *results, of_background, None
+        weight, color, end, background, ray = ctx.saved_tensors
+        of_samples = gradient.index_select(0, ray)
+        of_weight = (of_samples * color).sum(dim=1)
+        of_end = (gradient * background).sum(dim=1)
+        of_background = None
+        if ctx.needs_input_grad[3]:
+            of_background = (end[:, None] * gradient).sum_to_size(background.shape)
+        return of_weight, of_samples * weight[:, None], of_end, of_background, None, None
 
 
 @wp.func
@@ -81,28 +90,3 @@ def composite_kernel(
     for k in range(first_of(stops, ray), int(stops[ray])):
         total += weight[k] * color[k]
     image[ray] = total + transmittance[ray] * behind(background, ray)
-
-
-@wp.kernel(module="unique", enable_backward=False)
-def adjoint_kernel(
-    first: int,
-    stops: wp.array(dtype=wp.int64),
-    weight: wp.array(dtype=float),
-    color: wp.array(dtype=wp.vec3),
-    transmittance: wp.array(dtype=float),
-    background: wp.array(dtype=wp.vec3),
-    given: wp.array(dtype=wp.vec3),
-    of_weight: wp.array(dtype=float),
-    of_color: wp.array(dtype=wp.vec3),
-    of_transmittance: wp.array(dtype=float),
-    of_background: wp.array(dtype=wp.vec3),
-):
-    """The gradients of the arguments of :func:`composite_kernel` from that of the image."""
-    ray = first + wp.tid()
-    g = given[ray]
-    for k in range(first_of(stops, ray), int(stops[ray])):
-        of_weight[k] = wp.dot(g, color[k])
-        of_color[k] = weight[k] * g
-    of_transmittance[ray] = wp.dot(g, behind(background, ray))
-    if of_background.shape[0] > 0:
-        of_background[ray] = transmittance[ray] * g

@@ -83,20 +83,19 @@ class _Cycle(torch.autograd.Function):
     def forward(
         ctx: Any, canonical: Tensor, displacement: Tensor, points: Tensor, geometry: Any, box: Box
     ) -> Tensor:
-        ctx.save_for_backward(points, canonical, displacement)
-        ctx.geometry, ctx.box = geometry, box
         errors = torch.empty(len(points), device=points.device)
-        inputs = [geometry, points, canonical, displacement, errors]
+        gradients = torch.empty_like(points), torch.empty_like(points)
+        inputs = [geometry, points, canonical, displacement, errors, *gradients]
         launch(cycle_kernel, len(points), inputs, points.device)
+        ctx.save_for_backward(canonical, displacement, *gradients)
+        ctx.box = box
         return errors.mean() if len(errors) else errors.sum()
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        points, canonical, displacement = ctx.saved_tensors
-        of_canonical, moved = torch.empty_like(points), torch.empty_like(points)
-        inputs = [ctx.geometry, points, canonical, displacement, gradient.view(1)]
-        launch(cycle_adjoint_kernel, len(points), [*inputs, of_canonical, moved], points.device)
+        canonical, displacement, *gradients = ctx.saved_tensors
+        of_canonical, moved = torch._foreach_mul(gradients, gradient)
         of_displacement = torch.zeros_like(displacement)
         add_to_grid(of_displacement, canonical, moved, ctx.box)
         return of_canonical, of_displacement, None, None, None
@@ -108,23 +107,20 @@ class _Flow(torch.autograd.Function):
         ctx: Any, canonical: Tensor, weight: Tensor, geometry: Any, ndc: Any, by_ray: int, *of: Any
     ) -> Tensor:
         parts = torch.empty(len(weight), 2, device=weight.device)
-        inputs = [geometry, ndc, canonical, weight, *of]
-        launch(flow_kernel, len(weight), [*inputs, parts], weight.device)
+        gradients = torch.empty_like(canonical), torch.empty_like(weight)
+        inputs = [geometry, ndc, canonical, weight, *of, parts, *gradients]
+        launch(flow_kernel, len(weight), inputs, weight.device)
         total, count = parts.sum(dim=0)
-        valid = of[-1]
-        count = (valid.sum().float() if by_ray else count).clamp(min=1)
-        ctx.save_for_backward(canonical, weight, count.view(1), *of)
-        ctx.geometry, ctx.ndc = geometry, ndc
+        count = (of[-1].sum().float() if by_ray else count).clamp(min=1)
+        ctx.save_for_backward(count, *gradients)
+        ctx.further = 3 + len(of)
         return total / count
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        canonical, weight, count, *of = ctx.saved_tensors
-        results = [torch.empty_like(canonical), torch.empty_like(weight)]
-        inputs = [ctx.geometry, ctx.ndc, canonical, weight, *of, gradient.view(1), count]
-        launch(flow_adjoint_kernel, len(weight), [*inputs, *results], weight.device)
-        return *results, *(None,) * (3 + len(of))
+        count, *gradients = ctx.saved_tensors
+        return *torch._foreach_mul(gradients, gradient / count), *(None,) * ctx.further
 
 
 @lru_cache(maxsize=64)
@@ -166,29 +162,15 @@ def cycle_kernel(
     canonical: wp.array(dtype=wp.vec3),
     displacements: wp.array(dtype=wp.vec3),
     error: wp.array(dtype=float),
-):
-    """½ |x − (q + Δ(q))|² of each sample."""
-    sample = first + wp.tid()
-    missed = points[sample] - warped(geometry, displacements, canonical[sample])
-    error[sample] = 0.5 * wp.dot(missed, missed)
-
-
-@wp.kernel(module="unique", enable_backward=False)
-def cycle_adjoint_kernel(
-    first: int,
-    geometry: Geometry,
-    points: wp.array(dtype=wp.vec3),
-    canonical: wp.array(dtype=wp.vec3),
-    displacements: wp.array(dtype=wp.vec3),
-    gradient: wp.array(dtype=float),
     of_canonical: wp.array(dtype=wp.vec3),
     of_moved: wp.array(dtype=wp.vec3),
 ):
-    """The gradients of q and of Δ(q) from that of the mean error."""
+    """½ |x − (q + Δ(q))|² of each sample, and the mean's gradients of q and of Δ(q)."""
     sample = first + wp.tid()
     q = canonical[sample]
     missed = warped(geometry, displacements, q) - points[sample]
-    given = missed * (gradient[0] / float(points.shape[0]))
+    error[sample] = 0.5 * wp.dot(missed, missed)
+    given = missed / float(points.shape[0])
     of_canonical[sample] = slope_of_warped(geometry, displacements, q, given)
     of_moved[sample] = wp.where(follows(geometry, q), given, wp.vec3())
 
@@ -238,18 +220,9 @@ def slope_of_seen(
 
 
 @wp.func
-def away(local: wp.vec3):
-    """The depth of a point in a camera's axes, apart from 0, and whether it is that itself."""
-    if wp.abs(local[2]) < 1.0e-8:
-        return 1.0e-8, 0.0
-    return -local[2], 1.0
-
-
-@wp.func
-def missed_by(local: wp.vec3, focal: Xy, center: Xy, pixel: Xy, flow: Xy):
-    """π − u − φ in pixels."""
-    depth, _ = away(local)
-    return Xy(local[0] / depth * focal[0], -local[1] / depth * focal[1]) + center - pixel - flow
+def signum(x: float):
+    """−1, 0 or 1, as torch's gradient of the absolute value."""
+    return wp.where(x == 0.0, 0.0, wp.sign(x))
 
 
 @wp.kernel(module="unique", enable_backward=False)
@@ -270,44 +243,16 @@ def flow_kernel(
     flows: wp.array(dtype=Xy),
     valid: wp.array(dtype=wp.bool),
     part: wp.array(dtype=Xy),
-):
-    """w |π − u − φ|₁ of each sample, and 2; 0 and 0 where the flow of its ray is not valid."""
-    sample = first + wp.tid()
-    ray = int(rays[sample])
-    part[sample] = Xy(0.0, 0.0)
-    if valid[ray]:
-        camera = int(previous[int(images[ray])])
-        moved = warped(geometry, displacements, canonical[sample])
-        local = seen_by(ndc, poses, camera, moved)
-        missed = missed_by(local, focals[camera], centers[camera], pixels[ray], flows[ray])
-        part[sample] = Xy(weight[sample] * (wp.abs(missed[0]) + wp.abs(missed[1])), 2.0)
-
-
-@wp.kernel(module="unique", enable_backward=False)
-def flow_adjoint_kernel(
-    first: int,
-    geometry: Geometry,
-    ndc: wp.vec3,
-    canonical: wp.array(dtype=wp.vec3),
-    weight: wp.array(dtype=float),
-    rays: wp.array(dtype=wp.int64),
-    displacements: wp.array(dtype=wp.vec3),
-    poses: wp.array(dtype=Axis),
-    focals: wp.array(dtype=Xy),
-    centers: wp.array(dtype=Xy),
-    previous: wp.array(dtype=wp.int64),
-    images: wp.array(dtype=wp.int64),
-    pixels: wp.array(dtype=Xy),
-    flows: wp.array(dtype=Xy),
-    valid: wp.array(dtype=wp.bool),
-    gradient: wp.array(dtype=float),
-    count: wp.array(dtype=float),
     of_canonical: wp.array(dtype=wp.vec3),
     of_weight: wp.array(dtype=float),
 ):
-    """The gradients of q and of w from that of the mean error."""
+    """w |π − u − φ|₁ of each sample, and 2; and the sum's gradients of q and of w.
+
+    All are 0 where the flow of a sample's ray is not valid.
+    """
     sample = first + wp.tid()
     ray = int(rays[sample])
+    part[sample] = Xy(0.0, 0.0)
     of_canonical[sample] = wp.vec3()
     of_weight[sample] = 0.0
     if valid[ray]:
@@ -315,14 +260,18 @@ def flow_adjoint_kernel(
         q = canonical[sample]
         moved = warped(geometry, displacements, q)
         local = seen_by(ndc, poses, camera, moved)
+        depth = -local[2]
+        behind = wp.abs(depth) < 1.0e-8  # as in ``Cameras.project``
+        if behind:
+            depth = 1.0e-8
         focal = focals[camera]
-        missed = missed_by(local, focal, centers[camera], pixels[ray], flows[ray])
-        given = gradient[0] / count[0]
-        of_weight[sample] = given * (wp.abs(missed[0]) + wp.abs(missed[1]))
-        given *= weight[sample]
-        depth, itself = away(local)
-        x = given * wp.where(missed[0] == 0.0, 0.0, wp.sign(missed[0])) * focal[0] / depth
-        y = -given * wp.where(missed[1] == 0.0, 0.0, wp.sign(missed[1])) * focal[1] / depth
-        z = itself * (x * local[0] + y * local[1]) / depth
+        missed = Xy(local[0] / depth * focal[0], -local[1] / depth * focal[1])
+        missed += centers[camera] - pixels[ray] - flows[ray]
+        error = wp.abs(missed[0]) + wp.abs(missed[1])
+        part[sample] = Xy(weight[sample] * error, 2.0)
+        of_weight[sample] = error
+        x = weight[sample] * signum(missed[0]) * focal[0] / depth
+        y = -weight[sample] * signum(missed[1]) * focal[1] / depth
+        z = wp.where(behind, 0.0, (x * local[0] + y * local[1]) / depth)
         of_moved = slope_of_seen(ndc, poses, camera, moved, wp.vec3(x, y, z))
         of_canonical[sample] = slope_of_warped(geometry, displacements, q, of_moved)

@@ -68,29 +68,25 @@ class _Photometric(torch.autograd.Function):
         alpha: Tensor | None,
         factors: tuple[float, ...],
     ) -> tuple[Tensor, Tensor]:
-        mask = end.new_empty(0) if alpha is None else alpha.contiguous()
-        given = [weight, color, end, background.view(-1, 3), image, stop, truth, mask]
-        given = [each.contiguous() for each in given]
-        ctx.save_for_backward(*given)
-        ctx.factors = wp.vec4(*factors)
+        mask = end.new_empty(0) if alpha is None else alpha
+        behind_all = background.view(-1, 3)
+        given = [weight, color, end, behind_all, image, stop, truth, mask]
         parts = torch.empty(len(end), len(TERMS) + 3, device=end.device)
-        launch(photometric_kernel, len(end), [ctx.factors, *given, parts], end.device)
-        means = parts.mean(dim=0)
-        total, values = means[0], means[1:]
+        learned = background if ctx.needs_input_grad[3] else background.new_empty(0, 3)
+        ctx.gradients = [torch.empty_like(each) for each in (weight, color, end, learned)]
+        inputs = [wp.vec4(*factors), *(each.contiguous() for each in given), parts]
+        launch(photometric_kernel, len(end), [*inputs, *ctx.gradients], end.device)
+        total, values = parts.mean(dim=0).split((1, len(TERMS) + 2))
         ctx.mark_non_differentiable(values)
         ctx.set_materialize_grads(False)
-        return total, values
+        return total[0], values
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor, *_: None) -> tuple[Tensor | None, ...]:
-        given = ctx.saved_tensors
-        results = [torch.empty_like(each) for each in given[:3]]
-        of_background = torch.empty_like(given[3]) if ctx.needs_input_grad[3] else None
-        behind = gradient.new_empty(0, 3) if of_background is None else of_background
-        inputs = [ctx.factors, *given, gradient.view(1), *results, behind]
-        launch(loss_adjoint_kernel, len(given[2]), inputs, gradient.device)
-        return *results, of_background, *(None,) * 5
+        gradients = list(torch._foreach_mul(ctx.gradients, gradient))
+        of_background = gradients.pop() if ctx.needs_input_grad[3] else None
+        return *gradients[:3], of_background, *(None,) * 5
 
 
 @wp.kernel(module="unique", enable_backward=False)
@@ -106,17 +102,33 @@ def photometric_kernel(
     truth: wp.array(dtype=wp.vec3),
     alpha: wp.array(dtype=float),
     result: wp.array(dtype=Part),
+    of_weight: wp.array(dtype=float),
+    of_color: wp.array(dtype=wp.vec3),
+    of_transmittance: wp.array(dtype=float),
+    of_background: wp.array(dtype=wp.vec3),
 ):
-    """A ray's part of each term that counts, and of their weighted sum."""
+    """A ray's part of each term that counts, and of their weighted sum; the sum's gradients.
+
+    These are of what the image is composited of.
+    """
     ray = first + wp.tid()
+    rays = float(transmittance.shape[0])
     end = transmittance[ray]
     missed = image[ray] - truth[ray]
+    of_image = (factors[0] * 2.0 / 3.0 / rays) * missed
+    of_apart = factors[1] * 2.0 / rays
     by_sample = float(0.0)
-    if factors[1] > 0.0:
-        for k in range(first_of(stops, ray), int(stops[ray])):
-            apart = color[k] - truth[ray]
-            by_sample += weight[k] * wp.dot(apart, apart)
+    for k in range(first_of(stops, ray), int(stops[ray])):
+        apart = color[k] - truth[ray]
+        by_sample += weight[k] * wp.dot(apart, apart)
+        of_weight[k] = wp.dot(of_image, color[k])
+        of_color[k] = weight[k] * (of_image + of_apart * apart)
+    of_end = wp.dot(of_image, behind(background, ray))
+    if of_background.shape[0] > 0:
+        of_background[ray] = end * of_image
     p = wp.clamp(end, wp.static(NEAREST), wp.static(1.0 - NEAREST))
+    if p == end:
+        of_end += factors[2] / rays * (wp.log(1.0 - p) - wp.log(p))
     part = Part()
     part[1] = wp.dot(missed, missed) / 3.0
     part[2] = by_sample
@@ -124,45 +136,10 @@ def photometric_kernel(
     part[5] = 1.0 - end
     if alpha.shape[0] > 0:
         beside = end - (1.0 - alpha[ray])
+        of_end += factors[3] * 2.0 / rays * beside
         part[4] = beside * beside
         part[6] = alpha[ray]
     for term in range(4):
         part[0] += factors[term] * part[1 + term]
     result[ray] = part
-
-
-@wp.kernel(module="unique", enable_backward=False)
-def loss_adjoint_kernel(
-    first: int,
-    factors: wp.vec4,
-    weight: wp.array(dtype=float),
-    color: wp.array(dtype=wp.vec3),
-    transmittance: wp.array(dtype=float),
-    background: wp.array(dtype=wp.vec3),
-    image: wp.array(dtype=wp.vec3),
-    stops: wp.array(dtype=wp.int64),
-    truth: wp.array(dtype=wp.vec3),
-    alpha: wp.array(dtype=float),
-    given: wp.array(dtype=float),
-    of_weight: wp.array(dtype=float),
-    of_color: wp.array(dtype=wp.vec3),
-    of_transmittance: wp.array(dtype=float),
-    of_background: wp.array(dtype=wp.vec3),
-):
-    """The gradients of what the image is composited of, from that of the weighted sum."""
-    ray = first + wp.tid()
-    g = given[0] / float(transmittance.shape[0])
-    end = transmittance[ray]
-    of_image = (g * factors[0] * 2.0 / 3.0) * (image[ray] - truth[ray])
-    by_sample = g * factors[1] * 2.0
-    for k in range(first_of(stops, ray), int(stops[ray])):
-        of_weight[k] = wp.dot(of_image, color[k])
-        of_color[k] = weight[k] * (of_image + by_sample * (color[k] - truth[ray]))
-    if of_background.shape[0] > 0:
-        of_background[ray] = end * of_image
-    slope = float(0.0)
-    if end >= wp.static(NEAREST) and end <= wp.static(1.0 - NEAREST):
-        slope = factors[2] * (wp.log(1.0 - end) - wp.log(end))
-    if alpha.shape[0] > 0:
-        slope += factors[3] * 2.0 * (end - (1.0 - alpha[ray]))
-    of_transmittance[ray] = g * slope + wp.dot(of_image, behind(background, ray))
+    of_transmittance[ray] = of_end

@@ -155,6 +155,23 @@ def test_the_loss_weighs_what_counts_and_reports_it_unweighted(prediction):
         counted_weights({"render": -1.0}, PHOTOMETRIC_TERMS, "loss.fine")
 
 
+def test_a_term_of_ones_own_counts_beside_those_of_the_kernel(prediction):
+    def mass(prediction: Prediction) -> Tensor:
+        return prediction.output.samples.weight.sum()
+
+    # A further name, and another function under a known one.
+    terms = {**PHOTOMETRIC_TERMS, "mass": mass, "entropy": lambda seen: 3 * mass(seen)}
+    weights = {"alpha_mask": 2.0, "mass": 0.5, "entropy": 0.25}
+    total, values = batch_loss(prediction, terms, weights)
+    assert values["mass"].item() == pytest.approx(1.55)
+    assert values["entropy"].item() == pytest.approx(4.65)
+    expected = 2 * values["alpha_mask"] + 0.5 * 1.55 + 0.25 * 4.65
+    assert total.item() == pytest.approx(expected.item())
+    total.backward()
+    # 0.5 + 0.25 · 3; the alpha masks' term says nothing of weights.
+    assert prediction.output.samples.weight.grad.tolist() == pytest.approx([1.25] * 3)
+
+
 def seen(
     batch: RayBatch, ray: Tensor, points: Tensor, canonical: Tensor, weight: Tensor
 ) -> VoxelOutput:
