@@ -13,12 +13,12 @@ from devrf.data.batch import (
     PixelPool,
     all_pixels,
     concatenated,
-    gather_batch,
     gather_image,
     pixel_positions,
     wanted_pixels,
 )
 from devrf.geometry.cameras import Cameras
+from devrf.methods.batch import gather_batch
 from devrf.scenes.scene import OpticalFlow, Views
 
 WIDTH, HEIGHT = 4, 3

@@ -11,10 +11,11 @@ import torch
 from lightning import Callback, Trainer
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint, load_checkpoint, save_checkpoint
-from devrf.data.batch import RayBatch, gather_batch
+from devrf.data.batch import RayBatch
 from devrf.engine.protocol import ProtocolStage
 from devrf.engine.stage import Stage
 from devrf.methods.base import RayTrainable
+from devrf.methods.batch import gather_batch
 from devrf.methods.ray_schedule import RaySchedule
 from devrf.methods.ray_stage import RayStage
 from devrf.scenes.procedural.recipe import ProceduralForwardScene

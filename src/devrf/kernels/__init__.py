@@ -7,7 +7,7 @@ its definition.
 
 | module | functions |
 |---|---|
-| ``pixels`` | ``look_up``: rays, colours and flow of a batch; defined in ``data.batch`` |
+| ``pixels`` | ``look_up``: rays, colours and flow of a batch; defined in ``methods.batch`` |
 | ``march`` | ``march``: samples, warped and composited |
 | ``trilinear`` | ``interpolate``: values of a grid between its points |
 | ``compositing`` | ``composite_colors``: colours of rays |

@@ -22,7 +22,7 @@ def look_up(
     flat: Tensor,
     background: Tensor,
 ) -> tuple[Tensor, ...]:
-    """Pixels' centres, rays and truth by a kernel; ``devrf.data.batch`` has the definition.
+    """Pixels' centres, rays and truth by a kernel; ``devrf.methods.batch`` has the definition.
 
     Args:
         pixels: (N, H, W, 3 or 4) uint8, of fewer than 2³¹ pixels.

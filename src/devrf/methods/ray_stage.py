@@ -18,7 +18,6 @@ from devrf.data.batch import (
     ImageBatch,
     RayBatch,
     concatenated,
-    gather_batch,
 )
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.grid_adam import GridAdam
@@ -26,6 +25,7 @@ from devrf.engine.protocol import ProtocolStage
 from devrf.engine.schedule import Phase, configured_timeline
 from devrf.engine.stage import Stage, Terms
 from devrf.methods.base import Trainable
+from devrf.methods.batch import gather_batch
 from devrf.methods.ray_plan import RayPlan
 from devrf.methods.ray_schedule import GROWN, RaySchedule, RayTimeline
 from devrf.methods.weighted_loss import counted_weights, visibility, weighted_sum

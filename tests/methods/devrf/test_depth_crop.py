@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from devrf.data.batch import all_pixels, gather_batch
+from devrf.data.batch import all_pixels
 from devrf.geometry.box import Box
+from devrf.methods.batch import gather_batch
 from devrf.methods.devrf import depth_crop
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField, SigmoidColor

@@ -10,12 +10,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from devrf.data.batch import RayBatch, gather_batch
+from devrf.data.batch import RayBatch
 from devrf.data.flow import previous_images
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.rays import Rays
+from devrf.methods.batch import gather_batch
 from devrf.methods.devrf.losses import (
     PHOTOMETRIC_TERMS,
     MotionPrediction,

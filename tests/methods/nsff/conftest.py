@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 import torch
 
-from devrf.data.batch import RayBatch, gather_batch
+from devrf.data.batch import RayBatch
+from devrf.methods.batch import gather_batch
 from devrf.methods.nsff.model import NSFF
 from devrf.methods.nsff.renders import Renders
 from devrf.methods.nsff.settings import NSFFSettings, Warmup

@@ -8,8 +8,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from devrf.data.batch import gather_batch
 from devrf.data.rendered import ProceduralDataModule
+from devrf.methods.batch import gather_batch
 from devrf.methods.nsff.fields import BACKWARD, FORWARD
 from devrf.methods.nsff.model import NSFF
 from devrf.methods.nsff.priors import ImagePriors

@@ -10,11 +10,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from devrf.data.batch import PixelPool, gather_batch
+from devrf.data.batch import PixelPool
 from devrf.engine.ddp import broadcast
 from devrf.engine.grid_adam import GridAdam
 from devrf.engine.stage import Stage, Terms
 from devrf.errors import DevrfError
+from devrf.methods.batch import gather_batch
 from devrf.methods.devrf.architecture import Architecture, fitted_to, resolved_voxels
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.canonical_schedule import (

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
-from devrf.data.batch import gather_batch
 from devrf.data.flow import previous_images
 from devrf.engine.grid_adam import GridAdam
 from devrf.engine.stage import Stage, Terms
 from devrf.errors import DevrfError
+from devrf.methods.batch import gather_batch
 from devrf.methods.devrf.active_frame import ActiveFrame
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformation_schedule import (

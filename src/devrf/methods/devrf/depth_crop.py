@@ -7,9 +7,10 @@ import logging
 import torch
 from torch import Tensor, nn
 
-from devrf.data.batch import PixelPool, gather_batch
+from devrf.data.batch import PixelPool
 from devrf.geometry.box import Box
 from devrf.geometry.ndc import NormalizedDevice
+from devrf.methods.batch import gather_batch
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.volume_rendering import render

@@ -8,11 +8,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool3d, pad
 
-from devrf.data.batch import all_pixels, gather_batch
+from devrf.data.batch import all_pixels
 from devrf.engine.ddp import broadcast
 from devrf.errors import expect
 from devrf.geometry.box import Box
 from devrf.kernels.trilinear import interpolate
+from devrf.methods.batch import gather_batch
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
 from devrf.methods.devrf.extension import Extension, MotionContext
 from devrf.methods.devrf.frame_store import Directions

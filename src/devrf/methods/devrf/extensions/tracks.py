@@ -10,13 +10,14 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from devrf.data.batch import PixelPool, all_pixels, gather_batch
+from devrf.data.batch import PixelPool, all_pixels
 from devrf.data.flow import previous_images
 from devrf.engine.ddp import broadcast
 from devrf.engine.grid_adam import GridAdam
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import WORLD, Space
 from devrf.kernels.trilinear import interpolate
+from devrf.methods.batch import gather_batch
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
 from devrf.methods.devrf.extension import Extension, MotionContext
