@@ -44,6 +44,7 @@ ckpt: null
 scene: robot
 outputs: outputs
 method: devrf
+facing: inward
 objective: dynamic.psnr
 decoder_precision: auto
 kernels: auto

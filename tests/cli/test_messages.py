@@ -50,7 +50,7 @@ MISTAKES = {
     ),
     "folder of a scene that is rendered": (
         ["data.root=${oc.env:HOME}"],
-        "data.root: no such key; it belongs to data=colmap, dycheck, forward, inward, ",
+        "data.root: no such key; it belongs to data=colmap, dycheck, easyvolcap, forward, inward, ",
     ),
     "appended unknown root key": (["+sede=3"], "sede: no such key; did you mean seed?"),
     "forward-facing field of an inward-facing scene": (

@@ -185,21 +185,24 @@ def unknown_key(config: DictConfig, names: Names, others: Iterable[object] = ())
     meant = did_you_mean(name, sorted(map(str, known)), where[: -len(name)])
     instead = "--cfg job shows every key there is"
     path = where.split(".")
-    if having := ", ".join(_options_with(path)):
-        instead = f"it belongs to {path[0]}={having}"
+    if having := [*_options_with(path)]:
+        group = having[0].partition("=")[0]
+        instead = f"it belongs to {group}={', '.join(each.partition('=')[2] for each in having)}"
     elif deeper := " or ".join(dict.fromkeys(_deeper(path))):
         instead = f"it is {deeper}"
     return DevrfError(f"{where}: no such key{meant or f'; {instead}'}")
 
 
 def _options_with(names: Sequence[str]) -> Iterator[str]:
-    """The options of the group ``names[0]`` whose files have the key."""
-    for file in sorted((config_folder() / names[0]).glob("*.yaml")):
-        node: Any = OmegaConf.to_container(OmegaConf.load(file))
-        for name in names[1:]:
-            node = node.get(name, ...) if isinstance(node, Mapping) else ...
-        if node is not ...:
-            yield file.stem
+    """The options whose files have the key, as they are typed: ``data=inward``."""
+    # The files of a schedule have the sections that belong to its size.
+    for group, path in ((names[0], names[1:]), ("schedule", names)):
+        for file in sorted((config_folder() / group).glob("*.yaml")):
+            node: Any = OmegaConf.to_container(OmegaConf.load(file))
+            for name in path:
+                node = node.get(name, ...) if isinstance(node, Mapping) else ...
+            if node is not ...:
+                yield f"{group}={file.stem}"
 
 
 def _deeper(names: Sequence[str]) -> Iterator[str]:
