@@ -30,7 +30,7 @@ PUBLISHED = ", published"
 GREY = "#9a9a9a"
 # Markers of the methods, and the endings of their variants' names.
 NAMES = ("DeVRF", *list(METHODS.values())[1:])
-MARKERS = dict(zip(NAMES, "s^vDPXo*", strict=True))
+MARKERS = dict(zip(NAMES, "s^vDPXo*h", strict=True))
 VARIANT = r"-2 ?stage$|-dynamic$| \(base\)$| w/ .*$"
 SECONDS = "training time (s)"
 VIEWS = r"; data\.train_views=\d+"
