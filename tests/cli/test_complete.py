@@ -208,7 +208,7 @@ def test_a_sweep_over_scenes_of_one_layout_has_their_reader(devrf, tmp_path, sce
     [
         (["data.holdout=2"], "data.holdout: no such key; it belongs to data=colmap, dycheck, "),
         (["data.downscael=2"], "data.downscael: no such key; did you mean data.downscale?"),
-        (["data.root=empty"], "empty: no known layout ("),
+        (["data.root=empty"], "empty: no known layout: "),
         (["data.root=nowhere", "experiment=best_small"], "nowhere: no such folder"),
     ],
 )

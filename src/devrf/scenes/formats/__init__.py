@@ -138,15 +138,11 @@ def _of_no_layout(folder: Path) -> DevrfError:
     if packed := [path for path in inside if path.suffix.lower() in ARCHIVES]:
         return scene_error(packed[0], "is an archive; unpack it, and set data.root to its folder")
     # A layout is left out if another one lacks only some of the same files.
-    missing = {layout.name: layout.missing(folder) for layout in LAYOUTS}
-    lacks = [
-        f"{name}: {files[0]}"
-        for name, files in missing.items()
-        if not any({*fewer} < {*files} for fewer in missing.values())
-    ]
+    missing = [layout.missing(folder) for layout in LAYOUTS]
+    lacks = [files[0] for files in missing if not any({*f} < {*files} for f in missing)]
+    expected = ", ".join(dict.fromkeys(lacks))
     return scene_error(
-        folder,
-        f"no known layout (expected {'; '.join(lacks)}); set data.root to the scene's folder",
+        folder, f"no known layout: has none of {expected}; set data.root to the scene's folder"
     )
 
 
