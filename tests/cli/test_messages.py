@@ -21,6 +21,10 @@ from devrf.errors import DevrfError
 # Arguments, and what the one line must name.
 MISTAKES = {
     "misspelt key": (["data.widht=3"], "data.widht: no such key; did you mean data.width?"),
+    "misspelt settings for a scene": (
+        ["for_scene=paper_lgo"],
+        "did you mean for_scene=paper_lego?",
+    ),
     "option with dashes": (["--seed=1"], "--seed=1: no such option; write seed=1, or --help"),
     "template's group": (["debug=default"], "debug=default: no such group; rehearse=true takes"),
     "misspelt logger among several": (["logger=[csv,wand]"], "did you mean logger=wandb?"),

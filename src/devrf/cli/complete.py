@@ -36,7 +36,7 @@ from devrf.cli.restore_config import (
     values,
 )
 from devrf.cli.view import serves_page
-from devrf.errors import DevrfError
+from devrf.errors import DevrfError, did_you_mean
 from devrf.system.override import literal, without_reference
 from devrf.system.process import importing
 
@@ -101,6 +101,7 @@ def completed(arguments: Sequence[str]) -> Applied:
         if names and one and not isinstance(override.value(), str | list):
             line = override.input_line
             raise DevrfError(f"{line}: choose one of {', '.join(names)}, or leave it out")
+        _check_optional(override, options.config_dir, typed)
         if override.key_or_group == "debug":
             raise DevrfError(
                 f"{override.input_line}: no such group; rehearse=true takes every step in minutes, "
@@ -114,6 +115,18 @@ def completed(arguments: Sequence[str]) -> Applied:
     by_scene = _of_scenes(typed, overrides, options.config_dir, continued=bool(before.words))
     words = [*flags, *before.words, *texts, *by_scene.words]
     return Applied(words, before.remarks + by_scene.remarks)
+
+
+def _check_optional(override: Override, config_dir: str | None, typed: Sequence[Override]) -> None:
+    """Refuse a misspelt ``for_scene``: Hydra passes over an option that is optional, and absent."""
+    if config_dir is not None or values(typed, "hydra.searchpath"):
+        return  # other folders may have it
+    known = group_choices()["for_scene"]
+    for name in values([override], "for_scene"):
+        if name not in known:
+            meant = did_you_mean(name, known, "for_scene=")
+            names = ", ".join(known)
+            raise DevrfError(f"for_scene={name}: no such option; choose one of {names}{meant}")
 
 
 def _of_scenes(
