@@ -86,6 +86,14 @@ def test_a_part_may_take_anything():
     check_config(config(more={"_target_": f"{__name__}.forwarding", "whatever": 1}))
 
 
+def test_a_key_whose_only_reader_is_left_out_names_it(composed):
+    made = composed("schedule.seconds=60", "callbacks.time_budget=null")
+    with pytest.raises(
+        DevrfError, match=r"^schedule\.seconds: callbacks\.time_budget reads it, and"
+    ):
+        check_config(made)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

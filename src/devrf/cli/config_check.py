@@ -91,6 +91,9 @@ def check_config(config: DictConfig) -> None:
         elif key not in ROOT and not f"{key}.".startswith(read) and not any(_options_with(names)):
             unread.append(names)
     for names in [names for names, issue in issues if issue["type"] in UNKNOWN] + unread:
+        if names in unread and (readers := [*_readers(".".join(names))]):
+            left_out = f"{' or '.join(readers)} reads it, and is left out"
+            raise DevrfError(f"{'.'.join(names)}: {left_out}; leave out the one or the other")
         lacking = [other[-1] for other, issue in issues if issue["type"] in LEFT]
         raise unknown_key(config, names, lacking)
     places = [set_at(config, names) or names[0] for names, _ in issues]
@@ -203,6 +206,15 @@ def _options_with(names: Sequence[str]) -> Iterator[str]:
                 node = node.get(name, ...) if isinstance(node, Mapping) else ...
             if node is not ...:
                 yield f"{group}={file.stem}"
+
+
+def _readers(key: str) -> Iterator[str]:
+    """The sections of ``conf/`` that read a key: ``callbacks.time_budget``."""
+    for file in sorted(config_folder().glob("*/default.yaml")):
+        settings: Any = OmegaConf.to_container(OmegaConf.load(file))
+        for section, node in settings.items():
+            if f"${{{key}}}" in json.dumps(node, default=str):
+                yield f"{file.parent.name}.{section}"
 
 
 def _deeper(names: Sequence[str]) -> Iterator[str]:
