@@ -48,7 +48,7 @@ def _reduced_views(views: Views, longest: int) -> Views:
     # Masks and depths are not averaged: those of the middle pixel count.
     rows = ((torch.arange(height) + 0.5) * views.height / height).long()
     columns = ((torch.arange(width) + 0.5) * views.width / width).long()
-    for name in ("depth", "valid_mask", "exposure_mask"):
+    for name in ("depth", "valid_mask", "exposure_mask", "motion_mask"):
         if (of_pixels := getattr(views, name)) is not None:
             further[name] = of_pixels[:, rows[:, None], columns]
     cameras = views.cameras.resized(width, height)

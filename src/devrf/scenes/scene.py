@@ -62,6 +62,8 @@ class Views:
             ignored. None: all of them.
         exposure_mask: (N, H, W) bool, the pixels of held-out images that determine the exposure of
             each. None: they have the training images' exposure.
+        motion_mask: (N, H, W) bool, the pixels of held-out images that show what moves
+            (docs/stages.md#moving). None: it is not known.
         frames: (N,) int64, the frame of the scene's clock that is nearest to each image's time;
             None until the images are those of a :class:`Scene`.
     """
@@ -77,6 +79,7 @@ class Views:
     ambiguous_orientation: Tensor | None = None
     valid_mask: Tensor | None = None
     exposure_mask: Tensor | None = None
+    motion_mask: Tensor | None = None
     frames: Tensor | None = None
 
     def __len__(self) -> int:
@@ -167,16 +170,20 @@ class Capture:
         test: held-out views.
         validation: held-out views for the choice of settings, none of them in ``test``; None if
             they are not used, or there are none.
+        keypoints: (N, K, 3) of the training images: x and y of K points that move with the scene,
+            in shares of the image's sides, and 1 where the image shows the point, else 0. None:
+            no such points are known.
     """
 
     train: Views
     test: Views
     validation: Views | None = None
+    keypoints: Tensor | None = None
 
     def mapped(self, change: Callable[[Views], Views]) -> Capture:
         """The capture with ``change`` made to all of its views."""
         validation = None if self.validation is None else change(self.validation)
-        return Capture(change(self.train), change(self.test), validation)
+        return Capture(change(self.train), change(self.test), validation, self.keypoints)
 
 
 def both_mapped(

@@ -99,6 +99,19 @@ def test_a_capture_by_one_camera_holds_out_every_nth(folder, caplog):
     assert [Path(name).stem for name in scene.dynamic.test.names] == ["0_00003", "0_00007"]
 
 
+def test_key_points_are_shares_of_the_sides_of_the_images_that_have_them(folder):
+    assert DycheckReader(folder, downscale=1).read().dynamic.keypoints is None
+    place = folder / "keypoint/2x/train"
+    put(place / "0_00002.json", [[10, 4, 1], [5, 8, 0]])
+    put(place / "0_00007.json", [[20, 16, 1], [0, 0, 1]])
+    put(place / "skeleton.json", {"name": "unnamed"})
+    keypoints = DycheckReader(folder, downscale=1).read().dynamic.keypoints
+    assert keypoints.shape == (9, 2, 3)
+    assert keypoints[2].tolist() == [[0.5, 0.25, 1], [0.25, 0.5, 0]]
+    assert keypoints[7].tolist() == [[1, 1, 1], [0, 0, 1]]
+    assert not keypoints[[0, 1, 3, 4, 5, 6, 8]].any()
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -112,6 +125,13 @@ def test_a_capture_by_one_camera_holds_out_every_nth(folder, caplog):
                 root / "splits/train.json", {**split([(0, 1), (0, 2)]), "time_ids": [1]}
             ),
             "train.json: 2 frame_names, but 1 time_ids",
+        ),
+        (
+            lambda root: [
+                put(root / f"keypoint/2x/train/0_0000{k}.json", [[1, 2, 1]] * (1 + k))
+                for k in (0, 3)
+            ],
+            "0_00003.json: 4 key points, but others have another number",
         ),
     ],
 )

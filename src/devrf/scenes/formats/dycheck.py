@@ -5,17 +5,20 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Sequence
-from dataclasses import KW_ONLY
+from dataclasses import KW_ONLY, replace
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import BaseModel, Field
+import torch
+from pydantic import BaseModel, Field, RootModel
 from pydantic.dataclasses import dataclass
+from torch import Tensor
 
-from devrf.scenes.files import Ids, Number, inside, read_json
-from devrf.scenes.formats.nerfies import ItemsReader, Listed
+from devrf.scenes.files import Ids, Number, inside, read_json, scene_folder
+from devrf.scenes.formats.nerfies import Camera, ItemsReader, Listed
 from devrf.scenes.image_folders import Downscale, ImageFolder
 from devrf.scenes.names import ImageFinder
+from devrf.scenes.scene import Scene, Views
 from devrf.scenes.splits import parted
 from devrf.scenes.validation import scene_error
 from devrf.system.options import abbreviated
@@ -35,12 +38,17 @@ class _Split(BaseModel):
     time_ids: Annotated[list[Number], Field(fail_fast=True)]
 
 
+# ``keypoint/<n>x/train/<name>.json``: x, y in pixels of images n times smaller, and 1 if visible.
+_Keypoints = RootModel[Annotated[list[tuple[Number, Number, Number]], Field(max_length=1000)]]
+
+
 @dataclass(frozen=True)
 class DycheckReader(ItemsReader):
     """Reads ``splits/train.json``, ``splits/val.json``, ``scene.json``, ``camera/``, ``rgb/<n>x/``.
 
     One moving camera takes the training images, others are held out. Times are the ``time_ids`` of
-    the splits, brought to [0, 1]. Depth is not read.
+    the splits, brought to [0, 1]. Key points come from ``keypoint/``, if it is there; depth is not
+    read.
 
     Attributes:
         masks: ``ignore``: only pixels in the masks of ``covisible/``, which enough training images
@@ -76,6 +84,12 @@ class DycheckReader(ItemsReader):
         times = {**_read_split(folder / TRAIN), **_read_split(folder / VAL)}
         return [times[item] for item in ids]
 
+    def read(self) -> Scene:
+        """See :meth:`devrf.scenes.reader.SceneReader.read`."""
+        scene = super().read()
+        keypoints = _read_keypoints(scene_folder(self.root), scene.dynamic.train)
+        return replace(scene, dynamic=replace(scene.dynamic, keypoints=keypoints))
+
     def masks_of(
         self, folder: Path, ids: Sequence[str], images: ImageFolder
     ) -> tuple[Path | None, ...] | None:
@@ -88,6 +102,32 @@ class DycheckReader(ItemsReader):
                 files = (inside(folder, folder, f"{masks}/{item}", folder / SPLITS) for item in ids)
                 return tuple(map(ImageFinder(folder).find, files))
         return (None,) * len(ids)
+
+
+def _read_keypoints(folder: Path, views: Views) -> Tensor | None:
+    """The key points (N, K, 3) of training ``views``, as of a capture; None: the scene has none.
+
+    DevrfError if files have different numbers of them.
+    """
+    found: dict[int, Tensor] = {}
+    places = sorted(folder.glob("keypoint/[1-9]*x/train"))
+    for image, name in enumerate(views.names if places else ()):
+        item = Path(name).stem
+        file = inside(folder, places[0], f"{item}.json", folder / TRAIN)
+        if not os.path.isfile(file):
+            continue
+        points = torch.tensor(read_json(file, _Keypoints, "it has key points").root).view(-1, 3)
+        camera = read_json(folder / "camera" / f"{item}.json", Camera, "add it")
+        smaller = float(places[0].parent.name.removesuffix("x"))
+        sides = torch.tensor(camera.image_size) / smaller
+        found[image] = torch.cat([points[:, :2] / sides, points[:, 2:]], dim=1)
+        if len(points) != len(next(iter(found.values()))):
+            raise scene_error(file, f"{len(points)} key points, but others have another number")
+    if not found:
+        return None
+    keypoints = torch.zeros(len(views), *next(iter(found.values())).shape)
+    keypoints[list(found)] = torch.stack([*found.values()])
+    return keypoints
 
 
 def _read_split(file: Path) -> dict[str, float]:

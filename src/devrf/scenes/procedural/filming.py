@@ -11,6 +11,7 @@ from torch import Tensor
 
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
+from devrf.geometry.motion import moving, radius
 from devrf.scenes.procedural.march import CHUNK, MAX_STEPS, block_starts, trace
 from devrf.scenes.procedural.solids import Body, Shape
 from devrf.scenes.scene import Capture, OpticalFlow, Views
@@ -116,6 +117,8 @@ def exact_flow(shape: Shape, views: Views, *, forward: bool = False) -> OpticalF
 # A point is seen well if so many images show it, or a tenth of all if these are more (DyCheck);
 # half of all suffice if there are few.
 _SEEN_BY = 5
+# The number of key points.
+_KEYPOINTS = 32
 # A point is visible in an image if it is at most so much farther away, as a share.
 _SAME_DEPTH = 0.02
 
@@ -129,24 +132,67 @@ def covisible(shape: Shape, views: Views, learned: Views) -> Tensor:
     """
     assert views.depth is not None and learned.depth is not None
     needed = min(max(_SEEN_BY, len(learned) // 10), math.ceil(len(learned) / 2))
-    size = torch.tensor([learned.width, learned.height])
     masks = torch.zeros_like(views.depth, dtype=torch.bool)
     for k, time in enumerate(views.times.tolist()):
-        met = views.depth[k].flatten().isfinite()
-        rays = views.cameras.image_rays(k)
-        points = rays.at(met.nonzero()[:, 0], views.depth[k].flatten()[met])
+        met, points = _met(views, k)
         material = shape.material(points, time)
         count = torch.zeros(len(points), dtype=torch.long)
         for image, other in enumerate(learned.times.tolist()):
-            there = shape.forward(material, other)
-            pixels, ahead = learned.cameras.project_into(image, there)
-            inside = (ahead > 0) & ((pixels >= 0) & (pixels < size)).all(dim=-1)
-            column, row = pixels.clamp(min=torch.zeros(2), max=size - 1).long().unbind(-1)
-            depth = learned.depth[image][row, column]
-            away = (there - learned.cameras.positions[image]).norm(dim=-1)
-            count += inside & (away <= (1 + _SAME_DEPTH) * depth)
+            count += _shown(learned, image, shape.forward(material, other))[1]
         masks[k].view(-1)[met] = count >= needed
     return masks
+
+
+def _met(views: Views, image: int) -> tuple[Tensor, Tensor]:
+    """Positions (M,) of the pixels whose rays meet a surface, and the points (M, 3) there."""
+    assert views.depth is not None
+    depth = views.depth[image].flatten()
+    met = depth.isfinite().nonzero()[:, 0]
+    return met, views.cameras.image_rays(image).at(met, depth[met])
+
+
+def _shown(views: Views, image: int, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Pixels (M, 2) of points (M, 3) at an image's time, and whether the image shows each (M,)."""
+    assert views.depth is not None
+    size = torch.tensor([views.width, views.height])
+    pixels, ahead = views.cameras.project_into(image, points)
+    inside = (ahead > 0) & ((pixels >= 0) & (pixels < size)).all(dim=-1)
+    column, row = pixels.clamp(min=torch.zeros(2), max=size - 1).long().unbind(-1)
+    depth = views.depth[image][row, column]
+    away = (points - views.cameras.positions[image]).norm(dim=-1)
+    return pixels, inside & (away <= (1 + _SAME_DEPTH) * depth)
+
+
+def with_motion(shape: Shape, capture: Capture) -> Capture:
+    """The capture with exact masks of what moves in its held-out images, and with key points.
+
+    The point that the ray through a pixel's centre meets moves, or does not, over all times of the
+    held-out images. Key points are the moving ones among those that the first training image shows.
+    """
+    train, test = capture.train, capture.test
+    times = sorted({0.0, *test.times.tolist()})
+    rest = [_met(v, k)[1] for v in (train, test) for k in (v.times == 0).nonzero()[:, 0].tolist()]
+    size = radius(torch.cat(rest))
+
+    def moves(points: Tensor, time: float) -> Tensor:
+        material = shape.material(points, time)
+        return moving((shape.forward(material, other) for other in times), size)
+
+    masks = torch.zeros_like(test.pixels[..., 0], dtype=torch.bool)
+    for k, time in enumerate(test.times.tolist()):
+        met, points = _met(test, k)
+        masks[k].view(-1)[met] = moves(points, time)
+    capture = replace(capture, test=replace(test, motion_mask=masks))
+    first = rest[0][moves(rest[0], 0.0)]
+    if len(first) == 0:
+        return capture
+    material = shape.material(first[torch.linspace(0, len(first) - 1, _KEYPOINTS).long()], 0.0)
+    sides = torch.tensor([train.width, train.height])
+    keypoints = []
+    for k, time in enumerate(train.times.tolist()):
+        pixels, seen = _shown(train, k, shape.forward(material, time))
+        keypoints.append(torch.cat([pixels / sides, seen[:, None]], dim=1))
+    return replace(capture, keypoints=torch.stack(keypoints))
 
 
 @dataclass(frozen=True)
@@ -195,10 +241,11 @@ class Filming:
             train, pixels[learned, :count], depth[learned, :count], times, learned, "train"
         )
         others = _moving(test, pixels[:, count:], depth[:, count:], times, range(frames), "test")
-        return Capture(
+        capture = Capture(
             train=replace(views, flow=exact_flow(self.shape, views)),
             test=replace(others, flow=exact_flow(self.shape, others)),
         )
+        return with_motion(self.shape, capture)
 
     def handheld(self, camera: Cameras, others: Cameras) -> Capture:
         """The video of one moving camera, with the exact backward flow, and held-out views.
@@ -211,10 +258,11 @@ class Filming:
         pixels, depth = self._shot(pairs, times)
         train = _each(camera, pixels[:, 0], depth[:, 0], times, "hand-held train frame")
         test = _each(others, pixels[:, 1], depth[:, 1], times, "hand-held test frame")
-        return Capture(
+        capture = Capture(
             train=replace(train, flow=exact_flow(self.shape, train)),
             test=replace(test, valid_mask=covisible(self.shape, test, train)),
         )
+        return with_motion(self.shape, capture)
 
     def _shot(self, cameras: Sequence[Cameras], times: Tensor) -> tuple[Tensor, Tensor]:
         """Pictures (T, N, H, W, ·), distances (T, N, H, W) from N cameras at each of T times."""
