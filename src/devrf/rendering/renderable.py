@@ -2,7 +2,7 @@
 
 Everything that shows a learned scene (videos, stills, evaluation) asks for :meth:`Renderable.at`;
 exports also for :meth:`Renderable.surface` and :meth:`Renderable.forward_map`, which a method may
-have.
+have, and tracks for :meth:`Renderable.canonical_map`.
 """
 
 from __future__ import annotations
@@ -84,6 +84,13 @@ class Renderable(StoredClass, nn.Module, ABC):
         """q → x(q, t): where canonical points (M, 3) are at ``time``, both in the fields' space.
 
         The identity at time 0. None: the method knows only the way back, from x to q, or none.
+        """
+        return None
+
+    def canonical_map(self, time: float) -> Callable[[Tensor], Tensor] | None:
+        """x → q(x, t): the canonical points of points (M, 3) at ``time``, in the fields' space.
+
+        None: the method follows no points.
         """
         return None
 

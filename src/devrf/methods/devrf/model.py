@@ -158,6 +158,10 @@ class DeVRFModel(Renderable):
             return lambda points: points
         return torch.no_grad()(partial(self.deformation.unwarp, time=time))
 
+    def canonical_map(self, time: float) -> Callable[[Tensor], Tensor]:
+        """x → x + Δ_b(x, t) (docs/method.md#warp)."""
+        return self.warp(time) or (lambda points: points)
+
     @property
     def moves(self) -> bool:
         """Whether there is a deformation field."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
 from functools import partial
 
@@ -56,6 +56,16 @@ class DeformableField(DensityColorField):
         Returns:
             x′ (S, 3), and the further input of T, (S, ambient) or None.
         """
+
+    def canonical_map(self, time: float) -> Callable[[Tensor], Tensor]:
+        """x → x′, without w."""
+
+        def mapped(points: Tensor) -> Tensor:
+            place = self.placement
+            times = torch.full_like(points[:, 0], time)
+            return place.fields(self.deform(place.normalised(points), times)[0])
+
+        return mapped
 
     def radiance_parts(self) -> dict[str, Iterable[nn.Parameter]]:
         """The radiance fields as parts; layers that take w are a part of their own."""

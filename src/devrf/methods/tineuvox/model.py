@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -115,15 +115,31 @@ class TiNeuVox(DensityColorField):
         """
         code = self.time(time[:, None])
         position = self.encode(points)
+        features = self.grid(points + self._displacement(position, code, ray), self.grid_box)
+        hidden = self.radiance.hidden(features, position, code, ray)
+        density = nn.functional.softplus(self.radiance.density(hidden)[:, 0] + self.density_shift)
+        return density * (self.placement.half_edge / self.base_voxel), hidden
+
+    def _displacement(self, position: Tensor, code: Tensor, ray: Tensor) -> Tensor:
+        """Δ (S, 3) of encoded points, each at the encoded time of its ray."""
         first, *further = self.deformation
         assert isinstance(first, nn.Linear)
         displacement = linear_by_ray(first, [position], code, ray)
         for layer in further:
             displacement = layer(displacement)
-        features = self.grid(points + displacement, self.grid_box)
-        hidden = self.radiance.hidden(features, position, code, ray)
-        density = nn.functional.softplus(self.radiance.density(hidden)[:, 0] + self.density_shift)
-        return density * (self.placement.half_edge / self.base_voxel), hidden
+        return displacement
+
+    def canonical_map(self, time: float) -> Callable[[Tensor], Tensor]:
+        """x → x + Δ(x, t)."""
+
+        def mapped(points: Tensor) -> Tensor:
+            position = self.placement.normalised(points)
+            code = self.time(position.new_full((1, 1), time))
+            ray = torch.zeros_like(position[:, 0], dtype=torch.long)
+            moved = position + self._displacement(self.encode(position), code, ray)
+            return self.placement.fields(moved)
+
+        return mapped
 
     def rgb(self, features: Tensor, viewdirs: Tensor, ray: Tensor) -> Tensor:
         """RGB (S, 3)."""
