@@ -15,11 +15,9 @@ from devrf.evaluation.scoring import score_held_out
 from devrf.evaluation.suite import MEASURES, Evaluation, flow_error
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
-from devrf.geometry.clock import FrameClock
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.space import WORLD
 from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.metrics.image import psnr_masked, ssim_masked
 from devrf.metrics.lpips import TRUNKS, read_lpips
@@ -143,49 +141,7 @@ def test_mistakes_are_named(wrong, message):
         Evaluation(**wrong).check()
 
 
-GRID = 21
-SETTINGS = RenderSettings(step=0.1, alpha_threshold=1e-4, near=0.0, far=99.0)
-
-
-@pytest.fixture
-def block(cube):
-    """All below z = −0.05, halfway between two grid points, is solid.
-
-    It moves by +0.2 along x until t = 0.5 and by +0.5 until t = 1.
-    """
-    build = Architecture()
-    canonical = build.search_field(cube, GRID**3)
-    mask = torch.zeros(GRID, GRID, GRID, dtype=torch.bool)
-    mask[:, :, :10] = True
-    with torch.no_grad():
-        canonical.density.values[mask] = 400.0
-        canonical.density.values[~mask] = -400.0
-    deformation = DeformationField(cube, FrameClock((0.0, 0.5, 1.0)), voxels=27)
-    for frame, way in ((1, 0.2), (2, 0.5)):
-        deformation.to_canonical[frame, ..., 0] = -way
-        deformation.to_time[frame, ..., 0] = way
-    return DeVRFModel(build, canonical, Occupancy.full((GRID,) * 3, cube), SETTINGS, deformation)
-
-
-def filmed_from_above(flow):
-    """Three frames of a camera 4 above the face that looks down; x is to the right, y up."""
-    pose = torch.eye(3, 4)
-    pose[2, 3] = 3.95
-    cameras = Cameras(
-        pose[None].repeat(3, 1, 1), torch.full((3, 2), 40.0), torch.full((3, 2), 4.0), 8, 8
-    )
-    vectors = torch.tensor(flow).expand(3, 8, 8, 2).contiguous()
-    return Views(
-        torch.zeros(3, 8, 8, 3, dtype=torch.uint8),
-        cameras,
-        torch.tensor([0.0, 0.5, 1.0]),
-        torch.zeros(3, dtype=torch.long),
-        ("a", "b", "c"),
-        OpticalFlow(vectors, torch.ones(3, 8, 8, dtype=torch.bool)),
-    )
-
-
-def test_a_moving_block_by_hand(block):
+def test_a_moving_block_by_hand(block, filmed_from_above):
     # The face is 4 away, the lens has 40 px: 0.3 units along x are 3 px, and came from the left.
     views = filmed_from_above((-3.0, 1.0))
     assert flow_error(Renderer(block), views, 2) == pytest.approx(1.0, abs=0.015)
@@ -194,7 +150,7 @@ def test_a_moving_block_by_hand(block):
     assert flow_error(Renderer(block), views, 1) == pytest.approx(0, abs=0.015)
 
 
-def test_a_scene_without_motion_or_matter_shows_none(block):
+def test_a_scene_without_motion_or_matter_shows_none(block, filmed_from_above):
     views = filmed_from_above((-3.0, 4.0))
     block.deformation = None
     assert flow_error(Renderer(block), views, 2) == pytest.approx(5.0, abs=1e-3)
@@ -203,7 +159,7 @@ def test_a_scene_without_motion_or_matter_shows_none(block):
     assert flow_error(Renderer(block), views, 2) == pytest.approx(5.0)
 
 
-def test_flow_without_flow_or_an_earlier_frame_it_is_unknown(block):
+def test_flow_without_flow_or_an_earlier_frame_it_is_unknown(block, filmed_from_above):
     views, renderer = filmed_from_above((-3.0, 0.0)), Renderer(block)
     assert flow_error(renderer, views, 0) is None
     assert flow_error(renderer, replace(views, flow=None), 1) is None

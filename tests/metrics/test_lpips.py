@@ -66,6 +66,12 @@ def test_only_what_lies_inside_the_mask_counts(pair, tmp_path):
     inside = lpips(other, truth, mask)
     assert inside is not None and inside > 0
     assert lpips(other, truth, torch.zeros_like(mask)) is None
+    # Unfilled, what is wrong outside is seen by what is compared inside.
+    unfilled = lpips(outside, truth, mask, fill=False)
+    assert unfilled is not None and unfilled > 0
+    assert lpips(other, truth, torch.ones_like(mask), fill=False) == lpips(
+        other, truth, torch.ones_like(mask)
+    )
 
 
 def test_images_that_are_too_small_have_none(tmp_path):

@@ -26,11 +26,13 @@ from devrf.cli.restore_config import as_typed
 from devrf.cli.resume import unfinished
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import HeldOutView
+from devrf.evaluation.motion import pck_t, with_motion_masks
 from devrf.evaluation.objective import VALIDATION, objective
 from devrf.evaluation.predictions import picture_name, read_predictions
 from devrf.evaluation.scoring import score_held_out
 from devrf.pictures.held_out import write_contact_sheet
 from devrf.pictures.images import write_image
+from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Views
 from devrf.system.files import write_json
 from devrf.system.override import to_type
@@ -66,11 +68,14 @@ def evaluate(run: RunContext) -> list[Path] | None:
             log.info("%s: no validation split; the test views decide the objective", scene.name)
         else:
             sets[VALIDATION] = scene.dynamic.validation
+    sets, rule = _with_motion_masks(run, sets)
     frames = score_held_out(model, sets, scene.background, suite)
     validated = frames.pop(VALIDATION, [])
     _write_scores(run, frames, sets)
     size = round(run.checkpoint(metadata.stage).stat().st_size / 1e6, 3)
     sections = scores_by_section(frames, scene.clock, metadata, rest, size)
+    if "dynamic" in sets:
+        sections["dynamic"]["pck_t"] = pck_t(Renderer(model), scene.dynamic)
     if validated:
         sections[VALIDATION] = {**mean_scores(validated), "images": len(validated)}
     protocol = metadata.protocol or run.protocol.name
@@ -84,6 +89,7 @@ def evaluate(run: RunContext) -> list[Path] | None:
         **learning_record(metadata, run.stages_with_images),
         **data_record(scene),
         "lpips_network": run.evaluation.lpips_network,
+        "motion_masks": rule,
         "checkpoint": digest_of(run.checkpoint(metadata.stage)),
     }
     ran["wall_seconds"]["evaluate"] = run.step_seconds
@@ -102,6 +108,20 @@ def evaluate(run: RunContext) -> list[Path] | None:
         tracker.show_table("frames", frame_rows(frames))
     written = (metrics, "frames.csv", *(f"images/{capture}.png" for capture in frames))
     return [run.folder / name for name in written]
+
+
+def _with_motion_masks(
+    run: RunContext, sets: Mapping[str, Views]
+) -> tuple[dict[str, Views], str | None]:
+    """The sets with masks of what moves in the dynamic test views, and the rule of these."""
+    given = run.evaluation.motion_masks
+    views = run.scene.dynamic.test
+    if "dynamic" not in sets:
+        return dict(sets), None
+    folder = None if given is None else Path(given)
+    masked, rule = with_motion_masks(views, run.scene.background, folder)
+    # A set of the same views stays one, since its scores at rest serve both.
+    return {name: masked if own is views else own for name, own in sets.items()}, rule
 
 
 def _write_scores(
@@ -128,7 +148,8 @@ def _evaluate_predictions(run: RunContext) -> None:
     folder = Path(run.config.evaluation.predictions)
     pictures = read_predictions(folder, program, sets, scene.background)
     suite = run.evaluation.suite(run.device)
-    frames = score_held_out(pictures, pictures.sets, scene.background, suite)
+    scored, rule = _with_motion_masks(run, pictures.sets)
+    frames = score_held_out(pictures, scored, scene.background, suite)
     sections = {name: {**mean_scores(v), "images": len(v)} for name, v in frames.items()}
     _write_scores(run, frames, pictures.sets)
     name = f"{program} (pictures)"
@@ -140,6 +161,7 @@ def _evaluate_predictions(run: RunContext) -> None:
         "predictions": str(folder.resolve()),
         **data_record(scene),
         "lpips_network": run.evaluation.lpips_network,
+        "motion_masks": rule,
     }
     without_motion = {} if scene.moves else {"at_rest": True}
     write_json(run.folder / "metrics.json", {**head, **without_motion, **sections, "run": ran})

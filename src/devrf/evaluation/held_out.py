@@ -163,10 +163,14 @@ def truth_image(views: Views, index: int, background: Background) -> Tensor:
 
     A random background is white here.
     """
-    value = views.single(index).pixels[0].float() / 255
-    if not views.has_alpha:
+    return on_background(views.single(index).pixels[0], background_value(background))
+
+
+def on_background(pixels: Tensor, behind: float) -> Tensor:
+    """Pixels (..., 3 or 4) uint8 as RGB (..., 3) in [0, 1], those with alpha on a grey level."""
+    value = pixels.float() / 255
+    if value.shape[-1] == 3:
         return value
-    behind = background_value(background)
     return behind + value[..., 3:] * (value[..., :3] - behind)
 
 

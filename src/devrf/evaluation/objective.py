@@ -20,7 +20,7 @@ TRAINING = (
 # DeVRF's stages.
 SCORES = ("psnr", "ssim")
 OF_BOTH = (*SCORES, *TRAINING, "checkpoint_mb")
-OF_MOTION = ("rest_pose_psnr",)
+OF_MOTION = ("rest_pose_psnr", "flicker", "pck_t")
 STATIC = ("static", "canonical")
 DYNAMIC = ("dynamic", "deformation")
 # The section that metrics.json has only where the objective is one of its numbers.

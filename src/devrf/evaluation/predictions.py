@@ -28,7 +28,7 @@ from pydantic import BaseModel, Field
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from devrf.evaluation.held_out import background_value, truth_image
+from devrf.evaluation.held_out import background_value, on_background, truth_image
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import WORLD
@@ -169,9 +169,9 @@ def read_predictions(
     pictures = Pictures(program, {name: sets[name] for name in places})
     for name, place in places.items():
         views = sets[name]
-        found = _film(place, views) if os.path.isfile(place) else _folder(place, views)
+        found = _film(place, views) if os.path.isfile(place) else pictures_in(place, views)
         behind = background_value(background)
-        ready = [_on_background(found(k), behind) for k in range(len(views))]
+        ready = [on_background(torch.tensor(found(k)), behind) for k in range(len(views))]
         _check_order(ready, views, background, place)
         for k, picture in enumerate(ready):
             pictures.add(views, k, picture)
@@ -201,8 +201,12 @@ def _film(film: Path, views: Views) -> Callable[[int], Picture]:
     return lambda index: _sized(frames[index], views, index, f"{film}: frame {index}")
 
 
-def _folder(folder: Path, views: Views) -> Callable[[int], Picture]:
-    """The pictures in a folder, one for each image."""
+def pictures_in(folder: Path, views: Views) -> Callable[[int], Picture]:
+    """The pictures in a folder (see above), by the position of the image that each is of.
+
+    Raises:
+        DevrfError: one is missing, or of another size than its image.
+    """
     files = _listed(folder, views) if os.path.isfile(folder / LIST) else _named(folder, views)
     lacking = [index for index in range(len(views)) if index not in files]
     if lacking:
@@ -296,14 +300,6 @@ def _sized(picture: Picture, views: Views, index: int, where: object) -> Picture
             "data.downscale",
         )
     return picture
-
-
-def _on_background(picture: Picture, behind: float) -> Tensor:
-    """A picture (H, W, 3) in [0, 1]; one with an alpha channel is put on a grey level."""
-    color = torch.from_numpy(picture.copy()).float() / 255
-    if color.shape[2] == 3:
-        return color
-    return behind + color[..., 3:] * (color[..., :3] - behind)
 
 
 def _check_order(

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from statistics import fmean
 
 from lightning import LightningModule, Trainer
 
 from devrf.evaluation.held_out import HeldOutView, score
+from devrf.evaluation.motion import flicker
 from devrf.evaluation.suite import MetricSuite
 from devrf.rendering.renderable import Renderable
 from devrf.rendering.renderer import Renderer
@@ -44,6 +47,18 @@ class HeldOutScores(LightningModule):
         self.suite = suite or MetricSuite()
         self.renderer = Renderer(model)
         self.scored: dict[str, list[HeldOutView]] = {name: [] for name in sets}
+
+    def on_test_epoch_end(self) -> None:
+        """Add what compares consecutive images: :func:`~devrf.evaluation.motion.flicker`."""
+        for name in (name for name in self.sets if name != STATIC):
+            values = flicker(self.sets[name], self.scored[name])
+            pairs = zip(self.scored[name], values, strict=True)
+            self.scored[name] = [
+                replace(view, further={**view.further, "flicker": value}) for view, value in pairs
+            ]
+            known = [value for value in values if value is not None]
+            if known:
+                self.log(f"test/{name}/flicker", fmean(known))
 
     def test_dataloader(self) -> _HeldOut:
         """The name of the set and the position there of each view."""

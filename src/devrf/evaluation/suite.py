@@ -49,6 +49,14 @@ class MetricInput:
         return inside if self.valid_mask is None else inside & self.valid_mask
 
     @property
+    def moving(self) -> Tensor:
+        """(H, W) bool, valid pixels that show what moves; nowhere True where that is unknown."""
+        mask = self.views.single(self.index).motion_mask
+        if mask is None:
+            return torch.zeros(self.truth.shape[:2], dtype=torch.bool)
+        return mask[0].cpu() if self.valid_mask is None else mask[0].cpu() & self.valid_mask
+
+    @property
     def valid_mask(self) -> Tensor | None:
         """(H, W) bool, the valid pixels; None: all of them."""
         return self.views.valid_mask_of(self.index)
@@ -59,9 +67,9 @@ def _ms_ssim(inputs: MetricInput) -> float | None:
     return ms_ssim(inputs.prediction, inputs.truth) if inputs.valid_mask is None else None
 
 
-def _lpips(inputs: MetricInput, mask: Tensor | None) -> float | None:
+def _lpips(inputs: MetricInput, mask: Tensor | None, *, fill: bool = True) -> float | None:
     lpips = inputs.lpips
-    return None if lpips is None else lpips.forward(inputs.prediction, inputs.truth, mask)
+    return None if lpips is None else lpips(inputs.prediction, inputs.truth, mask, fill=fill)
 
 
 def _ssim_covisible(inputs: MetricInput) -> float | None:
@@ -93,6 +101,9 @@ MEASURES: dict[str, Callable[[MetricInput], float | None]] = {
     "psnr_masked": lambda inputs: psnr_masked(inputs.prediction, inputs.truth, inputs.mask),
     "ssim_masked": lambda inputs: ssim_masked(inputs.prediction, inputs.truth, inputs.mask),
     "lpips_masked": lambda inputs: _lpips(inputs, inputs.mask),
+    "psnr_moving": lambda inputs: psnr_masked(inputs.prediction, inputs.truth, inputs.moving),
+    "ssim_moving": lambda inputs: ssim_masked(inputs.prediction, inputs.truth, inputs.moving),
+    "lpips_moving": lambda inputs: _lpips(inputs, inputs.moving, fill=False),
     "ssim_covisible": _ssim_covisible,
     "lpips_covisible": _lpips_covisible,
     "depth_error": _depth_error,
@@ -111,6 +122,8 @@ class Evaluation:
             (:mod:`devrf.evaluation.predictions`); None: the run is scored.
         program: the name of that program; None: the folder's.
         pictures: whether the pictures that are scored are written as PNG, too.
+        motion_masks: a folder of masks of what moves in the held-out images, white, under names as
+            of predictions; None: they are found (:mod:`devrf.evaluation.motion`).
     """
 
     metrics: Sequence[str] = tuple(MEASURES)
@@ -120,6 +133,7 @@ class Evaluation:
     predictions: str | Path | None = None
     program: str | None = None
     pictures: bool = False
+    motion_masks: str | Path | None = None
 
     def check(self) -> None:
         """Check that the metrics and the file of weights exist.

@@ -119,14 +119,15 @@ class Lpips(nn.Module):
         self.eval().requires_grad_(False)
 
     def forward(
-        self, prediction: Tensor, truth: Tensor, mask: Tensor | None = None
+        self, prediction: Tensor, truth: Tensor, mask: Tensor | None = None, *, fill: bool = True
     ) -> float | None:
         """LPIPS of two (H, W, 3) images in [0, 1], where ``mask`` (H, W) is True if one is given.
 
-        The prediction counts as right outside it; the layers' differences, interpolated to the
-        image's size, are averaged inside. None where it is empty or the images are too small.
+        The prediction counts as right outside it, unless ``fill`` is False; the layers'
+        differences, interpolated to the image's size, are averaged inside. None where it is empty
+        or the images are too small.
         """
-        if mask is not None:
+        if mask is not None and fill:
             prediction = torch.where(mask[..., None], prediction, truth)
         maps = self.maps(prediction, truth)
         if maps is None or (mask is not None and not bool(mask.any())):

@@ -54,6 +54,19 @@ def test_seeds_are_averaged_with_their_spread_where_all_have_a_value(table, ran)
     ]
 
 
+def test_scores_of_what_moves_have_a_column_and_masks_of_two_rules_a_note(table, ran):
+    ran("one", scores={"psnr_moving": 21.25}, motion_masks="exact")
+    ran("other", ablation="base", scores={"psnr_moving": 20.0}, motion_masks="exact")
+    assert next(iter(table().blocks)).cells["PSNR moving ↑"].map(lambda c: c.text).tolist() == [
+        "21.25",
+        "20.00",
+    ]
+    assert "one rule" not in "".join(table().notes)
+    ran("third", ablation="c2f", scores={"psnr_moving": 19.0}, motion_masks="given: /masks")
+    notes = "".join(table().notes)
+    assert "robot: what moves is not by one rule, so do not compare it: exact; given: /mas" in notes
+
+
 def test_novel_times_have_a_column_where_a_run_has_them(table, ran):
     ran("one", scene="lego", scores={"novel_times": {"psnr": 25.5}})
     ran("other", scene="lego", ablation="base")

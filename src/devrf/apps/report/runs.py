@@ -49,6 +49,7 @@ KINDS: dict[str, Any] = {
     "run.image_size": Annotated[list[int], Len(2, 2)] | None,
     **dict.fromkeys(("run.device", "run.checkpoint", "run.date", "run.git"), _Text | None),
     **dict.fromkeys(("run.devrf", "run.fingerprint", "run.lpips_network"), _Text | None),
+    "run.motion_masks": _Text | None,
     **dict.fromkeys(("static", "dynamic", "run", "choices"), dict),
 }
 # The longest first line of a table: pandas would take hours for many columns of one name.

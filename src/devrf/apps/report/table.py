@@ -54,8 +54,10 @@ GPU = Column("GPU (GB)", "peak_gpu_gb", False, 1, True, "no run is known to have
 TIME = Column("Time", "train_seconds", False, None, True)
 COLUMNS = (PSNR, SSIM, LPIPS, GPU, TIME)
 TITLES = [column.title for column in COLUMNS]
-# Shown if a run was scored at times that no training view has; the paper has no such columns.
-OF_TIMES = (
+# Shown if a run was scored on what moves, or at times that no training view has; the paper has no
+# such columns.
+FURTHER = (
+    Column("PSNR moving", "dynamic.psnr_moving", True, 2),
     Column("PSNR at training times", "dynamic.training_times.psnr", True, 2),
     Column("PSNR at novel times", "dynamic.novel_times.psnr", True, 2),
 )
@@ -151,8 +153,8 @@ def tabulate(collection: Collection) -> Table:
     scored = _values(collection.runs, PSNR).notna()
     again = _scored_again(collection.runs[scored])
     runs = labelled(collection.runs[scored].drop(index=again.index))
-    of_times = [c for c in OF_TIMES if c.key in runs and _values(runs, c).notna().any()]
-    columns = (PSNR, *of_times, *COLUMNS[1:])
+    further = [c for c in FURTHER if c.key in runs and _values(runs, c).notna().any()]
+    columns = (PSNR, *further, *COLUMNS[1:])
     titles = [column.title for column in columns]
     for column in columns:
         runs[column.title] = _values(runs, column)
@@ -321,6 +323,11 @@ def _notes(runs: pd.DataFrame, at_rest: pd.Series, again: pd.Series) -> list[str
     if runs["run.device"].nunique(dropna=False) > 1:
         notes.append("Memory and time are marked only among rows of one device.")
     notes += _differences(runs)
+    rules = runs.get("run.motion_masks", pd.Series(dtype=object)).dropna()
+    for scene, used in rules.groupby(runs["scene"]):
+        if used.nunique() > 1:
+            listed = "; ".join(map(str, used.unique()))
+            notes.append(f"{scene}: what moves is not by one rule, so do not compare it: {listed}.")
     notes += [_scored(runs)] if len(runs) else []
     for why, folders in (
         ("Scored at rest only, and therefore not in the tables", at_rest),

@@ -1,0 +1,131 @@
+"""Scores of motion: masks of what moves in held-out images, points that are followed, flicker."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from devrf.data.flow import previous_images
+from devrf.evaluation.held_out import HeldOutView, background_value, on_background
+from devrf.evaluation.predictions import pictures_in
+from devrf.rendering.renderer import Renderer, points_at_depth
+from devrf.rendering.tracks import track
+from devrf.rendering.view import ImageView
+from devrf.scenes.scene import Background, Capture, Views
+
+# A pixel moves if a channel is further than this from the median of its camera's images, of which
+# there must be as many as SEVERAL.
+CHANGED = 0.1
+SEVERAL = 3
+# Rows of all images of a camera whose medians are found at once.
+BAND = 16
+# A point is followed rightly if it comes within this share of the image's larger side (DyCheck).
+NEAR = 0.05
+
+
+def with_motion_masks(
+    views: Views, background: Background, given: Path | None
+) -> tuple[Views, str | None]:
+    """Held-out views with masks of what moves, and the rule by which these were made.
+
+    The same masks serve every method (docs/stages.md#moving): the ``given`` ones, else the exact
+    ones that the views have, else those of :func:`changed` pixels. None: no rule gives any.
+
+    Raises:
+        DevrfError: a mask is missing in the folder ``given``, or of another size than its image.
+    """
+    if given is not None:
+        mask = torch.zeros_like(views.pixels[..., 0], dtype=torch.bool)
+        picture = pictures_in(given, views)
+        for image in range(len(views)):
+            white = torch.tensor(picture(image)[..., 0]) > 127
+            mask[image, : white.shape[0], : white.shape[1]] = white
+        return replace(views, motion_mask=mask), f"given: {given.resolve()}"
+    if views.motion_mask is not None:
+        return views, "exact"
+    mask = changed(views, background)
+    rule = f"differs by {CHANGED:g} from the median of the camera's images"
+    return (replace(views, motion_mask=mask), rule) if bool(mask.any()) else (views, None)
+
+
+def changed(views: Views, background: Background) -> Tensor:
+    """Mask (N, H, W) of pixels that differ from the median of the images of their fixed camera."""
+    mask = torch.zeros_like(views.pixels[..., 0], dtype=torch.bool)
+    for camera in {*views.view.tolist()}:
+        images = (views.view == camera).nonzero()[:, 0]
+        if len(images) < SEVERAL:
+            continue
+        for first in range(0, views.height, BAND):
+            where = images, slice(first, first + BAND)
+            color = on_background(views.pixels[where], background_value(background))
+            away = (color - color.median(dim=0).values).abs().amax(dim=-1)
+            mask[where] = away > CHANGED
+    return mask
+
+
+def flicker(views: Views, scored: Sequence[HeldOutView]) -> list[float | None]:
+    """Mean |e_t − e_{t−1}| of each image of a fixed camera and the one before it, in [0, 1].
+
+    e is the signed error of a channel, the prediction less the truth; only pixels that are valid in
+    both images count. None for a camera's first image, and for cameras that move.
+    """
+    values: list[float | None] = []
+    for image, earlier in enumerate(previous_images(views).tolist()):
+        if earlier == image or views.by_moving_camera:
+            values.append(None)
+            continue
+        errors = [scored[k].compared - scored[k].truth for k in (image, earlier)]
+        change = (errors[0] - errors[1]).abs().mean(dim=-1)
+        valid = torch.ones_like(change, dtype=torch.bool)
+        for mask in map(views.valid_mask_of, (image, earlier)):
+            valid = valid if mask is None else valid & mask
+        values.append(float(change[valid].mean()) if bool(valid.any()) else None)
+    return values
+
+
+@torch.no_grad()
+def pck_t(renderer: Renderer, capture: Capture) -> float | None:
+    """The share of key points that the model's field carries rightly to images at other times.
+
+    DyCheck's PCK-T (docs/stages.md#pck): the point at the mean depth of the ray through a key point
+    of a training image is followed to the time of another, and projected into it. None without key
+    points, or if the method does not follow points.
+    """
+    views, keypoints = capture.train, capture.keypoints
+    if keypoints is None:
+        return None
+    sides = views.cameras.extents[:, None].float()
+    places, shown = keypoints[..., :2] * sides, keypoints[..., 2] > 0
+    annotated = shown.any(dim=1).nonzero()[:, 0].tolist()
+    times = sorted({*views.times[annotated].tolist()})
+    right, total = 0, 0
+    for image in annotated:
+        time = float(views.times[image])
+        rays = views.cameras.rays(torch.full((len(places[image]),), image), places[image])
+        if isinstance(renderer.at(time), ImageView):
+            camera = views.cameras.single(image)
+            limits = places[image].new_tensor([camera.width - 1, camera.height - 1])
+            column, row = places[image].clamp(min=0).minimum(limits).long().unbind(1)
+            pixel = row * camera.width + column
+            depth = renderer.view(camera, 0, time, 0.0).depth[pixel]
+        else:
+            depth = renderer.picture(rays, time, 0.0).depth
+        points = points_at_depth(renderer.model.space, rays.to(renderer.device), depth)
+        tracks = track(renderer.model, points, time, times)
+        if tracks is None:
+            return None
+        for other in annotated:
+            both = shown[image] & shown[other]
+            if views.times[other] == time or not bool(both.any()):
+                continue
+            place = tracks[times.index(float(views.times[other]))].cpu()
+            pixels, ahead = views.cameras.project_into(other, place)
+            away = (pixels - places[other]).norm(dim=1)
+            near = (away <= NEAR * sides[other].max()) & (ahead > 0)
+            right += int((near & both).sum())
+            total += int(both.sum())
+    return round(right / total, 5) if total else None

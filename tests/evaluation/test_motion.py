@@ -1,0 +1,174 @@
+"""What moves in held-out images, what is scored of it, and points that are followed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from devrf.errors import DevrfError
+from devrf.evaluation.motion import changed, flicker, pck_t, with_motion_masks
+from devrf.evaluation.predictions import picture_name
+from devrf.evaluation.suite import MEASURES
+from devrf.geometry.motion import moving, radius
+from devrf.geometry.space import WORLD
+from devrf.ops.splatting import Gaussians
+from devrf.pictures.images import write_image
+from devrf.rendering.renderer import Renderer
+from devrf.rendering.tracks import track
+from devrf.scenes.procedural.filming import Filming
+from devrf.scenes.procedural.rigs import dynamic_rig
+from devrf.scenes.procedural.solids import Material
+from devrf.scenes.scene import Views
+
+WAY = torch.tensor([0.0, 0.3, 0.0])
+
+
+@dataclass(frozen=True)
+class TwoBalls:
+    """One ball stands at x = 0.4; one at x = -0.4 goes along y by 0.3 until t = 1."""
+
+    radius: float = 0.25
+
+    def _centers(self, time: float) -> torch.Tensor:
+        return torch.stack([torch.tensor([0.4, 0, 0]), torch.tensor([-0.4, 0, 0]) + time * WAY])
+
+    def distance(self, points, time):
+        return torch.cdist(points, self._centers(time)).amin(dim=1) - self.radius
+
+    def material(self, points, time):
+        part = torch.cdist(points, self._centers(time)).argmin(dim=1)
+        return Material(points - part[:, None] * time * WAY, part)
+
+    def forward(self, material, time):
+        return material.canonical + material.part[:, None] * time * WAY
+
+    def color(self, material):
+        return torch.ones_like(material.canonical)
+
+
+@pytest.fixture(scope="module")
+def balls():
+    train, test = dynamic_rig(2, width=32, height=24, reach=1.0)
+    return Filming(TwoBalls(), 1.0, supersample=1).dynamic(train, test, frames=3)
+
+
+def test_exact_masks_and_key_points_of_the_ball_that_moves(balls):
+    for k in range(len(balls.test)):
+        rays, depth = balls.test.cameras.image_rays(k), balls.test.depth[k].flatten()
+        points = rays.at(torch.arange(len(rays)), depth.nan_to_num(posinf=9.0))
+        expected = depth.isfinite() & (points[:, 0] < 0)
+        assert 0 < int(expected.sum()) < int(depth.isfinite().sum())
+        assert torch.equal(balls.test.motion_mask[k].flatten(), expected)
+    shown = balls.keypoints[..., 2] > 0
+    assert balls.keypoints.shape == (6, 32, 3) and shown[0].all() and not shown.all()
+    at = balls.keypoints[..., :2] * torch.tensor([32.0, 24.0])
+    rays = balls.train.cameras.rays(torch.zeros(32, dtype=torch.long), at[0])
+    column, row = at[0].long().unbind(1)
+    first = rays.at(torch.arange(32), balls.train.depth[0][row, column])
+    last, _ = balls.train.cameras.project_into(4, first + WAY)
+    torch.testing.assert_close(last, at[4])
+
+
+def test_one_threshold_and_a_size_that_far_points_do_not_change():
+    points = torch.tensor([[-1.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 9e9]])
+    assert radius(points) == 1
+    places = torch.zeros(3, 2, 3)
+    places[1, :, 0] = torch.tensor([0.049, 0.051])  # they return
+    assert moving(places, 1.0).tolist() == [False, True]
+
+
+def made(pixels, times, view=None) -> Views:
+    train, _ = dynamic_rig(1, width=pixels.shape[2], height=pixels.shape[1], reach=1.0)
+    count = len(pixels)
+    views = torch.zeros(count, dtype=torch.long) if view is None else view
+    names = tuple(f"{k}.png" for k in range(count))
+    return Views(pixels, train[torch.zeros(count, dtype=torch.long)], times, views, names)
+
+
+def test_without_exact_motion_masks_are_given_or_are_what_differs_from_the_median(tmp_path):
+    pixels = torch.full((3, 12, 16, 3), 100, dtype=torch.uint8)
+    pixels[1, 5, 6, 1] = 127  # 0.106 more
+    pixels[2, 5, 6, 1] = 125  # 0.098 more than the median, which is then 125
+    views = made(pixels, torch.tensor([0.0, 0.5, 1.0]))
+    pixels[2, 11, 15] = 0
+    mask = changed(views, "white")
+    assert mask.nonzero().tolist() == [[2, 11, 15]]
+    pixels[2, 5, 6, 1] = 100
+    masked, rule = with_motion_masks(views, "white", None)
+    assert masked.motion_mask.nonzero().tolist() == [[1, 5, 6], [2, 11, 15]]
+    assert rule == "differs by 0.1 from the median of the camera's images"
+    alone = replace(views, view=torch.arange(3))
+    assert with_motion_masks(alone, "white", None) == (alone, None)
+    for k in range(3):
+        write_image(tmp_path / picture_name(views, k), torch.ones(12, 16, 3) * (k == 1))
+    masked, rule = with_motion_masks(views, "white", tmp_path)
+    assert masked.motion_mask.flatten(1).float().mean(dim=1).tolist() == [0, 1, 0]
+    assert rule == f"given: {tmp_path}"
+    (tmp_path / picture_name(views, 2)).unlink()
+    with pytest.raises(DevrfError, match=r"has no picture of 2\.png"):
+        with_motion_masks(views, "white", tmp_path)
+
+
+def test_only_pixels_of_the_mask_count(rng):
+    mask = torch.zeros(40, 48, dtype=torch.bool)
+    mask[20:, :] = True
+    truth = torch.rand(40, 48, 3, generator=rng) / 2
+    wrong = torch.where(mask[..., None], truth + 0.1, truth + 0.3)
+    given = {"prediction": wrong, "truth": truth, "moving": mask, "lpips": None}
+    assert MEASURES["psnr_moving"](SimpleNamespace(**given)) == pytest.approx(20, abs=1e-3)
+    none = SimpleNamespace(**{**given, "moving": mask & False})
+    assert MEASURES["psnr_moving"](none) is None and MEASURES["ssim_moving"](none) is None
+
+
+def test_flicker_is_the_change_of_the_signed_error():
+    pixels = torch.zeros(3, 12, 16, 3, dtype=torch.uint8)
+    views = made(pixels, torch.tensor([0.0, 0.5, 1.0]))
+    truth = torch.rand(12, 16, 3) / 2 + 0.2
+    # Errors of one size; from the first to the second image half of them change their sign.
+    first, second = torch.full((12, 16, 3), 0.1), torch.full((12, 16, 3), 0.1)
+    second[:6] = -0.1
+    errors = (first, second, second)
+    scored = [SimpleNamespace(compared=truth + error, truth=truth) for error in errors]
+    assert flicker(views, scored) == [None, pytest.approx(0.1), pytest.approx(0)]
+    valid = torch.ones(3, 12, 16, dtype=torch.bool)
+    valid[0, 6:] = False
+    assert flicker(replace(views, valid_mask=valid), scored)[1] == pytest.approx(0.2)
+    assert flicker(replace(views, view=torch.arange(3)), scored) == [None] * 3
+
+
+def test_key_points_of_a_moving_block_by_hand(block, filmed_from_above):
+    # The face is 4 away, the lens has 40 px: 0.2 units until t = 0.5 are 2 px, 0.5 are 5 px.
+    views = filmed_from_above((0.0, 0.0))
+    places = [[[1.0, 4, 1], [2, 2, 1]], [[3, 4, 1], [4, 2, 0]], [[6, 4, 1], [5, 2, 1]]]
+    keypoints = torch.tensor(places) / torch.tensor([8.0, 8, 1])
+    # Of the second point, which is hidden in the second image, 5 should be 7: 2 of 8 are wrong.
+    capture = SimpleNamespace(train=views, keypoints=keypoints)
+    assert pck_t(Renderer(block), capture) == pytest.approx(6 / 8)
+    assert pck_t(Renderer(block), SimpleNamespace(train=views, keypoints=None)) is None
+
+
+def stub(**maps):
+    nothing = {"gaussians_at": lambda _: None, "forward_map": lambda _: None}
+    return SimpleNamespace(space=WORLD, **{**nothing, "canonical_map": lambda _: None, **maps})
+
+
+def test_points_are_followed_by_a_map_back_and_by_the_nearest_gaussian():
+    points = torch.tensor([[1.0, 0, 0], [0, 2, 0]])
+    back = stub(canonical_map=lambda time: lambda x: x * (1 - 0.4 * time))
+    places = track(back, points, 0.5, [1.0, 0.0])
+    torch.testing.assert_close(places, torch.stack([points * 0.8 / 0.6, points * 0.8]))
+    half = math.sqrt(0.5)
+
+    def turned(time: float) -> Gaussians:
+        about_z = torch.tensor([[1.0, 0, 0, 0], [half, 0, 0, half] if time else [1.0, 0, 0, 0]])
+        means = torch.tensor([[9.0, 9, 9], [1, 1, 0]]) + time
+        return Gaussians(means, torch.ones(2, 3), about_z, torch.ones(2), torch.ones(2, 3))
+
+    # One to the right of the middle comes to lie above it.
+    places = track(stub(gaussians_at=turned), torch.tensor([[2.0, 1, 0]]), 0.0, [1.0])
+    torch.testing.assert_close(places, torch.tensor([[[2.0, 3, 1]]]))
+    assert track(stub(), points, 0.0, [1.0]) is None
