@@ -47,6 +47,7 @@ class VideoSettings(Options):
     half: bool = True
     path: str | None = None
     time: Share = 0.5
+    motion_masks: bool = False
 
     def sized(self, cameras: Cameras) -> Cameras:
         """Captured cameras with images of the video's size."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from hydra.utils import instantiate
 
 from devrf.apps.captured_cameras import write_thumbnails
-from devrf.apps.export.geometry import ExportSettings
+from devrf.apps.export.geometry import ExportSettings, scene_radius
 from devrf.apps.export.scene import export_scene
 from devrf.apps.render import videos
 from devrf.apps.settings import ViewerSettings
@@ -24,11 +24,14 @@ from devrf.cli.context import RunContext
 from devrf.cli.restore_config import root
 from devrf.cli.resume import unfinished
 from devrf.cli.view import serve
-from devrf.errors import DevrfError
+from devrf.errors import DevrfError, expect
 from devrf.evaluation.held_out import background_value
+from devrf.evaluation.predictions import picture_name
+from devrf.pictures.images import write_image
 from devrf.pictures.video_file import write_pictures
 from devrf.rendering.renderable import Renderable
 from devrf.rendering.renderer import Renderer
+from devrf.rendering.tracks import moving_pixels
 from devrf.scenes.scene import Scene
 from devrf.system.files import refuse_links, write_text
 from devrf.system.memory import free_cache
@@ -41,12 +44,15 @@ log = logging.getLogger(__name__)
 
 # Times whose views stay at hand in the viewer: both ends, the rest state, and the current ones.
 CACHED = 6
+MASKS = Path("images", "motion_masks")
 
 
 def render(run: RunContext) -> list[Path] | None:
     """Write the videos that ``video`` asks for; return their files, None if one was left out."""
     settings: VideoSettings = instantiate(run.config.video)
     model, viewpoints = _learned(run)
+    if settings.motion_masks:
+        return _write_motion_masks(run, model, viewpoints)
     held_out = None
     without = "held_out.mp4, which shows its images, is left out"
     if settings.path is None and (scene := _with_images(run, without)) is not None:
@@ -63,6 +69,27 @@ def render(run: RunContext) -> list[Path] | None:
             tracker.show_video(f"videos/{video.name}", path)
         paths.append(path)
     return paths if settings.path or held_out else None
+
+
+def _write_motion_masks(
+    run: RunContext, model: Renderable, viewpoints: Viewpoints
+) -> list[Path] | None:
+    """Write a PNG for each held-out image, white where the model shows something that moves."""
+    scene = _with_images(run, "masks of its held-out images are left out")
+    if scene is None:
+        return None
+    views, renderer, folder = scene.dynamic.test, Renderer(model), run.folder / MASKS
+    size, times = scene_radius(model, viewpoints.static), (0.0, *viewpoints.clock.times)
+    paths = []
+    for index in followed(range(len(views)), len(views), "motion masks"):
+        camera, time = views.cameras.single(index), float(views.times[index])
+        mask = moving_pixels(renderer, camera, time, times, size)
+        if mask is None:
+            raise DevrfError(f"video.motion_masks: method={model.name} follows no points")
+        paths.append(folder / picture_name(views, index))
+        write_image(paths[-1], mask[..., None].expand(-1, -1, 3).float())
+    log.info("%d motion masks written to %s", len(paths), folder)
+    return paths
 
 
 def still(run: RunContext) -> None:
@@ -91,7 +118,9 @@ def view(run: RunContext) -> None:
         scene = _with_images(run, "its cameras are shown without pictures")
         server = Session(settings, viewpoints, scene, run.folder, run.config.ckpt)
         background = background_value(viewpoints.background)
-        server.present(Drawing(Renderer(model, times=CACHED), background))
+        parts = model.moving_and_still(scene_radius(model, viewpoints.static))
+        renderers = {name: Renderer(part, times=CACHED) for name, part in parts.items()}
+        server.present(Drawing(Renderer(model, times=CACHED), background, renderers))
     serve(server)
 
 
@@ -99,6 +128,11 @@ def export(run: RunContext) -> None:
     """Write geometry that moves, for other programs, or the page that browsers draw."""
     settings: ExportSettings = instantiate(run.config.export, _convert_="all")
     model, viewpoints = _learned(run)
+    if settings.part != "all":
+        parts = model.moving_and_still(scene_radius(model, viewpoints.static))
+        known = ("all", *parts)
+        expect(settings.part in known, "export.part", f"{' or '.join(known)} here", settings.part)
+        model = parts[settings.part]
     folder = run.folder / "export" if settings.into is None else Path(settings.into)
     refuse_links(folder)
     if settings.format == "html":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
 import torch
@@ -14,21 +15,22 @@ MOVED = 0.05
 def radius(points: Tensor) -> float:
     """The median distance of points (M, 3) from their middle, the median along each axis.
 
-    Neither a sky far away nor a few points that float about change it much.
+    Neither a sky far away nor a few points that float about change it much. Of no points it is
+    infinite: nothing moves.
     """
-    return float((points - points.median(dim=0).values).norm(dim=1).median())
-
-
-def farthest(places: Iterable[Tensor]) -> Tensor:
-    """How far (M,) points get from their first place; ``places`` are (M, 3), one for each time."""
-    remaining = iter(places)
-    first = next(remaining)
-    away = torch.zeros_like(first[:, 0])
-    for place in remaining:
-        away = torch.maximum(away, (place - first).norm(dim=1))
-    return away
+    if len(points) == 0:
+        return math.inf
+    return float((points - points.nanmedian(dim=0).values).norm(dim=1).nanmedian())
 
 
 def moving(places: Iterable[Tensor], size: float) -> Tensor:
-    """Mask (M,) of points that move (docs/stages.md#moving) in a scene of a radius ``size``."""
-    return farthest(places) > MOVED * size
+    """Mask (M,) of points that move (docs/stages.md#moving) in a scene of a radius ``size``.
+
+    ``places`` (M, 3) are theirs at each time, first at rest.
+    """
+    remaining = iter(places)
+    first = next(remaining)
+    moves = torch.zeros_like(first[:, 0], dtype=torch.bool)
+    for place in remaining:
+        moves |= (place - first).norm(dim=1) > MOVED * size
+    return moves

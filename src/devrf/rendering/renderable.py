@@ -94,6 +94,13 @@ class Renderable(StoredClass, nn.Module, ABC):
         """
         return None
 
+    def moving_and_still(self, size: float) -> Mapping[str, Renderable]:
+        """What is ``moving`` in a scene of radius ``size`` (docs/stages.md#moving), what ``still``.
+
+        They share this scene's memory. Empty: nothing moves, or the method cannot tell them apart.
+        """
+        return {}
+
     @property
     def device(self) -> torch.device:
         """Where the parameters are."""

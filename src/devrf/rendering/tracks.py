@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
 
+from devrf.geometry.cameras import Cameras
+from devrf.geometry.motion import moving
+from devrf.metrics.geometric import SOLID
 from devrf.ops.splatting import rotations
 from devrf.rendering.renderable import Renderable
+from devrf.rendering.renderer import Renderer, points_at_depth
 
 # Steps by which a map back to the canonical state is inverted.
 STEPS = 30
@@ -21,36 +26,50 @@ def track(model: Renderable, points: Tensor, time: float, times: Sequence[float]
     """Where ``points`` (M, 3) at ``time`` are at T ``times``: (T, M, 3), all in world units.
 
     They go to the canonical state and from there by the method's maps (``canonical_map``,
-    ``forward_map``). A method that only knows the way back is asked which point comes from there:
-    by a fixed point, from the place at the time before. In a scene of Gaussians a point goes with
-    the nearest one. None: the method has none of these.
+    ``forward_map``). Of a method that only knows the way back, the point that comes from there is
+    found as a fixed point. In a scene of Gaussians a point goes with the nearest one. None: the
+    method has none of these.
     """
     nearest = _with_gaussians(model, points, time, times)
     to_canonical = model.canonical_map(time)
     if nearest is not None or to_canonical is None:
         return nearest
-    start = model.space.from_world(points)
-    canonical = to_canonical(start)
-    places: dict[float, Tensor] = {}
-    ordered = sorted({*times})
-    for way in ([t for t in ordered if t >= time], [t for t in ordered[::-1] if t < time]):
-        place = start
-        for moment in way:
-            forward = model.forward_map(moment)
-            if forward is not None:
-                place = forward(canonical)
-            else:
-                back = model.canonical_map(moment)
-                assert back is not None
-                place = _inverse(back, canonical, place)
-            places[moment] = place
-    return torch.stack([model.space.to_world(places[moment]) for moment in times])
+    canonical = to_canonical(model.space.from_world(points))
+    places = []
+    for moment in times:
+        forward = model.forward_map(moment)
+        if forward is None:
+            back = model.canonical_map(moment)
+            assert back is not None
+            forward = partial(_inverse, back)
+        places.append(model.space.to_world(forward(canonical)))
+    return torch.stack(places)
 
 
-def _inverse(back: Callable[[Tensor], Tensor], canonical: Tensor, start: Tensor) -> Tensor:
-    """Points (M, 3) near ``start`` (M, 3) that ``back`` leads nearest to ``canonical`` (M, 3)."""
-    best = place = start
-    least = torch.full_like(start[:, 0], torch.inf)
+@torch.no_grad()
+def moving_pixels(
+    renderer: Renderer, camera: Cameras, time: float, times: Sequence[float], size: float
+) -> Tensor | None:
+    """Mask (H, W) of the pixels of a camera's picture at ``time`` that show what moves.
+
+    A pixel shows the point at the mean depth of its ray, if more than half of that is stopped. The
+    point moves, or not, over the ``times``, first at rest, in a scene of radius ``size``. None: the
+    method follows no points.
+    """
+    image = renderer.view(camera, 0, time, 0.0)
+    mask = image.opacity > SOLID
+    rays = camera.to(renderer.device).image_rays(0)[mask]
+    points = points_at_depth(renderer.model.space, rays, image.depth[mask])
+    places = track(renderer.model, points, time, times)
+    if places is None:
+        return None
+    return mask.masked_scatter(mask, moving(places, size)).view(camera.height, camera.width).cpu()
+
+
+def _inverse(back: Callable[[Tensor], Tensor], canonical: Tensor) -> Tensor:
+    """Points (M, 3) that ``back`` leads as near as can be to ``canonical`` (M, 3)."""
+    best = place = canonical
+    least = torch.full_like(place[:, 0], torch.inf)
     for _ in range(STEPS):
         miss = canonical - back(place)
         error = miss.norm(dim=1)

@@ -43,7 +43,7 @@ def ball(points):
     return points.norm(dim=1) - RADIUS
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def of_distance():
     """The function :func:`solid`."""
     return solid

@@ -6,7 +6,7 @@ import pytest
 import torch
 import trimesh
 
-from devrf.apps.export.geometry import ExportSettings, MovingMesh
+from devrf.apps.export.geometry import ExportSettings
 from devrf.apps.export.surface import surface_of
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
@@ -114,20 +114,3 @@ def test_a_threshold_that_nothing_crosses_is_refused(of_distance, cube, around):
     for threshold in (0.999, 1e-9):
         with pytest.raises(DevrfError, match=r"^export\.threshold: "):
             exported(flat, around, threshold=threshold)
-
-
-def test_the_moving_part_and_what_stays_share_the_faces():
-    # Two triangles that touch at a vertex; a corner of the second leaves its place for a while.
-    corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, -1, 0], [-1, 0, 0]])
-    later = corners.clone()
-    later[4, 2] = 0.03
-    colors = torch.arange(15.0).view(5, 3) / 15
-    faces = torch.tensor([[0, 1, 2], [0, 4, 3]])
-    mesh = MovingMesh((0.0, 0.5, 1.0), torch.stack([corners, later, corners]), faces, colors)
-    moving, still = mesh.part(moving=True), mesh.part(moving=False)
-    assert moving.faces.tolist() == [[0, 2, 1]] and still.faces.tolist() == [[0, 1, 2]]
-    assert torch.equal(moving.vertices, mesh.vertices[:, [0, 3, 4]])
-    assert torch.equal(moving.colors, colors[[0, 3, 4]]) and torch.equal(still.colors, colors[:3])
-    rest = MovingMesh((0.0,), corners[None], faces, colors)  # 0.03 is more than 1 % of the diagonal
-    with pytest.raises(DevrfError, match=r"^export.part: nothing moves by more than 1%"):
-        rest.part(moving=True)

@@ -138,6 +138,16 @@ def test_each_channel_has_a_frame_of_its_own(drawing, shot):
     assert int(opacity[0, 0, 0]) == 0 and int(opacity.max()) > 200
 
 
+def test_a_part_is_drawn_by_its_own_renderer(drawing, learned, shot):
+    whole = drawn(drawing, shot).pixels
+    at_rest = Renderer(learned[0].scene_model)
+    parts = Drawing(drawing.renderer, 1.0, {"still": at_rest})
+    assert torch.equal(drawn(parts, shot).pixels, whole)
+    still = drawn(parts, replace(shot, part="still")).pixels
+    assert torch.equal(still, drawn(Drawing(at_rest, 1.0), shot).pixels)
+    assert not torch.equal(still, whole)
+
+
 def test_the_rest_state_is_on_the_left_and_nothing_is_cut_off(drawing, shot):
     beside = drawn(drawing, replace(shot, beside_rest=True), 20).pixels
     rest = replace(shot, keyframe=replace(shot.keyframe, time=0.0))
@@ -378,10 +388,11 @@ def test_controls_say_what_they_offer_whatever_a_page_sends(learned, tiny_scene,
             assert controls.playback.speed == speed
         box = learned[0].scene_model.box
         set_value(controls._channel, "motion")  # a scene at rest has none
+        set_value(controls._part, "moving")
         set_value(controls._crop, True)
         set_value(controls._sides[0], (900, -900))
         shot = controls.shot(page_camera(), box, with_depth=False)
-        assert shot.channel == "color"
+        assert (shot.channel, shot.part) == ("color", "all")
         assert shot.crop.low == pytest.approx(box.low) and shot.crop.high == pytest.approx(box.high)
         drawn(at_rest, shot, 16)
         for sent, seconds in ((math.nan, 0.05), (1e300, 600), (2.0, 2.0)):

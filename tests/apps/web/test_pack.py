@@ -310,7 +310,14 @@ def test_the_controls_do_what_they_say(browser, file, tmp_path):
         shown = browser.changed(shown)
         assert psnr(whole, shown) < 30
     channel.select_by_visible_text("colour")
-    assert psnr(whole, browser.changed(shown)) > 60
+    shown = browser.changed(shown)
+    assert psnr(whole, shown) > 60
+    part = choice(browser.element("part"))
+    part.select_by_visible_text("moving")  # the forward field of this model moves nothing
+    nothing = browser.changed(shown)
+    assert float(nothing.std()) == 0
+    part.select_by_visible_text("still")
+    assert psnr(whole, browser.changed(nothing)) > 60
 
     def pose() -> str:
         browser.element("link").click()
@@ -436,7 +443,7 @@ def test_a_scene_may_be_called_as_a_part_of_the_page(moving, tiny_scene, name):
 def test_all_data_are_in_the_file_and_as_large_as_their_textures(moving, tiny_scene):
     text = page(moving, Viewpoints.of(tiny_scene), "tiny", "0123abcd")
     described = json.loads(re.search(r'id="description">(.*)</script>', text)[1])
-    bytes_of = {"density": 2, "rough": 3, "features": 4, "weights": 16, "distances": 1}
+    bytes_of = {"density": 2, "rough": 3, "features": 4, "weights": 16, "distances": 1, "moving": 1}
     bytes_of |= {"displacement": 6, "residual": 6}
     found = re.findall(r'<script type="text/plain" id="([a-z]+)(-\w+)?">(.+)</script>', text)
     for kind, _, packed in found:
@@ -459,6 +466,7 @@ def test_all_data_are_in_the_file_and_as_large_as_their_textures(moving, tiny_sc
             "rough",
             "features",
             "weights",
+            "moving",
             "distances-rest",
             "distances-0",
             "distances-1",

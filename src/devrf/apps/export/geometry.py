@@ -10,24 +10,24 @@ from typing import Annotated, ClassVar, Literal, cast
 
 import pydantic.dataclasses
 import torch
-from annotated_types import Ge, Gt, Le, Lt, MinLen
+from annotated_types import Ge, Gt, Le, Len, Lt, MinLen
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from devrf.errors import DevrfError, expect
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
+from devrf.geometry.motion import radius
 from devrf.geometry.offset import NO_OFFSET, Offset
 from devrf.metrics.geometric import SOLID
 from devrf.rendering.renderable import Renderable
 from devrf.rendering.renderer import Renderer, points_at_depth
 from devrf.system.options import Count, Options, Share
 
-Format = Literal["gltf", "html", "ply", "obj", "splats", "usd"]
+Format = Literal["gltf", "html", "ply", "obj", "splats", "usd", "csv", "json"]
+Point = Annotated[Sequence[float], Len(3, 3)]
 Up = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
 Factor = Annotated[float, Ge(1e-9), Le(1e9)]
-# What moves farther, in diagonals of the surface, is a moving part of it.
-MOVED = 0.01
 
 
 @pydantic.dataclasses.dataclass(frozen=True)
@@ -37,7 +37,7 @@ class ExportSettings(Options):
     key: ClassVar[str] = "export"
 
     format: Format = "gltf"
-    content: Literal["auto", "surface", "points", "splats"] = "auto"
+    content: Literal["auto", "surface", "points", "splats", "tracks"] = "auto"
     part: Literal["all", "moving", "still"] = "all"
     threshold: Annotated[float, Gt(0), Lt(1)] = 0.1
     side: Annotated[int, Ge(2), Le(1024)] | None = None
@@ -46,6 +46,7 @@ class ExportSettings(Options):
     reach: Factor = 10.0
     colors: Literal["normal", "mean"] = "mean"
     points: Count = 20_000
+    tracks: Annotated[Sequence[Point], MinLen(1)] | None = None
     times: Annotated[Sequence[float], MinLen(1)] | None = None
     fps: Annotated[float, Gt(0), Le(1000)] | None = None
     seconds: Annotated[float, Ge(0.01), Le(3600)] = 3.0
@@ -161,29 +162,6 @@ class MovingMesh:
     faces: Tensor
     colors: Tensor
 
-    def part(self, *, moving: bool) -> MovingMesh:
-        """The faces that move, or those that stay, with their vertices; at least one.
-
-        A vertex moves that leaves its first place by more than :data:`MOVED` diagonals of the mesh
-        there, a face of which a vertex moves.
-
-        Raises:
-            DevrfError: there is none.
-        """
-        first = self.vertices[0]
-        diagonal = (first.amax(dim=0) - first.amin(dim=0)).norm()
-        farthest = (self.vertices - first).norm(dim=2).amax(dim=0)
-        moves = (farthest > MOVED * diagonal)[self.faces].any(dim=1)
-        faces = self.faces[moves if moving else ~moves]
-        if len(faces) == 0:
-            which = "nothing" if moving else "everything"
-            raise DevrfError(
-                f"export.part: {which} moves by more than {MOVED:.0%} of the surface's size at "
-                "export's times; give export.part=all, or other export.times"
-            )
-        kept, numbers = faces.unique(return_inverse=True)  # type: ignore[no-untyped-call]
-        return MovingMesh(self.times, self.vertices[:, kept], numbers, self.colors[kept])
-
 
 def carried(surface: Surface, model: Renderable, times: Sequence[float]) -> MovingMesh:
     """A surface at rest, carried through time: each canonical vertex q goes to x(q, t)."""
@@ -244,6 +222,12 @@ def seen_points(
     points, colors = _seen(renderer, cameras, rows, time, background)
     subset = _every(len(points), count)
     return points[subset], colors[subset]
+
+
+def scene_radius(model: Renderable, cameras: Cameras) -> float:
+    """The radius of what the cameras (world units) see at rest, world units."""
+    cameras = cameras[_every(len(cameras), CAMERAS)].to(model.device)
+    return radius(_seen(Renderer(model), cameras, FIRST, 0.0, 0.0)[0])
 
 
 def _every(count: int, max_count: int) -> Tensor:

@@ -11,9 +11,10 @@ from devrf.apps.export.gltf import write_gltf
 from devrf.apps.export.sequence import Drawn, mesh_files, point_file, write_sequence
 from devrf.apps.export.splats import MovingGaussians, write_splats, write_usd_splats
 from devrf.apps.export.surface import surface_of
+from devrf.apps.export.tracks import FORMATS, write_tracks
 from devrf.apps.export.usd import write_usd
 from devrf.checkpoints.checkpoint import Viewpoints
-from devrf.errors import DevrfError, expect
+from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
 from devrf.geometry.cameras import Cameras
 from devrf.rendering.renderable import Renderable
@@ -37,11 +38,14 @@ def export_scene(
         DevrfError: the method has no such geometry, or it is empty.
     """
     times = settings.export_times(viewpoints.clock) if model.moves else (0.0,)
+    if settings.content == "tracks" or settings.format in FORMATS:
+        path = write_tracks(folder, model, viewpoints, settings, times)
+        log.info(
+            "%d tracks at %d times written to %s", len(settings.tracks or ()), len(times), path
+        )
+        return
     own = MovingGaussians.of_model(model, times) if settings.as_splats else None
     if own is not None:
-        expect(
-            settings.part == "all", "export.part", "all of a method's own Gaussians", settings.part
-        )
         path = _write_splats(folder, own, viewpoints, settings)
         count = len(own.of_time[0].means)
         log.info("%d Gaussians at %d times written to %s", count, len(times), path)
@@ -63,8 +67,6 @@ def export_scene(
         assert field is not None
         surface = surface_of(model, field, viewpoints.static, settings)
         mesh = carried(surface, model, times)
-        if settings.part != "all":
-            mesh = mesh.part(moving=settings.part == "moving")
         path = _write_mesh(folder, mesh, viewpoints, settings)
         faces = len(mesh.faces)
         vertices = mesh.vertices.shape[1]
@@ -87,11 +89,6 @@ def _takes_surface(model: Renderable, settings: ExportSettings) -> bool:
         raise DevrfError(
             f"export.content: method={model.name} has no surface; give export.content=points "
             "export.format=ply"
-        )
-    if settings.part != "all" and not (wanted and carries):
-        raise DevrfError(
-            f"export.part: only a surface that is carried through time has a {settings.part} part; "
-            "give export.part=all"
         )
     if wanted and not carries and settings.format in (*SINGLE, *SPLATS):
         raise DevrfError(

@@ -88,6 +88,7 @@ class Controls:
             self._follow = gui.add_checkbox("follow", True, visible=False, hint=hint)
         with gui.add_folder("Picture"):
             self._channel: Any = gui.add_dropdown("show", ("color",))
+            self._part: Any = gui.add_dropdown("part", ("all",), visible=False)
             self._rest = gui.add_checkbox("rest beside", False, hint="the rest state on the left")
             self._status = gui.add_markdown("")
         with gui.add_folder("Cameras", expand_by_default=False):
@@ -108,7 +109,7 @@ class Controls:
         scene = server.scene
         rest = self._rest
         rest.on_update(lambda _: scene.set_global_visibility(not rest.value))
-        boxes: list[Any] = [self._channel, rest, self.dynamic, self.static]
+        boxes: list[Any] = [self._channel, self._part, rest, self.dynamic, self.static]
         crop: list[Any] = [self._crop, *self._sides]
         for control in (*boxes, *crop):
             control.on_update(lambda _: self._changed())
@@ -120,6 +121,8 @@ class Controls:
         channel = self._channel.value
         self._channel.options = drawing.channels
         set_value(self._channel, channel if channel in drawing.channels else "color")
+        self._part.options = ("all", *drawing.parts)
+        self._part.visible = bool(drawing.parts)
         self._rest.visible = drawing.has_rest
         self._timing.visible = not drawing.at_rest
 
@@ -162,7 +165,8 @@ class Controls:
         with_depth = with_depth or self.dynamic.value or self.static.value
         beside = self._rest.value and self._rest.visible
         keyframe, aspect = from_browser(camera, self.playback.time)
-        return Shot(keyframe, aspect, choice_of(self._channel), beside, crop, with_depth)
+        shown = choice_of(self._channel), choice_of(self._part)
+        return Shot(keyframe, aspect, *shown, beside, crop, with_depth)
 
     def show_status(self, text: str) -> None:
         """Show a line below the choice of channels."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -44,6 +44,7 @@ class Shot:
         keyframe: the camera and the scene's time.
         aspect: width over height.
         channel: ``color``, ``depth``, ``opacity`` or ``motion``.
+        part: ``all`` of the scene, or one of the drawing's parts alone.
         beside_rest: whether the rest state is shown beside, on the left, from so much farther that
             each half shows the whole width.
         crop: leave out what is outside this box (:class:`~devrf.rendering.renderer.CroppedRays`).
@@ -53,6 +54,7 @@ class Shot:
     keyframe: Keyframe
     aspect: float
     channel: str = "color"
+    part: str = "all"
     beside_rest: bool = False
     crop: Box | None = None
     with_depth: bool = False
@@ -75,14 +77,18 @@ class Drawing:
 
     Attributes:
         renderer: renders the scene; it may be replaced while the scene is learned.
+        parts: those of what moves and of what stays, by their names, where they are known.
         channels: the names of its channels.
         has_rest: whether it has a rest state beside others.
         at_rest: whether it looks the same at all times.
     """
 
-    def __init__(self, renderer: Renderer, background: float) -> None:
+    def __init__(
+        self, renderer: Renderer, background: float, parts: Mapping[str, Renderer] | None = None
+    ) -> None:
         """``background``: the grey level behind the scene."""
         self.renderer = renderer
+        self.parts = parts or {}
         self._background = background
         end = renderer.at(1.0)
         self.at_rest = end.at_rest
@@ -107,16 +113,17 @@ class Drawing:
         keyframe = replace(shot.keyframe, fov=2 * math.degrees(math.atan(tangent)))
         parts = []
         depth = None
+        renderer = self.parts.get(shot.part, self.renderer)
         for current in times:
             camera = cameras_of([keyframe], shot.aspect / len(times), height)
-            camera = camera.to(self.renderer.device)
+            camera = camera.to(renderer.device)
             started = time.perf_counter()
             with torch.no_grad():
-                self.renderer.at(current)  # cached, or it takes a while
+                renderer.at(current)  # cached, or it takes a while
             self._overhead += 0.3 * (time.perf_counter() - started - self._overhead)
             started = time.perf_counter()
             blocks = []
-            for block in self._blocks(shot, camera, current):
+            for block in self._blocks(renderer, shot, camera, current):
                 blocks.append(block)
                 yield None
             image = RenderedImage.joined([image for image, _ in blocks])
@@ -130,20 +137,20 @@ class Drawing:
 
     @torch.no_grad()
     def _blocks(
-        self, shot: Shot, camera: Cameras, time: float
+        self, renderer: Renderer, shot: Shot, camera: Cameras, time: float
     ) -> Iterator[tuple[RenderedImage, Tensor]]:
         """Consecutive rows of pixels, with the motion (K, 2) where it is shown."""
-        crop = shot.crop or self.renderer.reach(camera.positions[0])
+        crop = shot.crop or renderer.reach(camera.positions[0])
         later = time + STEP if time + STEP <= 1 else time - STEP
         size = max(MIN_RAYS, int(BLOCK_SECONDS * self._rays_per_second))
         rows = math.ceil(size / camera.width)
         for first in range(0, camera.height, rows):
             band = camera.rows(first, min(first + rows, camera.height))
-            image = self.renderer.view(band, 0, time, self._background, crop)
+            image = renderer.view(band, 0, time, self._background, crop)
             vectors = torch.zeros_like(image.color[:, :2])
             if shot.channel == "motion":
                 rays, pixels = band.image_rays(0), band.pixel_grid()
-                flow = self.renderer.induced_flow(rays, pixels, band, time, later)
+                flow = renderer.induced_flow(rays, pixels, band, time, later)
                 assert flow is not None  # the channel is offered where there is motion
                 vectors = flow[0] * (1 if later > time else -1)
             yield image, vectors

@@ -8,6 +8,7 @@
 ``features``         colour features f, a byte each: its share of its channel's range, which the
                      network's first layer knows; blocks of four channels, one behind another
 ``weights``          the colour network, single precision
+``moving``           255 where a canonical point moves (docs/stages.md#moving), else 0
 ``distances-rest``   cells to the nearest occupied one at rest, a byte
 ``distances-K``      the same at all times between the frames K and K + 1
 ``displacement-K``   Δ_b of frame K in shares of a cell, half precision: devices may round what
@@ -40,9 +41,11 @@ from torch.nn.functional import normalize, pad
 
 from devrf.apps.camera_paths import upward
 from devrf.apps.captured_cameras import described, frustum_depth
+from devrf.apps.export.geometry import scene_radius
 from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
+from devrf.geometry.cameras import Cameras
 from devrf.geometry.contraction import ContractedSpace
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.methods.devrf.canonical_field import ColorDecoder
@@ -85,7 +88,7 @@ def page(model: Renderable, viewpoints: Viewpoints, name: str, checkpoint: str) 
     assert isinstance(model, DeVRFModel)
     sizes: dict[str, tuple[int, ...]] = {}
     elements = []
-    for part, values in _parts(model, viewpoints.static.positions):
+    for part, values in _parts(model, viewpoints.static):
         sizes[part.partition("-")[0]] = values.shape[2::-1]
         elements.append(_element(part, values))
     description = _description(model, viewpoints) | {"name": name, "shapes": sizes}
@@ -109,7 +112,7 @@ def _element(part: str, values: Tensor) -> str:
     return f'<script type="text/plain" id="{part}">{base64.b64encode(packed).decode()}</script>'
 
 
-def _parts(model: DeVRFModel, eyes: Tensor) -> Iterator[tuple[str, Tensor]]:
+def _parts(model: DeVRFModel, cameras: Cameras) -> Iterator[tuple[str, Tensor]]:
     """The contents of all textures by the elements' names: (depth, height, width, …)."""
     field = model.canonical
     sampling = model.at(0.0).picture_settings
@@ -120,7 +123,7 @@ def _parts(model: DeVRFModel, eyes: Tensor) -> Iterator[tuple[str, Tensor]]:
     yield "density", torch.where(visible, raw, raw.min()).half()
     if not model.space.is_linear:  # rays end in the field's outer faces
         visible[[0, -1]] = visible[:, [0, -1]] = visible[:, :, [0, -1]] = True
-    yield "rough", _rough(model, visible, eyes.to(visible.device))
+    yield "rough", _rough(model, visible, cameras.positions.to(visible.device))
     low, high = field.color.values[visible | ~visible.any()].aminmax(dim=0)
     high = torch.maximum(high, low + 1e-6)
     shares = ((field.color.values - low) / (high - low)).clamp(0, 1) * visible[..., None]
@@ -128,6 +131,8 @@ def _parts(model: DeVRFModel, eyes: Tensor) -> Iterator[tuple[str, Tensor]]:
     yield "features", torch.cat(torch.split(codes, 4, dim=-1))
     assert isinstance(field.decoder, ColorDecoder)
     yield "weights", _weights(field.decoder, low, high)
+    moves = model.moving_points(scene_radius(model, cameras))
+    yield "moving", 255 * moves.to(torch.uint8)
     motion = model.deformation
     residual = model.color_residual
     seen = _seen(motion, rest.cell, occupied) if motion else []

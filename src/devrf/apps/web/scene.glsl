@@ -23,6 +23,7 @@ const float MOTION_STEP = 0.05, MOTION_FULL = 0.02;
 // Of all grids z is along the texture's width and x along its depth, as they lie in memory.
 uniform sampler3D density, features, weights;   // features: blocks of four channels
 uniform sampler3D rough;                        // preview colours
+uniform sampler3D moving;                       // 1 where canonical points move
 uniform sampler3D displacement0, displacement1, residual0, residual1; // before, after the time
 uniform usampler3D distances;
 uniform vec3 low, high, motionLow, motionHigh;  // the boxes of all fields, and of displacements
@@ -35,7 +36,7 @@ uniform float share, interval;       // of the frame after; from one to the othe
 uniform vec3 eye, right, up, backward, background;
 uniform vec2 slope, middle;          // tangents of half the angles of view, of its middle's angles
 uniform vec4 frame;                  // x, y, width and height of the picture, in pixels
-uniform int channel;
+uniform int channel, part;           // part: 1 shows what moves alone, 2 what stays
 uniform vec3 palette[9];
 out vec4 pixel;
 
@@ -253,6 +254,7 @@ void main() {
       canonical = at(ray, s);
       if (warps) canonical += displacement(canonical, share);
       p = place(canonical, low, high, textureSize(density, 0));
+      if (part > 0 && part != (textureLod(moving, p, 0.0).r > 0.5 ? 1 : 2)) continue;
       float raw = textureLod(density, p, 0.0).r + shift;
       float alpha = 1.0 - exp(-STRIDE * delta * (raw > 15.0 ? raw : log(1.0 + exp(raw))));
       if (alpha < threshold) continue;

@@ -48,14 +48,15 @@ const KINDS = {
   rough: ["RGB8", "RGB", "UNSIGNED_BYTE", Uint8Array],
   features: ["RGBA8", "RGBA", "UNSIGNED_BYTE", Uint8Array],
   weights: ["RGBA32F", "RGBA", "FLOAT", Float32Array],
+  moving: ["R8", "RED", "UNSIGNED_BYTE", Uint8Array],
   distances: ["R8UI", "RED_INTEGER", "UNSIGNED_BYTE", Uint8Array],
   displacement: ["RGB16F", "RGB", "HALF_FLOAT", Uint16Array],
   residual: ["RGB16F", "RGB", "HALF_FLOAT", Uint16Array],
 };
-// Textures by their units' numbers: four that stay; of what changes one before the time, one after.
-const UNITS = ["density", "rough", "features", "weights", "distances", "rest"];
+// Textures by their units' numbers: five that stay; of what changes one before the time, one after.
+const UNITS = ["density", "rough", "features", "weights", "moving", "distances", "rest"];
 UNITS.push("displacement0", "displacement1", "residual0", "residual1");
-const [DISTANCES, REST] = [4, 5];
+const [DISTANCES, REST] = [5, 6];
 
 class Graphics {
   constructor(canvas, scene) {
@@ -146,7 +147,7 @@ class Graphics {
 
   /** Brings onto the device what is the same at all times. */
   async load() {
-    for (const kind of UNITS.slice(0, 4)) this.fill(kind, kind, await inflate(kind));
+    for (const kind of UNITS.slice(0, 5)) this.fill(kind, kind, await inflate(kind));
     this.fill("rest", "distances", await inflate("distances-rest"));
   }
 
@@ -299,7 +300,7 @@ class Page {
     const starts = !this.follow() && !matchMedia("(prefers-reduced-motion: reduce)").matches;
     this.play(starts);
     this.turning = starts && !this.motion.moves;
-    for (const id of ["timing", "beside"]) byId(id).hidden = !this.motion.moves;
+    for (const id of ["timing", "beside", "part"]) byId(id).hidden = !this.motion.moves;
     if (!this.motion.moves) byId("channel").lastElementChild.remove();
     byId("full").hidden = !document.fullscreenEnabled;
     this.listen();
@@ -365,8 +366,8 @@ class Page {
     // From as much farther that each half shows the whole width.
     const tangent = count * Math.tan(fov / 2);
     const slope = [(tangent * width) / height / count, tangent];
-    const channel = Number(byId("channel").value);
-    const view = { right, up, backward, eye, slope, middle, channel };
+    const [channel, part] = ["channel", "part"].map((id) => Number(byId(id).value));
+    const view = { right, up, backward, eye, slope, middle, channel, part };
     const now = { ...view, ...this.motion.uniforms(this.time) };
     return count > 1 ? [{ ...now, warps: false, distances: REST }, now] : [now];
   }

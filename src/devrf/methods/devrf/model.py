@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import partial
@@ -13,6 +14,7 @@ from torch import Tensor
 from devrf.checkpoints.stored_grids import pack, unpack
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
+from devrf.geometry.motion import moving as moving_of
 from devrf.geometry.space import WORLD, Space, space_config, space_from
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField, ColorDecoder
@@ -31,6 +33,8 @@ from devrf.system.stored_class import StoredClass, class_path, stored_class
 
 # Samples of a ray, at most, before empty space is skipped.
 SAMPLES = 2**14
+# Opacity of a base voxel that is left out.
+EMPTY = 1e-9
 
 
 class ColorField(StoredClass, FrameField):
@@ -161,6 +165,28 @@ class DeVRFModel(Renderable):
     def canonical_map(self, time: float) -> Callable[[Tensor], Tensor]:
         """x → x + Δ_b(x, t) (docs/method.md#warp)."""
         return self.warp(time) or (lambda points: points)
+
+    @torch.no_grad()
+    def moving_points(self, size: float) -> Tensor:
+        """Mask (X, Y, Z) of the density grid's points that move in a scene of radius ``size``."""
+        moves = self.occupancy.points_near(self.canonical.density.shape, self.box)
+        points = self.box.grid_points(self.canonical.density.shape, self.canonical.density.values)
+        near = points[moves]
+        times = (0.0,) if self.deformation is None else self.deformation.clock.times
+        places = (self.space.to_world(self.forward_map(time)(near)) for time in times)
+        return moves.masked_scatter(moves, moving_of(places, size))
+
+    def moving_and_still(self, size: float) -> dict[str, Renderable]:
+        """The scene with densities that are emptied elsewhere; the other fields are shared."""
+        moves = self.moving_points(size)
+        parts: dict[str, Renderable] = {}
+        for name, others in (("moving", ~moves), ("still", moves)) if bool(moves.any()) else ():
+            shared = (self.canonical.color, self.canonical.decoder)
+            field = copy.deepcopy(self.canonical, {id(module): module for module in shared})
+            field.clear(others, EMPTY)
+            fields = (self.settings, self.deformation, self.space, self.color_residual)
+            parts[name] = DeVRFModel(self.architecture, field, self.occupancy, *fields)
+        return parts
 
     @property
     def moves(self) -> bool:

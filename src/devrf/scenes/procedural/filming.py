@@ -97,20 +97,12 @@ def exact_flow(shape: Shape, views: Views, *, forward: bool = False) -> OpticalF
     vectors = views.depth.new_zeros(*views.depth.shape, 2)
     valid = torch.zeros_like(views.depth, dtype=torch.bool)
     for time, other in pairs:
-        at = (views.times == time).nonzero()[:, 0]
-        cameras = views.cameras[at]
-        depth = views.depth[at]
-        met = depth.isfinite()
-        camera, row, column = met.nonzero().unbind(-1)
-        pixels = torch.stack([column, row], dim=-1).to(depth) + 0.5
-        rays = cameras.rays(camera, pixels)
-        points = rays.at(torch.arange(len(rays)), depth[met])
-        seen_from = views.cameras[(views.times == other).nonzero()[:, 0]]
-        there, _ = seen_from.project(camera, moved(shape, points, time, other))
-        flow = depth.new_zeros(*depth.shape, 2)
-        flow[met] = there - pixels
-        vectors[at] = flow
-        valid[at] = met
+        images, others = ((views.times == moment).nonzero()[:, 0] for moment in (time, other))
+        for image, seen_from in zip(images.tolist(), others.tolist(), strict=True):
+            met, points = _met(views, image)
+            there, _ = views.cameras.project_into(seen_from, moved(shape, points, time, other))
+            vectors[image].view(-1, 2)[met] = there - views.cameras.pixel_grid()[met]
+            valid[image].view(-1)[met] = True
     return OpticalFlow(vectors, valid)
 
 
