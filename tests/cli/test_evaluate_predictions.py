@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 
+import imageio.v3 as iio
 import pytest
 
 
@@ -23,7 +24,18 @@ def test_a_runs_own_pictures_come_back_as_another_programs(devrf, tmp_path, tiny
     assert (again["scene"], again["method"]) == ("robot", "Splats (pictures)")
     for section in ("static", "dynamic"):
         assert again[section]["psnr"] == pytest.approx(own[section]["psnr"], abs=0.02)
-        assert {"depth_error", "rest_pose_psnr"}.isdisjoint(again[section])
+        assert {"depth_error", "rest_pose_psnr", "pck_t"}.isdisjoint(again[section])
+    # What moves is what the scene says, for both.
+    assert own["run"]["motion_masks"] == again["run"]["motion_masks"] == "exact"
+    for metric, rounding in (("psnr_moving", 0.02), ("ssim_moving", 1e-3), ("flicker", 1e-3)):
+        assert again["dynamic"][metric] == pytest.approx(own["dynamic"][metric], abs=rounding)
+    assert own["dynamic"]["psnr_moving"] < own["dynamic"]["psnr"]
+    assert 0 < own["dynamic"]["pck_t"] <= 1 and own["static"]["psnr_moving"] is None
+    assert devrf("stage=render", "hydra.run.dir=outputs/run", "video.motion_masks=true").status == 0
+    masks = sorted((tmp_path / "outputs" / "run" / "images" / "motion_masks").iterdir())
+    pictures = sorted((tmp_path / "outputs" / "run" / "images" / "held_out" / "dynamic").iterdir())
+    assert [mask.name for mask in masks] == [picture.name for picture in pictures]
+    assert iio.imread(masks[-1]).shape == iio.imread(pictures[-1]).shape
     report = devrf("stage=report")
     assert report.status == 0 and "Splats (pictures)" in report.out and "Ours" in report.out
     lacking = devrf(*tiny, "stage=evaluate", "evaluation.predictions=outputs/run/images")

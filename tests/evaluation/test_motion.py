@@ -1,8 +1,7 @@
-"""What moves in held-out images, what is scored of it, and points that are followed."""
+"""What moves in held-out images, what is scored of it."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
@@ -14,11 +13,8 @@ from devrf.evaluation.motion import changed, flicker, pck_t, with_motion_masks
 from devrf.evaluation.predictions import picture_name
 from devrf.evaluation.suite import MEASURES
 from devrf.geometry.motion import moving, radius
-from devrf.geometry.space import WORLD
-from devrf.ops.splatting import Gaussians
 from devrf.pictures.images import write_image
 from devrf.rendering.renderer import Renderer
-from devrf.rendering.tracks import track
 from devrf.scenes.procedural.filming import Filming
 from devrf.scenes.procedural.rigs import dynamic_rig
 from devrf.scenes.procedural.solids import Material
@@ -149,26 +145,3 @@ def test_key_points_of_a_moving_block_by_hand(block, filmed_from_above):
     capture = SimpleNamespace(train=views, keypoints=keypoints)
     assert pck_t(Renderer(block), capture) == pytest.approx(6 / 8)
     assert pck_t(Renderer(block), SimpleNamespace(train=views, keypoints=None)) is None
-
-
-def stub(**maps):
-    nothing = {"gaussians_at": lambda _: None, "forward_map": lambda _: None}
-    return SimpleNamespace(space=WORLD, **{**nothing, "canonical_map": lambda _: None, **maps})
-
-
-def test_points_are_followed_by_a_map_back_and_by_the_nearest_gaussian():
-    points = torch.tensor([[1.0, 0, 0], [0, 2, 0]])
-    back = stub(canonical_map=lambda time: lambda x: x * (1 - 0.4 * time))
-    places = track(back, points, 0.5, [1.0, 0.0])
-    torch.testing.assert_close(places, torch.stack([points * 0.8 / 0.6, points * 0.8]))
-    half = math.sqrt(0.5)
-
-    def turned(time: float) -> Gaussians:
-        about_z = torch.tensor([[1.0, 0, 0, 0], [half, 0, 0, half] if time else [1.0, 0, 0, 0]])
-        means = torch.tensor([[9.0, 9, 9], [1, 1, 0]]) + time
-        return Gaussians(means, torch.ones(2, 3), about_z, torch.ones(2), torch.ones(2, 3))
-
-    # One to the right of the middle comes to lie above it.
-    places = track(stub(gaussians_at=turned), torch.tensor([[2.0, 1, 0]]), 0.0, [1.0])
-    torch.testing.assert_close(places, torch.tensor([[[2.0, 3, 1]]]))
-    assert track(stub(), points, 0.0, [1.0]) is None
