@@ -131,7 +131,8 @@ def export(run: RunContext) -> None:
     if settings.part != "all":
         parts = model.moving_and_still(scene_radius(model, viewpoints.static))
         known = ("all", *parts)
-        expect(settings.part in known, "export.part", f"{' or '.join(known)} here", settings.part)
+        has = f"{' or '.join(known)}, which is what method={model.name} has here"
+        expect(settings.part in known, "export.part", has, settings.part)
         model = parts[settings.part]
     folder = run.folder / "export" if settings.into is None else Path(settings.into)
     refuse_links(folder)

@@ -110,16 +110,16 @@ def _read_keypoints(folder: Path, views: Views) -> Tensor | None:
     DevrfError if files have different numbers of them.
     """
     found: dict[int, Tensor] = {}
-    places = sorted(folder.glob("keypoint/[1-9]*x/train"))
-    for image, name in enumerate(views.names if places else ()):
+    factors = [n for n in (1, 2, 4, 8) if os.path.isdir(folder / f"keypoint/{n}x/train")]
+    for image, name in enumerate(views.names if factors else ()):
         item = Path(name).stem
-        file = inside(folder, places[0], f"{item}.json", folder / TRAIN)
+        place = folder / f"keypoint/{factors[0]}x/train"
+        file = inside(folder, place, f"{item}.json", folder / TRAIN)
         if not os.path.isfile(file):
             continue
         points = torch.tensor(read_json(file, _Keypoints, "it has key points").root).view(-1, 3)
         camera = read_json(folder / "camera" / f"{item}.json", Camera, "add it")
-        smaller = float(places[0].parent.name.removesuffix("x"))
-        sides = torch.tensor(camera.image_size) / smaller
+        sides = torch.tensor(camera.image_size) / factors[0]
         found[image] = torch.cat([points[:, :2] / sides, points[:, 2:]], dim=1)
         if len(points) != len(next(iter(found.values()))):
             raise scene_error(file, f"{len(points)} key points, but others have another number")
