@@ -85,7 +85,9 @@ def _write_motion_masks(
         camera, time = views.cameras.single(index), float(views.times[index])
         mask = moving_pixels(renderer, camera, time, times, size)
         if mask is None:
-            raise DevrfError(f"video.motion_masks: method={model.name} follows no points")
+            raise DevrfError(
+                f"video.motion_masks: method={model.name} follows no points; leave it out"
+            )
         paths.append(folder / picture_name(views, index))
         write_image(paths[-1], mask[..., None].expand(-1, -1, 3).float())
     log.info("%d motion masks written to %s", len(paths), folder)

@@ -136,10 +136,10 @@ class Evaluation:
     motion_masks: str | Path | None = None
 
     def check(self) -> None:
-        """Check that the metrics and the file of weights exist.
+        """Check that the metrics, the file of weights and the folder of masks exist.
 
         Raises:
-            DevrfError: an unknown metric, or no file of weights where one is given.
+            DevrfError: an unknown metric, or no file or folder where one is given.
         """
         for name in self.metrics:
             if name not in MEASURES:
@@ -147,6 +147,10 @@ class Evaluation:
                     f"evaluation.metrics: no metric {name!r}; choose from {', '.join(MEASURES)}"
                     f"{did_you_mean(name, MEASURES)}"
                 )
+        if self.motion_masks is not None and not Path(self.motion_masks).is_dir():
+            raise DevrfError(
+                f"evaluation.motion_masks: no folder {self.motion_masks}; give another"
+            )
         if self.lpips_weights is not None and not Path(self.lpips_weights).is_file():
             raise DevrfError(
                 f"evaluation.lpips_weights: no file {self.lpips_weights}; give the weights of "
