@@ -14,7 +14,7 @@ from torch import Tensor
 from devrf.checkpoints.stored_grids import pack, unpack
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
-from devrf.geometry.motion import moving as moving_of
+from devrf.geometry.motion import moving
 from devrf.geometry.space import WORLD, Space, space_config, space_from
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField, ColorDecoder
@@ -174,7 +174,7 @@ class DeVRFModel(Renderable):
         near = points[moves]
         times = (0.0,) if self.deformation is None else self.deformation.clock.times
         places = (self.space.to_world(self.forward_map(time)(near)) for time in times)
-        return moves.masked_scatter(moves, moving_of(places, size))
+        return moves.masked_scatter(moves, moving(places, size))
 
     def moving_and_still(self, size: float) -> dict[str, Renderable]:
         """The scene with densities that are emptied elsewhere; the other fields are shared."""
