@@ -137,7 +137,7 @@ def kernel_rows(into: Path) -> Iterator[Row]:
 def scene(into: Path) -> Iterator[Row]:
     """Write the embedded scene, so that each step reads it; or note where the given one is."""
     began = time.perf_counter()
-    where = [f"data.export={into / 'scene'}", f"hydra.run.dir={into / 'make'}"]
+    where = [f"prepare.into={into / 'scene'}", f"hydra.run.dir={into / 'make'}"]
     run = harness.open_run([*SCENE, "stage=prepare", *where])
     harness.run_stage(run.config, run.folder)
     yield {"seconds": time.perf_counter() - began, "views": run.scene.static.train.pixels.shape}

@@ -66,7 +66,7 @@ def main() -> None:
     into = options.into.resolve()
     for facing, words in STAND_INS.items():
         done = devrf(
-            "stage=prepare", *words, f"data.export={into / facing}", folder=into / f"{facing}-made"
+            "stage=prepare", *words, f"prepare.into={into / facing}", folder=into / f"{facing}-made"
         )
         if done.returncode:
             sys.exit(done.stdout + done.stderr)

@@ -15,7 +15,7 @@ SHOWN = re.findall(r"```console\n\$ python -m devrf (.*)\n([^`]*)```", PAGE.read
 @pytest.mark.parametrize(("command", "shown"), SHOWN, ids=[command for command, _ in SHOWN])
 def test_the_shown_lines_are_said_in_this_order(devrf, tiny_data, command, shown):
     if "data.root=scene" in command:
-        assert devrf(*tiny_data, "stage=prepare", "data.export=scene").status == 0
+        assert devrf(*tiny_data, "stage=prepare", "prepare.into=scene").status == 0
     outcome = devrf(*shlex.split(command))
     said = iter(line.rstrip() for line in f"{outcome.out}\n{outcome.err}".splitlines())
     expected = [line for line in shown.splitlines() if line != "…"]

@@ -54,7 +54,7 @@ def test_a_shortage_names_its_largest_key_and_the_size_that_suffices() -> None:
 
 
 def test_the_size_that_was_chosen_stays(devrf, tiny_data, short, tmp_path, monkeypatch) -> None:
-    assert devrf(*tiny_data, "stage=prepare", "data.export=scene").status == 0
+    assert devrf(*tiny_data, "stage=prepare", "prepare.into=scene").status == 0
     monkeypatch.setattr(image_folders, "LEAST_SIDE", 8)
     monkeypatch.setitem(image_folders.LONGEST, "cpu", 12)
     command = (*short, "data=inward", "data.root=scene", "data.downscale=auto")

@@ -90,7 +90,7 @@ MISTAKES = {
     "checkpoint where none is used": (["ckpt=no.ckpt"], "ckpt: stage=pipeline starts from nothing"),
     "no folder to prepare": (
         ["stage=prepare"],
-        "data.export: stage=prepare needs a folder; give data.export=PATH",
+        "prepare.into: stage=prepare needs a folder; give prepare.into=PATH",
     ),
 }
 
@@ -172,7 +172,7 @@ def test_a_file_where_the_run_folder_should_be(devrf, tmp_path, tiny):
 
 @pytest.mark.parametrize(
     ("stage", "key", "folder"),
-    [("canonical", "hydra.run.dir", "/proc/run"), ("prepare", "data.export", "x" * 300)],
+    [("canonical", "hydra.run.dir", "/proc/run"), ("prepare", "prepare.into", "x" * 300)],
 )
 def test_a_folder_that_cannot_be_made(devrf, tiny, stage, key, folder):
     outcome = devrf(*tiny, f"stage={stage}", f"{key}={folder}")
@@ -248,7 +248,7 @@ def test_names_with_other_letters_where_the_locale_has_but_ascii(
 ):
     for name, value in (("LC_ALL", "C"), ("PYTHONUTF8", "0"), ("PYTHONCOERCECLOCALE", "0")):
         monkeypatch.setenv(name, value)
-    typed = *tiny_data, "stage=prepare", "data.export=szöne", "hydra.run.dir=läufe"
+    typed = *tiny_data, "stage=prepare", "prepare.into=szöne", "hydra.run.dir=läufe"
     done = python(tmp_path, "-m", "devrf", *typed)
     assert (done.status, done.err) == (0, "")
     assert {path.name for path in tmp_path.iterdir()} == {"läufe", "szöne"}

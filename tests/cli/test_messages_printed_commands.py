@@ -171,7 +171,7 @@ def test_a_command_that_goes_on_names_the_present_run(devrf, tmp_path):
 
 def test_a_run_ends_with_commands_that_work(devrf, tiny_data, short, tmp_path):
     root, run = "it's, a\u202f👩\u200d🚀", "outputs/it's, a (1)"
-    assert devrf(*tiny_data, "stage=prepare", f"data.export={root}").status == 0
+    assert devrf(*tiny_data, "stage=prepare", f"prepare.into={root}").status == 0
     quick = (*short, "evaluation.metrics=[]", "video.frames=1")
     done = devrf(f"data.root={root}", *quick, f"hydra.run.dir={run}")
     assert (done.status, done.err) == (0, "")

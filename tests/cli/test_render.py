@@ -143,7 +143,7 @@ def test_what_cannot_be_exported_is_said_in_one_line(of_run, tmp_path, arguments
 
 
 def test_a_run_is_shown_without_its_scene(devrf, tmp_path, tiny_data, short):
-    assert devrf(*tiny_data, "stage=prepare", "data.export=walker").status == 0
+    assert devrf(*tiny_data, "stage=prepare", "prepare.into=walker").status == 0
     learned = ("experiment=cpu_small", "data.root=walker", "stage=canonical", "hydra.run.dir=run")
     assert devrf(*learned, *short).status == 0
     (tmp_path / "walker").rename(tmp_path / "moved")

@@ -38,7 +38,7 @@ def test_what_decides_nothing_may_change(again):
         "callbacks.checkpoint.share=0.5",
         "trainer.log_every_n_steps=2",
         "logger.csv.name=curves",
-        "data.export=elsewhere",
+        "prepare.into=elsewhere",
     )
     assert outcome.status == 0
     assert "canonical: learned already" in outcome.out

@@ -31,7 +31,7 @@ STEPS = ("prepare", "inspect", "evaluate", "render", "still", "view", "export", 
 OF_A_CHECKPOINT = ("evaluate", "render", "still", "view", "export")
 # Keys whose values are files or folders.
 PATHS = {
-    *("data.root", "data.export", "data.flow_cache", "ckpt", "fetch.into", "export.into"),
+    *("data.root", "prepare.into", "data.flow_cache", "ckpt", "fetch.into", "export.into"),
     *("capture.static", "capture.into", "capture.masks", "capture.alpha_masks", "video.path"),
     *("report.runs", "report.into", "fetch.catalogue", "evaluation.lpips_weights"),
     *("evaluation.predictions", "outputs", "hydra.run.dir", "hydra.sweep.dir"),

@@ -6,6 +6,7 @@ import logging
 import sys
 from functools import partial
 from pathlib import Path
+from typing import get_args
 
 from hydra import compose
 from hydra.utils import instantiate
@@ -20,9 +21,11 @@ from devrf.cli.complete import completed
 from devrf.cli.config import command_line
 from devrf.cli.context import RunContext
 from devrf.cli.memory import forecast, table_of_needs
+from devrf.data.rendered import ProceduralDataModule
 from devrf.engine.ddp import ManualDDP
 from devrf.engine.needs import SIZE
 from devrf.errors import DevrfError
+from devrf.scenes.exchange import Exchange, PrepareSettings, write_for_others
 from devrf.scenes.export import export
 from devrf.system.files import write_json
 from devrf.system.override import literal, to_type
@@ -77,13 +80,22 @@ def capture(run: RunContext) -> None:
 
 
 def prepare(run: RunContext) -> None:
-    """Write the scene to ``data.export`` in the published layout."""
-    folder = run.config.data.get("export")
-    if folder is None:
-        embedded = "for an embedded scene (data=procedural, flower, procedural_forward)"
-        given = "stage=prepare needs a folder; give data.export=PATH"
-        raise DevrfError(f"data.export: {given}, {embedded}")
-    export(run.scene, Path(folder))
+    """Write the scene to ``prepare.into``, in the published layout or for other programs.
+
+    Raises:
+        DevrfError: no folder is given, or the published layout cannot have the scene.
+    """
+    settings: PrepareSettings = instantiate(run.config.prepare)
+    if settings.into is None:
+        raise DevrfError("prepare.into: stage=prepare needs a folder; give prepare.into=PATH")
+    folder = Path(settings.into)
+    if settings.layout != "devrf":
+        write_for_others(run.scene, folder, settings.layout)
+    elif isinstance(run.datamodule, ProceduralDataModule):
+        export(run.scene, folder)
+    else:
+        others = " or ".join(f"prepare.layout={layout}" for layout in get_args(Exchange))
+        raise DevrfError(f"prepare.layout: devrf is for embedded scenes; give {others}")
     log.info("scene written to %s", folder)
 
 

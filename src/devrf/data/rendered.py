@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from dataclasses import replace
 from functools import lru_cache
-from pathlib import Path
 from typing import Any, Literal, get_args
 
 from devrf.data.datamodule import SceneDataModule
@@ -31,7 +30,6 @@ class ProceduralDataModule(SceneDataModule):
         self,
         *shape: Any,
         recipe: Callable[..., Callable[[], Scene]] = ProceduralScene,
-        export: str | Path | None = None,
         flow: Flow = "exact",
         **numbers: Any,
     ) -> None:
@@ -40,13 +38,11 @@ class ProceduralDataModule(SceneDataModule):
         Args:
             shape: the shape, or the scene's name.
             recipe: :class:`ProceduralScene` or :class:`ProceduralForwardScene`.
-            export: the folder that ``stage=prepare`` writes the scene to.
             flow: the training images' optical flow.
             numbers: the recipe's options.
         """
         super().__init__()
         self.recipe = recipe(*shape, **numbers)
-        self.export = None if export is None else Path(export)
         if flow not in FLOWS:
             raise scene_error("data.flow", f"expected 'exact' or 'none', not {flow!r}")
         self.flow = flow

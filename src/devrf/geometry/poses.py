@@ -54,6 +54,12 @@ def from_opencv(world_to_camera: Tensor) -> Tensor:
     return torch.cat([axes, -(turned @ world_to_camera[..., :3, 3:])], dim=-1)
 
 
+def to_opencv(camera_to_world: Tensor) -> Tensor:
+    """The inverse of :func:`from_opencv`: world-to-camera (..., 3, 4)."""
+    turned = (camera_to_world[..., :3] * camera_to_world.new_tensor([1, -1, -1])).mT
+    return torch.cat([turned, -(turned @ camera_to_world[..., 3:])], dim=-1)
+
+
 def rigid_motion(points: Tensor, rotation: Tensor, velocity: Tensor) -> Tensor:
     """x′ = e^{[r]} x + G v: the exponential of se(3), a motion along a screw.
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.offset import added
@@ -26,7 +26,7 @@ from devrf.scenes.validation import scene_error
 from devrf.system.files import write_json
 from devrf.system.folder_lock import private_folder
 
-_WRITE_HINT = "give data.export another folder"
+_WRITE_HINT = "give prepare.into another folder"
 
 
 @contextmanager
@@ -55,10 +55,6 @@ def time_major(views: Views) -> Views:
     return views[by_view[torch.argsort(views.times[by_view], stable=True)]]
 
 
-# The layout's validation split, which nothing here uses, gets a few of the test images.
-_VALIDATION_VIEWS = 4
-
-
 def export(scene: Scene, folder: Path) -> None:
     """Write an embedded ``scene`` for ``data=inward`` or ``data=forward``, depending on its kind.
 
@@ -71,10 +67,10 @@ def export(scene: Scene, folder: Path) -> None:
     write = _export_blender if scene.kind == "inward" else _export_llff
     if scene.dynamic.train.by_moving_camera:
         write = _export_video
-    write(_in_capture_world(scene), folder)
+    write(in_capture_world(scene), folder)
 
 
-def _in_capture_world(scene: Scene) -> Scene:
+def in_capture_world(scene: Scene) -> Scene:
     """The scene with its offset added to all cameras, whose poses are in double precision then."""
     if not any(scene.offset):
         return scene
@@ -89,50 +85,53 @@ def _in_capture_world(scene: Scene) -> Scene:
 def _export_video(scene: Scene, folder: Path) -> None:
     """Write the video to ``folder/images``, held-out views to ``folder/others``, and true poses.
 
-    ``folder/masks`` has the valid pixels of the held-out views. Poses, times and images read back
-    exactly; ``stage=capture`` takes ``images`` alone.
+    Poses, times, images and masks read back exactly; ``stage=capture`` takes ``images`` alone.
     """
     assert isinstance(scene.space, NormalizedDevice)
     bounds = {"space": "ndc", "near": scene.space.near}
+    images = {"images/{:03d}.png": scene.dynamic.train, "others/{:03d}.png": scene.dynamic.test}
     with whole_folder(folder) as partial:
-        frames = list[dict[str, Any]]()
-        names: dict[str, list[str]] = {}
-        for subfolder, views in (("images", scene.dynamic.train), ("others", scene.dynamic.test)):
-            _write_images(views, range(len(views)), partial / subfolder)
-            names[subfolder] = [f"{subfolder}/{k:03d}.png" for k in range(len(views))]
-            posed = zip(
-                names[subfolder],
-                views.cameras.camera_to_world.tolist(),
-                views.times.tolist(),
-                strict=True,
-            )
-            for k, (name, pose, time) in enumerate(posed):
-                matrix = [*pose, [0.0, 0.0, 0.0, 1.0]]
-                frame = {"file_path": name, "time": time, "transform_matrix": matrix}
-                if views.cameras.sizes is not None:
-                    frame |= _lens(views.cameras, k)
-                if (mask := views.valid_mask_of(k)) is not None:
-                    frame["mask_path"] = f"masks/{k:03d}.png"
-                    (partial / "masks").mkdir(exist_ok=True)
-                    iio.imwrite(partial / frame["mask_path"], mask.numpy().astype(np.uint8) * 255)
-                frames.append(frame)
-        content = {
-            "camera_model": "PINHOLE",
-            **_lens(scene.dynamic.train.cameras, 0),
-            "scene_bounds": bounds,
-            "frames": frames,
-            "train_filenames": names["images"],
-            "test_filenames": names["others"],
-        }
-        write_json(partial / "transforms.json", content)
+        named = {pattern: [*views.singles()] for pattern, views in images.items()}
+        write_nerfstudio(named, partial, scene_bounds=bounds)
 
 
-def _lens(cameras: Cameras, index: int) -> dict[str, float]:
-    """The keys of a pinhole in a transforms file, in pixels."""
-    fx, fy = cameras.focal[index].tolist()
-    cx, cy = cameras.center[index].tolist()
-    width, height = cameras.size_of(index)
-    return {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": width, "h": height}
+def write_nerfstudio(
+    images: Mapping[str, Sequence[Views]], folder: Path, **further: object
+) -> list[str]:
+    """Write ``folder/transforms.json`` and images, each of which is alone; return their names.
+
+    Args:
+        images: the training images, and then those held out, by the pattern of their names.
+        folder: where masks of the pixels that count go to ``masks/``, too.
+        further: keys of the file.
+    """
+    frames = list[dict[str, Any]]()
+    names = [[pattern.format(k) for k in range(len(views))] for pattern, views in images.items()]
+    for name, image in zip(chain(*names), chain(*images.values()), strict=True):
+        write_image(folder / name, image.pixels[0])
+        frames.append(listed(image, name))
+        if image.valid_mask is not None:
+            frames[-1]["mask_path"] = f"masks/{name}"
+            write_image(folder / "masks" / name, image.valid_mask[0] * 255)
+    lists = dict(zip(("train_filenames", "test_filenames"), names, strict=True))
+    write_json(
+        folder / "transforms.json",
+        {"camera_model": "PINHOLE", **further, **lists, "frames": frames},
+    )
+    return [*chain(*names)]
+
+
+def listed(image: Views, name: str) -> dict[str, Any]:
+    """An image alone as a transforms file lists it: its time, pose and pinhole, in pixels."""
+    cameras = image.cameras
+    (fx, fy), (cx, cy) = cameras.focal[0].tolist(), cameras.center[0].tolist()
+    return {
+        "file_path": name,
+        "time": float(image.times[0]),
+        # A float32 becomes the float64 of the same value, which JSON keeps digit for digit.
+        "transform_matrix": [*cameras.camera_to_world[0].tolist(), [0.0, 0.0, 0.0, 1.0]],
+        **{"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": cameras.width, "h": cameras.height},
+    }
 
 
 def _export_blender(scene: Scene, folder: Path) -> None:
@@ -150,34 +149,26 @@ def _export_blender(scene: Scene, folder: Path) -> None:
 
 
 def _write_capture(capture: Capture, folder: Path) -> None:
-    few = torch.arange(min(_VALIDATION_VIEWS, len(capture.test)))
-    _write_split(capture.train, "train", folder)
-    _write_split(capture.test[few], "val", folder)
-    _write_split(capture.test, "test", folder)
+    write_splits([*capture.train.singles()], [*capture.test.singles()], folder)
     if capture.train.flow is not None:
         # The first images of the views have no earlier one.
         later = (capture.train.times > 0).nonzero().flatten().tolist()
         write_flow(folder / "train_flow", capture.train, later)
 
 
-def _write_split(views: Views, split: str, folder: Path) -> None:
-    _write_images(views, range(len(views)), folder / split, "r_")
-    frames = [
-        {
-            "file_path": f"./{split}/r_{k:03d}",
-            "time": time,
-            # A float32 becomes the float64 of the same value, which JSON keeps digit for digit.
-            "transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]],
-            **({} if views.cameras.sizes is None else _lens(views.cameras, k)),
-        }
-        for k, (pose, time) in enumerate(
-            zip(views.cameras.camera_to_world, views.times.tolist(), strict=True)
-        )
-    ]
-    focal = float(views.cameras.focal[0, 0])
-    angle = 2 * math.atan(views.width / 2 / focal)
-    content = {"camera_angle_x": angle, "frames": frames}
-    write_json(folder / f"transforms_{split}.json", content)
+def write_splits(train: Sequence[Views], test: Sequence[Views], folder: Path) -> None:
+    """Write ``transforms_{train,val,test}.json`` and images, each of which is alone.
+
+    The validation split, which nothing here uses, lists the held-out images again.
+    """
+    for images, split, *others in ((train, "train"), (test, "test", "val")):
+        frames = [listed(image, f"./{split}/r_{k:03d}") for k, image in enumerate(images)]
+        for frame, image in zip(frames, images, strict=True):
+            write_image(folder / f"{frame['file_path']}.png", image.pixels[0])
+        angle = 2 * math.atan(frames[0]["w"] / 2 / frames[0]["fl_x"])
+        for name in (split, *others):
+            content = {"camera_angle_x": angle, "frames": frames}
+            write_json(folder / f"transforms_{name}.json", content)
 
 
 # The published scenes are read at this factor, from folders images_4: larger images are not
@@ -186,7 +177,7 @@ FACTOR = 4
 # Readers hold out every eighth static image, the first one included.
 HOLDOUT = 8
 # The largest depth if none is known, in multiples of the least one.
-_FAR = 100.0
+FAR = 100.0
 
 Flags = np.ndarray[Any, np.dtype[np.bool_]]
 
@@ -227,7 +218,7 @@ def _check_times(views: list[Views]) -> None:
     for view in views:
         if len(view) != frames or bool(((view.times - expected).abs() > near).any()):
             raise scene_error(
-                "data.export",
+                "prepare.into",
                 "the layout has no times: each view needs the same frames, evenly spread; set "
                 "data.novel_times_every=null",
             )
@@ -236,7 +227,7 @@ def _check_times(views: list[Views]) -> None:
 def _farthest(everyone: list[Views]) -> float:
     """The largest known distance from a camera, or a very large one."""
     depths = [views.depth[views.depth.isfinite()] for views in everyone if views.depth is not None]
-    return max(float(depth.max()) for depth in depths) if depths else _FAR / BOUND_FACTOR
+    return max(float(depth.max()) for depth in depths) if depths else FAR / BOUND_FACTOR
 
 
 def _intrinsics(views: Views, factor: int) -> Numbers:
@@ -276,8 +267,12 @@ def _double(poses: Tensor) -> Numbers:
     return array
 
 
-def _write_images(views: Views, numbers: Iterable[int], folder: Path, prefix: str = "") -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    for image, k in enumerate(numbers):
-        pixels = views.single(image).pixels[0].cpu().numpy()
-        iio.imwrite(folder / f"{prefix}{k:03d}.png", pixels)
+def _write_images(views: Views, numbers: Iterable[int], folder: Path) -> None:
+    for image, k in zip(views.singles(), numbers, strict=True):
+        write_image(folder / f"{k:03d}.png", image.pixels[0])
+
+
+def write_image(file: Path, pixels: Tensor) -> None:
+    """Write pixels (H, W) or (H, W, 3 or 4) as PNG, and the folders above it."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    iio.imwrite(file, pixels.to(torch.uint8).cpu().numpy())
