@@ -5,7 +5,9 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+from devrf.apps.benchmarks import followed
 from devrf.apps.records import (
     data_record,
     frame_rows,
@@ -87,8 +89,7 @@ def evaluate(run: RunContext) -> list[Path] | None:
         "overrides": as_typed(run.command),
         "seed": run.config.seed,
         **learning_record(metadata, run.stages_with_images),
-        **data_record(scene),
-        "lpips_network": run.evaluation.lpips_network,
+        **_scored_by(run),
         "motion_masks": rule,
         "checkpoint": digest_of(run.checkpoint(metadata.stage)),
     }
@@ -138,6 +139,14 @@ def _write_scores(
     write_frames(run.folder / "frames.csv", frames)
 
 
+def _scored_by(run: RunContext) -> dict[str, Any]:
+    """The record of the data, of LPIPS, and of the benchmark whose protocol these follow."""
+    data = data_record(run.scene)
+    network = run.evaluation.lpips_network
+    benchmark = followed(run.scene, run.datamodule, data, network)
+    return {**data, "lpips_network": network, "benchmark": benchmark}
+
+
 def _evaluate_predictions(run: RunContext) -> None:
     """Score another program's pictures as a run's are; nothing is learned or loaded."""
     scene = run.scene
@@ -159,8 +168,7 @@ def _evaluate_predictions(run: RunContext) -> None:
         "choices": choices(),
         "overrides": overrides(),
         "predictions": str(folder.resolve()),
-        **data_record(scene),
-        "lpips_network": run.evaluation.lpips_network,
+        **_scored_by(run),
         "motion_masks": rule,
     }
     without_motion = {} if scene.moves else {"at_rest": True}

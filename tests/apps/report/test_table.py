@@ -6,6 +6,8 @@ import pandas as pd
 import pytest
 
 from devrf.apps.report.table import GPU, LPIPS, PSNR, TIME, TITLES, published, ranked, shown
+from devrf.apps.report.text import caption
+from devrf.errors import DevrfError
 
 FULL = "Ours w/ c2f, tv, cycle, flow"
 
@@ -159,16 +161,28 @@ def test_published_rows_stand_below_runs_of_the_same_scene_and_data(table, ran):
     ran("a", "lego")
     ran("at_rest", "lego", at_rest=True)
     ran("b", "robot")
-    ran("c", "kuka", image_size=[100, 100])
-    ran("d", "daisy", choices={"data": "inward"})  # a folder that is called so
+    ran("c", "kuka", benchmark=None)
+    ran("d", "daisy", benchmark="devrf 2")
     found = table()
     lego, at_rest, robot, kuka, daisy = found.blocks
     assert (lego.title, at_rest.title) == ("lego", "lego (at rest)")
     assert len(paper(lego)) == 17
     assert not any(map(paper, (at_rest, robot, kuka, daisy)))
-    assert "than the paper's rows, which are left out: kuka, daisy." in found.notes[-1]
+    assert "as the paper's rows are, which are left out: kuka, daisy." in found.notes[-1]
     first = ["5.958", "0.369", "0.8314", "19.4", "22.4hrs"]
     assert texts(lego)["† Neural Volumes"] == first
+
+
+def test_rows_of_different_benchmarks_are_no_rows_of_one_table(table, ran):
+    ran("a", benchmark="embedded 1")
+    ran("b", "lego")
+    ran("c")
+    assert "Of no benchmark, beside rows of one: c." in table().notes
+    words = caption(table())
+    assert "Benchmark embedded 1: robot. Benchmark devrf 1: lego." in words
+    ran("d", benchmark="embedded 2")
+    with pytest.raises(DevrfError, match=r"^report.runs: robot .* 1 \(a\) and .* 2 \(d\)"):
+        table()
 
 
 def test_rows_of_one_name_stay_apart_and_a_note_says_in_what_they_differ(table, ran):

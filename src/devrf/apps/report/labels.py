@@ -74,7 +74,9 @@ def labelled(runs: pd.DataFrame) -> pd.DataFrame:
         label=[row_name(run) for run in records],
         views=runs.get("run.train_views", absent).map(number).astype(float),
         identity=_as_text(runs, identity_columns(runs)),
-        kind=_as_text(runs, ["at_rest", "run.kind", "run.image_size", f"{SETTINGS}priors"]),
+        kind=_as_text(
+            runs, ["at_rest", "run.kind", "run.image_size", "run.benchmark", f"{SETTINGS}priors"]
+        ),
         by_scene=pd.factorize(scene)[0],
         by_method=runs["method"].map(methods.index),
     )

@@ -37,7 +37,8 @@ _Plain = _Text | bool | int | float | Annotated[list[Any], Len(0, LONGEST)] | No
 COLUMNS = (
     *("folder", "status", "scene", "method", "protocol", "at_rest", "error", "mistake"),
     *("train_seconds", "peak_gpu_gb", "dynamic.psnr", "dynamic.ssim", "dynamic.lpips"),
-    *("run.device", "run.overrides", "run.seed", "run.checkpoint", "run.date", "path"),
+    *("run.device", "run.overrides", "run.seed", "run.checkpoint", "run.date", "run.benchmark"),
+    "path",
 )
 # Kinds of values that a report builds on; the last ones are mappings, and no values.
 KINDS: dict[str, Any] = {
@@ -50,6 +51,7 @@ KINDS: dict[str, Any] = {
     **dict.fromkeys(("run.device", "run.checkpoint", "run.date", "run.git"), _Text | None),
     **dict.fromkeys(("run.devrf", "run.fingerprint", "run.lpips_network"), _Text | None),
     "run.motion_masks": _Text | None,
+    "run.benchmark": _Text | None,
     **dict.fromkeys(("static", "dynamic", "run", "choices"), dict),
 }
 # The longest first line of a table: pandas would take hours for many columns of one name.

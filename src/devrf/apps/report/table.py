@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from itertools import repeat
 from operator import add
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pandas as pd
 
 from devrf.apps.report.labels import identity_columns, labelled
 from devrf.apps.report.runs import Collection, number
+from devrf.errors import DevrfError
 
 UNKNOWN = "–"
 # Keys that a note names of those in which rows of one name differ.
@@ -75,17 +76,17 @@ class Published:
     """Results that the paper reports, and their source.
 
     Attributes:
+        benchmark: the protocol of the measurements, and its version.
         hardware: of the measurements.
         credit: the source, in words.
-        data: of each scene, by devrf's name of the scene.
         texts: the cells as printed, indexed by scene and label. The column ``method`` is the
             paper's own name; its "Ours" is DeVRF in the label.
         values: the same cells as numbers, the time in seconds.
     """
 
+    benchmark: str
     hardware: str
     credit: str
-    data: dict[str, dict[str, Any]]
     texts: pd.DataFrame
     values: pd.DataFrame
 
@@ -100,8 +101,7 @@ def published() -> Published:
     texts = texts.assign(label=label).set_index(["scene", "label"])
     values = texts[TITLES].assign(Time=texts["Time"].str.extract(r"([\d.]+)")[0]).astype(float)
     values["Time"] *= texts["Time"].str.endswith("hrs").map({True: 3600.0, False: 60.0})
-    described = {scene["name"]: scene["data"] for scene in data["scenes"]}
-    return Published(**data["source"], data=described, texts=texts, values=values)
+    return Published(**data["source"], texts=texts, values=values)
 
 
 class Cell(NamedTuple):
@@ -165,7 +165,9 @@ def tabulate(collection: Collection) -> Table:
     spread = groups[titles].std().where(complete).droplevel("identity")
 
     scenes = list(runs["scene"].unique())
-    same = {run["scene"] for run in runs.to_dict("records") if _is_of_published_data(run)}
+    _check_benchmarks(runs)
+    papers = {*published().texts.index.get_level_values("scene")}
+    same = {*runs.loc[runs["run.benchmark"] == published().benchmark, "scene"]} & papers
     blocks: list[Block] = []
     for scene in scenes:
         devices = runs.loc[runs["scene"] == scene, "run.device"]
@@ -182,20 +184,25 @@ def tabulate(collection: Collection) -> Table:
         if len(average) > 1 and len(scenes) > 2:
             gains = _gains(rows.reset_index(), average)
     notes = _notes(runs, collection.runs.loc[~scored, "folder"], again)
-    if left_out := [scene for scene in scenes if scene in published().data and scene not in same]:
+    if left_out := [scene for scene in scenes if scene in papers - same]:
         notes.append(
-            f"Of other data than the paper's rows, which are left out: {', '.join(left_out)}."
+            f"Not scored as benchmark {published().benchmark}, as the paper's rows are, which are "
+            f"left out: {', '.join(left_out)}."
         )
     return Table(collection, runs, rows, frozenset(same), tuple(blocks), gains, tuple(notes))
 
 
-def _is_of_published_data(run: Mapping[str, Any]) -> bool:
-    """Whether a run's data are said (``data=NAME``) and seen to be those of the paper's rows."""
-    data = {key: run.get(f"run.{key}") for key in ("image_size", "frames", "train_views")}
-    if isinstance(data["image_size"], list):
-        data["image_size"] = sorted(data["image_size"])
-    is_named = run.get("run.choices.data") == run["scene"]
-    return is_named and data == published().data.get(run["scene"])
+def _check_benchmarks(runs: pd.DataFrame) -> None:
+    """DevrfError if the runs of a scene follow different protocols of benchmarks."""
+    for scene, same in runs[runs["run.benchmark"].notna()].groupby("scene", sort=False):
+        first = same.drop_duplicates("run.benchmark")
+        if len(first) > 1:
+            pairs = zip(first["run.benchmark"], first["folder"], strict=True)
+            which = " and ".join(f"{benchmark} ({folder})" for benchmark, folder in pairs)
+            raise DevrfError(
+                f"report.runs: {scene} was scored as benchmarks {which}, which are no rows of one "
+                "table; put their runs into folders of their own, and report on each"
+            )
 
 
 def _values(runs: pd.DataFrame, column: Column) -> pd.Series:
@@ -329,7 +336,10 @@ def _notes(runs: pd.DataFrame, at_rest: pd.Series, again: pd.Series) -> list[str
             listed = "; ".join(map(str, used.unique()))
             notes.append(f"{scene}: what moves is not by one rule, so do not compare it: {listed}.")
     notes += [_scored(runs)] if len(runs) else []
+    of_none = runs["run.benchmark"].isna()
+    beside = of_none & runs["scene"].isin(runs.loc[~of_none, "scene"])
     for why, folders in (
+        ("Of no benchmark, beside rows of one", runs.loc[beside, "folder"]),
         ("Scored at rest only, and therefore not in the tables", at_rest),
         ("Counted once, as last scored elsewhere with the same checkpoint", again),
     ):

@@ -35,12 +35,16 @@ def caption(table: Table) -> str:
     where = f" on {', '.join(devices)}" if len(devices) else ""
     repeated = bool((table.rows["count"] > 1).any())
     spread = " ± is the standard deviation over n runs." * repeated
+    scenes_of = table.runs.groupby("run.benchmark", sort=False)["scene"].unique()
+    benchmarks = "".join(
+        f" Benchmark {name}: {', '.join(scenes)}." for name, scenes in scenes_of.items()
+    )
     paper = f" † {published().credit}" if table.published else ""
     return (
         f"Measured{where}: means over the held-out images in motion, of a scene at rest over those "
         f"of the static set; peak GPU memory and wall-clock time of optimisation, all stages "
         f"together.{spread} Best, second and third are marked within a scene, among measured rows; "
-        f"values that look the same share a mark.{paper}"
+        f"values that look the same share a mark.{benchmarks}{paper}"
     )
 
 
