@@ -6,6 +6,7 @@ import json
 import shutil
 
 import imageio.v3 as iio
+import numpy as np
 import pytest
 
 
@@ -21,6 +22,11 @@ def test_a_runs_own_pictures_come_back_as_another_programs(devrf, tmp_path, tiny
     found = tmp_path / "outputs" / "robot" / "Splats-pictures"
     again = json.loads((found / "metrics.json").read_text())
     assert {path.name for path in found.iterdir()} >= {"frames.csv", "images", "metrics.json"}
+    # The film shows what that of the run does, but for depth.
+    films = [iio.imread(f / "videos" / "held_out.mp4") for f in (tmp_path / "outputs/run", found)]
+    assert films[0].shape == films[1].shape
+    differences = np.abs(films[0].astype(float) - films[1])[:, 18:, :100].mean(axis=(1, 2, 3))
+    assert differences.max() < 4
     assert (again["scene"], again["method"]) == ("robot", "Splats (pictures)")
     for section in ("static", "dynamic"):
         assert again[section]["psnr"] == pytest.approx(own[section]["psnr"], abs=0.02)

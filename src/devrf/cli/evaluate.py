@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from hydra.utils import instantiate
+
 from devrf.apps.benchmarks import followed
 from devrf.apps.records import (
     data_record,
@@ -20,10 +22,13 @@ from devrf.apps.records import (
     tracked_scores,
     write_frames,
 )
+from devrf.apps.render import Video
 from devrf.apps.settings import REHEARSAL
+from devrf.apps.video import VideoSettings, held_out_images, held_out_pictures
 from devrf.checkpoints.file_metadata import digest_of
 from devrf.cli.config import choices, foreign_program, overrides
 from devrf.cli.context import RunContext
+from devrf.cli.render import write_video
 from devrf.cli.restore_config import as_typed
 from devrf.cli.resume import unfinished
 from devrf.errors import DevrfError
@@ -175,3 +180,8 @@ def _evaluate_predictions(run: RunContext) -> None:
     write_json(run.folder / "metrics.json", {**head, **without_motion, **sections, "run": ran})
     for section, values in sections.items():
         log.info("%s, %s: %s", name, section, in_words(values))
+    settings: VideoSettings = instantiate(run.config.video)
+    shown = [*pictures.sets.values()][-1]
+    images = held_out_images(shown, settings.frames)
+    film = held_out_pictures(Renderer(pictures), shown, images, settings, scene.background)
+    write_video(run, Video("held_out", settings.fps, settings.frames, film))

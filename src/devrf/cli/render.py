@@ -11,7 +11,7 @@ from hydra.utils import instantiate
 from devrf.apps.captured_cameras import write_thumbnails
 from devrf.apps.export.geometry import ExportSettings, scene_radius
 from devrf.apps.export.scene import export_scene
-from devrf.apps.render import videos
+from devrf.apps.render import Video, videos
 from devrf.apps.settings import ViewerSettings
 from devrf.apps.still import StillSettings, write_still
 from devrf.apps.still import still as rendered
@@ -42,6 +42,11 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+# The page inside another one.
+FRAME = (
+    f'<iframe src="{PAGE}" width="800" height="500" style="border: 0" '
+    'allow="fullscreen; clipboard-write"></iframe>'
+)
 # Times whose views stay at hand in the viewer: both ends, the rest state, and the current ones.
 CACHED = 6
 MASKS = Path("images", "motion_masks")
@@ -60,14 +65,7 @@ def render(run: RunContext) -> list[Path] | None:
     renderer = Renderer(model, half=settings.half)
     paths = []
     for video in videos(renderer, viewpoints, settings, held_out):
-        path = run.folder / "videos" / f"{video.name}.mp4"
-        pictures = (picture.numpy() for picture in video.pictures)
-        write_pictures(path, followed(pictures, video.frames, path.name), video.fps)
-        free_cache(run.device)  # the C library keeps 0.2 GB of a video's memory
-        log.info("video written to %s", path)
-        for tracker in run.trackers:
-            tracker.show_video(f"videos/{video.name}", path)
-        paths.append(path)
+        paths.append(write_video(run, video))
     return paths if settings.path or held_out else None
 
 
@@ -92,6 +90,18 @@ def _write_motion_masks(
         write_image(paths[-1], mask[..., None].expand(-1, -1, 3).float())
     log.info("%d motion masks written to %s", len(paths), folder)
     return paths
+
+
+def write_video(run: RunContext, video: Video) -> Path:
+    """Write a video into the run's folder, and show it to trackers; return its file."""
+    path = run.folder / "videos" / f"{video.name}.mp4"
+    pictures = (picture.numpy() for picture in video.pictures)
+    write_pictures(path, followed(pictures, video.frames, path.name), video.fps)
+    free_cache(run.device)  # the C library keeps 0.2 GB of a video's memory
+    log.info("video written to %s", path)
+    for tracker in run.trackers:
+        tracker.show_video(f"videos/{video.name}", path)
+    return path
 
 
 def still(run: RunContext) -> None:
@@ -141,6 +151,7 @@ def export(run: RunContext) -> None:
     if settings.format == "html":
         write_text(folder / PAGE, _page(run, model, viewpoints))
         log.info("the scene, for any browser, written to %s", folder / PAGE)
+        log.info("in a page of your own beside it: %s", FRAME)
     else:
         export_scene(model, viewpoints, settings, folder)
 

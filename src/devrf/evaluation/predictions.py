@@ -92,6 +92,9 @@ class Pictures(Renderable):
         super().__init__()
         self.__dict__["name"] = program
         self.space = WORLD
+        # Depth, which nobody knows, is drawn in these: any will do.
+        self.box = Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+        self.depth_limits = (0.0, 1.0)
         self.sets = dict(sets)
         # By the pose of a camera: times and pictures (H, W, 3) in [0, 1].
         self._shots: dict[tuple[float, ...], list[tuple[float, Tensor]]] = {}
