@@ -138,6 +138,24 @@ def write_nerfies(scene: Scene, root: Path, size: str = "4x") -> None:
     put_json(root / "scene.json", world)
 
 
+def write_nerf_ds(scene: Scene, root: Path) -> None:
+    """The dynamic images as NeRF-DS has them: Nerfies' files, masks and cameras of each split."""
+    write_nerfies(scene, root, "1x")
+    ids = json.loads((root / "dataset.json").read_text())
+    ids["ids"] = [item for item in ids["ids"] if "static" not in item]
+    ids["train_ids"] = [item for item in ids["train_ids"] if "static" not in item]
+    ids["val_ids"] = [item for item in ids["val_ids"] if "static" not in item]
+    put_json(root / "dataset.json", ids)
+    for split, folder in (("train_ids", "train_camera"), ("val_ids", "vrig_camera")):
+        for item in ids[split]:
+            put_json(root / folder / f"{item}.json", {})
+    (root / "resized_mask").mkdir()
+    for item in ids["train_ids"]:  # the foreground is 0
+        mask = 255 - iio.imread(root / f"rgb/1x/{item}.png")[..., 3]
+        iio.imwrite(root / f"resized_mask/{item}.png", mask)
+    np.save(root / "points.npy", np.zeros((5, 3)))
+
+
 def write_dycheck(scene: Scene, root: Path) -> None:
     """The scene as DyCheck lists it: the dynamic images alone, made smaller by two."""
     write_nerfies(scene, root, "2x")
