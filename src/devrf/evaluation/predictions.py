@@ -115,8 +115,8 @@ class Pictures(Renderable):
 
     @property
     def moves(self) -> bool:
-        """Whether some camera has pictures at several times."""
-        return any(len(shots) > 1 for shots in self._shots.values())
+        """Whether there are pictures of several times."""
+        return len({time for shots in self._shots.values() for time, _ in shots}) > 1
 
     def at(self, time: float, *, half: bool = False) -> PicturesAt:
         """The pictures of the nearest time that a camera has one of."""
