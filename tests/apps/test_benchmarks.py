@@ -2,29 +2,29 @@
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import fields
 
 import pytest
 
 from devrf.apps import benchmarks
-from devrf.apps.benchmarks import Benchmark, followed
+from devrf.apps.benchmarks import followed
 from devrf.apps.records import data_record
 from devrf.data.recorded import READERS, InwardFacingDataModule
 from devrf.scenes.exchange import write_for_others
 
 TINY = """
 version = 3
-title = "one robot"
-source = "this file"
 data = "embedded"
+scenes = ["robot", "other"]
 lpips_network = "vgg"
-[scenes.robot]
+[own.robot]
 image_size = [18, 24]
 frames = 3
 train_views = 2
 static_images = 8
 test_frames = 3
-[scenes.other]
+[own.other]
 data = "inward"
 options = { frames = "all", alpha_weighted = true }
 """
@@ -41,18 +41,20 @@ def file(tmp_path, monkeypatch):
 
 def test_every_file_is_read_and_names_what_there_is():
     found = benchmarks.benchmarks()
-    counts = {name: len(benchmark.scenes) for name, benchmark in found.items()}
+    counts = {name: len(scenes) for name, scenes in found.items()}
     assert counts == {
-        **{"devrf": 9, "dnerf": 8, "dycheck": 7, "embedded": 4, "hypernerf_vrig": 4, "n3dv": 6}
+        **{"devrf 1": 9, "dnerf 1": 8, "dycheck 1": 7},
+        **{"embedded 1": 4, "hypernerf_vrig 1": 4, "n3dv 1": 6},
     }
-    for benchmark in found.values():
-        for scene in benchmark.scenes:
-            facts = benchmark.of_scene(scene)
-            if facts.data == "embedded":
-                assert facts.mean_color and facts.frames and not facts.options
-            else:
-                assert {*facts.options} <= {field.name for field in fields(READERS[facts.data])}
-            assert facts.lpips_network and benchmark.source and benchmark.version == 1
+    for file in benchmarks.FILES.glob("*.toml"):
+        table = tomllib.loads(file.read_text())
+        assert {*table.get("own", {})} <= {*table["scenes"]}
+    for facts in (facts for scenes in found.values() for facts in scenes.values()):
+        assert facts.lpips_network
+        if facts.data == "embedded":
+            assert facts.mean_color and facts.frames and not facts.options
+        else:
+            assert {*facts.options} <= {field.name for field in fields(READERS[facts.data])}
 
 
 def test_a_run_follows_what_it_did(file, tiny_scene, datamodule, caplog):
@@ -81,6 +83,8 @@ def test_a_readers_options_count(file, tiny_scene, tmp_path):
         assert followed(module.scene, module, data_record(module.scene), "vgg") == expected
 
 
-def test_a_misspelt_fact_is_an_error():
+def test_a_misspelt_fact_is_an_error(file):
+    file.parent.mkdir()
+    file.write_text(TINY.replace("image_size", "image_sise"))
     with pytest.raises(ValueError, match="image_sise"):
-        Benchmark(version=1, title="", source="", scenes={}, image_sise=(1, 2))
+        benchmarks.benchmarks()

@@ -15,18 +15,16 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict
 
 from devrf.data.datamodule import SceneDataModule
-from devrf.data.recorded import READERS, RecordedDataModule
+from devrf.data.recorded import READERS
 from devrf.scenes.scene import Scene
 
 log = logging.getLogger(__name__)
 
 FILES = Path(__file__).with_name("benchmark")
-# The layout of the embedded scenes.
+# The layout of scenes that no file has.
 EMBEDDED = "embedded"
 # Largest difference of a mean colour in [0, 1]: processors round pictures differently.
 SAME_COLOR = 2e-3
-# Differences that a line names.
-NAMED = 3
 # A reader's option that is null keeps all there is.
 ALL = "all"
 
@@ -42,6 +40,7 @@ class Facts(BaseModel):
         train_views: views that are learned from at one time.
         static_images: training images of the static capture.
         test_frames: held-out images in motion.
+        masked: whether some held-out pixels are not scored.
         background: what is behind the alpha masks of held-out images.
         lpips_network: that of LPIPS.
         mean_color: mean of the held-out images' channels in [0, 1]: a checksum of what they show.
@@ -57,41 +56,27 @@ class Facts(BaseModel):
     train_views: int | None = None
     static_images: int | None = None
     test_frames: int | None = None
+    masked: bool | None = None
     background: Literal["white", "black"] | None = None
     lpips_network: Literal["vgg", "alex"] | None = None
     mean_color: tuple[float, ...] | None = None
     options: dict[str, str | int | bool] = {}
 
 
-class Benchmark(Facts):
-    """A file of ``benchmark/``: the protocol of some scenes.
-
-    Attributes:
-        version: of the protocol.
-        title: the scenes, in words.
-        source: where the facts are from, and which of them are this file's own.
-        scenes: by name; what is fixed of one scene counts before that of all.
-    """
-
-    version: int
-    title: str
-    source: str
-    scenes: dict[str, Facts]
-
-    def of_scene(self, scene: str) -> Facts:
-        """What is fixed of a scene."""
-        facts = self.scenes[scene]
-        shared = {key: getattr(self, key) for key in Facts.model_fields}
-        return Facts(**(shared | facts.model_dump(exclude_unset=True)))
-
-
 @cache
-def benchmarks() -> dict[str, Benchmark]:
-    """All protocols by name."""
-    return {
-        file.stem: Benchmark.model_validate(tomllib.loads(file.read_text("utf-8")))
-        for file in sorted(FILES.glob("*.toml"))
-    }
+def benchmarks() -> dict[str, dict[str, Facts]]:
+    """What each protocol, by name and version (``dycheck 1``), fixes of its scenes.
+
+    Beside ``version`` and ``scenes`` a file has what it fixes of all of them; what it fixes of one,
+    in ``own``, counts before that.
+    """
+    found = {}
+    for file in sorted(FILES.glob("*.toml")):
+        shared = tomllib.loads(file.read_text("utf-8"))
+        version, scenes, own = shared.pop("version"), shared.pop("scenes"), shared.pop("own", {})
+        facts = {scene: Facts(**(shared | own.get(scene, {}))) for scene in scenes}
+        found[f"{file.stem} {version}"] = facts
+    return found
 
 
 def followed(
@@ -103,37 +88,36 @@ def followed(
     ``record`` is :func:`devrf.apps.records.data_record`.
     """
     source = getattr(datamodule, "reader", None) or getattr(datamodule, "recipe", None)
-    layouts = [name for name, reader in READERS.items() if type(source) is reader]
-    layout = EMBEDDED if not isinstance(datamodule, RecordedDataModule) else [*layouts, ""][0]
+    layout = next((name for name, kind in READERS.items() if type(source) is kind), EMBEDDED)
     seen = {
         **record,
         "data": layout,
         "image_size": tuple(sorted(record["image_size"])),
         "downscale": datamodule.downscale,
         "static_images": len(scene.static.train),
+        "masked": scene.dynamic.test.valid_mask is not None,
         "background": "black" if scene.background == "black" else "white",
         "lpips_network": lpips_network,
-        "mean_color": scene.dynamic.test.pixels.float().mean(dim=(0, 1, 2)).div(255).tolist(),
+        "mean_color": scene.dynamic.test.pixels,
     }
     differing: dict[str, list[str]] = {}
-    for name, benchmark in benchmarks().items():
-        facts = benchmark.of_scene(scene.name) if scene.name in benchmark.scenes else None
-        if facts is not None and facts.data == layout:
-            called = f"{name} {benchmark.version}"
-            differing[called] = [*_differences(facts, seen, source)]
-            if not differing[called]:
-                return called
+    for name, scenes in benchmarks().items():
+        if scene.name in scenes and scenes[scene.name].data == layout:
+            differing[name] = [*_differences(scenes[scene.name], seen, source)]
+            if not differing[name]:
+                return name
     if differing:
-        nearest = min(differing, key=lambda called: len(differing[called]))
-        what = "; ".join(
-            [*differing[nearest][:NAMED], *["others"] * (len(differing[nearest]) > NAMED)]
-        )
-        log.info("%s: not scored as benchmark %s is: %s", scene.name, nearest, what)
+        nearest = min(differing, key=lambda name: len(differing[name]))
+        first = "; ".join(differing[nearest][:3])
+        log.info("%s: not scored as benchmark %s is: %s", scene.name, nearest, first)
     return None
 
 
 def _differences(facts: Facts, seen: Mapping[str, Any], source: object) -> Iterator[str]:
-    """What was scored otherwise than a protocol says, in words."""
+    """What was scored otherwise than a protocol says, in words.
+
+    ``seen`` has pixels in place of their mean, which many real ones take too much memory for.
+    """
     stated = facts.model_dump(exclude_none=True)
     for option, value in stated.pop("options").items():
         has = getattr(source, option, None)
@@ -141,10 +125,10 @@ def _differences(facts: Facts, seen: Mapping[str, Any], source: object) -> Itera
             yield f"data.{option} is {has}, not {value}"
     for key, value in stated.items():
         if key == "mean_color":
-            pairs = zip(seen[key], value, strict=False)
+            pairs = zip(seen[key].float().mean(dim=(0, 1, 2)) / 255, value, strict=False)
             if any(abs(here - there) > SAME_COLOR for here, there in pairs):
                 yield "held-out images show something else"
         elif seen[key] != value:
             yield f"{key} is {seen[key]}, not {value}"
     if "exposure" in seen:
-        yield f"data.exposure is {source.exposure}, not none"  # type: ignore[attr-defined]
+        yield "held-out images have an exposure of their own"

@@ -78,12 +78,10 @@ def write_for_others(scene: Scene, folder: Path, layout: Exchange) -> None:
 
 def _warn_of_lenses(images: Sequence[Views]) -> None:
     """Say if cameras are not what D-NeRF's one angle says of all of them."""
-    pinholes = {
-        tuple(torch.cat([camera.focal[0], camera.center[0], camera.extents[0]]).tolist())
-        for camera in (image.cameras for image in images)
-    }
-    fx, fy, cx, cy, width, height = next(iter(pinholes))
-    if len(pinholes) > 1 or (fx, width, height) != (fy, 2 * cx, 2 * cy):
+    cameras = [image.cameras for image in images]
+    focal = float(cameras[0].focal[0, 0])
+    pinhole = [focal, focal, cameras[0].width, cameras[0].height]
+    if any(torch.cat([c.focal[0], 2 * c.center[0]]).tolist() != pinhole for c in cameras):
         log.warning(
             "cameras differ, or are not centred, or pixels not square: a program that reads "
             "camera_angle_x, but not fl_x, fl_y, cx and cy of each frame, takes others"
