@@ -41,9 +41,16 @@ def test_methods_have_rows_of_their_own_after_ours(labels, ran):
     ran("d", choices={"experiment": "best_small"})
     ran("e", method="dnerf")
     ran("f", choices={"experiment": "quickstart"})
+    ran("g", method="Splats (pictures)", predictions="/elsewhere")
     others = ["D-NeRF; joint; peer_small", "D-NeRF; two_stage", "NSFF; dynamic"]
     # DeVRF without an experiment learns as by the quickstart, and in two stages.
-    assert labels() == [f"{FULL}; best_small", FULL, *others, "mine (small); joint"]
+    assert labels() == [
+        f"{FULL}; best_small",
+        FULL,
+        *others,
+        "mine (small); joint",
+        "Splats (pictures)",
+    ]
 
 
 SETTINGS = {"data.frames": 14, "loss.tv": 0.5, "data.near": None, "seed": 0, "schedule.seconds": 9}

@@ -93,7 +93,9 @@ def row_name(run: Mapping[str, Any]) -> str:
             parts = [ABLATIONS[ablation]]
         elif ablation != "full":
             parts = [f"{parts[0]} ({ablation})"]
-    usual = (DEFAULT_PROTOCOL, DEFAULT_EXPERIMENT) if method == DEFAULT_METHOD else ()
+    # devrf's protocol is none of another program's.
+    unsaid = method == DEFAULT_METHOD or isinstance(run.get("run.predictions"), str)
+    usual = (DEFAULT_PROTOCOL, DEFAULT_EXPERIMENT) if unsaid else ()
     parts += [p for p in (run["protocol"], _option(run, "experiment")) if p not in usual]
     for text in run["run.overrides"]:
         key, _, value = text.lstrip("+").partition("=")
