@@ -57,8 +57,8 @@ def write_for_others(scene: Scene, folder: Path, layout: Exchange) -> None:
     cannot be written.
     """
     scene = in_capture_world(scene)
-    moving, static = scene.dynamic, scene.static.train
-    only_static = [k for k, name in enumerate(static.names) if name not in moving.train.names]
+    moving, static, shared = scene.dynamic, scene.static.train, {*scene.dynamic.train.names}
+    only_static = [k for k, name in enumerate(static.names) if name not in shared]
     train = [*map(static.single, only_static), *moving.train.singles()]
     test = [*moving.test.singles()]
     if layout != "colmap" and any(image.valid_mask is not None for image in train):
