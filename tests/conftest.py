@@ -14,6 +14,7 @@ gc.disable()  # what is imported until all tests are collected stays
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+import lightning.pytorch  # which sets its logger's level
 import pytest
 import torch
 from hypothesis import settings
@@ -22,7 +23,7 @@ from devrf.geometry.box import Box
 
 pytest_plugins = ["composed_configs", "tiny_scenes", "tiny_stages"]  # in support/
 
-logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
+logging.getLogger(lightning.pytorch.__name__).setLevel(logging.ERROR)
 
 # The same examples on every machine, however slow it is.
 settings.register_profile("house", derandomize=True, deadline=None, database=None)
