@@ -157,11 +157,11 @@ def test_what_is_no_path_is_refused_in_one_line(data, expected):
 
 
 def test_a_long_path_is_read_in_seconds():
-    """A minute, were each matrix looked at by itself."""
-    data = content(keyframes=[frame(seconds=k) for k in range(60_000)])
-    began = time.perf_counter()
-    assert len(path_from(data, "p").keyframes) == 60_000
-    assert time.perf_counter() - began < 10
+    """20 seconds, were each matrix looked at by itself."""
+    data = content(keyframes=[frame(seconds=k) for k in range(20_000)])
+    began = time.process_time()
+    assert len(path_from(data, "p").keyframes) == 20_000
+    assert time.process_time() - began < 5
 
 
 def test_a_path_is_saved_in_its_folder_alone():

@@ -37,7 +37,7 @@ from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.rendering.renderer import Renderer
 from devrf.system.memory import own_memory
 
-INPUTS = int(os.environ.get("DEVRF_FUZZ_INPUTS", "100"))
+INPUTS = int(os.environ.get("DEVRF_FUZZ_INPUTS", "60"))
 NUMBERS = [0, -1, 1, 0.5, 5e-324, 1e9, 1e30, 1e300, 2**63, math.nan, math.inf, True]
 OTHERS = [None, "", "a", "../x", "\x1b[2J\n", [], [0], [[0] * 4] * 4, {}, {"": 1}]
 TENSORS = [torch.zeros(()), torch.zeros(0), torch.ones(3), torch.ones(1, 1, 1, 1)]

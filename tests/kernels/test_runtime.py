@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -67,32 +68,42 @@ def test_memory_too_short_for_warp_is_one_line():
     assert done.stdout.endswith("; free memory, or give kernels=torch\n")
 
 
-# Where kernels are kept, and whether others may write there.
+# For each folder, in a process of its own: where kernels are kept, and whether others may write
+# there.
 CACHE = """
-import tempfile, torch, warp
+import os, sys, tempfile, torch, warp
 from pathlib import Path
 from devrf.kernels.runtime import others_may_write, is_supported
-assert is_supported(torch.empty(0))
-folder = Path(warp.config.kernel_cache_dir)
-assert folder.is_dir()
-print(folder.parent == Path(tempfile.gettempdir()), others_may_write(folder))
+for name in sys.argv[1:]:
+    if os.fork():
+        os.wait()
+        continue
+    os.environ["WARP_CACHE_PATH"] = str(Path(name, "cache"))
+    os.environ["TMPDIR"] = str(Path(name, "own"))
+    assert is_supported(torch.empty(0))
+    folder = Path(warp.config.kernel_cache_dir)
+    assert folder.is_dir()
+    print(folder.parent == Path(tempfile.gettempdir()), others_may_write(folder))
+    sys.exit()
 """
 
 
-@pytest.mark.parametrize(("mode", "private"), [(0o700, False), (0o755, False), (0o777, True)])
-def test_kernels_are_not_kept_where_others_may_write(tmp_path, mode, private):
-    own = tmp_path / "own"
-    (own / "devrf-kernels-of-a-killed-run").mkdir(parents=True)
-    (tmp_path / "cache").mkdir()
-    (tmp_path / "cache").chmod(mode)
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_kernels_are_not_kept_where_others_may_write(tmp_path):
+    left, folders = Path("own", "devrf-kernels-of-a-killed-run"), []
+    for mode in (0o700, 0o755, 0o777):
+        folders.append(folder := tmp_path / f"{mode:o}")
+        (folder / left).mkdir(parents=True)
+        (folder / "cache").mkdir()
+        (folder / "cache").chmod(mode)
+        folder.chmod(0o755)
     tmp_path.chmod(0o755)
-    places = {"WARP_CACHE_PATH": str(tmp_path / "cache"), "TMPDIR": str(own)}
-    done = subprocess.run(
-        [sys.executable, "-c", CACHE], capture_output=True, text=True, env={**os.environ, **places}
-    )
-    assert done.stdout == f"{private} False\n"
-    assert ("others may write there" in done.stderr) is private
-    assert list(own.iterdir()) == ([] if private else [own / "devrf-kernels-of-a-killed-run"])
+    command = [sys.executable, "-c", CACHE, *map(str, folders)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.stdout == "False False\nFalse False\nTrue False\n"
+    assert done.stderr.count("others may write there") == 1
+    assert [(folder / left).exists() for folder in folders] == [True, True, False]
+    assert not list((folders[2] / "own").iterdir())
 
 
 def scene(rng: torch.Generator, count: int = 500) -> tuple[Rays, MarchInputs]:

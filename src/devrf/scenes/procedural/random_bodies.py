@@ -38,12 +38,21 @@ SPIN = Swing(1.5, 1.2, 0.0)
 TIMES = tuple(k / 12 for k in range(13))
 
 
-@lru_cache(maxsize=32)
 def random_body(seed: int, speed: float = 1.0, sliding: bool = False) -> Assembled:
-    """The body of a ``seed``: among those drawn, the one whose parts enter each other the least.
+    """The body of a ``seed``.
 
     ``sliding``: round parts spin, so that their texture slides over a fixed silhouette.
     """
+    parts = drawn_body(seed).parts
+    round_parts = [part.half[0] == part.half[1] and part.kind != "box" for part in parts]
+    spins = (SPIN if sliding and is_round else NO_SWING for is_round in round_parts)
+    spinning = (replace(part, spin=spin) for part, spin in zip(parts, spins, strict=True))
+    return Assembled(tuple(spinning), speed)
+
+
+@lru_cache(maxsize=32)
+def drawn_body(seed: int) -> Assembled:
+    """Among the bodies drawn for a ``seed``, the one whose parts enter each other the least."""
     best = Assembled(())
     least = math.inf
     for attempt in range(TRIES):
@@ -58,10 +67,7 @@ def random_body(seed: int, speed: float = 1.0, sliding: bool = False) -> Assembl
             least = entered
         if least < ENTERED:
             break
-    round_parts = [part.half[0] == part.half[1] and part.kind != "box" for part in best.parts]
-    spins = (SPIN if sliding and is_round else NO_SWING for is_round in round_parts)
-    spinning = (replace(part, spin=spin) for part, spin in zip(best.parts, spins, strict=True))
-    return Assembled(tuple(spinning), speed)
+    return best
 
 
 def placed(body: Assembled, center: Xyz, reach: float) -> Assembled:
