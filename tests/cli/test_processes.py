@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
 import psutil
 import pytest
@@ -68,15 +69,21 @@ class Stop(Callback):
 class Trip(Callback):
     """Fails in the second process, while the first goes on."""
 
-    def __init__(self, how: str) -> None:
-        self.how = how
-
     def on_train_start(self, trainer, stage):
         if trainer.global_rank == 1:
-            if self.how == "killed":
-                os.kill(os.getpid(), signal.SIGKILL)
             raise DevrfError("data.root: gone")
 '''
+# Stands for the program in processes of which the second is killed, and the first goes on.
+KILLED = """
+import os, signal, time
+os.kill(os.getpid(), signal.SIGKILL) if os.environ["RANK"] == "1" else time.sleep(100)
+"""
+
+
+class Outcome(NamedTuple):
+    status: int
+    out: str
+    err: str
 
 
 @pytest.fixture(scope="module")
@@ -114,15 +121,43 @@ def commands(warm_with, modules):
         yield warm
 
 
+def by_torchrun(folder, modules, *arguments):
+    """Run the command on two nodes of torchrun, here; how each ended."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    agent = ("torch.distributed.run", "--nnodes=2", "--nproc-per-node=1")
+    agent += ("--master-addr=127.0.0.1", f"--master-port={port}")
+    learn = ("-m", "devrf", *arguments, "trainer.devices=1", "trainer.num_nodes=2")
+    path = os.pathsep.join([str(Path(package.__file__).parents[1]), str(modules)])
+    own = {"PYTHONPATH": path, "OMP_NUM_THREADS": "1", "HYDRA_FULL_ERROR": "0"}
+    begun = [
+        subprocess.Popen(
+            [sys.executable, "-m", *agent, f"--node-rank={rank}", *learn],
+            cwd=folder,
+            env={**os.environ, **own},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for rank in (0, 1)
+    ]
+    said = [process.communicate(timeout=120) for process in begun]
+    return [Outcome(p.returncode, *words) for p, words in zip(begun, said, strict=True)]
+
+
 @pytest.fixture(scope="module")
-def pair(commands, learning, tmp_path_factory):
-    """The folder of a run in two processes, interrupted, and how it ended and went on."""
+def pair(commands, learning, modules, tmp_path_factory):
+    """The folder of a run that two processes of a command begin, and how it was interrupted.
+
+    Two nodes of torchrun go on with it; how that went.
+    """
     folder = tmp_path_factory.mktemp("pair")
-    arguments = (*learning(folder), "trainer.devices=2")
-    stop = "+callbacks.stop._target_=witnesses.Stop"
-    interrupted = commands(folder, *arguments, "stage=canonical", stop)
+    arguments = learning(folder)
+    stop = ("trainer.devices=2", "stage=canonical", "+callbacks.stop._target_=witnesses.Stop")
+    interrupted = commands(folder, *arguments, *stop)
     assert (folder / "run" / "checkpoints" / "canonical-progress-3.ckpt").is_file(), interrupted.out
-    return folder, interrupted, commands(folder, *arguments)
+    return folder, interrupted, by_torchrun(folder, modules, *arguments)
 
 
 def test_an_interrupted_command_ends_its_processes(pair):
@@ -134,12 +169,14 @@ def test_an_interrupted_command_ends_its_processes(pair):
 
 
 def test_it_goes_on_ends_well_and_one_process_speaks(pair):
-    folder, _, done = pair
-    assert done.status == 0, done.out
-    said = done.out.splitlines()
+    folder, _, (first, second) = pair
+    assert (first.status, second.status) == (0, 0), first.err + second.err
+    said = first.out.splitlines()
     assert len([line for line in said if line.startswith("canonical: seconds")]) == 1
-    assert len(said) == len(set(said)) and not any(line.startswith("devrf:") for line in said)
-    assert "canonical: goes on at iteration 3" in done.out
+    assert len(said) == len(set(said))
+    assert "canonical: goes on at iteration 3" in first.out + first.err
+    # torchrun's agent warns there when the agent that keeps the store ends before it.
+    assert second.out == "" and "devrf:" not in first.err + second.err
     left = {path.name for path in (folder / "run" / "checkpoints").glob("*.ckpt")}
     assert left == {"canonical.ckpt", "deformation.ckpt"}
 
@@ -177,30 +214,45 @@ def test_one_process_records(pair):
 
 
 @pytest.mark.parametrize(
-    ("how", "line"),
+    ("killed", "line"),
     [
-        ("mistake", "data.root: gone"),
-        ("killed", "trainer.devices: the process of rank 1 ended by SIGKILL; was"),
+        (False, "data.root: gone"),
+        (True, "trainer.devices: the process of rank 1 ended by SIGKILL; was"),
     ],
 )
-def test_a_failure_of_one_process_ends_both_with_its_line(commands, tiny, tmp_path, how, line):
+def test_a_failure_of_one_process_ends_both_with_its_line(commands, tiny, tmp_path, killed, line):
     arguments = (*(word for word in tiny if word != "trainer=cpu"), *TWO, "stage=canonical")
-    trip = ("_target_=witnesses.Trip", f"how={how}")
     # A folder that is another whenever the command line is composed.
-    arguments += ("hydra.run.dir=${now:%f}", *(f"+callbacks.trip.{word}" for word in trip))
-    outcome = commands(tmp_path, *arguments)
+    arguments += ("hydra.run.dir=${now:%f}",)
+    own = {}
+    if killed:
+        (tmp_path / "devrf").mkdir()
+        (tmp_path / "devrf" / "__init__.py").touch()
+        (tmp_path / "devrf" / "__main__.py").write_text(KILLED)
+        own["environment"] = {"PYTHONPATH": str(tmp_path)}
+    else:
+        arguments += ("+callbacks.trip._target_=witnesses.Trip",)
+    outcome = commands(tmp_path, *arguments, **own)
     assert outcome.status == 2 and "Traceback" not in outcome.out
     lines = [said for said in outcome.out.splitlines() if said.startswith("devrf: ")]
     (said,) = (said for said in lines if "interrupted" not in said)
     assert said.startswith(f"devrf: {line}")
 
 
-def test_a_sweeps_job_learns_in_processes_of_its_own(commands, learning, tmp_path):
-    arguments = (*learning(tmp_path), "trainer.devices=2", "stage=canonical", "seed=5")
+def test_a_sweeps_job_learns_in_processes_of_its_own_what_others_learn(
+    pair, commands, learning, tmp_path
+):
+    arguments = (*learning(tmp_path), "trainer.devices=2", "stage=canonical")
     outcome = commands(tmp_path, "-m", *arguments, "hydra.sweep.dir=sweep")
     assert outcome.status == 0, outcome.out
     assert (tmp_path / "sweep" / "0_robot" / "checkpoints" / "canonical.ckpt").is_file()
-    assert len([*tmp_path.glob("static-*.json")]) == 2
+    # Without a break, and without torchrun's nodes.
+    fields = [
+        json.loads((folder / f"static-{rank}.json").read_text())["fields"]
+        for folder in (pair[0], tmp_path)
+        for rank in (0, 1)
+    ]
+    assert fields == fields[:1] * 4
 
 
 def test_where_none_can_be_started_a_line_says_so(tmp_path):
@@ -211,43 +263,6 @@ def test_where_none_can_be_started_a_line_says_so(tmp_path):
         assert starts_processes(trainer.strategy)
         with pytest.raises(DevrfError, match=line):
             run_in_each(trainer.strategy, tmp_path)
-
-
-def test_two_nodes_of_torchrun_learn_what_two_processes_of_one_command_learn(
-    pair, learning, modules, tmp_path
-):
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    agent = ("torch.distributed.run", "--nnodes=2", "--nproc-per-node=1")
-    agent += ("--master-addr=127.0.0.1", f"--master-port={port}")
-    learn = ("-m", "devrf", *learning(tmp_path), "stage=canonical")
-    learn += ("trainer.devices=1", "trainer.num_nodes=2")
-    path = os.pathsep.join([str(Path(package.__file__).parents[1]), str(modules)])
-    own = {"PYTHONPATH": path, "OMP_NUM_THREADS": "1", "HYDRA_FULL_ERROR": "0"}
-    begun = [
-        subprocess.Popen(
-            [sys.executable, "-m", *agent, f"--node-rank={rank}", *learn],
-            cwd=tmp_path,
-            env={**os.environ, **own},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for rank in (0, 1)
-    ]
-    said = [process.communicate(timeout=120) for process in begun]
-    assert [process.returncode for process in begun] == [0, 0], said
-    (first, _), (second, complaint) = said
-    assert first.count("canonical: seconds") == 1
-    # torchrun's agent warns there when the agent that keeps the store ends before it.
-    assert second == "" and "devrf:" not in complaint
-    fields = [
-        json.loads((folder / f"static-{rank}.json").read_text())["fields"]
-        for folder in (pair[0], tmp_path)
-        for rank in (0, 1)
-    ]
-    assert fields == fields[:1] * 4
 
 
 def test_tasks_of_slurm_without_a_common_folder_end_with_a_line_each(commands, tiny, tmp_path):
