@@ -16,16 +16,17 @@ from devrf.methods import ray_plan
 from devrf.methods.devrf import plans
 
 SCENE = ("data.width=32", "data.height=32", "data.static_views=16", "data.frames=4")
-SCENE += ("data.supersample=1", "~callbacks.training_curve")
-PAPER = ("experiment=paper", "rehearse=true", *SCENE)
+SCENE += ("data.supersample=1", "~callbacks.training_curve", "~callbacks.previews")
+FORWARD = ("experiment=paper", "rehearse=true", *SCENE)
+PAPER = (*FORWARD, "data.static_test_views=2")
 PEER = ("experiment=peer_paper", "protocol=joint", "rehearse=true", *SCENE)
+PEER += ("data.static_test_views=2",)
 
 
 @pytest.fixture(autouse=True)
 def shorter(monkeypatch: pytest.MonkeyPatch) -> None:
     """Half of a rehearsal's iterations, or less: these scenes are small."""
     monkeypatch.setattr(plans, "REHEARSED_ITERATIONS", 300)
-    monkeypatch.setattr(ray_plan, "REHEARSED_ITERATIONS", 140)
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +68,7 @@ def test_the_papers_settings_learn_an_inward_facing_scene(paper):
 
 def test_the_papers_settings_learn_a_forward_facing_scene(devrf, tmp_path):
     alone = ("stage=canonical", "hydra.run.dir=run")
-    done = devrf("data=procedural_forward", *PAPER, *alone)
+    done = devrf("data=procedural_forward", *FORWARD, *alone)
     assert done.status == 0, done.err
     found = record(tmp_path / "run")["rehearsal"]
     assert found["learned"]["static"]["psnr"] > found["learned"]["static"]["blank"] + 8
@@ -76,13 +77,16 @@ def test_the_papers_settings_learn_a_forward_facing_scene(devrf, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "event"),
+    ("words", "iterations", "event"),
     [
-        (("method=kplanes", "profile=kplanes_video"), "proposals learn rarely"),
-        (("method=tineuvox", "profile=tineuvox_phone"), "grids grown"),
+        (("method=kplanes", "profile=kplanes_video"), 140, "proposals learn rarely"),
+        (("method=tineuvox", "profile=tineuvox_phone"), 90, "grids grown"),
     ],
 )
-def test_published_sizes_of_other_methods_learn(devrf, tmp_path, words, event):
+def test_published_sizes_of_other_methods_learn(
+    devrf, tmp_path, monkeypatch, words, iterations, event
+):
+    monkeypatch.setattr(ray_plan, "REHEARSED_ITERATIONS", iterations)
     done = devrf(*PEER, *words, "hydra.run.dir=run")
     assert done.status == 0, done.err
     stage = record(tmp_path / "run")["rehearsal"]["stages"]["joint"]
@@ -106,16 +110,6 @@ def test_a_rehearsal_is_no_run(paper, devrf_in):
     assert not (place / "metrics.json").exists()
 
 
-def test_a_stage_is_rehearsed_alone_on_what_was_rehearsed_before(paper, devrf_in):
-    folder, _ = paper
-    place = folder / "outputs/robot/paper-rehearsal"
-    before = (place / "checkpoints/canonical.ckpt").stat().st_mtime_ns
-    done = devrf_in(folder, *PAPER, "stage=deformation")
-    assert done.status == 0, done.err
-    assert (place / "checkpoints/canonical.ckpt").stat().st_mtime_ns == before
-    assert list(record(place)["rehearsal"]["stages"]) == ["deformation"]
-
-
 def test_a_rehearsal_leaves_a_run_alone(trained, devrf_in, tmp_path):
     folder, _ = trained
     before = (folder / "checkpoints/canonical.ckpt").stat().st_mtime_ns
@@ -132,13 +126,18 @@ def test_settings_by_which_nothing_is_found_end_with_status_2(devrf):
     assert done.status == 2 and "the geometry search found nothing opaque" in done.err
 
 
-def test_a_stage_that_does_not_learn_ends_with_status_2(paper, devrf, tmp_path):
+def test_a_stage_is_rehearsed_alone_and_one_that_does_not_learn_ends_with_status_2(
+    paper, devrf, tmp_path
+):
     shutil.copytree(paper[0] / "outputs/robot/paper-rehearsal", tmp_path / "run")
+    before = (tmp_path / "run/checkpoints/canonical.ckpt").stat().st_mtime_ns
     still = ("schedule.motion.learning_rate=0", "loss.deformation.flow=0", "stage=deformation")
     done = devrf(*PAPER, *still, "hydra.run.dir=run")
     assert done.status == 2
     assert "rehearse: the deformation stage has learned no motion: " in done.err
-    assert record(tmp_path / "run")["rehearsal"]["shortfalls"]
+    found = record(tmp_path / "run")["rehearsal"]
+    assert found["shortfalls"] and list(found["stages"]) == ["deformation"]
+    assert (tmp_path / "run/checkpoints/canonical.ckpt").stat().st_mtime_ns == before
 
 
 def stage(capture: Any, events: dict[str, int] | None = None) -> RehearsedStage:
