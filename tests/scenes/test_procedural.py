@@ -362,7 +362,7 @@ def test_a_random_body_has_the_size_and_the_motion_that_are_said(seed: int) -> N
 
 
 def test_a_random_body_is_the_same_each_time() -> None:
-    one, other = (drawn_body.__wrapped__(2) for _ in range(2))
+    one, other = (drawn_body.__wrapped__(5) for _ in range(2))
     assert one is not other
     torch.testing.assert_close(one.outline().canonical, other.outline().canonical)
 

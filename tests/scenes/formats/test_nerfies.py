@@ -145,11 +145,11 @@ def test_what_is_held_out_is_not_learned_from(folder, caplog):
 
 
 def test_long_lists_of_absent_images_are_gone_through_once(folder, message_of):
-    train, val = ([f"{part}{k}" for k in range(30_000)] for part in "ab")
+    train, val = ([f"{part}{k}" for k in range(12_000)] for part in "ab")
     folder.write("dataset.json", {"train_ids": train, "val_ids": val})
-    began = time.perf_counter()
-    assert "60000 of the 60000 images" in message_of(folder.root)
-    assert time.perf_counter() - began < 20
+    began = time.process_time()
+    assert "24000 of the 24000 images" in message_of(folder.root)
+    assert time.process_time() - began < 6
     folder.write("dataset.json", {"ids": [str(k) for k in range(50_001)]})
     assert "ids: expected at most 50000 items" in message_of(folder.root)
 
