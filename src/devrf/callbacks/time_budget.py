@@ -2,8 +2,8 @@
 
 A short trial measures what iterations take, of two sizes of batches. Then the schedule is scaled
 (:func:`~devrf.engine.schedule.scale_schedule`): growths, decays and curricula take place as
-they do in the configured one. It is fitted again when the kind of phase has changed, and when a
-quarter of the time is over that was left at the last fit; in the last phase the stage ends with
+they do in the configured one. It is scaled again when the kind of phase has changed, and when a
+quarter of the time is over that was left at the last scaling; in the last phase the stage ends with
 its time.
 
 * The budget is that of the whole method. A stage has a share of it, in proportion to what its
@@ -137,17 +137,17 @@ class TimeBudget(Callback):
         self._tried: dict[float, list[float]] = {
             min(most, max(share, pl_module.useful_share)): [] for share in TRIED
         }
-        self._next_fit = math.inf  # seconds
         if self._pace is None:
             batch.share = min(self._tried)
-        else:  # a run that goes on
-            self._next_fit = self._record.seconds
+        self._is_due = self._pace is not None  # of a run that goes on
+        self._is_new_kind = False  # of a phase whose iterations were not measured yet
+        self._next = 0.0  # seconds at which the schedule is scaled again
         self._step_ended = self._record.seconds
 
     def on_train_batch_start(
         self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int
     ) -> None:
-        """Fit the schedule to the time that is left, if that is due."""
+        """Scale the schedule to the time that is left, if that is due."""
         if self.seconds is None:
             return
         assert isinstance(pl_module, Stage) and pl_module.phase is not None
@@ -158,11 +158,10 @@ class TimeBudget(Callback):
         if entered:
             before = self._entering.get(phase.kind)
             self._entering[phase.kind] = _running_mean(before, now - self._step_ended)
-        due = trainer.strategy.broadcast(now >= self._next_fit)
-        if self._pace is not None and due:
-            self._fit(trainer, pl_module)
+        if self._is_due:
+            self._scale(trainer, pl_module)
         if entered and self._phase is not None and phase.kind != self._phase.kind:
-            self._next_fit = 0.0  # once a step has been measured
+            self._is_new_kind = True
         self._phase = pl_module.phase
         self._done = pl_module.position.iterations_done
         self._step_share = pl_module.batch_size.share
@@ -188,17 +187,19 @@ class TimeBudget(Callback):
                 self._try(trainer, pl_module, pace)
             else:
                 ratio = pace / self._pace.at(share)
-                if self._next_fit > 0:
+                if not self._is_new_kind:
                     ratio = 1 + LATEST * (ratio - 1)
                 self._pace = Pace(self._pace.besides * ratio, self._pace.by_rays * ratio)
         timeline = pl_module.timeline
         over = self._step_ended >= self._budget and self._phase.stop >= timeline.total
-        if trainer.strategy.broadcast(over):
+        is_due = self._pace is not None and (self._is_new_kind or self._step_ended >= self._next)
+        over, self._is_due = trainer.strategy.broadcast((over, is_due))
+        if over:
             pl_module.position.iteration = timeline.total
             trainer.should_stop = True
 
     def _try(self, trainer: Trainer, stage: Stage, pace: float) -> None:
-        """Note the pace of a step of the trial, and go on with larger batches, or to the fit."""
+        """Note the pace of a step of the trial; then larger batches, or the schedule is scaled."""
         share = stage.batch_size.share
         self._tried[share].append(pace)
         measured = self._tried[share][1:]  # the first step warms up
@@ -214,29 +215,29 @@ class TimeBudget(Callback):
         (first, slow), (last, quick) = min(means.items()), max(means.items())
         by_rays = max((quick - slow) / (last - first), 0.0) if last > first else slow / first
         self._pace = Pace(max(slow - by_rays * first, 0.0), by_rays)
-        self._fit(trainer, stage)
+        self._scale(trainer, stage, first=True)
 
     @property
     def _phase_cost(self) -> float:
         assert self._phase is not None
         return self._phase.cost
 
-    def _fit(self, trainer: Trainer, stage: Stage) -> None:
-        """Scale the schedule to the time that is left.
+    def _scale(self, trainer: Trainer, stage: Stage, *, first: bool = False) -> None:
+        """Scale the schedule to the time that is left; ``first``: as the trial has just ended.
 
         Raises:
             DevrfError: one iteration of each phase takes longer.
         """
-        fitted = trainer.strategy.broadcast(self._fitted(stage))
-        if isinstance(fitted, str):
-            raise DevrfError(fitted)
-        factor, stage.batch_size.share, stage.iterations_per_step = fitted
+        scaling = trainer.strategy.broadcast(self._scaling(stage, first))
+        if isinstance(scaling, str):
+            raise DevrfError(scaling)
+        factor, stage.batch_size.share, stage.iterations_per_step = scaling
         scale_schedule(stage, factor)
         now = self._record.seconds
-        left = self._budget - now
-        self._next_fit = now + max(left / 4, STEP_SHARE * self._budget)
+        self._next = now + max((self._budget - now) / 4, STEP_SHARE * self._budget)
+        self._is_new_kind = False
 
-    def _fitted(self, stage: Stage) -> tuple[float, float, int] | str:
+    def _scaling(self, stage: Stage, first: bool) -> tuple[float, float, int] | str:
         """Factor of the schedule, share of batches, iterations of a step; or why nothing fits."""
         assert self._pace is not None and stage.phase is not None
         configured = configured_timeline(stage)
@@ -246,9 +247,9 @@ class TimeBudget(Callback):
         left = max(self._budget - self._record.seconds - entering, 1e-6 * self._budget)
         units = max(cost(configured, place, configured.total), 1e-9)
         share = stage.batch_size.share
-        if self._next_fit in (0.0, math.inf):  # after a trial, or in another kind of phase
+        if first or self._is_new_kind:
             share = self._share_of_batches(stage, iterations=left / units * configured.total)
-        if self._next_fit == math.inf:  # the trial has just ended; of a run that goes on, all fits
+        if first:  # a run that goes on has been let pass before
             least = entering + self._pace.at(share) * sum(phase.cost for phase in later)
             if later and least > self._budget - self._record.seconds:
                 return self._too_short(stage, self._record.seconds + least)
