@@ -77,7 +77,8 @@ class Progress(Callback):
         pace = (now[2] - before[2]) / since
         if self._bar is None:
             self._pace = pace if self._pace == 0 else self._pace + LATEST * (pace - self._pace)
-            log.info("%s", in_one_line(outputs or {}, pl_module, speed, self._pace))
+            line = in_one_line(outputs or {}, pl_module, speed, share=now[2], pace=self._pace)
+            log.info("%s", line)
         else:
             total = pl_module.timeline.total
             at = f"{pl_module.iteration}/{total}  {describe(outputs or {}, pl_module, speed)}"
@@ -104,16 +105,18 @@ class Progress(Callback):
             self._bar = None
 
 
-def in_one_line(means: Mapping[str, Tensor], stage: Stage, speed: float, pace: float) -> str:
+def in_one_line(
+    means: Mapping[str, Tensor], stage: Stage, speed: float, share: float, pace: float
+) -> str:
     """Where a stage is, what :func:`describe` says, and the time left.
 
-    ``speed`` is in iterations a second, ``pace`` in shares of the whole schedule's duration.
+    ``speed`` is in iterations a second, ``share`` the part of the whole schedule's duration that
+    is over, ``pace`` how much more of it a second.
     """
-    done = stage.iteration
-    total = stage.timeline.total
-    left = 1 - share_done(stage.timeline, done)
+    left = 1 - share
     ends = f"  {time_left(left / pace)}" if pace > 0 and left > 0 else ""
-    return f"{stage.capture} {done}/{total}  {describe(means, stage, speed)}{ends}"
+    place = f"{stage.capture} {stage.iteration}/{stage.timeline.total}"
+    return f"{place}  {describe(means, stage, speed)}{ends}"
 
 
 def describe(means: Mapping[str, Tensor], stage: Stage, speed: float) -> str:

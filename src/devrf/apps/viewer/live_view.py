@@ -63,7 +63,8 @@ class LiveView(Callback):
             seconds = now - self._began
             speed = (pl_module.position.iterations_done - self._first) / seconds
             share = share_done(pl_module.timeline, pl_module.iteration)
-            line = in_one_line(outputs or {}, pl_module, speed, (share - self._share) / seconds)
+            pace = (share - self._share) / seconds
+            line = in_one_line(outputs or {}, pl_module, speed, share, pace)
             controls.tell(f"**{pl_module.name}**: {line}")
         if self.seconds > self.share * (now - self._began):
             return
