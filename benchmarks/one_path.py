@@ -128,7 +128,7 @@ def measured(folder: Path) -> dict[str, float]:
     canonical = instantiate(run.config.canonical, _convert_="all")
     learn(canonical)
     build = instantiate(run.config.deformation, _partial_=True, _convert_="all")
-    deformation = build(rest=canonical.result())
+    deformation = build(earlier=canonical.result())
     learn(deformation)
     cameras = run.scene.dynamic.test.cameras.of_height(PICTURE)
     renderer = Renderer(deformation.current_model())

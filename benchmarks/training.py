@@ -69,7 +69,7 @@ def canonical_rows(run: RunContext, stored: LoadedCheckpoint, seconds: float) ->
 def deformation_rows(run: RunContext, stored: LoadedCheckpoint, seconds: float) -> list[Row]:
     """A row for each level."""
     build = instantiate(run.config.deformation, _partial_=True, _convert_="all")
-    return measure(run, build(rest=copy.deepcopy(stored)), "level", stored.model, seconds)
+    return measure(run, build(earlier=copy.deepcopy(stored)), "level", stored.model, seconds)
 
 
 def measure(

@@ -71,7 +71,7 @@ class Clocked(Stage):
         self.drawn.append(self.batch_size.rays(self.schedule.rays))
         if self.drawn[-1] > self.memory:
             raise torch.OutOfMemoryError("CUDA out of memory.")
-        self.step(loss := self.weight.square().sum())
+        self.optimise(loss := self.weight.square().sum())
         self.now += ITERATION[self.phase.level] * self.by_batch(self.batch_size.share)
         self.visits[self.phase.level, self.phase.frame] += 1
         return {"loss": loss.detach()}

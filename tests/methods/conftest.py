@@ -48,7 +48,7 @@ def ray_stage() -> Callable[..., RayStage]:
         model: RayTrainable,
         step: str | ProtocolStage = "joint",
         loss: Mapping[str, float] | None = None,
-        rest: LoadedCheckpoint | None = None,
+        earlier: LoadedCheckpoint | None = None,
         static_share: float = 0.5,
         **changes: Any,
     ) -> RayStage:
@@ -56,7 +56,7 @@ def ray_stage() -> Callable[..., RayStage]:
         rates = {"learning_rate": 1e-2, "final_learning_rate": 1e-3}
         schedule = RaySchedule(**{**usual, **rates, **changes})
         step = STEPS[step] if isinstance(step, str) else step
-        return RayStage(model, schedule, loss or {"render": 1.0}, step, static_share, rest)
+        return RayStage(model, schedule, loss or {"render": 1.0}, step, static_share, earlier)
 
     return make
 

@@ -41,7 +41,7 @@ def test_without_it_the_motion_is_learned(
     monkeypatch.delitem(sys.modules, "devrf.selfcheck", raising=False)
     config = composed("data=procedural", *removed, *QUICK, "schedule.deformation.rays=64")
     check_config(config)
-    stage = instantiate(config.deformation, _partial_=True, _convert_="all")(rest=rest)
+    stage = instantiate(config.deformation, _partial_=True, _convert_="all")(earlier=rest)
     assert isinstance(stage, DeformationStage)
     trainer(max_epochs=1).fit(stage, datamodule=datamodule)
     assert stage.iteration == stage.timeline.total

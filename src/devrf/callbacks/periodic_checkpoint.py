@@ -160,8 +160,8 @@ class PeriodicCheckpoint(Callback):
             for old in files[:newest] + files[newest + self.KEPT :]:
                 old.unlink(missing_ok=True)
         now = time.monotonic()
-        rest = (now - began) * (1 / self.share - 1)
-        self._due = now + max(self.every_seconds, rest)
+        pause = (now - began) * (1 / self.share - 1)
+        self._due = now + max(self.every_seconds, pause)
 
 
 class StopOnSignal(Callback):

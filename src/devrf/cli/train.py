@@ -57,7 +57,7 @@ def learn(run: RunContext, name: str) -> None:
         if before.stage != below:
             needed = f"stage={name} needs a checkpoint of the {below} stage"
             raise DevrfError(f"ckpt: {needed}, not of the {before.stage} stage")
-        stage = build(rest=rest)
+        stage = build(earlier=rest)
         stage.provenance.earlier_configs = {**before.earlier_configs, below: before.training_config}
     stage.provenance.protocol = run.protocol.name
     stage.time_share = run.protocol.time_share(name, run.stages_with_images)

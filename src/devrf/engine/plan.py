@@ -44,9 +44,9 @@ class StagePlan:
         own = "true, as the method's stages freeze what they build on"
         expect(self.protocol.freeze is True, "protocol.freeze", own, self.protocol.freeze)
 
-    def build(self, **rest: Any) -> Any:
-        """The stage; with the ``rest`` that it builds on, if on any."""
-        return self.stage(**self.settings, **rest)
+    def build(self, **earlier: Any) -> Any:
+        """The stage; with the result of the ``earlier`` one that it builds on, if on any."""
+        return self.stage(**self.settings, **earlier)
 
     @property
     def kernels(self) -> Sequence[Kernel]:
@@ -64,12 +64,12 @@ class StagePlan:
         total: int = self.settings["schedule"].total
         return total
 
-    def needs(self, scene: Scene, rest: StagePlan | None) -> StageNeeds:
+    def needs(self, scene: Scene, earlier: StagePlan | None) -> StageNeeds:
         """Memory that the stage needs; if it does not say, that of the images.
 
         Args:
             scene: the scene that is learned.
-            rest: the plan of the stage that it builds on, if any.
+            earlier: the plan of the stage that it builds on, if any.
         """
         return StageNeeds({SIZE: tensor_bytes(scene.captures.values())}, {SIZE: 0})
 

@@ -162,7 +162,7 @@ class Stage(LightningModule, ABC):
         """Called before each iteration; may wait for the device."""
 
     def converged(self, loss: Tensor) -> bool:
-        """Whether the rest of the phase can be skipped, by the mean ``loss`` () of a step."""
+        """Whether what is left of the phase can be skipped, by the mean ``loss`` () of a step."""
         return False
 
     def refresh(self) -> None:
@@ -213,7 +213,7 @@ class Stage(LightningModule, ABC):
         values["step"] = float(self.position.iterations_done)
         self.log_dict(values, on_step=True, on_epoch=False, batch_size=1)
 
-    def step(self, loss: Tensor) -> None:
+    def optimise(self, loss: Tensor) -> None:
         """Go back from a loss () to the gradients, and take the optimiser's step.
 
         Just before the step, LearningRateDecay sets the learning rates.

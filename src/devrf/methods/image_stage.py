@@ -62,7 +62,7 @@ class ImageStage(RayStage):
         loss: Mapping[str, float],
         step: ProtocolStage,
         static_share: float = 0.5,
-        rest: LoadedCheckpoint | None = None,
+        earlier: LoadedCheckpoint | None = None,
         half_size: float = 0.0,
         moving_share: float | None = None,
         static_first: float = 0.0,
@@ -75,7 +75,7 @@ class ImageStage(RayStage):
             loss: weights of the method's loss terms.
             step: which data trains which parts.
             static_share: share of static images in a stage of both captures.
-            rest: the result of an earlier stage, to go on with.
+            earlier: the result of an earlier stage, to go on with.
             half_size: share of the stage in which images have half of their width and height.
             moving_share: share of moving images in a stage of both captures; None: as
                 ``static_share`` says.
@@ -86,7 +86,7 @@ class ImageStage(RayStage):
             expect(share is None or 0 <= share < 1, f"ray_stage.{name}", "in [0, 1)", share)
         self.half_size, self.static_first = half_size, static_first
         static = static_share if moving_share is None else 1 - moving_share
-        super().__init__(model, schedule, loss, step, static, rest)
+        super().__init__(model, schedule, loss, step, static, earlier)
 
     def pool_of(self, views: Views) -> FrameSortedPixels:
         """A pixel for each image."""

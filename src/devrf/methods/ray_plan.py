@@ -26,10 +26,10 @@ REHEARSED_CROP = 0.25
 class RayPlan(StagePlan):
     """The plan of a :class:`~devrf.methods.ray_stage.RayStage`, or of one of images."""
 
-    def build(self, **rest: Any) -> Any:
+    def build(self, **earlier: Any) -> Any:
         """The stage, told which data trains which parts of the method."""
         share = self.protocol.static_share
-        return super().build(step=self.step, static_share=share, **rest)
+        return super().build(step=self.step, static_share=share, **earlier)
 
     @property
     def step(self) -> ProtocolStage:
@@ -56,7 +56,7 @@ class RayPlan(StagePlan):
         schedule: RaySchedule = self.settings["schedule"]
         return self.step.share_of(schedule.iterations)
 
-    def needs(self, scene: Scene, rest: StagePlan | None) -> StageNeeds:
+    def needs(self, scene: Scene, earlier: StagePlan | None) -> StageNeeds:
         """Images, the whole of the model, and a batch."""
         schedule: RaySchedule = self.settings["schedule"]
         rays = max(schedule.rays, schedule.rays_without_hull or 0)

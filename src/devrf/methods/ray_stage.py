@@ -54,17 +54,17 @@ class RayStage(Stage):
         loss: Mapping[str, float],
         step: ProtocolStage,
         static_share: float = 0.5,
-        rest: LoadedCheckpoint | None = None,
+        earlier: LoadedCheckpoint | None = None,
     ) -> None:
         """Build the stage.
 
         Args:
-            model: the method; not used where the stage builds on ``rest``.
+            model: the method; not used where the stage builds on ``earlier``.
             schedule: iterations, rays and rates.
             loss: weights of the method's loss terms; a term of weight 0 is not computed.
             step: which data trains which parts.
             static_share: share of static rays in a batch of both captures.
-            rest: the result of an earlier stage, to go on with.
+            earlier: the result of an earlier stage, to go on with.
         """
         super().__init__(schedule.iterations_per_step)
         self.name = step.name
@@ -74,10 +74,10 @@ class RayStage(Stage):
         self.schedule = RayTimeline(of_stage)
         self.static_share = static_share
         self.scene_model = model
-        self._ready = rest is not None
-        if rest is not None:
-            self.scene_model = rest.model
-            self.provenance.earlier_records = rest.metadata.records
+        self._ready = earlier is not None
+        if earlier is not None:
+            self.scene_model = earlier.model
+            self.provenance.earlier_records = earlier.metadata.records
         self.keeps_batches = self.scene_model.keeps_batches
         if schedule.times_per_batch is not None:
             self.useful_share = 1 / schedule.times_per_batch
@@ -97,7 +97,7 @@ class RayStage(Stage):
             terms |= visibility(output.transmittance, batch.alpha)
             if "render" not in terms:  # what the curves' PSNR is of
                 terms["render"] = mse_loss(output.color.detach(), batch.color)
-        self.step(loss)
+        self.optimise(loss)
         return {"loss": loss.detach(), **terms}
 
     def draw_batch(self, views: Views | tuple[Views, ...]) -> RayBatch | ImageBatch:

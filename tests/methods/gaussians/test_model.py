@@ -44,7 +44,7 @@ def stage(
     schedule = RaySchedule(iterations=iterations, rays=10_000, iterations_per_step=2, **rates)
     step = step or ProtocolStage("joint", "both")
     model = DeformableGaussians(settings)
-    return ImageStage(model, schedule, {"l1": 1.0, "ssim": 0.2}, step, rest=rest, half_size=0.25)
+    return ImageStage(model, schedule, {"l1": 1.0, "ssim": 0.2}, step, earlier=rest, half_size=0.25)
 
 
 def test_nothing_moves_at_time_0_and_a_frame_later_all_does() -> None:

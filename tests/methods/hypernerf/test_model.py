@@ -94,7 +94,7 @@ def test_two_stages_freeze_all_or_all_but_what_ambient_space_enters_by(
     cameras = tiny_scene.dynamic.test.cameras
     at_rest = Renderer(rest.model).view(cameras, 1, 0.0, 1.0).color
     step = ProtocolStage("deformation", "dynamic", frozen=(frozen,), builds_on="canonical")
-    second = fit(ray_stage(model, step, rest=rest))
+    second = fit(ray_stage(model, step, earlier=rest))
     after = second.scene_model.state_dict()
     changed = {k for k in before if not torch.equal(before[k], after[k])}
     columns = {k for k in before if k.startswith("canonical.trunk.beside.")}

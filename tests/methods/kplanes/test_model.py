@@ -228,7 +228,7 @@ def test_two_stages_leave_what_space_says_as_it_was(
     first = fit(ray_stage(KPlanes(TINY), "canonical", loss=LOSS))
     step = ProtocolStage("deformation", "dynamic", frozen=("canonical",), builds_on="canonical")
     before = {n: p.clone() for n, p in first.scene_model.named_parameters()}
-    second = fit(ray_stage(KPlanes(TINY), step, loss=LOSS, rest=first.result()))
+    second = fit(ray_stage(KPlanes(TINY), step, loss=LOSS, earlier=first.result()))
     model = second.scene_model
     moving = {id(grid) for grid in model.planes.time}  # type: ignore[union-attr]
     for name, parameter in model.named_parameters():

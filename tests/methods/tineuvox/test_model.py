@@ -136,7 +136,7 @@ def test_terms_by_hand(tiny_scene: Scene, some_rays: Any) -> None:
 @pytest.mark.parametrize("hull", [True, False])
 def test_it_learns(hull: bool, learned_losses: Callable[..., list[float]]) -> None:
     model = TiNeuVox(replace(TINY, hull=hull))
-    sizes = {"iterations": 60, "rays": 128, "iterations_per_step": 20}
+    sizes = {"iterations": 45, "rays": 128, "iterations_per_step": 15}
     losses = learned_losses(model, loss=LOSS, learning_rate=3e-3, betas=(0.9, 0.99), **sizes)
     assert losses[-1] < 0.7 * losses[0]
     assert model.resolution == model.grid.fitting(model.grid_box, 16)
@@ -160,7 +160,7 @@ def test_two_stages_leave_the_canonical_part_as_it_was(
     first = fit(ray_stage(TiNeuVox(TINY), "canonical", loss=LOSS))
     step = ProtocolStage("deformation", "dynamic", frozen=("canonical",), builds_on="canonical")
     before = {n: t.clone() for n, t in first.scene_model.state_dict().items()}
-    second = fit(ray_stage(TiNeuVox(TINY), step, loss=LOSS, rest=first.result()))
+    second = fit(ray_stage(TiNeuVox(TINY), step, loss=LOSS, earlier=first.result()))
     after = second.scene_model.state_dict()
     changed = {name.split(".")[0] for name in before if not torch.equal(before[name], after[name])}
     assert changed == {"deformation", "time"}

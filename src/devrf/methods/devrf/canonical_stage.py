@@ -154,7 +154,7 @@ class CanonicalStage(Stage):
             loss, terms = batch_loss(prediction, PHOTOMETRIC_TERMS, self.objective.weights)
             if not model.space.is_linear:
                 loss, terms = self._with_distortion(loss, terms, output)
-        self.step(loss)
+        self.optimise(loss)
         return {"loss": loss.detach(), **terms}
 
     def draw(self) -> tuple[Tensor, Tensor]:

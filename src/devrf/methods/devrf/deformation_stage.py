@@ -73,7 +73,7 @@ class DeformationStage(Stage):
 
     def __init__(
         self,
-        rest: LoadedCheckpoint,
+        earlier: LoadedCheckpoint,
         schedule: DeformationSchedule | None = None,
         motion: MotionSettings | None = None,
         loss: Mapping[str, float] = DEFORMATION_LOSS,
@@ -85,7 +85,7 @@ class DeformationStage(Stage):
         """Build the stage; the defaults are the paper's for inward-facing scenes.
 
         Args:
-            rest: the result of the canonical stage; its fields are frozen.
+            earlier: the result of the canonical stage; its fields are frozen.
             schedule: resolutions, iterations and frames.
             motion: learning rate and how batches are drawn.
             loss: weights of the loss terms; ``tv`` is the total variation of both fields.
@@ -101,7 +101,7 @@ class DeformationStage(Stage):
         self.decoder_precision = decoder_precision
         self.extensions = tuple((extensions or {}).values())
         self.motion_loss = MotionLoss(loss, self.extensions, self.schedule)
-        canonical = rest.model
+        canonical = earlier.model
         self.scene_model = DeVRFModel(
             canonical.architecture,
             canonical.canonical,
@@ -109,7 +109,7 @@ class DeformationStage(Stage):
             canonical.settings,
             space=canonical.space,
         ).requires_grad_(False)
-        self.provenance.earlier_records = rest.metadata.records
+        self.provenance.earlier_records = earlier.metadata.records
         placeholder = torch.zeros(2, 2, 2, 3, requires_grad=True)
         self.optimizer = GridAdam(
             [{"params": [placeholder], "lr": self.motion.learning_rate, "name": "motion"}]
@@ -160,7 +160,7 @@ class DeformationStage(Stage):
                 flow_mean=self.flow_mean,
             )
             loss, terms = batch_loss(prediction, self.motion_loss.terms, self.context.weights)
-        self.step(loss)
+        self.optimise(loss)
         return {"loss": loss.detach(), **terms}
 
     def draw(self) -> tuple[Tensor, Tensor]:

@@ -52,7 +52,7 @@ class CanonicalPlan(StagePlan):
         schedule: CanonicalSchedule = self.settings["schedule"]
         return schedule.in_space(scene.space).total
 
-    def needs(self, scene: Scene, rest: StagePlan | None) -> StageNeeds:
+    def needs(self, scene: Scene, earlier: StagePlan | None) -> StageNeeds:
         """Images, grids and a batch."""
         grid, values, ray = _field(self.settings, scene)
         parts = {
@@ -98,11 +98,11 @@ class DeformationPlan(StagePlan):
         schedule: DeformationSchedule = self.settings["schedule"]
         return schedule.total(len(scene.clock))
 
-    def needs(self, scene: Scene, rest: StagePlan | None) -> StageNeeds:
+    def needs(self, scene: Scene, earlier: StagePlan | None) -> StageNeeds:
         """Images, the frozen field, the motion grids, and a batch."""
-        assert rest is not None, "it builds on the canonical stage"
+        assert earlier is not None, "it builds on the canonical stage"
         schedule: DeformationSchedule = self.settings["schedule"]
-        grid, values, ray = _field(rest.settings, scene)
+        grid, values, ray = _field(earlier.settings, scene)
         # Displacements of a frame: three numbers in both directions. The active one is learned.
         frame, frames = 24 * schedule.levels[-1].side ** 3, len(scene.clock)
         on_device = 1 if self.settings["motion"].store == "host" else frames
