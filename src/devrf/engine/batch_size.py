@@ -2,9 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import logging
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
+
+import torch
+
+from devrf.engine.grid_adam import GridAdam
+from devrf.errors import DevrfError
+from devrf.system.memory import OutOfMemoryError, free_cache, is_oom, numbers
+
+log = logging.getLogger(__name__)
+
+Result = TypeVar("Result")
 
 
 @dataclass
@@ -16,12 +27,14 @@ class BatchSize:
         largest: the most that memory suffices for: less than 1 after it has run out.
         smallest: the least to which batches are halved where memory runs out.
         processes: the number of processes that draw a batch together.
+        is_final: whether the parameters change by the present batch: it cannot be drawn again.
     """
 
     share: float = 1.0
     largest: float = 1.0
     smallest: float = 0.5
     processes: int = 1
+    is_final: bool = False
 
     @property
     def of_process(self) -> float:
@@ -33,13 +46,36 @@ class BatchSize:
         whole = rays if most is None else min(rays, most)
         return max(1, round(whole * self.of_process))
 
-    def halve(self) -> bool:
-        """Draw half of the rays from now on, unless that is less than the smallest share."""
-        if self.share / 2 < self.smallest:
-            return False
-        self.share /= 2
-        self.largest = self.share
-        return True
+    def attempt(
+        self, iterate: Callable[[], Result], optimizer: GridAdam, device: torch.device
+    ) -> Result:
+        """``iterate()``; where memory runs out, again with half of the rays, from now on.
+
+        Raises:
+            OutOfMemoryError: half is less than the smallest share; no parameter has changed.
+            DevrfError: there are several processes: the others already wait for this one.
+        """
+        while True:
+            try:
+                optimizer.make_gradients()  # Lightning drops them where a run is resumed
+                return iterate()
+            except (RuntimeError, MemoryError) as error:
+                if self.is_final or not is_oom(error):
+                    raise
+                shortage = f"out of memory ({numbers(str(error), device)})"
+            # Outside the handler, where the error's traceback no longer holds the batch.
+            optimizer.zero_grad()
+            free_cache(device)
+            if self.processes > 1:
+                raise DevrfError(
+                    f"schedule: one of {self.processes} processes is {shortage}; fewer rays, "
+                    "smaller grids or more processes"
+                )
+            if self.share / 2 < self.smallest:
+                raise OutOfMemoryError(shortage)
+            self.share /= 2
+            self.largest = self.share
+            log.warning("%s: batches have half of their rays from now on", shortage)
 
     def state(self) -> dict[str, Any]:
         """The shares, for a progress file."""

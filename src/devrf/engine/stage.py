@@ -47,10 +47,11 @@ from devrf.engine.resumed_loops import resumed_fit_loop
 from devrf.engine.schedule import Phase, Schedule, scale_schedule
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import HeldOutView, score
+from devrf.evaluation.scoring import log_scores
 from devrf.rendering.renderable import Renderable
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import CaptureName, ImagesName, Scene, Views
-from devrf.system.memory import free_cache, is_oom, numbers
+from devrf.system.memory import OutOfMemoryError, is_oom
 from devrf.system.profiling import span
 
 log = logging.getLogger(__name__)
@@ -126,7 +127,6 @@ class Stage(LightningModule, ABC):
         self.time_share = 1.0
         self.abort_reason: str | None = None
         self.events: Counter[str] = Counter()
-        self._stepping = False
         self._progress: dict[str, Any] | None = None
         self._finished: dict[str, Any] | None = None
 
@@ -187,12 +187,14 @@ class Stage(LightningModule, ABC):
         if self.trainer.max_steps > 0:
             count = min(count, self.trainer.max_steps - self.trainer.global_step)
         losses: list[Terms] = []
+        iterate = partial(self.iterate, views)
         while len(losses) < count and position.iteration < stop:
             self.prepare()
-            terms = self._attempt(views)
-            if terms is None:
+            try:
+                losses.append(self.batch_size.attempt(iterate, self.optimizer, self.device))
+            except OutOfMemoryError as shortage:
+                self._abort_for_memory(shortage)
                 break
-            losses.append(terms)
             position.advance()
         means = mean_terms(losses, self.batch_size.processes)
         if losses and position.iteration < stop and self.converged(means["loss"]):
@@ -226,44 +228,10 @@ class Stage(LightningModule, ABC):
             average_gradients(p for group in groups for p in group["params"])
         optimizer = self.optimizers()
         assert isinstance(optimizer, LightningOptimizer)
-        self._stepping = True
+        self.batch_size.is_final = True
         with span("optimiser"):
             optimizer.step()
-        self._stepping = False
-
-    def _attempt(self, views: Any) -> Terms | None:
-        """:meth:`iterate`; where memory runs out before the step, again with half of the rays.
-
-        None where these are too few, and the stage is to end; no parameter has changed then.
-
-        Raises:
-            DevrfError: there are several processes: the others already wait for this one.
-        """
-        try:
-            self.optimizer.make_gradients()  # Lightning drops them where a run is resumed
-            return self.iterate(views)
-        except (RuntimeError, MemoryError) as error:
-            if self._stepping or not is_oom(error):
-                raise
-            shortage = f"out of memory ({numbers(str(error), self.device)})"
-        # Outside the handler, where the error's traceback no longer holds the batch.
-        self.optimizer.zero_grad()
-        free_cache(self.device)
-        if self.batch_size.processes > 1:
-            raise DevrfError(
-                f"schedule: one of {self.batch_size.processes} processes is {shortage}; fewer "
-                "rays, smaller grids or more processes"
-            )
-        if not self.batch_size.halve():
-            lower = " or ".join(self.memory_keys)
-            self.abort(
-                f"{shortage} at {self.describe(self.position.iteration)}; the same command goes on "
-                "where there is more memory; with less, begin afresh (resume=false) with "
-                f"{f'lower {lower}, or ' if lower else ''}higher data.downscale"
-            )
-            return None
-        log.warning("%s: batches have half of their rays from now on", shortage)
-        return self._attempt(views)
+        self.batch_size.is_final = False
 
     def _entered_phase(self) -> Phase:
         """The present phase, for whose iterations grids and learning rates are ready.
@@ -293,6 +261,14 @@ class Stage(LightningModule, ABC):
         """End the stage after the present step; the fit then raises an error that says ``why``."""
         self.abort_reason = f"{self.name} stage: {why}"
         self.trainer.should_stop = True
+
+    def _abort_for_memory(self, shortage: OutOfMemoryError) -> None:
+        lower = " or ".join(self.memory_keys)
+        self.abort(
+            f"{shortage} at {self.describe(self.position.iteration)}; the same command goes on "
+            "where there is more memory; with less, begin afresh (resume=false) with "
+            f"{f'lower {lower}, or ' if lower else ''}higher data.downscale"
+        )
 
     # What a subclass, callbacks and commands ask.
 
@@ -504,9 +480,7 @@ class Stage(LightningModule, ABC):
             ``view``, for callbacks.
         """
         view = self._score(self.scene.capture(self.scored_capture).test, index)
-        scores = {"psnr": view.psnr, "ssim": view.ssim, "rest_pose_psnr": view.rest_pose_psnr}
-        means = {f"test/{self.scored_capture}/{k}": v for k, v in scores.items()}
-        self.log_dict(means, batch_size=1, sync_dist=True)
+        log_scores(self, self.scored_capture, view)
         return {"view": view}
 
     def _score(self, views: Views, index: int) -> HeldOutView:

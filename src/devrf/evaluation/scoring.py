@@ -79,10 +79,15 @@ class HeldOutScores(LightningModule):
             rest_pose_psnr=self.scored[STATIC][index].psnr if shared else None,
         )
         self.scored[name].append(view)
-        known = {metric: value for metric, value in view.scores.items() if value is not None}
-        means = {f"test/{name}/{metric}": value for metric, value in known.items()}
-        self.log_dict(means, on_epoch=True, batch_size=1)
+        log_scores(self, name, view)
         return {"view": view}
+
+
+def log_scores(module: LightningModule, name: str, view: HeldOutView) -> None:
+    """Log a view's scores within ``test_step``: their means over its set ``name``."""
+    known = {metric: value for metric, value in view.scores.items() if value is not None}
+    means = {f"test/{name}/{metric}": value for metric, value in known.items()}
+    module.log_dict(means, on_epoch=True, batch_size=1, sync_dist=True)
 
 
 class _HeldOut:
