@@ -27,6 +27,7 @@ class BatchSize:
         largest: the most that memory suffices for: less than 1 after it has run out.
         smallest: the least to which batches are halved where memory runs out.
         processes: the number of processes that draw a batch together.
+        keys: the config keys of what to lower where even that is too much.
         is_final: whether the parameters change by the present batch: it cannot be drawn again.
     """
 
@@ -34,6 +35,7 @@ class BatchSize:
     largest: float = 1.0
     smallest: float = 0.5
     processes: int = 1
+    keys: tuple[str, ...] = ()
     is_final: bool = False
 
     @property
@@ -72,7 +74,11 @@ class BatchSize:
                     "smaller grids or more processes"
                 )
             if self.share / 2 < self.smallest:
-                raise OutOfMemoryError(shortage)
+                lower = f"lower {' or '.join(self.keys)}, or " if self.keys else ""
+                raise OutOfMemoryError(
+                    f"{shortage}; the same command goes on where there is more memory; with less, "
+                    f"begin afresh (resume=false) with {lower}higher data.downscale"
+                )
             self.share /= 2
             self.largest = self.share
             log.warning("%s: batches have half of their rays from now on", shortage)

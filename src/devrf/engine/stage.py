@@ -72,7 +72,6 @@ class Stage(LightningModule, ABC):
     Attributes:
         name: the stage's name in files, messages and protocols.
         capture: the part of the scene that is learned from.
-        memory_keys: the config keys of what to lower when memory runs out.
         rate_keys: the config keys of what to lower when training diverges.
         keeps_batches: whether a budget of time leaves out iterations before it makes batches
             smaller.
@@ -100,7 +99,6 @@ class Stage(LightningModule, ABC):
 
     name: str
     capture: CaptureName | Literal["both"]
-    memory_keys: tuple[str, ...] = ()
     rate_keys: ClassVar[str] = "the learning rates"
     keeps_batches: bool = False
     useful_share: float = 0.0
@@ -193,7 +191,7 @@ class Stage(LightningModule, ABC):
             try:
                 losses.append(self.batch_size.attempt(iterate, self.optimizer, self.device))
             except OutOfMemoryError as shortage:
-                self._abort_for_memory(shortage)
+                self.abort(f"{shortage}; it was at {self.describe(position.iteration)}")
                 break
             position.advance()
         means = mean_terms(losses, self.batch_size.processes)
@@ -261,14 +259,6 @@ class Stage(LightningModule, ABC):
         """End the stage after the present step; the fit then raises an error that says ``why``."""
         self.abort_reason = f"{self.name} stage: {why}"
         self.trainer.should_stop = True
-
-    def _abort_for_memory(self, shortage: OutOfMemoryError) -> None:
-        lower = " or ".join(self.memory_keys)
-        self.abort(
-            f"{shortage} at {self.describe(self.position.iteration)}; the same command goes on "
-            "where there is more memory; with less, begin afresh (resume=false) with "
-            f"{f'lower {lower}, or ' if lower else ''}higher data.downscale"
-        )
 
     # What a subclass, callbacks and commands ask.
 

@@ -42,7 +42,6 @@ class RayStage(Stage):
     """
 
     rate_keys = "ray_stage.schedule.learning_rate or the weights of ray_stage.loss"
-    memory_keys = ("ray_stage.schedule.rays",)
     plan = RayPlan
     scene_model: Trainable[Any]
     schedule: RayTimeline
@@ -67,6 +66,7 @@ class RayStage(Stage):
             earlier: the result of an earlier stage, to go on with.
         """
         super().__init__(schedule.iterations_per_step)
+        self.batch_size.keys = ("ray_stage.schedule.rays",)
         self.name = step.name
         self.capture = step.capture
         self.step_of_protocol = step

@@ -95,7 +95,6 @@ class CanonicalStage(Stage):
     phase: CanonicalPhase | None
     name = "canonical"
     capture: CaptureName = "static"
-    memory_keys = ("schedule.canonical.side", "schedule.canonical.rays")
     rate_keys = "schedule.rates or the weights of loss.fine"
     plan = CanonicalPlan
 
@@ -123,6 +122,7 @@ class CanonicalStage(Stage):
             decoder_precision: of the colour network while it learns; ``auto``: as the GPU allows.
         """
         super().__init__(iterations_per_step)
+        self.batch_size.keys = ("schedule.canonical.side", "schedule.canonical.rays")
         self.schedule = schedule or CanonicalSchedule()
         self.architecture = architecture or Architecture()
         self.rates = rates or CanonicalRates()

@@ -312,7 +312,7 @@ class DeformationStage(Stage):
         frame.check_out(phase.frame)
         self._losses = []
         side = f"schedule.deformation.levels.{phase.level + 1}.side"
-        self.memory_keys = (side, "schedule.deformation.rays")
+        self.batch_size.keys = (side, "schedule.deformation.rays")
         return frame
 
     def _allocate(self, phase: DeformationPhase) -> ActiveFrame:
