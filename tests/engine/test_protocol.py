@@ -17,7 +17,7 @@ def test_stages_keep_their_order() -> None:
     protocol = Protocol(
         "two_stage", {"canonical": STATIC, "deformation": {**MOVING, "builds_on": "canonical"}}
     )
-    assert [step.name for step in protocol.steps] == ["canonical", "deformation"]
+    assert [stage.name for stage in protocol.order] == ["canonical", "deformation"]
     assert protocol["deformation"].frozen == ["canonical"]
     assert protocol["deformation"].builds_on == "canonical"
 

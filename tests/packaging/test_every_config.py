@@ -167,7 +167,7 @@ def test_a_method_learns_by_the_protocols_that_it_has_stages_for(composed, tmp_p
         if "ray_stage" in config:
             known = get_class(config.ray_stage.model._target_).protocols
             learns = known is None or protocol in known
-        for step in run.protocol.steps:
+        for step in run.protocol.order:
             if not learns or not {step.name, "ray_stage"} & {*config}:
                 with pytest.raises(DevrfError, match=f"method={method} .* protocol={protocol}"):
                     run.plan(step.name)
@@ -184,7 +184,7 @@ def test_a_row_of_the_tables_is_a_method_and_a_protocol_that_it_learns_by(compos
     assert name.startswith(config.method)
     usual = "two_stage" if name == "devrf" else "joint"
     assert run.protocol.name == (name.removeprefix(config.method).removeprefix("_") or usual)
-    run.plan(run.protocol.steps[0].name)  # refuses what the method does not learn by
+    run.plan(run.protocol.order[0].name)  # refuses what the method does not learn by
 
 
 @pytest.mark.parametrize(

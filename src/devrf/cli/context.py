@@ -143,8 +143,8 @@ class RunContext(ExitStack):
     @property
     def stages_with_images(self) -> tuple[str, ...]:
         """The protocol's stages; of a scene at rest those that learn from the static set alone."""
-        steps = self.protocol.steps
-        return tuple(step.name for step in steps if step.capture == "static" or self.moves)
+        order = self.protocol.order
+        return tuple(stage.name for stage in order if stage.capture == "static" or self.moves)
 
     @property
     def moves(self) -> bool:

@@ -66,7 +66,7 @@ def evaluate(run: RunContext) -> list[Path] | None:
     scene = run.scene
     suite = run.evaluation.suite(run.device)
     # The stage that learns the scene at rest.
-    rest = next((step.name for step in run.protocol.steps if step.capture == "static"), None)
+    rest = next((stage.name for stage in run.protocol.order if stage.capture == "static"), None)
     sets: dict[str, Views] = {"static": scene.static.test}
     if model.moves and metadata.stage != rest:
         sets["dynamic"] = scene.dynamic.test

@@ -60,28 +60,28 @@ class Protocol:
     stages: Mapping[str, Any]
     static_share: float = 0.5
     freeze: bool | Literal["all"] = True
-    steps: tuple[ProtocolStage, ...] = field(init=False)
+    order: tuple[ProtocolStage, ...] = field(init=False)
 
     def __post_init__(self) -> None:
         share = self.static_share
         expect(0 < share < 1, "protocol.static_share", "between 0 and 1", share)
         try:
-            steps = tuple(
+            order = tuple(
                 self._frozen_as_asked(ProtocolStage(name, **settings))
                 for name, settings in self.stages.items()
             )
         except TypeError as error:
             raise DevrfError(f"protocol.stages: {error}") from None
-        names = [step.name for step in steps]
-        for k, step in enumerate(steps):
-            holds, key = step.builds_on in (None, *names[:k]), f"protocol.stages.{step.name}"
-            expect(holds, f"{key}.builds_on", "an earlier stage", repr(step.builds_on))
-        object.__setattr__(self, "steps", steps)
+        names = [stage.name for stage in order]
+        for k, stage in enumerate(order):
+            holds, key = stage.builds_on in (None, *names[:k]), f"protocol.stages.{stage.name}"
+            expect(holds, f"{key}.builds_on", "an earlier stage", repr(stage.builds_on))
+        object.__setattr__(self, "order", order)
 
-    def _frozen_as_asked(self, step: ProtocolStage) -> ProtocolStage:
+    def _frozen_as_asked(self, stage: ProtocolStage) -> ProtocolStage:
         if self.freeze is True:
-            return step
-        return replace(step, frozen=[f"{part}*" for part in step.frozen] if self.freeze else ())
+            return stage
+        return replace(stage, frozen=[f"{part}*" for part in stage.frozen] if self.freeze else ())
 
     def __getitem__(self, name: str) -> ProtocolStage:
         """The stage called ``name``.
@@ -89,7 +89,7 @@ class Protocol:
         Raises:
             KeyError: there is none.
         """
-        return {step.name: step for step in self.steps}[name]
+        return {stage.name: stage for stage in self.order}[name]
 
     def time_share(self, name: str, learned: Sequence[str]) -> float:
         """The part of the method's seconds that is the stage's ``name``, of those ``learned``."""

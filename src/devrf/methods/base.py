@@ -144,9 +144,9 @@ class Trainable(Renderable, Generic[Batch]):
             for parameter in parameters:
                 parameter.requires_grad_(name not in frozen)
 
-    def begin_stage(self, step: ProtocolStage) -> None:
+    def begin_stage(self, stage: ProtocolStage) -> None:
         """Called when a stage of a protocol begins: keeps its frozen parts as they are."""
-        self.freeze(step.frozen)
+        self.freeze(stage.frozen)
 
     def rehearsed(self, factor: float) -> Trainable[Batch]:
         """The method, not set up yet, at a size for seconds on a CPU and ``factor`` times as long.

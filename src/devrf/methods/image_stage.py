@@ -60,7 +60,7 @@ class ImageStage(RayStage):
         model: ImageTrainable,
         schedule: RaySchedule,
         loss: Mapping[str, float],
-        step: ProtocolStage,
+        protocol_stage: ProtocolStage,
         static_share: float = 0.5,
         earlier: LoadedCheckpoint | None = None,
         half_size: float = 0.0,
@@ -73,7 +73,7 @@ class ImageStage(RayStage):
             model: as of :class:`~devrf.methods.ray_stage.RayStage`, as are the next five.
             schedule: iterations, pixels and rates.
             loss: weights of the method's loss terms.
-            step: which data trains which parts.
+            protocol_stage: which data trains which parts.
             static_share: share of static images in a stage of both captures.
             earlier: the result of an earlier stage, to go on with.
             half_size: share of the stage in which images have half of their width and height.
@@ -86,7 +86,7 @@ class ImageStage(RayStage):
             expect(share is None or 0 <= share < 1, f"ray_stage.{name}", "in [0, 1)", share)
         self.half_size, self.static_first = half_size, static_first
         static = static_share if moving_share is None else 1 - moving_share
-        super().__init__(model, schedule, loss, step, static, earlier)
+        super().__init__(model, schedule, loss, protocol_stage, static, earlier)
 
     def pool_of(self, views: Views) -> FrameSortedPixels:
         """A pixel for each image."""

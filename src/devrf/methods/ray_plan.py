@@ -29,10 +29,10 @@ class RayPlan(StagePlan):
     def build(self, **earlier: Any) -> Any:
         """The stage, told which data trains which parts of the method."""
         share = self.protocol.static_share
-        return super().build(step=self.step, static_share=share, **earlier)
+        return super().build(protocol_stage=self.protocol_stage, static_share=share, **earlier)
 
     @property
-    def step(self) -> ProtocolStage:
+    def protocol_stage(self) -> ProtocolStage:
         """The stage as its protocol has it."""
         return self.protocol[self.name]
 
@@ -54,7 +54,7 @@ class RayPlan(StagePlan):
     def iterations(self, scene: Scene) -> int:
         """The stage's share of the schedule."""
         schedule: RaySchedule = self.settings["schedule"]
-        return self.step.share_of(schedule.iterations)
+        return self.protocol_stage.share_of(schedule.iterations)
 
     def needs(self, scene: Scene, earlier: StagePlan | None) -> StageNeeds:
         """Images, the whole of the model, and a batch."""

@@ -51,7 +51,7 @@ class RayStage(Stage):
         model: Trainable[Any],
         schedule: RaySchedule,
         loss: Mapping[str, float],
-        step: ProtocolStage,
+        protocol_stage: ProtocolStage,
         static_share: float = 0.5,
         earlier: LoadedCheckpoint | None = None,
     ) -> None:
@@ -61,16 +61,17 @@ class RayStage(Stage):
             model: the method; not used where the stage builds on ``earlier``.
             schedule: iterations, rays and rates.
             loss: weights of the method's loss terms; a term of weight 0 is not computed.
-            step: which data trains which parts.
+            protocol_stage: which data trains which parts.
             static_share: share of static rays in a batch of both captures.
             earlier: the result of an earlier stage, to go on with.
         """
         super().__init__(schedule.iterations_per_step)
         self.batch_size.keys = ("ray_stage.schedule.rays",)
-        self.name = step.name
-        self.capture = step.capture
-        self.step_of_protocol = step
-        of_stage = replace(schedule, iterations=step.share_of(schedule.iterations))
+        self.name = protocol_stage.name
+        self.capture = protocol_stage.capture
+        self.protocol_stage = protocol_stage
+        total = protocol_stage.share_of(schedule.iterations)
+        of_stage = replace(schedule, iterations=total)
         self.schedule = RayTimeline(of_stage)
         self.static_share = static_share
         self.scene_model = model
@@ -154,10 +155,10 @@ class RayStage(Stage):
         super().setup(stage)
         if not self._ready:
             # A protocol without a stage that learns from the static set does not look at it.
-            alone = self.capture == "dynamic" and self.step_of_protocol.builds_on is None
+            alone = self.capture == "dynamic" and self.protocol_stage.builds_on is None
             self.scene_model.setup(dynamic_only(self.scene) if alone else self.scene)
             self._ready = True
-        self.scene_model.begin_stage(self.step_of_protocol)
+        self.scene_model.begin_stage(self.protocol_stage)
         if hasattr(self, "optimizer"):
             return
         self.schedule = self._with_method()

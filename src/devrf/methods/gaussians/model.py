@@ -213,9 +213,9 @@ class DeformableGaussians(ImageTrainable):
                 groups.append({**own, "rate": rate, "decay": decay})
         return groups
 
-    def begin_stage(self, step: ProtocolStage) -> None:
+    def begin_stage(self, stage: ProtocolStage) -> None:
         """Freeze parts; a cloud that learns begins to count its growths."""
-        super().begin_stage(step)
+        super().begin_stage(stage)
         self.cloud.grown.zero_()
 
     def growths(self, total: int) -> Sequence[int]:

@@ -114,10 +114,10 @@ class HyperNeRF(Nerfies):
         if self.settings.slicing == "plane":
             self.slicing = TimeCodes(times, self.settings.ambient).to(self.device)
 
-    def begin_stage(self, step: ProtocolStage) -> None:
+    def begin_stage(self, stage: ProtocolStage) -> None:
         """Static images alone do not open ambient space."""
-        super().begin_stage(step)
-        self._shut = step.capture == "static"
+        super().begin_stage(stage)
+        self._shut = stage.capture == "static"
 
     def milestones(self, total: int) -> dict[str, int]:
         """The iteration at which ambient space is open, if it opens."""

@@ -136,10 +136,10 @@ class Nerfies(DeformableField):
         super().set_times(times)
         self.codes = TimeCodes(times, self.settings.code).to(self.device)
 
-    def begin_stage(self, step: ProtocolStage) -> None:
+    def begin_stage(self, stage: ProtocolStage) -> None:
         """Take the canonical state from the static images, if a stage learns from them alone."""
-        super().begin_stage(step)
-        self.rest_is_canonical |= step.capture == "static"
+        super().begin_stage(stage)
+        self.rest_is_canonical |= stage.capture == "static"
 
     def milestones(self, total: int) -> dict[str, int]:
         """The iteration at which all of the warp's octaves are open."""
