@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from devrf.errors import DevrfError
-from devrf.system.files import atomic_write, free_disk, refuse_links, write_json
+from devrf.system.files import DEEPEST, atomic_write, free_disk, refuse_links, walk, write_json
 
 
 def test_a_finished_file_stands_under_its_name_alone(tmp_path: Path) -> None:
@@ -64,6 +64,15 @@ def test_json_takes_the_place_of_what_was_there(tmp_path: Path) -> None:
 
 def test_a_disk_is_that_of_the_first_folder_that_exists(tmp_path: Path) -> None:
     assert free_disk(tmp_path) == pytest.approx(free_disk(tmp_path / "not" / "yet"), rel=0.05)
+
+
+def test_only_so_many_folders_in_one_another_are_looked_into(tmp_path: Path) -> None:
+    """Python's own walk ends in an error where they are a thousand."""
+    (tmp_path / "/".join("a" * (DEEPEST + 2))).mkdir(parents=True)
+    (tmp_path / ".hidden").mkdir()
+    assert [len(path.relative_to(tmp_path).parts) for path, _, _ in walk(tmp_path)] == [
+        *range(DEEPEST + 1)
+    ]
 
 
 def test_links_to_what_is_in_the_folder_are_as_wandb_leaves_them(tmp_path: Path) -> None:

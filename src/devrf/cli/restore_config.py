@@ -38,7 +38,7 @@ from devrf.cli.config import (
 )
 from devrf.cli.config_check import RESERVED
 from devrf.errors import DevrfError
-from devrf.system.files import read_record
+from devrf.system.files import read_yaml
 from devrf.system.override import literal, to_type
 from devrf.system.printed import is_shown
 from devrf.system.process import importing
@@ -298,11 +298,8 @@ def searched_runs(typed: Sequence[Override]) -> list[Path]:
 def _recorded(record: Path) -> tuple[str, list[Override]]:
     """The class of a sweep's sweeper, and the sweep's overrides, from its ``multirun.yaml``."""
     with suppress(*UNREADABLE):
-        text = read_record(record, 200 * MOST).decode()  # YAML takes ten seconds for this
-        # Hydra writes no aliases, which may unfold without end.
-        if not any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
-            hydra = yaml.safe_load(text)["hydra"]
-            return str(hydra["sweeper"]["_target_"]), parsed(hydra["overrides"]["task"])
+        hydra = read_yaml(record)["hydra"]
+        return str(hydra["sweeper"]["_target_"]), parsed(hydra["overrides"]["task"])
     raise DevrfError(f"{record}: not the record of a sweep; type the sweep again")
 
 

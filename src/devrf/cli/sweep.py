@@ -20,7 +20,7 @@ from devrf.cli.config import SWEEP_RECORD, choices, overrides, scene_name
 from devrf.cli.messages import is_user_error, one_line
 from devrf.cli.run_folder import FAILURE, FolderLock
 from devrf.errors import DevrfError
-from devrf.system.files import remove_if_only, write_json
+from devrf.system.files import remove_if_only, walk, write_json
 from devrf.system.folder_lock import PLACE, release_folder
 from devrf.system.process import forget_peak_memory
 
@@ -80,8 +80,9 @@ def naming_failures() -> Iterator[None]:
         release_folder(sweep)
         if problem is not None:
             remove_if_only(sweep, OF_SWEEP)
-        records = [file for file in sweep.rglob(FAILURE) if file.stat().st_mtime >= began]
-        if failed := sorted(str(file.parent.relative_to(sweep)) for file in records):
+        jobs = [folder for folder, _, names in walk(sweep) if FAILURE in names]
+        failing = (job for job in jobs if (job / FAILURE).stat().st_mtime >= began)
+        if failed := sorted(str(job.relative_to(sweep)) for job in failing):
             why = f"{FAILURE} in each folder below {sweep} says why"
             print(f"devrf: jobs failed: {', '.join(failed)}; {why}", file=sys.stderr)
             if problem is None or "No trials are completed" in str(problem):

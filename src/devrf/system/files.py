@@ -12,11 +12,17 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from devrf.errors import DevrfError
 
 # Bytes; the longest records, of footage of two hours, have some ten million. In memory each may
 # become 50.
 LARGEST_RECORD = 2**24
+# Bytes of a YAML file, of which a second takes in some 20,000.
+LARGEST_YAML = 200_000
+# Folders in one another, at most: Python's recursion ends at some hundreds.
+DEEPEST = 64
 # Errors of a disk, its permissions, or a path that was given. A missing file may be a fault of the
 # program instead.
 REFUSED = {
@@ -133,6 +139,37 @@ def read_record(path: Path, most: int = LARGEST_RECORD) -> bytes:
     if len(content) > most:
         raise ValueError(f"larger than {most / 2**20:.3g} MiB")
     return content
+
+
+class _PlainLoader(yaml.SafeLoader):  # type: ignore[misc]
+    """Plain values, OpenCV's matrices as mappings; no aliases, which unfold without end."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError("an alias")
+        return super().compose_node(parent, index)
+
+
+_PlainLoader.add_constructor("tag:yaml.org,2002:opencv-matrix", yaml.SafeLoader.construct_yaml_map)
+
+
+def read_yaml(path: Path) -> Any:
+    """The plain values in a YAML file.
+
+    Raises:
+        YAMLError | ValueError | RecursionError: it is damaged, too large or too deep.
+    """
+    text = read_record(path, LARGEST_YAML).decode()
+    return yaml.load(text.removeprefix("%YAML:1.0"), _PlainLoader)  # OpenCV's first line is no YAML
+
+
+def walk(folder: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
+    """As :func:`os.walk`, in order of names, without hidden folders and any deeper than DEEPEST."""
+    for walked, inner, names in os.walk(folder):
+        path = Path(walked)
+        deepest = len(path.parts) - len(folder.parts) >= DEEPEST
+        inner[:] = [] if deepest else sorted(name for name in inner if name[0] != ".")
+        yield path, inner, names
 
 
 def free_disk(folder: Path) -> int:

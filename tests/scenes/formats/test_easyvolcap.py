@@ -88,6 +88,9 @@ def test_what_is_refused(folder, message_of):
     assert "'../00' is no folder's name" in refused('"00"', '"../00"')
     assert "H_00: expected 1 finite" in refused("K_00", "H_00: .Nan\nK_00")
     assert "not a readable YAML file of OpenCV" in refused("data: [", "data: ]")
+    deep = f"deep: {'[' * 20_000}{']' * 20_000}\nnames:"  # OpenCV ends the program at this
+    assert "not a readable YAML file of OpenCV" in refused("names:", deep)
+    assert "an alias" in refused("names:", "one: &one [1]\nmany: [*one, *one]\nnames:")
     file.write_text(whole)
     (folder / "images" / "02" / "000001.png").unlink()
     assert "02: has 2 images, and others have 3" in message_of(folder)

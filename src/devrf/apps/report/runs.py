@@ -6,7 +6,6 @@ import io
 import json
 import logging
 import math
-import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from annotated_types import Len
 
 from devrf.apps.settings import REHEARSAL
 from devrf.errors import DevrfError
-from devrf.system.files import read_record, utf8_path
+from devrf.system.files import read_record, utf8_path, walk
 from devrf.system.plain_data import validate
 from devrf.system.printed import shown
 
@@ -90,9 +89,8 @@ def collect(folder: Path) -> Collection:
     records: dict[str, list[dict[str, Any]]] = {"finished": [], "failed": []}
     skipped: list[str] = []
     rehearsals = 0
-    for walked, inner, _ in os.walk(folder):
-        inner[:] = sorted((name for name in inner if not name.startswith(".")), key=_natural)
-        child = Path(walked)
+    for child, inner, _ in walk(folder):
+        inner.sort(key=_natural)
         rehearsals += (child / REHEARSAL).is_file()
         name = folder.resolve().name if child == folder else child.relative_to(folder).as_posix()
         for file, status, read in (

@@ -27,6 +27,7 @@ from devrf.scenes.view_folders import (
     view_folders,
     with_fixed_views,
 )
+from devrf.system.files import walk
 
 log = logging.getLogger(__name__)
 
@@ -73,8 +74,8 @@ def images_of(model: SparseModel, root: Path, factor: int) -> ImageFolder:
 
 def warn_of_unposed(posed: int, folder: Path) -> None:
     """Warn if a good part of the images in a folder is not among the ``posed`` ones."""
-    files = (path for path in folder.rglob("[!.]*") if path.suffix.lower() in SUFFIXES)
-    total = sum(map(os.path.isfile, files))
+    files = (name for _, _, names in walk(folder) for name in names if name[0] != ".")
+    total = sum(Path(name).suffix.lower() in SUFFIXES for name in files)
     if total - posed > UNPOSED * total:
         log.warning(
             "%d of the %d images in %s are posed, the others are left out; to pose more of them, "

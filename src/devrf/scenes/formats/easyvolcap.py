@@ -7,20 +7,20 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import KW_ONLY
 from pathlib import Path
 from typing import Annotated, Literal
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import torch
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from devrf.geometry.cameras import Distortion
-from devrf.scenes.files import decoding
+from devrf.scenes.files import Numbers, decoding, existing_file
 from devrf.scenes.image_folders import Downscale, listed_images
 from devrf.scenes.layout import Layout, fewer, with_static_times
 from devrf.scenes.lens import Intrinsics
@@ -29,14 +29,12 @@ from devrf.scenes.reader import EstimatedFlow, InwardReader
 from devrf.scenes.transforms import Shot, posed_images
 from devrf.scenes.validation import LARGEST, scene_error
 from devrf.scenes.view_folders import held_out_view
-from devrf.system.files import read_record
+from devrf.system.files import read_yaml
 from devrf.system.options import Count, abbreviated
 from devrf.system.printed import is_shown
 
 INTRINSICS = "intri.yml"
 EXTRINSICS = "extri.yml"
-
-Numbers = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -136,28 +134,29 @@ def read_cameras(intrinsics: Path, extrinsics: Path) -> dict[str, tuple[Tensor, 
 
 
 class OpenCVFile:
-    """Numbers in a YAML file that OpenCV has written."""
+    """Numbers in a YAML file that OpenCV has written.
+
+    OpenCV's own reader ends the program where a list is deep.
+    """
 
     def __init__(self, file: Path) -> None:
         """Read it; DevrfError if it is missing or damaged."""
-        if not os.path.isfile(file):
-            raise scene_error(file, "no such file; it has the cameras; add it")
-        self.file = file
+        self.file = existing_file(file, "it has the cameras; add it")
         with decoding(file, "YAML file of OpenCV", "write it again"):
-            content = read_record(file).decode()
-            reading = cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY
-            self._stored = cv2.FileStorage(content, reading)
+            self._stored = read_yaml(file)
+            if not isinstance(self._stored, dict):
+                raise ValueError("no names")
 
     def names(self) -> list[str]:
         """The texts in the list ``names``, each the name of a folder."""
-        node = self._stored.getNode("names")
-        names = [node.at(k).string() for k in range(node.size())]
-        for name in names:
-            if name in ("", ".", "..") or not is_shown(name) or {*name} & {*"/\\"}:
+        names = self._stored.get("names")
+        for name in names if isinstance(names, list) else [names]:
+            text = name if isinstance(name, str) else ""
+            if text in ("", ".", "..") or not is_shown(text) or {*text} & {*"/\\"}:
                 raise scene_error(
                     self.file, f"names: {abbreviated(name)} is no folder's name; correct it"
                 )
-        return names
+        return list(names)
 
     def numbers(
         self, key: str, counts: int | Sequence[int], default: Sequence[float] | None = None
@@ -166,14 +165,16 @@ class OpenCVFile:
 
         DevrfError if it is another, or not there and has no ``default``.
         """
-        node = self._stored.getNode(key)
-        if node.empty() and default is not None:
+        if key not in self._stored and default is not None:
             return np.array(default, dtype=np.float64)
-        with decoding(self.file, "YAML file of OpenCV", "write it again"):
-            value = [node.real()] if node.isReal() or node.isInt() else node.mat()
-            found = np.array([] if value is None else value, dtype=np.float64).reshape(-1)
+        value = self._stored.get(key)
+        value = value.get("data") if isinstance(value, dict) else value
+        found = np.array(np.nan)
+        with suppress(TypeError, ValueError, OverflowError):
+            found = np.array(value if isinstance(value, list) else [value], dtype=np.float64)
         allowed = (counts,) if isinstance(counts, int) else counts
-        if len(found) not in allowed or not (np.abs(found) < LARGEST).all():
+        # NaN compares false.
+        if found.shape not in [(n,) for n in allowed] or not (np.abs(found) < LARGEST).all():
             expected = " or ".join(map(str, allowed))
             raise scene_error(self.file, f"{key}: expected {expected} finite numbers; correct it")
         return found
