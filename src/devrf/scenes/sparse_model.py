@@ -21,7 +21,7 @@ from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.poses import average_pose, from_opencv, relative_to
 from devrf.scenes.bounds import LEAST_COSINE, nearest_point
-from devrf.scenes.files import decoding, entries
+from devrf.scenes.files import MOST_IMAGES, decoding, entries
 from devrf.scenes.lens import CameraKeys, Intrinsics, intrinsics_of
 from devrf.scenes.names import in_order
 from devrf.scenes.validation import FARTHEST, in_reach, scene_error
@@ -29,9 +29,17 @@ from devrf.system.options import abbreviated
 
 # The files of a model, binary or as text.
 PARTS = ("cameras", "images", "points3D")
-# Records of binary files that end with a list: bytes before it without a name, bytes of its length,
-# and bytes of an entry.
-LISTS = {"frames": (64, 4, 16), "images": (64, 8, 24), "points3D": (43, 8, 8)}
+# Further ones, of COLMAP's later versions.
+LATER_PARTS = ("rigs", "frames")
+# Bytes of a text file at most.
+LARGEST_TEXT = 2**28
+# Records of binary files that end with a list: how many there may be, bytes before the list without
+# a name, bytes of its length, and bytes of an entry.
+LISTS = {
+    "frames": (MOST_IMAGES, 64, 4, 16),
+    "images": (MOST_IMAGES, 64, 8, 24),
+    "points3D": (3_000_000, 43, 8, 8),
+}
 # Parameters of each camera model that can be read, in COLMAP's order; further ones have to be 0.
 PARAMETERS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -196,30 +204,42 @@ def _opened(folder: Path) -> Any:
     """The pycolmap.Reconstruction in a folder."""
     library = colmap(folder)
     with decoding(folder, "COLMAP model", "run COLMAP's mapper again"):
-        if all(os.path.isfile(folder / f"{part}.bin") for part in PARTS):
-            _check_counts(folder)
+        _check_files(folder)
         return library.Reconstruction(folder)
 
 
-def _check_counts(folder: Path) -> None:
-    """ValueError if a binary file counts more than it holds: COLMAP would read beyond its end.
+def _check_files(folder: Path) -> None:
+    """ValueError if COLMAP would wait for a file of a model, or find no end of it.
 
-    COLMAP itself checks the files that are not checked here.
+    COLMAP itself checks the binary files that are not checked here.
     """
-    for part, (fixed, width, entry) in LISTS.items():
-        if not (file := folder / f"{part}.bin").is_file():
-            continue
-        with file.open("rb") as stream:  # mapped: it may be larger than memory, of zeros
-            data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
-        count, at = int.from_bytes(data[:8], "little"), 8
-        while count > 0 and at < len(data):
-            at += fixed
-            if part == "images":
-                at = data.find(b"\0", at) + 1 or len(data)  # after its name
-            at += width + entry * int.from_bytes(data[at : at + width], "little")
-            count -= 1
-        if count > 0 or at > len(data):
-            raise ValueError(f"{file.name} counts more than it holds")
+    binary = all(os.path.isfile(folder / f"{part}.bin") for part in PARTS)
+    for part in (*PARTS, *LATER_PARTS):
+        file = folder / f"{part}.{'bin' if binary else 'txt'}"
+        if not os.path.isfile(file):
+            if file.exists():
+                raise ValueError(f"{file.name} is no file")
+        elif not binary and file.stat().st_size > LARGEST_TEXT:
+            raise ValueError(f"{file.name} is larger than 256 MiB: convert the model to binary")
+        elif binary and part in LISTS:
+            _check_counts(file, *LISTS[part])
+
+
+def _check_counts(file: Path, most: int, fixed: int, width: int, entry: int) -> None:
+    """ValueError if a binary file counts more than it may, or than it holds."""
+    with file.open("rb") as stream:  # mapped: it may be larger than memory, of zeros
+        data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+    count, at = int.from_bytes(data[:8], "little"), 8
+    if count > most:
+        raise ValueError(f"{file.name} counts more than {most}")
+    while count > 0 and at < len(data):
+        at += fixed
+        if file.stem == "images":
+            at = data.find(b"\0", at) + 1 or len(data)  # after its name
+        at += width + entry * int.from_bytes(data[at : at + width], "little")
+        count -= 1
+    if count > 0 or at > len(data):
+        raise ValueError(f"{file.name} counts more than it holds")
 
 
 def _of_reconstruction(folder: Path, model: Any) -> SparseModel:

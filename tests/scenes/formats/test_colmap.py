@@ -293,7 +293,7 @@ def test_counts_that_a_binary_model_cannot_hold_are_refused_before_they_are_beli
     data = bytearray((model / f"{part}.bin").read_bytes())
     struct.pack_into(form, data, place, min(number, 2 ** (8 * struct.calcsize(form)) - 1))
     (model / f"{part}.bin").write_bytes(data)
-    said = f"{model}: not a readable COLMAP model ({part}.bin counts more than it holds)"
+    said = f"{model}: not a readable COLMAP model ({part}.bin counts more than "
     assert message_of(folder).startswith(said)
 
 
@@ -305,6 +305,19 @@ def test_zeros_behind_a_binary_model_take_no_memory(folder):
     before = own_memory()
     assert len(ColmapReader(folder, downscale=1).read().static.train) == 14
     assert own_memory() - before < 300e6
+
+
+def test_a_text_model_without_end_is_refused(folder, message_of):
+    (folder / "sparse/0/points3D.txt").unlink()
+    for part in ("points3D", "frames"):
+        with (folder / f"sparse/0/{part}.txt").open("wb") as file:
+            file.truncate(2**34)  # of zeros: to COLMAP one line
+        said = f"{part}.txt is larger than 256 MiB: convert the model to binary"
+        assert said in message_of(folder)
+        (folder / f"sparse/0/{part}.txt").write_text("")
+    (folder / "sparse/0/frames.txt").unlink()
+    os.mkfifo(folder / "sparse/0/frames.txt")
+    assert "(frames.txt is no file)" in message_of(folder)
 
 
 @pytest.mark.parametrize("suffix", [".txt", ".bin"])
