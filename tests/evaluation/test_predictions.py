@@ -8,6 +8,7 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 import pytest
+from PIL import Image
 
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import score, truth_image
@@ -108,6 +109,9 @@ def test_what_does_not_fit_is_said_in_one_line(folder, sets):
     whole = iio.imread(first)
     iio.imwrite(first, whole[::2])
     assert "24x9 px, but " in refused(folder, sets) and "has 24x18" in refused(folder, sets)
+    Image.new("L", (9000, 9000)).save(first)
+    first.write_bytes(first.read_bytes()[:1000])  # it is not decoded
+    assert "9000x9000 px, but " in refused(folder, sets)
     iio.imwrite(first, whole)
     second.rename(folder / "away.png")
     assert "has no picture of " in (line := refused(folder, sets)) and "(time 0.5)" in line

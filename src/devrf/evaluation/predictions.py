@@ -194,14 +194,17 @@ def _place_of(path: Path, name: str, sets: Mapping[str, Views]) -> Path | None:
 
 def _film(film: Path, views: Views) -> Callable[[int], Picture]:
     """The frames of a film, one for each image in their order."""
-    count = footage_header(film).frames
+    header = footage_header(film)
+    count = header.frames
+    for index in range(len(views)):
+        _check_size(header.size, views, index, film)
     frames = dict(frames_at(film, range(min(count, len(views)))))
     if len(frames) != len(views) or count > len(views):
         raise scene_error(
             film,
             f"has {count} frames, but {len(views)} images are held out; one for each is needed",
         )
-    return lambda index: _sized(frames[index], views, index, f"{film}: frame {index}")
+    return frames.__getitem__
 
 
 def pictures_in(folder: Path, views: Views) -> Callable[[int], Picture]:
@@ -221,7 +224,9 @@ def pictures_in(folder: Path, views: Views) -> Callable[[int], Picture]:
 
     def picture(index: int) -> Picture:
         file = files[index]
-        return _sized(decode(file, read_header(file), "RGBA"), views, index, file)
+        header = read_header(file)
+        _check_size((header.width, header.height), views, index, file)
+        return decode(file, header, "RGBA")
 
     return picture
 
@@ -252,9 +257,8 @@ def _listed(folder: Path, views: Views) -> dict[int, Path]:
 def _named(folder: Path, views: Views) -> dict[int, Path]:
     """The pictures in a folder by the image that their names say, or by their order."""
     images = listed_images(folder)
-    by_name = {
-        k: path for path in images for k, name in enumerate(views.names) if _same(name, path.stem)
-    }
+    numbers = {key: k for k, name in enumerate(views.names) for key in (name, Path(name).stem)}
+    by_name = {numbers[path.stem]: path for path in images if path.stem in numbers}
     placed = [(path, match) for path in images if (match := _PLACED.fullmatch(path.stem))]
     by_place = {
         k: path for path, match in placed for k in _at(views, int(match[1]), float(match[2]))
@@ -291,18 +295,17 @@ def _in_words(views: Views, index: int) -> str:
     return f"{views.names[index]} (time {float(views.times[index]):.3g})"
 
 
-def _sized(picture: Picture, views: Views, index: int, where: object) -> Picture:
-    """The picture, if it has the size of its image."""
+def _check_size(size: tuple[int, int], views: Views, index: int, where: Path) -> None:
+    """DevrfError if a picture has not the size of its image."""
     camera = views.cameras.single(index)
-    height, width = picture.shape[:2]
-    if (width, height) != (camera.width, camera.height):
+    width, height = size
+    if size != (camera.width, camera.height):
         raise scene_error(
             where,
             f"{width}x{height} px, but {_in_words(views, index)} has {camera.width}x"
             f"{camera.height}; render it at that size, or read the scene with another "
             "data.downscale",
         )
-    return picture
 
 
 def _check_order(

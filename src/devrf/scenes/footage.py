@@ -37,8 +37,9 @@ VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mts", ".m2t
 # What else FFmpeg reads are lists of other files, of any number, and what nobody films in.
 _FORMATS = "mov,matroska,avi,mpeg,mpegts,mpegvideo,m4v,h264,hevc,asf,flv,ogg,mxf,dv,gif"
 _REMEDY = "convert it, for example to H.264 in an mp4 file"
-# Pixels of a frame's longer side.
-_LARGEST = 2**14
+# Pixels of a frame's longer side, and of a frame: of 8K films. FFmpeg holds several frames.
+_LONGEST = 2**14
+_LARGEST = 8192 * 4320
 # A video that has fewer of its frames, and ends before this share of its duration, was cut off.
 _WHOLE = 0.95
 # Lines of FFmpeg's log: a frame, numbered from 0, and its time in microseconds; the file's stated
@@ -100,8 +101,9 @@ def footage_header(path: Path) -> FootageHeader:
         height = round(height * aspect)
     elif aspect > 0:
         width = round(width * aspect)
-    if not 0 < min(width, height) <= max(width, height) <= _LARGEST:
-        raise scene_error(path, f"states {width}x{height} px, expected sides of 1 to {_LARGEST}")
+    if not 0 < min(width, height) <= max(width, height) <= _LONGEST or width * height > _LARGEST:
+        stated = f"states {width}x{height} px, expected 8192x4320 at most"
+        raise scene_error(path, f"{stated}; {_REMEDY}")
     # A frame takes some bytes, whatever the header says.
     return FootageHeader((width, height), min(frames, path.stat().st_size // 8), rate)
 
