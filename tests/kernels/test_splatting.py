@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.kernels import splatting
 from devrf.kernels.splatting import raster_of
@@ -155,6 +156,12 @@ def test_numbers_that_are_none_are_not_shown(rng: torch.Generator) -> None:
     assert image.color.isfinite().all()
     alone = picture(splatting, [each[2:] for each in tensors])
     assert torch.equal(image.color, alone.color)
+
+
+def test_a_picture_whose_tiles_take_all_memory_is_refused(rng: torch.Generator) -> None:
+    tensors = [each.repeat(20_000, *(1,) * (each.ndim - 1)) for each in cloud(10, rng, size=100)]
+    with pytest.raises(DevrfError, match="200000 Gaussians lie in [0-9]* tiles of a"):
+        picture(splatting, tensors, CAMERA.resized(16, 16_384))
 
 
 def test_a_picture_without_gradients_keeps_nothing(rng: torch.Generator) -> None:

@@ -25,6 +25,7 @@ from devrf.geometry.cameras import Cameras
 from devrf.kernels.runtime import array, empty_structs, is_supported, launch, row_type
 from devrf.ops import splatting as definition
 from devrf.ops.splatting import FAINTEST, LOW_PASS, MARGIN, MOST, STOP, Gaussians, SplatImage
+from devrf.system.memory import OutOfMemoryError
 
 # Rows of a tile on a CPU, whose pixels stay in its cache; width and height of one on a GPU.
 BAND = 32
@@ -32,6 +33,8 @@ TILE = 16
 # Pixels of a row from one exponential to the next. Between them it is a recurrence: a picture of
 # 400 × 400 and its adjoint take two thirds of the time, and it drifts by less than 1e-5.
 EXACT = 16
+# Pairs of a Gaussian and a tile that it touches, at most; each takes some 60 bytes.
+MOST_PAIRS = 2**26
 # RGB and depth; a quaternion.
 Vec4 = row_type(4)
 # A row of sums: of the slopes of RGB, depth, opacity, centre (2), and of the conic's entries (3).
@@ -71,6 +74,11 @@ class _Splat(torch.autograd.Function):
 
         starts = tiles.cumsum(0, dtype=torch.int32) - tiles
         pairs = int(tiles.sum())
+        if pairs > MOST_PAIRS:
+            raise OutOfMemoryError(
+                f"{count} Gaussians lie in {pairs} tiles of a picture of {raster.width}x"
+                f"{raster.height} px, {MOST_PAIRS} at most; take a smaller one"
+            )
         keys = torch.empty(pairs, dtype=torch.int64, device=device)
         owner = torch.empty(pairs, dtype=torch.int32, device=device)
         launch(list_kernel, count, [raster, splats, tiles, starts, keys, owner], device)
