@@ -13,7 +13,6 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 import torch
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from torch import Tensor
@@ -47,7 +46,8 @@ def _time(time: float) -> float:
 
 
 def _upright(matrix: list[Vector4]) -> list[Vector4]:
-    if len(matrix) == 4 and not np.allclose(matrix[3], (0, 0, 0, 1), atol=LAST_ROW):
+    off = (abs(x - whole) for x, whole in zip(matrix[-1], (0, 0, 0, 1), strict=True))
+    if len(matrix) == 4 and max(off) > LAST_ROW:
         raise ValueError(
             f"its last row is {', '.join(f'{x:g}' for x in matrix[3])}, expected 0, 0, 0, 1; "
             "correct it, or transpose the matrix if it has them in its last column"
@@ -248,8 +248,12 @@ class TransformsFiles:
                 frames have a time.
         """
         listing = self._listing(file)
+        matrices = [frame.transform_matrix[:3] for frame in listing.frames]
+        poses = torch.tensor(matrices, dtype=torch.float64)
+        check_poses(poses, lambda index: f"{file}: frames[{index}]: transform_matrix")
         names = [frame.file_path for frame in listing.frames]
         images = present_images(names, file, self._finder, self._missing)
+        poses = poses[[*images]]
         frames = [listing.frames[index] for index in images]
         where = [f"{file}: frames[{index}]" for index in images]
         times = [frame.time for frame in frames]
@@ -263,8 +267,6 @@ class TransformsFiles:
                 where[times.index(None)],
                 'has no "time" although others have; give every frame its time, or none',
             )
-        poses = torch.tensor([frame.transform_matrix[:3] for frame in frames], dtype=torch.float64)
-        check_poses(poses, lambda index: f"{where[index]}: transform_matrix")
         self._offset = offset_of(poses) if self._offset is None else self._offset
         lenses = [frame_intrinsics(listing, f, at) for f, at in zip(frames, where, strict=True)]
         shared = cache(lambda: intrinsics_of(listing, file))  # only if it is needed

@@ -323,6 +323,13 @@ def test_wrong_json_values(scene_folder, file, change, said, message_of):
     assert str(path) in message and said in message
 
 
+def test_poses_are_looked_at_before_images_are_looked_for(scene_folder, message_of):
+    """Of 50,000 frames the latter takes a minute."""
+    scene_folder.edit(scene_folder.root / TRAIN, in_first_frame("transform_matrix", pose(-1)))
+    (scene_folder.static / "train" / "r_000.png").unlink()
+    assert "frames[0]: transform_matrix: is no rigid" in message_of(scene_folder.root)
+
+
 def test_several_captures_are_listed(scene_folder, message_of):
     shutil.copytree(scene_folder.dynamic, scene_folder.root / "dynamic_3views")
     message = message_of(scene_folder.root)
