@@ -40,10 +40,7 @@ MISTAKES = {
     "an option that is no name": (["data=false"], "data=false: choose one of colmap, "),
     "several values outside a sweep": (["seed=1,2"], "for argument 'seed=1,2' 1. To use it as "),
     "two things at once": (["-m", "--cfg", "job"], "Only one of --run, --multirun, --cfg, "),
-    "a job's config that is not there": (
-        ["--experimental-rerun", "no.pickle"],
-        "--experimental-rerun: no.pickle: no such file",
-    ),
+    "a pickled job": (["--experimental-rerun", "no.pickle"], "a pickle may run code; write hydra."),
     "what the run gives the trainer": (
         ["+trainer.default_root_dir=here"],
         "trainer.default_root_dir: a run sets it itself; leave it out: hydra.run.dir=FOLDER",

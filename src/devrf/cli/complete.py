@@ -84,9 +84,8 @@ def completed(arguments: Sequence[str]) -> Applied:
     for word in unknown:
         meant = word.lstrip("-") if "=" in word else "KEY=VALUE, without dashes"
         raise DevrfError(f"{word}: no such option; write {meant}, or --help for what there is")
-    rerun = options.experimental_rerun
-    if rerun is not None and not Path(rerun).is_file():
-        raise DevrfError(f"--experimental-rerun: {rerun}: no such file; give a job's config.pickle")
+    if options.experimental_rerun is not None:
+        raise DevrfError("--experimental-rerun: a pickle may run code; write hydra.run.dir=FOLDER")
     flags = [word for word in arguments if word not in options.overrides]
     texts = [SHORTHAND.get(word.lower(), word) for word in options.overrides]
     in_sweep = options.multirun or _sweeps(texts, options.config_dir)

@@ -15,9 +15,12 @@ from lightning.pytorch.loggers import CSVLogger
 from lightning.pytorch.utilities import rank_zero_only
 
 from devrf.errors import DevrfError
-from devrf.system.files import atomic_write
+from devrf.system.files import atomic_write, read_record
 
 log = logging.getLogger(__name__)
+
+# Bytes of a table: published schedules of a day leave a quarter of them.
+LARGEST = 2**26
 
 
 class ResumableCSVLogger(CSVLogger):
@@ -39,7 +42,7 @@ class ResumableCSVLogger(CSVLogger):
         super().__init__(save_dir, name, version)
         self.path = Path(self.log_dir) / "metrics.csv"
         try:
-            text = self.path.read_text() if self.path.is_file() else ""
+            text = read_record(self.path, LARGEST).decode() if self.path.is_file() else ""
             reader = csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1]))
             self._columns = list(reader.fieldnames or [])
             self._rows = [{key: cell for key, cell in row.items() if cell} for row in reader]
