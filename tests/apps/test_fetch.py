@@ -172,6 +172,12 @@ def test_an_archive_of_many_empty_files_is_removed(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_an_archive_of_folders_in_one_another_is_refused(tmp_path):
+    written(tmp_path, {f"lego/{'a/' * count}f": b"" for count in (800, 1600)})
+    with pytest.raises(DevrfError, match=r"archive: cannot be unpacked \(more than 64 folders in"):
+        _unpacked(lego(), tmp_path)
+
+
 @pytest.fixture
 def trickle() -> Iterator[str]:
     """The address of a server that sends a part at once, then a byte now and then, without end."""

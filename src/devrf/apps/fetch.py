@@ -25,7 +25,7 @@ from rich.progress import track
 from typing_extensions import TypedDict
 
 from devrf.errors import DevrfError, did_you_mean
-from devrf.system.files import make_folder, read_record, refuse_links, write_json
+from devrf.system.files import DEEPEST, make_folder, read_record, refuse_links, write_json
 from devrf.system.plain_data import Line, validate
 
 log = logging.getLogger(__name__)
@@ -324,6 +324,8 @@ def _unpacked(scene: PublishedScene, work: Path) -> Path:
         with zipfile.ZipFile(archive) as packed:
             # A file takes 4 kB of a disk at least. No more of it is unpacked than is said here.
             unpacked_size = sum(max(file.file_size, 2**12) for file in packed.infolist())
+            if any(name.count("/") > DEEPEST for name in packed.namelist()):
+                raise ValueError(f"more than {DEEPEST} folders in one another")
             if unpacked_size <= most:
                 packed.extractall(unpacked)  # names that lead elsewhere are written below it, too
     except Exception as error:  # of any kind, where an archive is damaged
