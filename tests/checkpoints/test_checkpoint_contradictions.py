@@ -155,6 +155,13 @@ def test_numbers_that_nothing_can_be_computed_with_are_one_line(motion):
                 load_checkpoint(motion)
 
 
+def test_frames_of_other_times_do_not_fit(motion):
+    clock = ("state_dict", "scene_model.deformation._extra_state", "times")
+    write_checkpoint_file(motion, changed(read_checkpoint_file(motion), clock, [0.0]))
+    with pytest.raises(DevrfError, match="do not fit together .*: frames of other times"):
+        load_checkpoint(motion)
+
+
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", ["canonical", "deformation"])
 def test_a_progress_file_goes_on_or_is_refused(rest, datamodule, trainer, tmp_path, name):

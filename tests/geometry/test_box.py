@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 
+from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 
@@ -35,6 +36,11 @@ def test_a_cube_of_side_cubed_voxels_has_that_side():
 )
 def test_a_grid_follows_the_box_proportions(size, voxels, shape):
     assert Box((0.0, 0.0, 0.0), size).grid_shape(voxels) == shape
+
+
+def test_a_box_of_almost_no_thickness_has_no_grid():
+    with pytest.raises(DevrfError, match=r"a box of \[0 0 0\] to \[1 1 1e\+18\] is too thin for"):
+        Box((0.0,) * 3, (1.0, 1.0, 1e18)).grid_shape(1000)
 
 
 def test_derived_boxes_by_hand():

@@ -282,7 +282,8 @@ def _check_numbers(parts: Any) -> None:
             low, high = map(float, value.aminmax())
             valid = -FARTHEST <= low and high <= FARTHEST  # NaN compares false
         else:
-            valid = not isinstance(value, float) or abs(value) <= FARTHEST or math.isinf(value)
+            is_number = isinstance(value, int | float)
+            valid = not is_number or abs(value) <= FARTHEST or value in (math.inf, -math.inf)
         if not valid:
             raise ValueError("a number that is not finite, or too large")
 

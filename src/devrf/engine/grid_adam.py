@@ -189,7 +189,7 @@ class GridAdam(torch.optim.Optimizer):
         for group, own in zip(self.param_groups, settings, strict=True):
             group |= own
             for state, parameter in ((self.state.get(p), p) for p in group["params"]):
-                if state:
+                if state is not None:
                     state["steps"] = validate(Count, state["steps"])
                     if not parameter.shape == state["mean"].shape == state["square"].shape:
                         raise ValueError("moments of another shape than what is learned")

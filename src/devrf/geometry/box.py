@@ -9,7 +9,11 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from devrf.errors import DevrfError
 from devrf.geometry.rays import Rays
+
+# A grid has at most so many times the voxels that were asked for: of two along a thin axis.
+THINNEST = 16
 
 
 @dataclass(frozen=True)
@@ -97,6 +101,8 @@ class Box:
             sides = [width * wider / edge, height / wider / edge, planes]
         # 1e-6 is added so that a cube of 10^3 voxels has side 10 in spite of rounding.
         x, y, z = (max(2, int(side + 1e-6)) for side in sides)
+        if x * y * z > THINNEST * (voxels + 8):
+            raise DevrfError(f"a box of {self} is too thin for {voxels} voxels; make it thicker")
         return x, y, z
 
     def scaled(self, factor: float) -> Box:

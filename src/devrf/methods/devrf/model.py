@@ -249,6 +249,11 @@ class DeVRFModel(Renderable):
             self.deformation.frames.take(*frames)
             full |= zip(names, frames, strict=True)
         self.load_state_dict({name: unpack(v, self.device) for name, v in full.items()})
+        motion, residual = self.deformation, self.color_residual
+        timed = [(motion.clock, motion.to_canonical)] if motion else []
+        timed += [(residual.clock, residual.values)] if residual else []
+        if any(len(clock) != len(frames) for clock, frames in timed):
+            raise ValueError("frames of other times")
         field = self.canonical
         if field.grid_shape(field.voxels) != shape_of(field.density.values):
             raise ValueError("a grid of another size than its description says")
