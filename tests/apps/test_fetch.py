@@ -205,7 +205,7 @@ def trickle() -> Iterator[str]:
 
 @pytest.mark.parametrize(
     ("limit", "said"),
-    [({"PERIOD": 0.4}, "it comes too slowly"), ({"LARGEST": 1000}, "more than 1.0 kB came")],
+    [({"LONGEST": 0.4}, "it comes too slowly"), ({"LARGEST": 1000}, "more than 1.0 kB came")],
 )
 def test_a_download_without_end_is_ended(tmp_path, monkeypatch, trickle, limit, said):
     for name, value in limit.items():

@@ -136,7 +136,7 @@ def test_an_archive_is_unpacked_if_its_checksum_is_as_expected(devrf, web, tmp_p
 
 
 def test_files_that_came_before_an_interruption_are_kept(devrf, web, tmp_path, published):
-    web.cuts["/fox/images/0001.jpg"] = [4000, 0]
+    web.cuts["/fox/images/0001.jpg"] = [4000]
     outcome = devrf(*published, "scene=fox")
     assert outcome.status == 2 and "0001.jpg: cannot be fetched" in outcome.err
     assert not (tmp_path / "scenes" / "fox").exists()

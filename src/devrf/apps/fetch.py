@@ -12,20 +12,24 @@ import tomllib
 import zipfile
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import partial
-from multiprocessing.pool import ThreadPool
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Annotated, BinaryIO, Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 from rich.console import Console
 from rich.filesize import decimal
-from rich.progress import track
+from rich.progress import Progress
 from typing_extensions import TypedDict
 
 from devrf.errors import DevrfError, did_you_mean
-from devrf.system.files import DEEPEST, make_folder, read_record, refuse_links, write_json
+from devrf.system.files import (
+    DEEPEST,
+    atomic_write,
+    make_folder,
+    read_record,
+    refuse_links,
+    write_json,
+)
 from devrf.system.plain_data import Line, validate
 
 log = logging.getLogger(__name__)
@@ -57,9 +61,9 @@ SMALL = 2**26
 # Most bytes of a scene's download, and of its unpacked files; of a catalogue.
 LARGEST = 2**34
 LARGEST_CATALOGUE = 2**20
-# Seconds that a scene may take, and bytes that have to come in each PERIOD of seconds.
+# Seconds that a scene may take, and that a server may say nothing.
 LONGEST = 6 * 3600
-PERIOD, LEAST = 60, 2**18
+PATIENCE = 60
 # The file by which a scene's folder is known, by the layout that reads it.
 MARKERS = {
     "inward": "transforms_train.json",
@@ -242,68 +246,53 @@ def fetch_scene(scene: PublishedScene, into: Path, sha256: str | None, progress:
 
 
 def _download(scene: PublishedScene, folder: Path, progress: bool) -> dict[str, Path]:
-    """The downloaded files by their names."""
-    import pooch  # it loads much, and every command reads this module
+    """The downloaded files by their names; those that have come before are there already."""
+    import requests  # it loads much, and every command reads this module
+    import urllib3
 
-    pooch.get_logger().setLevel("ERROR")
-    files = pooch.create(
-        path=folder,
-        base_url="",
-        registry=dict.fromkeys(scene.downloads),
-        urls=scene.downloads,
-        retry_if_failed=1,
-    )
-    # Some servers refuse the name that Python gives itself.
-    headers = {"User-Agent": "devrf", "Accept-Encoding": "identity"}
-    get = pooch.HTTPDownloader(progressbar=progress and scene.is_archive, headers=headers)
-
-    came = 0
-
-    def write(file: BinaryIO, part: bytes) -> None:
-        nonlocal came
-        came += len(part)
-        if came > LARGEST:
-            raise ValueError(f"more than {decimal(LARGEST)} came")
-        file.write(part)
-
-    def get_bounded(url: str, path: str, files: object) -> None:
-        with open(path, "wb") as file:
-            get(url, SimpleNamespace(write=partial(write, file), flush=file.flush), files)
-
-    until = time.monotonic() + LONGEST
-    fetched = {}
+    files = {name: folder / name for name in scene.downloads}
+    left, until = LARGEST, time.monotonic() + LONGEST
     console = Console(stderr=True)
-    hidden = scene.is_archive or not progress
-    with ThreadPool(1) as thread:  # nothing else ends a wait for bytes that come one by one
-        for name in track(scene.downloads, scene.name, console=console, disable=hidden):
-            result = thread.apply_async(files.fetch, [name, None, get_bounded])
-            before = -LEAST
+    with requests.Session() as session, Progress(console=console, disable=not progress) as bar:
+        session.mount("https://", requests.adapters.HTTPAdapter(max_retries=2))
+        # Some servers refuse the name that Python gives itself.
+        session.headers.update({"User-Agent": "devrf", "Accept-Encoding": "identity"})
+        for name, url in bar.track(scene.downloads.items(), description=scene.name):
+            if files[name].is_file():
+                continue
             try:
-                while not result.ready():
-                    if came < before + LEAST or time.monotonic() > until:
-                        raise TimeoutError("it comes too slowly")
-                    before = came
-                    result.wait(PERIOD)
-                fetched[name] = Path(result.get())
-            except (OSError, ValueError) as error:
+                with (
+                    session.get(url, stream=True, timeout=PATIENCE) as answer,
+                    atomic_write(files[name]) as partial,
+                    partial.open("wb") as file,
+                ):
+                    answer.raise_for_status()
+                    size = int(answer.headers.get("Content-Length", 0)) or None
+                    task = bar.add_task(name, total=size, visible=scene.is_archive)
+                    while part := answer.raw.read1(2**20):  # what has come, be it a byte
+                        left -= len(part)
+                        if left < 0:
+                            raise ValueError(f"more than {decimal(LARGEST)} came")
+                        if time.monotonic() > until:
+                            raise TimeoutError("it comes too slowly")
+                        file.write(part)
+                        bar.advance(task, len(part))
+            except (OSError, ValueError, urllib3.exceptions.HTTPError) as error:
                 if getattr(error, "errno", None) is not None:  # the disk's
                     raise
-                url = scene.downloads[name]
                 raise DevrfError(
                     f"{url}: cannot be fetched ({error}); see that the network works, and that "
                     f"its page {scene.collection.page} names no other address"
                 ) from None
-    for path in folder.absolute().rglob("*"):  # of a download that was killed
-        if path.is_file() and path not in fetched.values():
-            path.unlink()
-    return fetched
+    return files
 
 
 def _digest(files: dict[str, Path]) -> str:
     """The SHA-256 of an archive; for several files, of the lines that sha256sum prints."""
-    import pooch
-
-    digests = {name: str(pooch.file_hash(str(path))) for name, path in files.items()}
+    digests = dict[str, str]()
+    for name, path in files.items():
+        with path.open("rb") as file:
+            digests[name] = hashlib.file_digest(file, "sha256").hexdigest()
     if list(files) == [ARCHIVE]:
         return digests[ARCHIVE]
     lines = "".join(f"{digests[name]}  {name}\n" for name in sorted(files))
