@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from devrf.pictures.images import evenly, scaled, to_bytes
 from devrf.rendering.renderable import Renderable
 from devrf.scenes.bounds import nearest_point
 from devrf.scenes.scene import Scene, Views
-from devrf.system.folder_lock import private_folder
+from devrf.system.files import atomic_folder
 from devrf.system.progress import followed
 
 # The most frusta of a capture.
@@ -93,9 +92,7 @@ def write_thumbnails(folder: Path, scene: Scene, viewpoints: Viewpoints) -> None
     The whole folder, or nothing; one that was there is replaced.
     """
     cameras = list(_shown(viewpoints))
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with private_folder(folder.parent, ".pictures-") as partial:
-        whole = partial / folder.name
+    with atomic_folder(folder) as whole:
         for kind, k, times in followed(cameras, len(cameras), "pictures of the cameras"):
             own = whole / f"{kind}_{k}"
             own.mkdir(parents=True)
@@ -108,8 +105,6 @@ def write_thumbnails(folder: Path, scene: Scene, viewpoints: Viewpoints) -> None
                 nearest = images[(views.times[images] - time).abs().argmin()]
                 picture = thumbnail(scene, views, int(nearest)).numpy()
                 iio.imwrite(own / f"{index}.jpg", picture, quality=90)
-        shutil.rmtree(folder, ignore_errors=True)
-        whole.rename(folder)
 
 
 def _shown(viewpoints: Viewpoints) -> Iterator[tuple[str, int, Sequence[float]]]:

@@ -8,14 +8,13 @@ torch's threads takes a part, except of additions to grids.
 
 from __future__ import annotations
 
-import atexit
 import logging
 import os
 import stat
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from functools import cache, wraps
 from itertools import pairwise
 from pathlib import Path
@@ -27,7 +26,6 @@ import warp as wp
 from torch import Tensor
 
 from devrf.errors import DevrfError
-from devrf.system.folder_lock import private_folder
 
 log = logging.getLogger(__name__)
 
@@ -236,8 +234,8 @@ def _begin() -> None:
     if not os.access(folder, os.W_OK):
         wp.config.kernel_cache_dir = _own_folder()
     elif others_may_write(folder):
-        log.warning("%s: others may write there; kernels are compiled for this run alone", folder)
         wp.config.kernel_cache_dir = _own_folder()
+        log.warning("%s: others may write there; kernels are kept in %s", folder, _own_folder())
 
 
 def others_may_write(folder: Path) -> bool:
@@ -252,11 +250,12 @@ def others_may_write(folder: Path) -> bool:
 
 
 def _own_folder() -> str:
-    """A folder that ends with this process."""
-    until_the_end = ExitStack()
-    atexit.register(until_the_end.close)
-    parent = Path(tempfile.gettempdir())
-    return str(until_the_end.enter_context(private_folder(parent, "devrf-kernels-")))
+    """A folder of this user among temporary files; DevrfError if others may write there, too."""
+    folder = Path(tempfile.gettempdir()) / f"devrf-kernels-{os.getuid()}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    if folder.is_symlink() or others_may_write(folder):
+        raise DevrfError(f"{folder}: others may write there; remove it, or set WARP_CACHE_PATH")
+    return str(folder)
 
 
 @contextmanager

@@ -23,8 +23,7 @@ from devrf.scenes.flow_files import write_flow
 from devrf.scenes.formats.llff_poses import BOUND_FACTOR
 from devrf.scenes.scene import Capture, Scene, Views
 from devrf.scenes.validation import scene_error
-from devrf.system.files import write_json
-from devrf.system.folder_lock import private_folder
+from devrf.system.files import atomic_folder, write_json
 
 _WRITE_HINT = "give prepare.into another folder"
 
@@ -39,12 +38,8 @@ def whole_folder(folder: Path) -> Iterator[Path]:
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
         raise scene_error(folder, f"is there already and not an empty folder; {_WRITE_HINT}")
     try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with private_folder(folder.parent, f".{folder.name}.partial-") as around:
-            partial = around / folder.name
-            partial.mkdir()
+        with atomic_folder(folder) as partial:
             yield partial
-            partial.rename(folder)
     except OSError as error:
         raise scene_error(folder, f"cannot be written ({error}); {_WRITE_HINT}") from error
 

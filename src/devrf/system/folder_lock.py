@@ -1,4 +1,4 @@
-"""Folders for one process at a time, and private folders of a process.
+"""A folder in which one process works at a time.
 
 The lock is the system's on an open file, so it ends with its process. A file beside it tells other
 processes which one that is.
@@ -6,15 +6,10 @@ processes which one that is.
 
 from __future__ import annotations
 
-import glob
 import logging
 import os
-import shutil
 import socket
-import stat
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 
@@ -74,28 +69,4 @@ def release_folder(folder: Path) -> None:
     lock = _held.pop(folder.resolve(), None)
     if lock is not None:
         (folder / PLACE / OWNER).unlink(missing_ok=True)
-        lock.release()
-
-
-@contextmanager
-def private_folder(parent: Path, prefix: str) -> Iterator[Path]:
-    """A new folder in ``parent`` for this process alone, which is removed at the end.
-
-    Folders of that ``prefix`` that killed processes of this user left are removed first.
-    """
-    for stale in parent.glob(f"{glob.escape(prefix)}*"):
-        with suppress(OSError, NotImplementedError):  # in use, or no locks there
-            info = stale.lstat()
-            if stat.S_ISDIR(info.st_mode) and info.st_uid == os.getuid():
-                with FileLock(stale / LOCK, timeout=0):
-                    shutil.rmtree(stale)
-    made = Path(tempfile.mkdtemp(prefix=".devrf-", dir=parent))
-    lock = FileLock(made / LOCK, timeout=0)
-    with suppress(OSError, NotImplementedError):
-        lock.acquire()
-    folder = made.rename(parent / f"{prefix}{made.name[7:]}")  # others see it when it is locked
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
         lock.release()
