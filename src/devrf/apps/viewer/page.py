@@ -10,10 +10,8 @@ import base64
 import hashlib
 import logging
 import re
-import socket
 import sys
 import threading
-from contextlib import suppress
 from functools import cache, partial
 from http import HTTPStatus
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -24,16 +22,18 @@ from typing import Any, BinaryIO
 from devrf.apps.settings import ViewerSettings
 from devrf.apps.viewer.guard import own_names, refusal
 from devrf.checkpoints.file_metadata import digest_of, latest_checkpoint
+from devrf.system.files import read_record
 
 log = logging.getLogger(__name__)
 
 PAGE = "scene.html"
 PICTURES = "pictures"
-# Bytes at the start of a page with its description.
+# Bytes of a page at most, and at its start with its description.
+LARGEST = 2**28
 START = 2000
 # Served paths.
 SERVED = re.compile(r"/(scene\.html|pictures/\w{1,80}/\d{1,9}\.jpg)", re.ASCII)
-# Seconds in which a request has to come, and in which a client has to take 64 KB of the answer.
+# Seconds in which a client has to send a part of its request, and to take 64 KB of the answer.
 PATIENCE = 10.0
 
 
@@ -45,9 +45,9 @@ def is_current(run: Path) -> bool:
     folder = run / "export"
     try:
         newest = latest_checkpoint(run)
-        page = (folder / PAGE).read_bytes()
+        page = read_record(folder / PAGE, LARGEST)
         digest = "" if newest is None or "-progress-" in newest.name else digest_of(newest)
-    except OSError:  # none is there, or another process has just removed it
+    except (OSError, ValueError):  # none is there, or another process has just removed it
         return False
     whole = digest != "" and (folder / PICTURES).is_dir()
     programs = _source("scene.js").encode(), _source("scene.glsl").encode()
@@ -118,19 +118,7 @@ class _Handler(SimpleHTTPRequestHandler):
         self.names = names
         super().__init__(*request, directory=directory)
 
-    def setup(self) -> None:
-        super().setup()
-        # A request may come byte by byte.
-        self.waiting = threading.Timer(PATIENCE, self._end)
-        self.waiting.daemon = True
-        self.waiting.start()
-
-    def _end(self) -> None:
-        with suppress(OSError):  # answered, or its client has gone away
-            self.connection.shutdown(socket.SHUT_RDWR)
-
     def send_head(self) -> BinaryIO | None:
-        self.waiting.cancel()
         path = self.path.partition("?")[0]
         file = Path(self.directory + path)
         why = refusal(self.headers.get, self.names)
