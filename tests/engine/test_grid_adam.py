@@ -96,8 +96,9 @@ def test_a_stored_state_chooses_no_memory(rng: torch.Generator) -> None:
         smaller = {**stored["state"][0], name: torch.zeros(1, 3)}
         with pytest.raises(ValueError, match="moments of another shape"):
             optimizer.load_state_dict({**stored, "state": {0: smaller}})
-    with pytest.raises(TypeError):
-        optimizer.load_state_dict({**stored, "state": {0: []}})
+    for nothing in ([], None):
+        with pytest.raises(TypeError):
+            optimizer.load_state_dict({**stored, "state": {0: nothing}})
 
 
 def test_a_parameter_without_gradient_is_not_moved_and_the_closure_is_called() -> None:

@@ -188,8 +188,9 @@ class GridAdam(torch.optim.Optimizer):
         super().load_state_dict(state_dict)
         for group, own in zip(self.param_groups, settings, strict=True):
             group |= own
-            for state, parameter in ((self.state.get(p), p) for p in group["params"]):
-                if state is not None:
+            for parameter in group["params"]:
+                if parameter in self.state:
+                    state = self.state[parameter]
                     state["steps"] = validate(Count, state["steps"])
                     if not parameter.shape == state["mean"].shape == state["square"].shape:
                         raise ValueError("moments of another shape than what is learned")
