@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import logging
 import os
 import shutil
@@ -19,14 +18,12 @@ from pydantic import BaseModel, ConfigDict, Field
 from rich.console import Console
 from rich.filesize import decimal
 from rich.progress import Progress
-from typing_extensions import TypedDict
 
 from devrf.errors import DevrfError, did_you_mean
 from devrf.system.files import (
     DEEPEST,
     atomic_write,
     make_folder,
-    read_record,
     refuse_links,
     write_json,
 )
@@ -166,16 +163,6 @@ def published_scene(name: str, file: str | Path | None = None) -> PublishedScene
     )
 
 
-class Record(TypedDict):
-    """The record beside a scene: the SHA-256 of its archive, or of the list of several files.
-
-    ``compared``: whether it was compared with a checksum that was known before.
-    """
-
-    sha256: str
-    compared: bool
-
-
 def fetched(scene: PublishedScene, settings: FetchSettings, progress: bool) -> Path:
     """A scene's folder in ``settings.into``, downloaded unless it is there; the log says so.
 
@@ -185,29 +172,20 @@ def fetched(scene: PublishedScene, settings: FetchSettings, progress: bool) -> P
     """
     into = Path(settings.into).expanduser()
     path = into / scene.name
-    there = os.path.lexists(path)
-    if there:
-        try:
-            record = validate(Record, json.loads(read_record(path / RECORD)))
-        except (OSError, ValueError, RecursionError):
-            raise DevrfError(
-                f"{path}: there is something else, without {RECORD}; remove it, or give "
-                "fetch.into=PATH"
-            ) from None
-    else:
-        source = scene.collection
-        log.info(
-            "%s: %s; from %s; licence: %s", scene.name, scene.about, source.page, source.licence
+    if (path / RECORD).is_file():
+        log.info("%s: is in %s already", scene.name, path)
+        return path
+    if os.path.lexists(path):
+        raise DevrfError(
+            f"{path}: there is something else, without {RECORD}; remove it, or give fetch.into=PATH"
         )
-        record = fetch_scene(scene, into, settings.sha256, progress)
-    log.info("%s: %s", scene.name, f"is in {path} already" if there else f"in {path}")
-    remark = f"none was known to compare it with; kept in {path / RECORD}"
-    told = ", as expected" if record["compared"] else f": {remark}"
-    log.info("SHA-256 %s%s", record["sha256"], told)
+    source = scene.collection
+    log.info("%s: %s; from %s; licence: %s", scene.name, scene.about, source.page, source.licence)
+    fetch_scene(scene, into, settings.sha256, progress)
     return path
 
 
-def fetch_scene(scene: PublishedScene, into: Path, sha256: str | None, progress: bool) -> Record:
+def fetch_scene(scene: PublishedScene, into: Path, sha256: str | None, progress: bool) -> None:
     """Download a scene to ``into``/<its name>, which appears when it is whole and checked.
 
     Files that have come are kept beside it until all are there: the same command goes on with the
@@ -218,7 +196,7 @@ def fetch_scene(scene: PublishedScene, into: Path, sha256: str | None, progress:
         OSError: the disk refuses.
     """
     expected = sha256.lower() if sha256 else scene.collection.sha256.get(scene.name)
-    work = into / f".{scene.name}.fetch"
+    path, work = into / scene.name, into / f".{scene.name}.fetch"
     refuse_links(work, itself=True)
     make_folder(work)
     files = _download(scene, work / "files", progress)
@@ -230,19 +208,22 @@ def fetch_scene(scene: PublishedScene, into: Path, sha256: str | None, progress:
             "was removed: try again, and if it comes again, ask who published it"
         )
     ready = _unpacked(scene, work) if scene.is_archive else work / "files"
-    record: Record = {"sha256": digest, "compared": expected is not None}
-    source = {
+    record = {
         "scene": scene.name,
         "page": scene.collection.page,
         "url": scene.collection.filled(scene.collection.url, scene.name),
         "licence": scene.collection.licence,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "files": len(files),
+        "sha256": digest,
+        "compared": expected is not None,
     }
-    write_json(ready / RECORD, {**source, **record})
-    ready.rename(into / scene.name)
+    write_json(ready / RECORD, record)
+    ready.rename(path)
     shutil.rmtree(work, ignore_errors=True)
-    return record
+    remark = f": none was known to compare it with; kept in {path / RECORD}"
+    log.info("%s: in %s", scene.name, path)
+    log.info("SHA-256 %s%s", digest, remark if expected is None else ", as expected")
 
 
 def _download(scene: PublishedScene, folder: Path, progress: bool) -> dict[str, Path]:
@@ -311,26 +292,20 @@ def _unpacked(scene: PublishedScene, work: Path) -> Path:
     shutil.rmtree(unpacked, ignore_errors=True)
     try:
         with zipfile.ZipFile(archive) as packed:
-            # A file takes 4 kB of a disk at least. No more of it is unpacked than is said here.
-            unpacked_size = sum(max(file.file_size, 2**12) for file in packed.infolist())
             if any(name.count("/") > DEEPEST for name in packed.namelist()):
                 raise ValueError(f"more than {DEEPEST} folders in one another")
-            if unpacked_size <= most:
-                packed.extractall(unpacked)  # names that lead elsewhere are written below it, too
+            # A file takes 4 kB of a disk at least. No more of it is unpacked than is said here.
+            whole = sum(max(file.file_size, 2**12) for file in packed.infolist())
+            if whole > most:
+                raise ValueError(f"its {decimal(size)} would become {decimal(whole)}")
+            packed.extractall(unpacked)  # names that lead elsewhere are written below it, too
     except Exception as error:  # of any kind, where an archive is damaged
         if getattr(error, "errno", None) is not None:  # the disk's
             raise
         raise DevrfError(
             f"{archive}: cannot be unpacked ({error}); remove it, and the same command fetches it "
-            "again"
+            "again; or ask who published it"
         ) from None
-    if unpacked_size > most:
-        shutil.rmtree(work, ignore_errors=True)
-        raise DevrfError(
-            f"{archive}: {decimal(size)} would unpack to {decimal(unpacked_size)}, more than "
-            f"{MOST_EXPANSION} times as much, or {decimal(LARGEST)}; it was removed: ask who "
-            "published it"
-        )
     source = scene.collection
     folder = source.folder and source.filled(source.folder, scene.name)
     marker = MARKERS[scene.collection.data]

@@ -82,15 +82,12 @@ class PeriodicCheckpoint(Callback):
         return where
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Start the clock, and remove half-written files of a process that was killed."""
+        """Start the clock."""
         assert isinstance(pl_module, Stage)
         self._failing = False
         self.saved = pl_module.iteration or None
         self._due = time.monotonic() + self.every_seconds
         self._steps = 0
-        if trainer.is_global_zero:
-            for path in self.folder.glob(f".partial-{pl_module.name}*.ckpt"):
-                path.unlink(missing_ok=True)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int

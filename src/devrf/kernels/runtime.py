@@ -231,11 +231,10 @@ def _begin() -> None:
             instead = "free memory, or give kernels=torch"
             raise DevrfError(f"kernels: Warp cannot be loaded ({why}); {instead}") from error
     folder = Path(wp.config.kernel_cache_dir)
-    if not os.access(folder, os.W_OK):
-        wp.config.kernel_cache_dir = _own_folder()
-    elif others_may_write(folder):
-        wp.config.kernel_cache_dir = _own_folder()
-        log.warning("%s: others may write there; kernels are kept in %s", folder, _own_folder())
+    if not os.access(folder, os.W_OK) or others_may_write(folder):
+        wp.config.kernel_cache_dir = own = _own_folder()
+        why = "cannot be written, or others may write there"
+        log.warning("%s: %s; kernels are kept in %s", folder, why, own)
 
 
 def others_may_write(folder: Path) -> bool:
