@@ -34,8 +34,11 @@ from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
+from devrf.methods.gaussians.model import DeformableGaussians
+from devrf.methods.gaussians.settings import GaussiansSettings
 from devrf.rendering.renderer import Renderer
 from devrf.system.memory import own_memory
+from devrf.system.stored_class import class_path
 
 INPUTS = int(os.environ.get("DEVRF_FUZZ_INPUTS", "60"))
 NUMBERS = [0, -1, 1, 0.5, 5e-324, 1e9, 1e30, 1e300, 2**63, math.nan, math.inf, True]
@@ -132,6 +135,34 @@ def test_a_checkpoint_is_shown_or_refused(motion, tmp_path):
 
     count = INPUTS * 3 // 4
     assert try_all(motion, ("devrf", "state_dict", "viewpoints"), show, count) > count // 4
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_gaussians_are_shown_or_refused(motion, tmp_path):
+    model = DeformableGaussians(GaussiansSettings(width=8, depth=2, harmonics=1))
+    model.cloud.begin(0.3 * torch.randn(50, 3), torch.rand(50, 3), torch.full((50,), 0.1), 0.5)
+    content = read_checkpoint_file(motion)
+    content["devrf"]["model"] = {"class": class_path(DeformableGaussians), **model.config()}
+    content["state_dict"] = {f"scene_model.{k}": v for k, v in model.stored_state().items()}
+    write_checkpoint_file(motion, content)
+
+    def show() -> None:
+        stored = load_checkpoint(motion)
+        assert stored.viewpoints is not None
+        camera = stored.viewpoints.held_out.of_height(12)
+        for moment in (0.0, 0.7):
+            Renderer(stored.model).view(camera, index=0, time=moment, background=1.0)
+        splats = ExportSettings(format="splats", times=[0, 0.7])
+        export_scene(stored.model, stored.viewpoints, splats, tmp_path / "splats")
+
+    show()
+    color = ("state_dict", "scene_model.cloud.color")
+    write_checkpoint_file(motion, changed(content, color, torch.zeros(1, 3)))
+    with pytest.raises(DevrfError, match="parts of other numbers of Gaussians"):
+        show()
+    write_checkpoint_file(motion, content)
+    count = INPUTS // 8
+    assert try_all(motion, ("devrf", "state_dict"), show, count) > count // 4
 
 
 PLACES: list[Place] = [

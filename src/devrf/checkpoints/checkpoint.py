@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -260,7 +260,8 @@ def _build_checked(
         ValueError: it would have more values than the file, or numbers that no model has.
     """
     config = {key: value for key, value in description.items() if key != "class"}
-    if any(isinstance(value, int) and abs(value) > LARGEST for value in _leaves(config)):
+    sizes = _leaves(config, model_class.unbuilt)
+    if any(isinstance(value, int) and abs(value) > LARGEST for value in sizes):
         raise ValueError("a number that is too large")
     with torch.device("meta"):  # takes no memory
         outline = model_class.from_config(config)
@@ -288,15 +289,15 @@ def _check_numbers(parts: Any) -> None:
             raise ValueError("a number that is not finite, or too large")
 
 
-def _leaves(value: Any) -> Iterator[Any]:
-    """The leaves of nested mappings, lists and tuples."""
+def _leaves(value: Any, without: Collection[str] = ()) -> Iterator[Any]:
+    """The leaves of nested mappings, lists and tuples, but for entries of some names."""
     if isinstance(value, Mapping):
-        value = list(value.values())
+        value = [item for key, item in value.items() if key not in without]
     if not isinstance(value, list | tuple):
         yield value
         return
     for item in value:
-        yield from _leaves(item)
+        yield from _leaves(item, without)
 
 
 def check_scene(path: Path, metadata: CheckpointMetadata, scene: Scene) -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from contextlib import suppress
 from importlib import import_module
 from importlib.metadata import entry_points
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 METHODS = "devrf.methods"
 
@@ -20,7 +20,13 @@ _known: dict[str, type[Any]] = {}
 
 
 class StoredClass:
-    """A class whose modules a checkpoint may hold: each subclass is known by its path."""
+    """A class whose modules a checkpoint may hold: each subclass is known by its path.
+
+    Attributes:
+        unbuilt: names of settings that no layer or grid is built by: they may be large numbers.
+    """
+
+    unbuilt: ClassVar[tuple[str, ...]] = ()
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -62,6 +62,11 @@ class Cloud(StoredShape):
         self.register_buffer("grown", torch.zeros((), dtype=torch.int64))
         self.register_buffer("seen", torch.zeros(1, 2))
         self.begin(torch.zeros(1, 3), torch.full((1, 3), GREY), torch.ones(1), 0.5)
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        super()._load_from_state_dict(*args, **kwargs)
+        if {len(getattr(self, name)) for name in self.resizable} != {len(self)}:
+            raise ValueError("parts of other numbers of Gaussians")
 
     def __len__(self) -> int:
         return len(self.means)

@@ -58,6 +58,7 @@ class DeformableGaussians(ImageTrainable):
     name: ClassVar[str] = "gaussians"
     losses: ClassVar[tuple[str, ...]] = ("l1", "ssim")
     random_background: ClassVar[bool] = True
+    unbuilt: ClassVar[tuple[str, ...]] = ("start_points", "max_points")
 
     def __init__(self, settings: GaussiansSettings | None = None) -> None:
         """Build the network, and a cloud of one; of published sizes if no settings are given."""
@@ -161,7 +162,9 @@ class DeformableGaussians(ImageTrainable):
     @torch.no_grad()
     def gaussians_at(self, time: float) -> Gaussians:
         """The cloud at a time, its colours those of the harmonic of degree 0."""
-        return self.cloud.gaussians(self.moved(time), self.cloud.means.new_ones(len(self.cloud), 1))
+        basis = self.cloud.means.new_ones(len(self.cloud), 1)
+        gaussians = self.cloud.gaussians(self.moved(time), basis)
+        return replace(gaussians, means=gaussians.means.detach())
 
     def forward(self, batch: ImageBatch) -> RenderOutput:
         """Render an image; while the cloud learns, note where it lacks detail."""
