@@ -109,7 +109,11 @@ class ActiveFrame:
 
     @torch.no_grad()
     def load_state(self, state: dict[str, Any], views: Views) -> None:
-        """Restore the result of :meth:`state`; the frame has been checked out."""
+        """Restore the result of :meth:`state`; the frame has been checked out.
+
+        Raises:
+            ValueError: there is no pixel in it, or other masks.
+        """
         images = images_of(views, self.number)
         area = views.height * views.width
         for tensor, value in zip(self.slices, state["displacements"], strict=False):
@@ -119,3 +123,5 @@ class ActiveFrame:
         self.occupancy.refill(Occupancy(mask, self.occupancy.box))
         masks = [unpack_bits(bits, (len(images), area), device) for bits in state["pixels"]]
         self.pools = [PixelPool.of_mask(images, mask) for mask in masks]
+        if not self.pools or not all(map(len, self.pools)):
+            raise ValueError("no pixels to learn from")
