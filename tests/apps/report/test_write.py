@@ -11,7 +11,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from devrf.apps.report.runs import collect
+from devrf.apps.report.runs import SKIPPED, collect
 from devrf.apps.report.write import write_report
 from devrf.apps.settings import ReportSettings
 from devrf.errors import DevrfError
@@ -123,8 +123,7 @@ def test_a_film_that_cannot_be_read_is_left_out(runs, ran, caplog):
     listed = b"ffconcat version 1.0\nfile ../../a/videos/held_out.mp4\n"
     broken["list"].write_bytes(listed)
     write_report(ReportSettings(runs))
-    for file, message in zip(broken.values(), caplog.messages, strict=True):
-        assert message.startswith(f"{file}: ")
+    assert caplog.messages == [SKIPPED % file for file in broken.values()]
     assert iio.imread(runs / "report" / "videos" / "side_by_side_robot.mp4").shape[0] == 1
 
 

@@ -5,22 +5,22 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import repeat
+from itertools import islice, repeat
 from pathlib import Path
 
+import imageio.v3 as iio
 import numpy as np
 import pandas as pd
 from PIL import Image, ImageDraw
 
 from devrf.apps.report.plots import file_name, plots
-from devrf.apps.report.runs import collect
+from devrf.apps.report.runs import SKIPPED, collect
 from devrf.apps.report.table import Table, tabulate
 from devrf.apps.report.text import latex, markdown, plain
 from devrf.apps.settings import ReportSettings
 from devrf.errors import DevrfError
 from devrf.pictures.figures import write_figure
 from devrf.pictures.video_file import fitted_font, write_pictures
-from devrf.scenes.footage import frame_count, frames_at
 from devrf.system.files import refuse_links, write_text
 from devrf.system.printed import csv_cell
 
@@ -28,8 +28,9 @@ log = logging.getLogger(__name__)
 
 # Pictures a second of the videos that show rows side by side.
 FPS = 10
-# Frames of a run's video that are read, at most.
+# Frames of a run's video that are read, and pixels of each, at most.
 LONGEST = 2000
+LARGEST = 8192 * 4320
 # Columns of each run's video of the held-out views, from the left: truth, rendering, depth.
 COLUMNS = 3
 TRUTH = 0
@@ -116,14 +117,16 @@ def _write_videos(table: Table, folder: Path) -> dict[str, str]:
 
 
 def _frame_count(path: Path) -> int:
-    """The number of a video's frames, those beyond LONGEST left out; 0, and a line, for none."""
+    """The number of readable frames of a video, LONGEST at most; a line in the log for none."""
     try:
-        count = min(frame_count(path), LONGEST)
-        for _ in frames_at(path, [count - 1]):  # it may be cut off
-            pass
-        return count
-    except DevrfError as error:
-        log.warning("%s", error)
+        with path.open("rb") as file:
+            if file.read(8)[4:] != b"ftyp":  # FFmpeg would follow what a list of files says
+                raise ValueError
+        if math.prod(iio.immeta(path)["size"]) > LARGEST:
+            raise ValueError
+        return sum(1 for _ in islice(iio.imiter(path), LONGEST))
+    except Exception:  # what decoders raise depends on the damage
+        log.warning(SKIPPED, path)
         return 0
 
 
@@ -145,8 +148,8 @@ def _pictures(videos: Mapping[str, tuple[Path, int]]) -> Iterator[np.ndarray]:
 
 def _frames_at(positions: Sequence[int], path: Path) -> Iterator[np.ndarray]:
     """A video's frames at increasing ``positions``, of which one at a time is in memory."""
-    for position, frame in frames_at(path, positions):
-        yield from repeat(frame, positions.count(position))
+    for k, frame in enumerate(islice(iio.imiter(path), positions[-1] + 1)):
+        yield from repeat(frame, positions.count(k))
 
 
 def _column(picture: np.ndarray, column: int) -> Image.Image:
