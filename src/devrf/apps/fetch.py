@@ -22,6 +22,7 @@ from rich.progress import Progress
 from devrf.errors import DevrfError, did_you_mean
 from devrf.system.files import (
     DEEPEST,
+    UNREADABLE,
     atomic_write,
     make_folder,
     refuse_links,
@@ -142,7 +143,7 @@ def catalogue(file: str | Path | None = None) -> list[PublishedScene]:
         if not path.is_file() or path.stat().st_size > LARGEST_CATALOGUE:
             raise ValueError("no file, or a larger one than a catalogue's")
         listed = validate(dict[str, list[Collection]], tomllib.loads(path.read_text()))
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, *UNREADABLE) as error:
         why = " ".join(str(error).split())
         raise DevrfError(f"fetch.catalogue: {path} cannot be read ({why[:200]})") from None
     return [

@@ -27,6 +27,7 @@ from devrf.geometry.offset import NO_OFFSET, Offset
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Background, Scene
 from devrf.scenes.validation import check_poses
+from devrf.system.files import UNREADABLE
 from devrf.system.memory import OutOfMemoryError, is_oom
 from devrf.system.plain_data import Line, validate
 from devrf.system.printed import shown
@@ -41,16 +42,7 @@ LARGEST = 2**14
 # Numbers of a file are at most this: their squares, too, are float32.
 FARTHEST = 1e12
 # Errors that parts of a file raise which contradict each other.
-UNFIT: tuple[type[Exception], ...] = (
-    DevrfError,
-    RuntimeError,
-    LookupError,
-    ValueError,
-    TypeError,
-    AttributeError,
-    ArithmeticError,
-    AssertionError,
-)
+UNFIT = (*UNREADABLE, DevrfError, RuntimeError, AssertionError)
 # A model may have so many more values than its file: small grids that take the stored shape.
 UNSTORED = 2**16
 # The most pixels along the side of an image.

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from devrf.checkpoints.file_metadata import FORMAT, file_metadata
 from devrf.errors import DevrfError
-from devrf.system.files import atomic_write
+from devrf.system.files import UNREADABLE, atomic_write
 from devrf.system.memory import need_memory
 
 UNKNOWN = "0" * 64  # in the digest's place until it is known
@@ -93,7 +93,7 @@ def read_description(path: Path) -> dict[str, Any]:
 def _content(path: Path, metadata: Mapping[str, str], tensors: Mapping[str, Any]) -> dict[str, Any]:
     try:
         content: dict[str, Any] = _unflatten(json.loads(metadata["nested"]), tensors)
-    except (LookupError, ValueError, TypeError, RecursionError):
+    except UNREADABLE:
         raise DevrfError(f"{path}: damaged; take a copy that is whole, or train again") from None
     return content
 

@@ -11,12 +11,11 @@ from typing import Any
 from safetensors import SafetensorError, safe_open
 
 from devrf.errors import DevrfError
+from devrf.system.files import UNREADABLE
 
 FORMAT = "5"
 # Key of a training config for the digest of the run's canonical checkpoint that is built on.
 OWN_REST = "checkpoints/canonical.ckpt"
-# Errors of nested data that are not as devrf writes them.
-UNREADABLE = (LookupError, TypeError, ValueError, ArithmeticError, RecursionError)
 # Bytes of a header at most: usual are 20,000. In memory each may become 50.
 HEADER = 2**23
 

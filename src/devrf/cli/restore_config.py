@@ -38,7 +38,7 @@ from devrf.cli.config import (
 )
 from devrf.cli.config_check import RESERVED
 from devrf.errors import DevrfError
-from devrf.system.files import read_yaml
+from devrf.system.files import UNREADABLE, read_yaml
 from devrf.system.override import literal, to_type
 from devrf.system.printed import is_shown
 from devrf.system.process import importing
@@ -60,8 +60,6 @@ OPTION = re.compile(r"(?!null$)[\w-]+", re.ASCII | re.IGNORECASE)
 KEY = re.compile(r"/?[\w-]+([./][\w-]+){0,15}", re.ASCII)
 # Text that is more than text.
 CODE = re.compile(rf"\$\{{|^\?\?\?$|{'|'.join(RESERVED)}")
-# Errors of reading a damaged record.
-UNREADABLE = (yaml.YAMLError, HydraException, LookupError, TypeError, ValueError, RecursionError)
 
 # Keys of a command, and items of its lists, at most.
 MOST = 1000
@@ -297,7 +295,7 @@ def searched_runs(typed: Sequence[Override]) -> list[Path]:
 
 def _recorded(record: Path) -> tuple[str, list[Override]]:
     """The class of a sweep's sweeper, and the sweep's overrides, from its ``multirun.yaml``."""
-    with suppress(*UNREADABLE):
+    with suppress(yaml.YAMLError, HydraException, *UNREADABLE):
         hydra = read_yaml(record)["hydra"]
         return str(hydra["sweeper"]["_target_"]), parsed(hydra["overrides"]["task"])
     raise DevrfError(f"{record}: not the record of a sweep; type the sweep again")

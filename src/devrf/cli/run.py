@@ -35,7 +35,7 @@ from devrf.errors import DevrfError, did_you_mean, expect
 from devrf.evaluation.objective import check_objective, objective
 from devrf.kernels import runtime
 from devrf.kernels.ahead import compile_ahead
-from devrf.system.files import read_record
+from devrf.system.files import UNREADABLE, read_record
 from devrf.system.folder_lock import PLACE
 from devrf.system.memory import free_cache, shortage_in_words
 from devrf.system.override import to_type
@@ -165,7 +165,7 @@ def _objective(run: RunContext, steps: Names) -> float | None:
     try:
         metrics = json.loads(read_record(scores))
         best = objective(run.config.objective, metrics)
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
+    except UNREADABLE:
         raise DevrfError(f"{scores}: damaged; remove it, and the run is scored again") from None
     if steps == tuple(AFTER_LEARNING) and not in_sweep():
         results = ", ".join(name for name in RESULTS if (run.folder / name).exists())

@@ -21,6 +21,8 @@ from devrf.errors import DevrfError
 LARGEST_RECORD = 2**24
 # Bytes of a YAML file, of which a second takes in some 20,000.
 LARGEST_YAML = 200_000
+# Errors of values in a file that are not as devrf writes them.
+UNREADABLE = (LookupError, TypeError, ValueError, ArithmeticError, AttributeError, RecursionError)
 # Folders in one another, at most: Python's recursion ends at some hundreds.
 DEEPEST = 64
 # Errors of a disk, its permissions, or a path that was given. A missing file may be a fault of the

@@ -38,7 +38,14 @@ from devrf.scenes.sparse_model import (
     normalised,
 )
 from devrf.scenes.splits import every_nth
-from devrf.system.files import make_folder, read_record, refuse_links, write_json, write_text
+from devrf.system.files import (
+    UNREADABLE,
+    make_folder,
+    read_record,
+    refuse_links,
+    write_json,
+    write_text,
+)
 from devrf.system.plain_data import Kind, validate
 from devrf.system.progress import followed
 
@@ -143,7 +150,7 @@ def kept(file: Path, source: Any, kind: type[Kind], make: Callable[[], dict[str,
                 stored = validate(kind, result)
                 log.info("%s: found before", file.stem)
                 return stored
-        except (ValueError, LookupError, TypeError, RecursionError, OverflowError):
+        except UNREADABLE:
             raise DevrfError(f"{file}: damaged; remove it, and it is made again") from None
     result = make()
     write_text(file, json.dumps({"key": key, "result": result}))

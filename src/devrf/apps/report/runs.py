@@ -16,7 +16,7 @@ from annotated_types import Len
 
 from devrf.apps.settings import REHEARSAL
 from devrf.errors import DevrfError
-from devrf.system.files import read_record, utf8_path, walk
+from devrf.system.files import UNREADABLE, read_record, utf8_path, walk
 from devrf.system.plain_data import validate
 from devrf.system.printed import shown
 
@@ -102,7 +102,7 @@ def collect(folder: Path) -> Collection:
             try:
                 utf8_path(child)  # or no table could be printed
                 record = read(_flat(json.loads(read_record(file))))
-            except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+            except (OSError, *UNREADABLE):
                 skipped.append(shown(SKIPPED % file))
             except DevrfError as error:
                 skipped.append(str(error))
