@@ -155,7 +155,11 @@ def test_a_damaged_file_is_read_or_refused(layout, write_layout, tmp_path):
     write_layout(layout, whole)
     shutil.copytree(whole, changed)
 
-    @settings(max_examples=max(2, INPUTS * share // 100), suppress_health_check=list(HealthCheck))
+    @settings(
+        max_examples=max(2, INPUTS * share // 100),
+        suppress_health_check=list(HealthCheck),
+        deadline=20_000,  # milliseconds: nothing in a file makes a reader wait
+    )
     @given(changes(whole))
     def each(change: tuple[Path, bytes | str]) -> None:
         put(changed / change[0], change[1])

@@ -19,7 +19,7 @@ from devrf.system.files import atomic_write, read_record
 
 log = logging.getLogger(__name__)
 
-# Bytes of a table: published schedules of a day leave a quarter of them.
+# Bytes of a table at most.
 LARGEST = 2**26
 
 

@@ -19,7 +19,7 @@ from devrf.errors import DevrfError
 # Bytes; the longest records, of footage of two hours, have some ten million. In memory each may
 # become 50.
 LARGEST_RECORD = 2**24
-# Bytes of a YAML file, of which a second takes in some 20,000.
+# Bytes of a YAML file, for which Python takes seconds.
 LARGEST_YAML = 200_000
 # Errors of values in a file that are not as devrf writes them.
 UNREADABLE = (LookupError, TypeError, ValueError, ArithmeticError, AttributeError, RecursionError)
