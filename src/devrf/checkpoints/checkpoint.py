@@ -175,8 +175,16 @@ class ChecksummedCheckpointIO(CheckpointIO):
     def load_checkpoint(
         self, path: str | Path, map_location: Any = None, weights_only: bool | None = None
     ) -> dict[str, Any]:
-        """Read a checkpoint onto the host, without running code; other arguments are ignored."""
-        return read_checkpoint_file(Path(path))
+        """Read a checkpoint onto the host, without running code; other arguments are ignored.
+
+        Raises:
+            DevrfError: the file is damaged, or not devrf's.
+            ValueError: its model has numbers that nothing can be computed with.
+        """
+        content = read_checkpoint_file(Path(path))
+        state = content.get("state_dict", {})
+        _check_numbers({name: value for name, value in state.items() if MODEL in name})
+        return content
 
     def remove_checkpoint(self, path: str | Path) -> None:
         """Remove the file."""

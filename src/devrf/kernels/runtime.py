@@ -238,11 +238,14 @@ def _begin() -> None:
 
 
 def others_may_write(folder: Path) -> bool:
-    """Whether a folder is another user's, or others may write to it."""
-    info = folder.stat()
-    # Many systems give each user a group of the same number.
-    others = stat.S_IWOTH | (0 if info.st_gid == info.st_uid else stat.S_IWGRP)
-    return info.st_uid != os.getuid() or bool(info.st_mode & others)
+    """Whether other users may write to a folder, or put another in its place."""
+    for path in (folder, *folder.parents):
+        info = path.stat()
+        # Many systems give each user a group of the same number.
+        others = stat.S_IWOTH | (0 if info.st_gid == info.st_uid else stat.S_IWGRP)
+        if info.st_mode & others and (path == folder or not info.st_mode & stat.S_ISVTX):
+            return True
+    return folder.stat().st_uid != os.getuid()
 
 
 def _own_folder() -> str:
