@@ -23,8 +23,9 @@ TRAINING |= {"lost_frames"}
 FURTHER = {"ms_ssim", "lpips", "depth_error", "flow_error"}
 NO_METRICS = "evaluation.metrics=[]"  # beside PSNR and SSIM
 MASKED = {"psnr_masked", "ssim_masked", "lpips_masked", "ssim_covisible", "lpips_covisible"}
-CANONICAL_KEYS = {"psnr", "ssim"} | TRAINING | FURTHER | MASKED
-DEFORMATION_KEYS = CANONICAL_KEYS | {"rest_pose_psnr", "checkpoint_mb"}
+MOVING = {"psnr_moving", "ssim_moving", "lpips_moving"}
+CANONICAL_KEYS = {"psnr", "ssim"} | TRAINING | FURTHER | MASKED | MOVING
+DEFORMATION_KEYS = CANONICAL_KEYS | {"rest_pose_psnr", "flicker", "pck_t", "checkpoint_mb"}
 
 
 def metrics(folder: Path) -> dict:
@@ -279,7 +280,7 @@ def test_validation_views_are_scored_where_the_objective_is_theirs(
     assert (asked.status, asked.err) == (0, "")
     assert "deformation: learned already" in asked.out and "render: done already" in asked.out
     found = metrics(run)
-    assert set(found["validation"]) == {"psnr", "ssim", "images"}
+    assert set(found["validation"]) == {"psnr", "ssim", "flicker", "images"}
     assert found["validation"]["images"] == 3
     assert found["validation"]["psnr"] != found["dynamic"]["psnr"]
     # Neither the scene nor its test scores are others for it.
