@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,8 @@ from omegaconf import OmegaConf
 from devrf.cli.complete import completed
 from devrf.cli.config import PATHS
 from devrf.errors import DevrfError
+from devrf.evaluation.suite import Evaluation
+from devrf.scenes.exchange import PrepareSettings
 from devrf.scenes.export import export
 from devrf.scenes.procedural import ProceduralForwardScene, ProceduralScene
 
@@ -39,6 +42,12 @@ def test_the_rest_is_left_to_hydra():
     for argument in ("report.runs=/a/b c", "ckpt=null", "seed=1,2", "--help", "x=["):
         assert completed([argument]).words == [argument]
     assert completed(["viewer=True"]).words == ["viewer.training=true"]
+
+
+def test_options_that_are_paths_are_known_as_such():
+    for section, settings in (("evaluation", Evaluation), ("prepare", PrepareSettings)):
+        paths = {f"{section}.{option.name}" for option in fields(settings) if "Path" in option.type}
+        assert paths and paths <= PATHS
 
 
 def test_the_keys_of_paths_exist(devrf):

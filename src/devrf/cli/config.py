@@ -34,7 +34,8 @@ PATHS = {
     *("data.root", "prepare.into", "data.flow_cache", "ckpt", "fetch.into", "export.into"),
     *("capture.static", "capture.into", "capture.masks", "capture.alpha_masks", "video.path"),
     *("report.runs", "report.into", "fetch.catalogue", "evaluation.lpips_weights"),
-    *("evaluation.predictions", "outputs", "hydra.run.dir", "hydra.sweep.dir"),
+    *("evaluation.predictions", "evaluation.motion_masks", "outputs"),
+    *("hydra.run.dir", "hydra.sweep.dir"),
 }
 
 
