@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from hydra.utils import instantiate
 
 from devrf.apps.captured_cameras import write_thumbnails
-from devrf.apps.export.geometry import ExportSettings, scene_radius
+from devrf.apps.export.geometry import ExportSettings
 from devrf.apps.export.scene import export_scene
 from devrf.apps.render import Video, videos
 from devrf.apps.settings import ViewerSettings
@@ -31,6 +31,7 @@ from devrf.pictures.images import write_image
 from devrf.pictures.video_file import write_pictures
 from devrf.rendering.renderable import Renderable
 from devrf.rendering.renderer import Renderer
+from devrf.rendering.seen_points import scene_radius
 from devrf.rendering.tracks import moving_pixels
 from devrf.scenes.scene import Scene
 from devrf.system.files import refuse_links, write_text

@@ -13,12 +13,13 @@ import torch
 import trimesh
 from pxr import Gf, Usd, UsdGeom
 
-from devrf.apps.export.geometry import ExportSettings, MovingMesh, UpFrame, carried, seen_points
+from devrf.apps.export.geometry import ExportSettings, MovingMesh, UpFrame, carried
 from devrf.apps.export.gltf import write_gltf
 from devrf.apps.export.sequence import mesh_files, point_file, write_sequence
 from devrf.apps.export.surface import surface_of
 from devrf.apps.export.usd import write_usd
 from devrf.rendering.renderer import Renderer
+from devrf.rendering.seen_points import seen_points
 
 TIMES = (0.0, 0.25, 0.5, 1.0)
 SECONDS = 2.0

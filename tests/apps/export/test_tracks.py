@@ -8,7 +8,7 @@ import json
 import pytest
 import torch
 
-from devrf.apps.export.geometry import ExportSettings, scene_radius
+from devrf.apps.export.geometry import ExportSettings
 from devrf.apps.export.scene import export_scene
 from devrf.apps.export.surface import surface_of
 from devrf.checkpoints.checkpoint import Viewpoints
@@ -16,6 +16,7 @@ from devrf.errors import DevrfError
 from devrf.geometry.clock import FrameClock
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.rendering.renderer import Renderer
+from devrf.rendering.seen_points import scene_radius
 from devrf.rendering.tracks import moving_pixels
 
 

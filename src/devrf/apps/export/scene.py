@@ -6,7 +6,7 @@ import logging
 from collections.abc import Iterator
 from pathlib import Path
 
-from devrf.apps.export.geometry import ExportSettings, MovingMesh, UpFrame, carried, seen_points
+from devrf.apps.export.geometry import ExportSettings, MovingMesh, UpFrame, carried
 from devrf.apps.export.gltf import write_gltf
 from devrf.apps.export.sequence import Drawn, mesh_files, point_file, write_sequence
 from devrf.apps.export.splats import MovingGaussians, write_splats, write_usd_splats
@@ -19,6 +19,7 @@ from devrf.evaluation.held_out import background_value
 from devrf.geometry.cameras import Cameras
 from devrf.rendering.renderable import Renderable
 from devrf.rendering.renderer import Renderer
+from devrf.rendering.seen_points import seen_points
 from devrf.system.progress import followed
 
 log = logging.getLogger(__name__)

@@ -41,7 +41,6 @@ from torch.nn.functional import normalize, pad
 
 from devrf.apps.camera_paths import upward
 from devrf.apps.captured_cameras import described, frustum_depth
-from devrf.apps.export.geometry import scene_radius
 from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
@@ -55,6 +54,7 @@ from devrf.methods.devrf.volume_rendering import deformed_occupancy, march_input
 from devrf.ops.trilinear import shape_of
 from devrf.rendering.occupancy import Occupancy, dilate
 from devrf.rendering.renderable import Renderable
+from devrf.rendering.seen_points import scene_radius
 from devrf.system.printed import shown
 
 # Displacements are rounded to this share of a cell, residual colours to this share of a logit:
