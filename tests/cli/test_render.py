@@ -18,7 +18,7 @@ import trimesh
 from devrf.apps.keyframes import CameraPath, Keyframe, write_path
 from devrf.checkpoints.checkpoint import load_checkpoint
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file, write_checkpoint_file
-from devrf.checkpoints.file_metadata import latest_checkpoint
+from devrf.checkpoints.file_metadata import digest_of, latest_checkpoint
 from devrf.cli.restore_config import parsed
 from devrf.cli.view import serves_page
 
@@ -249,6 +249,23 @@ def test_a_page_is_that_of_the_last_checkpoint(trained, tmp_path):
     assert not serves_page(typed, run)  # of another version
     shutil.rmtree(run / "export" / "pictures")
     assert not serves_page(typed, run)
+
+
+def test_the_page_of_a_part_is_not_served_as_the_scene(trained, tmp_path, devrf):
+    run = tmp_path / "run"
+    shutil.copytree(trained[0], run)
+    checkpoint = run / "checkpoints" / "deformation.ckpt"
+    content = read_checkpoint_file(checkpoint)
+    solid, moving = "canonical.density.values", "deformation.frames.to_time"
+    for name, number in ((solid, 20.0), (moving, 0.3)):
+        content["state_dict"][f"scene_model.{name}"]["kept"].fill_(number)
+    write_checkpoint_file(checkpoint, content)
+    outcome = devrf(
+        *("stage=export", "hydra.run.dir=run", "export.format=html", "export.part=moving")
+    )
+    assert (outcome.status, outcome.err) == (0, "")
+    page = (run / "export" / "scene.html").read_text("utf-8")
+    assert digest_of(checkpoint) not in page and 'data-checkpoint=""' in page
 
 
 def test_a_port_in_use_is_said_in_one_line(of_run, tmp_path, port):

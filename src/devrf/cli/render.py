@@ -24,7 +24,7 @@ from devrf.cli.context import RunContext
 from devrf.cli.restore_config import root
 from devrf.cli.resume import unfinished
 from devrf.cli.view import serve
-from devrf.errors import DevrfError, expect
+from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
 from devrf.evaluation.predictions import picture_name
 from devrf.pictures.images import write_image
@@ -143,14 +143,15 @@ def export(run: RunContext) -> None:
     model, viewpoints = _learned(run)
     if settings.part != "all":
         parts = model.moving_and_still(scene_radius(model, viewpoints.static))
-        known = ("all", *parts)
-        has = f"{' or '.join(known)}, which is what method={model.name} has here"
-        expect(settings.part in known, "export.part", has, settings.part)
+        if not parts:
+            unknown = f"nothing moves, or method={model.name} cannot tell what does"
+            raise DevrfError(f"export.part: {unknown}; give export.part=all")
         model = parts[settings.part]
     folder = run.folder / "export" if settings.into is None else Path(settings.into)
     refuse_links(folder)
     if settings.format == "html":
-        write_text(folder / PAGE, _page(run, model, viewpoints))
+        text = _page(run, model, viewpoints, whole=settings.part == "all")
+        write_text(folder / PAGE, text)
         log.info("the scene, for any browser, written to %s", folder / PAGE)
         log.info("in a page of your own beside it: %s", FRAME)
     else:
@@ -176,8 +177,10 @@ def _write_with_pictures(run: RunContext, model: Renderable, viewpoints: Viewpoi
     write_text(folder / PAGE, text)
 
 
-def _page(run: RunContext, model: Renderable, viewpoints: Viewpoints) -> str:
-    return page(model, viewpoints, run.config.scene, digest_of(run.checkpoint()))
+def _page(run: RunContext, model: Renderable, viewpoints: Viewpoints, *, whole: bool = True) -> str:
+    """The page; one of a part names no checkpoint, lest ``stage=view`` serve it as the scene."""
+    checkpoint = digest_of(run.checkpoint()) if whole else ""
+    return page(model, viewpoints, run.config.scene, checkpoint)
 
 
 def _learned(run: RunContext) -> tuple[Renderable, Viewpoints]:
