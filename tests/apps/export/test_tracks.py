@@ -91,7 +91,8 @@ def test_tracks_by_hand(moving_ball, around, tmp_path):
     for wrong, said in (
         ({"format": "gltf"}, r"^export\.format: expected csv, json or usd"),
         ({"format": "csv", "tracks": None}, r"^export\.tracks: "),
-        ({"format": "csv", "content": "points"}, r"^export\.content: expected tracks"),
+        ({"format": "csv", "content": "surface"}, r"^export\.content: expected tracks"),
+        ({"format": "gltf", "content": "auto"}, r"^export\.format: expected csv, json or usd"),
     ):
         with pytest.raises(DevrfError, match=said):
             written(**wrong)

@@ -22,6 +22,8 @@ from devrf.rendering.renderable import Renderable
 from devrf.system.options import Count, Options, Share
 
 Format = Literal["gltf", "html", "ply", "obj", "splats", "usd", "csv", "json"]
+# Formats of nothing but tracks.
+TRACK_FORMATS = ("csv", "json")
 Point = Annotated[Sequence[float], Len(3, 3)]
 Up = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
 Factor = Annotated[float, Ge(1e-9), Le(1e9)]
@@ -52,6 +54,12 @@ class ExportSettings(Options):
     into: str | Path | None = None
 
     def __post_init__(self) -> None:
+        if self.as_tracks:
+            expect(self.content in ("auto", "tracks"), "export.content", "tracks", self.content)
+            kinds = (*TRACK_FORMATS, "usd")
+            expect(self.format in kinds, "export.format", "csv, json or usd of tracks", self.format)
+            given = self.tracks is not None
+            expect(given, "export.tracks", "points [[x,y,z],...] at rest", self.tracks)
         if self.times is None:
             return
         if self.fps is not None:
@@ -64,6 +72,12 @@ class ExportSettings(Options):
     def as_splats(self) -> bool:
         """Whether Gaussians are asked for."""
         return self.format == "splats" or (self.format == "usd" and self.content == "splats")
+
+    @property
+    def as_tracks(self) -> bool:
+        """Whether the ways of points are asked for, by content, format, or these points."""
+        of_tracks = self.content == "tracks" or self.format in TRACK_FORMATS
+        return of_tracks or self.tracks is not None
 
     def export_times(self, clock: FrameClock) -> tuple[float, ...]:
         """The times to export, of a scene whose training frames have the clock's times."""

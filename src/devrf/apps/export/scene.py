@@ -11,7 +11,7 @@ from devrf.apps.export.gltf import write_gltf
 from devrf.apps.export.sequence import Drawn, mesh_files, point_file, write_sequence
 from devrf.apps.export.splats import MovingGaussians, write_splats, write_usd_splats
 from devrf.apps.export.surface import surface_of
-from devrf.apps.export.tracks import FORMATS, write_tracks
+from devrf.apps.export.tracks import write_tracks
 from devrf.apps.export.usd import write_usd
 from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError
@@ -33,13 +33,13 @@ SPLATS = {"splats": ("splats", write_splats), "usd": ("splats.usdc", write_usd_s
 def export_scene(
     model: Renderable, viewpoints: Viewpoints, settings: ExportSettings, folder: Path
 ) -> None:
-    """Write the surface of the learned scene, as it moves, or coloured points of each time.
+    """Write the learned scene's surface as it moves, Gaussians, coloured points, or tracks.
 
     Raises:
         DevrfError: the method has no such geometry, or it is empty.
     """
     times = settings.export_times(viewpoints.clock) if model.moves else (0.0,)
-    if settings.content == "tracks" or settings.format in FORMATS:
+    if settings.as_tracks:
         path = write_tracks(folder, model, viewpoints, settings, times)
         log.info(
             "%d tracks at %d times written to %s", len(settings.tracks or ()), len(times), path

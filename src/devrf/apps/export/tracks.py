@@ -12,13 +12,10 @@ from devrf.apps.export.geometry import ExportSettings, UpFrame
 from devrf.apps.export.sequence import FRAME
 from devrf.apps.export.usd import SceneFile
 from devrf.checkpoints.checkpoint import Viewpoints
-from devrf.errors import DevrfError, expect
+from devrf.errors import DevrfError
 from devrf.rendering.renderable import Renderable
 from devrf.rendering.tracks import track
 from devrf.system.files import atomic_write, write_json
-
-# Formats of nothing but tracks.
-FORMATS = ("csv", "json")
 
 
 def write_tracks(
@@ -33,12 +30,8 @@ def write_tracks(
     Points are in the capture's world; those of USD in metres with y up.
 
     Raises:
-        DevrfError: no points are given, another format is, or the method follows none.
+        DevrfError: the method follows no points.
     """
-    expect(settings.content != "points", "export.content", "tracks", settings.content)
-    kinds = (*FORMATS, "usd")
-    expect(settings.format in kinds, "export.format", "csv, json or usd of tracks", settings.format)
-    expect(bool(settings.tracks), "export.tracks", "points [[x,y,z],...] at rest", settings.tracks)
     offset = torch.tensor(viewpoints.offset, dtype=torch.float64)
     points = torch.tensor(settings.tracks, dtype=torch.float64) - offset
     tracks = track(model, points.float().to(model.device), 0.0, times)
