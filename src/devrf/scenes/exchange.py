@@ -47,7 +47,7 @@ class PrepareSettings:
     """Settings of ``stage=prepare``; ``conf/prepare/default.yaml`` says what each does."""
 
     into: str | Path | None = None
-    layout: Literal["devrf"] | Exchange = "devrf"
+    layout: Literal["devrf", Exchange] = "devrf"
 
 
 def write_for_others(scene: Scene, folder: Path, layout: Exchange) -> None:
