@@ -63,10 +63,14 @@ def test_scores_of_what_moves_have_a_column_and_masks_of_two_rules_a_note(table,
         "21.25",
         "20.00",
     ]
+    assert [cell.rank for cell in table().blocks[0].cells["PSNR moving ↑"]] == [1, 2]
     assert "one rule" not in "".join(table().notes)
     ran("third", ablation="c2f", scores={"psnr_moving": 19.0}, motion_masks="given: /masks")
     notes = "".join(table().notes)
     assert "robot: what moves is not by one rule, so do not compare it: exact; given: /mas" in notes
+    assert {cell.rank for cell in table().blocks[0].cells["PSNR moving ↑"]} == {0}
+    ran("fourth", scores={"psnr_moving": 23.25}, motion_masks="given: /masks")
+    assert not any("(n = 2)" in name for name in texts(table().blocks[0]))
 
 
 def test_novel_times_have_a_column_where_a_run_has_them(table, ran):

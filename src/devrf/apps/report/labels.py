@@ -46,7 +46,8 @@ NOT_LEARNED = {"objective", "seed", "stage", "method"}
 # What runs that share a row have in common beside their settings.
 RECORDED = (
     *("method", "run.train_views", "run.frames", "run.image_size", "run.test_frames"),
-    *("run.device", "run.lpips_network", "run.fingerprint", "run.git", "run.devrf"),
+    *("run.device", "run.lpips_network", "run.motion_masks"),
+    *("run.fingerprint", "run.git", "run.devrf"),
 )
 
 
@@ -93,7 +94,7 @@ def row_name(run: Mapping[str, Any]) -> str:
             parts = [ABLATIONS[ablation]]
         elif ablation != "full":
             parts = [f"{parts[0]} ({ablation})"]
-    # devrf's protocol is none of another program's.
+    # Another program did not follow devrf's protocol.
     unsaid = method == DEFAULT_METHOD or isinstance(run.get("run.predictions"), str)
     usual = (DEFAULT_PROTOCOL, DEFAULT_EXPERIMENT) if unsaid else ()
     parts += [p for p in (run["protocol"], _option(run, "experiment")) if p not in usual]

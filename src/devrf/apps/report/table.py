@@ -27,15 +27,15 @@ MOST_DIFFERENCES = 3
 class Column:
     """A column of the tables, and the ``key`` of its values in a collection; times in seconds.
 
-    A value without ``digits`` is a time in the unit that reads best. Values ``of_hardware`` of
-    different devices cannot be compared.
+    A value without ``digits`` is a time in the unit that reads best. Values compare only among runs
+    that agree in the column ``alike`` of the collection, if there is one.
     """
 
     title: str
     key: str
     higher_is_better: bool
     digits: int | None
-    of_hardware: bool = False
+    alike: str | None = None
     why_missing: str = "it was not recorded"
 
     @property
@@ -50,15 +50,16 @@ NO_WEIGHTS = (
 )
 PSNR = Column("PSNR", "dynamic.psnr", True, 2)
 SSIM = Column("SSIM", "dynamic.ssim", True, 3)
-LPIPS = Column("LPIPS", "dynamic.lpips", False, 4, False, NO_WEIGHTS)
-GPU = Column("GPU (GB)", "peak_gpu_gb", False, 1, True, "no run is known to have used a GPU")
-TIME = Column("Time", "train_seconds", False, None, True)
+LPIPS = Column("LPIPS", "dynamic.lpips", False, 4, None, NO_WEIGHTS)
+NO_GPU = "no run is known to have used a GPU"
+GPU = Column("GPU (GB)", "peak_gpu_gb", False, 1, "run.device", NO_GPU)
+TIME = Column("Time", "train_seconds", False, None, "run.device")
 COLUMNS = (PSNR, SSIM, LPIPS, GPU, TIME)
 TITLES = [column.title for column in COLUMNS]
 # Shown if a run was scored on what moves, or at times that no training view has; the paper has no
 # such columns.
 FURTHER = (
-    Column("PSNR moving", "dynamic.psnr_moving", True, 2),
+    Column("PSNR moving", "dynamic.psnr_moving", True, 2, "run.motion_masks"),
     Column("PSNR at training times", "dynamic.training_times.psnr", True, 2),
     Column("PSNR at novel times", "dynamic.novel_times.psnr", True, 2),
 )
@@ -170,16 +171,16 @@ def tabulate(collection: Collection) -> Table:
     same = {*runs.loc[runs["run.benchmark"] == published().benchmark, "scene"]} & papers
     blocks: list[Block] = []
     for scene in scenes:
-        devices = runs.loc[runs["scene"] == scene, "run.device"]
-        cells = [_cells(rows.loc[scene], spread.loc[scene], columns, devices)]
+        of_scene = runs[runs["scene"] == scene]
+        cells = [_cells(rows.loc[scene], spread.loc[scene], columns, of_scene)]
         if scene in same:
             cells.append(_published_cells(scene, columns))
         blocks.append(Block(scene, pd.concat(cells)))
     gains = pd.DataFrame()
     average = _average(rows, scenes, titles)
     if len(scenes) > 1 and len(average):
-        devices = runs.loc[runs["label"].isin(average.index), "run.device"]
-        measured = _cells(average, average[titles] * math.nan, columns, devices)
+        averaged = runs[runs["label"].isin(average.index)]
+        measured = _cells(average, average[titles] * math.nan, columns, averaged)
         blocks.append(Block(f"average over {len(scenes)} scenes", measured))
         if len(average) > 1 and len(scenes) > 2:
             gains = _gains(rows.reset_index(), average)
@@ -240,14 +241,16 @@ def ranked(values: pd.Series, column: Column) -> pd.Series:
 
 
 def _cells(
-    rows: pd.DataFrame, spread: pd.DataFrame, columns: Sequence[Column], devices: pd.Series
+    rows: pd.DataFrame, spread: pd.DataFrame, columns: Sequence[Column], runs: pd.DataFrame
 ) -> pd.DataFrame:
-    """A block's measured rows; memory and time have ranks only if all ``devices`` agree."""
+    """A block's measured rows; a column has ranks only if its values of all ``runs`` compare."""
     cells = {}
     for column in columns:
         values = rows[column.title]
-        is_ranked = devices.nunique(dropna=False) == 1 or not column.of_hardware
-        ranks = ranked(values, column) if is_ranked else [0] * len(rows)
+        ranks = ranked(values, column)
+        if column.alike is not None:
+            of_values = runs.reindex(columns=[column.alike])[runs[column.title].notna()]
+            ranks *= len(of_values.drop_duplicates()) == 1
         texts = map(shown, values, repeat(column), spread[column.title])
         cells[column.heading] = list(map(Cell, texts, ranks))
     # The number of runs that a row's values are means of, if it is more than one.
