@@ -91,6 +91,7 @@ def test_tracks_by_hand(moving_ball, around, tmp_path):
     for wrong, said in (
         ({"format": "gltf"}, r"^export\.format: expected csv, json or usd"),
         ({"format": "csv", "tracks": None}, r"^export\.tracks: "),
+        ({"format": "csv", "tracks": [[0, 0, torch.nan]]}, r"^export\.tracks.*: expected a finite"),
         ({"format": "csv", "content": "surface"}, r"^export\.content: expected tracks"),
         ({"format": "gltf", "content": "auto"}, r"^export\.format: expected csv, json or usd"),
     ):

@@ -8,6 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, cast
 
+import pydantic
 import pydantic.dataclasses
 import torch
 from annotated_types import Ge, Gt, Le, Len, Lt, MinLen
@@ -24,7 +25,7 @@ from devrf.system.options import Count, Options, Share
 Format = Literal["gltf", "html", "ply", "obj", "splats", "usd", "csv", "json"]
 # Formats of nothing but tracks.
 TRACK_FORMATS = ("csv", "json")
-Point = Annotated[Sequence[float], Len(3, 3)]
+Point = Annotated[Sequence[pydantic.FiniteFloat], Len(3, 3)]
 Up = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
 Factor = Annotated[float, Ge(1e-9), Le(1e9)]
 
