@@ -105,16 +105,7 @@ def pck_t(renderer: Renderer, capture: Capture) -> float | None:
     right, total = 0, 0
     for image in annotated:
         time = float(views.times[image])
-        rays = views.cameras.rays(torch.full((len(places[image]),), image), places[image])
-        if isinstance(renderer.at(time), ImageView):
-            camera = views.cameras.single(image)
-            limits = places[image].new_tensor([camera.width - 1, camera.height - 1])
-            column, row = places[image].clamp(min=0).minimum(limits).long().unbind(1)
-            pixel = row * camera.width + column
-            depth = renderer.view(camera, 0, time, 0.0).depth[pixel]
-        else:
-            depth = renderer.picture(rays, time, 0.0).depth
-        points = points_at_depth(renderer.model.space, rays.to(renderer.device), depth)
+        points = _shown_points(renderer, views, image, places[image])
         tracks = track(renderer.model, points, time, times)
         if tracks is None:
             return None
@@ -129,3 +120,21 @@ def pck_t(renderer: Renderer, capture: Capture) -> float | None:
             right += int((near & both).sum())
             total += int(both.sum())
     return round(right / total, 5) if total else None
+
+
+def _shown_points(renderer: Renderer, views: Views, image: int, places: Tensor) -> Tensor:
+    """World points (K, 3), on the scene's device, at the mean depths of K rays of an image.
+
+    The rays go through ``places`` (K, 2) in pixels; in a scene that renders whole images a place
+    has the depth of its pixel.
+    """
+    time = float(views.times[image])
+    rays = views.cameras.rays(torch.full((len(places),), image), places)
+    if isinstance(renderer.at(time), ImageView):
+        camera = views.cameras.single(image)
+        limits = places.new_tensor([camera.width - 1, camera.height - 1])
+        column, row = places.clamp(min=0).minimum(limits).long().unbind(1)
+        depth = renderer.view(camera, 0, time, 0.0).depth[row * camera.width + column]
+    else:
+        depth = renderer.picture(rays, time, 0.0).depth
+    return points_at_depth(renderer.model.space, rays.to(renderer.device), depth)
