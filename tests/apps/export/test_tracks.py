@@ -93,6 +93,7 @@ def test_tracks_by_hand(moving_ball, around, tmp_path):
         ({"format": "csv", "tracks": None}, r"^export\.tracks: "),
         ({"format": "csv", "tracks": [[0, 0, torch.nan]]}, r"^export\.tracks.*: expected a finite"),
         ({"format": "csv", "content": "surface"}, r"^export\.content: expected tracks"),
+        ({"format": "csv", "part": "still"}, r"^export\.part: expected all beside export\.tracks"),
         ({"format": "gltf", "content": "auto"}, r"^export\.format: expected csv, json or usd"),
     ):
         with pytest.raises(DevrfError, match=said):

@@ -61,6 +61,7 @@ class ExportSettings(Options):
             expect(self.format in kinds, "export.format", "csv, json or usd of tracks", self.format)
             given = self.tracks is not None
             expect(given, "export.tracks", "points [[x,y,z],...] at rest", self.tracks)
+            expect(self.part == "all", "export.part", "all beside export.tracks", self.part)
         if self.times is None:
             return
         if self.fps is not None:
