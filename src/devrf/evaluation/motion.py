@@ -71,11 +71,13 @@ def flicker(views: Views, scored: Sequence[HeldOutView]) -> list[float | None]:
     """Mean |e_t − e_{t−1}| of each image of a fixed camera and the one before it, in [0, 1].
 
     e is the signed error of a channel, the prediction less the truth; only pixels that are valid in
-    both images count. None for a camera's first image, and for cameras that move.
+    both images count. None for a camera's first image, for cameras that move, and where the image
+    before has another size.
     """
     values: list[float | None] = []
     for image, earlier in enumerate(previous_images(views).tolist()):
-        if earlier == image or views.by_moving_camera:
+        same_raster = scored[image].truth.shape == scored[earlier].truth.shape
+        if earlier == image or views.by_moving_camera or not same_raster:
             values.append(None)
             continue
         errors = [scored[k].compared - scored[k].truth for k in (image, earlier)]
