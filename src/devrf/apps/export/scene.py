@@ -41,9 +41,8 @@ def export_scene(
     times = settings.export_times(viewpoints.clock) if model.moves else (0.0,)
     if settings.as_tracks:
         path = write_tracks(folder, model, viewpoints, settings, times)
-        log.info(
-            "%d tracks at %d times written to %s", len(settings.tracks or ()), len(times), path
-        )
+        points = len(settings.tracks or ())
+        log.info("tracks: points %d, times %d; written to %s", points, len(times), path)
         return
     own = MovingGaussians.of_model(model, times) if settings.as_splats else None
     if own is not None:
