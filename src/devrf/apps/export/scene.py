@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from devrf.apps.export.geometry import ExportSettings, MovingMesh, UpFrame, carried
 from devrf.apps.export.gltf import write_gltf
@@ -25,9 +26,15 @@ from devrf.system.progress import followed
 log = logging.getLogger(__name__)
 
 # Formats that move one mesh: the name of what is written, and how.
-SINGLE = {"gltf": ("scene.glb", write_gltf), "usd": ("scene.usdc", write_usd)}
+SINGLE: dict[str, tuple[str, Any]] = {
+    "gltf": ("scene.glb", write_gltf),
+    "usd": ("scene.usdc", write_usd),
+}
 # Formats of Gaussians.
-SPLATS = {"splats": ("splats", write_splats), "usd": ("splats.usdc", write_usd_splats)}
+SPLATS: dict[str, tuple[str, Any]] = {
+    "splats": ("splats", write_splats),
+    "usd": ("splats.usdc", write_usd_splats),
+}
 
 
 def export_scene(
@@ -46,7 +53,7 @@ def export_scene(
         return
     own = MovingGaussians.of_model(model, times) if settings.as_splats else None
     if own is not None:
-        path = _write_splats(folder, own, viewpoints, settings)
+        path = _write_whole(folder, own, viewpoints, settings)
         count = len(own.of_time[0].means)
         log.info("%d Gaussians at %d times written to %s", count, len(times), path)
     elif not _takes_surface(model, settings):
@@ -57,14 +64,12 @@ def export_scene(
         )
         if max_points == 0:
             log.warning("the files are empty: nothing that the cameras see hides what is behind it")
-    elif model.surface() is None:
+    elif (field := model.surface()) is None:
         path = folder / settings.format
         meshes = followed(_meshes(model, viewpoints, settings, times), len(times), "meshes")
         write_sequence(path, settings.format, times, meshes, "surface", settings.seconds)
         log.info("a mesh of its own at %d times written to %s", len(times), path)
     else:
-        field = model.surface()
-        assert field is not None
         surface = surface_of(model, field, viewpoints.static, settings)
         mesh = carried(surface, model, times)
         path = _write_mesh(folder, mesh, viewpoints, settings)
@@ -109,23 +114,24 @@ def _write_mesh(
 ) -> Path:
     """Write in the wanted format; the file, or the folder of files."""
     if settings.as_splats:
-        return _write_splats(folder, MovingGaussians.on_surface(mesh), viewpoints, settings)
-    if settings.format not in SINGLE:
-        path = folder / settings.format
-        drawn = mesh_files(mesh, viewpoints.offset)
-        write_sequence(path, settings.format, mesh.times, drawn, "surface", settings.seconds)
-        return path
-    name, write = SINGLE[settings.format]
-    frame = UpFrame.of(viewpoints.static, settings.up, settings.metres, viewpoints.offset)
-    write(folder / name, mesh, _named_cameras(viewpoints), frame, settings.seconds)
-    return folder / name
+        return _write_whole(folder, MovingGaussians.on_surface(mesh), viewpoints, settings)
+    if settings.format in SINGLE:
+        return _write_whole(folder, mesh, viewpoints, settings)
+    path = folder / settings.format
+    drawn = mesh_files(mesh, viewpoints.offset)
+    write_sequence(path, settings.format, mesh.times, drawn, "surface", settings.seconds)
+    return path
 
 
-def _write_splats(
-    folder: Path, moving: MovingGaussians, viewpoints: Viewpoints, settings: ExportSettings
+def _write_whole(
+    folder: Path,
+    moving: MovingMesh | MovingGaussians,
+    viewpoints: Viewpoints,
+    settings: ExportSettings,
 ) -> Path:
-    """Write Gaussians; the file, or the folder of files."""
-    name, write = SPLATS[settings.format]
+    """Write what moves by a format's own motion; the file, or the folder of files."""
+    writers = SPLATS if isinstance(moving, MovingGaussians) else SINGLE
+    name, write = writers[settings.format]
     frame = UpFrame.of(viewpoints.static, settings.up, settings.metres, viewpoints.offset)
     write(folder / name, moving, _named_cameras(viewpoints), frame, settings.seconds)
     return folder / name

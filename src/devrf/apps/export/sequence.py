@@ -52,14 +52,25 @@ def write_sequence(
     colours are sRGB. The index says that ``content`` is a surface or points, and how many
     ``seconds`` time 0 to 1 takes.
     """
+    files = ((f"frame_{k:04d}.{format}", _content(g, format)) for k, g in enumerate(drawn))
+    write_files(folder, files, times, seconds, {"content": content, "frame": FRAME})
+
+
+def write_files(
+    folder: Path,
+    files: Iterable[tuple[str, bytes]],
+    times: tuple[float, ...],
+    seconds: float,
+    index: dict[str, Any],
+) -> None:
+    """Write a file ``frame….SUFFIX`` for each time, its name and content, and the index last."""
     frames = []
-    for number, (time, geometry) in enumerate(zip(times, drawn, strict=True)):
-        name = f"frame_{number:04d}.{format}"
+    for time, (name, content) in zip(times, files, strict=True):
         with atomic_write(folder / name) as partial:
-            partial.write_bytes(_content(geometry, format))
+            partial.write_bytes(content)
         frames.append({"file": name, "time": time, "seconds": time * seconds})
-    write_json(folder / "index.json", {"content": content, "frame": FRAME, "frames": frames})
-    for path in folder.glob(f"frame_[0-9]*.{format}"):
+    write_json(folder / "index.json", index | {"frames": frames})
+    for path in folder.glob(f"frame*[0-9]{Path(name).suffix}"):
         if path.name not in {frame["file"] for frame in frames}:
             path.unlink()
 

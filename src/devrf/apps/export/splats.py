@@ -10,15 +10,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
+from kornia.geometry.conversions import rotation_matrix_to_quaternion
 from torch import Tensor
-from torch.nn.functional import normalize, pad
+from torch.nn.functional import pad
 
 from devrf.apps.export.geometry import MovingMesh, UpFrame, halfway, vertex_normals
+from devrf.apps.export.sequence import write_files
 from devrf.apps.export.usd import SceneFile
 from devrf.geometry.cameras import Cameras
 from devrf.ops.splatting import Gaussians, rotations
 from devrf.rendering.renderable import Renderable
-from devrf.system.files import atomic_write, write_json
 
 # The properties of a Gaussian, in the order of 3D Gaussian Splatting's files.
 PROPERTIES = (
@@ -71,7 +72,7 @@ class MovingGaussians:
             yield Gaussians(
                 means=frame.points(gaussians.means) * torch.tensor(axes),
                 scales=frame.metres * gaussians.scales,
-                quaternions=quaternions(turn @ rotations(gaussians.quaternions)),
+                quaternions=rotation_matrix_to_quaternion(turn @ rotations(gaussians.quaternions)),
                 opacity=gaussians.opacity,
                 color=gaussians.color,
             )
@@ -100,28 +101,6 @@ def discs(vertices: Tensor, faces: Tensor, colors: Tensor) -> Gaussians:
         opacity=torch.full_like(across, OPACITY),
         color=colors,
     )
-
-
-def quaternions(matrices: Tensor) -> Tensor:
-    """Unit quaternions (N, 4), w first, of rotations (N, 3, 3)."""
-    # Of 4 q qᵀ, all of whose rows are multiples of q: the one with the largest entry.
-    m = matrices
-    trace = m.diagonal(dim1=1, dim2=2)
-    signs = m.new_tensor([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
-    squares = 1 + trace @ signs.T
-    x, y, z = m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]
-    xy, xz, yz = m[:, 1, 0] + m[:, 0, 1], m[:, 0, 2] + m[:, 2, 0], m[:, 2, 1] + m[:, 1, 2]
-    rows = torch.stack(
-        [
-            torch.stack([squares[:, 0], x, y, z], dim=1),
-            torch.stack([x, squares[:, 1], xy, xz], dim=1),
-            torch.stack([y, xy, squares[:, 2], yz], dim=1),
-            torch.stack([z, xz, yz, squares[:, 3]], dim=1),
-        ],
-        dim=1,
-    )
-    largest = squares.argmax(dim=1)
-    return normalize(rows[torch.arange(len(m)), largest], dim=1)
 
 
 def ply(gaussians: Gaussians) -> bytes:
@@ -159,20 +138,12 @@ def write_splats(
     :func:`~devrf.apps.export.gltf.write_gltf`, but y points down. Files of an earlier, longer
     sequence there are removed.
     """
-    frames = []
-    for number, splats in enumerate(moving.placed(frame, DOWN), start=1):
-        name = f"frame{number:04d}.ply"
-        time = moving.times[number - 1]
-        with atomic_write(folder / name) as partial:
-            partial.write_bytes(ply(splats))
-        frames.append({"file": name, "time": time, "seconds": time * seconds})
-    index: dict[str, Any] = {"content": "splats", "frame": "y down, metres", "frames": frames}
+    files = enumerate(map(ply, moving.placed(frame, DOWN)), start=1)
+    index: dict[str, Any] = {"content": "splats", "frame": "y down, metres"}
     if any(frame.offset):
         index["origin"] = [sign * v for sign, v in zip(DOWN, frame.origin, strict=True)]
-    write_json(folder / "index.json", index)
-    for path in folder.glob("frame[0-9]*.ply"):
-        if path.name not in {entry["file"] for entry in frames}:
-            path.unlink()
+    named = ((f"frame{number:04d}.ply", content) for number, content in files)
+    write_files(folder, named, moving.times, seconds, index)
 
 
 def write_usd_splats(
