@@ -107,7 +107,9 @@ def distinct_poses(poses: Tensor) -> Tensor:
     for row, (start, stop) in enumerate(ends.T):
         if numbers[row] < 0:
             rows = order[start:stop]
-            for column in entries.T:  # few are left after the first ones
+            for column in entries.T:
+                if len(rows) == 1:  # itself: soon, of most
+                    break
                 rows = rows[np.abs(column[rows] - column[row]) <= near]
             numbers[rows[numbers[rows] < 0]] = numbers[row] = count
             count += 1

@@ -9,22 +9,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from devrf.apps.inspection.layout import box_middle, box_points, widest_gap
+from devrf.apps.inspection.layout import box_points, widest_gap
 from devrf.errors import DevrfError
 from devrf.geometry.clock import FrameClock
 from devrf.pictures.images import evenly
 from devrf.scenes.bounds import box_from_cameras
 from devrf.scenes.optical_flow import estimator, flow_between, frame_pairs
 from devrf.scenes.scene import Scene, Views
-from devrf.scenes.splits import standing
+from devrf.scenes.splits import distinct_poses, standing
 
 # Largest gap between neighbouring static views, as seen from the box's middle, in degrees.
 WIDEST_GAP = 120.0
-# Two cameras are the same when their axes differ by less than this (radians, about), and their
-# positions by less than this share of the distance to the scene.
-SAME = 1e-4
-# Cameras are ordered by their positions along this direction.
-LINE = torch.tensor([1.0, 2**0.5, 3**0.5], dtype=torch.float64)
 # An image whose values all lie within this of one another, of 255, shows nothing.
 FLAT = 2
 # A pixel is in the alpha mask above this, of 255.
@@ -90,7 +85,7 @@ def _held_out(scene: Scene) -> Iterator[Advice]:
                 "holds no view, so nothing can be scored",
                 "hold out some images of the capture",
             )
-        elif twins := _twins(capture.test, capture.train, box_middle(scene)):
+        elif twins := _twins(capture.test, capture.train):
             yield Advice(
                 f"{name} test set",
                 f"{listed(twins)}: the same camera and time as a training view, so the score "
@@ -99,29 +94,15 @@ def _held_out(scene: Scene) -> Iterator[Advice]:
             )
 
 
-def _twins(test: Views, train: Views, middle: Tensor) -> list[str]:
+def _twins(test: Views, train: Views) -> list[str]:
     """Names of the test views that have the camera and the time of a training view."""
-    reach = max(float((train.cameras.positions - middle).norm(dim=1).mean()), 1e-9)
-    poses = train.cameras.camera_to_world
-
-    def along(views: Views) -> Tensor:
-        return views.cameras.positions.double() @ LINE / reach + views.times
-
-    # Only views that are near along LINE and in time can be the same, so that few are compared.
-    order = along(train).argsort()
-    near = 2 * (SAME * float(LINE.norm()) + FrameClock.TOLERANCE)
-    places = torch.stack([along(test) - near, along(test) + near], dim=1)
-    ends = torch.searchsorted(along(train)[order], places)
-    names = []
-    for k, (start, stop) in enumerate(ends.tolist()):
-        pose = test.cameras.camera_to_world[k]
-        near_views = order[start:stop]
-        turned = (poses[near_views, :, :3] - pose[:, :3]).abs().amax(dim=(1, 2))
-        moved = (poses[near_views, :, 3] - pose[:, 3]).norm(dim=1) / reach
-        apart = (train.times[near_views] - test.times[k]).abs()
-        if bool(((turned < SAME) & (moved < SAME) & (apart <= FrameClock.TOLERANCE)).any()):
-            names.append(test.names[k])
-    return names
+    poses = [views.cameras.camera_to_world for views in (train, test)]
+    times = torch.cat([train.times, test.times])
+    frames = FrameClock.from_times(times).frames_of(times)
+    shots = [*zip(distinct_poses(torch.cat(poses)).tolist(), frames.tolist(), strict=True)]
+    learned = {*shots[: len(train)]}
+    of_test = zip(test.names, shots[len(train) :], strict=True)
+    return [name for name, shot in of_test if shot in learned]
 
 
 def _box_unknown(scene: Scene) -> Iterator[Advice]:
@@ -174,30 +155,24 @@ def _images(scene: Scene) -> Iterator[Advice]:
     """Problems of single images; sets may share files, and each is named once."""
     points = box_points(scene, scene.bounds.box, (9, 9, 9))
 
-    def project(views: Views, images: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels (K, M, 2) and depths (K, M) of ``targets`` (M, 3) in K images."""
-        repeated = targets.repeat(len(images), 1)
-        pixels, depth = views.cameras.project(images.repeat_interleave(len(targets)), repeated)
-        return pixels.view(len(images), -1, 2), depth.view(len(images), -1)
+    def of_middle(views: Views) -> tuple[Tensor, Tensor]:
+        """Pixels (N, 2) and depths (N,) of the middle of the box."""
+        middle = points[4, 4, 4].expand(len(views), 3)
+        return views.cameras.project(torch.arange(len(views)), middle)
 
-    def sees(views: Views, images: Tensor, targets: Tensor) -> Tensor:
-        """(K,) bool: whether any of the ``targets`` is in the picture."""
-        pixels, depth = project(views, images, targets)
-        size = views.cameras.extents[images]
-        within = ((pixels >= 0) & (pixels <= size[:, None])).all(dim=2)
-        return ((depth > 0) & within).any(dim=1)
+    def shown(pixels: Tensor, depth: Tensor, size: Tensor) -> Tensor:
+        return (depth > 0) & ((pixels >= 0) & (pixels <= size)).all(dim=-1)
 
     def away(views: Views) -> list[bool]:
-        middle = points[4, 4, 4:5]
-        return (project(views, torch.arange(len(views)), middle)[1][:, 0] <= 0).tolist()
+        return (of_middle(views)[1] <= 0).tolist()
 
     def beside(views: Views) -> list[bool]:
-        coarse = points[::4, ::4, ::4].reshape(-1, 3)
-        fine = points.reshape(-1, 3)
-        in_picture = sees(views, torch.arange(len(views)), coarse) | torch.tensor(away(views))
-        for k in (~in_picture).nonzero()[:, 0]:
-            in_picture[k] = sees(views, k[None], fine)[0]
-        return (~in_picture).tolist()
+        pixels, depth = of_middle(views)
+        size = views.cameras.extents
+        fine = (depth <= 0) | shown(pixels, depth, size)
+        for k in (~fine).nonzero()[:, 0].tolist():
+            fine[k] = shown(*views.cameras.project_into(k, points.view(-1, 3)), size[k]).any()
+        return (~fine).tolist()
 
     pose = "check the pose (camera-to-world, x right, y up, looking along -z), or set data.box"
     for test, problem, remedy in (
