@@ -16,7 +16,7 @@ from devrf.geometry.clock import FrameClock
 from devrf.scenes.files import Number, scene_folder
 from devrf.scenes.flow_files import FlowDirection
 from devrf.scenes.image_folders import Downscale, SizeAt, whole_factor
-from devrf.scenes.layout import Layout, load_layout
+from devrf.scenes.layout import Layout, fewer, load_layout
 from devrf.scenes.names import Missing
 from devrf.scenes.scene import Background, Capture, OpticalFlow, Scene, Views
 from devrf.scenes.space import SpaceChoice, centred, forward_facing_scene, inward_space
@@ -81,7 +81,7 @@ class SceneReader(Options, ABC):
     root: str | Path
     _: KW_ONLY
     name: str | None = None
-    downscale: Downscale = 1
+    downscale: Downscale = "auto"
     background: Background = "white"
     flow: FlowSource = "auto"
     flow_cache: str | Path | None = None
@@ -124,11 +124,21 @@ class SceneReader(Options, ABC):
 
 @dataclass(frozen=True)
 class LayoutReader(SceneReader):
-    """Reads lists of images and their poses: a :class:`~devrf.scenes.layout.Layout`."""
+    """Reads lists of images and their poses: a :class:`~devrf.scenes.layout.Layout`.
+
+    Attributes:
+        train_views: train on the first so many fixed views of the scene in motion; None: all.
+    """
+
+    _: KW_ONLY
+    train_views: Count | None = None
 
     @abstractmethod
     def layout(self, folder: Path) -> Layout:
-        """The splits of the scene in ``folder``, from files and the headers of images."""
+        """The splits of the scene in ``folder``, from files and the headers of images.
+
+        All views and times; those that options leave out are left out afterwards.
+        """
 
     @abstractmethod
     def placed(self, layout: Layout, static: Capture, dynamic: Capture) -> Scene:
@@ -144,7 +154,7 @@ class LayoutReader(SceneReader):
     def read(self) -> Scene:
         """See :meth:`SceneReader.read`."""
         folder = scene_folder(self.root)
-        layout = self.layout(folder)
+        layout = fewer(self.layout(folder), self.train_views, self.frames)
         factor = layout.static_train.transforms.downscale or self.choose_factor(layout.size_at)
         static, dynamic = load_layout(layout, folder, factor)
         if self.wants_flow_files:
@@ -155,7 +165,8 @@ class LayoutReader(SceneReader):
 
     def forward_flow(self, views: Views) -> OpticalFlow | None:
         """See :meth:`SceneReader.forward_flow`."""
-        return self._flow(self.layout(scene_folder(self.root)), views, "fwd")
+        layout = self.layout(scene_folder(self.root))
+        return self._flow(fewer(layout, self.train_views, self.frames), views, "fwd")
 
     def _flow(self, layout: Layout, views: Views, direction: FlowDirection) -> OpticalFlow | None:
         if not layout.moves:
@@ -175,17 +186,14 @@ class FixedViewsReader(LayoutReader):
     Attributes:
         dynamic: name of the ``dynamic_*views`` folder, if there are several.
         test_view: the held-out fixed view: 4 is ``view4``, −1 the last, −2 the last but one.
-        train_views: train on the first so many of the views that are not held out; None: all.
         holdout: every ``holdout``-th static image, in the order of their names, is held out, the
             first one included.
     """
 
     _: KW_ONLY
     dynamic: str | None = None
-    downscale: Downscale = "auto"
     test_view: Annotated[int, Field(strict=True)] = -1
     holdout: Several = 8
-    train_views: Count | None = None
 
 
 @dataclass(frozen=True)

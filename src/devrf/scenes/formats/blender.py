@@ -12,7 +12,8 @@ from pydantic.dataclasses import dataclass
 
 from devrf.scenes.files import existing_folder
 from devrf.scenes.flow_files import FlowDirection, read_flow
-from devrf.scenes.layout import Layout, Pair, fewer, one_capture, static_alone, two_captures
+from devrf.scenes.image_folders import Downscale
+from devrf.scenes.layout import Layout, Pair, one_capture, static_alone, two_captures
 from devrf.scenes.reader import InwardReader, Time
 from devrf.scenes.scene import OpticalFlow, Views
 from devrf.scenes.splits import (
@@ -26,7 +27,6 @@ from devrf.scenes.splits import (
 )
 from devrf.scenes.transforms import Transforms, TransformsFiles
 from devrf.scenes.view_folders import dynamic_folder, dynamic_folders
-from devrf.system.options import Count
 
 log = logging.getLogger(__name__)
 
@@ -50,7 +50,6 @@ class BlenderReader(InwardReader):
 
     Attributes:
         dynamic: name of the ``dynamic_*views`` folder, if there are several.
-        train_views: train on the first so many dynamic views; None: all.
         static_until: without a static set, the latest time of an image that counts as static.
         alpha_weighted: whether colours are weighted by their alpha when images are made smaller;
             DeVRF's authors average each channel by itself.
@@ -59,8 +58,8 @@ class BlenderReader(InwardReader):
     has_flow_files: ClassVar[bool] = True
 
     _: KW_ONLY
+    downscale: Downscale = 1
     dynamic: str | None = None
-    train_views: Count | None = None
     static_until: Time = 1.0
     alpha_weighted: bool = True
 
@@ -88,8 +87,7 @@ class BlenderReader(InwardReader):
             _, validation = files.read(val)
             check_timed_alike(layout.dynamic_train.transforms, validation)
             layout = layout.with_validation(validation)
-        layout = replace(layout, alpha_weighted=self.alpha_weighted)
-        return fewer(layout, self.train_views, self.frames)
+        return replace(layout, alpha_weighted=self.alpha_weighted)
 
     def flow_of(self, split: Split, views: Views, direction: FlowDirection) -> OpticalFlow | None:
         """See :meth:`devrf.scenes.reader.LayoutReader.flow_of`."""

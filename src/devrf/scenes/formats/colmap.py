@@ -11,9 +11,9 @@ from typing import ClassVar
 from pydantic.dataclasses import dataclass
 
 from devrf.scenes.files import inside
-from devrf.scenes.image_folders import Downscale, ImageFolder, image_folder
+from devrf.scenes.image_folders import ImageFolder, image_folder
 from devrf.scenes.images import SUFFIXES
-from devrf.scenes.layout import Layout, fewer, static_alone
+from devrf.scenes.layout import Layout, static_alone
 from devrf.scenes.names import ImageFinder, present_images
 from devrf.scenes.reader import EstimatedFlow, FixedViewsReader, PosedReader
 from devrf.scenes.scene import Capture
@@ -131,7 +131,6 @@ class ColmapReader(PosedReader, FixedViewsReader):
     stater: ClassVar[str] = "the sparse model"
 
     _: KW_ONLY
-    downscale: Downscale = "auto"
     flow: EstimatedFlow = "auto"
 
     def layout(self, folder: Path) -> Layout:
@@ -169,24 +168,22 @@ class ColmapReader(PosedReader, FixedViewsReader):
         moving = dynamic_folder(folder, self.dynamic)
         if moving is None:
             why = "there is no folder dynamic_<V>views"
-            layout = static_alone(images[train], images[test], why)
-        else:
-            views = view_folders(moving, factor)
-            posed = fixed_cameras(model, moving, len(views))
-            test_view = held_out_view(len(views), self.test_view)
-            # The held-out camera's static image is held out, too.
-            unseen = {k for k, position in enumerate(positions) if position == posed[test_view]}
-            train = [k for k in train if k not in unseen]
-            test = sorted({*test, *unseen})
-            layout = with_fixed_views(
-                (images[train], images[test]),
-                views,
-                posed_by=model.folder,
-                poses=world.poses[posed],
-                lenses=[lenses[k] for k in posed],
-                test=test_view,
-            )
-        return fewer(layout, self.train_views, self.frames)
+            return static_alone(images[train], images[test], why)
+        views = view_folders(moving, factor)
+        posed = fixed_cameras(model, moving, len(views))
+        test_view = held_out_view(len(views), self.test_view)
+        # The held-out camera's static image is held out, too.
+        unseen = {k for k, position in enumerate(positions) if position == posed[test_view]}
+        train = [k for k in train if k not in unseen]
+        test = sorted({*test, *unseen})
+        return with_fixed_views(
+            (images[train], images[test]),
+            views,
+            posed_by=model.folder,
+            poses=world.poses[posed],
+            lenses=[lenses[k] for k in posed],
+            test=test_view,
+        )
 
     def stated(self, layout: Layout, static: Capture) -> SceneBounds | None:
         """The bounds of the sparse points."""

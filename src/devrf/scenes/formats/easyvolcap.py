@@ -21,8 +21,8 @@ from torch import Tensor
 
 from devrf.geometry.cameras import Distortion
 from devrf.scenes.files import Numbers, decoding, existing_file
-from devrf.scenes.image_folders import Downscale, listed_images
-from devrf.scenes.layout import Layout, fewer, with_static_times
+from devrf.scenes.image_folders import listed_images
+from devrf.scenes.layout import Layout, with_static_times
 from devrf.scenes.lens import Intrinsics
 from devrf.scenes.names import ImageFinder
 from devrf.scenes.reader import EstimatedFlow, InwardReader
@@ -30,7 +30,7 @@ from devrf.scenes.transforms import Shot, posed_images
 from devrf.scenes.validation import LARGEST, scene_error
 from devrf.scenes.view_folders import held_out_view
 from devrf.system.files import read_yaml
-from devrf.system.options import Count, abbreviated
+from devrf.system.options import abbreviated
 from devrf.system.printed import is_shown
 
 INTRINSICS = "intri.yml"
@@ -46,16 +46,13 @@ class EasyVolcapReader(InwardReader):
 
     Attributes:
         test_view: the held-out camera: 4 is the fourth of the file, −1 the last.
-        train_views: train on the first so many of the others; None: all.
         masks: ``alpha``: what is black in ``masks/``, if it is there, is background; ``none``:
             masks are not read.
     """
 
     _: KW_ONLY
-    downscale: Downscale = "auto"
     flow: EstimatedFlow = "auto"
     test_view: Annotated[int, Field(strict=True)] = -1
-    train_views: Count | None = None
     masks: Literal["alpha", "none"] = "alpha"
 
     def layout(self, folder: Path) -> Layout:
@@ -93,8 +90,7 @@ class EasyVolcapReader(InwardReader):
         test = held_out_view(len(cameras), self.test_view)
         held_out = range(test, len(shots), len(cameras))
         learned = sorted({*range(len(shots))} - {*held_out})
-        layout = with_static_times(everything[learned], everything[held_out], None)
-        return fewer(layout, self.train_views, self.frames)
+        return with_static_times(everything[learned], everything[held_out], None)
 
 
 def read_cameras(intrinsics: Path, extrinsics: Path) -> dict[str, tuple[Tensor, Intrinsics]]:

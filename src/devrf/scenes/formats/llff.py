@@ -21,7 +21,7 @@ from devrf.scenes.formats.llff_poses import (
     read_static_poses,
 )
 from devrf.scenes.image_folders import ImageFolder, folder_size, image_folder, listed_images
-from devrf.scenes.layout import Layout, fewer, static_alone, without_static_set
+from devrf.scenes.layout import Layout, static_alone, without_static_set
 from devrf.scenes.names import in_order
 from devrf.scenes.reader import FixedViewsReader, Time
 from devrf.scenes.scene import Capture, OpticalFlow, Scene, Views
@@ -84,30 +84,27 @@ class LlffReader(FixedViewsReader):
             video = moving is None and os.path.isfile(static / PRECOMPUTED)
         if video:
             near = SceneBounds(space="ndc", near=posed.near_plane())
-            layout = self._video(replace(images, bounds=near))
-            return fewer(layout, self.train_views, self.frames)
+            return self._video(replace(images, bounds=near))
         parts = parted(range(len(posed)), (), self.holdout, posed.file, start=0)
         train, test = (images[part] for part in parts)
         if moving is None:
-            layout = static_alone(train, test, "there are no times")
-        else:
-            views = view_folders(moving, factor)
-            cameras = read_dynamic_poses(moving)
-            count = len(views)
-            if len(cameras) < count:
-                raise scene_error(
-                    cameras.file,
-                    f"has {len(cameras)} cameras, but there are {count} folders view1 …; add some",
-                )
-            layout = with_fixed_views(
-                (train, test),
-                views,
-                posed_by=cameras.file,
-                poses=cameras.poses[-count:],
-                lenses=cameras.intrinsics[-count:],
-                test=held_out_view(count, self.test_view),
+            return static_alone(train, test, "there are no times")
+        views = view_folders(moving, factor)
+        cameras = read_dynamic_poses(moving)
+        count = len(views)
+        if len(cameras) < count:
+            raise scene_error(
+                cameras.file,
+                f"has {len(cameras)} cameras, but there are {count} folders view1 …; add some",
             )
-        return fewer(layout, self.train_views, self.frames)
+        return with_fixed_views(
+            (train, test),
+            views,
+            posed_by=cameras.file,
+            poses=cameras.poses[-count:],
+            lenses=cameras.intrinsics[-count:],
+            test=held_out_view(count, self.test_view),
+        )
 
     def placed(self, layout: Layout, static: Capture, dynamic: Capture) -> Scene:
         """See :meth:`devrf.scenes.reader.LayoutReader.placed`."""

@@ -26,8 +26,8 @@ from devrf.scenes.files import (
     inside,
     read_json,
 )
-from devrf.scenes.image_folders import Downscale, ImageFolder, folder_size, image_folder
-from devrf.scenes.layout import Layout, fewer, one_capture
+from devrf.scenes.image_folders import ImageFolder, folder_size, image_folder
+from devrf.scenes.layout import Layout, one_capture
 from devrf.scenes.lens import Intrinsics
 from devrf.scenes.names import ImageFinder, present_images
 from devrf.scenes.reader import EstimatedFlow, InwardReader, Time
@@ -184,8 +184,7 @@ class ItemsReader(InwardReader):
             bounds=SceneBounds(space="contracted", near=world.near, far=world.far),
             offset=offset,
         )
-        layout = one_capture(posed[train], posed[test], self.static_until)
-        return fewer(layout, None, self.frames)
+        return one_capture(posed[train], posed[test], self.static_until)
 
     def placed(self, layout: Layout, static: Capture, dynamic: Capture) -> Scene:
         """See :meth:`devrf.scenes.reader.LayoutReader.placed`."""
@@ -237,9 +236,6 @@ class NerfiesReader(ItemsReader):
     """
 
     listing: ClassVar[str] = "dataset.json"
-
-    _: KW_ONLY
-    downscale: Downscale = "auto"
 
     def listed(self, folder: Path) -> Listed:
         """The ids in ``dataset.json``."""

@@ -9,11 +9,9 @@ from typing import ClassVar, Literal
 
 from pydantic.dataclasses import dataclass
 
-from devrf.scenes.image_folders import Downscale
 from devrf.scenes.layout import (
     Layout,
     dynamic_images,
-    fewer,
     static_alone,
     two_captures,
     with_static_times,
@@ -23,7 +21,7 @@ from devrf.scenes.reader import EstimatedFlow, PosedReader, Time
 from devrf.scenes.splits import parted
 from devrf.scenes.transforms import Transforms, TransformsFiles
 from devrf.scenes.validation import scene_error
-from devrf.system.options import Count, Several, abbreviated
+from devrf.system.options import Several, abbreviated
 
 FILE = "transforms.json"
 
@@ -42,7 +40,6 @@ class NerfstudioReader(PosedReader):
     pixels left out.
 
     Attributes:
-        train_views: train on the first so many dynamic views; None: all.
         holdout: without lists in the file, one of so many images is held out.
         times: ``file`` takes each frame's ``time``; ``order`` spreads times evenly over the images
             in the order of their names, for a video that another program posed.
@@ -59,9 +56,7 @@ class NerfstudioReader(PosedReader):
     stater: ClassVar[str] = f"scene_bounds in {FILE}"
 
     _: KW_ONLY
-    downscale: Downscale = "auto"
     flow: EstimatedFlow = "auto"
-    train_views: Count | None = None
     holdout: Several = 8
     times: Literal["file", "order"] = "file"
     static_until: Time | None = None
@@ -89,8 +84,7 @@ class NerfstudioReader(PosedReader):
                 layout = two_captures(static_pair, (train, test))
             else:
                 layout = static_alone(train, test, f"there is no dynamic/{FILE}")
-        layout = layout.with_validation(validation)
-        return fewer(layout, self.train_views, self.frames)
+        return layout.with_validation(validation)
 
     def _splits(
         self, files: TransformsFiles, file: Path

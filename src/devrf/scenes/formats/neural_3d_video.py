@@ -20,7 +20,6 @@ from torch import Tensor
 from devrf.scenes.files import Positive, entries, scene_folder
 from devrf.scenes.footage import VIDEOS, FootageHeader, Size, footage_header, frames_at
 from devrf.scenes.formats.llff_poses import PosedSet, read_static_poses
-from devrf.scenes.image_folders import Downscale
 from devrf.scenes.images import in_threads
 from devrf.scenes.names import in_order
 from devrf.scenes.reader import EstimatedFlow, SceneReader
@@ -155,7 +154,6 @@ class Neural3DVideoReader(SceneReader):
     """
 
     _: KW_ONLY
-    downscale: Downscale = "auto"
     flow: EstimatedFlow = "auto"
     test_view: Whole = 0
     near: Positive = 1.0

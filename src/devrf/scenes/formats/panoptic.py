@@ -12,14 +12,12 @@ from pydantic.dataclasses import dataclass
 
 from devrf.geometry.offset import Offset
 from devrf.scenes.files import MOST_IMAGES, Name, Positive, Vector3, Vector4, read_json
-from devrf.scenes.image_folders import Downscale
-from devrf.scenes.layout import Layout, fewer, with_static_times
+from devrf.scenes.layout import Layout, with_static_times
 from devrf.scenes.lens import Intrinsics
 from devrf.scenes.names import ImageFinder
 from devrf.scenes.reader import EstimatedFlow, InwardReader
 from devrf.scenes.transforms import Shot, Transforms, posed_images
 from devrf.scenes.validation import scene_error
-from devrf.system.options import Count
 
 TRAIN = "train_meta.json"
 TEST = "test_meta.json"
@@ -57,15 +55,12 @@ class PanopticReader(InwardReader):
     Cameras all around take an image each at each time. Those of the first time are the static set.
 
     Attributes:
-        train_views: train on the first so many cameras; None: all.
         masks: ``none``: the dome behind the subject is learned, too; ``alpha``: what is black in
             ``seg/`` is background.
     """
 
     _: KW_ONLY
-    downscale: Downscale = "auto"
     flow: EstimatedFlow = "auto"
-    train_views: Count | None = None
     masks: Literal["none", "alpha"] = "none"
 
     def layout(self, folder: Path) -> Layout:
@@ -73,7 +68,7 @@ class PanopticReader(InwardReader):
         finder = ImageFinder(folder)
         train = self._listed(folder / TRAIN, finder)
         test = self._listed(folder / TEST, finder, train.offset)
-        return fewer(with_static_times(train, test, None), self.train_views, self.frames)
+        return with_static_times(train, test, None)
 
     def _listed(self, file: Path, finder: ImageFinder, offset: Offset | None = None) -> Transforms:
         """The images of a file; positions lose the ``offset``, or one of their own."""
