@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -305,15 +306,23 @@ def box_between(
     −1 is the near plane, 1 infinity. DevrfError if a camera sees points that are not before the
     reference camera.
     """
-    ends = torch.cat([_seen(views, space, (front, back)) for views in everyone])
+    frusta = (frusta_in(space, views.cameras, views.names, (front, back)) for views in everyone)
+    ends = torch.cat([*frusta])
     low = ends.amin(dim=0).tolist()
     high = ends.amax(dim=0).tolist()
     return Box.of([low[0], low[1], front], [high[0], high[1], back])
 
 
-def _seen(views: Views, space: NormalizedDevice, depths: tuple[float, float]) -> Tensor:
-    """NDC (8 · N, 3) of the rays through the corners of N images at two ``depths`` z'."""
-    cameras = views.cameras
+def frusta_in(
+    space: NormalizedDevice,
+    cameras: Cameras,
+    names: Sequence[str],
+    depths: tuple[float, float] = (-1.0, 1.0),
+) -> Tensor:
+    """NDC (8 · N, 3) of the rays through the corners of N images at two ``depths`` z'.
+
+    Errors are those of :func:`box_between`, by the images' ``names``.
+    """
     edge = cameras.focal.new_tensor([(0, 0), (1, 0), (0, 1), (1, 1)])
     corners = (edge * cameras.extents[:, None]).flatten(0, 1)
     image = torch.arange(len(cameras)).repeat_interleave(len(edge))
@@ -321,7 +330,7 @@ def _seen(views: Views, space: NormalizedDevice, depths: tuple[float, float]) ->
     steep = (-rays.directions[:, 2] < LEAST_COSINE).nonzero().flatten()
     if len(steep):
         raise scene_error(
-            views.names[int(image[steep[0]])],
+            names[int(image[steep[0]])],
             "its camera does not look along the common viewing "
             "direction, so normalised device coordinates cannot hold its view; leave the "
             "image out, or use data=inward for cameras around a scene",
@@ -332,7 +341,7 @@ def _seen(views: Views, space: NormalizedDevice, depths: tuple[float, float]) ->
     away = (~(ends.abs() <= WIDEST).all(dim=-1).all(dim=0)).nonzero().flatten()
     if len(away):
         raise scene_error(
-            views.names[int(image[away[0]])],
+            names[int(image[away[0]])],
             "its camera is too far from the others for "
             "normalised device coordinates to hold its view; correct its position, or leave "
             "the image out",

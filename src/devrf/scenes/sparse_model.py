@@ -20,10 +20,12 @@ from torch.nn.functional import normalize
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.poses import average_pose, from_opencv, relative_to
-from devrf.scenes.bounds import LEAST_COSINE, nearest_point
+from devrf.scenes.bounds import frusta_in, nearest_point, reference_space
 from devrf.scenes.files import MOST_IMAGES, decoding, entries
 from devrf.scenes.lens import CameraKeys, Intrinsics, intrinsics_of
 from devrf.scenes.names import in_order
+from devrf.scenes.splits import pinholes
+from devrf.scenes.transforms import SceneBounds
 from devrf.scenes.validation import FARTHEST, in_reach, scene_error
 from devrf.system.options import abbreviated
 
@@ -323,19 +325,14 @@ class World:
     Attributes:
         poses: (N, 3, 4) float64 camera-to-world, OpenGL axes, world units.
         points: (P, 3) float64.
-        space: ``ndc`` or ``contracted``.
-        near: least distance of the scene, world units.
-        far: largest distance of a sparse point, world units.
-        box: low and high corner of the part that the cameras look at; None for ``ndc``, and if the
-            cameras' axes meet: then the part that all cameras see is the better guess.
+        bounds: its space, ``ndc`` or ``contracted``, its distances, and the part that the cameras
+            look at: no box for ``ndc``, and if the cameras' axes meet: then the part that all
+            cameras see is the better guess.
     """
 
     poses: Tensor
     points: Tensor
-    space: Literal["ndc", "contracted"]
-    near: float
-    far: float
-    box: tuple[Corner, Corner] | None
+    bounds: SceneBounds
 
 
 def normalised(model: SparseModel, facing: Facing = "auto", *, left_out: float = LEFT_OUT) -> World:
@@ -351,15 +348,19 @@ def normalised(model: SparseModel, facing: Facing = "auto", *, left_out: float =
     if facing == "auto":
         facing = "forward" if widest_angle(poses) <= ONE_SIDE else "inward"
     if facing == "forward":
-        world = _forward(poses, points, near, far)
+        scale = NEAREST / near
+        poses, points = _moved(poses, points, average_pose(poses), scale)
+        near, far, box = 1.0, far * scale, None
     else:
-        world = _inward(poses, points, near, far, left_out)
-    here = bool(in_reach(world.poses[:, :, 3]).all())
-    if not here or not 0 < world.near < world.far <= FARTHEST:  # NaN compares false
+        poses, points, near, far, box = _inward(poses, points, near, far, left_out)
+    here = bool(in_reach(poses[:, :, 3]).all())
+    if not here or not 0 < near < far <= FARTHEST:  # NaN compares false
         raise scene_error(
             model.folder, f"its cameras do not look {facing} at a scene; run COLMAP's mapper again"
         )
-    return world
+    space = "ndc" if facing == "forward" else "contracted"
+    bounds = SceneBounds.model_validate({"space": space, "near": near, "far": far, "box": box})
+    return World(poses, points, bounds)
 
 
 def _depth_range(model: SparseModel) -> tuple[float, float]:
@@ -385,29 +386,21 @@ def ndc_holds(model: SparseModel) -> bool:
     are too few points.
     """
     nearest, _ = _depth_range(model)
-    if widest_angle(model.poses) > ONE_SIDE:
-        return False
-    poses = relative_to(average_pose(model.poses), model.poses)
     plane = nearest / NEAREST
-    if float(poses[:, 2, 3].min()) <= -plane:
+    poses = relative_to(average_pose(model.poses), model.poses)
+    if widest_angle(model.poses) > ONE_SIDE or float(poses[:, 2, 3].min()) <= -plane:
         return False
-    lenses = [model.cameras[image.camera] for image in model.images]
-    focal = torch.tensor([[lens["fl_x"], lens["fl_y"]] for lens in lenses], dtype=poses.dtype)
-    size = torch.tensor([[lens["w"], lens["h"]] for lens in lenses], dtype=poses.dtype)
-    center = torch.tensor([[lens["cx"], lens["cy"]] for lens in lenses], dtype=poses.dtype)
-    corner = torch.cartesian_prod(*[torch.tensor([0.0, 1.0], dtype=poses.dtype)] * 2)
-    x, y = ((corner * size[:, None] - center[:, None]) / focal[:, None]).unbind(-1)
-    ahead = torch.stack([x, -y, -torch.ones_like(x)], dim=-1)
-    rays = normalize(ahead @ poses[:, :, :3].mT, dim=-1)
-    if float((-rays[..., 2]).min()) < LEAST_COSINE:
+    keys = [model.cameras[image.camera] for image in model.images]
+    sizes = [(int(camera["w"]), int(camera["h"])) for camera in keys]
+    shots = zip(model.intrinsics, sizes, strict=True)
+    cameras = pinholes(poses, [c.lens(*size, model.folder) for c, size in shots], sizes)
+    space = reference_space(cameras, plane)
+    try:
+        ends = frusta_in(space, cameras, [image.name for image in model.images])
+    except DevrfError:
         return False
-    # Positions of rays through the corners, on the plane and at infinity, over depth.
-    at_infinity = rays[..., :2] / -rays[..., 2:]
-    position = poses[:, None, :, 3]
-    on_plane = (position[..., :2] + at_infinity * (plane + position[..., 2:])) / plane
-    slopes = torch.cat([at_infinity, on_plane]).flatten(0, 1)
-    wide = (slopes.amax(dim=0) - slopes.amin(dim=0)) * (focal / size).mean(dim=0)
-    return float(wide.max()) <= WIDEST
+    across = ends[:, :2].amax(dim=0) - ends[:, :2].amin(dim=0)
+    return float(across.max()) / 2 <= WIDEST  # NDC are from −1 to 1
 
 
 def widest_angle(poses: Tensor) -> float:
@@ -417,14 +410,9 @@ def widest_angle(poses: Tensor) -> float:
     return float(torch.rad2deg((axes @ mean).clamp(-1, 1).acos()).max())
 
 
-def _forward(poses: Tensor, points: Tensor, near: float, far: float) -> World:
-    frame = average_pose(poses)
-    scale = NEAREST / near
-    poses, points = _moved(poses, points, frame, scale)
-    return World(poses, points, space="ndc", near=1.0, far=far * scale, box=None)
-
-
-def _inward(poses: Tensor, points: Tensor, near: float, far: float, left_out: float) -> World:
+def _inward(
+    poses: Tensor, points: Tensor, near: float, far: float, left_out: float
+) -> tuple[Tensor, Tensor, float, float, tuple[Corner, Corner] | None]:
     axes_meet = nearest_point(poses[:, :, 3], poses[:, :, 2], 1e-2)
     # The axes of cameras that do not go round the scene meet anywhere, or behind them.
     if axes_meet is not None and (widest_angle(poses) <= ONE_SIDE or _is_behind(axes_meet, poses)):
@@ -442,7 +430,7 @@ def _inward(poses: Tensor, points: Tensor, near: float, far: float, left_out: fl
     if axes_meet is not None:
         # Sparse points are on floor and walls, too: the subject would have a fraction of the voxels
         # in their box.
-        return World(poses, points, "contracted", near, far, None)
+        return poses, points, near, far, None
     # The span of the sparse points around the middle, within the cameras' circle.
     around = points[points.norm(dim=1) < AROUND]
     if len(around) < 10:
@@ -451,7 +439,7 @@ def _inward(poses: Tensor, points: Tensor, near: float, far: float, left_out: fl
     high = np.percentile(around.numpy(), 100 - left_out, axis=0).clip(-AROUND, AROUND)
     margin = 0.1 * np.maximum(high - low, 0.1 * AROUND)
     inner = Box.of((low - margin).tolist(), (high + margin).tolist())
-    return World(poses, points, "contracted", near, far, (inner.low, inner.high))
+    return poses, points, near, far, (inner.low, inner.high)
 
 
 def _is_behind(point: Tensor, poses: Tensor) -> bool:

@@ -38,6 +38,7 @@ from devrf.scenes.sparse_model import (
     normalised,
 )
 from devrf.scenes.splits import every_nth
+from devrf.scenes.transforms import SceneBounds
 from devrf.system.files import (
     UNREADABLE,
     make_folder,
@@ -108,22 +109,20 @@ def scene_from_footage(settings: CaptureSettings) -> Path:
     left_out = LEFT_OUT_OF_VIDEO if settings.monocular else LEFT_OUT
     world = normalised(model, facing, left_out=left_out)
     if settings.facing == "auto":
-        facing = "forward" if world.space == "ndc" else "inward"
+        facing = "forward" if world.bounds.space == "ndc" else "inward"
         log.info("cameras look %s-facing; capture.facing says otherwise", facing)
     if settings.subtracts:
         world = _around_motion(world, model, into / IMAGES, fixed)
     frame_seconds = surveys[static].times if settings.monocular else None
     frames, test = _frames(model, world, moving, fixed, clock, settings, frame_seconds)
     names = [frame["file_path"] for frame in frames]
-    bounds: dict[str, Any] = {"space": world.space, "near": world.near, "far": world.far}
-    if world.box is not None:
-        bounds["box"] = world.box
-    if masks and world.space == "contracted":
+    bounds = world.bounds
+    if masks and bounds.space == "contracted":
         # There is nothing around what is cut out, and the reader finds its box.
-        bounds = {"space": "world"}
+        bounds = SceneBounds(space="world")
     content = {
         "camera_model": settings.camera,
-        "scene_bounds": bounds,
+        "scene_bounds": bounds.model_dump(exclude_none=True),
         "frames": frames,
         "train_filenames": [name for name in names if name not in test],
         "test_filenames": [name for name in names if name in test],
@@ -251,7 +250,7 @@ def _around_motion(
     world: World, model: SparseModel, images: Path, fixed: Sequence[Chosen]
 ) -> World:
     """The world with the box of moving objects, if it has a box."""
-    if world.space != "contracted":
+    if world.bounds.space != "contracted":
         log.warning(
             "capture.alpha_masks=subtract: a forward-facing scene has no box, it changes nothing"
         )
@@ -262,7 +261,7 @@ def _around_motion(
     around = Box.of([-AROUND] * 3, [AROUND] * 3)
     names = [video.names for video in fixed]
     box = box_of_motion(images, names, world.poses[first], lenses, around)
-    return replace(world, box=(box.low, box.high))
+    return replace(world, bounds=world.bounds.model_copy(update={"box": (box.low, box.high)}))
 
 
 def _frames(

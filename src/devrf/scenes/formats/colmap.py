@@ -162,7 +162,7 @@ class ColmapReader(PosedReader, FixedViewsReader):
             world.poses[positions].float(),
             None,
             downscale=source.downscale,
-            bounds=SceneBounds(space=world.space, near=world.near, far=world.far, box=world.box),
+            bounds=world.bounds,
         )
         train, test = parted(range(len(positions)), (), self.holdout, model.folder, start=0)
         moving = dynamic_folder(folder, self.dynamic)
