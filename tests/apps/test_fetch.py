@@ -19,10 +19,11 @@ import pytest
 from devrf.apps.fetch import (
     MARKERS,
     Collection,
+    FetchSettings,
     PublishedScene,
     _unpacked,
     catalogue,
-    fetch_scene,
+    fetched,
     published_scene,
 )
 from devrf.cli.config import config_folder
@@ -205,7 +206,7 @@ def test_a_download_without_end_is_ended(tmp_path, monkeypatch, trickle, limit, 
     scene = published("lego", url=f"{trickle}/lego.zip")
     began = time.monotonic()
     with pytest.raises(DevrfError, match=rf"lego\.zip: cannot be fetched \({said}\)"):
-        fetch_scene(scene, tmp_path, None, progress=False)
+        fetched(scene, FetchSettings(tmp_path), progress=False)
     assert time.monotonic() - began < 20 and not (tmp_path / "lego").exists()
 
 

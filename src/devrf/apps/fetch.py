@@ -167,12 +167,15 @@ def published_scene(name: str, file: str | Path | None = None) -> PublishedScene
 def fetched(scene: PublishedScene, settings: FetchSettings, progress: bool) -> Path:
     """A scene's folder in ``settings.into``, downloaded unless it is there; the log says so.
 
+    It appears when it is whole and checked. Files that have come are kept beside it until all are
+    there: the same command goes on with the others.
+
     Raises:
         DevrfError: it cannot be fetched, or is not what was expected, or something else is there.
         OSError: the disk refuses.
     """
-    into = Path(settings.into).expanduser()
-    path = into / scene.name
+    into, source = Path(settings.into).expanduser(), scene.collection
+    path, work = into / scene.name, into / f".{scene.name}.fetch"
     if (path / RECORD).is_file():
         log.info("%s: is in %s already", scene.name, path)
         return path
@@ -180,24 +183,8 @@ def fetched(scene: PublishedScene, settings: FetchSettings, progress: bool) -> P
         raise DevrfError(
             f"{path}: there is something else, without {RECORD}; remove it, or give fetch.into=PATH"
         )
-    source = scene.collection
     log.info("%s: %s; from %s; licence: %s", scene.name, scene.about, source.page, source.licence)
-    fetch_scene(scene, into, settings.sha256, progress)
-    return path
-
-
-def fetch_scene(scene: PublishedScene, into: Path, sha256: str | None, progress: bool) -> None:
-    """Download a scene to ``into``/<its name>, which appears when it is whole and checked.
-
-    Files that have come are kept beside it until all are there: the same command goes on with the
-    others. ``sha256`` is the checksum to insist on; None: the catalogue's, if it has one.
-
-    Raises:
-        DevrfError: it cannot be fetched, or is not what was expected.
-        OSError: the disk refuses.
-    """
-    expected = sha256.lower() if sha256 else scene.collection.sha256.get(scene.name)
-    path, work = into / scene.name, into / f".{scene.name}.fetch"
+    expected = settings.sha256.lower() if settings.sha256 else source.sha256.get(scene.name)
     refuse_links(work, itself=True)
     make_folder(work)
     files = _download(scene, work / "files", progress)
@@ -211,9 +198,9 @@ def fetch_scene(scene: PublishedScene, into: Path, sha256: str | None, progress:
     ready = _unpacked(scene, work) if scene.is_archive else work / "files"
     record = {
         "scene": scene.name,
-        "page": scene.collection.page,
-        "url": scene.collection.filled(scene.collection.url, scene.name),
-        "licence": scene.collection.licence,
+        "page": source.page,
+        "url": source.filled(source.url, scene.name),
+        "licence": source.licence,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "files": len(files),
         "sha256": digest,
@@ -225,6 +212,7 @@ def fetch_scene(scene: PublishedScene, into: Path, sha256: str | None, progress:
     remark = f": none was known to compare it with; kept in {path / RECORD}"
     log.info("%s: in %s", scene.name, path)
     log.info("SHA-256 %s%s", digest, remark if expected is None else ", as expected")
+    return path
 
 
 def _download(scene: PublishedScene, folder: Path, progress: bool) -> dict[str, Path]:
