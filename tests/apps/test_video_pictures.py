@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from devrf.apps.still import StillSettings, still
+from devrf.apps.still import StillSettings, sized, still
 from devrf.apps.video import VideoSettings, held_out_images, held_out_pictures, path_pictures
 from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError
@@ -166,10 +166,10 @@ def test_pictures_of_two_sizes_have_their_own_within_a_video_of_one(moving, two_
 
 def test_a_video_of_cameras_of_several_sizes_has_the_commonest(two_sizes):
     cameras = two_sizes.static.train.cameras[[0, 1, 3]]  # 18 x 18, twice 24 x 16
-    sized = VideoSettings().sized(cameras)
-    assert (sized.width, sized.height) == (600, 400) and sized.sizes is None
-    assert torch.equal(sized.camera_to_world, cameras.camera_to_world)
-    assert sized.focal[1].tolist() == (cameras.focal[1] * 25).tolist()
+    larger = sized(cameras, VideoSettings().height)
+    assert (larger.width, larger.height) == (600, 400) and larger.sizes is None
+    assert torch.equal(larger.camera_to_world, cameras.camera_to_world)
+    assert larger.focal[1].tolist() == (cameras.focal[1] * 25).tolist()
     one = StillSettings(view=0).camera(Viewpoints.of(two_sizes))
     assert (one.width, one.height) == (400, 400)
 

@@ -48,7 +48,7 @@ class TwoBalls:
 
 @pytest.fixture(scope="module")
 def balls():
-    train, test = dynamic_rig(2, width=32, height=24, reach=1.0)
+    train, test = dynamic_rig(2, (32, 24), reach=1.0)
     return Filming(TwoBalls(), 1.0, supersample=1).dynamic(train, test, frames=3)
 
 
@@ -78,7 +78,7 @@ def test_one_threshold_and_a_size_that_far_points_do_not_change():
 
 
 def made(pixels, times, view=None) -> Views:
-    train, _ = dynamic_rig(1, width=pixels.shape[2], height=pixels.shape[1], reach=1.0)
+    train, _ = dynamic_rig(1, (pixels.shape[2], pixels.shape[1]), reach=1.0)
     count = len(pixels)
     views = torch.zeros(count, dtype=torch.long) if view is None else view
     names = tuple(f"{k}.png" for k in range(count))

@@ -268,7 +268,7 @@ def test_every_ray_meets_something_beyond_the_bound_of_the_published_layout(name
 
 
 def test_the_static_cameras_are_centred_and_face_the_scene() -> None:
-    cameras = facing_static_rig(7, width=40, height=28)
+    cameras = facing_static_rig(7, (40, 28))
     average = average_pose(cameras.camera_to_world.double())
     torch.testing.assert_close(average, torch.eye(3, 4).double(), atol=1e-6, rtol=0)
     assert bool((cameras.forwards[:, 2] < -0.98).all())
@@ -303,10 +303,10 @@ def shape(request: pytest.FixtureRequest) -> Shape:
 def surface(shape: Shape, time: float) -> Tensor:
     """World points (S, 3) that three cameras see of the shape at ``time``."""
     if isinstance(shape, Surrounded):
-        cameras, _ = facing_dynamic_rig(3, width=24, height=18)
+        cameras, _ = facing_dynamic_rig(3, (24, 18))
         depth = Filming(shape, 9.0, 1, steps=400).pictures(cameras, time)[1]
     else:
-        cameras, _ = dynamic_rig(3, width=32, height=32, reach=1.4)
+        cameras, _ = dynamic_rig(3, (32, 32), reach=1.4)
         depth = Filming(shape, 1.6, 1).pictures(cameras, time)[1]
     camera, row, column = depth.isfinite().nonzero().unbind(-1)
     rays = cameras.rays(camera, torch.stack([column, row], dim=-1) + 0.5)

@@ -22,7 +22,7 @@ from devrf.apps.camera_paths import (
     swing,
 )
 from devrf.apps.keyframes import CameraPath, cameras_of, read_path
-from devrf.apps.still import still
+from devrf.apps.still import sized, still
 from devrf.apps.video import (
     MIN_HEIGHT,
     VideoSettings,
@@ -78,20 +78,20 @@ def videos(
     path = camera_path(settings, viewpoints.offset)
     if path is not None:
         settings = replace(settings, frames=path.frames, fps=path.fps)
-    settings = _within_limit(settings, renderer, settings.sized(viewpoints.held_out))
-    sized = settings.sized(static)
+    settings = _within_limit(settings, renderer, sized(viewpoints.held_out, settings.height))
+    captured = sized(static, settings.height)
     space = renderer.model.space
 
     def filmed(name: str) -> Callable[[VideoSettings], Cameras]:
         target = looked_at(renderer.model, static, lambda: focus_distance(renderer, static))
-        return lambda of: CAMERA_PATHS[name](sized, target, of)
+        return lambda of: CAMERA_PATHS[name](captured, target, of)
 
     def video(name: str, pictures: Iterator[Tensor]) -> Video:
         return Video(name, settings.fps, settings.frames, pictures)
 
     if path is not None:
         keyframes = path.sampled(settings.frames)
-        cameras = cameras_of(keyframes, path.aspect, sized.height)
+        cameras = cameras_of(keyframes, path.aspect, captured.height)
         times = [frame.time for frame in keyframes]
         yield video(Path(str(settings.path)).stem, path_pictures(renderer, cameras, behind, times))
         return
@@ -107,7 +107,7 @@ def videos(
         yield video("held_out", pictures)
     name = settings.path or default_path(space)
     if name == SWING or (viewpoints.followed and not settings.path and name != "orbit"):
-        followed = settings.sized(viewpoints.dynamic)
+        followed = sized(viewpoints.dynamic, settings.height)
         cameras, times = swing(followed, viewpoints.followed, settings)
         yield video(SWING, path_pictures(renderer, cameras, behind, times))
         return

@@ -13,7 +13,7 @@ from annotated_types import Ge, Le
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
-from devrf.apps.still import DEPTH, MAX_ROWS, READABLE, sized, still
+from devrf.apps.still import DEPTH, MAX_ROWS, READABLE, still
 from devrf.evaluation.held_out import background_value, truth_image
 from devrf.geometry.cameras import Cameras
 from devrf.pictures.images import centred, image_grid, scaled
@@ -48,10 +48,6 @@ class VideoSettings(Options):
     path: str | None = None
     time: Share = 0.5
     motion_masks: bool = False
-
-    def sized(self, cameras: Cameras) -> Cameras:
-        """Captured cameras with images of the video's size."""
-        return sized(cameras, self.height)
 
     def within_limit(self, seconds: float, height: int) -> VideoSettings:
         """The settings for images of ``height`` rows that take ``seconds`` each.

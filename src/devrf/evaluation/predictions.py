@@ -21,8 +21,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
-import numpy.typing as npt
 import torch
 from pydantic import BaseModel, Field
 from torch import Tensor
@@ -35,7 +33,7 @@ from devrf.geometry.space import WORLD
 from devrf.rendering.output import RenderedImage
 from devrf.rendering.renderable import Renderable
 from devrf.scenes.files import MOST_IMAGES, Name, Number, inside, read_json
-from devrf.scenes.footage import VIDEOS, footage_header, frames_at
+from devrf.scenes.footage import VIDEOS, Picture, footage_header, frames_at
 from devrf.scenes.image_folders import listed_images
 from devrf.scenes.images import decode, read_header
 from devrf.scenes.scene import Background, Views
@@ -54,8 +52,6 @@ SAME_TIME = 1e-3
 IN_ANOTHER_ORDER = 0.5
 # Pixels of the sides of pictures when they are told apart.
 SMALL = 32
-
-Picture = npt.NDArray[np.uint8]
 
 
 class Listed(BaseModel):

@@ -174,8 +174,6 @@ HOLDOUT = 8
 # The largest depth if none is known, in multiples of the least one.
 FAR = 100.0
 
-Flags = np.ndarray[Any, np.dtype[np.bool_]]
-
 
 def _export_llff(scene: Scene, folder: Path) -> None:
     """Write ``folder/static`` and ``folder/dynamic_<V>views``.
@@ -235,7 +233,9 @@ def _intrinsics(views: Views, factor: int) -> Numbers:
 def _write_static(static: Capture, held_out: Tensor, bounds: Numbers, folder: Path) -> None:
     rows = np.empty((len(held_out), 17))
     for views, mask in ((static.train, ~held_out), (static.test, held_out)):
-        right, up, back, position = _double(views.cameras.camera_to_world).transpose(2, 0, 1)
+        # In double precision what was exact in single precision stays so.
+        poses = views.cameras.camera_to_world.double().numpy()
+        right, up, back, position = poses.transpose(2, 0, 1)
         matrix = np.stack([-up, right, back, position, _intrinsics(views, FACTOR)], axis=2)
         rows[mask] = np.hstack([matrix.reshape(-1, 15), np.tile(bounds, (len(views), 1))])
         _write_images(views, np.flatnonzero(mask), folder / f"images_{FACTOR}")
@@ -250,16 +250,10 @@ def _write_moving(views: list[Views], bounds: Numbers, folder: Path) -> None:
         if view.flow is not None and number < len(views):
             flow_folder = images.with_name(f"{images.name}_flow")
             write_flow(flow_folder, view, range(1, len(view)))
-        pose = _double(view.cameras.camera_to_world[0])
+        pose = view.cameras.camera_to_world[0].double().numpy()
         matrices.append(np.concatenate([pose, _intrinsics(view, 1)[:1].T], axis=1))
     np.save(folder / "poses.npy", np.stack(matrices))
     np.save(folder / "bds.npy", np.tile(bounds, (len(views), 1)))
-
-
-def _double(poses: Tensor) -> Numbers:
-    """Poses in double precision: values that were exact in single precision stay so."""
-    array: Numbers = poses.double().cpu().numpy()
-    return array
 
 
 def _write_images(views: Views, numbers: Iterable[int], folder: Path) -> None:

@@ -108,32 +108,30 @@ def read_flow(
         if wanted
     }
     present = {row: path for row, path in files.items() if os.path.isfile(path)}
-    if not present:
-        log.info("no optical flow: no NNN_%s.npz in %s", direction, folder)
-        return None
-    warn_of_missing(len(present), len(files), folder)
-    return stacked_flow(present, source_sizes, cameras)
-
-
-def warn_of_missing(present: int, expected: int, folder: Path) -> None:
-    """Log the number of expected flow files that are missing in ``folder``, if any are."""
-    if present < expected:
-        log.warning(
-            "%d of %d flow files are missing in %s; those images go without flow",
-            expected - present,
-            expected,
-            folder,
-        )
+    return stacked_flow(present, len(files), folder / f"NNN_{direction}.npz", source_sizes, cameras)
 
 
 def stacked_flow(
-    files: Mapping[int, Path], source_sizes: Sequence[tuple[int, int]], cameras: Cameras
-) -> OpticalFlow:
-    """The flow of N images; those without one of the ``files`` (at least one) have none.
+    files: Mapping[int, Path],
+    expected: int,
+    pattern: Path,
+    source_sizes: Sequence[tuple[int, int]],
+    cameras: Cameras,
+) -> OpticalFlow | None:
+    """The flow of N images, whose numbers those of ``files`` are; the others have none.
 
+    So many files, of names like ``pattern``, were ``expected``; None if there is no file.
     ``source_sizes`` are N (width, height) before downscaling, ``cameras`` those of the images after
     it: the flow's pixels.
     """
+    if not files:
+        log.info("no optical flow: no %s", pattern)
+        return None
+    if len(files) < expected:
+        log.warning(
+            "%d of %d flow files are missing, %s and its like; those images go without flow",
+            *(expected - len(files), expected, pattern),
+        )
     start = time.perf_counter()
     raster = (len(cameras), cameras.height, cameras.width)
     folder = next(iter(files.values())).parent

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fnmatch
-import logging
 import os
 import re
 from collections.abc import Callable, Sequence
@@ -14,7 +13,7 @@ import torch
 from torch import Tensor
 
 from devrf.scenes.files import entries
-from devrf.scenes.flow_files import FlowDirection, stacked_flow, warn_of_missing
+from devrf.scenes.flow_files import FlowDirection, stacked_flow
 from devrf.scenes.image_folders import ImageFolder, image_folder, listed_images
 from devrf.scenes.layout import Layout, Pair
 from devrf.scenes.lens import Intrinsics
@@ -23,8 +22,6 @@ from devrf.scenes.splits import Split, file_sizes, static_split
 from devrf.scenes.transforms import Transforms
 from devrf.scenes.validation import scene_error
 from devrf.system.files import utf8_path
-
-log = logging.getLogger(__name__)
 
 
 def dynamic_folders(root: Path) -> list[Path]:
@@ -190,12 +187,8 @@ def flow_of_views(split: Split, views: Views, direction: FlowDirection) -> Optic
         for way in ways
     ]
     best = max(candidates, key=len)
-    first = folders[images[0].parent]
-    if not best:
-        log.info("no optical flow: no <frame>%s in %s and its like", suffix, first)
-        return None
-    warn_of_missing(len(best), len(shots), first)
-    return stacked_flow(best, file_sizes(split, views), views.cameras)
+    pattern = folders[images[0].parent] / f"<frame>{suffix}"
+    return stacked_flow(best, len(shots), pattern, file_sizes(split, views), views.cameras)
 
 
 def _named(folder: Path, suffix: str) -> dict[str | int | None, Path]:

@@ -92,6 +92,11 @@ class Recipe(Options, ABC):
         return self
 
     @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the images."""
+        return self.width, self.height
+
+    @property
     def unseen_frames(self) -> list[int]:
         """The frames that are not training frames."""
         if self.novel_times_every is None:
@@ -135,16 +140,9 @@ class ProceduralScene(Recipe):
         rig = HAND_HELD if inside else STUDIO
         surface = self.visible_shape()
         learned, tested = static_rig(
-            self.static_views,
-            self.static_test_views,
-            width=self.width,
-            height=self.height,
-            reach=where.reach,
-            rig=rig,
+            self.static_views, self.static_test_views, self.size, reach=where.reach, rig=rig
         )
-        watching, unseen = dynamic_rig(
-            self.train_views, width=self.width, height=self.height, reach=where.reach, rig=rig
-        )
+        watching, unseen = dynamic_rig(self.train_views, self.size, reach=where.reach, rig=rig)
         filming = Filming(surface, where.reach, self.supersample, self.light)
         if inside:
             filming = Filming(surface, REACH, self.supersample, self.light, STEPS, opaque=True)
@@ -227,20 +225,16 @@ class ProceduralForwardScene(Recipe):
         )
         name = {"random": "random_forward"}.get(self.shape, self.shape)
         if self.camera == "handheld":
-            camera, others = hand_held_rig(self.frames, width=self.width, height=self.height)
+            camera, others = hand_held_rig(self.frames, self.size)
             video = filming.handheld(camera, others)
             return self._scene(f"{name}_by_hand", video, video)
         # Seven of each eight views are training views.
         held_out = -(-self.static_views // (HOLDOUT - 1))
-        cameras = facing_static_rig(
-            self.static_views + held_out, width=self.width, height=self.height
-        )
+        cameras = facing_static_rig(self.static_views + held_out, self.size)
         order = torch.arange(len(cameras))
         learned = cameras[order % HOLDOUT != 0]
         tested = cameras[order % HOLDOUT == 0]
-        watching, unseen = facing_dynamic_rig(
-            self.train_views, width=self.width, height=self.height
-        )
+        watching, unseen = facing_dynamic_rig(self.train_views, self.size)
         static = filming.static(learned, tested)
         dynamic = filming.dynamic(watching, unseen, self.frames, self.unseen_frames)
         return self._scene(name, static, dynamic)

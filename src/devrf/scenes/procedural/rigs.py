@@ -11,6 +11,9 @@ from torch import Tensor
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.poses import average_pose, relative_to
 
+# Width and height of images in pixels.
+Size = tuple[int, int]
+
 
 @dataclass(frozen=True)
 class Rig:
@@ -39,18 +42,18 @@ _TEST_ELEVATION = math.radians(28)
 
 
 def static_rig(
-    train: int, test: int, *, width: int, height: int, reach: float, rig: Rig = STUDIO
+    train: int, test: int, size: Size, *, reach: float, rig: Rig = STUDIO
 ) -> tuple[Cameras, Cameras]:
     """Training and held-out cameras, spread evenly from the rig's lowest elevation upwards.
 
     All are points of one Fibonacci lattice; the held-out ones lie evenly between the others. Every
-    image, ``width`` × ``height`` pixels, holds the ball of radius ``reach`` about the origin.
+    image, of a ``size`` in pixels, holds the ball of radius ``reach`` about the origin.
     """
     count = train + test
     index = torch.arange(count, dtype=torch.float64)
     sine = rig.lowest + (rig.highest - rig.lowest) * (index + 0.5) / count
     golden = math.pi * (3 - math.sqrt(5))
-    cameras = _around(golden * index, sine.asin(), width, height, reach, rig)
+    cameras = _around(golden * index, sine.asin(), size, reach, rig)
     held_out = ((torch.arange(test) + 0.5) * count / test).long()
     mask = torch.zeros(count, dtype=torch.bool)
     mask[held_out] = True
@@ -58,33 +61,30 @@ def static_rig(
 
 
 def dynamic_rig(
-    train: int, *, width: int, height: int, reach: float, rig: Rig = STUDIO
+    train: int, size: Size, *, reach: float, rig: Rig = STUDIO
 ) -> tuple[Cameras, Cameras]:
     """``train`` fixed cameras all around, and one held out between the first two of them."""
     step = 2 * math.pi / train
     index = torch.arange(train, dtype=torch.float64)
     low, high = _ELEVATIONS
     elevation = torch.where(index % 2 == 0, low, high).double()
-    cameras = _around(_FIRST_AZIMUTH + step * index, elevation, width, height, reach, rig)
+    cameras = _around(_FIRST_AZIMUTH + step * index, elevation, size, reach, rig)
     # A lone camera sees one side only: the held-out one is on that side, too.
     azimuth = torch.tensor([_FIRST_AZIMUTH + min(step / 2, math.pi / 4)], dtype=torch.float64)
     elevation = torch.full_like(azimuth, _TEST_ELEVATION)
-    return cameras, _around(azimuth, elevation, width, height, reach, rig)
+    return cameras, _around(azimuth, elevation, size, reach, rig)
 
 
-def _around(
-    azimuth: Tensor, elevation: Tensor, width: int, height: int, reach: float, rig: Rig
-) -> Cameras:
+def _around(azimuth: Tensor, elevation: Tensor, size: Size, reach: float, rig: Rig) -> Cameras:
     """Float32 cameras that look at the origin from directions (N,), (N,) in radians."""
     directions = torch.stack(
         [elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin()], dim=-1
     )
     positions = (rig.distance * directions).float()
     field = max(rig.field_of_view, 2 * math.asin(min(reach / rig.distance, 0.95)))
-    focal = min(width, height) / 2 / math.tan(field / 2)
-    return Cameras.looking_at(
-        positions, torch.zeros_like(positions), focal=focal, width=width, height=height
-    )
+    focal = min(size) / 2 / math.tan(field / 2)
+    middle = torch.zeros_like(positions)
+    return Cameras.looking_at(positions, middle, focal=focal, width=size[0], height=size[1])
 
 
 FIELD_OF_VIEW = 1.05  # radians across the image's longer side
@@ -98,7 +98,7 @@ _TARGET_DEPTH = 3.4
 _UNEVEN = 0.05
 
 
-def facing_static_rig(count: int, *, width: int, height: int) -> Cameras:
+def facing_static_rig(count: int, size: Size) -> Cameras:
     """``count`` cameras evenly over an ellipse, whose average pose is the identity."""
     index = torch.arange(count, dtype=torch.float64)
     radius = ((index + 0.5) / count).sqrt()
@@ -106,16 +106,16 @@ def facing_static_rig(count: int, *, width: int, height: int) -> Cameras:
     x = _STATIC[0] * radius * angle.cos()
     y = _STATIC[1] * radius * angle.sin()
     positions = torch.stack([x, y, _UNEVEN * (2.0 * index).sin()], dim=-1)
-    return _facing(positions, width, height, centred=True)
+    return _facing(positions, size, centred=True)
 
 
-def facing_dynamic_rig(train: int, *, width: int, height: int) -> tuple[Cameras, Cameras]:
+def facing_dynamic_rig(train: int, size: Size) -> tuple[Cameras, Cameras]:
     """``train`` fixed cameras on an ellipse, and one held out near its middle."""
     angle = math.pi / 4 + 2 * math.pi * torch.arange(train, dtype=torch.float64) / train
     level = torch.zeros_like(angle)
     around = torch.stack([_DYNAMIC[0] * angle.cos(), _DYNAMIC[1] * angle.sin(), level], dim=-1)
     middle = torch.tensor([[*_HELD_OUT, 0.0]], dtype=torch.float64)
-    return _facing(around, width, height), _facing(middle, width, height)
+    return _facing(around, size), _facing(middle, size)
 
 
 # Half widths (x, y, z) of a hand-held camera's path, and its periods in the video.
@@ -126,7 +126,7 @@ _LATER = 0.4
 _ASIDE = (-0.08, 0.06, 0.0)
 
 
-def hand_held_rig(frames: int, *, width: int, height: int) -> tuple[Cameras, Cameras]:
+def hand_held_rig(frames: int, size: Size) -> tuple[Cameras, Cameras]:
     """A hand-held camera at each of ``frames`` times, and another view at each of them.
 
     It sways, trembles, and looks about the rig's target. The average pose of all is the identity.
@@ -137,7 +137,7 @@ def hand_held_rig(frames: int, *, width: int, height: int) -> tuple[Cameras, Cam
     at = torch.cat([time, time + _LATER])
     # Nobody holds the target in the middle of the picture.
     wanders = torch.stack([0.15 * (9 * at).sin(), 0.10 * (7 * at + 1).cos(), 0 * at], dim=-1)
-    cameras = _facing(positions, width, height, centred=True, wanders=wanders)
+    cameras = _facing(positions, size, centred=True, wanders=wanders)
     return cameras[slice(frames)], cameras[slice(frames, None)]
 
 
@@ -149,12 +149,7 @@ def _swayed(time: Tensor) -> Tensor:
 
 
 def _facing(
-    positions: Tensor,
-    width: int,
-    height: int,
-    *,
-    centred: bool = False,
-    wanders: Tensor | float = 0.0,
+    positions: Tensor, size: Size, *, centred: bool = False, wanders: Tensor | float = 0.0
 ) -> Cameras:
     """Float32 cameras at positions (N, 3) float64 that look at the rig's target, y up.
 
@@ -163,9 +158,9 @@ def _facing(
     cameras = Cameras.looking_at(
         positions,
         positions.new_tensor([0.0, 0.0, -_TARGET_DEPTH]).expand_as(positions) + wanders,
-        focal=max(width, height) / 2 / math.tan(FIELD_OF_VIEW / 2),
-        width=width,
-        height=height,
+        focal=max(size) / 2 / math.tan(FIELD_OF_VIEW / 2),
+        width=size[0],
+        height=size[1],
         up=positions.new_tensor([0.0, 1.0, 0.0]),
     )
     poses = cameras.camera_to_world
