@@ -56,7 +56,8 @@ def motion_box(views: Views, box: Box, *, resolution: int = 64, search: float = 
     points = area.grid_points((resolution,) * 3, views.cameras.focal).reshape(-1, 3)
     low, high = area.corners(views.cameras.positions)
     distance = float((views.cameras.positions - (low + high) / 2).norm(dim=1).median())
-    masks = _silhouettes(views, _reach(views, cell, distance, float(views.cameras.focal.amax())))
+    reach = _reach(views, cell, distance, float(views.cameras.focal.amax()))
+    masks = [_silhouette(view, reach, ALPHA_THRESHOLD) for view in views.singles()]
     cached: dict[tuple[int, tuple[int, int]], Array] = {}
     hull = np.zeros(len(points), dtype=np.bool_)
     for images in frames:
@@ -68,7 +69,9 @@ def motion_box(views: Views, box: Box, *, resolution: int = 64, search: float = 
             if key not in cached:
                 if len(cached) >= 16:  # moving cameras: no projection is used twice
                     cached.clear()
-                cached[key] = _pixel_index(views.cameras.single(image), points)
+                camera = views.cameras.single(image)
+                projected = camera.project(torch.zeros_like(points[:, 0], dtype=torch.long), points)
+                cached[key] = _pixel_index(projected, camera).cpu().numpy()
             verdict = masks[image][cached[key][open_points]]
             keep = verdict != OUTSIDE
             open_points = open_points[keep]
@@ -103,41 +106,32 @@ def _reach(views: Views, cell: float, distance: float, focal: float) -> int:
     return max(1, min(math.ceil(pixels), max(views.width, views.height)))
 
 
-def _silhouettes(views: Views, reach: int) -> list[Array]:
-    """N codes (H·W + 1,) uint8: pixels are INSIDE or OUTSIDE the dilated silhouette.
+def _silhouette(view: Views, reach: int, threshold: int) -> Array:
+    """Codes (H·W + 1,) uint8: pixels are INSIDE or OUTSIDE the dilated silhouette of an image.
 
-    Pixels that are not valid are UNSEEN. The last entry is for all points beyond the image:
-    OUTSIDE, or UNSEEN if the image's border cuts off the silhouette or the whole object.
+    It is of alpha above ``threshold``. Pixels that are not valid, and those as near to them, are
+    UNSEEN. The last entry is for all points beyond the image: OUTSIDE, or UNSEEN if the image's
+    border cuts off the silhouette or the whole object.
     """
-
-    def silhouette(view: Views) -> Array:
-        solid = view.pixels[0, ..., 3].cpu().numpy() > ALPHA_THRESHOLD
-        valid = view.valid_mask_of(0)
-        unknown = np.zeros_like(solid) if valid is None else ~valid.numpy()
-        solid &= ~unknown
-        perhaps = solid | unknown
-        cut_off = perhaps[[0, -1]].any() or perhaps[:, [0, -1]].any() or not solid.any()
-        grown = _dilated(solid.astype(np.uint8), reach)
-        codes = np.where(unknown, UNSEEN, grown).ravel()
-        return np.append(codes, UNSEEN if cut_off else OUTSIDE).astype(np.uint8)
-
-    return [silhouette(view) for view in views.singles()]
+    solid = view.pixels[0, ..., 3].cpu().numpy() > threshold
+    valid = view.valid_mask_of(0)
+    unknown = np.zeros_like(solid) if valid is None else ~valid.numpy()
+    solid &= ~unknown
+    perhaps = solid | unknown
+    cut_off = perhaps[[0, -1]].any() or perhaps[:, [0, -1]].any() or not solid.any()
+    square = np.ones((2 * reach + 1,) * 2, dtype=np.uint8)
+    grown, near_unknown = (cv2.dilate(m.astype(np.uint8), square) > 0 for m in (solid, unknown))
+    codes = np.select([unknown, grown, near_unknown], [UNSEEN, INSIDE, UNSEEN], OUTSIDE).ravel()
+    return np.append(codes, UNSEEN if cut_off else OUTSIDE).astype(np.uint8)
 
 
-def _dilated(mask: Array, reach: int) -> Array:
-    """The greatest value (H, W) uint8 within ``reach`` pixels along both axes."""
-    return cv2.dilate(mask, np.ones((2 * reach + 1,) * 2, dtype=np.uint8))
-
-
-def _pixel_index(camera: Cameras, points: Tensor) -> Array:
-    """(P,) the pixel of each point in the flattened image; H·W for points beyond it."""
+def _pixel_index(projected: tuple[Tensor, Tensor], camera: Cameras) -> Tensor:
+    """(P,) the pixel of each projected point in the flattened image; H·W for points beyond it."""
+    pixels, depth = projected
     width, height = camera.width, camera.height
-    first = torch.zeros(len(points), dtype=torch.long, device=points.device)
-    pixels, depth = camera.project(first, points)
-    column, row = pixels.floor().unbind(-1)
+    column, row = pixels.floor().long().unbind(-1)
     held = (depth > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    index = row.long() * width + column.long()
-    return torch.where(held, index, width * height).cpu().numpy()
+    return torch.where(held, row * width + column, width * height)
 
 
 def visual_hull(
@@ -168,19 +162,13 @@ def visual_hull(
     held = torch.ones(len(points), dtype=torch.bool, device=points.device)
     for k in range(len(views)):
         open_points = held.nonzero()[:, 0]
-        pixel, depth = cameras.project_into(k, points[open_points])
         position = views.cameras.positions[k]
         nearest = float((position - box.nearest(position)).norm())
-        reach = _reach(views, cell, nearest, float(views.cameras.focal[k].max()))
         view = views.single(k)
-        solid = view.pixels[0, :, :, 3]
-        if view.valid_mask is not None:
-            solid = solid.masked_fill(~view.valid_mask[0], 255)
-        grown = torch.from_numpy(_dilated(solid.cpu().numpy(), reach)).to(points.device)
-        x, y = pixel.floor().long().unbind(-1)
-        in_image = (depth > 0) & (x >= 0) & (x < view.width) & (y >= 0) & (y < view.height)
-        row = torch.where(in_image, y * view.width + x, 0)
-        border = torch.cat([solid[[0, -1]].flatten(), solid[:, [0, -1]].flatten()])
-        ends = whole_in_view and bool(solid.any()) and not bool(border.any())
-        held[open_points[torch.where(in_image, grown.view(-1)[row] == 0, ends)]] = False
+        reach = _reach(views, cell, nearest, float(view.cameras.focal.max()))
+        codes = _silhouette(view, reach, threshold=0)
+        codes[-1] = codes[-1] if whole_in_view else UNSEEN
+        outside = torch.from_numpy(codes == OUTSIDE).to(points.device)
+        projected = cameras.project_into(k, points[open_points])
+        held[open_points[outside[_pixel_index(projected, view.cameras)]]] = False
     return held.view(shape)
