@@ -63,7 +63,7 @@ def test_poses_that_come_again_without_times(tmp_path, balls, caplog):
     assert (
         f"{root}/transforms.json: 4 cameras stand still for 6 images each, as if the scene moved, "
         'but is learned at rest; if it moves, give each frame its "time" in [0, 1], not '
-        "timestep_index"
+        '"timestamp" or "timestep_index"'
     ) in caplog.messages
     assert any("stand still for" in str(advice) for advice in advice_on(scene))
 

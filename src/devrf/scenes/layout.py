@@ -116,13 +116,11 @@ def static_alone(train: Transforms, test: Transforms, why: str) -> Layout:
     """The layout of a static scene, whose images all show one moment; ``why`` is for the log."""
     log.info("%s: %s: all images show one moment, the scene is at rest", train.file, why)
     if cameras := standing(torch.cat([train.poses, test.poses])):
-        unread = f", not {' or '.join(train.unread_times)}" * bool(train.unread_times)
         log.warning(
             "%s: %s, as if the scene moved, but is learned at rest; if it moves, give each "
-            'frame its "time" in [0, 1]%s',
+            'frame its "time" in [0, 1], not "timestamp" or "timestep_index"',
             train.file,
             cameras,
-            unread,
         )
     train_set = at_one_moment(train)
     test_set = at_one_moment(test)

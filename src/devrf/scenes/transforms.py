@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import torch
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
@@ -63,7 +63,6 @@ class Frame(CameraKeys):
         transform_matrix: 4×4 or 3×4 camera-to-world, OpenGL axes, world units.
         time: in [0, 1]; None where no frame has one.
         mask_path: a grey image, relative to the file's folder.
-        timestep_index: with ``timestamp``, other programs' times; not read.
     """
 
     file_path: Name
@@ -74,8 +73,6 @@ class Frame(CameraKeys):
     ]
     time: Annotated[Number, AfterValidator(_time)] | None = None
     mask_path: Name | None = None
-    timestep_index: Any = None
-    timestamp: Any = None
 
 
 FileNames = Annotated[list[Name], Field(fail_fast=True, max_length=MOST_IMAGES)]
@@ -133,7 +130,6 @@ class Transforms:
         downscale: the factor by which the images are yet to be made smaller; None: not chosen yet.
         skipped: number of images of the file that are absent, and left out.
         bounds: the scene's bounds in the world of the file, if it states them.
-        unread_times: keys of frames about time that are not read.
         offset: the offset that is subtracted from positions (:mod:`devrf.geometry.offset`).
     """
 
@@ -147,7 +143,6 @@ class Transforms:
     downscale: int | None = None
     skipped: int = 0
     bounds: SceneBounds | None = None
-    unread_times: tuple[str, ...] = ()
     offset: Offset = NO_OFFSET
 
     def __getitem__(self, index: Sequence[int]) -> Transforms:
@@ -281,11 +276,6 @@ class TransformsFiles:
             cut_out=self._masks == "alpha",
             skipped=len(listing.frames) - len(frames),
             bounds=listing.scene_bounds,
-            unread_times=tuple(
-                key
-                for key in ("timestep_index", "timestamp")
-                if any(getattr(frame, key) is not None for frame in frames)
-            ),
             offset=self._offset,
         )
         return listing, transforms
