@@ -122,7 +122,7 @@ class SceneReader(Options, ABC):
         return self.name or scene_folder(self.root).resolve().name
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class LayoutReader(SceneReader):
     """Reads lists of images and their poses: a :class:`~devrf.scenes.layout.Layout`.
 
@@ -130,7 +130,6 @@ class LayoutReader(SceneReader):
         train_views: train on the first so many fixed views of the scene in motion; None: all.
     """
 
-    _: KW_ONLY
     train_views: Count | None = None
 
     @abstractmethod
@@ -177,7 +176,7 @@ class LayoutReader(SceneReader):
         return self.flow_of(layout.dynamic_train, views, direction)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class FixedViewsReader(LayoutReader):
     """Options of layouts with folders ``dynamic_<V>views/view1`` … of fixed cameras.
 
@@ -190,13 +189,12 @@ class FixedViewsReader(LayoutReader):
             first one included.
     """
 
-    _: KW_ONLY
     dynamic: str | None = None
     test_view: Annotated[int, Field(strict=True)] = -1
     holdout: Several = 8
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class InwardReader(LayoutReader):
     """Options of inward-facing scenes.
 
@@ -213,7 +211,6 @@ class InwardReader(LayoutReader):
         missing: whether absent images of the list are an ``error``, or left out (``skip``).
     """
 
-    _: KW_ONLY
     bound_scale: BoundScale = "auto"
     near: Number | None = None
     far: Number | None = None
@@ -251,7 +248,7 @@ class InwardReader(LayoutReader):
         return Scene(name, "inward", static, dynamic, bounds, self.background, space, offset)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PosedReader(InwardReader):
     """Options of layouts that may state bounds.
 
@@ -265,7 +262,6 @@ class PosedReader(InwardReader):
 
     stater: ClassVar[str]
 
-    _: KW_ONLY
     space: SpaceChoice | Literal["ndc"] = "auto"  # type: ignore[assignment]
 
     def stated(self, layout: Layout, static: Capture) -> SceneBounds | None:

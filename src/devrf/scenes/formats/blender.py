@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from dataclasses import KW_ONLY, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -37,7 +37,7 @@ SCORED_ON_VAL = "lego"
 HOLDOUT = 8
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class BlenderReader(InwardReader):
     """Reads ``transforms_{train,test}.json`` and images.
 
@@ -57,7 +57,6 @@ class BlenderReader(InwardReader):
 
     has_flow_files: ClassVar[bool] = True
 
-    _: KW_ONLY
     downscale: Downscale = 1
     dynamic: str | None = None
     static_until: Time = 1.0

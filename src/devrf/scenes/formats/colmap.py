@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-from dataclasses import KW_ONLY
 from pathlib import Path, PurePosixPath
 from typing import ClassVar
 
@@ -108,7 +107,7 @@ def fixed_cameras(model: SparseModel, folder: Path, count: int) -> list[int]:
     return [positions[name] for name in names]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ColmapReader(PosedReader, FixedViewsReader):
     """Reads COLMAP's ``sparse/0``, binary or as text, and ``images/``.
 
@@ -130,7 +129,6 @@ class ColmapReader(PosedReader, FixedViewsReader):
 
     stater: ClassVar[str] = "the sparse model"
 
-    _: KW_ONLY
     flow: EstimatedFlow = "auto"
 
     def layout(self, folder: Path) -> Layout:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Sequence
-from dataclasses import KW_ONLY, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
@@ -42,7 +42,7 @@ class _Split(BaseModel):
 _Keypoints = RootModel[Annotated[list[tuple[Number, Number, Number]], Field(max_length=1000)]]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DycheckReader(ItemsReader):
     """Reads ``splits/train.json``, ``splits/val.json``, ``scene.json``, ``camera/``, ``rgb/<n>x/``.
 
@@ -57,7 +57,6 @@ class DycheckReader(ItemsReader):
 
     listing: ClassVar[str] = SPLITS
 
-    _: KW_ONLY
     downscale: Downscale = "up_to_2"
     masks: Literal["ignore", "none"] = "ignore"
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import KW_ONLY
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -37,7 +36,7 @@ INTRINSICS = "intri.yml"
 EXTRINSICS = "extri.yml"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class EasyVolcapReader(InwardReader):
     """Reads ``intri.yml``, ``extri.yml``, ``images/<camera>/`` and ``masks/<camera>/``.
 
@@ -50,7 +49,6 @@ class EasyVolcapReader(InwardReader):
             masks are not read.
     """
 
-    _: KW_ONLY
     flow: EstimatedFlow = "auto"
     test_view: Annotated[int, Field(strict=True)] = -1
     masks: Literal["alpha", "none"] = "alpha"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from dataclasses import KW_ONLY, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -41,7 +41,7 @@ from devrf.scenes.view_folders import (
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class LlffReader(FixedViewsReader):
     """Reads a forward-facing scene.
 
@@ -62,7 +62,6 @@ class LlffReader(FixedViewsReader):
 
     has_flow_files: ClassVar[bool] = True
 
-    _: KW_ONLY
     near: Positive | None = None
     monocular: bool | None = None
     static_until: Time = 1.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import KW_ONLY, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, ClassVar
 
@@ -114,7 +114,7 @@ def read_camera(folder: Path, item: str, world: World) -> tuple[Tensor, Intrinsi
 Listed = tuple[list[str], list[int], list[int]]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ItemsReader(InwardReader):
     """Reads layouts that keep a camera file for each image, and have no static set.
 
@@ -130,7 +130,6 @@ class ItemsReader(InwardReader):
 
     listing: ClassVar[str]
 
-    _: KW_ONLY
     flow: EstimatedFlow = "auto"
     holdout: Several = 8
     static_until: Time = 1.0

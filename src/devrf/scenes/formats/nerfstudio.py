@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import KW_ONLY, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -26,7 +26,7 @@ from devrf.system.options import Several, abbreviated
 FILE = "transforms.json"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class NerfstudioReader(PosedReader):
     """Reads ``transforms.json`` and images.
 
@@ -55,7 +55,6 @@ class NerfstudioReader(PosedReader):
 
     stater: ClassVar[str] = f"scene_bounds in {FILE}"
 
-    _: KW_ONLY
     flow: EstimatedFlow = "auto"
     holdout: Several = 8
     times: Literal["file", "order"] = "file"

@@ -9,7 +9,7 @@ import re
 import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -133,7 +133,7 @@ def read_frames(paths: Sequence[Path], frames: Sequence[int], size: Size, downsc
     return torch.from_numpy(pixels.reshape(-1, *shape[2:]))
 
 
-@pydantic.dataclasses.dataclass(frozen=True)
+@pydantic.dataclasses.dataclass(frozen=True, kw_only=True)
 class Neural3DVideoReader(SceneReader):
     """Reads ``poses_bounds.npy`` and ``cam00.mp4``, ``cam01.mp4`` … of one length.
 
@@ -153,7 +153,6 @@ class Neural3DVideoReader(SceneReader):
         train_views: train on the first so many of the cameras that are not held out; None: all.
     """
 
-    _: KW_ONLY
     flow: EstimatedFlow = "auto"
     test_view: Whole = 0
     near: Positive = 1.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import KW_ONLY
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
@@ -48,7 +47,7 @@ class _Meta(BaseModel):
     fn: ByTime[Name]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PanopticReader(InwardReader):
     """Reads ``train_meta.json``, ``test_meta.json``, ``ims/`` and ``seg/``.
 
@@ -59,7 +58,6 @@ class PanopticReader(InwardReader):
             ``seg/`` is background.
     """
 
-    _: KW_ONLY
     flow: EstimatedFlow = "auto"
     masks: Literal["none", "alpha"] = "none"
 

@@ -46,7 +46,7 @@ Speed = Annotated[float, Field(strict=True, ge=0, le=2)]
 Texture = Literal["soft", "fine"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Recipe(Options, ABC):
     """Calling a recipe renders its scene. The same recipe always gives the same scene.
 
@@ -69,7 +69,6 @@ class Recipe(Options, ABC):
     """
 
     key: ClassVar[str] = "data"
-    _: KW_ONLY
     width: Side = 96
     height: Side = 96
     static_views: Count = 36
