@@ -22,7 +22,7 @@ from devrf.scenes.scene import Background, Capture, OpticalFlow, Scene, Views
 from devrf.scenes.space import SpaceChoice, centred, forward_facing_scene, inward_space
 from devrf.scenes.splits import Split
 from devrf.scenes.transforms import SceneBounds
-from devrf.scenes.validation import LARGEST, checked_box, scene_error
+from devrf.scenes.validation import checked_box, scene_error
 from devrf.system.options import Count, Options, Several
 
 log = logging.getLogger(__name__)
@@ -35,19 +35,11 @@ EstimatedFlow = Literal["auto", "dis", "raft", "none"]
 Time = Annotated[Number, Field(ge=0, le=1)]
 
 
-def _bound_scale(value: object) -> object:
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    # NaN compares false.
-    if value != "auto" and not (number and 1 <= value < LARGEST):  # type: ignore[operator]
-        raise ValueError(f'expected "auto" or a number of at least 1, not {value!r}')
-    return value
-
-
 def _box(value: Any) -> Box | None:
     return value if value is None or isinstance(value, Box) else checked_box(value)
 
 
-BoundScale = Annotated[float | str, PlainValidator(_bound_scale)]
+BoundScale = Literal["auto"] | Annotated[Number, Field(ge=1)]
 # A config gives corners; the reader turns them into a Box.
 BoxOption = Annotated[Any, PlainValidator(_box)]
 
