@@ -236,7 +236,8 @@ def _listed(folder: Path, views: Views) -> dict[int, Path]:
         if not os.path.isfile(path):
             raise scene_error(path, f"no such picture, but {LIST} lists it; add it")
         if entry.image is not None:
-            meant = [k for k, name in enumerate(views.names) if _same(name, entry.image)]
+            # Whatever its folder and suffix.
+            meant = [k for k, n in enumerate(views.names) if Path(n).stem == Path(entry.image).stem]
         elif entry.view is not None and entry.time is not None:
             meant = _at(views, entry.view, entry.time)
         else:
@@ -270,11 +271,6 @@ def _named(folder: Path, views: Views) -> dict[int, Path]:
             f"({Path(views.names[0]).stem}.png), view0_time0.250.png, or list them in {LIST}",
         )
     return best
-
-
-def _same(name: str, other: str) -> bool:
-    """Whether two names are of one image, whatever their folders and suffixes."""
-    return Path(name).stem == Path(other).stem or name == other
 
 
 def _at(views: Views, view: int, time: float) -> list[int]:

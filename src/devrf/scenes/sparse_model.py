@@ -415,8 +415,10 @@ def _inward(
 ) -> tuple[Tensor, Tensor, float, float, tuple[Corner, Corner] | None]:
     axes_meet = nearest_point(poses[:, :, 3], poses[:, :, 2], 1e-2)
     # The axes of cameras that do not go round the scene meet anywhere, or behind them.
-    if axes_meet is not None and (widest_angle(poses) <= ONE_SIDE or _is_behind(axes_meet, poses)):
-        axes_meet = None
+    if axes_meet is not None:
+        ahead = ((axes_meet - poses[:, :, 3]) * -poses[:, :, 2]).sum(dim=1).median()
+        if widest_angle(poses) <= ONE_SIDE or float(ahead) <= 0:
+            axes_meet = None
     middle = points.median(dim=0).values if axes_meet is None else axes_meet
     # z up, as far as the cameras were held upright.
     up = normalize(poses[:, :, 1].sum(dim=0), dim=0)
@@ -440,11 +442,6 @@ def _inward(
     margin = 0.1 * np.maximum(high - low, 0.1 * AROUND)
     inner = Box.of((low - margin).tolist(), (high + margin).tolist())
     return poses, points, near, far, (inner.low, inner.high)
-
-
-def _is_behind(point: Tensor, poses: Tensor) -> bool:
-    """Whether a point (3,) is behind most cameras (N, 3, 4)."""
-    return float(((point - poses[:, :, 3]) * -poses[:, :, 2]).sum(dim=1).median()) <= 0
 
 
 def _moved(poses: Tensor, points: Tensor, frame: Tensor, scale: float) -> tuple[Tensor, Tensor]:

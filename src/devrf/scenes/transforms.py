@@ -226,7 +226,8 @@ class TransformsFiles:
         self._missing = missing
         self._masks = masks
         self._finder = ImageFinder(root)
-        self._listing = cache(_listing)
+        what = "every capture needs its posed images"
+        self._listing = cache(lambda file: read_json(file, TransformsFile, what))
         self._offset: Offset | None = None
 
     def read(
@@ -296,7 +297,3 @@ class TransformsFiles:
             path = inside(self._finder.root, file.parent, name, file)
             raise scene_error(path, "no such mask; correct mask_path, or set data.masks=none")
         return mask
-
-
-def _listing(file: Path) -> TransformsFile:
-    return read_json(file, TransformsFile, "every capture needs its posed images")

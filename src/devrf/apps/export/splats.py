@@ -57,8 +57,9 @@ class MovingGaussians:
     def of_model(cls, model: Renderable, times: Sequence[float]) -> MovingGaussians | None:
         """Those of a method of Gaussians; None for another."""
         found = [model.gaussians_at(time) for time in times]
-        known = [_on_host(gaussians) for gaussians in found if gaussians is not None]
-        return cls(tuple(times), tuple(known)) if known else None
+        known = [vars(gaussians).items() for gaussians in found if gaussians is not None]
+        on_host = [Gaussians(**{name: v.float().cpu() for name, v in part}) for part in known]
+        return cls(tuple(times), tuple(on_host)) if known else None
 
     @classmethod
     def on_surface(cls, mesh: MovingMesh) -> MovingGaussians:
@@ -76,10 +77,6 @@ class MovingGaussians:
                 opacity=gaussians.opacity,
                 color=gaussians.color,
             )
-
-
-def _on_host(gaussians: Gaussians) -> Gaussians:
-    return Gaussians(**{name: value.float().cpu() for name, value in vars(gaussians).items()})
 
 
 def discs(vertices: Tensor, faces: Tensor, colors: Tensor) -> Gaussians:

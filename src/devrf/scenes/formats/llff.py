@@ -76,7 +76,9 @@ class LlffReader(FixedViewsReader):
             )
         factor = self.choose_factor(folder_size(static))
         # The cameras of fixed views have LLFF's own unit, so the static ones need it, too.
-        posed = _read_cameras(static, with_strays=moving is not None)
+        alone = os.path.isfile(static / PRECOMPUTED) and not os.path.isfile(static / POSES)
+        read = read_precomputed_poses if alone else read_static_poses
+        posed = read(static).normalised(with_strays=moving is not None)
         images = _posed_images(posed, image_folder(static, factor))
         video = self.monocular
         if video is None:
@@ -137,13 +139,6 @@ def static_folder(root: Path) -> Path:
     if not os.path.isdir(static) and any(map(os.path.isfile, here)) and not dynamic_folders(root):
         return root
     return existing_folder(static)
-
-
-def _read_cameras(folder: Path, *, with_strays: bool) -> PosedSet:
-    """The cameras of ``poses_bounds.npy``, or NR-NeRF's file, normalised."""
-    alone = os.path.isfile(folder / PRECOMPUTED) and not os.path.isfile(folder / POSES)
-    read = read_precomputed_poses if alone else read_static_poses
-    return read(folder).normalised(with_strays=with_strays)
 
 
 def _posed_images(posed: PosedSet, source: ImageFolder) -> Transforms:

@@ -158,7 +158,9 @@ def _fitted(parts: Sequence[Part], covers: float, moves: float) -> Assembled:
     motion = 1.0
     for _ in range(6):
         body = Assembled(tuple(_scaled(part, 1.0, motion) for part in parts))
-        canonical, paths = _paths(body)
+        outline = body.outline()
+        canonical = outline.canonical
+        paths = torch.stack([body.forward(outline, time) for time in TIMES])
         edge = float((canonical.amax(dim=0) - canonical.amin(dim=0)).max())
         went = float((paths - canonical).norm(dim=-1).max())
         motion *= min(max(moves * edge / max(went, 1e-6), 0.3), 2.0)
@@ -182,12 +184,6 @@ def _scaled(part: Part, size: float, motion: float) -> Part:
     half = (size * a, size * b, size * c)
     base = size * part.base
     return replace(part, half=half, base=base, slide=slide, **moving)
-
-
-def _paths(body: Assembled) -> tuple[Tensor, Tensor]:
-    """The canonical points (M, 3) around the parts, and those at all times (T, M, 3)."""
-    outline = body.outline()
-    return outline.canonical, torch.stack([body.forward(outline, time) for time in TIMES])
 
 
 def _entered(body: Assembled) -> float:
