@@ -7,7 +7,8 @@ rounded to TF32 on a GPU: at 400 pixels that is a fifth of a pixel.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -66,13 +67,12 @@ class Cameras:
 
     def __getitem__(self, index: Tensor | slice | list[int]) -> Cameras:
         """The cameras at ``index``; always N of them, so an int is not an index."""
-        return replace(
-            self,
-            camera_to_world=self.camera_to_world[index],
-            focal=self.focal[index],
-            center=self.center[index],
-            sizes=None if self.sizes is None else self.sizes[index],
-        )
+        return self._mapped(lambda of_cameras: of_cameras[index])
+
+    def _mapped(self, change: Callable[[Tensor], Tensor]) -> Cameras:
+        values = ((field.name, getattr(self, field.name)) for field in fields(self))
+        tensors = {name: value for name, value in values if isinstance(value, Tensor)}
+        return replace(self, **{name: change(value) for name, value in tensors.items()})
 
     @property
     def extents(self) -> Tensor:
@@ -241,13 +241,7 @@ class Cameras:
 
     def to(self, device: torch.device | str) -> Cameras:
         """The same cameras on ``device``."""
-        return replace(
-            self,
-            camera_to_world=self.camera_to_world.to(device),
-            focal=self.focal.to(device),
-            center=self.center.to(device),
-            sizes=None if self.sizes is None else self.sizes.to(device),
-        )
+        return self._mapped(lambda of_cameras: of_cameras.to(device))
 
     @staticmethod
     def looking_at(
