@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 
@@ -100,7 +101,7 @@ def shrink_flow(
 
 # A lens that has to be zoomed by more than this to fill its image counts as folded.
 _LONGEST = 2.0
-_HALVINGS = 24
+_STEPS = 2**24
 
 
 def as_pinhole(
@@ -169,19 +170,11 @@ def _zoom(lens: Lens, centres: Tensor) -> float | None:
         upright = lens.distortion.upright(directions / zoom)
         return bool((((source >= 0) & (source <= size)).all(dim=-1) & upright).all())
 
-    if fills(1.0):
-        return 1.0
-    low = 1.0
-    high = _LONGEST
-    if not fills(high):
-        return None
-    for _ in range(_HALVINGS):
-        middle = (low + high) / 2
-        if fills(middle):
-            high = middle
-        else:
-            low = middle
-    return high
+    def zoom(step: int) -> float:
+        return 1 + (_LONGEST - 1) * step / _STEPS
+
+    step = bisect_left(range(_STEPS + 1), True, key=lambda step: fills(zoom(step)))
+    return None if step > _STEPS else zoom(step)
 
 
 def _centres(width: int, height: int) -> Tensor:
