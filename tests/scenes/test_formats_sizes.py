@@ -28,7 +28,7 @@ from devrf.scenes.scene import Scene, Views
 from devrf.scenes.silhouettes import motion_box, visual_hull
 from devrf.scenes.sparse_model import normalised, read_model
 from devrf.scenes.validation import same_shape
-from layouts import write_sparse
+from layouts import points_in, write_sparse
 
 COUNT = 9
 # Landscape and portrait in turn, by one phone; principal points off the middle.
@@ -124,7 +124,8 @@ def test_a_sparse_model_with_two_cameras(photos, balls_are_where_they_project):
     )
     (model / "cameras.txt").write_text("".join(lines))
     scene = ColmapReader(root, downscale=1).read()
-    centers = normalised(read_model(model)).points[:3].float()
+    sparse = read_model(model)
+    centers = points_in(normalised(sparse)[0], sparse)[:3].float()
     for views in (scene.static.train, scene.static.test):
         balls_are_where_they_project(views, centers)
         assert {views.cameras.size_of(k) for k in range(len(views))} <= set(SIZES)

@@ -17,6 +17,7 @@ from devrf.geometry.cameras import Cameras
 from devrf.pictures.video_file import write_pictures
 from devrf.scenes.lens import Lens
 from devrf.scenes.scene import Scene, Views
+from devrf.scenes.sparse_model import SparseModel
 
 
 def write_sparse(
@@ -45,6 +46,15 @@ def write_sparse(
     (folder / "images.txt").write_text("\n".join(lines) + "\n")
     rows = [f"{n} {x!r} {y!r} {z!r} 9 9 9 0.5" for n, (x, y, z) in enumerate(points.tolist())]
     (folder / "points3D.txt").write_text("\n".join(rows) + "\n")
+
+
+def points_in(poses: torch.Tensor, model: SparseModel) -> torch.Tensor:
+    """The points of a model in the world of its normalised ``poses``."""
+    before = model.poses
+    turn = poses[0, :, :3] @ before[0, :, :3].T
+    apart = [(each[1] - each[0])[:, 3].norm() for each in (poses, before)]
+    local = (torch.from_numpy(model.points) - before[0, :, 3]) @ turn.T
+    return local * apart[0] / apart[1] + poses[0, :, 3]
 
 
 def write_rig(

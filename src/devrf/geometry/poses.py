@@ -32,10 +32,14 @@ def average_pose(poses: Tensor) -> Tensor:
     return torch.stack([right, up, back, poses[:, :, 3].mean(dim=0)], dim=1)
 
 
-def relative_to(frame: Tensor, poses: Tensor) -> Tensor:
-    """Poses (N, 3, 4) in a world in which the rigid pose ``frame`` (3, 4) is the identity."""
+def relative_to(frame: Tensor, poses: Tensor, scale: float = 1.0) -> Tensor:
+    """Poses (N, 3, 4) in a world in which the rigid pose ``frame`` (3, 4) is the identity.
+
+    That world is ``scale`` times larger.
+    """
     turned = frame[:, :3].T @ poses
     turned[:, :, 3] -= frame[:, :3].T @ frame[:, 3]
+    turned[:, :, 3] *= scale
     return turned
 
 

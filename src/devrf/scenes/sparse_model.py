@@ -318,49 +318,39 @@ NEAREST = 1 / 0.75
 AROUND = 4.0
 
 
-@dataclass(frozen=True)
-class World:
-    """The normalised scene.
-
-    Attributes:
-        poses: (N, 3, 4) float64 camera-to-world, OpenGL axes, world units.
-        points: (P, 3) float64.
-        bounds: its space, ``ndc`` or ``contracted``, its distances, and the part that the cameras
-            look at: no box for ``ndc``, and if the cameras' axes meet: then the part that all
-            cameras see is the better guess.
-    """
-
-    poses: Tensor
-    points: Tensor
-    bounds: SceneBounds
-
-
-def normalised(model: SparseModel, facing: Facing = "auto", *, left_out: float = LEFT_OUT) -> World:
-    """The scene of a model in a world of its own origin, axes and unit.
+def normalised(
+    model: SparseModel, facing: Facing = "auto", *, left_out: float = LEFT_OUT
+) -> tuple[Tensor, SceneBounds]:
+    """The poses of a model in a world of its own origin, axes and unit, and the bounds there.
 
     ``facing`` is the kind of capture; ``left_out`` is the percentage of the points beyond each face
     of the inner box, before its margin, if points give the box. DevrfError if points or cameras do
     not determine the bounds.
+
+    Returns:
+        (N, 3, 4) float64 camera-to-world, OpenGL axes; and ``ndc`` or ``contracted``, distances,
+        and the part that the cameras look at: no box for ``ndc``, and if the cameras' axes meet:
+        then the part that all cameras see is the better guess.
     """
     poses = model.poses
-    points = torch.from_numpy(model.points)
     near, far = _depth_range(model)
     if facing == "auto":
         facing = "forward" if widest_angle(poses) <= ONE_SIDE else "inward"
     if facing == "forward":
         scale = NEAREST / near
-        poses, points = _moved(poses, points, average_pose(poses), scale)
+        poses = relative_to(average_pose(poses), poses, scale)
         near, far, box = 1.0, far * scale, None
     else:
-        poses, points, near, far, box = _inward(poses, points, near, far, left_out)
+        poses, scale, box = _inward(poses, torch.from_numpy(model.points), left_out)
+        near, far = 0.5 * near * scale, far * scale
     here = bool(in_reach(poses[:, :, 3]).all())
     if not here or not 0 < near < far <= FARTHEST:  # NaN compares false
         raise scene_error(
             model.folder, f"its cameras do not look {facing} at a scene; run COLMAP's mapper again"
         )
     space = "ndc" if facing == "forward" else "contracted"
-    bounds = SceneBounds.model_validate({"space": space, "near": near, "far": far, "box": box})
-    return World(poses, points, bounds)
+    bounds = {"space": space, "near": near, "far": far, "box": box}
+    return poses, SceneBounds.model_validate(bounds)
 
 
 def _depth_range(model: SparseModel) -> tuple[float, float]:
@@ -411,8 +401,9 @@ def widest_angle(poses: Tensor) -> float:
 
 
 def _inward(
-    poses: Tensor, points: Tensor, near: float, far: float, left_out: float
-) -> tuple[Tensor, Tensor, float, float, tuple[Corner, Corner] | None]:
+    poses: Tensor, points: Tensor, left_out: float
+) -> tuple[Tensor, float, tuple[Corner, Corner] | None]:
+    """Poses in the world of an inward-facing scene, its unit in the model's, and its inner box."""
     axes_meet = nearest_point(poses[:, :, 3], poses[:, :, 2], 1e-2)
     # The axes of cameras that do not go round the scene meet anywhere, or behind them.
     if axes_meet is not None:
@@ -426,14 +417,13 @@ def _inward(
     right = normalize(torch.linalg.cross(aside, up), dim=0)
     frame = torch.stack([right, torch.linalg.cross(up, right), up, middle], dim=1)
     scale = AROUND / float((poses[:, :, 3] - middle).norm(dim=1).median())
-    poses, points = _moved(poses, points, frame, scale)
-    near = 0.5 * near * scale
-    far = far * scale
+    poses = relative_to(frame, poses, scale)
     if axes_meet is not None:
         # Sparse points are on floor and walls, too: the subject would have a fraction of the voxels
         # in their box.
-        return poses, points, near, far, None
+        return poses, scale, None
     # The span of the sparse points around the middle, within the cameras' circle.
+    points = (points - frame[:, 3]) @ frame[:, :3] * scale
     around = points[points.norm(dim=1) < AROUND]
     if len(around) < 10:
         around = points
@@ -441,11 +431,4 @@ def _inward(
     high = np.percentile(around.numpy(), 100 - left_out, axis=0).clip(-AROUND, AROUND)
     margin = 0.1 * np.maximum(high - low, 0.1 * AROUND)
     inner = Box.of((low - margin).tolist(), (high + margin).tolist())
-    return poses, points, near, far, (inner.low, inner.high)
-
-
-def _moved(poses: Tensor, points: Tensor, frame: Tensor, scale: float) -> tuple[Tensor, Tensor]:
-    """Poses and points in the world in which ``frame`` is the identity, ``scale`` times larger."""
-    turned = relative_to(frame, poses)
-    turned[:, :, 3] *= scale
-    return turned, (points - frame[:, 3]) @ frame[:, :3] * scale
+    return poses, scale, (inner.low, inner.high)

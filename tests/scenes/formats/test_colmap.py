@@ -24,7 +24,7 @@ from devrf.scenes.formats.colmap import ColmapReader
 from devrf.scenes.lens import Lens
 from devrf.scenes.sparse_model import normalised, read_model, scene_model
 from devrf.system.memory import own_memory
-from layouts import write_sparse
+from layouts import points_in, write_sparse
 
 # Not square, the principal point off the middle.
 WIDTH, HEIGHT, COUNT = 80, 60, 17
@@ -56,7 +56,8 @@ def folder(tmp_path, ring_cameras, picture) -> Path:
 
 def test_points_fall_on_the_pixels_that_show_them(folder, balls_are_where_they_project):
     scene = ColmapReader(folder, downscale=1).read()
-    balls = normalised(read_model(folder / "sparse/0")).points[:3].float()
+    model = read_model(folder / "sparse/0")
+    balls = points_in(normalised(model)[0], model)[:3].float()
     for views in (scene.static.train, scene.static.test):
         balls_are_where_they_project(views, balls)
 
@@ -125,7 +126,8 @@ def test_cameras_on_one_side_make_a_forward_facing_scene(tmp_path, ring_cameras)
     assert scene.kind == "forward" and (len(scene.static.train), len(scene.static.test)) == (5, 1)
     assert faces_forward("colmap", tmp_path, None)
     # The nearest point is at 1/0.75 of the near plane.
-    depths = (-normalised(read_model(tmp_path / "sparse")).points[:, 2]).numpy()
+    model = read_model(tmp_path / "sparse")
+    depths = -points_in(normalised(model)[0], model)[:, 2].numpy()
     assert depths.min() == pytest.approx(4 / 3, rel=0.1)
     around = ColmapReader(tmp_path, downscale=1, space="contracted").read()
     assert around.kind == "inward" and not faces_forward("colmap", tmp_path, "world")

@@ -7,9 +7,11 @@ import json
 import logging
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
+
+from torch import Tensor
 
 from devrf.apps.capture.alignment import Timeline, timeline
 from devrf.apps.capture.images import (
@@ -32,7 +34,6 @@ from devrf.scenes.sparse_model import (
     LEFT_OUT,
     LEFT_OUT_OF_VIDEO,
     SparseModel,
-    World,
     colmap,
     ndc_holds,
     normalised,
@@ -107,16 +108,15 @@ def scene_from_footage(settings: CaptureSettings) -> Path:
     if facing == "auto" and settings.monocular:
         facing = "forward" if ndc_holds(model) else "inward"
     left_out = LEFT_OUT_OF_VIDEO if settings.monocular else LEFT_OUT
-    world = normalised(model, facing, left_out=left_out)
+    poses, bounds = normalised(model, facing, left_out=left_out)
     if settings.facing == "auto":
-        facing = "forward" if world.bounds.space == "ndc" else "inward"
+        facing = "forward" if bounds.space == "ndc" else "inward"
         log.info("cameras look %s-facing; capture.facing says otherwise", facing)
     if settings.subtracts:
-        world = _around_motion(world, model, into / IMAGES, fixed)
+        bounds = _around_motion(poses, bounds, model, into / IMAGES, fixed)
     frame_seconds = surveys[static].times if settings.monocular else None
-    frames, test = _frames(model, world, moving, fixed, clock, settings, frame_seconds)
+    frames, test = _frames(model, poses, moving, fixed, clock, settings, frame_seconds)
     names = [frame["file_path"] for frame in frames]
-    bounds = world.bounds
     if masks and bounds.space == "contracted":
         # There is nothing around what is cut out, and the reader finds its box.
         bounds = SceneBounds(space="world")
@@ -247,26 +247,26 @@ def _model(
 
 
 def _around_motion(
-    world: World, model: SparseModel, images: Path, fixed: Sequence[Chosen]
-) -> World:
-    """The world with the box of moving objects, if it has a box."""
-    if world.bounds.space != "contracted":
+    poses: Tensor, bounds: SceneBounds, model: SparseModel, images: Path, fixed: Sequence[Chosen]
+) -> SceneBounds:
+    """The bounds with the box of moving objects, if they have a box."""
+    if bounds.space != "contracted":
         log.warning(
             "capture.alpha_masks=subtract: a forward-facing scene has no box, it changes nothing"
         )
-        return world
+        return bounds
     index = {image.name: k for k, image in enumerate(model.images)}
     first = [index[video.names[0]] for video in fixed]
     lenses = [model.cameras[model.images[k].camera] for k in first]
     around = Box.of([-AROUND] * 3, [AROUND] * 3)
     names = [video.names for video in fixed]
-    box = box_of_motion(images, names, world.poses[first], lenses, around)
-    return replace(world, bounds=world.bounds.model_copy(update={"box": (box.low, box.high)}))
+    box = box_of_motion(images, names, poses[first], lenses, around)
+    return bounds.model_copy(update={"box": (box.low, box.high)})
 
 
 def _frames(
     model: SparseModel,
-    world: World,
+    poses: Tensor,
     moving: Chosen,
     fixed: Sequence[Chosen],
     clock: Timeline,
@@ -285,7 +285,7 @@ def _frames(
         k = index[camera]
         path = f"{IMAGES}/{name}"
         lens = model.cameras[model.images[k].camera]
-        pose = [*world.poses[k].tolist(), [0.0, 0.0, 0.0, 1.0]]
+        pose = [*poses[k].tolist(), [0.0, 0.0, 0.0, 1.0]]
         frames.append({"file_path": path, "time": time, **lens, "transform_matrix": pose})
         if held_out:
             test.add(path)

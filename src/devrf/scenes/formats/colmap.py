@@ -141,7 +141,7 @@ class ColmapReader(PosedReader, FixedViewsReader):
                 len(model.images),
                 ", ".join(others),
             )
-        world = normalised(model, FACING.get(self.space, "inward"))
+        poses, bounds = normalised(model, FACING.get(self.space, "inward"))
         cameras = (model.cameras[k] for k in dict.fromkeys(i.camera for i in model.images))
         width, height = max(((int(c["w"]), int(c["h"])) for c in cameras), key=max)
         factor = self.choose_factor(lambda factor: (width // factor, height // factor))
@@ -157,10 +157,10 @@ class ColmapReader(PosedReader, FixedViewsReader):
             model.folder,
             tuple(lenses[k] for k in positions),
             tuple(present.values()),
-            world.poses[positions].float(),
+            poses[positions].float(),
             None,
             downscale=source.downscale,
-            bounds=world.bounds,
+            bounds=bounds,
         )
         train, test = parted(range(len(positions)), (), self.holdout, model.folder, start=0)
         moving = dynamic_folder(folder, self.dynamic)
@@ -178,7 +178,7 @@ class ColmapReader(PosedReader, FixedViewsReader):
             (images[train], images[test]),
             views,
             posed_by=model.folder,
-            poses=world.poses[posed],
+            poses=poses[posed],
             lenses=[lenses[k] for k in posed],
             test=test_view,
         )

@@ -75,8 +75,7 @@ class PosedSet:
                 self.file,
                 "its cameras do not face the scene from one side; use data=inward for others",
             )
-        poses = relative_to(middle, self.poses)
-        poses[:, :, 3] *= scale
+        poses = relative_to(middle, self.poses, scale)
         if not bool(in_reach(poses[:, :, 3]).all()):
             raise scene_error(
                 self.file, "its cameras are too far from one another; correct positions and depths"
