@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -71,8 +72,8 @@ class Cameras:
 
     def _mapped(self, change: Callable[[Tensor], Tensor]) -> Cameras:
         values = ((field.name, getattr(self, field.name)) for field in fields(self))
-        tensors = {name: value for name, value in values if isinstance(value, Tensor)}
-        return replace(self, **{name: change(value) for name, value in tensors.items()})
+        changed: dict[str, Any] = {n: change(v) for n, v in values if isinstance(v, Tensor)}
+        return replace(self, **changed)
 
     @property
     def extents(self) -> Tensor:
