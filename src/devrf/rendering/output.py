@@ -55,11 +55,8 @@ class RenderedImage:
         """The rays of one part or more, one part after another."""
         if len(parts) == 1:
             return parts[0]
-        return RenderedImage(
-            torch.cat([part.color for part in parts]),
-            torch.cat([part.depth for part in parts]),
-            torch.cat([part.opacity for part in parts]),
-        )
+        columns = zip(*(vars(part).values() for part in parts), strict=True)
+        return RenderedImage(*map(torch.cat, columns))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,7 +6,6 @@ from abc import ABC, abstractmethod
 from dataclasses import KW_ONLY
 from typing import Annotated, ClassVar, Literal
 
-import torch
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
@@ -229,10 +228,9 @@ class ProceduralForwardScene(Recipe):
             return self._scene(f"{name}_by_hand", video, video)
         # Seven of each eight views are training views.
         held_out = -(-self.static_views // (HOLDOUT - 1))
-        cameras = facing_static_rig(self.static_views + held_out, self.size)
-        order = torch.arange(len(cameras))
-        learned = cameras[order % HOLDOUT != 0]
-        tested = cameras[order % HOLDOUT == 0]
+        count = self.static_views + held_out
+        cameras = facing_static_rig(count, self.size)
+        learned, tested = (cameras[part] for part in every_nth(count, HOLDOUT, start=0))
         watching, unseen = facing_dynamic_rig(self.train_views, self.size)
         static = filming.static(learned, tested)
         dynamic = filming.dynamic(watching, unseen, self.frames, self.unseen_frames)
