@@ -65,18 +65,16 @@ def inward_space(
         DevrfError: the cameras do not determine the bounds, or near is not before far.
     """
     given = "data.box is given" if box else ""
+    where = given or "the common view of the static cameras"
     masks = "the images have alpha masks" if static.cut_out else "the images have no alpha masks"
     if choice == "world" or (choice == "auto" and (static.cut_out or box)):
         bounds = inward_bounds(
             static, dynamic, everyone, bound_scale=bound_scale, near=near, far=far, box=box
         )
         why = "data.space=world" if choice == "world" else given or masks
-        where = given or "the common view of the static cameras"
         return WORLD, replace(bounds, reason=why, box_source=where)
     inner = box or box_from_cameras(static.cameras)
-    where = given
     if box is None:
-        where = "the common view of the static cameras"
         motion = motion_box(dynamic, inner) if dynamic is not None and dynamic.cut_out else None
         if motion is not None:
             inner = inner.union(motion)
