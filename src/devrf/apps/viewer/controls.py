@@ -150,17 +150,11 @@ class Controls:
         """
         crop = None
         if self._crop.value:
-            shares = [
-                (
-                    within(min(slider.value), (0, 100)) / 100,
-                    within(max(slider.value), (0, 100)) / 100,
-                )
-                for slider in self._sides
-            ]
-            corners = list(zip(box.low, box.size, shares, strict=True))
+            shares = [[within(end, (0, 100)) / 100 for end in side.value] for side in self._sides]
+            sides = list(zip(box.low, box.size, map(min, shares), map(max, shares), strict=True))
             crop = Box.of(
-                [low + size * first for low, size, (first, _) in corners],
-                [low + size * max(last, first + 0.01) for low, size, (first, last) in corners],
+                [low + size * first for low, size, first, _ in sides],
+                [low + size * max(last, first + 0.01) for low, size, first, last in sides],
             )
         with_depth = with_depth or self.dynamic.value or self.static.value
         beside = self._rest.value and self._rest.visible
