@@ -54,15 +54,12 @@ def offset_of(poses: Tensor) -> Offset:
 
 def added(poses: Tensor, offset: Offset) -> Tensor:
     """Poses (..., 3, 4) of a scene in the capture's world, float64."""
-    return _moved(poses, offset, 1.0)
+    moved = poses.double().clone()
+    moved[..., 3] += moved.new_tensor(offset)
+    return moved
 
 
 def subtracted(poses: Tensor, offset: Offset) -> Tensor:
     """Poses (..., 3, 4) of the capture's world in the scene's, float64."""
-    return _moved(poses, offset, -1.0)
-
-
-def _moved(poses: Tensor, offset: Offset, sign: float) -> Tensor:
-    moved = poses.double().clone()
-    moved[..., 3] += sign * moved.new_tensor(offset)
-    return moved
+    x, y, z = offset
+    return added(poses, (-x, -y, -z))
