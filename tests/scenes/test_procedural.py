@@ -304,7 +304,7 @@ def surface(shape: Shape, time: float) -> Tensor:
     """World points (S, 3) that three cameras see of the shape at ``time``."""
     if isinstance(shape, Surrounded):
         cameras, _ = facing_dynamic_rig(3, (24, 18))
-        depth = Filming(shape, 9.0, 1, steps=400).pictures(cameras, time)[1]
+        depth = Filming(shape, 9.0, 1, opaque=True).pictures(cameras, time)[1]
     else:
         cameras, _ = dynamic_rig(3, (32, 32), reach=1.4)
         depth = Filming(shape, 1.6, 1).pictures(cameras, time)[1]

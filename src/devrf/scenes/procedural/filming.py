@@ -12,7 +12,7 @@ from torch import Tensor
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.motion import moving, radius
-from devrf.scenes.procedural.march import CHUNK, MAX_STEPS, block_starts, trace
+from devrf.scenes.procedural.march import CHUNK, MAX_STEPS, STEPS_TO_WALLS, block_starts, trace
 from devrf.scenes.procedural.solids import Body, Shape
 from devrf.scenes.scene import Capture, OpticalFlow, Views
 
@@ -196,7 +196,6 @@ class Filming:
         reach: radius of a ball about the origin that holds the shape at all times, world units.
         supersample: n: colour and alpha are the mean of n × n rays a pixel.
         light: share of the lamp in the lighting, 0 (albedo alone) … 1.
-        steps: the number of steps after which a ray counts as a miss.
         opaque: whether every ray meets a surface, so that the images need no alpha.
     """
 
@@ -204,7 +203,6 @@ class Filming:
     reach: float
     supersample: int = 2
     light: float = 0.2
-    steps: int = MAX_STEPS
     opaque: bool = False
 
     def static(self, train: Cameras, test: Cameras) -> Capture:
@@ -280,6 +278,7 @@ class Filming:
         steps = (torch.arange(self.supersample) + 0.5) / self.supersample - 0.5
         offsets = torch.cat([torch.zeros(1, 2), torch.cartesian_prod(steps, steps)])
         count = len(offsets)
+        steps = STEPS_TO_WALLS if self.opaque else MAX_STEPS
         live = start.isfinite().nonzero().squeeze(-1)
         for pixel in torch.split(live, max(CHUNK // count, 1)):
             centers = grid[pixel % len(grid)]
@@ -287,7 +286,7 @@ class Filming:
                 (pixel // len(grid)).repeat(count), (centers + offsets[:, None]).view(-1, 2)
             )
             onset = start[pixel].repeat(count)
-            distance = trace(self.shape, rays, time, onset, self.reach, self.steps)
+            distance = trace(self.shape, rays, time, onset, self.reach, steps)
             depth[pixel] = distance[: len(pixel)]
             hit = distance[len(pixel) :].isfinite().nonzero().squeeze(-1) + len(pixel)
             # Colour times alpha, and alpha: only these may be averaged.

@@ -15,15 +15,15 @@ from devrf.scenes.procedural.solids import Shape
 HIT = 3e-4
 # A ray that grazes a surface creeps; after so many steps it counts as a miss.
 MAX_STEPS = 96
+# Rays that creep past toy or furniture have to reach a wall; in 256 steps not all do.
+STEPS_TO_WALLS = 400
 # Rays traced at once: enough to hide the cost of a call; more take memory and no less time.
 CHUNK = 131072
 # Side in pixels of the blocks whose rays share their first steps.
 BLOCK = 4
 
 
-def trace(
-    shape: Shape, rays: Rays, time: float, start: Tensor, reach: float, steps: int = MAX_STEPS
-) -> Tensor:
+def trace(shape: Shape, rays: Rays, time: float, start: Tensor, reach: float, steps: int) -> Tensor:
     """Distance (M,) along each ray to the surface at ``time``, +inf where it meets none.
 
     Args:

@@ -28,7 +28,7 @@ from devrf.scenes.procedural.rigs import (
 )
 from devrf.scenes.procedural.robot import Robot
 from devrf.scenes.procedural.solids import Body, Shape
-from devrf.scenes.procedural.surroundings import REACH, STEPS, Backdrop, Room, Surrounded
+from devrf.scenes.procedural.surroundings import REACH, Backdrop, Room, Surrounded
 from devrf.scenes.scene import Bounds, Capture, Scene
 from devrf.scenes.space import inward_space
 from devrf.scenes.splits import every_nth
@@ -42,7 +42,6 @@ Frames = Annotated[int, Field(strict=True, ge=2, le=10_000)]
 # Above speed 2 the flower folds into itself, the robot goes through its own body and the toy is
 # squashed to pieces.
 Speed = Annotated[float, Field(strict=True, ge=0, le=2)]
-Texture = Literal["soft", "fine"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +58,8 @@ class Recipe(Options, ABC):
         supersample: n × n rays a pixel.
         light: share of the lamp in the lighting, 0 … 1: with more, motion changes colours more.
         scene_seed: of the body of ``shape`` ``random``.
+        texture: the paint of room, wall and floor: ``soft``, or ``fine`` for images of about 240
+            pixels or more, in which no place looks like another.
         sliding: whether its round parts spin, so that texture slides over a fixed silhouette.
         novel_times_every: n: only the held-out camera has every n-th frame, except the last one;
             None: all frames are training frames.
@@ -77,6 +78,7 @@ class Recipe(Options, ABC):
     supersample: Annotated[int, Field(strict=True, ge=1, le=16)] = 2
     light: Share = 0.2
     scene_seed: Whole = 0
+    texture: Literal["soft", "fine"] = "soft"
     sliding: bool = False
     novel_times_every: Several | None = None
 
@@ -120,15 +122,12 @@ class ProceduralScene(Recipe):
         static_test_views: held-out views of the static scene.
         surroundings: ``none``: the images have alpha masks; ``room``: the object stands in a
             furnished room, filmed from inside it, and the images have none.
-        texture: the room's paint: ``soft``, or ``fine`` for images of about 240 pixels or
-            more, in which no place looks like another.
     """
 
     shape: Literal["robot", "flower", "random"] = "robot"
     _: KW_ONLY
     static_test_views: Count = 8
     surroundings: Literal["none", "room"] = "none"
-    texture: Texture = "soft"
 
     @one_thread()
     def __call__(self) -> Scene:
@@ -143,7 +142,7 @@ class ProceduralScene(Recipe):
         watching, unseen = dynamic_rig(self.train_views, self.size, reach=where.reach, rig=rig)
         filming = Filming(surface, where.reach, self.supersample, self.light)
         if inside:
-            filming = Filming(surface, REACH, self.supersample, self.light, STEPS, opaque=True)
+            filming = Filming(surface, REACH, self.supersample, self.light, opaque=True)
         static = filming.static(learned, tested)
         dynamic = filming.dynamic(watching, unseen, self.frames, self.unseen_frames)
         if inside:
@@ -203,14 +202,11 @@ class ProceduralForwardScene(Recipe):
         camera: ``fixed``: a static set, and fixed cameras; ``handheld``: one camera that moves
             while the scene does, and at each time another view, held out; then there is no static
             set, and ``static_views`` and ``train_views`` are not used.
-        texture: the paint of wall and floor: ``soft``, or ``fine`` for images of about 240
-            pixels or more, in which it has waves of five to twelve pixels.
     """
 
     shape: Literal["plush", "cushion", "random"] = "plush"
     _: KW_ONLY
     camera: Literal["fixed", "handheld"] = "fixed"
-    texture: Texture = "soft"
     height: Side = 72
     static_views: Count = 20
     frames: Frames = 12
@@ -218,9 +214,8 @@ class ProceduralForwardScene(Recipe):
     @one_thread()
     def __call__(self) -> Scene:
         """Render everything."""
-        filming = Filming(
-            self.visible_shape(), _REACH, self.supersample, self.light, STEPS, opaque=True
-        )
+        shape = self.visible_shape()
+        filming = Filming(shape, _REACH, self.supersample, self.light, opaque=True)
         name = {"random": "random_forward"}.get(self.shape, self.shape)
         if self.camera == "handheld":
             camera, others = hand_held_rig(self.frames, self.size)

@@ -170,8 +170,6 @@ REACH = 10.0
 # The share of the mural in fine paint, and how much longer its waves are than on the wall.
 _MURAL = 0.6
 _LONGER = 1.6
-# Rays that creep past toy or furniture have to reach a wall; in 256 steps not all do.
-STEPS = 400
 
 WOOD: Rgb = (0.62, 0.43, 0.26)
 DARK: Rgb = (0.33, 0.22, 0.15)
