@@ -18,7 +18,7 @@ from devrf.geometry.cameras import Cameras
 from devrf.pictures.video_file import write_pictures
 from devrf.scenes.procedural.filming import Filming
 from devrf.scenes.procedural.recipe import ProceduralForwardScene, ProceduralScene
-from devrf.scenes.procedural.surroundings import REACH, STEPS
+from devrf.scenes.procedural.surroundings import REACH
 from devrf.scenes.scene import Scene
 
 RATE = 10
@@ -168,7 +168,7 @@ def _kept(file: Path, cameras: Cameras, times: list[float]) -> np.ndarray:
     """(N, H, W, 3) uint8: what cameras see of the robot in its room, each at its time."""
     if not file.is_file():
         room = ProceduralScene(surroundings="room", texture="fine")
-        film = Filming(room.visible_shape(), REACH, steps=STEPS, opaque=True)
+        film = Filming(room.visible_shape(), REACH, opaque=True)
         shown = [film.pictures(cameras[[k]], time)[0] for k, time in enumerate(times)]
         torch.save(torch.cat(shown), file)
     pixels: Tensor = torch.load(file, weights_only=True)

@@ -278,7 +278,7 @@ class Filming:
         steps = (torch.arange(self.supersample) + 0.5) / self.supersample - 0.5
         offsets = torch.cat([torch.zeros(1, 2), torch.cartesian_prod(steps, steps)])
         count = len(offsets)
-        steps = STEPS_TO_WALLS if self.opaque else MAX_STEPS
+        most = STEPS_TO_WALLS if self.opaque else MAX_STEPS
         live = start.isfinite().nonzero().squeeze(-1)
         for pixel in torch.split(live, max(CHUNK // count, 1)):
             centers = grid[pixel % len(grid)]
@@ -286,7 +286,7 @@ class Filming:
                 (pixel // len(grid)).repeat(count), (centers + offsets[:, None]).view(-1, 2)
             )
             onset = start[pixel].repeat(count)
-            distance = trace(self.shape, rays, time, onset, self.reach, steps)
+            distance = trace(self.shape, rays, time, onset, self.reach, most)
             depth[pixel] = distance[: len(pixel)]
             hit = distance[len(pixel) :].isfinite().nonzero().squeeze(-1) + len(pixel)
             # Colour times alpha, and alpha: only these may be averaged.
