@@ -179,3 +179,25 @@ def test_what_is_not_in_world_space_is_refused(
         DevrfError, match="gaussians needs a scene in world space, and .* use another"
     ):
         fit(stage(), data=serve(tiny_toy))
+
+
+def test_what_moves_is_apart_from_what_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = DeformableGaussians(TINY)
+    model.clock = type(model.clock)((0.0, 0.5, 1.0))
+    places = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [0.0, 1, 0]])
+    model.cloud.begin(places, torch.rand(3, 3), torch.full((3,), 0.1), 0.5)
+    # Halfway the second is a tenth of the radius farther along z, the third a 25th.
+    along_z = torch.tensor([[0.0, 0, 0.1], [0.0, 0, 0.04], [0.0, 0, 0]])
+
+    def moved(self: DeformableGaussians, time: float) -> Any:
+        return (time == 0.5) * self.cloud.means @ along_z, torch.zeros(1, 4), torch.zeros(1, 3)
+
+    monkeypatch.setattr(DeformableGaussians, "moved", moved)
+    parts = model.moving_and_still(1.0)
+    assert isinstance(parts["moving"], DeformableGaussians)
+    assert torch.equal(parts["moving"].cloud.means, places[1:2])
+    assert torch.equal(parts["still"].cloud.means, places[[0, 2]])
+    assert parts["still"].trunk is model.trunk and len(model.cloud) == 3
+    gone = parts["moving"].gaussians_at(0.5).means
+    torch.testing.assert_close(gone, torch.tensor([[1.0, 0, 0.1]]))
+    assert not model.moving_and_still(10.0)  # where a tenth is little

@@ -91,6 +91,11 @@ class Cloud(StoredShape):
             setattr(self, name, nn.Parameter(value, requires_grad=learns))
         self.seen = self.seen.new_zeros(len(self.means), 2)
 
+    @torch.no_grad()
+    def keep(self, rows: Tensor) -> None:
+        """Remove the Gaussians where the mask ``rows`` (N,) is False."""
+        self._take({name: getattr(self, name)[rows] for name in self.parts})
+
     def gaussians(self, moves: tuple[Tensor, Tensor, Tensor] | None, basis: Tensor) -> Gaussians:
         """The Gaussians with ``moves`` (N, 3), (N, 4), (N, 3) of means, rotations and scales.
 

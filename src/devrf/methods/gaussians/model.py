@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -19,6 +20,7 @@ from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
+from devrf.geometry.motion import moving
 from devrf.geometry.space import WORLD, WorldSpace
 from devrf.kernels.ahead import splatting_kernels
 from devrf.kernels.splatting import splat
@@ -31,6 +33,7 @@ from devrf.ops.compositing import LEAST_MASS
 from devrf.ops.spherical_harmonics import spherical_harmonics
 from devrf.ops.splatting import LOW_PASS, Gaussians
 from devrf.rendering.output import RenderedImage, RenderOutput
+from devrf.rendering.renderable import Renderable
 from devrf.scenes.scene import Scene
 from devrf.system.plain_data import validate
 
@@ -165,6 +168,16 @@ class DeformableGaussians(ImageTrainable):
         basis = self.cloud.means.new_ones(len(self.cloud), 1)
         gaussians = self.cloud.gaussians(self.moved(time), basis)
         return replace(gaussians, means=gaussians.means.detach())
+
+    def moving_and_still(self, size: float) -> dict[str, Renderable]:
+        """The scene with some of its Gaussians alone; the network is shared."""
+        moves = moving((self.gaussians_at(time).means for time in self.clock.times), size)
+        parts: dict[str, Renderable] = {}
+        for name, rows in (("moving", moves), ("still", ~moves)) if bool(moves.any()) else ():
+            part = copy.deepcopy(self, {id(module): module for module in (self.trunk, self.last)})
+            part.cloud.keep(rows)
+            parts[name] = part
+        return parts
 
     def forward(self, batch: ImageBatch) -> RenderOutput:
         """Render an image; while the cloud learns, note where it lacks detail."""
