@@ -1,9 +1,10 @@
-"""Every kernel compiles for NVIDIA's GPUs, whether there is one or not."""
+"""Every kernel compiles for NVIDIA's GPUs without one, and spills no register."""
 
 from __future__ import annotations
 
 import inspect
 import pkgutil
+import struct
 import sys
 from importlib import import_module
 from pathlib import Path
@@ -13,7 +14,7 @@ import torch
 import warp as wp
 
 import devrf.kernels
-from devrf.kernels.runtime import is_supported
+from devrf.kernels.runtime import is_supported, row_type
 
 # Densities, displacements, features.
 CHANNELS = (1, 3, 12)
@@ -21,8 +22,11 @@ CHANNELS = (1, 3, 12)
 SPACES = (False, True)
 # Whether images have an alpha mask.
 ALPHAS = (False, True)
-# Ampere and Blackwell: no kernel has code of an architecture's own, so that those between do, too.
-ARCHITECTURES = (80, 120)
+# Ampere, Hopper, Blackwell: no kernel has code of an architecture's own, so others do, too.
+ARCHITECTURES = (80, 90, 120)
+# Attributes of a kernel in a cubin's .nv.info (EIATTR_REGCOUNT, EIATTR_FRAME_SIZE).
+REGISTERS, FRAME = 0x2F, 0x11
+Numbers = row_type(64)
 
 
 def every_kernel() -> dict[str, wp.Kernel]:
@@ -47,16 +51,54 @@ def every_kernel() -> dict[str, wp.Kernel]:
     return found
 
 
+@wp.kernel(enable_backward=False)
+def fits_no_registers(first: int, result: wp.array(dtype=float)):
+    """Numbers that are looked up by an index do not fit registers: the check sees local memory."""
+    numbers = Numbers()
+    for k in range(64):
+        numbers[(first * k) % 64] = float(k)
+    result[first] = numbers[first]
+
+
 @pytest.fixture(scope="module")
 def together() -> wp.Module:
     """All kernels in one module: the compiler reads Warp's own functions once, not for each."""
     assert is_supported(torch.zeros(1))  # starts Warp
     module = wp.get_module("devrf_kernels_together")
-    module.made = [
-        wp.Kernel(kernel.func, key=name.replace(".", "_"), module=module, options=kernel.options)
-        for name, kernel in every_kernel().items()
-    ]
+    kernels = every_kernel() | {"fits_no_registers": fits_no_registers}
+    module.made = {
+        name: wp.Kernel(
+            kernel.func, key=name.replace(".", "_"), module=module, options=kernel.options
+        )
+        for name, kernel in kernels.items()
+    }
     return module
+
+
+def attributes(cubin: bytes) -> dict[str, dict[int, int]]:
+    """The number of registers, and bytes of local memory, of each function in a cubin, an ELF."""
+    (start,) = struct.unpack_from("<Q", cubin, 40)
+    size, count, names = struct.unpack_from("<HHH", cubin, 58)
+    # Of each section its name's place, and where it begins and how long it is.
+    heads = [struct.unpack_from("<I20xQQ", cubin, start + k * size) for k in range(count)]
+
+    def text(table: int, place: int) -> str:
+        begin = table + place
+        return cubin[begin : cubin.index(b"\0", begin)].decode()
+
+    sections = {text(heads[names][1], name): (at, length) for name, at, length in heads}
+    symbols, strings = sections[".symtab"][0], sections[".strtab"][0]
+    at, length = sections[".nv.info"]
+    stop = at + length
+    found: dict[str, dict[int, int]] = {}
+    while at < stop:
+        form, attribute, size = struct.unpack_from("<BBH", cubin, at)
+        if form == 4 and attribute in (REGISTERS, FRAME):
+            symbol, value = struct.unpack_from("<II", cubin, at + 4)
+            (name,) = struct.unpack_from("<I", cubin, symbols + 24 * symbol)
+            found.setdefault(text(strings, name), {})[attribute] = value
+        at += 4 + (size if form == 4 else 0)  # the other forms have their value in ``size``
+    return found
 
 
 def test_all_are_found() -> None:
@@ -77,9 +119,21 @@ def test_all_are_found() -> None:
 
 @pytest.mark.skipif(sys.platform == "darwin", reason="Warp has no compiler for CUDA there")
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
-def test_every_kernel_compiles(together: wp.Module, architecture: int, tmp_path: Path) -> None:
+def test_every_kernel_compiles_without_spills(
+    together: wp.Module, architecture: int, tmp_path: Path
+) -> None:
     (made,) = wp.compile_aot_module(together, arch=architecture, module_dir=tmp_path, use_ptx=False)
-    code = made.read_bytes()
-    assert made.suffix == ".cubin" and together.made
-    for kernel in together.made:
-        assert f"{kernel.get_mangled_name()}_cuda_kernel_forward".encode() in code, kernel.key
+    assert made.suffix == ".cubin"
+    of = attributes(made.read_bytes())
+    compiled = {
+        name: of[f"{kernel.get_mangled_name()}_cuda_kernel_forward"]
+        for name, kernel in together.made.items()
+    }
+    print(f"\nsm_{architecture}: registers and bytes of local memory of a thread")
+    for name, each in compiled.items():
+        print(f"{each[REGISTERS]:4} {each[FRAME]:4} {name}")
+    # No kernel has an array of its own: local memory would hold registers that are spilled.
+    assert compiled.pop("fits_no_registers")[FRAME] >= 64 * 4
+    assert {name for name, each in compiled.items() if each[FRAME]} == set()
+    # Two blocks of 256 threads fit a multiprocessor's 65,536.
+    assert max(each[REGISTERS] for each in compiled.values()) <= 128
