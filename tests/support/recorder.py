@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any, NamedTuple
 
 import pytest
@@ -84,6 +85,17 @@ def outline(values: Any) -> tuple[Any, ...]:
         return value if isinstance(value, int | float) else type(value).__name__
 
     return tuple(of(value) for value in values)
+
+
+def by_samples(entries: list[Entry]) -> list[str]:
+    """An iteration's entries with K in place of its number of samples, the optimiser's by name."""
+    (count,) = {entry.arguments[1][0][0] for entry in entries if entry.name == "composite_kernel"}
+    return [
+        entry.name
+        if "adam" in entry.name or entry.name == "aten::full"
+        else re.sub(rf"\b{count}\b", "K", str(entry))
+        for entry in entries
+    ]
 
 
 def recording(stage_type: type[Stage], iterations: list[list[Entry]]) -> type[Any]:
