@@ -6,13 +6,11 @@ See docs/method.md#compositing. The loss that is learned from has its own gradie
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 import warp as wp
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
+from devrf.kernels.adjoint import with_adjoint
 from devrf.kernels.runtime import is_supported, launch
 from devrf.ops import compositing as definition
 from devrf.ops.march import Samples
@@ -23,41 +21,21 @@ def composite_colors(samples: Samples, color: Tensor, background: Tensor) -> Ten
     weight, end = samples.weight, samples.transmittance
     if not is_supported(color):
         return definition.composite_colors(weight, color, samples.ray, end, background)
-    image: Tensor = _Composite.apply(  # type: ignore[no-untyped-call]
-        weight, color, end, background, samples.ray, samples.stop
-    )
-    return image
+    given = [each.detach().contiguous() for each in (weight, color, end, background)]
+    image = torch.empty(len(end), 3, device=color.device)
+    inputs = [samples.stop, *given[:3], given[3].view(-1, 3), image]
+    launch(composite_kernel, len(end), inputs, color.device)
 
-
-class _Composite(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any,
-        weight: Tensor,
-        color: Tensor,
-        end: Tensor,
-        background: Tensor,
-        ray: Tensor,
-        stop: Tensor,
-    ) -> Tensor:
-        behind = background.contiguous().view(-1, 3)
-        ctx.save_for_backward(weight, color, end, background, ray)
-        image = torch.empty(len(end), 3, device=color.device)
-        inputs = [stop, weight.contiguous(), color.contiguous(), end.contiguous(), behind, image]
-        launch(composite_kernel, len(end), inputs, color.device)
-        return image
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        weight, color, end, background, ray = ctx.saved_tensors
-        of_samples = gradient.index_select(0, ray)
+    def adjoint(gradient: Tensor) -> tuple[Tensor | None, ...]:
+        of_samples = gradient.index_select(0, samples.ray)
         of_weight = (of_samples * color).sum(dim=1)
         of_end = (gradient * background).sum(dim=1)
         of_background = None
-        if ctx.needs_input_grad[3]:
+        if background.requires_grad:
             of_background = (end[:, None] * gradient).sum_to_size(background.shape)
-        return of_weight, of_samples * weight[:, None], of_end, of_background, None, None
+        return of_weight, of_samples * weight[:, None], of_end, of_background
+
+    return with_adjoint((image,), (weight, color, end, background), adjoint)[0]
 
 
 @wp.func

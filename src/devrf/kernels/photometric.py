@@ -6,13 +6,12 @@ See docs/method.md#photometric-losses.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import torch
 import warp as wp
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
+from devrf.kernels.adjoint import with_adjoint
 from devrf.kernels.compositing import behind, first_of
 from devrf.kernels.runtime import launch, row_type
 from devrf.ops.march import Samples
@@ -45,48 +44,25 @@ def photometric(
         alpha: (R,) A, or None.
         weights: of some of the terms of :mod:`devrf.ops.photometric`.
     """
-    factors = tuple(weights.get(name, 0.0) for name in TERMS)
-    learned = (samples.weight, color, samples.transmittance, background)
-    given = (image.detach(), samples.stop, truth, alpha, factors)
-    total, parts = _Photometric.apply(*learned, *given)  # type: ignore[no-untyped-call]
-    values = dict(zip((*TERMS, "opacity", "coverage"), parts.unbind(), strict=True))
+    factors = wp.vec4(*(weights.get(name, 0.0) for name in TERMS))
+    device, rays = color.device, len(samples.transmittance)
+    learned = [samples.weight, color, samples.transmittance]
+    learned += [background] if background.requires_grad else []
+    mask = truth.new_empty(0) if alpha is None else alpha
+    given = [samples.weight, color, samples.transmittance, background.view(-1, 3), image]
+    given += [samples.stop, truth, mask]
+    parts = torch.empty(rays, len(TERMS) + 3, device=device)
+    gradients = [torch.empty_like(each) for each in learned]
+    results = gradients if background.requires_grad else [*gradients, truth.new_empty(0, 3)]
+    inputs = [factors, *(each.detach().contiguous() for each in given), parts, *results]
+    launch(photometric_kernel, rays, inputs, device)
+    sum_of_terms, *values = parts.mean(dim=0).unbind()
+    (total,) = with_adjoint(
+        (sum_of_terms,), learned, lambda gradient: torch._foreach_mul(gradients, gradient)
+    )
+    by_name = dict(zip((*TERMS, "opacity", "coverage"), values, strict=True))
     named = [*weights, "opacity"] + ["coverage"] * (alpha is not None)
-    return total, {name: values[name] for name in named}
-
-
-class _Photometric(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any,
-        weight: Tensor,
-        color: Tensor,
-        end: Tensor,
-        background: Tensor,
-        image: Tensor,
-        stop: Tensor,
-        truth: Tensor,
-        alpha: Tensor | None,
-        factors: tuple[float, ...],
-    ) -> tuple[Tensor, Tensor]:
-        mask = end.new_empty(0) if alpha is None else alpha
-        behind_all = background.view(-1, 3)
-        given = [weight, color, end, behind_all, image, stop, truth, mask]
-        parts = torch.empty(len(end), len(TERMS) + 3, device=end.device)
-        learned = background if ctx.needs_input_grad[3] else background.new_empty(0, 3)
-        ctx.gradients = [torch.empty_like(each) for each in (weight, color, end, learned)]
-        inputs = [wp.vec4(*factors), *(each.contiguous() for each in given), parts]
-        launch(photometric_kernel, len(end), [*inputs, *ctx.gradients], end.device)
-        total, values = parts.mean(dim=0).split((1, len(TERMS) + 2))
-        ctx.mark_non_differentiable(values)
-        ctx.set_materialize_grads(False)
-        return total[0], values
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: Tensor, *_: None) -> tuple[Tensor | None, ...]:
-        gradients = list(torch._foreach_mul(ctx.gradients, gradient))
-        of_background = gradients.pop() if ctx.needs_input_grad[3] else None
-        return *gradients[:3], of_background, *(None,) * 5
+    return total, {name: by_name[name] for name in named}
 
 
 @wp.kernel(module="unique", enable_backward=False)

@@ -14,14 +14,13 @@ Gaussian's rows are added in their order.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
 
 import torch
 import warp as wp
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from devrf.geometry.cameras import Cameras
+from devrf.kernels.adjoint import with_adjoint
 from devrf.kernels.runtime import array, empty_structs, is_supported, launch, row_type
 from devrf.ops import splatting as definition
 from devrf.ops.splatting import FAINTEST, LOW_PASS, MARGIN, MOST, STOP, Gaussians, SplatImage
@@ -55,62 +54,46 @@ def splat(
     shift = torch.zeros_like(means[:, :2]) if shift is None else shift
     opacity = gaussians.opacity[:, None]
     columns = [means, gaussians.scales, gaussians.quaternions, opacity, gaussians.color, shift]
-    color, transmittance = _Splat.apply(  # type: ignore[no-untyped-call]
-        torch.cat(columns, dim=1), raster, pinhole
-    )
-    return SplatImage(color[:, :3], color[:, 3], transmittance)
+    learned = torch.cat(columns, dim=1)
+    table, device, count = learned.detach(), means.device, len(means)
+    splats = empty_structs(Projected, count, device)
+    tiles = torch.empty(count, dtype=torch.int32, device=device)
+    scene = [raster, pinhole, array(table, Gaussian)]
+    launch(project_kernel, count, [*scene, splats, tiles], device)
 
+    starts = tiles.cumsum(0, dtype=torch.int32) - tiles
+    pairs = int(tiles.sum())
+    if pairs > MOST_PAIRS:
+        raise OutOfMemoryError(
+            f"{count} Gaussians lie in {pairs} tiles of a picture of {raster.width}x"
+            f"{raster.height} px, {MOST_PAIRS} at most; take a smaller one"
+        )
+    keys = torch.empty(pairs, dtype=torch.int64, device=device)
+    owner = torch.empty(pairs, dtype=torch.int32, device=device)
+    launch(list_kernel, count, [raster, splats, tiles, starts, keys, owner], device)
+    keys, order = keys.sort(stable=True)
+    edges = torch.arange(raster.tiles + 1, device=device) << 32
+    edges = torch.searchsorted(keys, edges, out_int32=True)
 
-class _Splat(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any, gaussians: Tensor, raster: Raster, pinhole: wp.array
-    ) -> tuple[Tensor, Tensor]:
-        device, count = gaussians.device, len(gaussians)
-        splats = empty_structs(Projected, count, device)
-        tiles = torch.empty(count, dtype=torch.int32, device=device)
-        scene = [raster, pinhole, array(gaussians, Gaussian)]
-        launch(project_kernel, count, [*scene, splats, tiles], device)
+    color = torch.zeros(raster.width * raster.height, 4, device=device)
+    transmittance = torch.ones(len(color), device=device)
+    listed = [raster, edges, order.int(), owner, splats]
+    threads = raster.tiles * raster.threads
+    launch(composite_kernel, threads, [*listed, color, transmittance], device, grain=1)
 
-        starts = tiles.cumsum(0, dtype=torch.int32) - tiles
-        pairs = int(tiles.sum())
-        if pairs > MOST_PAIRS:
-            raise OutOfMemoryError(
-                f"{count} Gaussians lie in {pairs} tiles of a picture of {raster.width}x"
-                f"{raster.height} px, {MOST_PAIRS} at most; take a smaller one"
-            )
-        keys = torch.empty(pairs, dtype=torch.int64, device=device)
-        owner = torch.empty(pairs, dtype=torch.int32, device=device)
-        launch(list_kernel, count, [raster, splats, tiles, starts, keys, owner], device)
-        keys, order = keys.sort(stable=True)
-        edges = torch.arange(raster.tiles + 1, device=device) << 32
-        edges = torch.searchsorted(keys, edges, out_int32=True)
-
-        color = torch.zeros(raster.width * raster.height, 4, device=device)
-        transmittance = torch.ones(len(color), device=device)
-        listed = [raster, edges, order.int(), owner, splats]
-        threads = raster.tiles * raster.threads
-        launch(composite_kernel, threads, [*listed, color, transmittance], device, grain=1)
-        ctx.save_for_backward(color, transmittance)
-        ctx.scene, ctx.listed, ctx.rows = scene, listed, [tiles, starts]
-        return color, transmittance
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, of_color: Tensor, of_transmittance: Tensor) -> tuple[Any, ...]:
-        color, transmittance = ctx.saved_tensors
-        raster, _, gaussians = ctx.scene
-        of_color, device, pairs = of_color.contiguous(), color.device, len(ctx.listed[2])
+    def adjoint(of_color: Tensor, of_transmittance: Tensor) -> tuple[Tensor]:
         behind = (of_color * color).sum(dim=1) + of_transmittance * transmittance
         sums = torch.zeros(pairs, 10, device=device)
         passed = torch.ones_like(transmittance)
-        arguments = [*ctx.listed, of_color, passed, behind, sums]
-        threads = raster.tiles * raster.threads
+        arguments = [*listed, of_color, passed, behind, sums]
         launch(composite_adjoint_kernel, threads, arguments, device, grain=1)
-        slopes = torch.zeros_like(gaussians.tensor)
-        arguments = [*ctx.scene, ctx.listed[-1], *ctx.rows, sums, array(slopes, Gaussian)]
-        launch(project_adjoint_kernel, len(slopes), arguments, device)
-        return slopes, None, None
+        slopes = torch.zeros_like(table)
+        arguments = [*scene, splats, tiles, starts, sums, array(slopes, Gaussian)]
+        launch(project_adjoint_kernel, count, arguments, device)
+        return (slopes,)
+
+    image, end = with_adjoint((color, transmittance), (learned,), adjoint)
+    return SplatImage(image[:, :3], image[:, 3], end)
 
 
 @wp.struct

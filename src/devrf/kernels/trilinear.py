@@ -1,13 +1,11 @@
 """Trilinear interpolation of a grid, and its adjoints (docs/method.md#notation)."""
 
-from typing import Any
-
 import torch
 import warp as wp
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from devrf.geometry.box import Box
+from devrf.kernels.adjoint import with_adjoint
 from devrf.kernels.grid import Grid, add_cell, cell, grid_over, inside, interpolate_cell, slope
 from devrf.kernels.runtime import cached_kernel, is_supported, launch, row_type
 from devrf.ops import trilinear as definition
@@ -32,40 +30,25 @@ def interpolate(grid: Tensor, points: Tensor, box: Box, stride: int = 1) -> Tens
     if not is_supported(points):
         return definition.interpolate(grid, points, box, stride)
     kept = grid.grad if grid.is_leaf else None
-    values: Tensor = _Interpolate.apply(grid, points, box, stride, kept)  # type: ignore[no-untyped-call]
-    return values
+    table, places = grid.detach().contiguous(), points.detach().contiguous()
+    geometry = grid_over(box, shape_of(grid), stride)
+    values = grid.new_empty(len(points), grid.shape[-1])
+    inputs = [geometry, places, table, values]
+    launch(interpolate_kernel(grid.shape[-1]), len(points), inputs, points.device)
 
-
-class _Interpolate(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any, grid: Tensor, points: Tensor, box: Box, stride: int, kept: Tensor | None
-    ) -> Tensor:
-        grid = grid.contiguous()
-        points = points.contiguous()
-        ctx.save_for_backward(grid, points)
-        ctx.box, ctx.stride, ctx.kept = box, stride, kept
-        values = grid.new_empty(len(points), grid.shape[-1])
-        inputs = [grid_over(box, shape_of(grid), stride), points, grid, values]
-        launch(interpolate_kernel(grid.shape[-1]), len(points), inputs, points.device)
-        return values
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        grid, points = ctx.saved_tensors
-        gradient = gradient.contiguous()
+    def adjoint(gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:
         of_grid = of_points = None
-        if ctx.needs_input_grad[0]:
-            of_grid = torch.zeros_like(grid) if ctx.kept is None else None
-            into = ctx.kept if of_grid is None else of_grid
-            add_to_grid(into, points, gradient, ctx.box, ctx.stride)
-        if ctx.needs_input_grad[1]:
-            of_points = torch.empty_like(points)
-            geometry = grid_over(ctx.box, shape_of(grid), ctx.stride)
-            inputs = [geometry, points, grid, gradient, of_points]
+        if grid.requires_grad:
+            of_grid = torch.zeros_like(table) if kept is None else None
+            into = kept if of_grid is None else of_grid
+            add_to_grid(into, places, gradient, box, stride)
+        if points.requires_grad:
+            of_points = torch.empty_like(places)
+            inputs = [geometry, places, table, gradient, of_points]
             launch(slope_kernel(grid.shape[-1]), len(points), inputs, points.device)
-        return of_grid, of_points, None, None, None
+        return of_grid, of_points
+
+    return with_adjoint((values,), (grid, points), adjoint)[0]
 
 
 def add_to_grid(grid: Tensor, points: Tensor, values: Tensor, box: Box, stride: int = 1) -> None:
