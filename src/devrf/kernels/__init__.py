@@ -16,5 +16,7 @@ its definition.
 | ``splatting`` | ``splat``: a picture of 3D Gaussians |
 | ``adam`` | ``adam_step``, ``add_total_variation_gradient``: a step of the optimiser |
 | ``grid`` | shared by the kernels: grids, and the cell that holds a point |
+| ``displacement`` | shared by the kernels: the warp, and its adjoint |
+| ``adjoint`` | ``with_adjoint``: results of kernels for autograd |
 | ``runtime`` | tensors that kernels support, and launches |
 """

@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Any
 
 import torch
 import warp as wp
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from devrf.geometry.contraction import INFINITY, ContractedRays, ContractedSpace
 from devrf.geometry.rays import PARALLEL, Rays
+from devrf.kernels.adjoint import with_adjoint
+from devrf.kernels.compositing import first_of
+from devrf.kernels.displacement import Motion, follows, motion_of, warped
 from devrf.kernels.grid import (
     Grid,
     add_cell,
@@ -55,121 +56,80 @@ def march(rays: Rays, inputs: MarchInputs) -> Samples:
     """
     if not is_supported(rays.origins):
         return definition.march(rays, inputs)
-    kept = inputs.density.grad if inputs.density.is_leaf else None
-    results = _March.apply(  # type: ignore[no-untyped-call]
-        inputs.density, inputs.displacement, rays, inputs, kept
-    )
-    return Samples(*results)
+    density, displacement, limits = inputs.density, inputs.displacement, inputs.range
+    device, count = density.device, len(rays)
+    kept = density.grad if density.is_leaf else None
+    geometry = _geometry(rays, inputs)
+    # Room for all of a ray's samples, as the host knows it: the number of visible ones is known
+    # afterwards. Memory that is not written to costs a CPU nothing.
+    longest = rays.longest(limits.box.low, limits.box.high, limits.near, limits.far)
+    room = 2 + int(longest / limits.step * (1 + 1e-5))
+    followed = empty_structs(Ray, count, device)
+    visible = empty_structs(VisibleSample, count * room, device)
+    significant = torch.empty(count, dtype=torch.int32, device=device)
+    transmittance = torch.empty(count, device=device)
+    # Straight rays have no course: their origins stand in for it.
+    course = rays.course if isinstance(rays, ContractedRays) else rays.origins
+    given = [each.contiguous() for each in (rays.origins, rays.directions, course)]
+    # Without displacements kernels get an array that they do not read.
+    moves = density.new_empty(0, 3) if displacement is None else displacement.detach().contiguous()
+    raw = density.detach().contiguous()
+    arguments = [geometry, *given, limits.near, limits.far, limits.distances.cells.flatten()]
+    arguments += [raw, moves, room, int(device.type == "cpu")]
+    arguments += [followed, visible, significant, transmittance]
+    kernel = march_kernel(isinstance(rays, ContractedRays))
+    launch(kernel, count, arguments, device, grain=GRAIN_OF_RAYS)
 
+    stop = significant.cumsum(0)
+    length = int(stop[-1]) if count else 0
+    ray = torch.empty(length, dtype=torch.int64, device=device)
+    distance = torch.empty(length, device=device)
+    points = torch.empty(length, 3, device=device)
+    canonical = torch.empty_like(points)
+    weight = torch.empty_like(distance)
+    depth = torch.empty(count, device=device)
+    arguments = [geometry, followed, visible, stop, ray, distance, points, canonical, weight, depth]
+    launch(keep_significant_kernel, count, arguments, device)
 
-class _March(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any,
-        density: Tensor,
-        displacement: Tensor | None,
-        rays: Rays,
-        inputs: MarchInputs,
-        kept: Tensor | None,
-    ) -> tuple[Tensor, ...]:
-        device = density.device
-        geometry = _geometry(rays, inputs)
-        limits = inputs.range
-        # Room for all of a ray's samples, as the host knows it: the number of visible ones is
-        # known afterwards. Memory that is not written to costs a CPU nothing.
-        longest = rays.longest(limits.box.low, limits.box.high, limits.near, limits.far)
-        room = 2 + int(longest / limits.step * (1 + 1e-5))
-        lines = empty_structs(Ray, len(rays), device)
-        visible = empty_structs(VisibleSample, len(rays) * room, device)
-        visible_start = torch.empty(len(rays), dtype=torch.int32, device=device)
-        visible_count = torch.empty_like(visible_start)
-        significant_count = torch.empty_like(visible_start)
-        transmittance = torch.empty(len(rays), device=device)
-        # Straight rays have no course: their origins stand in for it.
-        course = rays.course if isinstance(rays, ContractedRays) else rays.origins
-        # Without displacements kernels get an array that they do not read.
-        moves = density.new_empty(0, 3) if displacement is None else displacement.contiguous()
-        arguments = [each.contiguous() for each in (rays.origins, rays.directions, course)]
-        arguments = [
-            geometry,
-            *arguments,
-            limits.near,
-            limits.far,
-            limits.distances.cells.flatten(),
-        ]
-        arguments += [density.contiguous(), moves, room, int(device.type == "cpu"), lines]
-        arguments += [visible_start, visible, visible_count, significant_count, transmittance]
-        kernel = march_kernel(isinstance(rays, ContractedRays))
-        launch(kernel, len(rays), arguments, device, grain=GRAIN_OF_RAYS)
-
-        stop = significant_count.cumsum(0)
-        length = int(stop[-1]) if len(rays) else 0
-        ray = torch.empty(length, dtype=torch.int64, device=device)
-        distance = torch.empty(length, device=device)
-        points = torch.empty(length, 3, device=device)
-        canonical = torch.empty(length, 3, device=device)
-        weight = torch.empty(length, device=device)
-        depth = torch.empty(len(rays), device=device)
-        arguments = [
-            geometry,
-            lines,
-            visible_start,
-            visible,
-            visible_count,
-            significant_count,
-            stop,
-        ]
-        arguments += [ray, distance, points, canonical, weight, depth]
-        launch(keep_significant_kernel, len(rays), arguments, device)
-
-        fixed = displacement is None or not displacement.requires_grad
-        given = [ray, distance, points, depth, stop]
-        ctx.mark_non_differentiable(*given, *([canonical] if fixed else []))
-        ctx.set_materialize_grads(False)
-        ctx.save_for_backward(density, moves, visible_start, visible_count, stop, transmittance)
-        ctx.geometry, ctx.lines, ctx.visible = geometry, lines, visible
-        ctx.kept = kept
-        return ray, distance, points, canonical, weight, transmittance, depth, stop
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        density, moves, visible_start, visible_count, stop, transmittance = ctx.saved_tensors
-        device = density.device
+    def adjoint(
+        of_weight: Tensor, of_end: Tensor, of_canonical: Tensor | None = None
+    ) -> tuple[Tensor | None, Tensor | None]:
+        nonlocal visible
+        assert visible is not None, "a march has one backward pass"
+        if of_canonical is None:
+            of_canonical = density.new_empty(0, 3)
+        arguments = [geometry, followed, visible, raw, stop]
+        arguments += [of_canonical, of_weight, of_end, transmittance]
+        launch(adjoint_kernel, count, arguments, device, grain=GRAIN_OF_RAYS)
         # A kernel does not read an array of nothing.
-        given = [
-            density.new_empty((0, 3) if k == 0 else 0) if each is None else each.contiguous()
-            for k, each in enumerate(gradients[3:6])
-        ]
-        # The gradients take the place of the samples: they are not needed again.
-        assert ctx.visible is not None, "a march has one backward pass"
-        of_rays = [ctx.geometry, ctx.lines, visible_start, ctx.visible, visible_count]
-        arguments = [*of_rays, density.contiguous(), stop, *given, transmittance]
-        launch(adjoint_kernel, len(visible_count), arguments, device, grain=GRAIN_OF_RAYS)
-
-        of_density = of_displacement = None
         into = [density.new_empty(0, 1), density.new_empty(0, 3)]
-        if ctx.needs_input_grad[0]:
-            of_density = torch.zeros_like(density) if ctx.kept is None else None
-            into[0] = ctx.kept if of_density is None else of_density
-        if ctx.needs_input_grad[1]:
+        of_density = of_displacement = None
+        if density.requires_grad:
+            of_density = torch.zeros_like(raw) if kept is None else None
+            into[0] = kept if of_density is None else of_density
+        if displacement is not None and displacement.requires_grad:
             into[1] = of_displacement = torch.zeros_like(moves)
-        arguments = [*of_rays, moves, *into]
-        launch(scatter_kernel, len(visible_count), arguments, device, grain=None)
-        ctx.visible = None
-        return of_density, of_displacement, None, None, None
+        arguments = [geometry, followed, visible, moves, *into]
+        launch(scatter_kernel, count, arguments, device, grain=None)
+        # The gradients have taken the place of the samples.
+        visible = None
+        return of_density, of_displacement
+
+    learned, results = (density, displacement), (weight, transmittance)
+    if displacement is not None and displacement.requires_grad:
+        results = (*results, canonical)
+    weight, end, *moved = with_adjoint(results, learned, adjoint)
+    canonical = moved[0] if moved else canonical
+    return Samples(ray, distance, points, canonical, weight, end, depth, stop)
 
 
 def _geometry(rays: Rays, inputs: MarchInputs) -> Geometry:
-    distances = inputs.range.distances
-    motion = None
-    if inputs.displacement is not None and inputs.motion_box is not None:
-        motion = grid_over(inputs.motion_box, shape_of(inputs.displacement))
+    distances, displacement = inputs.range.distances, inputs.displacement
+    shape = None if displacement is None else shape_of(displacement)
     return geometry_of(
         density=grid_over(inputs.range.box, shape_of(inputs.density)),
         occupancy=grid_over(distances.box, shape_of(distances.cells)),
-        motion=motion,
-        zero_outside_box=inputs.zero_outside_box,
+        motion=motion_of(inputs.motion_box, shape, inputs.zero_outside_box),
         space=rays.space if isinstance(rays, ContractedRays) else None,
         step=inputs.range.step,
         shift=inputs.shift,
@@ -183,8 +143,7 @@ def geometry_of(
     *,
     density: Grid,
     occupancy: Grid,
-    motion: Grid | None,
-    zero_outside_box: bool,
+    motion: Motion,
     space: ContractedSpace | None,
     step: float,
     shift: float,
@@ -195,10 +154,7 @@ def geometry_of(
     geometry = Geometry()
     geometry.density = density
     geometry.occupancy = occupancy
-    if motion is not None:
-        geometry.moves = 1
-        geometry.motion = motion
-        geometry.zero_outside_box = int(zero_outside_box)
+    geometry.motion = motion
     if space is not None:
         inner = space.inner()
         geometry.contracted = 1
@@ -224,9 +180,7 @@ class Geometry:
     Attributes:
         density: the grid of raw densities.
         occupancy: the grid of distances to occupied cells.
-        motion: the grid of displacements.
-        moves: 1 where there are displacements, else 0.
-        zero_outside_box: 1 where nothing moves outside the motion's grid, else 0.
+        motion: the warp.
         contracted: 1 in contracted space, else 0.
         center: of the contracted space's inner box.
         half: its half edges.
@@ -237,9 +191,7 @@ class Geometry:
 
     density: Grid
     occupancy: Grid
-    motion: Grid
-    moves: int
-    zero_outside_box: int
+    motion: Motion
     contracted: int
     center: wp.vec3
     half: wp.vec3
@@ -266,8 +218,9 @@ class Ray:
     """A ray: in the fields' space, or if it is contracted in the world, with its course.
 
     It has ``count`` samples from the distance ``entry`` on, and moves by a cell of the occupancy in
-    ``samples_per_cell`` or more. Its k-th sample is at ``start`` + k · ``pace`` in the occupancy's
-    grid coordinates; in contracted space these mean nothing.
+    ``samples_per_cell`` or more. Its k-th sample is at ``at_entry`` + k · ``pace`` in the grid
+    coordinates of the occupancy; in contracted space these mean nothing. Its ``visible`` samples
+    are in memory from ``start`` on.
     """
 
     origin: wp.vec3
@@ -275,9 +228,11 @@ class Ray:
     course: wp.vec3
     entry: float
     count: int
-    start: wp.vec3
+    at_entry: wp.vec3
     pace: wp.vec3
     samples_per_cell: float
+    start: int
+    visible: int
 
 
 @wp.func
@@ -319,7 +274,7 @@ def grid_position(geometry: Geometry, ray: Ray, k: int):
 @wp.func
 def straight_grid_position(geometry: Geometry, ray: Ray, k: int):
     """The same in straight space, by one multiplication."""
-    return ray.start + ray.pace * float(k)
+    return ray.at_entry + ray.pace * float(k)
 
 
 @wp.func
@@ -331,18 +286,6 @@ def clearance(grid: Grid, distances: wp.array(dtype=wp.uint8), at: wp.vec3):
     if i < 0 or j < 0 or k < 0 or i >= grid.x or j >= grid.y or k >= grid.z:
         return 1
     return int(distances[i * grid.next_x + j * grid.next_y + k * grid.next_z])
-
-
-@wp.func
-def warped(geometry: Geometry, displacements: wp.array(dtype=wp.vec3), point: wp.vec3):
-    """q = x + Δ(x)."""
-    if geometry.moves == 0:
-        return point
-    if geometry.zero_outside_box == 1:
-        if wp.min(inside(geometry.motion, point)) == 0.0:
-            return point
-    row, fraction = cell(geometry.motion, point)
-    return point + interpolate_cell(displacements, geometry.motion, row, fraction)
 
 
 @wp.func
@@ -398,7 +341,7 @@ def entering(
             to_high = (geometry.density.high[axis] - ray.origin[axis]) / along
             ray.entry = wp.max(ray.entry, wp.min(to_low, to_high))
             leave = wp.min(leave, wp.max(to_low, to_high))
-        ray.start = coordinates(geometry.occupancy, ray.origin + ray.direction * ray.entry)
+        ray.at_entry = coordinates(geometry.occupancy, ray.origin + ray.direction * ray.entry)
         ray.pace = wp.cw_mul(ray.direction, geometry.occupancy.scale) * geometry.step
         cells = wp.max(wp.abs(ray.pace))
     # A little less: positions are rounded.
@@ -429,9 +372,7 @@ def march_kernel(contracted: bool) -> wp.Kernel:
         room: int,
         in_order: int,
         rays: wp.array(dtype=Ray),
-        visible_start: wp.array(dtype=int),
         visible: wp.array(dtype=VisibleSample),
-        visible_count: wp.array(dtype=int),
         significant_count: wp.array(dtype=int),
         transmittance: wp.array(dtype=float),
     ):
@@ -444,11 +385,9 @@ def march_kernel(contracted: bool) -> wp.Kernel:
         number = first + wp.tid()
         ray = entering(geometry, origins[number], directions[number], courses[number], near, far)
         ray.count = wp.min(ray.count, room)
-        rays[number] = ray
         start = number * room
         if in_order == 1 and number > first:
-            start = visible_start[number - 1] + visible_count[number - 1]
-        visible_start[number] = start
+            start = rays[number - 1].start + rays[number - 1].visible
         count = int(0)
         significant = int(0)
         remaining = float(1.0)
@@ -461,7 +400,7 @@ def march_kernel(contracted: bool) -> wp.Kernel:
             else:
                 distance = ray.entry + float(k) * geometry.step
                 point = position(geometry, ray, distance)
-                canonical = warped(geometry, displacements, point)
+                canonical = warped(geometry.motion, displacements, point)
                 row, fraction = cell(geometry.density, canonical)
                 raw = interpolate_cell(density, geometry.density, row, fraction)[0]
                 if raw >= geometry.faintest:
@@ -478,7 +417,9 @@ def march_kernel(contracted: bool) -> wp.Kernel:
                     if remaining < wp.static(STOP):
                         k = ray.count
             k += 1
-        visible_count[number] = count
+        ray.start = start
+        ray.visible = count
+        rays[number] = ray
         significant_count[number] = significant
         transmittance[number] = remaining
 
@@ -490,10 +431,7 @@ def keep_significant_kernel(
     first: int,
     geometry: Geometry,
     rays: wp.array(dtype=Ray),
-    visible_start: wp.array(dtype=int),
     visible: wp.array(dtype=VisibleSample),
-    visible_count: wp.array(dtype=int),
-    significant_count: wp.array(dtype=int),
     stops: wp.array(dtype=wp.int64),
     result_ray: wp.array(dtype=wp.int64),
     result_distance: wp.array(dtype=float),
@@ -504,17 +442,12 @@ def keep_significant_kernel(
 ):
     """The visible samples of enough weight, without gaps, each ray's up to its stop; its depth."""
     number = first + wp.tid()
-    count = visible_count[number]
-    result_depth[number] = 0.0
-    if count == 0:
-        return
     ray = rays[number]
-    start = visible_start[number]
-    into = int(stops[number]) - significant_count[number]
+    into = first_of(stops, number)
     mass = float(0.0)
     reached = float(0.0)
-    for k in range(count):
-        sample = visible[start + k]
+    for k in range(ray.start, ray.start + ray.visible):
+        sample = visible[k]
         if sample.weight >= geometry.threshold:
             mass += sample.weight
             reached += sample.weight * sample.distance
@@ -532,9 +465,7 @@ def adjoint_kernel(
     first: int,
     geometry: Geometry,
     rays: wp.array(dtype=Ray),
-    visible_start: wp.array(dtype=int),
     visible: wp.array(dtype=VisibleSample),
-    visible_count: wp.array(dtype=int),
     density: wp.array(dtype=Density),
     significant_stop: wp.array(dtype=wp.int64),
     given_canonical: wp.array(dtype=wp.vec3),
@@ -544,33 +475,27 @@ def adjoint_kernel(
 ):
     """∂L/∂v and ∂L/∂Δ of visible samples from the gradients of the march's results.
 
-    They take the place of τ and, where there are displacements, of q. The gradients of results that
-    have none are empty arrays.
+    They take the place of τ and, where there are displacements, of q. The gradient of q is an empty
+    array where displacements are not learned.
 
     Back to front ∂L/∂τ_i = ∂L/∂w_i T_i exp(−τ_i) − Σ_{j>i} ∂L/∂w_j w_j − ∂L/∂T_end T_end.
     """
     number = first + wp.tid()
-    count = visible_count[number]
-    if count == 0:
-        return
     ray = rays[number]
-    start = visible_start[number]
+    last = ray.start + ray.visible - 1
     significant = int(significant_stop[number])
     after = transmittance[number]
-    behind = float(0.0)
-    if given_transmittance.shape[0] > 0:
-        behind = given_transmittance[number] * after
-    for back in range(count):
-        sample = visible[start + count - 1 - back]
+    behind = given_transmittance[number] * after
+    for back in range(ray.visible):
+        sample = visible[last - back]
         tau = sample.tau
         weight = sample.weight
         slope_of_tau = -behind
         slope_of_canonical = wp.vec3()
         if weight >= geometry.threshold:
             significant -= 1
-            if given_weight.shape[0] > 0:
-                slope_of_tau += given_weight[significant] * after
-                behind += given_weight[significant] * weight
+            slope_of_tau += given_weight[significant] * after
+            behind += given_weight[significant] * weight
             if given_canonical.shape[0] > 0:
                 slope_of_canonical = given_canonical[significant]
         # T_i, from T_i exp(−τ_i) or from w_i = T_i α_i, whichever is not a small number's ratio.
@@ -581,15 +506,14 @@ def adjoint_kernel(
         # ∂τ/∂v = δ · sigmoid(v + b), and sigmoid = 1 − exp(−softplus).
         slope_of_raw = slope_of_tau * geometry.delta * opacity(tau / geometry.delta)
         sample.tau = slope_of_raw
-        if geometry.moves == 1:
+        if geometry.motion.moves == 1:
             row, fraction = cell(geometry.density, sample.canonical)
             change = slope(density, Density(slope_of_raw), geometry.density, row, fraction)
             slope_of_canonical += wp.cw_mul(change, inside(geometry.density, sample.canonical))
-            if geometry.zero_outside_box == 1:
-                point = position(geometry, ray, sample.distance)
-                slope_of_canonical *= wp.min(inside(geometry.motion, point))
+            if not follows(geometry.motion, position(geometry, ray, sample.distance)):
+                slope_of_canonical = wp.vec3()
             sample.canonical = slope_of_canonical
-        visible[start + count - 1 - back] = sample
+        visible[last - back] = sample
 
 
 @wp.kernel(module="unique", enable_backward=False)
@@ -597,9 +521,7 @@ def scatter_kernel(
     first: int,
     geometry: Geometry,
     rays: wp.array(dtype=Ray),
-    visible_start: wp.array(dtype=int),
     visible: wp.array(dtype=VisibleSample),
-    visible_count: wp.array(dtype=int),
     displacements: wp.array(dtype=wp.vec3),
     of_density: wp.array(dtype=Density),
     of_displacement: wp.array(dtype=wp.vec3),
@@ -608,15 +530,14 @@ def scatter_kernel(
 
     On a CPU in one thread, in the order of the rays.
     """
-    number = first + wp.tid()
-    start = visible_start[number]
-    for place in range(start, start + visible_count[number]):
-        sample = visible[place]
-        point = position(geometry, rays[number], sample.distance)
+    ray = rays[first + wp.tid()]
+    for k in range(ray.start, ray.start + ray.visible):
+        sample = visible[k]
+        point = position(geometry, ray, sample.distance)
         if of_density.shape[0] > 0:
-            canonical = warped(geometry, displacements, point)
+            canonical = warped(geometry.motion, displacements, point)
             row, fraction = cell(geometry.density, canonical)
             add_cell(of_density, geometry.density, row, fraction, Density(sample.tau))
         if of_displacement.shape[0] > 0:
-            row, fraction = cell(geometry.motion, point)
-            add_cell(of_displacement, geometry.motion, row, fraction, sample.canonical)
+            row, fraction = cell(geometry.motion.grid, point)
+            add_cell(of_displacement, geometry.motion.grid, row, fraction, sample.canonical)

@@ -6,35 +6,41 @@ at one sample.
 
 from __future__ import annotations
 
-from functools import lru_cache
-from typing import Any
-
 import torch
 import warp as wp
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.ndc import BEFORE_INFINITY, NormalizedDevice
-from devrf.kernels.grid import cell, grid_over, inside, slope
-from devrf.kernels.march import Geometry, warped
+from devrf.kernels.adjoint import with_adjoint
+from devrf.kernels.displacement import Motion, follows, motion_of, slope_of_warped, warped
 from devrf.kernels.pixels import Axis, Xy
 from devrf.kernels.runtime import launch
 from devrf.kernels.trilinear import add_to_grid
 from devrf.ops.march import Samples
-from devrf.ops.trilinear import Shape, shape_of
+from devrf.ops.trilinear import shape_of
 
 
 def cycle_error(
     samples: Samples, displacement: Tensor, box: Box, *, zero_outside_box: bool
 ) -> Tensor:
     """mean_i ½ |x_i − (q_i + Δ(q_i))|² () of Δ (X, Y, Z, 3) over ``box``."""
-    geometry = motion_of(box, shape_of(displacement), zero_outside_box)
-    error: Tensor = _Cycle.apply(  # type: ignore[no-untyped-call]
-        samples.canonical, displacement, samples.points, geometry, box
-    )
-    return error
+    points, canonical = samples.points, samples.canonical.detach()
+    motion = motion_of(box, shape_of(displacement), zero_outside_box)
+    errors = torch.empty(len(points), device=points.device)
+    gradients = torch.empty_like(points), torch.empty_like(points)
+    inputs = [motion, points, canonical, displacement.detach(), errors, *gradients]
+    launch(cycle_kernel, len(points), inputs, points.device)
+
+    def adjoint(gradient: Tensor) -> tuple[Tensor, Tensor]:
+        of_canonical, moved = torch._foreach_mul(gradients, gradient)
+        of_displacement = torch.zeros_like(displacement)
+        add_to_grid(of_displacement, canonical, moved, box)
+        return of_canonical, of_displacement
+
+    mean = errors.mean() if len(errors) else errors.sum()
+    return with_adjoint((mean,), (samples.canonical, displacement), adjoint)[0]
 
 
 def flow_error(
@@ -68,96 +74,30 @@ def flow_error(
         ndc: the samples' space; None: the world.
         by_ray: whether M is the number of valid rays, or twice that of their samples.
     """
+    canonical, weight = samples.canonical.detach(), samples.weight.detach()
     shape = None if displacement is None else shape_of(displacement)
-    moves = samples.weight.new_empty(0, 3) if displacement is None else displacement.detach()
+    moves = weight.new_empty(0, 3) if displacement is None else displacement.detach()
     slopes = wp.vec3() if ndc is None else wp.vec3(*ndc.slopes, ndc.near)
-    given = [motion_of(box, shape, zero_outside_box), slopes, int(by_ray), samples.ray, moves]
-    given += [cameras.camera_to_world, cameras.focal, cameras.center]
-    given += [previous, image, pixel, flow, valid]
-    error: Tensor = _Flow.apply(samples.canonical, samples.weight, *given)  # type: ignore[no-untyped-call]
+    parts = torch.empty(len(weight), 2, device=weight.device)
+    gradients = torch.empty_like(canonical), torch.empty_like(weight)
+    inputs = [motion_of(box, shape, zero_outside_box), slopes, canonical, weight, samples.ray]
+    inputs += [moves, cameras.camera_to_world, cameras.focal, cameras.center]
+    inputs += [previous, image, pixel, flow, valid, parts, *gradients]
+    launch(flow_kernel, len(weight), inputs, weight.device)
+    total, count = parts.sum(dim=0)
+    count = (valid.sum().float() if by_ray else count).clamp(min=1)
+    (error,) = with_adjoint(
+        (total / count,),
+        (samples.canonical, samples.weight),
+        lambda gradient: torch._foreach_mul(gradients, gradient / count),
+    )
     return error
-
-
-class _Cycle(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any, canonical: Tensor, displacement: Tensor, points: Tensor, geometry: Any, box: Box
-    ) -> Tensor:
-        errors = torch.empty(len(points), device=points.device)
-        gradients = torch.empty_like(points), torch.empty_like(points)
-        inputs = [geometry, points, canonical, displacement, errors, *gradients]
-        launch(cycle_kernel, len(points), inputs, points.device)
-        ctx.save_for_backward(canonical, displacement, *gradients)
-        ctx.box = box
-        return errors.mean() if len(errors) else errors.sum()
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        canonical, displacement, *gradients = ctx.saved_tensors
-        of_canonical, moved = torch._foreach_mul(gradients, gradient)
-        of_displacement = torch.zeros_like(displacement)
-        add_to_grid(of_displacement, canonical, moved, ctx.box)
-        return of_canonical, of_displacement, None, None, None
-
-
-class _Flow(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any, canonical: Tensor, weight: Tensor, geometry: Any, ndc: Any, by_ray: int, *of: Any
-    ) -> Tensor:
-        parts = torch.empty(len(weight), 2, device=weight.device)
-        gradients = torch.empty_like(canonical), torch.empty_like(weight)
-        inputs = [geometry, ndc, canonical, weight, *of, parts, *gradients]
-        launch(flow_kernel, len(weight), inputs, weight.device)
-        total, count = parts.sum(dim=0)
-        count = (of[-1].sum().float() if by_ray else count).clamp(min=1)
-        ctx.save_for_backward(count, *gradients)
-        ctx.further = 3 + len(of)
-        return total / count
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        count, *gradients = ctx.saved_tensors
-        return *torch._foreach_mul(gradients, gradient / count), *(None,) * ctx.further
-
-
-@lru_cache(maxsize=64)
-def motion_of(box: Box, shape: Shape | None, zero_outside_box: bool) -> Geometry:
-    """The part of a march's geometry that is of displacements; without a ``shape``, none."""
-    geometry = Geometry()
-    if shape is not None:
-        geometry.moves = 1
-        geometry.motion = grid_over(box, shape)
-        geometry.zero_outside_box = int(zero_outside_box)
-    return geometry
-
-
-@wp.func
-def follows(geometry: Geometry, point: wp.vec3):
-    """Whether a point moves with the displacements around it."""
-    if geometry.moves == 0:
-        return False
-    return geometry.zero_outside_box == 0 or wp.min(inside(geometry.motion, point)) > 0.0
-
-
-@wp.func
-def slope_of_warped(
-    geometry: Geometry, displacements: wp.array(dtype=wp.vec3), point: wp.vec3, given: wp.vec3
-):
-    """The gradient of a point x from that of its warped place, ``given``."""
-    if not follows(geometry, point):
-        return given
-    row, fraction = cell(geometry.motion, point)
-    change = slope(displacements, given, geometry.motion, row, fraction)
-    return given + wp.cw_mul(change, inside(geometry.motion, point))
 
 
 @wp.kernel(module="unique", enable_backward=False)
 def cycle_kernel(
     first: int,
-    geometry: Geometry,
+    motion: Motion,
     points: wp.array(dtype=wp.vec3),
     canonical: wp.array(dtype=wp.vec3),
     displacements: wp.array(dtype=wp.vec3),
@@ -168,11 +108,11 @@ def cycle_kernel(
     """½ |x − (q + Δ(q))|² of each sample, and the mean's gradients of q and of Δ(q)."""
     sample = first + wp.tid()
     q = canonical[sample]
-    missed = warped(geometry, displacements, q) - points[sample]
+    missed = warped(motion, displacements, q) - points[sample]
     error[sample] = 0.5 * wp.dot(missed, missed)
     given = missed / float(points.shape[0])
-    of_canonical[sample] = slope_of_warped(geometry, displacements, q, given)
-    of_moved[sample] = wp.where(follows(geometry, q), given, wp.vec3())
+    of_canonical[sample] = slope_of_warped(motion, displacements, q, given)
+    of_moved[sample] = wp.where(follows(motion, q), given, wp.vec3())
 
 
 @wp.func
@@ -228,7 +168,7 @@ def signum(x: float):
 @wp.kernel(module="unique", enable_backward=False)
 def flow_kernel(
     first: int,
-    geometry: Geometry,
+    motion: Motion,
     ndc: wp.vec3,
     canonical: wp.array(dtype=wp.vec3),
     weight: wp.array(dtype=float),
@@ -258,7 +198,7 @@ def flow_kernel(
     if valid[ray]:
         camera = int(previous[int(images[ray])])
         q = canonical[sample]
-        moved = warped(geometry, displacements, q)
+        moved = warped(motion, displacements, q)
         local = seen_by(ndc, poses, camera, moved)
         depth = -local[2]
         behind = wp.abs(depth) < 1.0e-8  # as in ``Cameras.project``
@@ -274,4 +214,4 @@ def flow_kernel(
         y = -weight[sample] * signum(missed[1]) * focal[1] / depth
         z = wp.where(behind, 0.0, (x * local[0] + y * local[1]) / depth)
         of_moved = slope_of_seen(ndc, poses, camera, moved, wp.vec3(x, y, z))
-        of_canonical[sample] = slope_of_warped(geometry, displacements, q, of_moved)
+        of_canonical[sample] = slope_of_warped(motion, displacements, q, of_moved)

@@ -1,0 +1,66 @@
+"""The warp x → q = x + Δ(x) by a grid of displacements, as kernels know it."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import warp as wp
+
+from devrf.geometry.box import Box
+from devrf.kernels.grid import Grid, cell, grid_over, inside, interpolate_cell, slope
+from devrf.ops.trilinear import Shape
+
+
+@wp.struct
+class Motion:
+    """A warp by displacements.
+
+    Attributes:
+        grid: of the displacements.
+        moves: 1 where there are displacements, else 0: q = x.
+        zero_outside_box: 1 where nothing moves outside the grid, else 0.
+    """
+
+    grid: Grid
+    moves: int
+    zero_outside_box: int
+
+
+@lru_cache(maxsize=64)
+def motion_of(box: Box | None, shape: Shape | None, zero_outside_box: bool) -> Motion:
+    """The warp by displacements of ``shape`` (X, Y, Z) over ``box``; without them, none."""
+    motion = Motion()
+    if box is not None and shape is not None:
+        motion.grid = grid_over(box, shape)
+        motion.moves = 1
+        motion.zero_outside_box = int(zero_outside_box)
+    return motion
+
+
+@wp.func
+def follows(motion: Motion, point: wp.vec3):
+    """Whether a point moves with the displacements around it."""
+    if motion.moves == 0:
+        return False
+    return motion.zero_outside_box == 0 or wp.min(inside(motion.grid, point)) > 0.0
+
+
+@wp.func
+def warped(motion: Motion, displacements: wp.array(dtype=wp.vec3), point: wp.vec3):
+    """q = x + Δ(x)."""
+    if not follows(motion, point):
+        return point
+    row, fraction = cell(motion.grid, point)
+    return point + interpolate_cell(displacements, motion.grid, row, fraction)
+
+
+@wp.func
+def slope_of_warped(
+    motion: Motion, displacements: wp.array(dtype=wp.vec3), point: wp.vec3, given: wp.vec3
+):
+    """The gradient of a point x from that of its warped place, ``given``."""
+    if not follows(motion, point):
+        return given
+    row, fraction = cell(motion.grid, point)
+    change = slope(displacements, given, motion.grid, row, fraction)
+    return given + wp.cw_mul(change, inside(motion.grid, point))
