@@ -38,7 +38,8 @@ def look_up(
         then flow (R, 2), 0 where it is not valid, and valid (R,). Empty: what images lack.
     """
     count, device, has_alpha = len(image), image.device, pixels.shape[3] == 4
-    vectors, valid = flow or (background.new_empty(0, 2), valid_nowhere(device))
+    nowhere = torch.empty(0, dtype=torch.bool, device=device)
+    vectors, valid = flow or (background.new_empty(0, 2), nowhere)
     alphas, flows = count * has_alpha, count * (flow is not None)
     results = [
         *(torch.empty(count, size, device=device) for size in (2, 3, 3, 3)),
@@ -52,11 +53,6 @@ def look_up(
     inputs += [background.contiguous().view(-1, 3), *results]
     launch(look_up_kernel(has_alpha), count, inputs, device)
     return tuple(results)
-
-
-def valid_nowhere(device: torch.device) -> Tensor:
-    """A mask of nothing."""
-    return torch.empty(0, dtype=torch.bool, device=device)
 
 
 @cached_kernel

@@ -126,21 +126,18 @@ def flow(prediction: MotionPrediction) -> Tensor:
             ndc=space if isinstance(space, NormalizedDevice) else None,
             by_ray=prediction.flow_mean == "rays",
         )
-    # The gradient of index_select takes half the time of that of indexing.
-    valid_samples = valid.index_select(0, samples.ray).nonzero()[:, 0]
-    ray = samples.ray.index_select(0, valid_samples)
-    weight = samples.weight.index_select(0, valid_samples)
+    ray = samples.ray
     induced = induced_flow(
-        samples.canonical.index_select(0, valid_samples),
-        prediction.unwarp_previous,
+        samples.canonical,
+        unwarp,
         prediction.cameras,
-        prediction.previous_image[batch.image].index_select(0, ray),
-        batch.pixel.index_select(0, ray),
-        prediction.space,
+        prediction.previous_image[batch.image][ray],
+        batch.pixel[ray],
+        space,
     )
-    error = (induced - batch.flow.index_select(0, ray)).abs().sum(dim=1)
-    count = valid.sum().clamp(min=1) if prediction.flow_mean == "rays" else max(2 * len(ray), 1)
-    return (weight * error).sum() / count
+    error = torch.where(valid[ray], (induced - batch.flow[ray]).abs().sum(dim=1), 0.0)
+    count = valid.sum() if prediction.flow_mean == "rays" else 2 * valid[ray].sum()
+    return (samples.weight * error).sum() / count.clamp(min=1)
 
 
 def induced_flow(

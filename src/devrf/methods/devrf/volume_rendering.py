@@ -8,14 +8,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 from devrf.kernels.compositing import composite_colors
 from devrf.kernels.march import march
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.deformation_field import GridWarp
 from devrf.ops.march import MarchInputs, MarchRange
-from devrf.ops.trilinear import Shape
 from devrf.rendering.occupancy import Occupancy, dilate
 from devrf.rendering.output import ColorChange, VoxelOutput
 from devrf.rendering.sampling import RenderSettings
@@ -96,6 +94,7 @@ def march_inputs(
     )
 
 
+@torch.no_grad()
 def deformed_occupancy(
     field: CanonicalField, occupancy: Occupancy, settings: RenderSettings, warp: GridWarp
 ) -> Occupancy:
@@ -112,13 +111,17 @@ def deformed_occupancy(
         warp: x → x + Δ_b(x, t).
     """
     box, shape, densities = field.box, field.density.shape, field.density.values
-    rows, canonical = points_that_arrive(occupancy, warp, box, shape)
+    moved = warp.of_grid(box, shape, densities.device)
+    arrived = occupancy.at(moved)
+    canonical = moved[arrived]
     x, y, z = box.to_grid(box.nearest(canonical), shape).round().long().unbind(1)
     raw = torch.maximum(field.density(canonical, box), densities[x, y, z])
-    opaque = field.alpha(raw, settings.step)[:, 0] >= settings.alpha_threshold
-    return Occupancy(dilate(mask_of(rows[opaque], shape), 1), box)
+    opaque = arrived.clone()
+    opaque[arrived] = field.alpha(raw, settings.step)[:, 0] >= settings.alpha_threshold
+    return Occupancy(dilate(opaque.view(shape), 1), box)
 
 
+@torch.no_grad()
 def possible_occupancy(occupancy: Occupancy, warp: GridWarp) -> Occupancy:
     """The occupancy while a frame is learned, of the grid of that at rest.
 
@@ -126,32 +129,5 @@ def possible_occupancy(occupancy: Occupancy, warp: GridWarp) -> Occupancy:
     may be occupied at rest, grown by one point.
     """
     x, y, z = occupancy.mask.shape
-    rows, _ = points_that_arrive(occupancy, warp, occupancy.box, (x, y, z))
-    return Occupancy(dilate(mask_of(rows, (x, y, z)), 1), occupancy.box)
-
-
-@torch.no_grad()
-def points_that_arrive(
-    occupancy: Occupancy, warp: GridWarp, box: Box, shape: Shape
-) -> tuple[Tensor, Tensor]:
-    """The points of a grid that move to an occupied cell.
-
-    Args:
-        occupancy: of the scene at rest.
-        warp: x → x + Δ_b(x, t) at that time.
-        box: of the grid.
-        shape: its points along x, y, z.
-
-    Returns:
-        Their rows (K,) in the grid, and their moved positions (K, 3).
-    """
-    moved = warp.of_grid(box, shape, occupancy.mask.device)
-    rows = occupancy.at(moved).nonzero()[:, 0]
-    return rows, moved[rows]
-
-
-def mask_of(rows: Tensor, shape: Shape) -> Tensor:
-    """The mask of ``shape`` (X, Y, Z) that is True at ``rows`` (K,)."""
-    mask = torch.zeros(shape, dtype=torch.bool, device=rows.device)
-    mask.view(-1)[rows] = True
-    return mask
+    arrived = occupancy.at(warp.of_grid(occupancy.box, (x, y, z), occupancy.mask.device))
+    return Occupancy(dilate(arrived.view(x, y, z), 1), occupancy.box)
