@@ -8,8 +8,7 @@ from typing import Any
 import warp as wp
 
 from devrf.geometry.box import Box
-
-Shape = tuple[int, int, int]
+from devrf.ops.trilinear import Shape
 
 
 @wp.struct

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import Any
 
 import torch
 import warp as wp
@@ -127,10 +128,10 @@ def _geometry(rays: Rays, inputs: MarchInputs) -> Geometry:
     distances, displacement = inputs.range.distances, inputs.displacement
     shape = None if displacement is None else shape_of(displacement)
     return geometry_of(
+        rays.space if isinstance(rays, ContractedRays) else None,
         density=grid_over(inputs.range.box, shape_of(inputs.density)),
         occupancy=grid_over(distances.box, shape_of(distances.cells)),
         motion=motion_of(inputs.motion_box, shape, inputs.zero_outside_box),
-        space=rays.space if isinstance(rays, ContractedRays) else None,
         step=inputs.range.step,
         shift=inputs.shift,
         delta=inputs.delta,
@@ -139,37 +140,22 @@ def _geometry(rays: Rays, inputs: MarchInputs) -> Geometry:
 
 
 @lru_cache(maxsize=64)
-def geometry_of(
-    *,
-    density: Grid,
-    occupancy: Grid,
-    motion: Motion,
-    space: ContractedSpace | None,
-    step: float,
-    shift: float,
-    delta: float,
-    threshold: float,
-) -> Geometry:
-    """Grids and settings of a march; with a ``space``, of rays in contracted space."""
+def geometry_of(space: ContractedSpace | None, **settings: Any) -> Geometry:
+    """A geometry with these attributes, of rays in contracted space if there is one; kept."""
     geometry = Geometry()
-    geometry.density = density
-    geometry.occupancy = occupancy
-    geometry.motion = motion
+    for name, value in settings.items():
+        setattr(geometry, name, value)
     if space is not None:
         inner = space.inner()
         geometry.contracted = 1
         geometry.center = wp.vec3(*inner.middle)
         geometry.half = wp.vec3(*(edge / 2 for edge in inner.size))
         geometry.shell = space.shell
-    geometry.step = step
-    geometry.shift = shift
-    geometry.delta = delta
-    geometry.threshold = threshold
     # α ≥ threshold where v + b ≥ softplus⁻¹(τ / δ).
     geometry.faintest = -math.inf
-    if threshold > 0:
-        tau = -math.log1p(-threshold)
-        geometry.faintest = math.log(math.expm1(tau / delta)) - shift
+    if settings["threshold"] > 0:
+        tau = -math.log1p(-settings["threshold"])
+        geometry.faintest = math.log(math.expm1(tau / settings["delta"])) - settings["shift"]
     return geometry
 
 
