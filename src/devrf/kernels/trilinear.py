@@ -13,19 +13,9 @@ from devrf.ops.trilinear import shape_of
 
 
 def interpolate(grid: Tensor, points: Tensor, box: Box, stride: int = 1) -> Tensor:
-    """Trilinear values of a grid over a box; outside they are those of the border.
+    """As :func:`devrf.ops.trilinear.interpolate`, differentiable once.
 
-    Args:
-        grid: (X, Y, Z, C), at least two points along x and y; one along z is a plane, the same for
-            all z. A leaf that has a gradient is added to there, without a temporary tensor of the
-            grid's size.
-        points: (M, 3) in the box's units.
-        box: the grid's outer points lie on it.
-        stride: use every stride-th of the grid's points along each axis; X, Y, Z are one more than
-            a multiple of it.
-
-    Returns:
-        (M, C), differentiable once in ``grid`` and ``points``.
+    A leaf that has a gradient is added to there, without a temporary tensor of the grid's size.
     """
     if not is_supported(points):
         return definition.interpolate(grid, points, box, stride)
