@@ -46,37 +46,26 @@ def threads() -> Iterator[Callable[[int], None]]:
     torch.set_num_threads(usual)
 
 
-# Leaves the process less memory than Warp's library takes.
-SHORT = """
-import resource, sys, torch
-from devrf.errors import DevrfError
-from devrf.kernels.runtime import is_supported
-pages = int(open("/proc/self/statm").read().split()[0])
-resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + 20 * 2**20,) * 2)
-try:
-    is_supported(torch.empty(0))
-except DevrfError as error:
-    print(error)
-"""
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="memory as Linux limits it")
-def test_memory_too_short_for_warp_is_one_line():
-    done = subprocess.run([sys.executable, "-c", SHORT], capture_output=True, text=True)
-    assert done.stdout.startswith("kernels: Warp cannot be loaded (") and done.stderr == ""
-    assert done.stdout.endswith("; free memory, or give kernels=torch\n")
-
-
-# For each folder, in a process of its own: where kernels are kept, and whether others may write
-# there.
-CACHE = """
-import os, sys, tempfile, torch, warp
+# Each in a process of its own: first with less memory than Warp's library takes; then, for each
+# folder, where kernels are kept, and whether others may write there.
+STARTS = """
+import os, resource, sys, tempfile, torch, warp
 from pathlib import Path
-from devrf.kernels.runtime import others_may_write, is_supported
-for name in sys.argv[1:]:
+from devrf.errors import DevrfError
+from devrf.kernels.runtime import is_supported, others_may_write
+for name in sys.argv:
     if os.fork():
         os.wait()
         continue
+    if name == sys.argv[0]:
+        pages = int(open("/proc/self/statm").read().split()[0])
+        most = pages * resource.getpagesize() + 20 * 2**20
+        resource.setrlimit(resource.RLIMIT_AS, (most, most))
+        try:
+            is_supported(torch.empty(0))
+        except DevrfError as error:
+            print(error)
+        sys.exit()
     os.environ["WARP_CACHE_PATH"] = str(Path(name, "cache"))
     os.environ["TMPDIR"] = str(Path(name, "own"))
     assert is_supported(torch.empty(0))
@@ -87,8 +76,8 @@ for name in sys.argv[1:]:
 """
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-def test_kernels_are_not_kept_where_others_may_write(tmp_path):
+@pytest.mark.skipif(sys.platform != "linux", reason="memory as Linux limits it")
+def test_short_memory_is_one_line_and_kernels_are_not_kept_where_others_may_write(tmp_path):
     folders = []
     for mode in (0o700, 0o755, 0o777):
         folders.append(folder := tmp_path / f"{mode:o}")
@@ -97,10 +86,14 @@ def test_kernels_are_not_kept_where_others_may_write(tmp_path):
         (folder / "cache").chmod(mode)
         folder.chmod(0o755)
     tmp_path.chmod(0o755)
-    command = [sys.executable, "-c", CACHE, *map(str, folders)]
+    command = [sys.executable, "-c", STARTS, *map(str, folders)]
     done = subprocess.run(command, capture_output=True, text=True)
-    assert done.stdout == "False False\nFalse False\nTrue False\n"
-    assert done.stderr.count("others may write there") == 1
+    short, *kept = done.stdout.splitlines()
+    assert short.startswith("kernels: Warp cannot be loaded (")
+    assert short.endswith("; free memory, or give kernels=torch")
+    assert kept == ["False False", "False False", "True False"]
+    (warning,) = done.stderr.splitlines()
+    assert "others may write there" in warning
     own = [[path.name for path in (folder / "own").iterdir()] for folder in folders]
     assert own == [[], [], [f"devrf-kernels-{os.getuid()}"]]
 
