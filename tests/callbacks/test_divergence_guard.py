@@ -131,6 +131,28 @@ def test_a_field_that_empties_or_fills_is_rolled_back(
     assert stage.position.num_rollbacks == 1 and stage.iteration == 50
 
 
+def test_an_occupancy_that_a_diverged_field_has_narrowed_comes_back(fit, canonical):
+    masks: list[tuple[int, Tensor]] = []
+
+    class HalfGone(Callback):
+        def on_train_batch_start(self, trainer: Trainer, stage: Any, *_: Any) -> None:
+            masks.append((stage.iteration, stage.scene_model.occupancy.mask))
+            if stage.iteration == 14 and not stage.position.num_rollbacks:
+                values = stage.scene_model.canonical.density.values.data
+                values[: len(values) // 2] = -100.0
+                values[0, 0, 0] = math.inf
+
+    # The occupancy is renewed at 14 and later; the field is looked at where the phase ends.
+    stage = fit(canonical(**SHORT, occupancy_every=4), HalfGone(), DivergenceGuard(50))
+    assert stage.position.num_rollbacks == 1
+    assert [n for n, _ in masks] == [*range(24), *range(10, 24)]
+    assert masks[20][1].sum() < 0.7 * masks[10][1].sum()
+    assert torch.equal(masks[24][1], masks[10][1]) and masks[34][1].sum() > masks[20][1].sum()
+    # Where nothing is left the guard still has its say, not the pixels that meet nothing.
+    stage = fit(canonical(**LONG, occupancy_every=4), Spoil("-100", 30), DivergenceGuard(20))
+    assert stage.position.num_rollbacks == 1 and stage.iteration == 50
+
+
 def test_a_stage_that_never_saw_anything_warns(fit, canonical, caplog):
     clear = {"alpha_init": 1e-7, "rates": CanonicalRates(density=1e-9)}
     guard = DivergenceGuard(every_iterations=20)

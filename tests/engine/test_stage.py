@@ -142,9 +142,9 @@ def test_what_is_due_comes_at_multiples_after_its_start(fit):
     found = []
 
     class Watched(CanonicalStage):
-        def update_occupancy(self) -> None:
+        def opaque(self) -> torch.Tensor:
             found.append(self.iteration)
-            super().update_occupancy()
+            return super().opaque()
 
     schedule = CanonicalSchedule(0, 12, True, 30, 12, (), rays=16, occupancy_every=8)
     fit(Watched(schedule, SMALL, iterations_per_step=5))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from statistics import mean
 from typing import Any, NamedTuple
 
@@ -57,13 +57,14 @@ def collapsed_to_opaque(opacity: float, lowest: float, expected: float) -> bool:
 class Snapshot(NamedTuple):
     """Copies of the optimiser's parameters, in its order, at an iteration of a phase.
 
-    ``iterations_done`` had been carried out there.
+    ``iterations_done`` had been carried out there; ``restore`` restores what else had changed.
     """
 
     phase: Phase
     iteration: int
     iterations_done: int
     values: tuple[Tensor, ...]
+    restore: Callable[[], None]
 
 
 class DivergenceGuard(Callback):
@@ -170,7 +171,13 @@ class DivergenceGuard(Callback):
         assert stage.phase is not None
         self._good = None  # its memory is free before the next takes as much
         values = tuple(value.detach().clone() for value in _trained(stage))
-        self._good = Snapshot(stage.phase, stage.iteration, stage.position.iterations_done, values)
+        self._good = Snapshot(
+            phase=stage.phase,
+            iteration=stage.iteration,
+            iterations_done=stage.position.iterations_done,
+            values=values,
+            restore=stage.remember(),
+        )
 
     def _collapsed(self, stage: Stage, steps: Sequence[dict[str, float]], since: int) -> str | None:
         """In words, that everything has become empty or opaque."""
@@ -205,7 +212,7 @@ class DivergenceGuard(Callback):
         iteration = stage.iteration if scaled else good.iteration
         stage.position.roll_back(iteration, good.iterations_done, self.rate_factor)
         stage.optimizer.forget()
-        stage.refresh()
+        good.restore()
         stage.position.seed_generator(stage.generator, stage.global_rank)
         stage.trainer.should_stop = False
         self._count_from(stage)

@@ -6,7 +6,7 @@ import logging
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial, reduce
 from pathlib import Path
@@ -163,8 +163,13 @@ class Stage(LightningModule, ABC):
         """Whether what is left of the phase can be skipped, by the mean ``loss`` () of a step."""
         return False
 
-    def refresh(self) -> None:
-        """Find anew what follows from the learned values, which have changed from outside."""
+    def remember(self) -> Callable[[], None]:
+        """Keep what iterations change beside the optimiser's parameters, such as the occupancy.
+
+        Returns:
+            restores it; called once the parameters are again what they are now.
+        """
+        return lambda: None
 
     def current_model(self) -> Renderable:
         """The model, with everything learned so far written back to it."""

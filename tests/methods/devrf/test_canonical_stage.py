@@ -143,9 +143,9 @@ def test_a_search_goes_on_past_renewals_of_its_occupancy_and_finds_the_robot(
     opaque_at_first: list[float] = []
 
     class Watched(CanonicalStage):
-        def update_occupancy(self) -> None:
+        def opaque(self) -> torch.Tensor:
             opaque_at_first.append(float(self.scene_model.canonical.voxel_alpha(0.5).max()))
-            super().update_occupancy()
+            return super().opaque()
 
     stage = Watched(schedule, architecture)
     trainer(max_epochs=1).fit(stage, datamodule=datamodule)
@@ -239,9 +239,9 @@ def test_a_grown_grid_is_thinned_and_gets_a_new_optimiser(fit):
     renewed, grown = [], []
 
     class Watched(CanonicalStage):
-        def update_occupancy(self) -> None:
+        def opaque(self) -> torch.Tensor:
             renewed.append(self.iteration)
-            super().update_occupancy()
+            return super().opaque()
 
         def enter(self, phase: Any) -> None:
             # A corner of the grid is the same point at every resolution.

@@ -71,6 +71,11 @@ def test_what_has_gone_is_forgotten_and_found_when_it_comes_back(cube: Box) -> N
         assert not (cells.opacity[3:] > LEAST).any()
 
 
+def test_a_field_that_has_diverged_leaves_nothing_out(cube: Box) -> None:
+    cells = looked(1, lambda points, time: torch.full_like(time, math.nan), cube)
+    assert cells.occupied(torch.arange(45)).all()  # type: ignore[union-attr]
+
+
 def test_rays_skip_what_is_empty_but_for_their_last_sample(cube: Box) -> None:
     occupancy = OccupancyFrames(1, (5, 3, 3))
     occupancy.learned = looked(1, on_the_left, cube)

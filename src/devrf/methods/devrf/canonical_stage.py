@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -319,7 +319,7 @@ class CanonicalStage(Stage):
         # Cropping leaves a share of the voxels that the field was built for.
         share = field.base_voxels / round(self.schedule.side**3)
         field.resize(round(phase.voxels * share))
-        self.update_occupancy()
+        self._keep_occupied(self.opaque())
         field.density.values.data.sub_(self.schedule.density_drop)
 
     def _begin_fine(self, phase: CanonicalPhase) -> None:
@@ -361,15 +361,26 @@ class CanonicalStage(Stage):
         return field
 
     @torch.no_grad()
-    def update_occupancy(self) -> None:
-        """Find the occupancy at rest on the field's own grid, within the one before."""
+    def opaque(self) -> Tensor:
+        """Mask (X, Y, Z) of the voxels that count as occupied at rest."""
         objective = self.objective
         threshold = objective.occupancy_threshold
         if not (objective.searches or self.scene_model.space.is_linear):
             # Fog in unbounded space clears until it is not coloured, and no further.
             threshold = max(threshold, objective.alpha_threshold)
-        opacity = self.scene_model.canonical.voxel_alpha(self.sampling.step)
-        self._keep_occupied(opacity > threshold)
+        return self.scene_model.canonical.voxel_alpha(self.sampling.step) > threshold
+
+    def remember(self) -> Callable[[], None]:
+        """Keep the occupancy, which each renewal narrows."""
+        occupancy = self.scene_model.occupancy
+        mask, box = occupancy.mask, occupancy.box
+
+        def restore() -> None:
+            occupancy.replace(mask, box)
+            self._choose_pixels()
+            self._look_for_gradients()
+
+        return restore
 
     def _keep_occupied(self, where: Tensor) -> None:
         """Keep of the occupancy what is within a voxel of ``where`` (X, Y, Z)."""
@@ -383,6 +394,7 @@ class CanonicalStage(Stage):
         """In contracted space, occupy only what this phase's rays have reached.
 
         A voxel that no ray has reached had no gradient: Adam's second moment of it is still zero.
+        After a rollback the phase is counted from there.
         """
         state = self.optimizer.state.get(self.scene_model.canonical.density.values)
         if state and not self.scene_model.space.is_linear:
@@ -441,8 +453,9 @@ class CanonicalStage(Stage):
         iteration = self.position.iteration
         begin = schedule.search_iterations if iteration >= schedule.search_iterations else 0
         renews = every is not None and self.position.is_due(every, begin - every // 2)
-        if renews:
-            self.update_occupancy()
+        # A field that has diverged is DivergenceGuard's to set back.
+        if renews and bool((opaque := self.opaque()).any()):
+            self._keep_occupied(opaque)
             self._choose_pixels()
             self.events[RENEWED] += 1
         touched_only = not schedule.smooths_all(iteration)
@@ -464,7 +477,7 @@ class CanonicalStage(Stage):
             return
         self.scene_model.canonical.learn_directions(True)
         self._clear_unobserved()
-        self.update_occupancy()
+        self._keep_occupied(self.opaque())
         self.scene_model.canonical.clear(~self.scene_model.occupancy.mask, alpha=1e-6)
         super().on_train_end()
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any
 
@@ -339,10 +339,14 @@ class DeformationStage(Stage):
         warp = self.field.warp_by(frame.backward)
         frame.occupancy.refill(possible_occupancy(self.scene_model.occupancy, warp))
 
-    def refresh(self) -> None:
-        """Find the frame's occupancy anew, and judge its losses afresh."""
-        self._losses = []
-        self._update_occupancy()
+    def remember(self) -> Callable[[], None]:
+        """Nothing: the frame's occupancy is found anew, and its losses are judged afresh."""
+
+        def restore() -> None:
+            self._losses = []
+            self._update_occupancy()
+
+        return restore
 
     def _write_back(self) -> None:
         """Copy what was learned of the active frame into the fields; learning may go on."""

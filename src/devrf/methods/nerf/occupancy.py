@@ -95,7 +95,8 @@ class LearnedOccupancy(StoredShape):
         for cells in looks:
             for part in torch.split(cells, CHUNK):
                 points = self._points(part, box)
-                opacity = opacity_at(points, torch.rand_like(points[:, 0]))
+                # A field that has diverged leaves nothing out.
+                opacity = opacity_at(points, torch.rand_like(points[:, 0])).nan_to_num(nan=1.0)
                 flat[part] = torch.maximum(DECAY * flat[part], opacity)
 
     def _points(self, cells: Tensor, box: Box) -> Tensor:
