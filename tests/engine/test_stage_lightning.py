@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 
 import pytest
@@ -19,6 +20,7 @@ from devrf.callbacks import Previews
 from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, load_checkpoint
 from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 
 
@@ -75,6 +77,27 @@ def test_model_checkpoint_keeps_the_best(canonical, datamodule, trainer, tmp_pat
     assert best == pytest.approx(max(p for _, p in fitted.callbacks[2].psnr), abs=1e-4)
     loaded = load_checkpoint(tmp_path / "best.ckpt", stage.scene)
     assert loaded.metadata.stage == "canonical"
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_a_stage_that_is_over_is_saved_and_goes_on_nowhere(
+    canonical, rest, datamodule, trainer, tmp_path, moving
+):
+    def build():
+        if not moving:
+            return canonical()
+        levels = DeformationSchedule(levels=(Level(4, 2),), rays=64)
+        return DeformationStage(copy.deepcopy(rest), levels, iterations_per_step=1)
+
+    stage, fitted = build(), trainer(max_epochs=1)
+    fitted.fit(stage, datamodule=datamodule)
+    fitted.save_checkpoint(tmp_path / "over.ckpt")
+    again = build()
+    trainer(max_epochs=1).fit(again, datamodule=datamodule, ckpt_path=tmp_path / "over.ckpt")
+    assert again.is_complete
+    learned = {name: v for name, v in stage.state_dict().items() if isinstance(v, torch.Tensor)}
+    for name, value in learned.items():
+        assert torch.equal(again.state_dict()[name], value), name
 
 
 def test_learning_rates_are_monitored(canonical, datamodule, trainer, tmp_path):

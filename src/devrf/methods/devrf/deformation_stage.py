@@ -370,13 +370,16 @@ class DeformationStage(Stage):
         super().on_train_end()
 
     def phase_state(self) -> dict[str, Any]:
-        """The state of the active frame, and its losses so far."""
-        assert self.active is not None
+        """The state of the active frame, and its losses so far; nothing once all is learned."""
+        if self.active is None:
+            return {}
         exact = self.motion.stored_half(self.device)
         views = self.context.views
         return {"frame": self.active.state(views, exact=exact), "losses": [*self._losses]}
 
     def restore(self, phase: DeformationPhase, state: dict[str, Any]) -> None:
         """Go on with the frame of ``phase``, the field being loaded."""
-        self._activate(phase).load_state(state["frame"], self.context.views)
-        self._losses = [float(loss) for loss in state["losses"]]
+        frame = self._activate(phase)
+        if state:
+            frame.load_state(state["frame"], self.context.views)
+            self._losses = [float(loss) for loss in state["losses"]]
