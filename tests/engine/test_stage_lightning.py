@@ -160,3 +160,8 @@ def test_the_devices_figures_are_logged(canonical, datamodule, trainer, tmp_path
     fitted.fit(canonical(), datamodule=datamodule)
     table = (tmp_path / "stats" / "version_0" / "metrics.csv").read_text()
     assert "DeviceStatsMonitor.on_train_batch_end" in table
+
+
+def test_a_fit_without_a_datamodule_is_refused(canonical, trainer):
+    with pytest.raises(DevrfError, match="CanonicalStage: it learns from .* give datamodule="):
+        trainer(max_epochs=1).fit(canonical(), [0])

@@ -72,7 +72,7 @@ class TrainingRecord(Callback):
         seconds = self.seconds
         done = pl_module.position.iterations_done
         allocated, reserved = self._peaks() or (None, None)
-        pl_module.provenance.record = {
+        pl_module.provenance.record |= {
             "seconds": round(seconds, 2),
             "iterations": done,
             "iterations_per_second": round(done / seconds, 2),

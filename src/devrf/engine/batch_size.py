@@ -28,7 +28,7 @@ class BatchSize:
         smallest: the least to which batches are halved where memory runs out.
         processes: the number of processes that draw a batch together.
         keys: the config keys of what to lower where even that is too much.
-        is_final: whether the parameters change by the present batch: it cannot be drawn again.
+        is_final: whether the optimiser is stepping, and the batch cannot be drawn again.
     """
 
     share: float = 1.0
@@ -44,7 +44,7 @@ class BatchSize:
         return self.share / self.processes
 
     def rays(self, rays: int, most: int | None = None) -> int:
-        """The number of rays that one process draws of a batch of ``rays``, or of at ``most``."""
+        """One process's part of a batch of ``rays``, or of ``most`` where that is less."""
         whole = rays if most is None else min(rays, most)
         return max(1, round(whole * self.of_process))
 

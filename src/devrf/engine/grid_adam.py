@@ -31,6 +31,8 @@ class GridAdam(torch.optim.Optimizer):
       of the backward pass; ``along_z`` times as much between neighbours along z.
     * ``touched_only``: add it only to entries that have a gradient.
 
+    Callbacks read ``name``, ``base_lr`` and ``decay`` (the power of the schedule's factor of the
+    rate, 1 if it is not there) of each group of a stage's optimiser.
     """
 
     def __init__(

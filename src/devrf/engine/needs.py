@@ -2,7 +2,7 @@
 
 Counted are the images, the fields with their gradients and Adam's state, and a batch. The rest is
 small beside them; where memory runs out all the same, batches are halved
-(:mod:`devrf.engine.stage`).
+(:mod:`devrf.engine.batch_size`).
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol, Self
+from typing import Any, Protocol
 
 from devrf.engine.position import Position
 
@@ -52,10 +52,6 @@ class Schedule(Protocol):
 
     def learning_rate_factor(self, iteration: int) -> float:
         """Factor of the base learning rates at an iteration."""
-        ...
-
-    def scaled(self, factor: float) -> Self:
-        """The schedule in ``factor`` times its iterations: as many phases, in their order."""
         ...
 
 
@@ -110,7 +106,8 @@ class Scalable(Scheduled, Protocol):
     """A stage whose schedule can be scaled while it learns.
 
     Attributes:
-        schedule: the present settings of the schedule.
+        schedule: the present settings of the schedule; ``schedule.scaled(factor)`` has as many
+            phases, in ``factor`` times their iterations.
         configured_schedule: those before it was scaled; None until then.
     """
 

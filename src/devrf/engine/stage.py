@@ -75,8 +75,8 @@ class Stage(LightningModule, ABC):
         rate_keys: the config keys of what to lower when training diverges.
         keeps_batches: whether a budget of time leaves out iterations before it makes batches
             smaller.
-        useful_share: batches of a smaller share take no less time.
-        plan: the class of the stage's plan.
+        useful_share: the smallest share of a batch that is worth drawing: less saves no time.
+        plan: class of the plan, by which needs are forecast before the stage is built.
         iterations_per_step: iterations of a Lightning step at most.
         scene_model: the scene that is learned.
         schedule: the settings of the schedule.
@@ -132,7 +132,14 @@ class Stage(LightningModule, ABC):
 
     @abstractmethod
     def iterate(self, views: Any) -> Terms:
-        """One iteration on training ``views``, from drawing pixels to the optimiser's step."""
+        """One iteration on training ``views``, from drawing pixels to the optimiser's step.
+
+        Returns:
+            ``loss``; ``opacity``, the mean opacity of the rays, which ``DivergenceGuard`` reads,
+            and ``coverage``, what it should be, where alpha masks tell; ``render``, a mean squared
+            error, from which the PSNR follows; further terms. The names are the same throughout a
+            phase.
+        """
 
     def timeline_of(self, schedule: Any) -> Schedule:
         """The course of a schedule with the stage's scene: by default the schedule itself."""
@@ -157,7 +164,7 @@ class Stage(LightningModule, ABC):
         return {}
 
     def prepare(self) -> None:
-        """Called before each iteration; may wait for the device."""
+        """Renew what follows from the iteration's number, before it; may wait for the device."""
 
     def converged(self, loss: Tensor) -> bool:
         """Whether what is left of the phase can be skipped, by the mean ``loss`` () of a step."""
@@ -205,15 +212,14 @@ class Stage(LightningModule, ABC):
         position.seed_generator(self.generator, self.global_rank)
         if self.is_complete:
             self.trainer.should_stop = True
+        if "render" in means:
+            means["psnr"] = -10 * means["render"].clamp_min(1e-12).log10()
         if means:
             self._log(means)
         return means
 
     def _log(self, means: Terms) -> None:
-        """Log the terms and the PSNR of the batches, which is added, by iterations."""
-        error = means.get("render")
-        if error is not None:
-            means["psnr"] = -10 * error.clamp_min(1e-12).log10()
+        """Log the means of a step, by iterations."""
         values: dict[str, Any] = {f"{self.capture}/{name}": value for name, value in means.items()}
         values["step"] = float(self.position.iterations_done)
         self.log_dict(values, on_step=True, on_epoch=False, batch_size=1)
@@ -324,8 +330,8 @@ class Stage(LightningModule, ABC):
         """Check the trainer and make the generator.
 
         Raises:
-            DevrfError: the precision is not 32 bit, or several processes run with a strategy that
-                does not support growing grids.
+            DevrfError: there is no datamodule, the precision is not 32 bit, or several processes
+                run with a strategy that does not support growing grids.
         """
         if self.trainer.precision != "32-true":
             raise DevrfError(
@@ -333,6 +339,11 @@ class Stage(LightningModule, ABC):
                 "need all their digits; decoder_precision=bfloat16 takes fewer for colours alone"
             )
         check_strategy(self.trainer)
+        if getattr(self.trainer, "datamodule", None) is None:
+            raise DevrfError(
+                f"{type(self).__name__}: it learns from the scene of a datamodule; give "
+                "datamodule=… to the trainer"
+            )
         self.began = time.perf_counter()
         self.position.seed = torch.initial_seed()
         self.batch_size.processes = self.trainer.world_size

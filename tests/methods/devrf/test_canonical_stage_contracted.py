@@ -47,7 +47,7 @@ def test_a_field_knows_that_what_is_outside_stays():
     field = DeformationField(SPACE.inner(), clock, voxels=27, zero_outside_box=True)
     field.to_canonical[1:] = 0.25
     outside = torch.tensor([[1.3, 0.0, 0.0]])
-    assert torch.equal(field.warp(outside, 1.0), outside)
+    assert torch.equal(field.warp_at(1.0)(outside), outside)
     again = DeformationField(Box((0.0,) * 3, (1.0,) * 3), clock, voxels=8)
     again.set_extra_state(field.get_extra_state())
     assert again.zero_outside_box and again.box == SPACE.inner()
@@ -159,5 +159,5 @@ def test_a_room_is_learned_and_moves_inside_the_inner_box(tiny_room, trainer):
     trainer(max_epochs=1).fit(moving, datamodule=data)
     assert moving.field.box == room.space.inner(room.bounds.box) and moving.field.zero_outside_box
     far = torch.tensor([[room.bounds.box.high[0], 0.0, 0.0]])
-    assert torch.equal(moving.scene_model.deformation.warp(far, 1.0), far)
+    assert torch.equal(moving.scene_model.deformation.warp_at(1.0)(far), far)
     assert bool(moving.field.to_canonical[1].any())

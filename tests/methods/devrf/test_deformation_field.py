@@ -28,7 +28,7 @@ def points(count: int, rng: torch.Generator) -> Tensor:
 
 def test_time_zero_is_exactly_the_identity(field, rng):
     x = 1.5 * points(500, rng)
-    assert torch.equal(field.warp(x, 0.0), x)
+    assert torch.equal(field.warp_at(0.0)(x), x)
     assert torch.equal(field.unwarp(x, 0.0), x)
 
 
@@ -40,11 +40,11 @@ def test_between_frames_by_hand(cube):
     x = torch.tensor([[0.5, 0.0, 0.0], [-1.0, 0.2, 0.3]])
     # x = 0.5 lies 3/4 on the way between the faces; time 0.3 a quarter on from frame 1 to 2.
     on_frame = x + torch.tensor([[0.75, 0.0, 0.0], [0.0, 0.0, 0.0]])
-    torch.testing.assert_close(field.warp(x, 0.2), on_frame)
+    torch.testing.assert_close(field.warp_at(0.2)(x), on_frame)
     between = x + torch.tensor([[0.75 * 0.75, 0.1, 0.0], [0.0, 0.1, 0.0]])
-    torch.testing.assert_close(field.warp(x, 0.3), between)
+    torch.testing.assert_close(field.warp_at(0.3)(x), between)
     # Between rest and frame 1, half of frame 1.
-    torch.testing.assert_close(field.warp(x, 0.1), (x + on_frame) / 2)
+    torch.testing.assert_close(field.warp_at(0.1)(x), (x + on_frame) / 2)
     torch.testing.assert_close(field.unwarp(x, 0.3), x)
 
 
@@ -82,7 +82,7 @@ def test_resizing_keeps_a_linear_motion_exactly_and_frames_never_trained_zero(cu
     truth = x + x @ turn + 0.05
     for voxels in (1000, 64):
         field.resize(voxels)
-        torch.testing.assert_close(field.warp(x, 0.6), truth, atol=1e-5, rtol=0)
+        torch.testing.assert_close(field.warp_at(0.6)(x), truth, atol=1e-5, rtol=0)
         for frame in (0, 1, 3):
             assert not field.to_canonical[frame].any()
         assert not field.to_time.any()

@@ -443,7 +443,10 @@ class CanonicalStage(Stage):
             group["rows"] = reached
 
     def prepare(self) -> None:
-        """At the schedule's iterations renew the occupancy, smooth less, and learn directions."""
+        """At the schedule's iterations renew the occupancy, smooth less, and learn directions.
+
+        A search in fewer iterations begins less faintly.
+        """
         schedule = self.schedule
         if self.objective.searches:
             shorter = self.architecture.for_search(self.position.schedule_scale)

@@ -126,10 +126,6 @@ class DeformationField(FrameField):
         """Grid points along x, y, z."""
         return self.frames.shape
 
-    def warp(self, points: Tensor, time: float) -> Tensor:
-        """x + Δ_b(x, t) (M, 3) of ``points`` x (M, 3) at ``time`` t."""
-        return self.warp_at(time)(points)
-
     def unwarp(self, points: Tensor, time: float) -> Tensor:
         """q + Δ_f(q, t) (M, 3) of canonical ``points`` q (M, 3) at ``time`` t."""
         return self._at(self.to_time, time)(points)

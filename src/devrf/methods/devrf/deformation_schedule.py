@@ -257,10 +257,6 @@ class Visits:
         """Factor of the iteration's level, and within its visit."""
         return self.phase(iteration).learning_rate_at(iteration)
 
-    def scaled(self, factor: float) -> Visits:
-        """As many visits in ``factor`` times the iterations."""
-        return replace(self, schedule=self.schedule.scaled(factor))
-
 
 def converged(losses: Sequence[float], min_rel_improvement: float) -> bool:
     """Whether the last two steps of a visit lowered its best loss by too little.

@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
@@ -110,10 +109,8 @@ class DeformationStage(Stage):
             space=canonical.space,
         ).requires_grad_(False)
         self.provenance.earlier_records = earlier.metadata.records
-        placeholder = torch.zeros(2, 2, 2, 3, requires_grad=True)
-        self.optimizer = GridAdam(
-            [{"params": [placeholder], "lr": self.motion.learning_rate, "name": "motion"}]
-        )
+        rate = self.motion.learning_rate
+        self.optimizer = GridAdam([{"params": [], "lr": rate, "base_lr": rate, "name": "motion"}])
         # The state holds what the active frame has learned.
         self.register_state_dict_pre_hook(  # type: ignore[no-untyped-call]
             lambda *_: self._write_back()
@@ -227,8 +224,9 @@ class DeformationStage(Stage):
             self._build_field()
             for extension in self.extensions:
                 extension.setup(self.context)
-        scale = self.field.box.longest if self.motion.unit == "box" else 1.0
-        self.optimizer.param_groups[0]["base_lr"] = self.motion.learning_rate * scale
+        if self.motion.unit == "box":
+            rate = self.motion.learning_rate * self.field.box.longest
+            self.optimizer.param_groups[0]["base_lr"] = rate
 
     def _build_field(self) -> None:
         """The field over the canonical field's box; in contracted space, over the inner box."""

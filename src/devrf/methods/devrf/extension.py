@@ -65,7 +65,10 @@ class Extension:
     """Adds to the deformation stage; a hook that is not overridden adds nothing.
 
     An extension is one file of ``extensions/`` and one block of ``schedule.extensions``; without
-    both, all else runs as before. Hooks are called in the order in which they stand here.
+    both, all else runs as before. The first three are read when the stage is built, then comes
+    :meth:`setup`. At each visit of a frame follow :meth:`initialise`, unless the visit is resumed,
+    and where a level begins :meth:`frame_fields` and :meth:`begin_level`; in each iteration
+    :meth:`weight_factor` and :meth:`color_change`.
     """
 
     @property
@@ -80,11 +83,14 @@ class Extension:
 
     @property
     def scaled_terms(self) -> Collection[str]:
-        """The loss terms that :meth:`weight_factor` may change."""
+        """Names from the config that have to be those of loss terms."""
         return ()
 
     def setup(self, context: MotionContext) -> None:
         """Add fields to the model and groups to the optimiser, before learning starts."""
+
+    def initialise(self, context: MotionContext, phase: DeformationPhase) -> None:
+        """Give the phase's frame its first values, in the fields, before a visit."""
 
     def frame_fields(self, context: MotionContext, level: int) -> Mapping[str, FrameField]:
         """Fields whose frames are learned at ``level`` as the displacements are, by name."""
@@ -96,9 +102,6 @@ class Extension:
     def weight_factor(self, term: str, level: int, share: float) -> float:
         """Factor of the weight of any loss term at ``level``, a ``share`` of a visit being over."""
         return 1.0
-
-    def initialise(self, context: MotionContext, phase: DeformationPhase) -> None:
-        """Give the phase's frame its first values, in the fields, before a visit."""
 
     def color_change(self, frame: ActiveFrame) -> ColorChange | None:
         """The residual that is added to the colours' logits of an active frame; None: none."""

@@ -14,7 +14,7 @@ from devrf.errors import expect
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.ndc import NormalizedDevice
-from devrf.geometry.space import WORLD, Space, WorldSpace
+from devrf.geometry.space import WORLD, Space
 from devrf.kernels.motion import cycle_error, flow_error
 from devrf.kernels.photometric import photometric
 from devrf.kernels.runtime import is_supported
@@ -110,8 +110,7 @@ def flow(prediction: MotionPrediction) -> Tensor:
     if batch.flow is None or valid is None:
         return samples.weight.new_zeros(())
     unwarp, space = prediction.unwarp_previous, prediction.space
-    straight = isinstance(space, WorldSpace | NormalizedDevice)
-    if isinstance(unwarp, GridWarp) and straight and is_supported(samples.weight):
+    if isinstance(unwarp, GridWarp) and space.is_linear and is_supported(samples.weight):
         return flow_error(
             samples,
             unwarp.displacement,

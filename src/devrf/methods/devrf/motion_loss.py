@@ -44,7 +44,7 @@ class MotionLoss:
         weights, self._total_variation = apart_from_total_variation(loss, "loss.deformation")
         for extension in extensions:
             self.terms |= extension.terms
-            weights |= extension.weights
+            weights = {**extension.weights, **weights}
         names = ", ".join(sorted(self.terms))
         for extension in extensions:
             for name in sorted(set(extension.scaled_terms) - self.terms.keys()):

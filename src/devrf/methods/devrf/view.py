@@ -39,7 +39,7 @@ class DeVRFView:
 
     Attributes:
         canonical: the scene's look at rest.
-        occupancy: of the scene; at first at rest.
+        occupancy: given as of the scene at rest; kept as of the view's time.
         settings: of the sampling of rays.
         motion: the scene's; None: it is at rest at every time.
         space: the space that the fields live in.

@@ -154,7 +154,7 @@ def test_three_views_of_a_shift_give_the_shift_and_the_way_back():
     # The shift is more than the ball's radius: no rendered overlap could have shown it.
     assert (moved - tracks.canonical - SHIFT).norm(dim=1).median() < 0.02
     assert not field.to_canonical[:2].any() and not field.to_time[:2].any()
-    back = field.warp(tracks.canonical + SHIFT, 1.0)
+    back = field.warp_at(1.0)(tracks.canonical + SHIFT)
     assert (back - tracks.canonical).norm(dim=1).median() < 0.03
 
 
