@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from devrf.geometry.clock import FrameClock, Moment
+from devrf.geometry.clock import BetweenFrames, FrameClock
 
 UNEVEN = FrameClock((0.0, 0.1, 0.5, 1.0))
 
@@ -32,7 +32,7 @@ def test_every_frame_is_found_exactly_in_spite_of_float32(frames):
     times = torch.arange(frames) / (frames - 1)
     clock = FrameClock(tuple(k / (frames - 1) for k in range(frames)))
     for k, time in enumerate(times.tolist()):
-        assert clock.at(time) == Moment(k, k, 0.0)
+        assert clock.at(time) == BetweenFrames(k, k, 0.0)
     assert clock.frames_of(times).tolist() == list(range(frames))
     assert FrameClock.from_times(times.double()).times == pytest.approx(clock.times, abs=1e-6)
 

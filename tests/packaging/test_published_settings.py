@@ -46,7 +46,7 @@ def test_deformation_schedule(paper):
     assert (tuple(schedule.levels), schedule.rays) == (PAPER_LEVELS, 8192)
     motion = instantiate(paper.schedule.motion)
     assert (motion.learning_rate, motion.unit) == (1e-3, "world")
-    factors = [schedule.phase(i, frames=50).learning_rate_factor for i in (0, 24_999)]
+    factors = [schedule.phase(i, frames=50).rate_factor for i in (0, 24_999)]
     assert factors == pytest.approx([1, 0.1])
     # A batch is drawn from all pixels of one view.
     assert (motion.views, motion.pixels) == ("one", "all")
@@ -145,15 +145,15 @@ def test_each_forward_scene_has_its_published_schedule(
     config = composed("experiment=paper", f"data={scene}", ROOT)
     schedule = instantiate(config.schedule.deformation, _convert_="all")
     assert (config.data.name, [level.side for level in schedule.levels]) == (scene, sides)
-    assert (schedule.growths(frames), schedule.total(frames)) == (growths, total)
+    assert (schedule.level_starts(frames), schedule.total(frames)) == (growths, total)
     # 128 planes at the end, halved from level to level downwards.
     cube = Box((-1.0,) * 3, (1.0,) * 3)
     shapes = [cube.grid_shape(*schedule.grid(k)) for k in range(len(sides))]
     assert [z for *_, z in shapes] == [128 // 2**k for k in reversed(range(len(sides)))]
     assert shapes[-1] == (finest, finest, 128)
     # From growth to growth down to a tenth.
-    assert schedule.learning_rate_factor(1) == pytest.approx(factor, abs=1e-4)
-    assert schedule.learning_rate_factor(len(sides) - 1) == pytest.approx(0.1)
+    assert schedule.level_rate_factor(1) == pytest.approx(factor, abs=1e-4)
+    assert schedule.level_rate_factor(len(sides) - 1) == pytest.approx(0.1)
     assert config.schedule.canonical.dense_tv_iterations == 10_000
     assert config.loss.flow_mean == "samples"
     assert (config.field.planes, config.field.channels, config.field.width) == (128, 9, 64)

@@ -155,9 +155,9 @@ class Stage(LightningModule, ABC):
     def enter(self, phase: Any) -> None:
         """Make grids and optimiser ready for ``phase``."""
 
-    @abstractmethod
     def restore(self, phase: Any, state: dict[str, Any]) -> None:
-        """Continue ``phase`` with what :meth:`phase_state` gave; the model's tensors are loaded."""
+        """Go on in ``phase`` with what :meth:`phase_state` gave; the model's tensors are loaded."""
+        self.enter(phase)
 
     def phase_state(self) -> dict[str, Any]:
         """State of the present phase that does not follow from schedule and model: plain data."""

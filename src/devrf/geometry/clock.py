@@ -13,7 +13,7 @@ from devrf.geometry.box import constant
 
 
 @dataclass(frozen=True)
-class Moment:
+class BetweenFrames:
     """A time between two frames.
 
     Attributes:
@@ -60,14 +60,14 @@ class FrameClock:
                 frames.append(time)
         return FrameClock(tuple(frames))
 
-    def at(self, time: float) -> Moment:
-        """The moment of ``time``; times outside the clock's range are the first or last frame's."""
+    def at(self, time: float) -> BetweenFrames:
+        """The frames around ``time``; outside the clock's range that is the first or last one."""
         frame = bisect_right(self.times, time, key=lambda t: t - self.TOLERANCE) - 1
         frame = max(frame, 0)
         before = self.times[frame]
         if frame == len(self) - 1 or time <= before + self.TOLERANCE:
-            return Moment(frame, frame, 0.0)
-        return Moment(frame, frame + 1, (time - before) / (self.times[frame + 1] - before))
+            return BetweenFrames(frame, frame, 0.0)
+        return BetweenFrames(frame, frame + 1, (time - before) / (self.times[frame + 1] - before))
 
     def knows(self, time: float) -> bool:
         """Whether ``time`` is that of a frame."""

@@ -262,7 +262,3 @@ class RayStage(Stage):
             batches.append(replace(batch, image=image[index]))
             offset += len(view_set)
         return batches[0] if len(batches) == 1 else concatenated(batches)
-
-    def restore(self, phase: Phase, state: dict[str, Any]) -> None:
-        """Go on with ``phase``: the images tell which pixels there are."""
-        self.enter(phase)

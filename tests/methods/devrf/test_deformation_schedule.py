@@ -76,7 +76,7 @@ def test_canonical_rates_fall_to_a_tenth_in_each_part_or_begin_again_at_each_gro
 def test_deformation_defaults_are_the_papers_inward():
     schedule, frames = DeformationSchedule(), 50
     assert schedule.total(frames) == 25000
-    assert schedule.growths(frames) == [10000, 15000, 20000, 22500]
+    assert schedule.level_starts(frames) == [10000, 15000, 20000, 22500]
     phases = deformation_phases(schedule, frames)
     assert len(phases) == 5 * 49
     assert [p.side for p in phases[::49]] == [10, 20, 40, 80, 160]
@@ -85,20 +85,20 @@ def test_deformation_defaults_are_the_papers_inward():
         # Frame 0 is the identity: its share goes to frame 1.
         assert [p.stop - p.start for p in of_level] == [2 * share] + [share] * 48
         for phase in of_level:
-            assert phase.learning_rate_factor == pytest.approx(10 ** (-level / 4))
-    assert 1e-3 * phases[-1].learning_rate_factor == pytest.approx(1e-4)
+            assert phase.rate_factor == pytest.approx(10 ** (-level / 4))
+    assert 1e-3 * phases[-1].rate_factor == pytest.approx(1e-4)
     assert schedule.rays == 8192
 
 
 def test_forward_facing_and_without_coarse_to_fine():
     forward = DeformationSchedule(with_level(2, iterations=200), rays=4096)
     assert forward.total(40) == 24000
-    assert forward.growths(40) == [8000, 16000, 20000, 22000]
+    assert forward.level_starts(40) == [8000, 16000, 20000, 22000]
     # Every share goes to the finest grid, where each frame starts from the one before it.
     schedule = DeformationSchedule(coarse_to_fine=False)
     phases = deformation_phases(schedule, 50)
-    assert schedule.total(50) == 25000 and schedule.growths(50) == []
-    assert {(p.side, p.level, p.learning_rate_factor) for p in phases} == {(160, 0, 1.0)}
+    assert schedule.total(50) == 25000 and schedule.level_starts(50) == []
+    assert {(p.side, p.level, p.rate_factor) for p in phases} == {(160, 0, 1.0)}
     assert [p.frame for p in phases] == list(range(1, 50))
     assert [p.init_from_previous for p in phases] == [False] + [True] * 48
 
@@ -119,7 +119,7 @@ def test_frames_are_visited_one_after_another():
         (1, 2, 32, 36),
         (1, 3, 36, 40),
     ]
-    assert schedule.total(4) == 40 and schedule.growths(4) == [24]
+    assert schedule.total(4) == 40 and schedule.level_starts(4) == [24]
     phases = deformation_phases(schedule, 4)
     assert [p.init_from_previous for p in phases] == [False, True, True, False, False, False]
 
@@ -160,7 +160,7 @@ def test_deformation_phases_tile_every_schedule(levels, frames, coarse_to_fine):
     ]
     assert [(p.level, p.frame) for p in phases] == visits
     begun = [[p.start for p in phases if p.level == level][0] for level in range(depth)]
-    assert begun == [0, *schedule.growths(frames)]
+    assert begun == [0, *schedule.level_starts(frames)]
     assert schedule.phase(schedule.total(frames) + 3, frames) == phases[-1]
 
 
@@ -207,7 +207,7 @@ def test_a_level_may_have_a_rate_of_its_own():
     last = Level(8, 2, lr_factor=0.3, lr_final_factor=0.1)
     schedule = DeformationSchedule((Level(4, 2), Level(8, 2, lr_factor=0.5), last))
     phases = [schedule.phase(i, frames=2) for i in (0, 4, 8)]
-    rates = [(p.learning_rate_factor, p.lr_final_factor) for p in phases]
+    rates = [(p.rate_factor, p.lr_final_factor) for p in phases]
     assert rates == [(1, 1), (0.5, 1), (0.3, 0.1)]
     assert phases[2].learning_rate_at(phases[2].stop) == pytest.approx(0.03)
 

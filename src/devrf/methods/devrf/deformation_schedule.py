@@ -61,7 +61,7 @@ class DeformationPhase(Phase):
         frame: the frame, from 1 on.
         level: 0 is the coarsest resolution.
         side: the motion grid has about side³ voxels.
-        learning_rate_factor: of the learning rate at the visit's start.
+        rate_factor: of the learning rate at the visit's start.
         lr_final_factor: a further factor of it at the visit's end.
         init_from_previous: whether the frame starts from the result of the frame before it.
         step: 1, or −1 where frames are gone through from the last to the first.
@@ -70,7 +70,7 @@ class DeformationPhase(Phase):
     frame: int
     level: int
     side: int
-    learning_rate_factor: float
+    rate_factor: float
     lr_final_factor: float
     init_from_previous: bool
     step: int = 1
@@ -82,7 +82,7 @@ class DeformationPhase(Phase):
 
     def learning_rate_at(self, iteration: int) -> float:
         """Factor of the learning rate in the visit (docs/method.md#motion-learning-rate)."""
-        return self.learning_rate_factor * math.pow(self.lr_final_factor, self.share(iteration))
+        return self.rate_factor * math.pow(self.lr_final_factor, self.share(iteration))
 
     def share(self, iteration: int) -> float:
         """The share of the visit that is over, from 0 to below 1."""
@@ -185,7 +185,7 @@ class DeformationSchedule(Options):
         finest = self.levels[-1].side
         return side**3, self.planes and round(self.planes * side / finest)
 
-    def learning_rate_factor(self, level: int) -> float:
+    def level_rate_factor(self, level: int) -> float:
         """Factor of the learning rate when a visit of ``level`` begins."""
         factor = self.levels[level].lr_factor
         if factor is not None:
@@ -197,7 +197,7 @@ class DeformationSchedule(Options):
         """Iterations of the whole stage for T = ``frames`` frames, frame 0 included."""
         return sum(self._lengths(frames))
 
-    def growths(self, frames: int) -> list[int]:
+    def level_starts(self, frames: int) -> list[int]:
         """Iterations at which a further level begins; the motion grid grows if its side does."""
         return list(accumulate(self._lengths(frames)[:-1]))
 
@@ -207,7 +207,7 @@ class DeformationSchedule(Options):
 
     def phase(self, iteration: int, frames: int) -> DeformationPhase:
         """The visit that ``iteration`` belongs to; the last one from the end on."""
-        begins = [0, *self.growths(frames)]
+        begins = [0, *self.level_starts(frames)]
         level = bisect_right(begins, iteration) - 1
         row = self.levels[level]
         # The frame that is visited first takes the share of frame 0, too.
@@ -220,7 +220,7 @@ class DeformationSchedule(Options):
             frame=frames - number if row.backwards else number,
             level=level,
             side=row.side,
-            learning_rate_factor=self.learning_rate_factor(level),
+            rate_factor=self.level_rate_factor(level),
             lr_final_factor=row.lr_final_factor,
             init_from_previous=level == 0 and number > 1,
             step=-1 if row.backwards else 1,
@@ -246,7 +246,7 @@ class Visits:
 
     @property
     def planned_events(self) -> Mapping[str, int]:
-        """Number of levels, growths and visits."""
+        """Number of levels, level_starts and visits."""
         return self.schedule.events(self.frames)
 
     def phase(self, iteration: int) -> DeformationPhase:

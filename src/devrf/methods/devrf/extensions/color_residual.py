@@ -175,9 +175,7 @@ class ColorResidual(Extension):
         residuals = [grid for name, grid in context.active.further.items() if name == NAME]
         for number, group in enumerate(context.optimizer.param_groups):
             if group["name"] == NAME:
-                group["base_lr"] = self._learning_rate / context.schedule.learning_rate_factor(
-                    level
-                )
+                group["base_lr"] = self._learning_rate / context.schedule.level_rate_factor(level)
                 longest = max([2, *(max(grid.shape) for grid in residuals)])
                 weight = total_variation_weight(self._tv, longest, context.schedule.rays)
                 context.optimizer.replace(number, residuals, smoothing=weight)
