@@ -26,7 +26,10 @@ PARSER = OverridesParser.create()
 @pytest.mark.parametrize(
     "path", ["/my scenes/fox [1]", "München (2)", "a=b", 'a "b"', "2026", "a,b", "x, y"]
 )
-def test_a_path_is_taken_as_it_is_typed(key, path):
+def test_a_path_is_taken_as_it_is_typed(tmp_path, monkeypatch, key, path):
+    monkeypatch.chdir(tmp_path)
+    if "," in path:  # else it separates two
+        Path(path).mkdir()
     argument = completed(["data=inward", f"{key}={path}"]).words[-1]
     assert PARSER.parse_override(argument).value() == path
 

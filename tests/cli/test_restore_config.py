@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from devrf.checkpoints.checkpoint import load_checkpoint
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file, write_checkpoint_file
-from devrf.cli.complete import completed
+from devrf.cli.complete import commands, completed
 from devrf.cli.config import config_folder
 from devrf.cli.run import STEPS
 from devrf.errors import DevrfError
@@ -95,14 +94,19 @@ def test_what_is_made_of_a_checkpoint_goes_to_its_run(devrf, run, tmp_path):
     assert list((tmp_path / "outputs" / "robot" / "my copy" / "images").iterdir())
 
 
-def test_the_jobs_of_a_sweep_go_on(devrf, tiny, tmp_path, monkeypatch):
-    monkeypatch.setitem(STEPS, "inspect", lambda run: None)
-    there = "hydra.sweep.dir=sweep"
-    assert devrf("-m", *tiny, there, "stage=inspect", "seed=0,1").status == 0
-    outcome = devrf("stage=inspect", there)
-    assert (outcome.status, outcome.err) == (0, "")
-    found = [config(tmp_path / "sweep" / f"{k}_robot_seed_{k}") for k in (0, 1)]
-    assert [(one.seed, one.data.width) for one in found] == [(0, 24), (1, 24)]
+def test_on_the_folder_of_a_sweep_a_command_stands_for_one_on_each_learned_run(run, tmp_path):
+    folder = f"hydra.sweep.dir={tmp_path}"
+    assert commands(["-m", folder]) == [["-m", folder]]
+    (tmp_path / "multirun.yaml").touch()
+    with pytest.raises(DevrfError, match="a sweep without a learned run; type the sweep again$"):
+        commands(["stage=still", folder])
+    for name in ("10_robot", "2_robot"):
+        shutil.copytree(run, tmp_path / name)
+    (tmp_path / "3_robot").mkdir()  # of a job that failed
+    runs = [["stage=still", f"hydra.run.dir={tmp_path}/{k}_robot"] for k in (2, 10)]
+    assert commands(["-m", "stage=still", folder]) == runs
+    for typed in ("seed=1,2", "experiment=ablation_table", "stage=report"):
+        assert commands([typed, folder]) == [[typed, folder]]
 
 
 def test_a_job_of_an_experiment_that_sweeps_does_not_start_its_sweep(devrf, run, edited):
@@ -271,67 +275,6 @@ def test_a_checkpoint_names_no_class_but_a_method_s(
         with pytest.raises(DevrfError):
             load_checkpoint(evil)
     assert not list(tmp_path.rglob("PWNED"))
-
-
-def recorded(*task: object) -> dict:
-    """The record of a sweep of ``task``."""
-    basic = "hydra._internal.core_plugins.basic_sweeper.BasicSweeper"
-    return {"hydra": {"sweeper": {"_target_": basic}, "overrides": {"task": task}}}
-
-
-RECORDS = {
-    "an interpolation": ["+aa=_tar", "+bb=get_", "canonical.x='${oc.env:HOME}'"],
-    "a path as an option": ["data=../../evil,inward"],
-    "a list of options": ["protocol=[two_stage,../../evil]"],
-    "a part": ["+canonical.x={_target_:sympy.sympify}"],
-    "a part of a group": ["++data={shape:{_target_:sympy.sympify}}"],
-    "a part at the root": ["++canonical={_target_:sympy.sympify}"],
-    "a part among values": ["seed=1,{_target_:sympy.sympify}"],
-    "an option elsewhere": ["data@callbacks.x=procedural"],
-    "an interpolation among values": ["field.width=1,${seed}"],
-    "no text": [5],
-}
-
-
-@pytest.mark.parametrize("task", RECORDS.values(), ids=list(RECORDS))
-def test_the_record_of_a_sweep_chooses_no_code(tmp_path, task):
-    record = tmp_path / "multirun.yaml"
-    record.write_text(json.dumps(recorded("seed=0,1", *task)))
-    with pytest.raises(DevrfError, match=f"^{record}: "):
-        completed(["stage=inspect", f"hydra.sweep.dir={tmp_path}"])
-
-
-def test_the_record_of_a_sweep_does_not_unfold(tmp_path):
-    """Each line refers ten times to the one before: 10^9 words in 460 bytes."""
-    for first, form in (("[x]", "[{}]"), ("{k: 1}", "{{<<: [{}]}}")):
-        refers = [f"a{k}: &a{k} {form.format(','.join([f'*a{k - 1}'] * 10))}" for k in range(1, 9)]
-        text = "\n".join([f"a0: &a0 {first}", *refers, "hydra: *a8"])
-        (tmp_path / "multirun.yaml").write_text(text)
-        with pytest.raises(DevrfError, match="not the record of a sweep"):
-            completed(["stage=inspect", f"hydra.sweep.dir={tmp_path}"])
-
-
-def test_the_record_of_a_sweep_is_no_longer_than_a_command(tmp_path):
-    """A quarter of a minute is what YAML takes for 500 kB of empty lists."""
-    text = f"hydra: {{overrides: {{task: [seed=1]}}, a: [{'[],' * 200_000}]}}"
-    (tmp_path / "multirun.yaml").write_text(text)
-    began = time.perf_counter()
-    with pytest.raises(DevrfError, match="not the record of a sweep"):
-        completed(["stage=inspect", f"hydra.sweep.dir={tmp_path}"])
-    assert time.perf_counter() - began < 5
-
-
-def test_a_sweep_goes_on_with_all_kinds_of_values(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    task = ["experiment=quickstart,cpu_small", "schedule.canonical.upsample_at=[1],[2,3]", "seed=2"]
-    of_the_command = ["trainer=cpu", "data.flow_cache=/elsewhere", "stage=inspect"]
-    typed = [*task, "+data.name='a, b'", *of_the_command]
-    (tmp_path / "multirun.yaml").write_text(json.dumps(recorded(*typed)))
-    typed = [f"hydra.sweep.dir={tmp_path}", "stage=inspect"]
-    assert completed(typed).words == [*task, "+data.name='a, b'", "hydra.mode=MULTIRUN", *typed]
-    # Of a group, or a key, that is typed nothing is taken over.
-    other = [*typed, "experiment=paper", "seed=3"]
-    assert completed(other).words == [task[1], "+data.name='a, b'", "hydra.mode=MULTIRUN", *other]
 
 
 WRITTEN = ["run.log", ".hydra", ".devrf", ".hydra/config.yaml", ".devrf/process.txt"]

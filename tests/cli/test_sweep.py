@@ -144,8 +144,8 @@ def test_a_search_maximises_the_objective(devrf, tmp_path, tiny):
 
 def test_a_folder_without_the_record_of_a_sweep_is_refused(devrf, tmp_path):
     outcome = devrf("stage=still", "hydra.sweep.dir=elsewhere")
-    said = "no multirun.yaml in elsewhere; name the folder of a sweep, or type one (-m)"
-    assert (outcome.status, outcome.err) == (2, f"devrf: hydra.sweep.dir: {said}\n")
+    said = "no sweep is typed (-m); without one it names the folder of a sweep, which has multirun"
+    assert (outcome.status, outcome.err) == (2, f"devrf: hydra.sweep.dir: {said}.yaml\n")
     assert not list(tmp_path.iterdir())
 
 

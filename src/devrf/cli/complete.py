@@ -17,13 +17,10 @@ from contextlib import suppress
 from itertools import product
 from pathlib import Path
 
-from hydra import initialize_config_dir
+from hydra import compose, initialize_config_dir
 from hydra._internal.utils import get_args_parser
-from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.types import Override, ValueType
+from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
-from hydra.types import RunMode
-from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from devrf.cli.config import PATHS, SCENELESS_STAGES, STEPS, config_folder, group_choices
@@ -31,7 +28,7 @@ from devrf.cli.restore_config import (
     Applied,
     of_named_run,
     parsed,
-    searched_runs,
+    runs_of_sweep,
     value,
     values,
 )
@@ -55,17 +52,17 @@ KEY_VALUE = re.compile(r"(\+{0,2}([\w./@-]+)=)(.*)", re.DOTALL)
 
 
 def commands(arguments: Sequence[str]) -> list[list[str]]:
-    """The commands that typed arguments stand for: on the folder of a search, one for each run.
+    """The commands that typed arguments stand for: on the folder of a sweep, one for each run.
 
     Raises:
-        DevrfError: no run of the search has learned anything.
+        DevrfError: no run of the sweep has learned anything.
     """
     named = [word for word in arguments if word.startswith("hydra.sweep.dir=")]
     runs: list[Path] = []
     if named:
         options, _ = get_args_parser().parse_known_intermixed_args(arguments)
         with suppress(HydraException):  # reported when Hydra parses them
-            runs = searched_runs(parsed(quoted_path(word, False) for word in options.overrides))
+            runs = runs_of_sweep(parsed(map(quoted_path, options.overrides)))
     others = [word for word in arguments if word not in (*named, "-m", "--multirun")]
     return [[*others, f"hydra.run.dir={literal(str(run))}"] for run in runs] or [[*arguments]]
 
@@ -87,9 +84,7 @@ def completed(arguments: Sequence[str]) -> Applied:
     if options.experimental_rerun is not None:
         raise DevrfError("--experimental-rerun: a pickle may run code; write hydra.run.dir=FOLDER")
     flags = [word for word in arguments if word not in options.overrides]
-    texts = [SHORTHAND.get(word.lower(), word) for word in options.overrides]
-    in_sweep = options.multirun or _sweeps(texts, options.config_dir)
-    texts = [quoted_path(text, in_sweep) for text in texts]
+    texts = [quoted_path(SHORTHAND.get(word.lower(), word)) for word in options.overrides]
     try:
         typed = parsed(texts)
     except HydraException:  # reported when Hydra parses them
@@ -158,10 +153,10 @@ def _of_scenes(
     return Applied(scenes[0].words if scenes else [], remarks)
 
 
-def quoted_path(argument: str, multirun: bool) -> str:
+def quoted_path(argument: str) -> str:
     """An argument as typed; if it names a file, as Hydra's grammar takes just that name.
 
-    In a multirun a comma separates paths, as it does other values; else it belongs to the name.
+    A comma separates paths, as it does other values, unless it is in the name of one that is there.
 
     Raises:
         DevrfError: it names a file that no config can hold.
@@ -170,47 +165,20 @@ def quoted_path(argument: str, multirun: bool) -> str:
     if not match or match[2] not in PATHS:
         return argument
     start, _, text = match.groups()
+    is_there = os.path.lexists(path := os.path.expanduser(text))
     if "${" in text:
-        if os.path.lexists(path := os.path.expanduser(text)):
+        if is_there:
             without_reference(Path(path))
         return argument
-    paths = text.split(",") if multirun else [text]
+    paths = [text] if is_there else text.split(",")
     with suppress(HydraException):
         (override,) = parsed([argument])
         read = override.value()
-        is_one = override.value_type == ValueType.SIMPLE_CHOICE_SWEEP and not multirun
-        if (override.is_sweep_override() and not is_one) or read in (None, "", text):
+        if read in (None, "", text) or (override.is_sweep_override() and not is_there):
             return argument
         # A folder's name may look like a number or a list.
         paths = [read if isinstance(read, str) else text]
     return start + ",".join(literal(os.path.expanduser(path)) for path in paths)
-
-
-def _sweeps(texts: Sequence[str], config_dir: str | None) -> bool:
-    """Whether a command without -m is a multirun, by an experiment; asked if a path has a comma."""
-    paths = {text for text in texts if (word := KEY_VALUE.fullmatch(text)) and word[2] in PATHS}
-    if not any("," in path for path in paths):
-        return False
-    config = _composed([text for text in texts if text not in paths], config_dir)
-    return config is not None and config.hydra.mode == RunMode.MULTIRUN
-
-
-def _composed(words: Sequence[str], config_dir: str | None) -> DictConfig | None:
-    """The config of a command before Hydra itself has begun; None if Hydra will refuse it."""
-    folder = [] if config_dir is None else [literal(f"file://{os.path.abspath(config_dir)}")]
-    searched = [f"hydra.searchpath=[{path}]" for path in folder]
-    with (
-        suppress(HydraException, OmegaConfBaseException),
-        initialize_config_dir(str(config_folder()), version_base="1.3"),
-    ):
-        return (
-            GlobalHydra.instance()
-            .config_loader()
-            .load_configuration(
-                "config", [*words, *searched], RunMode.MULTIRUN, validate_sweep_overrides=False
-            )
-        )
-    return None
 
 
 def _says_how(override: Override) -> bool:
@@ -288,8 +256,17 @@ def _for_one_camera(scene: str, overrides: Sequence[Override], *, continued: boo
 def _of_experiments(overrides: Sequence[Override], config_dir: str | None) -> list[str | None]:
     """The options of ``data`` that experiments choose, which may lie in other folders; or None."""
     searched = [str(o.input_line) for o in overrides if o.key_or_group == "hydra.searchpath"]
-    names = values(overrides, "experiment")
-    configs = [_composed([f"experiment={name}", *searched], config_dir) for name in names]
-    # Where an experiment does not choose, the scene is embedded, and has no folder.
-    of_folders = [config for config in configs if config is not None and "root" in [*config.data]]
-    return [str(config.hydra.runtime.choices.data) for config in of_folders] or [None]
+    if config_dir is not None:
+        searched.append(f"hydra.searchpath=[{literal(f'file://{os.path.abspath(config_dir)}')}]")
+    chosen: list[str | None] = []
+    for name in values(overrides, "experiment"):
+        with (
+            suppress(HydraException, OmegaConfBaseException),  # reported when Hydra composes it
+            initialize_config_dir(str(config_folder()), version_base="1.3"),
+        ):
+            words = [f"experiment={name}", *searched]
+            config = compose("config", words, return_hydra_config=True)
+            # Where an experiment does not choose, the scene is embedded, and has no folder.
+            if "root" in config.data.keys():  # also one that is still to be typed
+                chosen.append(str(config.hydra.runtime.choices.data))
+    return chosen or [None]

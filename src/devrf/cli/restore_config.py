@@ -1,27 +1,24 @@
 """A later command on a run begins from the settings of its training.
 
 A checkpoint holds the options of config groups that were chosen, by ``/group``, and the values set
-beside them, by config key, resolved; a sweep's ``multirun.yaml`` holds what was typed. A later
-command sets the same, beneath what is typed, by Hydra's own overrides. :func:`taken` alone says
-which of a file's keys these are: names of options, and plain values; text is put in quotes, so that
-nothing in a file is read as an interpolation or as code.
+beside them, by config key, resolved. A later command sets the same, beneath what is typed, by
+Hydra's own overrides. :func:`taken` alone says which of a file's keys these are: names of options,
+and plain values; text is put in quotes, so that nothing in a file is read as an interpolation or as
+code.
 """
 
 from __future__ import annotations
 
 import json
 import re
-import shlex
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
-import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
-from hydra.errors import HydraException
 from omegaconf import DictConfig
 
 from devrf.checkpoints.file_metadata import latest_checkpoint
@@ -31,14 +28,12 @@ from devrf.cli.config import (
     SCENELESS_STAGES,
     SWEEP_RECORD,
     choices,
-    group_choices,
     leaves,
     overrides,
     scene_folder_name,
 )
 from devrf.cli.config_check import RESERVED
 from devrf.errors import DevrfError
-from devrf.system.files import UNREADABLE, read_yaml
 from devrf.system.override import literal, to_type
 from devrf.system.printed import is_shown
 from devrf.system.process import importing
@@ -53,8 +48,8 @@ PLACES = {"data.flow_cache", "evaluation.download"}
 OF_A_SCENE = {"data", "facing", "seed"}
 # Keys without a section.
 ALONE = {"seed", "priors", "deterministic", "decoder_precision", "rehearse"}
-# Groups that choose another sweep than that of a folder.
-SWEEPERS = ("hparams_search", "hydra/sweeper")
+# Groups whose options may sweep.
+SWEEPERS = ("experiment", "hparams_search", "hydra/sweeper")
 # An option's name leads to no other folder than its group's; a key is a path of plain names.
 OPTION = re.compile(r"(?!null$)[\w-]+", re.ASCII | re.IGNORECASE)
 KEY = re.compile(r"/?[\w-]+([./][\w-]+){0,15}", re.ASCII)
@@ -91,46 +86,48 @@ def present_command(config: DictConfig) -> Command:
     for key in PATHS & {*said}:  # relative to the folder in which they were typed
         if isinstance(said[key], str) and (path := Path(said[key])).exists():
             said[key] = str(path.absolute())
-    return {key: value for key, value in said.items() if _is_known(key, [value])}
+    return {key: value for key, value in said.items() if _is_known(key, value)}
 
 
-def taken(source: Path, stored: Mapping[str, list[Any]], typed: Sequence[Override]) -> list[str]:
-    """The keys of a file's settings that apply beneath the typed overrides.
+def taken(source: Path, stored: Command, typed: Sequence[Override]) -> Command:
+    """The part of a file's settings that applies beneath the typed overrides.
 
     Another option of a group begins from its own values; another method takes over the scene and
     the seed alone.
 
     Args:
         source: the file, which somebody else may have written.
-        stored: the values of each key, by ``/group`` or config key; of a sweep all of them.
+        stored: its settings, by ``/group`` or config key.
         typed: the overrides of the present command.
 
     Raises:
         DevrfError: something else than a name of an option or a plain value is among them.
     """
     _check_length(source, stored.values())
-    for key, texts in stored.items():
-        if not _is_known(key, texts):
-            said = f"{key}={', '.join(map(str, texts))}"[:80]
+    for key, setting in stored.items():
+        if not _is_known(key, setting):
+            said = f"{key}={setting}"[:80]
             raise DevrfError(f"{source}: {said!r} is no option or setting of a learned run")
     keys = {override.key_or_group for override in typed}
-    other = tuple(f"{k}." for k in keys if [value(typed, k)] != stored.get(f"/{k}"))
-    another = value(typed, "method") not in (None, *stored.get("/method", ["devrf"]))
-    return [
-        key
-        for key in stored
+    other = tuple(f"{k}." for k in keys if value(typed, k) != stored.get(f"/{k}", ...))
+    another = value(typed, "method") not in (None, stored.get("/method", "devrf"))
+    return {
+        key: setting
+        for key, setting in stored.items()
         if key.lstrip("/") not in keys and not key.startswith(other)
         if not another or root(key) in OF_A_SCENE
-    ]
+    }
 
 
-def _is_known(key: str, values: list[Any]) -> bool:
-    """Whether a run may have been learned with it: options by name, or plain values by key."""
-    if not KEY.fullmatch(key) or _of_a_command(key) or RESERVED & {*key.split(".")}:
+def _is_known(key: str, setting: object) -> bool:
+    """Whether a run may have been learned with it: an option by name, or a plain value by key."""
+    if not KEY.fullmatch(key) or root(key) in OF_A_COMMAND or key in PLACES:
+        return False
+    if RESERVED & {*key.split(".")}:
         return False
     if key.startswith("/"):
-        return all(isinstance(name, str) and OPTION.fullmatch(name) for name in values)
-    return ("." in key or key in ALONE) and _is_plain(values)
+        return isinstance(setting, str) and OPTION.fullmatch(setting) is not None
+    return ("." in key or key in ALONE) and _is_plain(setting)
 
 
 def _is_plain(value: object, depth: int = 8) -> bool:
@@ -142,11 +139,6 @@ def _is_plain(value: object, depth: int = 8) -> bool:
     if isinstance(value, str):
         return is_shown(value) and not CODE.search(value)
     return value is None or isinstance(value, bool | int | float)
-
-
-def _of_a_command(key: str) -> bool:
-    """Whether a key or group says only what to do."""
-    return root(key) in OF_A_COMMAND or key in PLACES
 
 
 def root(key: str) -> str:
@@ -181,16 +173,13 @@ def _check_length(where: object, words: Iterable[object]) -> None:
 def values(overrides: Sequence[Override], key: str) -> list[str]:
     """The last value of ``key``, of a sweep all of them; none where there is none."""
     for override in reversed(overrides):
-        if override.key_or_group == key and not override.is_delete():
-            return [str(value) for value in _each(override) if value is not None]
+        if override.key_or_group != key or override.is_delete():
+            continue
+        if override.is_choice_sweep():
+            return [str(getattr(value, "text", value)) for value in override.sweep_iterator()]
+        is_set = not override.is_sweep_override() and override.value() is not None
+        return [str(override.value())] if is_set else []
     return []
-
-
-def _each(override: Override) -> list[Any]:
-    """The value of an override; of a sweep over choices each, of another sweep none."""
-    if override.is_choice_sweep():
-        return [getattr(value, "text", value) for value in override.sweep_iterator()]
-    return [] if override.is_sweep_override() else [override.value()]
 
 
 def value(overrides: Sequence[Override], key: str) -> str | None:
@@ -210,8 +199,6 @@ def of_named_run(typed: Sequence[Override], multirun: bool) -> Applied:
     sweep = value(typed, "hydra.sweep.dir")
     if value(typed, "stage") == "report":
         return Applied([] if sweep is None else [f"report.runs={literal(sweep)}"])
-    if not checkpoints and sweep is not None:
-        return _of_sweep(typed, Path(sweep))
     if not checkpoints and (folder is None or multirun):
         return Applied()
     with importing():  # it loads torch
@@ -222,12 +209,8 @@ def of_named_run(typed: Sequence[Override], multirun: bool) -> Applied:
     if not checkpoints or not all(path.is_file() for path in checkpoints):
         return Applied()  # a file that is missing is reported by the step that loads it
     commands = [metadata_of(path).command for path in checkpoints]
-    kept = [
-        taken(path, {key: [setting] for key, setting in command.items()}, typed)
-        for path, command in zip(checkpoints, commands, strict=True)
-    ]
-    first = commands[0]
-    shared = {k: first[k] for k in kept[0] if all(c.get(k, ...) == first[k] for c in commands)}
+    first, *others = map(taken, checkpoints, commands, repeat(typed))
+    shared = {k: v for k, v in first.items() if all(other.get(k, ...) == v for other in others)}
     remarks = []
     if shared or {} in commands:
         words = [to_type(key.lstrip("/"), setting) for key, setting in shared.items()]
@@ -249,56 +232,23 @@ def of_named_run(typed: Sequence[Override], multirun: bool) -> Applied:
     return Applied(put, remarks)
 
 
-def _of_sweep(typed: Sequence[Override], folder: Path) -> Applied:
-    """The overrides of the sweep in ``hydra.sweep.dir``, unless another is typed.
+def runs_of_sweep(typed: Sequence[Override]) -> list[Path]:
+    """The learned runs of the sweep in ``hydra.sweep.dir``, in the order of their numbers.
+
+    There are none if a sweep is typed.
 
     Raises:
-        DevrfError: its record holds more than names of options and plain values.
-    """
-    record = folder / SWEEP_RECORD
-    if any(override.is_sweep_override() for override in typed) or not record.is_file():
-        return Applied()
-    stored = {
-        f"/{key}" if key in group_choices() else key: override
-        for override in _recorded(record)[1]
-        for key in [override.get_key_element().lstrip("+")]
-        if not override.is_delete() and not _of_a_command(key)
-    }
-    keys = taken(record, {key: _each(override) for key, override in stored.items()}, typed)
-    kept = [str(stored[key].input_line) for key in keys]
-    return Applied(
-        [*kept, "hydra.mode=MULTIRUN"],
-        [f"{folder}: the sweep goes on, with {shlex.join(kept)}"],
-    )
-
-
-def searched_runs(typed: Sequence[Override]) -> list[Path]:
-    """The learned runs of the search in ``hydra.sweep.dir``, in the order of their numbers.
-
-    There are none if another kind of sweep is there, or one is typed.
-
-    Raises:
-        DevrfError: the search has no learned run.
+        DevrfError: the sweep has no learned run.
     """
     folder = Path(value(typed, "hydra.sweep.dir") or "")
-    of_a_sweep = any(o.is_sweep_override() or o.key_or_group in SWEEPERS for o in typed)
-    record = folder / SWEEP_RECORD
-    if of_a_sweep or value(typed, "stage") in SCENELESS_STAGES or not record.is_file():
+    sweeps = any(o.is_sweep_override() or o.key_or_group in SWEEPERS for o in typed)
+    of_a_scene = value(typed, "stage") not in SCENELESS_STAGES
+    if sweeps or not of_a_scene or not (folder / SWEEP_RECORD).is_file():
         return []
-    if _recorded(record)[0].endswith(".BasicSweeper"):
-        return []  # it knows its jobs before they have begun
     runs = [path for path in folder.glob("[0-9]*_*/") if latest_checkpoint(path)]
     if not runs:
-        raise DevrfError(f"{folder}: a search without a learned run; type the search again")
+        raise DevrfError(f"{folder}: a sweep without a learned run; type the sweep again")
     return sorted(runs, key=lambda path: int(re.split(r"\D", path.name)[0]))
-
-
-def _recorded(record: Path) -> tuple[str, list[Override]]:
-    """The class of a sweep's sweeper, and the sweep's overrides, from its ``multirun.yaml``."""
-    with suppress(yaml.YAMLError, HydraException, *UNREADABLE):
-        hydra = read_yaml(record)["hydra"]
-        return str(hydra["sweeper"]["_target_"]), parsed(hydra["overrides"]["task"])
-    raise DevrfError(f"{record}: not the record of a sweep; type the sweep again")
 
 
 def _folder_for(checkpoint: Path, outputs: str | None) -> Path:
