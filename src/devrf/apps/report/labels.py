@@ -10,9 +10,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
-from devrf.apps.report.runs import DEFAULT_METHOD, DEFAULT_PROTOCOL, LONGEST_NAME, number
+from devrf.apps.report.runs import (
+    DEFAULT_METHOD,
+    DEFAULT_PROTOCOL,
+    LONGEST_NAME,
+    PRIORS,
+    SECONDS,
+    number,
+)
 from devrf.system.printed import shown
 
 METHODS = {
@@ -46,7 +54,7 @@ NOT_LEARNED = {"objective", "seed", "stage", "method"}
 # What runs that share a row have in common beside their settings.
 RECORDED = (
     *("method", "run.train_views", "run.frames", "run.image_size", "run.test_frames"),
-    *("run.device", "run.lpips_network", "run.motion_masks"),
+    *("run.device", "run.lpips_network", "run.motion_masks", "run.benchmark"),
     *("run.fingerprint", "run.git", "run.devrf"),
 )
 
@@ -60,11 +68,9 @@ def labelled(runs: pd.DataFrame) -> pd.DataFrame:
     row's name; ``views``, the number of dynamic training views (NaN where unknown); ``identity``,
     the same for runs that share a row; ``kind``, the same for runs of alike scenes.
     """
-    absent = pd.Series(None, runs.index, dtype=object)
-    bare = runs.get(f"{SETTINGS}priors", absent).eq("none")
-    budget = runs.get(f"{SETTINGS}schedule.seconds", absent).map(number).astype(float)
-    place = runs["scene"].where(~runs["at_rest"].eq(True), runs["scene"] + " (at rest)")
-    place = place.mask(bare, place + ", without priors")
+    budget = runs[SECONDS].map(number).astype(float)
+    place = runs["scene"] + np.where(runs["at_rest"].eq(True), " (at rest)", "")
+    place += np.where(runs[PRIORS].eq("none"), ", without priors", "")
     scene = place.where(budget.isna(), place + budget.map(", {:g} s".format))
     records = runs.to_dict("records")
     methods = [*METHODS, *runs["method"].unique()]
@@ -73,11 +79,9 @@ def labelled(runs: pd.DataFrame) -> pd.DataFrame:
         place=place,
         budget=budget,
         label=[row_name(run) for run in records],
-        views=runs.get("run.train_views", absent).map(number).astype(float),
+        views=runs["run.train_views"].map(number).astype(float),
         identity=_as_text(runs, identity_columns(runs)),
-        kind=_as_text(
-            runs, ["at_rest", "run.kind", "run.image_size", "run.benchmark", f"{SETTINGS}priors"]
-        ),
+        kind=_as_text(runs, ["at_rest", "run.kind", "run.image_size", "run.benchmark", PRIORS]),
         by_scene=pd.factorize(scene)[0],
         by_method=runs["method"].map(methods.index),
     )

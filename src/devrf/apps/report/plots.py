@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from textwrap import fill
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ from matplotlib.ticker import LogFormatter, MaxNLocator, NullFormatter, ScalarFo
 
 from devrf.apps.report.labels import METHODS
 from devrf.apps.report.runs import metric_over_time
-from devrf.apps.report.table import LPIPS, PSNR, SSIM, TIME, Table, published
+from devrf.apps.report.table import LPIPS, PSNR, SSIM, TIME, Column, Table, published
 from devrf.pictures.figures import STYLE
 
 # The palette of Okabe and Ito, distinguishable with colour-blindness; other dashes, or points, each
@@ -44,6 +45,7 @@ class Plot(NamedTuple):
     figure: Figure
 
 
+@mpl.rc_context(STYLE)
 def plots(table: Table) -> list[Plot]:
     """Every plot that has data."""
     candidates = [
@@ -56,7 +58,10 @@ def plots(table: Table) -> list[Plot]:
     for scene in table.runs.loc[table.runs["budget"].isna(), "scene"].unique():
         name = file_name(f"psnr_over_time_{scene}")
         candidates.append((name, f"{scene}: PSNR over time", psnr_over_time(table, scene)))
-    return [Plot(name, shows, figure) for name, shows, figure in candidates if figure is not None]
+    drawn = [Plot(name, shows, figure) for name, shows, figure in candidates if figure is not None]
+    for plot in drawn:
+        _legend(plot.figure)
+    return drawn
 
 
 def file_name(text: str) -> str:
@@ -64,7 +69,6 @@ def file_name(text: str) -> str:
     return re.sub(r"[^\w.-]+", "_", text).encode()[:200].decode(errors="ignore")
 
 
-@mpl.rc_context(STYLE)
 def psnr_over_time(table: Table, scene: str) -> Figure | None:
     """PSNR of one scene's held-out images over time, a mean curve a row; None without frames."""
     figure = Figure(figsize=(6.4, 3.6), layout="constrained")
@@ -80,11 +84,9 @@ def psnr_over_time(table: Table, scene: str) -> Figure | None:
     if not axes.has_data():
         return None
     axes.set(title=scene, xlabel="time", ylabel=f"{PSNR.title} (dB)")
-    _legend(figure)
     return figure
 
 
-@mpl.rc_context(STYLE)
 def psnr_against_seconds(table: Table) -> Figure | None:
     """PSNR against training time, a panel a scene, the paper's rows hollow; None without both.
 
@@ -114,67 +116,63 @@ def psnr_against_seconds(table: Table) -> Figure | None:
         axes.set(title=scene, xscale="log", xlabel=SECONDS, ylabel=f"{PSNR.title} (dB)")
         axes.xaxis.set_major_formatter(LogFormatter())
         axes.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
-    _legend(figure)
     return figure
 
 
-@mpl.rc_context(STYLE)
 def against_budget(table: Table, place: str) -> Figure | None:
-    """PSNR, SSIM and LPIPS of a scene against budgets of seconds, a panel each.
-
-    Each row has a line, with the standard deviation over its runs. None unless there are several
-    budgets.
-    """
+    """PSNR, SSIM and LPIPS of a scene against budgets of seconds; None unless there are several."""
     runs = table.runs[table.runs["place"] == place].dropna(subset="budget")
     budgets = sorted(runs["budget"].unique())
     if len(budgets) < 2:
         return None
     columns = [column for column in (PSNR, SSIM, LPIPS) if runs[column.title].notna().any()]
-    figure = Figure(figsize=(0.8 + 3.3 * len(columns), 4.0), layout="constrained")
-    panels = figure.subplots(1, len(columns), squeeze=False)[0]
-    for axes, column in zip(panels, columns, strict=True):
-        for label, row in runs.groupby("label", sort=False):
-            values = row.groupby("budget")[column.title].agg(["mean", "std"])
-            color, dashes = _look(table, label)
-            look = {"color": color, "linestyle": dashes, "marker": "o", "capsize": 2}
-            axes.errorbar(
-                values.index, values["mean"], values["std"].fillna(0), label=label, **look
-            )
-        axes.set(title=place, xscale="log", xlabel=SECONDS, ylabel=column.heading)
-        axes.set_xticks(budgets)
+    figure = _panels(runs, "label", "budget", columns, list(table.runs["label"].unique()))
+    for axes in figure.axes:
+        axes.set(title=place, xscale="log", xlabel=SECONDS, xticks=budgets)
         axes.xaxis.set_major_formatter(ScalarFormatter())
         axes.xaxis.set_minor_formatter(NullFormatter())
-    _legend(figure)
     return figure
 
 
-@mpl.rc_context(STYLE)
 def against_views(table: Table) -> Figure | None:
     """PSNR, and LPIPS or else SSIM, against the number of dynamic training views.
 
     Each scene and configuration has a line. None unless one was run with several numbers.
     """
-    rows = table.rows.dropna(subset="views").sort_values("views")
+    runs = table.runs.dropna(subset="views")
     # A row's name but for the number of views, where it was typed.
-    names = [re.sub(VIEWS, "", label) for _, label in rows.index]
-    lines = rows.assign(line=names).groupby(["scene", "line"], sort=False)
-    lines = lines.filter(lambda line: line["views"].nunique() > 1)
-    if lines.empty:
+    runs = runs.assign(line=[re.sub(VIEWS, "", label) for label in runs["label"]])
+    runs = runs.groupby(["scene", "line"]).filter(lambda line: line["views"].nunique() > 1)
+    if runs.empty:
         return None
-    one_line = lines["line"].nunique() == 1
-    second = LPIPS if lines[LPIPS.title].notna().any() else SSIM
-    figure = Figure(figsize=(7.4, 3.4), layout="constrained")
-    for axes, column in zip(figure.subplots(1, 2), (PSNR, second), strict=True):
-        for k, ((scene, line), group) in enumerate(lines.groupby(["scene", "line"], sort=False)):
-            color, dashes = _style(k)
-            rows = group.dropna(subset=column.title)
-            label = scene if one_line else f"{scene}: {line}"
-            axes.plot(
-                rows["views"], rows[column.title], dashes, color=color, marker="o", label=label
-            )
-        axes.set(xlabel="dynamic training views", ylabel=column.heading)
+    if runs["line"].nunique() == 1:
+        runs["line"] = runs["scene"]
+    else:
+        runs["line"] = runs["scene"] + ": " + runs["line"]
+    second = LPIPS if runs[LPIPS.title].notna().any() else SSIM
+    figure = _panels(runs, "line", "views", [PSNR, second], list(runs["line"].unique()))
+    for axes in figure.axes:
+        axes.set(xlabel="dynamic training views")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    _legend(figure)
+    return figure
+
+
+def _panels(
+    runs: pd.DataFrame, line: str, x: str, columns: Sequence[Column], lines: Sequence[str]
+) -> Figure:
+    """A panel for each column, with means over runs, and standard deviations, by ``x``.
+
+    The values of ``line``, in the order of ``lines``, have a line each.
+    """
+    figure = Figure(figsize=(0.8 + 3.3 * len(columns), 4.0), layout="constrained")
+    panels = figure.subplots(1, len(columns), squeeze=False)[0]
+    for axes, column in zip(panels, columns, strict=True):
+        for name, group in runs.dropna(subset=column.title).groupby(line, sort=False):
+            values = group.groupby(x)[column.title].agg(["mean", "std"]).fillna({"std": 0})
+            color, dashes = _style(lines.index(str(name)))
+            look = {"color": color, "linestyle": dashes, "marker": "o", "capsize": 2}
+            axes.errorbar(values.index, values["mean"], values["std"], label=name, **look)
+        axes.set_ylabel(column.heading)
     return figure
 
 

@@ -32,11 +32,15 @@ LARGEST = 1e9
 _Name = Annotated[str, Len(1, LONGEST_NAME)]
 _Text = Annotated[str, Len(0, LONGEST)]
 _Plain = _Text | bool | int | float | Annotated[list[Any], Len(0, LONGEST)] | None
+# Settings that make scenes of their own.
+PRIORS = "run.settings.priors"
+SECONDS = "run.settings.schedule.seconds"
 # Columns of every run; further columns are entries of its file, by dotted name.
 COLUMNS = (
     *("folder", "status", "scene", "method", "protocol", "at_rest", "error", "mistake"),
     *("train_seconds", "peak_gpu_gb", "dynamic.psnr", "dynamic.ssim", "dynamic.lpips"),
     *("run.device", "run.overrides", "run.seed", "run.checkpoint", "run.date", "run.benchmark"),
+    *("run.lpips_network", "run.motion_masks", "run.train_views", PRIORS, SECONDS),
     "path",
 )
 # Kinds of values that a report builds on; the last ones are mappings, and no values.
@@ -49,8 +53,7 @@ KINDS: dict[str, Any] = {
     "run.image_size": Annotated[list[int], Len(2, 2)] | None,
     **dict.fromkeys(("run.device", "run.checkpoint", "run.date", "run.git"), _Text | None),
     **dict.fromkeys(("run.devrf", "run.fingerprint", "run.lpips_network"), _Text | None),
-    "run.motion_masks": _Text | None,
-    "run.benchmark": _Text | None,
+    **dict.fromkeys(("run.motion_masks", "run.benchmark"), _Text | None),
     **dict.fromkeys(("static", "dynamic", "run", "choices"), dict),
 }
 # The longest first line of a table: pandas would take hours for many columns of one name.

@@ -16,7 +16,6 @@ import pandas as pd
 
 from devrf.apps.report.labels import identity_columns, labelled
 from devrf.apps.report.runs import Collection, number
-from devrf.errors import DevrfError
 
 UNKNOWN = "–"
 # Keys that a note names of those in which rows of one name differ.
@@ -28,14 +27,14 @@ class Column:
     """A column of the tables, and the ``key`` of its values in a collection; times in seconds.
 
     A value without ``digits`` is a time in the unit that reads best. Values compare only among runs
-    that agree in the column ``alike`` of the collection, if there is one.
+    that agree in the column ``alike`` of the collection.
     """
 
     title: str
     key: str
     higher_is_better: bool
     digits: int | None
-    alike: str | None = None
+    alike: str = "run.benchmark"
     why_missing: str = "it was not recorded"
 
     @property
@@ -50,7 +49,7 @@ NO_WEIGHTS = (
 )
 PSNR = Column("PSNR", "dynamic.psnr", True, 2)
 SSIM = Column("SSIM", "dynamic.ssim", True, 3)
-LPIPS = Column("LPIPS", "dynamic.lpips", False, 4, None, NO_WEIGHTS)
+LPIPS = Column("LPIPS", "dynamic.lpips", False, 4, "run.benchmark", NO_WEIGHTS)
 NO_GPU = "no run is known to have used a GPU"
 GPU = Column("GPU (GB)", "peak_gpu_gb", False, 1, "run.device", NO_GPU)
 TIME = Column("Time", "train_seconds", False, None, "run.device")
@@ -134,9 +133,9 @@ class Table:
         rows: means over runs, indexed by scene and label: ``views``, ``count`` and each column's
             title; NaN unless all runs of the row have the value.
         published: the scenes whose data are those of the paper's rows.
-        blocks: one for each scene, then the average if there is more than one.
-        gains: over three scenes or more, if they are alike: PSNR by label as text, its mean and its
-            least, and its gain over the first row's; seconds as a multiple of that row's.
+        blocks: one for each scene, then the average if there is more than one, then the gains over
+            three scenes or more, if they are alike: PSNR, its mean and its least, and its gain over
+            the first row's; seconds as a multiple of that row's.
         notes: remarks on columns and rows, a sentence each.
     """
 
@@ -145,20 +144,21 @@ class Table:
     rows: pd.DataFrame
     published: frozenset[str]
     blocks: tuple[Block, ...]
-    gains: pd.DataFrame
     notes: tuple[str, ...]
 
 
 def tabulate(collection: Collection) -> Table:
     """The tables of a collection, beside the paper's rows of the same data."""
-    scored = _values(collection.runs, PSNR).notna()
-    again = _scored_again(collection.runs[scored])
-    runs = labelled(collection.runs[scored].drop(index=again.index))
-    further = [c for c in FURTHER if c.key in runs and _values(runs, c).notna().any()]
+    found = collection.runs
+    scored = _values(found, PSNR).notna()
+    # Those whose checkpoint was scored again later, in another folder.
+    dated = found[scored].sort_values("run.date", kind="stable", na_position="first")
+    again = dated[dated["run.checkpoint"].notna() & dated.duplicated("run.checkpoint", keep="last")]
+    runs = labelled(found[scored].drop(index=again.index))
+    further = [column for column in FURTHER if _values(runs, column).notna().any()]
     columns = (PSNR, *further, *COLUMNS[1:])
     titles = [column.title for column in columns]
-    for column in columns:
-        runs[column.title] = _values(runs, column)
+    runs = runs.assign(**{column.title: _values(runs, column) for column in columns})
     groups = runs.groupby(["scene", "label", "identity"], sort=False)
     heads = groups[["views", "kind"]].first().assign(count=groups.size())
     complete = groups[titles].count().eq(heads["count"], axis=0)
@@ -166,55 +166,54 @@ def tabulate(collection: Collection) -> Table:
     spread = groups[titles].std().where(complete).droplevel("identity")
 
     scenes = list(runs["scene"].unique())
-    _check_benchmarks(runs)
     papers = {*published().texts.index.get_level_values("scene")}
     same = {*runs.loc[runs["run.benchmark"] == published().benchmark, "scene"]} & papers
     blocks: list[Block] = []
+    notes = _notes(runs)
     for scene in scenes:
         of_scene = runs[runs["scene"] == scene]
+        notes += _incomparable(of_scene, columns)
         cells = [_cells(rows.loc[scene], spread.loc[scene], columns, of_scene)]
         if scene in same:
             cells.append(_published_cells(scene, columns))
         blocks.append(Block(scene, pd.concat(cells)))
-    gains = pd.DataFrame()
     average = _average(rows, scenes, titles)
     if len(scenes) > 1 and len(average):
         averaged = runs[runs["label"].isin(average.index)]
         measured = _cells(average, average[titles] * math.nan, columns, averaged)
         blocks.append(Block(f"average over {len(scenes)} scenes", measured))
         if len(average) > 1 and len(scenes) > 2:
-            gains = _gains(rows.reset_index(), average)
-    notes = _notes(runs, collection.runs.loc[~scored, "folder"], again)
-    if left_out := [scene for scene in scenes if scene in papers - same]:
-        notes.append(
-            f"Not scored as benchmark {published().benchmark}, as the paper's rows are, which are "
-            f"left out: {', '.join(left_out)}."
-        )
-    return Table(collection, runs, rows, frozenset(same), tuple(blocks), gains, tuple(notes))
-
-
-def _check_benchmarks(runs: pd.DataFrame) -> None:
-    """DevrfError if the runs of a scene follow different protocols of benchmarks."""
-    for scene, same in runs[runs["run.benchmark"].notna()].groupby("scene", sort=False):
-        first = same.drop_duplicates("run.benchmark")
-        if len(first) > 1:
-            pairs = zip(first["run.benchmark"], first["folder"], strict=True)
-            which = " and ".join(f"{benchmark} ({folder})" for benchmark, folder in pairs)
-            raise DevrfError(
-                f"report.runs: {scene} was scored as benchmarks {which}, which are no rows of one "
-                "table; put their runs into folders of their own, and report on each"
-            )
+            blocks.append(Block("gains over all scenes", _gains(rows.reset_index(), average)))
+    left_out = [scene for scene in scenes if scene in papers - same]
+    for why, names in (
+        ("Scored at rest only, and therefore not in the tables", found[~scored]["folder"]),
+        ("Counted once, as last scored elsewhere with the same checkpoint", again["folder"]),
+        (f"The paper's rows are of benchmark {published().benchmark}, and left out", left_out),
+    ):
+        notes += [f"{why}: {', '.join(names)}."] if len(names) else []
+    return Table(collection, runs, rows, frozenset(same), tuple(blocks), tuple(notes))
 
 
 def _values(runs: pd.DataFrame, column: Column) -> pd.Series:
     """The values of a column, NaN where unknown; scenes at rest have those of the static set."""
-    values = runs[column.key].map(number).astype(float)
     section, _, name = column.key.partition(".")
-    at_rest = runs["at_rest"].eq(True)
-    key = f"static.{name}"
-    if section == "dynamic" and key in runs:
-        values = values.where(~at_rest, runs[key].map(number).astype(float))
-    return values
+    keys = [column.key, f"static.{name}" if section == "dynamic" else column.key]
+    own, at_rest = (runs.reindex(columns=[key])[key].map(number).astype(float) for key in keys)
+    return own.where(~runs["at_rest"].eq(True), at_rest)
+
+
+def _is_comparable(runs: pd.DataFrame, column: Column) -> bool:
+    """Whether the runs that have values of a column agree in what these depend on."""
+    return runs.loc[runs[column.title].notna(), column.alike].nunique(dropna=False) < 2
+
+
+def _incomparable(runs: pd.DataFrame, columns: Sequence[Column]) -> Iterator[str]:
+    """The columns of a scene's runs in which nothing is marked, and in what the runs differ."""
+    unmarked = [column for column in columns if not _is_comparable(runs, column)]
+    for key in dict.fromkeys(column.alike for column in unmarked):
+        titles = ", ".join(column.title for column in unmarked if column.alike == key)
+        differ = "; ".join(runs[key].fillna("none").map(str).unique())
+        yield f"{runs['scene'].iloc[0]}: no comparison of {titles}: {key} is {differ}."
 
 
 def shown(value: float, column: Column, spread: float = math.nan) -> str:
@@ -247,10 +246,7 @@ def _cells(
     cells = {}
     for column in columns:
         values = rows[column.title]
-        ranks = ranked(values, column)
-        if column.alike is not None:
-            of_values = runs.reindex(columns=[column.alike])[runs[column.title].notna()]
-            ranks *= len(of_values.drop_duplicates()) == 1
+        ranks = ranked(values, column) * _is_comparable(runs, column)
         texts = map(shown, values, repeat(column), spread[column.title])
         cells[column.heading] = list(map(Cell, texts, ranks))
     # The number of runs that a row's values are means of, if it is more than one.
@@ -282,7 +278,7 @@ def _gains(rows: pd.DataFrame, average: pd.DataFrame) -> pd.DataFrame:
     psnr, seconds = (by_scene[title].reindex(average.index) for title in ("PSNR", "Time"))
     gain = psnr - psnr.iloc[0]
     least = zip(gain.min(axis=1), gain.idxmin(axis=1), strict=True)
-    return pd.DataFrame(
+    texts = pd.DataFrame(
         {
             "PSNR": psnr.mean(axis=1).map("{:.2f}".format),
             "PSNR, least": psnr.min(axis=1).map("{:.2f}".format),
@@ -291,26 +287,7 @@ def _gains(rows: pd.DataFrame, average: pd.DataFrame) -> pd.DataFrame:
             "time": seconds.div(seconds.iloc[0]).mean(axis=1).map("{:.2f}×".format),
         }
     )
-
-
-def _scored_again(runs: pd.DataFrame) -> pd.Series:
-    """Folders of runs whose checkpoint was scored again later, in another folder."""
-    checkpointed = runs[runs["run.checkpoint"].notna()].sort_values(
-        "run.date", kind="stable", na_position="first"
-    )
-    again = checkpointed.loc[checkpointed.duplicated("run.checkpoint", keep="last"), "folder"]
-    return again.sort_index()
-
-
-def _scored(runs: pd.DataFrame) -> str:
-    """The form of the scores, for comparison with other tables: filter, range, network."""
-    networks = runs.get("run.lpips_network", pd.Series(dtype=object)).dropna().unique()
-    perceptual = f" LPIPS is that of {' or '.join(sorted(networks))}, on images in [-1, 1]."
-    has_lpips = len(networks) and runs[LPIPS.title].notna().any()
-    return (
-        "Images are made smaller by the mean over areas (OpenCV's INTER_AREA); PSNR and SSIM are "
-        f"of colours in [0, 1].{perceptual if has_lpips else ''}"
-    )
+    return texts.map(Cell)
 
 
 def _differences(runs: pd.DataFrame) -> Iterator[str]:
@@ -324,27 +301,21 @@ def _differences(runs: pd.DataFrame) -> Iterator[str]:
             yield f"{scene}: the rows called {label} differ in {', '.join(texts)}."
 
 
-def _notes(runs: pd.DataFrame, at_rest: pd.Series, again: pd.Series) -> list[str]:
+def _notes(runs: pd.DataFrame) -> list[str]:
+    """Columns without values, rows of one name, and the form of the scores."""
+    if not len(runs):
+        return []
     notes = [
         f"No run has {column.title}: {column.why_missing}."
         for column in COLUMNS
-        if len(runs) and runs[column.title].isna().all()
+        if runs[column.title].isna().all()
     ]
-    if runs["run.device"].nunique(dropna=False) > 1:
-        notes.append("Memory and time are marked only among rows of one device.")
     notes += _differences(runs)
-    rules = runs.get("run.motion_masks", pd.Series(dtype=object)).dropna()
-    for scene, used in rules.groupby(runs["scene"]):
-        if used.nunique() > 1:
-            listed = "; ".join(map(str, used.unique()))
-            notes.append(f"{scene}: what moves is not by one rule, so do not compare it: {listed}.")
-    notes += [_scored(runs)] if len(runs) else []
-    of_none = runs["run.benchmark"].isna()
-    beside = of_none & runs["scene"].isin(runs.loc[~of_none, "scene"])
-    for why, folders in (
-        ("Of no benchmark, beside rows of one", runs.loc[beside, "folder"]),
-        ("Scored at rest only, and therefore not in the tables", at_rest),
-        ("Counted once, as last scored elsewhere with the same checkpoint", again),
-    ):
-        notes += [f"{why}: {', '.join(folders)}."] if len(folders) else []
+    networks = sorted(runs["run.lpips_network"].dropna().unique())
+    perceptual = f" LPIPS is that of {' or '.join(networks)}, on images in [-1, 1]."
+    has_lpips = len(networks) and runs[LPIPS.title].notna().any()
+    notes.append(
+        "Images are made smaller by the mean over areas (OpenCV's INTER_AREA); PSNR and SSIM are "
+        f"of colours in [0, 1].{perceptual if has_lpips else ''}"
+    )
     return notes

@@ -13,20 +13,32 @@ from devrf.system import printed
 
 
 class Style(NamedTuple):
-    """How a format escapes text, and forms an unmarked, best, second and third cell."""
+    """How a format escapes text, and forms an unmarked, best, second and third cell, and a table.
+
+    ``form`` is the table's name for tabulate.
+    """
 
     escape: Callable[[str], str]
     marks: tuple[str, str, str, str]
+    form: str
 
     def cells(self, block: Block) -> pd.DataFrame:
         """The cells of a block as text."""
         texts = block.cells.map(lambda cell: self.marks[cell.rank].format(self.escape(cell.text)))
         return texts.rename(index=self.escape, columns=self.escape)
 
+    def table(self, block: Block) -> str:
+        """A block as text."""
+        align = ["left"] + ["right"] * len(block.cells.columns)
+        cells = self.cells(block)
+        return str(cells.to_markdown(tablefmt=self.form, disable_numparse=True, colalign=align))
 
-MARKDOWN = Style(printed.markdown, ("{}", "**{}**", "<ins>{}</ins>", "*{}*"))
-PLAIN = Style(str, ("{} ", "{}¹", "{}²", "{}³"))
-LATEX = Style(printed.latex, ("{}", r"\textbf{{{}}}", r"\underline{{{}}}", r"\textit{{{}}}"))
+
+MARKDOWN = Style(printed.markdown, ("{}", "**{}**", "<ins>{}</ins>", "*{}*"), "pipe")
+PLAIN = Style(str, ("{} ", "{}¹", "{}²", "{}³"), "plain")
+LATEX = Style(
+    printed.latex, ("{}", r"\textbf{{{}}}", r"\underline{{{}}}", r"\textit{{{}}}"), "latex_raw"
+)
 
 
 def caption(table: Table) -> str:
@@ -57,11 +69,6 @@ def reasons(collection: Collection) -> list[str]:
     return lines
 
 
-def _formatted(frame: pd.DataFrame, form: str) -> str:
-    align = ["left"] + ["right"] * len(frame.columns)
-    return str(frame.to_markdown(tablefmt=form, disable_numparse=True, colalign=align))
-
-
 def markdown(
     table: Table, figures: Mapping[str, str], videos: Mapping[str, str] | None = None
 ) -> str:
@@ -76,10 +83,7 @@ def markdown(
         f"{escape(caption(table))} **Best**, <ins>second</ins>, *third*.",
     ]
     for block in table.blocks:
-        parts += [f"## {escape(block.title)}", _formatted(MARKDOWN.cells(block), "pipe")]
-    if len(table.gains):
-        gains = table.gains.map(escape).rename(index=escape)
-        parts += ["## Gains over all scenes", _formatted(gains, "pipe")]
+        parts += [f"## {escape(block.title)}", MARKDOWN.table(block)]
     for heading, lines in (
         ("", table.notes),
         ("## Failed", reasons(collection)),
@@ -102,7 +106,6 @@ def plain(table: Table) -> str:
         PLAIN.cells(block).rename(columns="{} ".format).rename_axis(columns=block.title)
         for block in table.blocks
     ]
-    frames += [table.gains] * (len(table.gains) > 0)
     lines = [line.rstrip() for frame in frames for line in [*frame.to_string().split("\n"), ""]]
     failed = [f"failed: {why}" for why in reasons(table.collection)]
     return "\n".join([*lines, *table.notes, *failed, *table.collection.skipped]).rstrip()
@@ -114,10 +117,9 @@ def latex(table: Table) -> str:
     words = caption(table)
     for block in table.blocks:
         title = printed.latex(f"{block.title}. {words}")
-        body = _formatted(LATEX.cells(block), "latex_raw")
         parts.append(
             "\\begin{table}[t]\n\\centering\n\\scriptsize\n"
-            f"\\caption{{{title}}}\n{body}\n\\end{{table}}\n\n"
+            f"\\caption{{{title}}}\n{LATEX.table(block)}\n\\end{{table}}\n\n"
         )
         words = "As above."
     lines = [*table.notes, *(f"failed: {why}" for why in reasons(table.collection))]
