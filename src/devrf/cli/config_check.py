@@ -3,8 +3,8 @@
 Each part, a section with ``_target_``, is checked for itself: the keys that its class or function
 takes, by name and type. The types are those by which settings check themselves when they are built
 from Python (:mod:`devrf.system.options`), so that each is written once. A key outside the parts
-belongs to the root (``ROOT``), is read by a part (``${loss.search}``), or is in ``conf/``: typing
-over a part's ``${...}`` leaves one unread.
+belongs to the root (``ROOT``), is read by a part (``${loss.search}``), or is one of an option of a
+group: typing over a part's ``${...}`` leaves one unread.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ import inspect
 import json
 import logging
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import is_dataclass
-from functools import reduce
+from functools import cache, reduce
 from importlib.util import find_spec
 from operator import getitem
 from pathlib import Path
@@ -82,28 +82,25 @@ def check_config(config: DictConfig) -> None:
     # A key that is missing is wrong in its type, too.
     issues = _issues(dict.fromkeys(ROOT) | resolved, ROOT | {"**": Any}, ())
     read = tuple(f"{key}." for key in REFERENCE.findall(json.dumps(raw, default=str)))
-    unread = []
     for names, value in _walk(raw):
         key = ".".join(names)
         if _is_part(value):
             part = reduce(getitem, names, resolved)
             issues += _issues(part, _settings(part, key), names)
-        elif key not in ROOT and not f"{key}.".startswith(read) and not any(_options_with(names)):
-            unread.append(names)
-    for names in [names for names, issue in issues if issue["type"] in UNKNOWN] + unread:
-        if names in unread and (readers := [*_readers(".".join(names))]):
-            left_out = f"{' or '.join(readers)} reads it, and is left out"
-            raise DevrfError(f"{'.'.join(names)}: {left_out}; leave out the one or the other")
-        lacking = [other[-1] for other, issue in issues if issue["type"] in LEFT]
-        raise unknown_key(config, names, lacking)
-    places = [set_at(config, names) or names[0] for names, _ in issues]
-    for where, (_, issue) in zip(places, issues, strict=True):
-        value = issue["input"]
+        elif key not in ROOT and not f"{key}.".startswith(read) and key not in _of_options():
+            issues.append((names, {"type": UNKNOWN[0]}))
+    for names, issue in issues:
+        if issue["type"] in UNKNOWN:
+            lacking = [other[-1] for other, issue in issues if issue["type"] in LEFT]
+            raise unknown_key(config, names, lacking)
+    wrong: dict[str, list[Any]] = {}
+    for names, issue in issues:
         # Whether it is right, only building the part tells: a row's keys, a part's class.
-        if issue["type"] in LEFT or (issue["type"] in BUILT and _is_part(value)):
-            continue
-        alike = [issue["msg"] for at, (_, issue) in zip(places, issues, strict=True) if at == where]
-        said = expectation(alike, repr(value))
+        if issue["type"] not in LEFT and not (issue["type"] in BUILT and _is_part(issue["input"])):
+            wrong.setdefault(set_at(config, names) or names[0], []).append(issue)
+    for where, (issue, *others) in wrong.items():
+        value = issue["input"]
+        said = expectation([each["msg"] for each in (issue, *others)], repr(value))
         choices = re.findall("'([^']+)'", said.rpartition(", not ")[0])
         if issue["type"] in BUILT:
             said = f"expected a section with _target_, not {value!r}"
@@ -185,45 +182,34 @@ def unknown_key(config: DictConfig, names: Names, others: Iterable[object] = ())
     where = f"{section}.{name}".lstrip(".")
     there = OmegaConf.select(config, section) if section else config
     known = {*there, *others} - {name} if isinstance(there, DictConfig) else others
-    meant = did_you_mean(name, sorted(map(str, known)), where[: -len(name)])
-    instead = "--cfg job shows every key there is"
-    path = where.split(".")
-    if having := [*_options_with(path)]:
-        group = having[0].partition("=")[0]
-        instead = f"it belongs to {group}={', '.join(each.partition('=')[2] for each in having)}"
-    elif deeper := " or ".join(dict.fromkeys(_deeper(path))):
-        instead = f"it is {deeper}"
-    return DevrfError(f"{where}: no such key{meant or f'; {instead}'}")
+    group, *path = where.split(".")
+    deeper = [k for k in _of_options() if k.startswith(f"{group}.") and k.split(".")[2:] == path]
+    if meant := did_you_mean(name, sorted(map(str, known)), where[: -len(name)]):
+        pass
+    elif where in _of_options():
+        meant = f"; it belongs to {_of_options()[where]}"
+    elif path and deeper:
+        meant = f"; it is {' or '.join(deeper)}"
+    else:
+        return DevrfError(f"{where}: no part reads it; leave it out (--cfg job shows every key)")
+    return DevrfError(f"{where}: no such key{meant}")
 
 
-def _options_with(names: Sequence[str]) -> Iterator[str]:
-    """The options whose files have the key, as they are typed: ``data=inward``."""
-    # The files of a schedule have the sections that belong to its size.
-    for group, path in ((names[0], names[1:]), ("schedule", names)):
-        for file in sorted((config_folder() / group).glob("*.yaml")):
-            node: Any = OmegaConf.to_container(OmegaConf.load(file))
-            for name in path:
-                node = node.get(name, ...) if isinstance(node, Mapping) else ...
-            if node is not ...:
-                yield f"{group}={file.stem}"
-
-
-def _readers(key: str) -> Iterator[str]:
-    """The sections of ``conf/`` that read a key: ``callbacks.time_budget``."""
-    for file in sorted(config_folder().glob("*/default.yaml")):
-        settings: Any = OmegaConf.to_container(OmegaConf.load(file))
-        for section, node in settings.items():
-            if f"${{{key}}}" in json.dumps(node, default=str):
-                yield f"{file.parent.name}.{section}"
-
-
-def _deeper(names: Sequence[str]) -> Iterator[str]:
-    """The keys of a group that are called so, a section further down: ``logger.wandb.offline``."""
-    for file in sorted((config_folder() / names[0]).glob("*.yaml")):
-        settings: Any = OmegaConf.to_container(OmegaConf.load(file))
-        for section, node in settings.items():
-            if isinstance(node, Mapping) and names[1:] == [key for key in node if key in names[1:]]:
-                yield ".".join([names[0], section, *names[1:]])
+@cache
+def _of_options() -> Mapping[str, str]:
+    """The keys that options of groups set, and these options: ``data=inward, forward``."""
+    keys: dict[str, str] = {}
+    for file in sorted(config_folder().glob("*/*.yaml")):
+        group = file.parent.name
+        # The files of a schedule have the sections that belong to its size.
+        above = () if group == "schedule" else (group,)
+        nodes: list[tuple[Names, Any]] = [(above, OmegaConf.to_container(OmegaConf.load(file)))]
+        for names, node in nodes:
+            key = ".".join(names)
+            keys[key] = f"{keys[key]}, {file.stem}" if key in keys else f"{group}={file.stem}"
+            if isinstance(node, Mapping):
+                nodes += [((*names, str(name)), below) for name, below in node.items()]
+    return keys
 
 
 def check_extras(config: DictConfig) -> None:
