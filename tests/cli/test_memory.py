@@ -96,17 +96,16 @@ def test_what_cannot_be_is_refused_with_the_key_to_lower(
     assert not (tmp_path / "run").exists()
 
 
-def test_a_budget_of_seconds_makes_do_with_the_batches_that_fit(
+def test_a_budget_of_seconds_needs_what_its_largest_batches_do(
     devrf, tiny_data, short, monkeypatch
 ) -> None:
     method = ("method=dnerf", "profile=dnerf_small", "protocol=joint", "stage=joint")
     command = (*tiny_data, *method, "ray_stage.schedule.rays=64000", "trainer=cpu")
     monkeypatch.setattr(forecast, "free_host_memory", lambda: 2 * 10**9 - forecast.own_memory())
-    outcome = devrf(*command)
-    assert outcome.status == 2 and "lack of host memory" in outcome.err
-    outcome = devrf(*command, "schedule.seconds=600", "+trainer.fast_dev_run=true")
-    assert outcome.status == 0
-    assert "batches have at most 0.016 of their rays" in outcome.out
+    budget = ("schedule.seconds=600", "+trainer.fast_dev_run=true")
+    outcome = devrf(*command, *budget)
+    assert outcome.status == 2 and outcome.err.startswith("devrf: ray_stage.schedule.rays: the run")
+    assert devrf(*command, *budget, "callbacks.time_budget.largest_batch=0.01").status == 0
 
 
 def test_a_full_disk_is_noticed_before_it_begins(devrf, tiny, monkeypatch) -> None:

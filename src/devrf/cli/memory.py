@@ -10,15 +10,13 @@ from omegaconf import OmegaConf
 
 from devrf.apps.forecast import Forecast, free_bytes, needed_bytes, needs_table
 from devrf.apps.inspection.advice import Advice
-from devrf.callbacks.time_budget import BATCHES, LEAST_BATCH
 from devrf.cli.context import RunContext
-from devrf.cli.messages import as_own_errors
 from devrf.engine.needs import SIZE, StageNeeds
 from devrf.scenes.scene import Scene
 
 log = logging.getLogger(__name__)
 
-# The key of the most of a batch that is drawn within a budget of seconds.
+# The most of a batch that is drawn within a budget of seconds.
 LARGEST_BATCH = "callbacks.time_budget.largest_batch"
 
 
@@ -32,33 +30,24 @@ def table_of_needs(run: RunContext, scene: Scene) -> list[tuple[str, str]]:
 def forecast(run: RunContext, names: Sequence[str]) -> tuple[str, Advice | None]:
     """Needs of the stages ``names`` in words, and a remedy if something lacks.
 
-    If the images' size was left to the run, it is changed at once; with ``schedule.seconds``
-    the largest batch is.
+    If the images' size was left to the run, it is changed at once.
     """
     scene = run.scene
-    with as_own_errors():
-        stages = _needs(run, scene, names).values()
+    stages = _needs(run, scene, names).values()
     processes = int(getattr(run.strategy, "num_processes", 1))
     free = free_bytes(run.device, run.folder, resume=run.config.resume)
     on_gpu = run.device.type == "cuda"
-
-    def with_batches(share: float) -> Forecast:
-        needs = [stage.with_batches(share) for stage in stages]
-        return Forecast(needed_bytes(scene, needs, processes, on_gpu=on_gpu), free)
-
     budget = run.config.schedule.seconds is not None
     largest = OmegaConf.select(run.config, LARGEST_BATCH) if budget else 1.0
-    whole = with_batches(largest)
-    line = f"needs about {whole}"
-    if budget and whole.shortage():
-        # Images that may be made smaller are, before batches teach little.
-        smallest = LEAST_BATCH if run.chooses_size else BATCHES[-1]
-        for share in (share for share in BATCHES if smallest <= share < largest):
-            if not with_batches(share).shortage():
-                OmegaConf.update(run.config, LARGEST_BATCH, share)
-                return f"{line}: batches have at most {share:.2g} of their rays", None
     # A GPU says that it has no more memory, and half is drawn.
-    least = with_batches(largest / 2) if on_gpu else whole
+    whole, least = (
+        Forecast(
+            needed_bytes(scene, [s.with_batches(share) for s in stages], processes, on_gpu=on_gpu),
+            free,
+        )
+        for share in (largest, largest / 2 if on_gpu else largest)
+    )
+    line = f"needs about {whole}"
     lacking = least.shortage()
     if lacking is None:
         return line + "; batches will be halved" * bool(whole.shortage()), None

@@ -39,17 +39,6 @@ def report_user_errors() -> Iterator[None]:
         raise SystemExit(2) from None
 
 
-@contextmanager
-def as_own_errors() -> Iterator[None]:
-    """Turn an error that the user can correct, of whatever library, into a DevrfError."""
-    try:
-        yield
-    except Exception as error:
-        if isinstance(error, DevrfError) or not is_user_error(error):
-            raise
-        raise DevrfError(one_line(error)) from error
-
-
 def is_user_error(error: BaseException) -> bool:
     """Whether the user can correct it: input, config, or a disk that refuses."""
     if isinstance(_cause(error), DevrfError):
