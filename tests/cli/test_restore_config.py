@@ -299,7 +299,7 @@ FOREIGN = {
     "scores that are none": ("metrics.json", "[]"),
     "deep notes": (".devrf/done.json", DEEP),
     "endless notes": (".devrf/done.json", " " * (LARGEST_RECORD + 1)),
-    "notes of no files": (".devrf/done.json", '{"notes": [3, {"with": 1, "files": [5, [1]]}]}'),
+    "notes of no digest": (".devrf/done.json", '{"render": [3]}'),
 }
 
 

@@ -185,17 +185,17 @@ def test_a_finished_run_says_so_and_reads_nothing(devrf, tiny, run, monkeypatch)
     assert (outcome.status, outcome.err) == (0, "")
     for stage in ("canonical", "deformation"):
         assert f"{stage}: learned already ({run}/checkpoints/{stage}.ckpt)" in outcome.out
-    assert "evaluate: done already (frames.csv, " in outcome.out
-    assert "render: done already (videos/held_out.mp4, videos/orbit.mp4)" in outcome.out
+    for step in ("evaluate", "render"):
+        assert f"{step}: done already; stage={step} does it again" in outcome.out
     assert stamps(run) == before
 
 
 def test_what_differs_or_is_missing_is_done(devrf, tiny, run):
     before = stamps(run)
-    (run / "images" / "static.png").unlink()
+    (run / "metrics.json").unlink()
     assert devrf(*tiny, "hydra.run.dir=run", "video.frames=3").status == 0
     scores = {"metrics.json", "frames.csv", "static.png", "dynamic.png"}
-    redone = {name for name, stamp in stamps(run).items() if before[name] != stamp}
+    redone = {name for name, stamp in stamps(run).items() if before.get(name) != stamp}
     assert redone == scores | {"held_out.mp4", "orbit.mp4"}
 
 
@@ -205,10 +205,9 @@ def test_a_film_by_path_leaves_the_others_alone(devrf, tiny, run, tmp_path):
     keyframes.write_text(json.dumps({"keyframes": [row, {**row, "seconds": 0.1}]}))
     by_path, before = (*tiny, "hydra.run.dir=run", f"video.path={keyframes}"), stamps(run)
     assert devrf(*by_path).status == 0
-    assert "render: done already (videos/held_out.mp4, " in devrf(*tiny, "hydra.run.dir=run").out
     assert {name: stamps(run)[name] for name in before} == before
+    assert "render: done already" in devrf(*by_path).out
     # Other keyframes, another film.
-    assert "render: done already (videos/walk.mp4)" in devrf(*by_path).out
     keyframes.write_text(keyframes.read_text().replace("40", "50"))
     assert "video written to" in devrf(*by_path).out
 

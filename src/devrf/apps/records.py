@@ -187,13 +187,8 @@ def learning_record(metadata: CheckpointMetadata, stages: Sequence[str]) -> dict
     }
 
 
-def provenance(size: int, device: torch.device) -> dict[str, Any]:
-    """The origin of numbers, as plain data: versions, device, memory in GiB, UTC date.
-
-    Args:
-        size: number of learned values.
-        device: the device that they were learned on.
-    """
+def provenance(device: torch.device) -> dict[str, Any]:
+    """The origin of numbers, as plain data: versions, ``device``, memory in GiB, UTC date."""
     return {
         "devrf": devrf.__version__,
         "python": platform.python_version(),
@@ -201,7 +196,6 @@ def provenance(size: int, device: torch.device) -> dict[str, Any]:
         "lightning": lightning.__version__,
         "device": device_name(device),
         "git": git_revision(),
-        "parameters": size,
         "peak_host_gb": peak_host_memory(),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
     }

@@ -47,15 +47,15 @@ from devrf.system.override import to_type
 log = logging.getLogger(__name__)
 
 
-def evaluate(run: RunContext) -> list[Path] | None:
-    """Score the learned scene on held-out views; return the files: metrics and contact sheets.
+def evaluate(run: RunContext) -> None:
+    """Score the learned scene on held-out views, or another program's pictures of them.
 
     Raises:
         DevrfError: the last stage is not finished, and not named by ``ckpt``.
     """
     if run.evaluation.predictions is not None:
         _evaluate_predictions(run)
-        return None
+        return
     standing = unfinished(run)
     if standing is not None and run.config.ckpt is None:
         given = to_type("ckpt", run.checkpoint())
@@ -85,16 +85,12 @@ def evaluate(run: RunContext) -> list[Path] | None:
         sections["dynamic"]["pck_t"] = pck_t(Renderer(model), scene.dynamic)
     if validated:
         sections[VALIDATION] = {**mean_scores(validated), "images": len(validated)}
-    protocol = metadata.protocol or run.protocol.name
-    head = {"scene": scene.name, "method": model.name, "protocol": protocol}
-    without_motion = {} if scene.moves else {"at_rest": True}
+    head = {"method": model.name, "protocol": metadata.protocol or run.protocol.name}
     ran = {
-        **provenance(model.size, run.device),
-        "choices": choices(),
+        "parameters": model.size,
         "overrides": as_typed(run.command),
         "seed": run.config.seed,
         **learning_record(metadata, run.stages_with_images),
-        **_scored_by(run),
         "motion_masks": rule,
         "checkpoint": digest_of(run.checkpoint(metadata.stage)),
     }
@@ -102,7 +98,7 @@ def evaluate(run: RunContext) -> list[Path] | None:
     # A report takes metrics.json for the scores of a finished run.
     metrics = "metrics.json" if standing is None else "metrics-unfinished.json"
     metrics = REHEARSAL if run.rehearses else metrics
-    write_json(run.folder / metrics, {**head, **without_motion, **sections, "run": ran})
+    _write_record(run, metrics, head | sections, ran)
     summary = shown_sections(sections)
     for name, values in summary.items():
         log.info("%s: %s", name.replace("_", " "), in_words(values))
@@ -112,8 +108,6 @@ def evaluate(run: RunContext) -> list[Path] | None:
         tracker.conclude(numbers)
         tracker.show_table("metrics", [{"section": name, **row} for name, row in summary.items()])
         tracker.show_table("frames", frame_rows(frames))
-    written = (metrics, "frames.csv", *(f"images/{capture}.png" for capture in frames))
-    return [run.folder / name for name in written]
 
 
 def _with_motion_masks(
@@ -144,12 +138,22 @@ def _write_scores(
     write_frames(run.folder / "frames.csv", frames)
 
 
-def _scored_by(run: RunContext) -> dict[str, Any]:
-    """The record of the data, of LPIPS, and of the benchmark whose protocol these follow."""
+def _write_record(
+    run: RunContext, name: str, scores: Mapping[str, Any], ran: Mapping[str, Any]
+) -> None:
+    """Write scores with their provenance: of data, LPIPS, and a benchmark that these follow."""
     data = data_record(run.scene)
     network = run.evaluation.lpips_network
-    benchmark = followed(run.scene, run.datamodule, data, network)
-    return {**data, "lpips_network": network, "benchmark": benchmark}
+    origin = {
+        **provenance(run.device),
+        "choices": choices(),
+        **ran,
+        **data,
+        "lpips_network": network,
+        "benchmark": followed(run.scene, run.datamodule, data, network),
+    }
+    at_rest = {} if run.scene.moves else {"at_rest": True}
+    write_json(run.folder / name, {"scene": run.scene.name, **scores, **at_rest, "run": origin})
 
 
 def _evaluate_predictions(run: RunContext) -> None:
@@ -167,17 +171,9 @@ def _evaluate_predictions(run: RunContext) -> None:
     sections = {name: {**mean_scores(v), "images": len(v)} for name, v in frames.items()}
     _write_scores(run, frames, pictures.sets)
     name = f"{program} (pictures)"
-    head = {"scene": scene.name, "method": name, "protocol": run.protocol.name}
-    ran = {
-        **provenance(0, run.device),
-        "choices": choices(),
-        "overrides": overrides(),
-        "predictions": str(folder.resolve()),
-        **_scored_by(run),
-        "motion_masks": rule,
-    }
-    without_motion = {} if scene.moves else {"at_rest": True}
-    write_json(run.folder / "metrics.json", {**head, **without_motion, **sections, "run": ran})
+    head = {"method": name, "protocol": run.protocol.name}
+    given = {"overrides": overrides(), "predictions": str(folder.resolve()), "motion_masks": rule}
+    _write_record(run, "metrics.json", head | sections, given)
     for section, values in sections.items():
         log.info("%s, %s: %s", name, section, in_words(values))
     settings: VideoSettings = instantiate(run.config.video)

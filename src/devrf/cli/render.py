@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,7 +24,6 @@ from devrf.checkpoints.file_metadata import digest_of
 from devrf.cli.context import RunContext
 from devrf.cli.restore_config import root
 from devrf.cli.resume import unfinished
-from devrf.cli.view import serve
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
 from devrf.evaluation.predictions import picture_name
@@ -36,6 +36,7 @@ from devrf.rendering.tracks import moving_pixels
 from devrf.scenes.scene import Scene
 from devrf.system.files import refuse_links, write_text
 from devrf.system.memory import free_cache
+from devrf.system.process import handle_signals
 from devrf.system.progress import followed
 
 if TYPE_CHECKING:
@@ -53,33 +54,29 @@ CACHED = 6
 MASKS = Path("images", "motion_masks")
 
 
-def render(run: RunContext) -> list[Path] | None:
-    """Write the videos that ``video`` asks for; return their files, None if one was left out."""
+def render(run: RunContext) -> None:
+    """Write the videos that ``video`` asks for."""
     settings: VideoSettings = instantiate(run.config.video)
     model, viewpoints = _learned(run)
     if settings.motion_masks:
-        return _write_motion_masks(run, model, viewpoints)
+        _write_motion_masks(run, model, viewpoints)
+        return
     held_out = None
     without = "held_out.mp4, which shows its images, is left out"
     if settings.path is None and (scene := _with_images(run, without)) is not None:
         held_out = (scene.dynamic if scene.moves else scene.static).test
     renderer = Renderer(model, half=settings.half)
-    paths = []
     for video in videos(renderer, viewpoints, settings, held_out):
-        paths.append(write_video(run, video))
-    return paths if settings.path or held_out else None
+        write_video(run, video)
 
 
-def _write_motion_masks(
-    run: RunContext, model: Renderable, viewpoints: Viewpoints
-) -> list[Path] | None:
+def _write_motion_masks(run: RunContext, model: Renderable, viewpoints: Viewpoints) -> None:
     """Write a PNG for each held-out image, white where the model shows something that moves."""
     scene = _with_images(run, "masks of its held-out images are left out")
     if scene is None:
-        return None
+        return
     views, renderer, folder = scene.dynamic.test, Renderer(model), run.folder / MASKS
     size, times = scene_radius(model, viewpoints.static), (0.0, *viewpoints.clock.times)
-    paths = []
     for index in followed(range(len(views)), len(views), "motion masks"):
         camera, time = views.cameras.single(index), float(views.times[index])
         mask = moving_pixels(renderer, camera, time, times, size)
@@ -87,14 +84,13 @@ def _write_motion_masks(
             raise DevrfError(
                 f"video.motion_masks: method={model.name} follows no points; leave it out"
             )
-        paths.append(folder / picture_name(views, index))
-        write_image(paths[-1], mask[..., None].expand(-1, -1, 3).float())
-    log.info("%d motion masks written to %s", len(paths), folder)
-    return paths
+        name = picture_name(views, index)
+        write_image(folder / name, mask[..., None].expand(-1, -1, 3).float())
+    log.info("%d motion masks written to %s", len(views), folder)
 
 
-def write_video(run: RunContext, video: Video) -> Path:
-    """Write a video into the run's folder, and show it to trackers; return its file."""
+def write_video(run: RunContext, video: Video) -> None:
+    """Write a video into the run's folder, and show it to trackers."""
     path = run.folder / "videos" / f"{video.name}.mp4"
     pictures = (picture.numpy() for picture in video.pictures)
     write_pictures(path, followed(pictures, video.frames, path.name), video.fps)
@@ -102,7 +98,6 @@ def write_video(run: RunContext, video: Video) -> Path:
     log.info("video written to %s", path)
     for tracker in run.trackers:
         tracker.show_video(f"videos/{video.name}", path)
-    return path
 
 
 def still(run: RunContext) -> None:
@@ -122,7 +117,8 @@ def view(run: RunContext) -> None:
     model, viewpoints = _learned(run)
     server: PageServer | Session
     if settings.renderer == "browser" or (settings.renderer == "auto" and drawable(model)):
-        _write_with_pictures(run, model, viewpoints)
+        if run.config.ckpt is not None or not is_current(run.folder):
+            _write_with_pictures(run, model, viewpoints)
         server = PageServer(settings, run.folder / "export")
     else:
         from devrf.apps.viewer.drawing import Drawing
@@ -134,7 +130,8 @@ def view(run: RunContext) -> None:
         parts = model.moving_and_still(scene_radius(model, viewpoints.static))
         renderers = {name: Renderer(part, times=CACHED) for name, part in parts.items()}
         server.present(Drawing(Renderer(model, times=CACHED), background, renderers))
-    serve(server)
+    with closing(server), handle_signals(lambda _: server.stop()):
+        server.serve()
 
 
 def export(run: RunContext) -> None:

@@ -9,15 +9,15 @@ Each checkpoint holds the settings that decided its result:
 
 Settings of logging, scoring, rendering, the device and the place of the data may differ.
 
-A pipeline does not score and render again either: a step notes the files it wrote, and what decided
-them (checkpoint, settings, data, loggers, version).
+A pipeline does not score and render again either: a step notes what decided its results
+(checkpoint, settings, data, loggers, version).
 """
 
 from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -44,10 +44,10 @@ from devrf.system.override import to_type
 
 log = logging.getLogger(__name__)
 
-# The config group that decides a step's results, by step; other steps are always done.
-DECIDES = {"evaluate": "evaluation", "render": "video"}
+# The config group that decides a step's results, and these, by step; other steps are always done.
+DECIDES = {"evaluate": ("evaluation", "metrics.json"), "render": ("video", "videos/*.mp4")}
 NOTE = "done.json"  # in the folder of the lock
-NOTES = TypeAdapter(dict[str, list[str]])
+NOTES = TypeAdapter(dict[str, str])
 # Settings of a datamodule or a stage that do not change the result.
 UNDECISIVE = {"root", "name", "flow_cache", "export", "store"}
 
@@ -166,38 +166,36 @@ def unfinished(run: RunContext) -> str | None:
 
 def done(run: RunContext, step: str) -> bool:
     """Whether a step has been done with the same checkpoint and settings; says so."""
-    files = _notes(run.folder).get(_made_with(run, step), []) if step in DECIDES else []
-    if not files or not all((run.folder / name).is_file() for name in files):
+    if step not in DECIDES or _notes(run.folder).get(step) != _made_with(run, step):
         return False
-    log.info("%s: done already (%s); stage=%s does it again", step, ", ".join(files), step)
+    log.info("%s: done already; stage=%s does it again", step, step)
     return True
 
 
-def note_done(run: RunContext, step: str, files: Sequence[Path] | None) -> None:
-    """Note the files that a step has written, and forget their earlier notes."""
-    if step in DECIDES and files:
-        names = sorted(path.relative_to(run.folder).as_posix() for path in files)
-        others = {k: v for k, v in _notes(run.folder).items() if not {*names} & {*v}}
-        write_json(run.folder / PLACE / NOTE, {**others, _made_with(run, step): names})
+def note_done(run: RunContext, step: str) -> None:
+    """Note what has decided the results of a step."""
+    if step in DECIDES and run.config.evaluation.predictions is None:
+        note = {step: _made_with(run, step)}
+        write_json(run.folder / PLACE / NOTE, _notes(run.folder) | note)
 
 
 def _made_with(run: RunContext, step: str) -> str:
-    """A digest of all that decides a step's results."""
+    """A digest of all that decides a step's results, and of their names."""
     root = run.config.data.get("root")
     keyframes = Path(str(run.config.video.path))
-    loggers = run.config.get("logger") or {}
+    group, results = DECIDES[step]
     made = (
-        *(step, digest_of(run.checkpoint()), devrf.__version__, sorted(loggers)),
-        *(_values(run.config, "data"), root and Path(root).resolve()),
-        _values(run.config, DECIDES[step]),
+        *(digest_of(run.checkpoint()), devrf.__version__, sorted(run.config.get("logger") or ())),
+        *(_values(run.config, "data"), root and Path(root).resolve(), _values(run.config, group)),
         step == "evaluate" and run.datamodule.validation,
         step == "render" and keyframes.is_file() and keyframes.read_bytes(),
+        sorted(path.name for path in run.folder.glob(results)),
     )
     return sha256(repr(made).encode()).hexdigest()
 
 
-def _notes(folder: Path) -> dict[str, list[str]]:
-    """The files that steps have written, by the digest of their deciding settings."""
+def _notes(folder: Path) -> dict[str, str]:
+    """What decided the results of steps, by step."""
     try:
         return NOTES.validate_json(read_record(folder / PLACE / NOTE))
     except (OSError, ValueError):

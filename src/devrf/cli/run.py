@@ -43,8 +43,7 @@ from devrf.system.process import importing
 
 log = logging.getLogger(__name__)
 
-# Does its work; returns the files it wrote, where these need not be made again.
-Step = Callable[[RunContext], Sequence[Path] | None]
+Step = Callable[[RunContext], object]
 Names = tuple[str, ...]
 
 # By the names in devrf.cli.config.STEPS.
@@ -208,10 +207,10 @@ def _run_step(run: RunContext, name: str, step: Step) -> None:
     rays = f"schedule.{name}.rays"
     has_rays = OmegaConf.select(run.config, rays) is not None
     with shortage_in_words(name, run.device, rays if has_rays else None):
-        files = step(run)
+        step(run)
     # Leftovers of a step, as a trainer held in circles, would count as the next step's memory.
     free_cache(run.device)
-    note_done(run, name, files)
+    note_done(run, name)
     run.step_began = time.perf_counter()
 
 
