@@ -152,8 +152,7 @@ def test_curves_are_over_the_dynamic_images_views_of_a_time_averaged(ran, caplog
     assert metric_over_time(folder, "psnr").empty and caplog.messages == [
         SKIPPED % (folder / "frames.csv")
     ]
-    for head in (",a" * 100_000, ',"\n"' + ",a" * 100_000):  # in pandas these take minutes
-        (folder / "frames.csv").write_text(f"capture,time,psnr{head}\ndynamic,0,3\n")
-        assert metric_over_time(folder, "psnr").empty
+    (folder / "frames.csv").write_text(f"capture,time,psnr{',a' * 100_000}\ndynamic,0,3\n")
+    assert metric_over_time(folder, "psnr").to_dict() == {0.0: 3.0}  # in pandas it takes minutes
     (folder / "frames.csv").write_text(f"capture,time,psnr\ndynamic,0,{10**400}\n")
     assert metric_over_time(folder, "psnr").empty and metric_over_time(ran("b"), "psnr").empty

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import io
+import csv
 import json
 import logging
 import math
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -56,8 +55,6 @@ KINDS: dict[str, Any] = {
     **dict.fromkeys(("run.motion_masks", "run.benchmark"), _Text | None),
     **dict.fromkeys(("static", "dynamic", "run", "choices"), dict),
 }
-# The longest first line of a table: pandas would take hours for many columns of one name.
-HEADER = re.compile(rb'[^"\r\n]{1,1000}\r?\n')
 DEFAULT_METHOD = "devrf"
 DEFAULT_PROTOCOL = "two_stage"
 
@@ -131,18 +128,17 @@ def metric_over_time(path: Path, metric: str) -> pd.Series:
     It is empty if the run has no such values.
     """
     file = path / "frames.csv"
-    if file.is_file():  # a pipe would be waited for
-        try:
-            table = read_record(file)
-            if not HEADER.match(table):
-                raise ValueError("no names of columns")
-            frames = pd.read_csv(io.BytesIO(table), usecols=["capture", "time", metric])
-            frames = frames[frames["capture"] == "dynamic"].dropna(subset=metric)
-            frames = frames.astype({"time": float, metric: float})
-            return frames[frames[metric].abs() < LARGEST].groupby("time")[metric].mean()
-        except (OSError, ValueError, KeyError, OverflowError):
-            log.warning(SKIPPED, file)
-    return pd.Series(dtype=float)
+    curve = pd.DataFrame({"time": [], metric: []})
+    try:
+        if file.is_file():  # a pipe would be waited for
+            # pandas would take hours for many columns of one name.
+            rows = csv.DictReader(read_record(file).decode().splitlines())
+            pairs = [(r["time"], r[metric]) for r in rows if r["capture"] == "dynamic"]
+            known = [(float(time), float(value)) for time, value in pairs if value]
+            curve = pd.DataFrame(known, columns=["time", metric])
+    except (OSError, ValueError, KeyError, TypeError, csv.Error):
+        log.warning(SKIPPED, file)
+    return curve[curve[metric].abs() < LARGEST].groupby("time")[metric].mean()
 
 
 def _natural(name: str) -> tuple[int, int, str]:

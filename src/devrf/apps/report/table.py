@@ -287,7 +287,7 @@ def _gains(rows: pd.DataFrame, average: pd.DataFrame) -> pd.DataFrame:
             "time": seconds.div(seconds.iloc[0]).mean(axis=1).map("{:.2f}×".format),
         }
     )
-    return texts.map(Cell)
+    return texts.map(Cell).rename_axis(None)
 
 
 def _differences(runs: pd.DataFrame) -> Iterator[str]:

@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
-import pandas as pd
-
 from devrf.apps.report.runs import Collection
 from devrf.apps.report.table import Block, Table, published
 from devrf.system import printed
 
 
 class Style(NamedTuple):
-    """How a format escapes text, and forms an unmarked, best, second and third cell, and a table.
+    """A format of text: an escape, cells that are unmarked, best, second and third, and tables.
 
     ``form`` is the table's name for tabulate.
     """
@@ -22,20 +20,16 @@ class Style(NamedTuple):
     marks: tuple[str, str, str, str]
     form: str
 
-    def cells(self, block: Block) -> pd.DataFrame:
-        """The cells of a block as text."""
-        texts = block.cells.map(lambda cell: self.marks[cell.rank].format(self.escape(cell.text)))
-        return texts.rename(index=self.escape, columns=self.escape)
-
     def table(self, block: Block) -> str:
         """A block as text."""
-        align = ["left"] + ["right"] * len(block.cells.columns)
-        cells = self.cells(block)
+        cells = block.cells.map(lambda cell: self.marks[cell.rank].format(self.escape(cell.text)))
+        cells = cells.rename(index=self.escape, columns=self.escape)
+        align = ["left"] + ["right"] * len(cells.columns)
         return str(cells.to_markdown(tablefmt=self.form, disable_numparse=True, colalign=align))
 
 
 MARKDOWN = Style(printed.markdown, ("{}", "**{}**", "<ins>{}</ins>", "*{}*"), "pipe")
-PLAIN = Style(str, ("{} ", "{}¹", "{}²", "{}³"), "plain")
+PLAIN = Style(str, ("{} ", "{}¹", "{}²", "{}³"), "simple")
 LATEX = Style(
     printed.latex, ("{}", r"\textbf{{{}}}", r"\underline{{{}}}", r"\textit{{{}}}"), "latex_raw"
 )
@@ -102,13 +96,9 @@ def markdown(
 
 def plain(table: Table) -> str:
     """The tables, notes and failures, for a terminal; ¹ ² ³ mark the best."""
-    frames = [
-        PLAIN.cells(block).rename(columns="{} ".format).rename_axis(columns=block.title)
-        for block in table.blocks
-    ]
-    lines = [line.rstrip() for frame in frames for line in [*frame.to_string().split("\n"), ""]]
+    blocks = [f"{block.title}\n{PLAIN.table(block)}\n" for block in table.blocks]
     failed = [f"failed: {why}" for why in reasons(table.collection)]
-    return "\n".join([*lines, *table.notes, *failed, *table.collection.skipped]).rstrip()
+    return "\n".join([*blocks, *table.notes, *failed, *table.collection.skipped])
 
 
 def latex(table: Table) -> str:
