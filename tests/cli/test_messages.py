@@ -43,7 +43,7 @@ MISTAKES = {
     "a pickled job": (["--experimental-rerun", "no.pickle"], "a pickle may run code; write hydra."),
     "what the run gives the trainer": (
         ["+trainer.default_root_dir=here"],
-        "trainer.default_root_dir: a run sets it itself; leave it out: hydra.run.dir=FOLDER",
+        "trainer.default_root_dir: a run sets it itself; hydra.run.dir=FOLDER is its folder; ",
     ),
     "key of other scenes": (
         ["data=inward", "data.root=scene", "data.scene_seed=3"],

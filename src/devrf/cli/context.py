@@ -47,12 +47,16 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-# Keys of the trainer that a run sets itself, and what chooses their values.
+# Keys of Lightning's trainer that have no effect here, and what has one.
 OF_THE_RUN = {
-    "logger": "logger=NAME chooses it",
-    "callbacks": "+callbacks.NAME._target_=CLASS adds one",
-    "default_root_dir": "hydra.run.dir=FOLDER is the run's folder",
-    "enable_checkpointing": "a ModelCheckpoint among callbacks turns it on",
+    "logger": "a run sets it itself; logger=NAME chooses it",
+    "callbacks": "a run sets them itself; +callbacks.NAME._target_=CLASS adds one",
+    "default_root_dir": "a run sets it itself; hydra.run.dir=FOLDER is its folder",
+    "enable_checkpointing": "a run sets it itself; a ModelCheckpoint among callbacks turns it on",
+    "accumulate_grad_batches": "stages take optimiser steps of their own; schedule.canonical.rays, "
+    "schedule.deformation.rays or ray_stage.schedule.rays sizes batches",
+    "gradient_clip_val": "stages take optimiser steps of their own; callbacks.divergence_guard "
+    "lowers the learning rates",
 }
 
 
@@ -273,20 +277,11 @@ def _strategy(config: DictConfig) -> Strategy:
     """The configured trainer's strategy.
 
     Raises:
-        DevrfError: several processes without ``trainer=ddp``, what only Lightning's own optimiser
-            steps have, or what a run gives the trainer itself.
+        DevrfError: several processes without ``trainer=ddp``, or a key that has no effect.
     """
     for key, instead in OF_THE_RUN.items():
         if key in config.trainer:
-            raise DevrfError(f"trainer.{key}: a run sets it itself; leave it out: {instead}")
+            raise DevrfError(f"trainer.{key}: {instead}; leave it out")
     trainer: Trainer = instantiate(config.trainer, logger=False)
-    rays = "schedule.canonical.rays, schedule.deformation.rays or ray_stage.schedule.rays"
-    for key, usual, instead in (
-        ("accumulate_grad_batches", 1, f"{rays} sizes batches"),
-        ("gradient_clip_val", 0, "callbacks.divergence_guard lowers the learning rates"),
-    ):
-        if getattr(trainer, key) not in (None, usual):
-            own = "stages take optimiser steps of their own"
-            raise DevrfError(f"trainer.{key}: {own}; leave it out: {instead}")
     check_strategy(trainer)
     return trainer.strategy

@@ -60,7 +60,7 @@ def capture(run: RunContext) -> None:
         log.info("%s", line)
     config = compose("config", [*applied.words, *how])
     captured = RunContext(config, run.folder)
-    shortage = _inspect(captured)
+    shortage = inspect(captured)
     command = [to_type("data.root", folder), *how]
     if shortage is not None:  # nothing can be tried out
         say_next(command + [f"{SIZE}=auto"] * (shortage.where == SIZE))
@@ -99,13 +99,12 @@ def prepare(run: RunContext) -> None:
     log.info("scene written to %s", folder)
 
 
-def inspect(run: RunContext) -> None:
-    """Report and draw the scene's content, its needs and its likely mistakes."""
-    _inspect(run)
+def inspect(run: RunContext) -> Advice | None:
+    """Report and draw the scene's content, its needs and its likely mistakes.
 
-
-def _inspect(run: RunContext) -> Advice | None:
-    """Inspect a scene; return what to do where this machine has too little for the run."""
+    Returns:
+        What to do where this machine has too little for the run.
+    """
     # Only this step draws with matplotlib.
     from devrf.apps.inspection.picture import write_inspection_picture
 
