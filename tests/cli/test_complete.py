@@ -133,8 +133,6 @@ def scenes(tmp_path_factory) -> Path:
         # One camera that moves: what learns it is typed, or it is not learned.
         ("data.root=hook experiment=phone", "data=inward"),
         ("stage=inspect data.root=hook schedule.seconds=60", "data=inward"),
-        ("data.root=hook field.channels=3", "data=inward"),
-        ("data.root=hook loss.canonical.tv=1", "data=inward"),
         ("data.root=hook data.static_until=0.3", "data=inward"),
         ("data.root=hook experiment=phone profile=tineuvox_light", "data=inward"),
         ("data.root=hook stage=canonical", "data=inward"),

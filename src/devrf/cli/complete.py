@@ -38,12 +38,8 @@ from devrf.system.process import importing
 
 # Stages of DeVRF's protocol alone.
 DEVRF_STAGES = ("canonical", "deformation")
-# Training settings of a scene: groups, and keys that DeVRF alone has.
-TRAINING_KEYS = (
-    *("method", "profile", "protocol", "comparison", "experiment", "ablation", "hparams_search"),
-    *("data.static_until", "field", "sampling", "loss", "canonical", "deformation"),
-    *("schedule.canonical", "schedule.deformation", "schedule.motion"),
-)
+# Keys that say how a scene without a static set is learned, or that a part of it is at rest.
+CHOICES = ("method", "profile", "protocol", "comparison", "experiment", "data.static_until")
 # `viewer` is a group, whose choices Hydra wants to be text; so it does of these.
 SHORTHAND = {f"viewer={value}": f"viewer.training={value}" for value in ("true", "false")}
 SHORTHAND |= {f"{group}=null": f"~{group}" for group in ("logger", "callbacks")}
@@ -102,7 +98,7 @@ def completed(arguments: Sequence[str]) -> Applied:
             )
     before = of_named_run(typed, options.multirun)
     overrides = parsed([*before.words, *texts])
-    by_scene = _of_scenes(typed, overrides, options.config_dir, continued=bool(before.words))
+    by_scene = _of_scenes(typed, overrides, options.config_dir)
     words = [*flags, *before.words, *texts, *by_scene.words]
     return Applied(words, before.remarks + by_scene.remarks)
 
@@ -120,17 +116,13 @@ def _check_optional(override: Override, config_dir: str | None, typed: Sequence[
 
 
 def _of_scenes(
-    typed: Sequence[Override],
-    overrides: Sequence[Override],
-    config_dir: str | None,
-    *,
-    continued: bool,
+    typed: Sequence[Override], overrides: Sequence[Override], config_dir: str | None
 ) -> Applied:
     """Settings by the scenes that the overrides name, which are the typed ones and a run's."""
     if value(overrides, "stage") in SCENELESS_STAGES:
         return Applied()
     if value(overrides, "data.camera") == "handheld":
-        found = _for_one_camera("data.camera=handheld", overrides, continued=continued)
+        found = _for_one_camera("data.camera=handheld", overrides)
         line = f"data.camera=handheld: one camera ({' '.join(found.words)})"
         return Applied(found.words, found.remarks + [line] * bool(found.words))
     roots = values(typed, "data.root")
@@ -138,10 +130,7 @@ def _of_scenes(
         return Applied()
     readers: list[str | None] = [*values(overrides, "data")]
     readers = readers or (_of_experiments(overrides, config_dir) if roots else [])
-    scenes = [
-        _defaults_of_scene(reader, root, overrides, continued=continued)
-        for reader, root in product(readers, roots)
-    ]
+    scenes = [_defaults_of_scene(*scene, overrides) for scene in product(readers, roots)]
     if any(scene.words != scenes[0].words for scene in scenes):
         needed = " and ".join(dict.fromkeys(" ".join(s.words) or "neither" for s in scenes))
         raise DevrfError(f"data.root: the scenes need {needed}; sweep over those of each apart")
@@ -177,18 +166,8 @@ def quoted_path(argument: str) -> str:
     return start + ",".join(literal(os.path.expanduser(path)) for path in paths)
 
 
-def _says_how(override: Override) -> bool:
-    """Whether an override is a training setting."""
-    key = f"{override.key_or_group}."
-    return any(key.startswith(f"{name}.") for name in TRAINING_KEYS)
-
-
-def _defaults_of_scene(
-    option: str | None, root: str, overrides: Sequence[Override], *, continued: bool
-) -> Applied:
+def _defaults_of_scene(option: str | None, root: str, overrides: Sequence[Override]) -> Applied:
     """Settings by the files of a scene, which ``data=option`` reads, that no override sets.
-
-    Training settings are not among them if a run is ``continued``.
 
     Raises:
         DevrfError: ``option`` is None, and no reader knows the layout; or DeVRF, which nothing
@@ -198,8 +177,8 @@ def _defaults_of_scene(
         from devrf.data.kind import by_one_camera, faces_forward
         from devrf.scenes.formats import recognise
 
-    words = []
-    remarks = []
+    words: list[str] = []
+    remarks: list[str] = []
     why = "its cameras"
     remark = ""
     if option is None:
@@ -211,35 +190,32 @@ def _defaults_of_scene(
     space = value(overrides, "data.space")
     if not values(overrides, "facing") and faces_forward(option, root, space):
         words.append("facing=forward")
-    video = value(overrides, "data.monocular")
     ordered = value(overrides, "data.times") == "order"
-    if video == "True" or (video is None and by_one_camera(option, root, ordered=ordered)):
-        monocular = _for_one_camera(root, overrides, continued=continued)
+    video = value(overrides, "data.monocular") or str(by_one_camera(option, root, ordered=ordered))
+    if video == "True":
+        monocular = _for_one_camera(root, overrides)
         words += monocular.words
         remarks += monocular.remarks
-    scene = Path(root).expanduser().resolve().name
     if value(overrides, "experiment") == "paper" and option in ("inward", "forward"):
-        if (config_folder() / f"for_scene/paper_{scene}.yaml").is_file():
-            line = f"{root}: if it is DeVRF's, data={scene} has what is published for it"
-            remarks.append(line)
+        scene = Path(root).expanduser().resolve().name
+        if f"paper_{scene}" in group_choices()["for_scene"]:
+            remarks.append(f"{root}: if it is DeVRF's, data={scene} has what is published for it")
     if words:
         remarks.append(f"{root}: {why} ({' '.join(words)}){remark}")
     return Applied(words, remarks)
 
 
-def _for_one_camera(scene: str, overrides: Sequence[Override], *, continued: bool) -> Applied:
+def _for_one_camera(scene: str, overrides: Sequence[Override]) -> Applied:
     """The protocol for a monocular scene, by which a typed method learns it.
 
-    There is none if a run is ``continued``; if DeVRF is asked for, a line says what it lacks.
-
     Raises:
-        DevrfError: the run would learn it by DeVRF, though no training setting is typed.
+        DevrfError: the run would learn it by DeVRF, though nothing typed says so.
     """
     method, stage = value(overrides, "method"), value(overrides, "stage")
     lacks = f"{scene}: one moving camera, and nothing at rest, which method=devrf needs"
     if method == "devrf" or stage in DEVRF_STAGES:
         return Applied([], [f"{lacks}; experiment=phone learns more of it"])
-    if not continued and not any(map(_says_how, overrides)):
+    if not any(values(overrides, key) for key in CHOICES):
         line = f"{lacks}; give experiment=phone, on a GPU experiment=phone_gpu"
         if stage not in STEPS:
             raise DevrfError(line)
