@@ -169,10 +169,9 @@ def tabulate(collection: Collection) -> Table:
     papers = {*published().texts.index.get_level_values("scene")}
     same = {*runs.loc[runs["run.benchmark"] == published().benchmark, "scene"]} & papers
     blocks: list[Block] = []
-    notes = _notes(runs)
+    notes = _notes(runs) + _incomparable(runs, columns)
     for scene in scenes:
         of_scene = runs[runs["scene"] == scene]
-        notes += _incomparable(of_scene, columns)
         cells = [_cells(rows.loc[scene], spread.loc[scene], columns, of_scene)]
         if scene in same:
             cells.append(_published_cells(scene, columns))
@@ -204,16 +203,20 @@ def _values(runs: pd.DataFrame, column: Column) -> pd.Series:
 
 def _is_comparable(runs: pd.DataFrame, column: Column) -> bool:
     """Whether the runs that have values of a column agree in what these depend on."""
-    return runs.loc[runs[column.title].notna(), column.alike].nunique(dropna=False) < 2
+    return bool(runs.loc[runs[column.title].notna(), column.alike].nunique(dropna=False) < 2)
 
 
-def _incomparable(runs: pd.DataFrame, columns: Sequence[Column]) -> Iterator[str]:
-    """The columns of a scene's runs in which nothing is marked, and in what the runs differ."""
-    unmarked = [column for column in columns if not _is_comparable(runs, column)]
-    for key in dict.fromkeys(column.alike for column in unmarked):
-        titles = ", ".join(column.title for column in unmarked if column.alike == key)
-        differ = "; ".join(runs[key].fillna("none").map(str).unique())
-        yield f"{runs['scene'].iloc[0]}: no comparison of {titles}: {key} is {differ}."
+def _incomparable(runs: pd.DataFrame, columns: Sequence[Column]) -> list[str]:
+    """The columns of scenes in which nothing is marked, and in what their runs differ."""
+    scenes: dict[str, list[str]] = {}
+    for scene, same in runs.groupby("scene", sort=False):
+        unmarked = [column for column in columns if not _is_comparable(same, column)]
+        for key in dict.fromkeys(column.alike for column in unmarked):
+            titles = ", ".join(column.title for column in unmarked if column.alike == key)
+            differ = "; ".join(same[key].fillna("none").map(str).unique())
+            text = f"no comparison of {titles}: {key} is {differ}."
+            scenes.setdefault(text, []).append(str(scene))
+    return [f"{', '.join(names)}: {text}" for text, names in scenes.items()]
 
 
 def shown(value: float, column: Column, spread: float = math.nan) -> str:

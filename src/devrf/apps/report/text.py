@@ -63,10 +63,8 @@ def reasons(collection: Collection) -> list[str]:
     return lines
 
 
-def markdown(
-    table: Table, figures: Mapping[str, str], videos: Mapping[str, str] | None = None
-) -> str:
-    """The whole report, with links to ``figures`` and ``videos``, by their captions."""
+def markdown(table: Table, links: Mapping[str, str]) -> str:
+    """The whole report, with ``links`` to pictures and videos, by their captions."""
     escape = printed.markdown
     collection = table.collection
     failed = f", {len(collection.failures)} failed" if len(collection.failures) else ""
@@ -85,12 +83,10 @@ def markdown(
     ):
         if lines:
             parts += [heading, "\n".join(f"- {escape(line)}" for line in lines)]
-    if figures:
-        parts.append("## Plots")
-        parts += [f"![{escape(shows)}](<{link}>)" for shows, link in figures.items()]
-    if videos:
-        links = [f"- [{escape(shows)}](<{link}>)" for shows, link in videos.items()]
-        parts += ["## Videos", "\n".join(links)]
+    if links:
+        parts.append("## Plots and videos")
+    for shows, link in links.items():
+        parts.append(f"{'!' * link.endswith('.png')}[{escape(shows)}](<{link}>)")
     return "\n\n".join(filter(None, parts)) + "\n"
 
 

@@ -60,9 +60,8 @@ def write_report(settings: ReportSettings) -> str:
         )
     refuse_links(folder, itself=settings.into is None)
     table = tabulate(collection)
-    figures = _write_plots(table, folder)
-    videos = _write_videos(table, folder)
-    write_text(folder / "report.md", markdown(table, figures, videos))
+    links = _write_plots(table, folder) | _write_videos(table, folder)
+    write_text(folder / "report.md", markdown(table, links))
     write_text(folder / "report.tex", latex(table))
     write_text(folder / "report.csv", csv(table))
     return f"{plain(table)}\nreport written to {folder / 'report.md'}"
