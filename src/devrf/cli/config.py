@@ -16,7 +16,6 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from devrf.apps.settings import ReportSettings
-from devrf.system.override import to_type
 
 # A value that is another key's.
 REFERENCE = re.compile(r"\$\{([\w.]+)\}")
@@ -154,15 +153,17 @@ def command_line(*words: str) -> str:
 
     Words with paths come from :func:`devrf.system.override.to_type`.
     """
-    options = list[str]()
-    folders = list[str]()
-    for source in HydraConfig.get().runtime.config_sources if HydraConfig.initialized() else ():
-        if source.provider == "command-line":
-            options += ["--config-dir", shlex.quote(source.path)]
-        elif source.provider == "hydra.searchpath in command-line":
-            folders.append(f"{source.schema}://{source.path}")
-    searched = [to_type("hydra.searchpath", folders)] if folders else []
-    return " ".join(["python", "-m", "devrf", *options, *searched, *words])
+    return " ".join(["python", "-m", "devrf", *map(shlex.quote, own_folders()), *words])
+
+
+def own_folders() -> list[str]:
+    """The words of the present command that name further folders of configs."""
+    if not HydraConfig.initialized():
+        return []
+    job = HydraConfig.get()
+    folders = [s.path for s in job.runtime.config_sources if s.provider == "command-line"]
+    words = [word for folder in folders for word in ("--config-dir", folder)]
+    return [*words, *(w for w in job.overrides.hydra if w.startswith("hydra.searchpath="))]
 
 
 def choices() -> dict[str, str | None]:

@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import torch
-from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.strategies import Strategy
 from torch import distributed
@@ -20,7 +19,7 @@ from torch.distributed import run as torchrun
 from torch.distributed.elastic.multiprocessing.api import SignalException
 from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
 
-from devrf.cli.config import in_sweep
+from devrf.cli.config import in_sweep, own_folders
 from devrf.cli.messages import FULL_ERRORS, is_user_error
 from devrf.engine.ddp import ManualDDP
 from devrf.errors import DevrfError
@@ -107,12 +106,7 @@ def _words(folder: Path) -> list[str]:
     """The command line of the present job alone, in its folder."""
     words = sys.argv[1:]
     if in_sweep():
-        options, _ = get_args_parser().parse_known_intermixed_args(words)
-        jobs_own = HydraConfig.get().overrides
-        found = [word for word in jobs_own.hydra if word.startswith("hydra.searchpath=")]
-        flags = {*words} - {*options.overrides, "-m", "--multirun"}
-        words = [word for word in words if word in flags]
-        words += [*found, *jobs_own.task, "hydra.mode=RUN"]
+        words = [*own_folders(), *HydraConfig.get().overrides.task, "hydra.mode=RUN"]
     elif not any(word.startswith("hydra.run.dir=") for word in words):
         return words
     # With ${now:} each process would have another folder.
