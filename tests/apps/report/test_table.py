@@ -7,6 +7,7 @@ import pytest
 
 from devrf.apps.report.table import GPU, LPIPS, PSNR, TIME, TITLES, published, ranked, shown
 from devrf.apps.report.text import caption
+from devrf.errors import DevrfError
 
 FULL = "Ours w/ c2f, tv, cycle, flow"
 
@@ -180,17 +181,19 @@ def test_published_rows_stand_below_runs_of_the_same_scene_and_data(table, ran):
     assert texts(lego)["† Neural Volumes"] == first
 
 
-def test_rows_of_different_benchmarks_are_not_compared(table, ran):
+def test_rows_of_different_benchmarks_are_no_rows_of_one_table(table, ran):
     ran("a", benchmark="embedded 1")
     ran("b", "lego")
     assert not any("no comparison" in note for note in table().notes)
     words = caption(table())
     assert "Benchmark embedded 1: robot. Benchmark devrf 1: lego." in words
     ran("c", scores={"psnr": 20.0})
-    ran("d", benchmark="embedded 2", scores={"psnr": 30.0})
-    assert ranks(table().blocks[0], PSNR) == [0, 0, 0]
-    differ = "run.benchmark is embedded 1; none; embedded 2."
+    assert ranks(table().blocks[0], PSNR) == [0, 0]
+    differ = "run.benchmark is embedded 1; none."
     assert f"robot: no comparison of PSNR, SSIM: {differ}" in table().notes
+    ran("d", benchmark="embedded 2", scores={"psnr": 30.0})
+    with pytest.raises(DevrfError, match=r"^report.runs: robot .* 1 \(a\) and .* 2 \(d\)"):
+        table()
 
 
 def test_rows_of_one_name_stay_apart_and_a_note_says_in_what_they_differ(table, ran):

@@ -16,6 +16,7 @@ import pandas as pd
 
 from devrf.apps.report.labels import identity_columns, labelled
 from devrf.apps.report.runs import Collection, number
+from devrf.errors import DevrfError
 
 UNKNOWN = "–"
 # Keys that a note names of those in which rows of one name differ.
@@ -165,6 +166,7 @@ def tabulate(collection: Collection) -> Table:
     rows = heads.join(groups[titles].mean().where(complete)).droplevel("identity")
     spread = groups[titles].std().where(complete).droplevel("identity")
 
+    _check_benchmarks(runs)
     scenes = list(runs["scene"].unique())
     papers = {*published().texts.index.get_level_values("scene")}
     same = {*runs.loc[runs["run.benchmark"] == published().benchmark, "scene"]} & papers
@@ -199,6 +201,19 @@ def _values(runs: pd.DataFrame, column: Column) -> pd.Series:
     keys = [column.key, f"static.{name}" if section == "dynamic" else column.key]
     own, at_rest = (runs.reindex(columns=[key])[key].map(number).astype(float) for key in keys)
     return own.where(~runs["at_rest"].eq(True), at_rest)
+
+
+def _check_benchmarks(runs: pd.DataFrame) -> None:
+    """DevrfError if the runs of a scene follow different protocols of benchmarks."""
+    for scene, same in runs[runs["run.benchmark"].notna()].groupby("scene", sort=False):
+        first = same.drop_duplicates("run.benchmark")
+        if len(first) > 1:
+            pairs = zip(first["run.benchmark"], first["folder"], strict=True)
+            which = " and ".join(f"{benchmark} ({folder})" for benchmark, folder in pairs)
+            raise DevrfError(
+                f"report.runs: {scene} was scored as benchmarks {which}, which are no rows of one "
+                "table; put their runs into folders of their own, and report on each"
+            )
 
 
 def _is_comparable(runs: pd.DataFrame, column: Column) -> bool:
