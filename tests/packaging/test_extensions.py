@@ -24,6 +24,7 @@ QUICK = [f"schedule.deformation.levels.{number}.iterations=1" for number in (1, 
     [
         ("color_residual", ["~schedule.extensions.color_residual"]),
         ("tracks", ["~schedule.extensions.tracks"]),
+        ("frame_start", ["~schedule.extensions.frame_start"]),
         ("priors", ["~schedule.extensions.elastic", "~schedule.extensions.bending"]),
     ],
 )
