@@ -46,11 +46,12 @@ log = logging.getLogger(__name__)
 
 # The most of the budget that a Lightning step may take.
 STEP_SHARE = 0.01
-# The parts of the schedule's batches of which one is drawn; those of the trial, each for this share
-# of the budget at most; the least for want of time unless fewer iterations than enough would fit.
+# Shares of the schedule's batches, of which one is chosen.
 BATCHES = tuple(2.0**-k for k in range(9))
+# Shares that the trial draws, each for TRIAL_SHARE of the budget at most.
 TRIED = (1 / 32, 1 / 4)
 TRIAL_SHARE = 0.02
+# For want of time batches are no smaller than this, unless fewer than ENOUGH_ITERATIONS would fit.
 LEAST_BATCH = 1 / 4
 ENOUGH_ITERATIONS = 100
 # How much of an average the latest measurement is.
@@ -58,18 +59,21 @@ LATEST = 0.3
 
 
 class Pace(NamedTuple):
-    """Seconds for a unit of the phases' cost: ``besides`` the rays, and ``by_rays`` of a batch."""
+    """Seconds for a unit of the phases' cost: ``fixed``, and ``of_batch`` in proportion to rays."""
 
-    besides: float
-    by_rays: float
+    fixed: float
+    of_batch: float
 
     def at(self, share: float) -> float:
         """Seconds with ``share`` of the rays."""
-        return self.besides + self.by_rays * share
+        return self.fixed + self.of_batch * share
 
 
 class TimeBudget(Callback):
     """Has a stage end its schedule when its share of ``seconds`` is over.
+
+    It sets the stage's ``iterations_per_step`` and ``batch_size``, scales its schedule, and moves
+    its position to the end when the time is over.
 
     It needs a :class:`~devrf.callbacks.TrainingRecord` among the trainer's callbacks, and a place
     behind :class:`~devrf.callbacks.GridUpscaling`.
@@ -189,7 +193,7 @@ class TimeBudget(Callback):
                 ratio = pace / self._pace.at(share)
                 if not self._is_new_kind:
                     ratio = 1 + LATEST * (ratio - 1)
-                self._pace = Pace(self._pace.besides * ratio, self._pace.by_rays * ratio)
+                self._pace = Pace(self._pace.fixed * ratio, self._pace.of_batch * ratio)
         timeline = pl_module.timeline
         over = self._step_ended >= self._budget and self._phase.stop >= timeline.total
         is_due = self._pace is not None and (self._is_new_kind or self._step_ended >= self._next)
@@ -213,8 +217,8 @@ class TimeBudget(Callback):
             return
         means = {s: sum(p[1:]) / len(p[1:]) for s, p in self._tried.items() if len(p) > 1}
         (first, slow), (last, quick) = min(means.items()), max(means.items())
-        by_rays = max((quick - slow) / (last - first), 0.0) if last > first else slow / first
-        self._pace = Pace(max(slow - by_rays * first, 0.0), by_rays)
+        of_batch = max((quick - slow) / (last - first), 0.0) if last > first else slow / first
+        self._pace = Pace(max(slow - of_batch * first, 0.0), of_batch)
         self._scale(trainer, stage, first=True)
 
     @property
@@ -260,7 +264,7 @@ class TimeBudget(Callback):
     def _share_of_batches(self, stage: Stage, iterations: float) -> float:
         """The part of the schedule's batches to draw.
 
-        ``iterations`` fit where a unit of cost takes a second.
+        ``iterations`` are those that are left if a unit of cost took a second.
         """
         assert self._pace is not None
         total = configured_timeline(stage).total
@@ -270,7 +274,7 @@ class TimeBudget(Callback):
             pace = self._pace.at(share)
             tight = iterations / pace < total and share > least
             few = iterations / pace < min(ENOUGH_ITERATIONS, total / 4)
-            if not tight and not (few and pace > 2 * self._pace.besides):
+            if not tight and not (few and pace > 2 * self._pace.fixed):
                 break
         return min(share, most)
 

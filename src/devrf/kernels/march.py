@@ -53,13 +53,14 @@ Density = row_type(1)
 def march(rays: Rays, inputs: MarchInputs) -> Samples:
     """As :func:`devrf.ops.march.march`, differentiable once.
 
-    A leaf of densities that has a gradient is added to there.
+    Where ``density`` is a leaf that has a gradient (``GridAdam.make_gradients``), the backward pass
+    adds to that tensor and gives autograd none: hooks of the leaf see nothing.
     """
     if not is_supported(rays.origins):
         return definition.march(rays, inputs)
     density, displacement, limits = inputs.density, inputs.displacement, inputs.range
     device, count = density.device, len(rays)
-    kept = density.grad if density.is_leaf else None
+    grad = density.grad if density.is_leaf else None
     geometry = _geometry(rays, inputs)
     # Room for all of a ray's samples, as the host knows it: the number of visible ones is known
     # afterwards. Memory that is not written to costs a CPU nothing.
@@ -106,8 +107,8 @@ def march(rays: Rays, inputs: MarchInputs) -> Samples:
         into = [density.new_empty(0, 1), density.new_empty(0, 3)]
         of_density = of_displacement = None
         if density.requires_grad:
-            of_density = torch.zeros_like(raw) if kept is None else None
-            into[0] = kept if of_density is None else of_density
+            of_density = torch.zeros_like(raw) if grad is None else None
+            into[0] = grad if of_density is None else of_density
         if displacement is not None and displacement.requires_grad:
             into[1] = of_displacement = torch.zeros_like(moves)
         arguments = [geometry, followed, visible, moves, *into]
