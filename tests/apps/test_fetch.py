@@ -61,6 +61,7 @@ def test_a_misspelt_name_is_answered_with_the_closest():
         "collection=5",
         "a=" + "[" * 100_000,
         "#" * (2**20 + 1),
+        "a." * 30_000 + "a=1",
         *(
             f"[[collection]]\npage='https://a'\nlicence=\"{licence}\"\ndata='inward'\n"
             f"learn='{learn}'\nurl='https://a'\nscenes.a=''"
@@ -153,10 +154,11 @@ def test_another_file_than_expected_is_refused(tmp_path, content, said):
 
 
 def test_an_archive_that_expands_beyond_what_scenes_do_is_not_unpacked(tmp_path):
-    # 100 MB of zeros in 100 kB; 20,000 empty files.
+    # 100 MB of zeros in 100 kB; 20,000 empty files; 300 empty files in 60 folders each.
     for files, said in (
         ({"lego/train/r_0.png": bytes(100_000_000)}, r"its 9\d\.\d kB would become 100\.0 MB"),
-        ({f"lego/{k}": b"" for k in range(20_000)}, r"MB would become 81\.9 MB"),
+        ({f"lego/{k}": b"" for k in range(20_000)}, r"MB would become 163\.8 MB"),
+        ({f"{k}/{'a/' * 60}": b"" for k in range(300)}, r"kB would become 7\d\.\d MB"),
     ):
         shutil.rmtree(tmp_path / "files", ignore_errors=True)
         written(tmp_path, {"lego/transforms_train.json": b"{}", **files})
@@ -173,16 +175,24 @@ def test_an_archive_of_folders_in_one_another_is_refused(tmp_path):
 
 @pytest.fixture
 def trickle() -> Iterator[str]:
-    """The address of a server that sends a part at once, then a byte now and then, without end."""
+    """The address of a server that sends a part at once, then a byte now and then, for a minute.
+
+    ``/moved`` leads elsewhere, ``/busy`` asks to be asked later.
+    """
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:  # noqa: N802
             assert self.headers["Accept-Encoding"] == "identity"
-            self.send_response(200)
+            code, header, said = {
+                "/moved": (302, "Location", "/there"),
+                "/busy": (503, "Retry-After", "30"),
+            }.get(self.path, (200, "Server", ""))
+            self.send_response(code)
+            self.send_header(header, said)
             self.end_headers()
             with suppress(OSError):
                 self.wfile.write(bytes(2000))
-                while True:
+                for _ in range(1200):
                     self.wfile.write(b"x")
                     time.sleep(0.05)
 
@@ -197,15 +207,20 @@ def trickle() -> Iterator[str]:
 
 
 @pytest.mark.parametrize(
-    ("limit", "said"),
-    [({"LONGEST": 0.4}, "it comes too slowly"), ({"LARGEST": 1000}, "more than 1.0 kB came")],
+    ("path", "limit", "said"),
+    [
+        ("lego.zip", {"LONGEST": 0.4}, "it comes too slowly"),
+        ("lego.zip", {"LARGEST": 1000}, "more than 1.0 kB came"),
+        ("moved", {"LONGEST": 0.4}, "it comes too slowly"),
+        ("busy", {}, "503 .*"),
+    ],
 )
-def test_a_download_without_end_is_ended(tmp_path, monkeypatch, trickle, limit, said):
+def test_a_download_without_end_is_ended(tmp_path, monkeypatch, trickle, path, limit, said):
     for name, value in limit.items():
         monkeypatch.setattr(f"devrf.apps.fetch.{name}", value)
-    scene = published("lego", url=f"{trickle}/lego.zip")
+    scene = published("lego", url=f"{trickle}/{path}")
     began = time.monotonic()
-    with pytest.raises(DevrfError, match=rf"lego\.zip: cannot be fetched \({said}\)"):
+    with pytest.raises(DevrfError, match=rf"/{path}: cannot be fetched \({said}\)"):
         fetched(scene, FetchSettings(tmp_path), progress=False)
     assert time.monotonic() - began < 20 and not (tmp_path / "lego").exists()
 

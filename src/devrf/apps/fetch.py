@@ -12,7 +12,7 @@ import zipfile
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 from rich.console import Console
@@ -59,6 +59,8 @@ SMALL = 2**26
 # Most bytes of a scene's download, and of its unpacked files; of a catalogue.
 LARGEST = 2**34
 LARGEST_CATALOGUE = 2**20
+# Points in a line of a catalogue: time and memory for a name grow with the square of its parts.
+MOST_POINTS = 100
 # Seconds that a scene may take, and that a server may say nothing.
 LONGEST = 6 * 3600
 PATIENCE = 60
@@ -142,7 +144,10 @@ def catalogue(file: str | Path | None = None) -> list[PublishedScene]:
     try:
         if not path.is_file() or path.stat().st_size > LARGEST_CATALOGUE:
             raise ValueError("no file, or a larger one than a catalogue's")
-        listed = validate(dict[str, list[Collection]], tomllib.loads(path.read_text()))
+        text = path.read_text()
+        if any(line.count(".") > MOST_POINTS for line in text.split("\n")):
+            raise ValueError(f"a line of more than {MOST_POINTS} points")
+        listed = validate(dict[str, list[Collection]], tomllib.loads(text))
     except (OSError, *UNREADABLE) as error:
         why = " ".join(str(error).split())
         raise DevrfError(f"fetch.catalogue: {path} cannot be read ({why[:200]})") from None
@@ -224,7 +229,11 @@ def _download(scene: PublishedScene, folder: Path, progress: bool) -> dict[str, 
     left, until = LARGEST, time.monotonic() + LONGEST
     console = Console(stderr=True)
     with requests.Session() as session, Progress(console=console, disable=not progress) as bar:
-        session.mount("https://", requests.adapters.HTTPAdapter(max_retries=2))
+        # A server may ask for any wait, and send any amount with a redirection, which is read.
+        retries = urllib3.Retry(2, respect_retry_after_header=False)
+        for scheme in ("http://", "https://"):
+            session.mount(scheme, requests.adapters.HTTPAdapter(max_retries=retries))
+        session.hooks["response"].append(_close_redirection)
         # Some servers refuse the name that Python gives itself.
         session.headers.update({"User-Agent": "devrf", "Accept-Encoding": "identity"})
         for name, url in bar.track(scene.downloads.items(), description=scene.name):
@@ -257,6 +266,12 @@ def _download(scene: PublishedScene, folder: Path, progress: bool) -> dict[str, 
     return files
 
 
+def _close_redirection(answer: Any, **_: object) -> None:
+    """Let nothing be read of an answer that only leads elsewhere."""
+    if answer.is_redirect:
+        answer.close()
+
+
 def _digest(files: dict[str, Path]) -> str:
     """The SHA-256 of an archive; for several files, of the lines that sha256sum prints."""
     digests = dict[str, str]()
@@ -283,8 +298,12 @@ def _unpacked(scene: PublishedScene, work: Path) -> Path:
         with zipfile.ZipFile(archive) as packed:
             if any(name.count("/") > DEEPEST for name in packed.namelist()):
                 raise ValueError(f"more than {DEEPEST} folders in one another")
-            # A file takes 4 kB of a disk at least. No more of it is unpacked than is said here.
-            whole = sum(max(file.file_size, 2**12) for file in packed.infolist())
+            # A file takes 4 kB of a disk at least, and so does each folder that it may be the first
+            # in. No more of it is unpacked than is said here.
+            whole = sum(
+                max(file.file_size, 2**12) + 2**12 * file.filename.count("/")
+                for file in packed.infolist()
+            )
             if whole > most:
                 raise ValueError(f"its {decimal(size)} would become {decimal(whole)}")
             packed.extractall(unpacked)  # names that lead elsewhere are written below it, too
