@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import imageio.v3 as iio
 import numpy as np
@@ -12,7 +14,7 @@ from PIL import Image
 
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import score, truth_image
-from devrf.evaluation.predictions import picture_name, read_predictions
+from devrf.evaluation.predictions import picture_name, pictures_in, read_predictions
 from devrf.evaluation.scoring import score_held_out
 from devrf.pictures.images import to_bytes, write_image
 from devrf.pictures.video_file import write_pictures
@@ -121,6 +123,17 @@ def test_what_does_not_fit_is_said_in_one_line(folder, sets):
     assert "no such folder" in refused(folder / "nowhere", sets)
     (here / "predictions.json").write_text(json.dumps({"images": [{"file": "../../x.png"}]}))
     assert "leads outside" in refused(folder, sets)
+
+
+def test_a_name_of_millions_of_folders_is_looked_at_once(folder, sets):
+    """And not once for each of 300 held-out images, which took half a minute."""
+    here = folder / "dynamic"
+    entry = {"file": next(here.iterdir()).name, "image": "a/" * 1_000_000}
+    (here / "predictions.json").write_text(json.dumps({"images": [entry]}))
+    began = time.monotonic()
+    with pytest.raises(DevrfError, match="a picture of none of the held-out images"):
+        pictures_in(here, SimpleNamespace(names=["r_0.png"] * 300))
+    assert time.monotonic() - began < 10
 
 
 def test_a_motion_that_was_not_learned_is_no_other_order(folder, sets):

@@ -89,3 +89,10 @@ def test_packed_arrays_larger_than_an_image_are_not_unpacked(tmp_path):
         assert load_flow(path, "key", (1, 4, 6)) is None
     finally:
         tracemalloc.stop()
+
+
+@pytest.mark.parametrize("numbers", [1, 2, 3])
+def test_kept_flow_has_two_numbers_a_pixel(tmp_path, numbers):
+    arrays = {"vectors": np.zeros((1, 4, 6, numbers)), "valid": np.ones((1, 4, 6), bool)}
+    np.savez(tmp_path / "flow.npz", key=np.array("key"), **arrays)
+    assert (load_flow(tmp_path / "flow.npz", "key", (1, 4, 6)) is not None) == (numbers == 2)

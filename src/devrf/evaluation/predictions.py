@@ -231,13 +231,15 @@ def _listed(folder: Path, views: Views) -> dict[int, Path]:
     """The pictures that ``predictions.json`` lists, by the image that they show."""
     file = folder / LIST
     files: dict[int, Path] = {}
+    # Whatever the folders and suffixes of names.
+    stems = [Path(name).stem for name in views.names]
     for entry in read_json(file, PredictionsFile, "it lists the pictures; add it").images:
         path = inside(folder, folder, entry.file, file)
         if not os.path.isfile(path):
             raise scene_error(path, f"no such picture, but {LIST} lists it; add it")
         if entry.image is not None:
-            # Whatever its folder and suffix.
-            meant = [k for k, n in enumerate(views.names) if Path(n).stem == Path(entry.image).stem]
+            wanted = Path(entry.image).stem
+            meant = [k for k, stem in enumerate(stems) if stem == wanted]
         elif entry.view is not None and entry.time is not None:
             meant = _at(views, entry.view, entry.time)
         else:

@@ -191,7 +191,8 @@ def load_flow(path: Path, key: str, shape: tuple[int, int, int]) -> OpticalFlow 
         stored = _arrays(path, shapes, "it is written again")
         with decoding(path, "npz", "it is written again"):
             vectors, valid = (torch.from_numpy(stored[name]) for name in ("vectors", "valid"))
-            fits = str(stored["key"]) == key and vectors[..., 0].shape == valid.shape == shape
+            sizes = (tuple(vectors.shape), tuple(valid.shape))
+            fits = str(stored["key"]) == key and sizes == ((*shape, 2), shape)
     except DevrfError as error:
         log.warning("the flow is estimated again: %s", error)
         return None

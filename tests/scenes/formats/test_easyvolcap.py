@@ -90,6 +90,7 @@ def test_what_is_refused(folder, message_of):
     assert "not a readable YAML file of OpenCV" in refused("data: [", "data: ]")
     deep = f"deep: {'[' * 20_000}{']' * 20_000}\nnames:"  # OpenCV ends the program at this
     assert "not a readable YAML file of OpenCV" in refused("names:", deep)
+    assert "a large number is no folder's" in refused("names:", f"names: 0x{'f' * 6000}\nrest:")
     assert "an alias" in refused("names:", "one: &one [1]\nmany: [*one, *one]\nnames:")
     file.write_text(whole)
     (folder / "images" / "02" / "000001.png").unlink()

@@ -143,14 +143,15 @@ class OpenCVFile:
 
     def names(self) -> list[str]:
         """The texts in the list ``names``, each the name of a folder."""
-        names = self._stored.get("names")
-        for name in names if isinstance(names, list) else [names]:
+        stored = self._stored.get("names")
+        names = stored if isinstance(stored, list) else [stored]
+        for name in names:
             text = name if isinstance(name, str) else ""
             if text in ("", ".", "..") or not is_shown(text) or {*text} & {*"/\\"}:
                 raise scene_error(
                     self.file, f"names: {abbreviated(name)} is no folder's name; correct it"
                 )
-        return list(names)
+        return names
 
     def numbers(
         self, key: str, counts: int | Sequence[int], default: Sequence[float] | None = None
