@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import reduce
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -26,8 +27,14 @@ from devrf.apps.export.geometry import ExportSettings
 from devrf.apps.export.scene import export_scene
 from devrf.apps.web.pack import drawable, page
 from devrf.callbacks import DivergenceGuard, Previews, TrainingRecord
-from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, load_checkpoint, save_checkpoint
+from devrf.checkpoints.checkpoint import (
+    ChecksummedCheckpointIO,
+    load_checkpoint,
+    metadata_in,
+    save_checkpoint,
+)
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file, write_checkpoint_file
+from devrf.cli.resume import unfinished
 from devrf.engine.stage import Stage, fit
 from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
@@ -187,6 +194,18 @@ def test_numbers_that_nothing_can_be_computed_with_are_one_line(motion):
             if place[0] == "state_dict":  # as Lightning reads it, to go on
                 with pytest.raises(ValueError, match="a number that is not finite, or too large"):
                     ChecksummedCheckpointIO().load_checkpoint(motion)
+
+
+def test_settings_and_progress_are_looked_at_before_they_are_used(motion):
+    """Settings are compared, and printed as JSON; the place where a stage was left is printed."""
+    content = read_checkpoint_file(motion)
+    for value in ({1, 2}, torch.zeros(3)):
+        write_checkpoint_file(motion, changed(content, ("devrf", "training_config"), {"a": value}))
+        with pytest.raises(DevrfError, match="do not fit together .*training_config: a: "):
+            metadata_in(motion, read_checkpoint_file(motion))
+    write_checkpoint_file(motion, {**content, "progress": "half"})
+    with pytest.raises(DevrfError, match="its parts do not fit together"):
+        unfinished(SimpleNamespace(checkpoint=lambda: motion))
 
 
 def test_frames_of_other_times_do_not_fit(motion):

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from lightning import Trainer
 from lightning.fabric.plugins import CheckpointIO
-from pydantic import ValidationError
+from pydantic import JsonValue, ValidationError
 
 from devrf.checkpoints.checkpoint_file import (
     read_checkpoint_file,
@@ -80,9 +80,9 @@ class CheckpointMetadata:
     model: dict[str, Any]
     protocol: Line | None = None
     records: dict[str, TrainingFigures] = field(default_factory=dict)
-    training_config: dict[str, Any] = field(default_factory=dict)
-    earlier_configs: dict[str, dict[str, Any]] = field(default_factory=dict)
-    command: dict[str, Any] = field(default_factory=dict)
+    training_config: dict[str, JsonValue] = field(default_factory=dict)
+    earlier_configs: dict[str, dict[str, JsonValue]] = field(default_factory=dict)
+    command: dict[str, JsonValue] = field(default_factory=dict)
     complete: bool = True
     moves: bool | None = None
 

@@ -158,7 +158,9 @@ def remove_progress(folder: Path, stage: str) -> None:
 def unfinished(run: RunContext) -> str | None:
     """The progress of the run's last stage, and how to go on; None if it is finished."""
     path = run.checkpoint()
-    if (at := read_description(path).get("progress")) is None:
+    content = read_description(path)
+    metadata_in(path, content)  # or an error: a progress that cannot be
+    if (at := content.get("progress")) is None:
         return None
     stands = f"iteration {at['iteration']} of {at['total']} of the {at['stage']} stage"
     return f"{path}: {stands}; {command_line(to_type('hydra.run.dir', run.place))} goes on"
