@@ -186,3 +186,11 @@ def test_sizes_that_no_frame_has_are_refused_before_any_is_decoded(film, tmp_pat
         next(pictures(wide))
     with pytest.raises(DevrfError, match=r"0.png: not a readable image \(Image size \(1073741824"):
         next(pictures(photo.parent))
+
+
+def test_more_frames_than_a_command_can_name_are_read(film, monkeypatch):
+    """FFmpeg's command had a place for some 11,000."""
+    monkeypatch.setattr("devrf.scenes.footage._MOST_NAMED", 2)
+    read = [(k, number(picture)) for k, picture in frames_at(film("a.mp4"), [1, 3, 4])]
+    assert read == [(1, 1), (3, 3), (4, 4)]
+    assert not [*frames_at(film("a.mp4"), [])]

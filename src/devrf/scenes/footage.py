@@ -6,7 +6,7 @@ import logging
 import os
 import re
 import subprocess
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from io import BufferedReader
@@ -40,6 +40,8 @@ _REMEDY = "convert it, for example to H.264 in an mp4 file"
 # Pixels of a frame's longer side, and of a frame: of 8K films. FFmpeg holds several frames.
 _LONGEST = 2**14
 _LARGEST = 8192 * 4320
+# So many frames are named to FFmpeg, whose command has a largest length; of more all are decoded.
+_MOST_NAMED = 2000
 # A video that has fewer of its frames, and ends before this share of its duration, was cut off.
 _WHOLE = 0.95
 # Lines of FFmpeg's log: a frame, numbered from 0, and its time in microseconds; the file's stated
@@ -149,17 +151,23 @@ def _decoded(
     """Position, time in seconds since the first frame, and picture: of all frames, or of some."""
     header = footage_header(path)
     width, height = header.size
-    with _ffmpeg(path, header.size, wanted) as (frames, lines):
+    kept = None if wanted is None else {*wanted}
+    targets: Iterable[int] = count() if wanted is None else wanted
+    is_named = wanted is not None and len(wanted) <= _MOST_NAMED
+    if wanted is not None and not is_named:
+        targets = range(wanted[-1] + 1)
+    with _ffmpeg(path, header.size, wanted if is_named else None) as (frames, lines):
         frame_times = _frame_times(path, lines, header.rate)
         position, time = -1, 0.0
-        for target in count() if wanted is None else wanted:
+        for target in targets:
             picture = np.empty((height, width, 3), np.uint8)
             if frames.readinto(picture.data) < picture.nbytes:
                 break
             # FFmpeg has written a frame's line before the frame.
             while position < target:
                 position, time = next(frame_times)
-            yield position, time, picture
+            if kept is None or position in kept:
+                yield position, time, picture
         else:
             return
         *_, (position, time) = [(position, time), *frame_times]
