@@ -12,6 +12,9 @@ from typing import Any, NamedTuple
 
 import pytest
 
+from devrf.errors import DevrfError
+from devrf.loggers.trackers import WandbTracker
+
 BLOCK, HEADER = 32768, 7
 SWEEP = Path(__file__).parents[2] / "docs" / "wandb_sweep.yaml"
 
@@ -148,6 +151,14 @@ def test_wandb_holds_pictures_videos_and_tables(watched):
     assert frames["columns"][:4] == ["capture", "name", "time", "psnr"]
     assert [row[0] for row in frames["data"]] == ["static"] * 2 + ["dynamic"] * 3
     assert [row[0] for row in metrics["data"]][:2] == ["static", "dynamic"]
+
+
+@pytest.mark.parametrize("content", [b"\xff", bytes(1000)])
+def test_what_is_no_runs_id_is_one_line(tmp_path, content):
+    (tmp_path / "wandb").mkdir()
+    (tmp_path / "wandb" / "run_id").write_bytes(content)
+    with pytest.raises(DevrfError, match="wandb/run_id: no run's id"):
+        WandbTracker(tmp_path)
 
 
 def test_a_later_command_continues_the_run(watched):

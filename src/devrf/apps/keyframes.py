@@ -26,7 +26,7 @@ from devrf.geometry.cameras import Cameras
 from devrf.geometry.offset import NO_OFFSET, Offset, added, subtracted
 from devrf.scenes.files import Number, read_json
 from devrf.scenes.validation import check_poses, scene_error
-from devrf.system.files import write_json
+from devrf.system.files import LARGEST_RECORD, write_json
 from devrf.system.options import first_error
 
 
@@ -214,6 +214,8 @@ def read_path(file: Path, offset: Offset = NO_OFFSET) -> CameraPath:
 
 def path_from(content: bytes, name: str, offset: Offset = NO_OFFSET) -> CameraPath:
     """As :func:`read_path`, from the ``content`` of a file called ``name``."""
+    if len(content) > LARGEST_RECORD:
+        raise scene_error(name, f"larger than {LARGEST_RECORD // 2**20} MiB; expected a path")
     try:
         return _path(_PathFile.model_validate_json(content), name, offset)
     except ValidationError as error:

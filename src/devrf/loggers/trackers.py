@@ -15,6 +15,7 @@ from torch import Tensor
 
 from devrf.errors import DevrfError, did_you_mean
 from devrf.pictures.images import to_bytes
+from devrf.system.files import read_record
 
 if TYPE_CHECKING:
     from wandb.sdk.wandb_run import Run
@@ -127,7 +128,12 @@ class WandbTracker(WandbLogger):
         """
         self._folder = Path(save_dir).resolve()
         self._id_file = self._folder / "wandb" / "run_id"
-        kept = self._id_file.read_text().strip() if self._id_file.is_file() else None
+        kept = None
+        if self._id_file.is_file():
+            try:
+                kept = read_record(self._id_file, LONGEST_NAME).decode().strip()
+            except ValueError:
+                raise DevrfError(f"{self._id_file}: no run's id; remove it") from None
         mode = "offline" if offline and SWEEP not in os.environ else "online"
         settings = init | {
             key: value if value is not None or os.environ.get(variable) else usual
