@@ -74,6 +74,8 @@ class PanopticReader(InwardReader):
         fn, *others = ([len(taken) for taken in lists] for lists in (meta.fn, meta.k, meta.w2c))
         if others != [fn, fn]:
             raise scene_error(file, "fn, k and w2c do not list as many images; correct them")
+        if sum(fn) > MOST_IMAGES:
+            raise scene_error(file, f"lists more than {MOST_IMAGES} images; leave some out")
         last = max(len(fn) - 1, 1)
         shots = [
             Shot(
