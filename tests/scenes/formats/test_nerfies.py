@@ -161,6 +161,11 @@ CAMERA = "camera/000004.json"
     ("file", "change", "said"),
     [
         ("metadata.json", lambda c: c[IDS[5]].pop("warp_id"), "image '000005' has no warp_id"),
+        (
+            "metadata.json",
+            lambda c: c.update(dict.fromkeys(map(str, range(50_001)), {})),
+            "at most",
+        ),
         ("scene.json", lambda c: c.pop("near"), "near: is missing"),
         (CAMERA, lambda c: c.update(focal_length=0), "focal_length: expected more than 0"),
         (CAMERA, lambda c: c.update(orientation=[[1, 0, 0]] * 3), "orientation or position"),

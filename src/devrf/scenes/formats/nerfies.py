@@ -18,6 +18,7 @@ from devrf.geometry.cameras import Distortion
 from devrf.geometry.offset import offset_of, subtracted
 from devrf.scenes.bounds import FALLBACK_BOUND_SCALE, axes_do_meet, box_of_frusta
 from devrf.scenes.files import (
+    MOST_IMAGES,
     Ids,
     Number,
     Positive,
@@ -223,7 +224,7 @@ class _Moment(BaseModel):
     warp_id: Number | None = None
 
 
-_Moments = RootModel[dict[str, _Moment]]
+_Moments = RootModel[Annotated[dict[str, _Moment], Field(max_length=MOST_IMAGES)]]
 
 
 @dataclass(frozen=True)
