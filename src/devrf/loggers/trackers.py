@@ -131,7 +131,7 @@ class WandbTracker(WandbLogger):
         kept = None
         if self._id_file.is_file():
             try:
-                kept = read_record(self._id_file, LONGEST_NAME).decode().strip()
+                kept = read_record(self._id_file, LONGEST_NAME + 1).decode().strip()
             except ValueError:
                 raise DevrfError(f"{self._id_file}: no run's id; remove it") from None
         mode = "offline" if offline and SWEEP not in os.environ else "online"
