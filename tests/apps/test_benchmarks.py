@@ -10,7 +10,7 @@ import pytest
 from devrf.apps import benchmarks
 from devrf.apps.benchmarks import followed
 from devrf.apps.records import data_record
-from devrf.data.recorded import READERS, RecordedDataModule
+from devrf.data.recorded import READERS, InwardFacingDataModule
 from devrf.scenes.exchange import write_for_others
 
 TINY = """
@@ -79,7 +79,7 @@ def test_a_readers_options_count(file, tiny_scene, tmp_path):
     file.write_text(TINY)
     write_for_others(tiny_scene, tmp_path / "other", "dnerf")
     for options, expected in (({}, "tiny 3"), ({"frames": 2}, None), ({"name": "robot"}, None)):
-        module = RecordedDataModule(tmp_path / "other", **options)
+        module = InwardFacingDataModule(tmp_path / "other", **options)
         assert followed(module.scene, module, data_record(module.scene), "vgg") == expected
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
-from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,7 +11,12 @@ import pytest
 import torch
 
 from devrf.data.priors import without_priors
-from devrf.data.recorded import READERS, RecordedDataModule
+from devrf.data.recorded import (
+    READERS,
+    ForwardFacingDataModule,
+    InwardFacingDataModule,
+    RecordedDataModule,
+)
 from devrf.data.rendered import ProceduralDataModule
 from devrf.errors import DevrfError
 from devrf.scenes.export import export
@@ -130,13 +134,13 @@ def test_an_embedded_scene_may_come_without_flow():
 def test_options_are_checked_before_anything_is_read():
     inward = "'auto', 'files', 'dis', 'raft' or 'none'"
     with pytest.raises(DevrfError, match=f"data.flow: expected {inward}, not 'farneback'"):
-        RecordedDataModule("nowhere", flow="farneback")
+        InwardFacingDataModule("nowhere", flow="farneback")
     with pytest.raises(DevrfError, match="data.flow: expected 'auto', 'dis', 'raft' or 'none'"):
-        RecordedDataModule("nowhere", reader=READERS["nerfies"], flow="files")
+        RecordedDataModule(READERS["nerfies"], "nowhere", flow="files")
     with pytest.raises(DevrfError, match="data.rot: no such option"):
-        RecordedDataModule("nowhere", reader=READERS["forward"], rot=3)
+        ForwardFacingDataModule("nowhere", rot=3)
     with pytest.raises(DevrfError, match="data.root: is missing"):
-        RecordedDataModule()
+        InwardFacingDataModule()
 
 
 @pytest.mark.parametrize("facing", ["inward", "forward"])
@@ -146,7 +150,7 @@ def test_a_scene_written_to_disk_is_read_with_its_flow(facing, tiny_scene, tmp_p
     scene = tiny_scene if facing == "inward" else toy.scene
     assert scene.kind == facing
     export(scene, tmp_path / "toy")
-    module = partial(RecordedDataModule, reader=READERS[facing])
+    module = InwardFacingDataModule if facing == "inward" else ForwardFacingDataModule
     read = module(tmp_path / "toy").scene
     ours, flow = scene.dynamic.train.flow, read.dynamic.train.flow
     assert read.name == "toy" and ours is not None and flow is not None
@@ -189,7 +193,7 @@ def test_forward_flow_is_read_from_files_else_estimated_beside_the_backward_one(
             number = int(path.name[:3]) - 2  # two views
             path.with_name(f"{number:03d}_fwd.npz").write_bytes(path.read_bytes())
     source = "auto" if written else "dis"
-    module = RecordedDataModule(folder, flow=source, flow_cache=tmp_path / "flow.npz")
+    module = InwardFacingDataModule(folder, flow=source, flow_cache=tmp_path / "flow.npz")
     assert module.scene.dynamic.train.forward_flow is None
     module.provide(("forward_flow",))
     views = module.scene.dynamic.train

@@ -175,11 +175,11 @@ def test_what_is_no_film_is_left_alone(film, tiny_scene):
 
 def test_a_film_from_disk_is_made_equal_as_data_exposure_says(film, tmp_path: Path):
     export(filmed(film), tmp_path / "film")
-    module = RecordedDataModule(tmp_path / "film", reader=NerfstudioReader)
+    module = RecordedDataModule(NerfstudioReader, tmp_path / "film")
     assert module.scene.dynamic.test.exposure_mask is not None
-    plain = RecordedDataModule(tmp_path / "film", reader=NerfstudioReader, exposure="none")
+    plain = RecordedDataModule(NerfstudioReader, tmp_path / "film", exposure="none")
     assert plain.scene.dynamic.test.exposure_mask is None
-    fewer = RecordedDataModule(tmp_path / "film", reader=NerfstudioReader, frames=9)
+    fewer = RecordedDataModule(NerfstudioReader, tmp_path / "film", frames=9)
     train, rest = fewer.scene.dynamic.train, fewer.scene.static.train
     assert (len(train), len(rest)) == (9, 18) and fewer.scene.dynamic.test.exposure_mask is not None
     among = [rest.names.index(name) for name in train.names]

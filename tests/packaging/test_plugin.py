@@ -71,7 +71,7 @@ def test_a_program_that_names_the_folder_has_devrfs_groups(tmp_path: Path) -> No
     app = app.replace("run: {", f'searchpath: ["file://{config_folder()}"], run: {{')
     files = {"app.yaml": app, "local/mine.yaml": "name: theirs\n"}
     config = run(tmp_path, files, "scene.root=/scenes/suzanne")
-    assert config["scene"]["_target_"] == "devrf.data.recorded.RecordedDataModule"
+    assert config["scene"]["_target_"] == "devrf.data.recorded.InwardFacingDataModule"
     assert config["devrf"]["schedule"]["canonical"]["search_side"] == 48
     assert config["devrf"]["loss"]["deformation"]["elastic"] == 0.05
     assert {*config} == {"scene", "devrf", "local"}

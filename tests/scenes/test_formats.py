@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from devrf.data.recorded import RecordedDataModule
+from devrf.data.recorded import InwardFacingDataModule
 from devrf.errors import DevrfError
 from devrf.scenes.formats import check_choice, recognise
 
@@ -118,7 +118,7 @@ def test_the_line_says_what_to_type(tmp_path: Path, files, root, typed) -> None:
 def test_a_wrong_reader_is_answered_with_the_right_one(tmp_path: Path) -> None:
     touch(tmp_path, MODEL)
     with pytest.raises(DevrfError, match="the files of COLMAP, .*; write data=colmap, or leave"):
-        _ = RecordedDataModule(tmp_path).scene
+        _ = InwardFacingDataModule(tmp_path).scene
 
     with pytest.raises(DevrfError, match="nowhere: no such folder"):
         recognise(tmp_path / "nowhere")

@@ -42,10 +42,10 @@ def test_a_layout_is_read_learned_and_scored(layout, tiny_scene, trainer, tmp_pa
     root = tmp_path / "scene"
     if layout == "nerf_ds":
         write_nerf_ds(tiny_scene, root)
-        module = RecordedDataModule(root, reader=READERS["nerfies"])
+        module = RecordedDataModule(READERS["nerfies"], root)
     else:
         write_scene(layout, tiny_scene, root)
-        module = RecordedDataModule(root, reader=READERS[layout], masks="alpha")
+        module = RecordedDataModule(READERS[layout], root, masks="alpha")
     schedule = RaySchedule(
         iterations=10, rays=32, iterations_per_step=5, learning_rate=1e-2, final_learning_rate=1e-3
     )

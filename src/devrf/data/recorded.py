@@ -44,14 +44,12 @@ READERS: dict[str, type[SceneReader]] = {
 class RecordedDataModule(SceneDataModule):
     """A scene that is read from disk when it is first needed."""
 
-    def __init__(
-        self, *where: Any, reader: Callable[..., SceneReader] = BlenderReader, **options: Any
-    ) -> None:
-        """Choose the scene, the reader and its options.
+    def __init__(self, reader: Callable[..., SceneReader], *where: Any, **options: Any) -> None:
+        """Choose the reader and its options.
 
         Args:
-            where: the scene's folder.
             reader: one of :data:`READERS`, or another.
+            where: the scene's folder.
             options: the reader's.
         """
         super().__init__()
@@ -95,3 +93,23 @@ class RecordedDataModule(SceneDataModule):
         """The file of estimated flow."""
         cache = self.reader.flow_cache
         return None if cache is None else Path(cache)
+
+
+class InwardFacingDataModule(RecordedDataModule):
+    """A scene that cameras look in at, in DeVRF's published Blender layout or D-NeRF's."""
+
+    def __init__(
+        self, *where: Any, reader: Callable[..., SceneReader] = BlenderReader, **options: Any
+    ) -> None:
+        """Choose the scene and the options of its reader; see :class:`BlenderReader`."""
+        super().__init__(reader, *where, **options)
+
+
+class ForwardFacingDataModule(RecordedDataModule):
+    """A scene that cameras face from one side, in DeVRF's published layout or LLFF's."""
+
+    def __init__(
+        self, *where: Any, reader: Callable[..., SceneReader] = LlffReader, **options: Any
+    ) -> None:
+        """Choose the scene and the options of its reader; see :class:`LlffReader`."""
+        super().__init__(reader, *where, **options)

@@ -99,7 +99,7 @@ def capture(footage, structure, tmp_path):
         walk, views = footage
         usual = {"static": walk, "views": views, "offsets": [0, 0, 0]}
         scene_from_footage(CaptureSettings(into=tmp_path / "scene", **{**usual, **settings}))
-        return RecordedDataModule(tmp_path / "scene", reader=NerfstudioReader, flow="none").scene
+        return RecordedDataModule(NerfstudioReader, tmp_path / "scene", flow="none").scene
 
     return run
 
