@@ -108,6 +108,10 @@ def test_each_row_is_a_tile_beside_the_truth_at_the_same_time(runs, ran, monkeyp
         tiles = [picture[46, 24], picture[46, 76], picture[46, 128]]
         for found, wanted in zip(tiles, (TRUTH, first, blue), strict=True):
             assert np.abs(found.astype(int) - wanted).max() < 24
+    # Of large pictures fewer are read.
+    monkeypatch.setattr("devrf.apps.report.write.MOST_PIXELS", 64 * 3 * 64)
+    write_report(ReportSettings(runs))
+    assert len(iio.imread(runs / "report" / "videos" / "side_by_side_robot.mp4")) == 1
 
 
 def test_a_film_that_cannot_be_read_is_left_out(runs, ran, caplog):

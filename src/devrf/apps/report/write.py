@@ -28,9 +28,10 @@ log = logging.getLogger(__name__)
 
 # Pictures a second of the videos that show rows side by side.
 FPS = 10
-# Frames of a run's video that are read, and pixels of each, at most.
+# Frames of a run's video that are read, pixels of each, and of all, at most.
 LONGEST = 2000
 LARGEST = 8192 * 4320
+MOST_PIXELS = 2**31
 # Columns of each run's video of the held-out views, from the left: truth, rendering, depth.
 COLUMNS = 3
 TRUTH = 0
@@ -116,14 +117,16 @@ def _write_videos(table: Table, folder: Path) -> dict[str, str]:
 
 
 def _frame_count(path: Path) -> int:
-    """The number of readable frames of a video, LONGEST at most; a line in the log for none."""
+    """The number of frames of a video to read; 0, with a line in the log, for none."""
     try:
         with path.open("rb") as file:
             if file.read(8)[4:] != b"ftyp":  # FFmpeg would follow what a list of files says
                 raise ValueError
-        if math.prod(iio.immeta(path)["size"]) > LARGEST:
+        size = math.prod(iio.immeta(path)["size"])
+        if size > LARGEST:
             raise ValueError
-        return sum(1 for _ in islice(iio.imiter(path), LONGEST))
+        most = min(LONGEST, MOST_PIXELS // size)
+        return sum(1 for _ in islice(iio.imiter(path), most))
     except Exception:  # what decoders raise depends on the damage
         log.warning(SKIPPED, path)
         return 0
