@@ -21,7 +21,7 @@ from PIL import Image
 from torch import Tensor
 
 from devrf.apps.camera_paths import orbit
-from devrf.apps.still import still
+from devrf.apps.still import sized, still
 from devrf.apps.video import VideoSettings
 from devrf.checkpoints.checkpoint import load_checkpoint
 from devrf.geometry.cameras import Cameras
@@ -47,9 +47,9 @@ def scene_columns(run: Path) -> tuple[list[list[Tensor]], list[str]]:
     data, model = opened(run)
     scene, recipe = data.scene, data.recipe
     shape, film = recipe.model(), VideoSettings(frames=8, height=HEIGHT)
-    camera = film.sized(scene.dynamic.test.cameras[[0]])
+    camera = sized(scene.dynamic.test.cameras[[0]], HEIGHT)
     middle = torch.tensor(model.box.middle)
-    around = orbit(film.sized(scene.static.train.cameras), middle, film)
+    around = orbit(sized(scene.static.train.cameras, HEIGHT), middle, film)
     filming = Filming(shape, extent(shape).reach, recipe.supersample, recipe.light)
     shots: list[tuple[Cameras, float, str]] = [
         *((camera, time, f"{scene.name}, t = {time:g}") for time in (0.0, 0.5, 1.0)),

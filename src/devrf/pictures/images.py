@@ -105,16 +105,17 @@ def image_grid(
     rows: Sequence[Sequence[Tensor]],
     headings: Sequence[str] = (),
     labels: Sequence[Sequence[str]] = (),
+    text: int | None = None,
 ) -> Tensor:
     """A picture (H', W', 3), uint8, of images (H, W, 3) in [0, 1], and fitted text.
 
     Images of several sizes are in the middle of tiles for the largest. ``headings`` stand above
-    each column, ``labels`` are lines left of each row. Text is a twentieth as high as the images,
-    within limits.
+    each column, ``labels`` are lines left of each row. ``text`` is its height in pixels; None: a
+    twentieth of that of the images, within limits.
     """
     height = max(image.shape[0] for row in rows for image in row)
     width = max(image.shape[1] for row in rows for image in row)
-    size = min(max(round(TEXT * height), SMALLEST_TEXT), LARGEST_TEXT)
+    size = text or min(max(round(TEXT * height), SMALLEST_TEXT), LARGEST_TEXT)
     gap = size // 3 + 1
     widths = (font(size).getlength(line) for label in labels for line in label)
     left = round(max(widths, default=-3 * gap)) + 3 * gap
