@@ -246,7 +246,7 @@ class Visits:
 
     @property
     def planned_events(self) -> Mapping[str, int]:
-        """Number of levels, level_starts and visits."""
+        """Numbers of levels, growths of the grid, and visits."""
         return self.schedule.events(self.frames)
 
     def phase(self, iteration: int) -> DeformationPhase:
