@@ -12,7 +12,7 @@ from annotated_types import Ge, Lt, MinLen
 from pydantic.dataclasses import dataclass
 
 from devrf.errors import DevrfError
-from devrf.system.options import Count, Options, expectation
+from devrf.system.options import Count, Options, abbreviated, expectation
 
 
 @dataclass(frozen=True)
@@ -66,3 +66,8 @@ def test_pydantic_speaks_as_the_project_does() -> None:
     empty = "List should have at least 1 item after validation, not 0"
     assert expectation([empty], "[]") == "expected at least 1 item, not 0"
     assert expectation(["Odd input"], "3") == "odd input, not 3"
+
+
+def test_a_value_is_shown_in_few_words() -> None:
+    assert abbreviated([[[1]], 10**400]) == "[[[...]], a large number]"
+    assert len(abbreviated("x" * 10**6)) <= 60

@@ -36,14 +36,13 @@ WORDS = {
 
 
 class _Brief(reprlib.Repr):
-    maxlevel = 2
-
     def repr_int(self, x: int, level: int) -> str:
         """A number, but for those that Python refuses to write in digits."""
         return super().repr_int(x, level) if x.bit_length() < 1024 else "a large number"
 
 
 _brief = _Brief()
+_brief.maxlevel = 2
 
 
 def one_line(where: object, what: str, typed: str = "") -> str:
