@@ -144,8 +144,9 @@ def test_a_search_maximises_the_objective(devrf, tmp_path, tiny):
 
 def test_a_folder_without_the_record_of_a_sweep_is_refused(devrf, tmp_path):
     outcome = devrf("stage=still", "hydra.sweep.dir=elsewhere")
-    said = "no sweep is typed (-m); without one it names the folder of a sweep, which has multirun"
-    assert (outcome.status, outcome.err) == (2, f"devrf: hydra.sweep.dir: {said}.yaml\n")
+    said = "no sweep is typed (-m); without one, and without experiment=, it names the folder of a"
+    said = f"devrf: hydra.sweep.dir: {said} sweep, which has multirun.yaml\n"
+    assert (outcome.status, outcome.err) == (2, said)
     assert not list(tmp_path.iterdir())
 
 

@@ -64,8 +64,8 @@ class FolderLock(Callback):
             typed = [word.partition("=")[0] for word in config.hydra.overrides.hydra]
             if "hydra.sweep.dir" in typed and config.stage != "report":
                 raise DevrfError(
-                    "hydra.sweep.dir: no sweep is typed (-m); without one it names the folder of a "
-                    f"sweep, which has {SWEEP_RECORD}"
+                    "hydra.sweep.dir: no sweep is typed (-m); without one, and without "
+                    f"experiment=, it names the folder of a sweep, which has {SWEEP_RECORD}"
                 )
             # A report's default folder is a name in the folder of the runs.
             named = config.stage == "report" and folder == Path(str(config.report.runs)) / "report"
