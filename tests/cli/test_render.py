@@ -157,10 +157,10 @@ def test_a_run_is_shown_without_its_scene(devrf, tmp_path, tiny_data, short):
     outcome = devrf("stage=evaluate", "hydra.run.dir=copy")
     assert outcome.status == 2 and outcome.err.count("\n") == 1
     assert all("walker: no such folder" in text for text in (said["render"], outcome.err))
-    videos = tmp_path / "copy" / "videos"
-    assert [video.name for video in videos.iterdir()] == ["orbit.mp4"]
+    videos, note = tmp_path / "copy" / "videos", tmp_path / "copy" / ".devrf" / "done.json"
+    assert [video.name for video in videos.iterdir()] == ["orbit.mp4"] and not note.exists()
     assert devrf("stage=render", "hydra.run.dir=copy", "data.root=moved").status == 0
-    assert (videos / "held_out.mp4").is_file()
+    assert (videos / "held_out.mp4").is_file() and note.exists()
 
 
 # The page in a browser

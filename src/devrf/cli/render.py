@@ -54,13 +54,12 @@ CACHED = 6
 MASKS = Path("images", "motion_masks")
 
 
-def render(run: RunContext) -> None:
-    """Write the videos that ``video`` asks for."""
+def render(run: RunContext) -> bool:
+    """Write the videos that ``video`` asks for; False if one is left out for lack of images."""
     settings: VideoSettings = instantiate(run.config.video)
     model, viewpoints = _learned(run)
     if settings.motion_masks:
-        _write_motion_masks(run, model, viewpoints)
-        return
+        return _write_motion_masks(run, model, viewpoints)
     held_out = None
     without = "held_out.mp4, which shows its images, is left out"
     if settings.path is None and (scene := _with_images(run, without)) is not None:
@@ -68,13 +67,17 @@ def render(run: RunContext) -> None:
     renderer = Renderer(model, half=settings.half)
     for video in videos(renderer, viewpoints, settings, held_out):
         write_video(run, video)
+    return settings.path is not None or held_out is not None
 
 
-def _write_motion_masks(run: RunContext, model: Renderable, viewpoints: Viewpoints) -> None:
-    """Write a PNG for each held-out image, white where the model shows something that moves."""
+def _write_motion_masks(run: RunContext, model: Renderable, viewpoints: Viewpoints) -> bool:
+    """Write a PNG for each held-out image, white where the model shows something that moves.
+
+    False if there are no images.
+    """
     scene = _with_images(run, "masks of its held-out images are left out")
     if scene is None:
-        return
+        return False
     views, renderer, folder = scene.dynamic.test, Renderer(model), run.folder / MASKS
     size, times = scene_radius(model, viewpoints.static), (0.0, *viewpoints.clock.times)
     for index in followed(range(len(views)), len(views), "motion masks"):
@@ -87,6 +90,7 @@ def _write_motion_masks(run: RunContext, model: Renderable, viewpoints: Viewpoin
         name = picture_name(views, index)
         write_image(folder / name, mask[..., None].expand(-1, -1, 3).float())
     log.info("%d motion masks written to %s", len(views), folder)
+    return True
 
 
 def write_video(run: RunContext, video: Video) -> None:

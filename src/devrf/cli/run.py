@@ -43,6 +43,7 @@ from devrf.system.process import importing
 
 log = logging.getLogger(__name__)
 
+# Does its work; returns False if something was left out that another time may be there.
 Step = Callable[[RunContext], object]
 Names = tuple[str, ...]
 
@@ -207,10 +208,11 @@ def _run_step(run: RunContext, name: str, step: Step) -> None:
     rays = f"schedule.{name}.rays"
     has_rays = OmegaConf.select(run.config, rays) is not None
     with shortage_in_words(name, run.device, rays if has_rays else None):
-        step(run)
+        whole = step(run)
     # Leftovers of a step, as a trainer held in circles, would count as the next step's memory.
     free_cache(run.device)
-    note_done(run, name)
+    if whole is not False:
+        note_done(run, name)
     run.step_began = time.perf_counter()
 
 
