@@ -16,10 +16,11 @@ import torch
 import trimesh
 
 from devrf.apps.keyframes import CameraPath, Keyframe, write_path
-from devrf.apps.viewer.page import is_current
 from devrf.checkpoints.checkpoint import load_checkpoint
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file, write_checkpoint_file
 from devrf.checkpoints.file_metadata import digest_of, latest_checkpoint
+from devrf.cli.restore_config import parsed
+from devrf.cli.view import serves_page
 
 
 @pytest.fixture
@@ -203,44 +204,51 @@ def test_it_serves_until_a_signal_and_ends_well(of_run, tmp_path, port):
     assert {path.name for path in (tmp_path / "run").iterdir()} <= {"run.log", "export"}
 
 
-def test_a_page_that_the_run_has_written_is_served_as_it_is(
+def test_the_page_of_a_run_is_served_before_anything_is_read(
     devrf, trained, tmp_path, port, monkeypatch
 ):
     shutil.copytree(trained[0], tmp_path / "run")
 
-    def write(*arguments):
+    def read(*arguments):
         raise AssertionError("the page was there already")
 
-    monkeypatch.setattr("devrf.cli.render.page", write)
+    monkeypatch.setattr("devrf.cli.run.run_stage", read)
+    monkeypatch.setattr("devrf.checkpoints.checkpoint.metadata_of", read)
     sender = ended_by(signal.SIGINT, port)
     outcome = devrf("stage=view", "hydra.run.dir=run", f"viewer.port={port}")
     sender.join()
     assert (outcome.status, outcome.err) == (0, "")
     assert "the viewer has ended" in outcome.out
+    outcome = devrf("stage=view", "hydra.run.dir=run", "viewer.port=page")
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert outcome.err.startswith("devrf: viewer.port: expected a valid integer")
 
 
 def test_a_page_is_that_of_the_last_checkpoint(trained, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(trained[0], run)
-    assert is_current(run)
+    typed = parsed(["stage=view", "hydra.run.dir=run", "viewer.port=8123"])
+    assert serves_page(typed, run)
+    assert not serves_page([*typed, *parsed(["viewer.renderer=server"])], run)
+    assert not serves_page([*typed, *parsed(["data=flower"])], run)
     rest = run / "checkpoints" / "canonical.ckpt"
     os.utime(rest)  # as a copy of the folder may do
-    assert is_current(run) and latest_checkpoint(run).name == "deformation.ckpt"
+    assert serves_page(typed, run) and latest_checkpoint(run).name == "deformation.ckpt"
     content = read_checkpoint_file(rest)
     write_checkpoint_file(rest, {**content, "again": 1})  # learned since
-    assert not is_current(run) and latest_checkpoint(run) == rest
+    assert not serves_page(typed, run) and latest_checkpoint(run) == rest
     write_checkpoint_file(rest, content)
-    assert is_current(run)
+    assert serves_page(typed, run)
     progress = run / "checkpoints" / "deformation-progress-3.ckpt"
     (run / "checkpoints" / "deformation.ckpt").rename(progress)  # it does not say how far it is
-    assert not is_current(run)
+    assert not serves_page(typed, run)
     progress.rename(run / "checkpoints" / "deformation.ckpt")
-    assert is_current(run)
+    assert serves_page(typed, run)
     page = run / "export" / "scene.html"
     page.write_text(page.read_text("utf-8").replace("const BUDGET", "const  BUDGET"), "utf-8")
-    assert not is_current(run)  # of another version
+    assert not serves_page(typed, run)  # of another version
     shutil.rmtree(run / "export" / "pictures")
-    assert not is_current(run)
+    assert not serves_page(typed, run)
 
 
 def test_the_page_of_a_part_is_not_served_as_the_scene(trained, tmp_path, devrf):

@@ -32,6 +32,7 @@ from devrf.cli.restore_config import (
     value,
     values,
 )
+from devrf.cli.view import serves_page
 from devrf.errors import DevrfError, did_you_mean
 from devrf.system.override import literal, without_reference
 from devrf.system.process import importing
@@ -96,6 +97,9 @@ def completed(arguments: Sequence[str]) -> Applied:
                 f"{override.input_line}: no such group; rehearse=true takes every step in minutes, "
                 "+trainer.fast_dev_run=true a step of each stage"
             )
+    run = value(typed, "hydra.run.dir")
+    if run is not None and serves_page(typed, Path(run)):
+        return Applied([*flags, *texts])
     before = of_named_run(typed, options.multirun)
     overrides = parsed([*before.words, *texts])
     by_scene = _of_scenes(typed, overrides, options.config_dir)

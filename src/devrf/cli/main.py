@@ -21,10 +21,12 @@ from omegaconf import DictConfig
 
 import devrf
 from devrf.cli.complete import commands, completed
-from devrf.cli.config import config_folder, in_sweep
+from devrf.cli.config import config_folder, in_sweep, overrides
 from devrf.cli.messages import report_user_errors
+from devrf.cli.restore_config import parsed
 from devrf.cli.run_folder import working_in
 from devrf.cli.sweep import naming_failures, record_failure
+from devrf.cli.view import serve_page, serves_page
 from devrf.errors import expect
 from devrf.system.files import utf8_path
 from devrf.system.override import without_reference
@@ -82,6 +84,9 @@ def run(config: DictConfig) -> float | None:
     with guard, working_in(folder, config):
         for line in remarks:
             log.info("%s", line)
+        if serves_page(parsed(overrides()), folder):
+            serve_page(config, folder)
+            return None
         chosen = f"{folder}, which hydra.run.dir=FOLDER chooses"
         expect(config.output_dir == str(folder), "output_dir", chosen, config.output_dir)
         with importing():

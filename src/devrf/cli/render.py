@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,6 +23,7 @@ from devrf.checkpoints.file_metadata import digest_of
 from devrf.cli.context import RunContext
 from devrf.cli.restore_config import root
 from devrf.cli.resume import unfinished
+from devrf.cli.view import serve
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
 from devrf.evaluation.predictions import picture_name
@@ -36,7 +36,6 @@ from devrf.rendering.tracks import moving_pixels
 from devrf.scenes.scene import Scene
 from devrf.system.files import refuse_links, write_text
 from devrf.system.memory import free_cache
-from devrf.system.process import handle_signals
 from devrf.system.progress import followed
 
 if TYPE_CHECKING:
@@ -134,8 +133,7 @@ def view(run: RunContext) -> None:
         parts = model.moving_and_still(scene_radius(model, viewpoints.static))
         renderers = {name: Renderer(part, times=CACHED) for name, part in parts.items()}
         server.present(Drawing(Renderer(model, times=CACHED), background, renderers))
-    with closing(server), handle_signals(lambda _: server.stop()):
-        server.serve()
+    serve(server)
 
 
 def export(run: RunContext) -> None:

@@ -1,7 +1,7 @@
 """Serves the page of a scene, which a browser draws by itself, and its cameras' pictures.
 
 A run's ``export/`` has both: ``scene.html``, which says which checkpoint it shows, and
-``pictures/``. A page that shows the run's last checkpoint is not written again.
+``pictures/``. So a page that shows the run's last checkpoint is served before torch has loaded.
 """
 
 from __future__ import annotations
