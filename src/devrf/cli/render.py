@@ -143,7 +143,7 @@ def export(run: RunContext) -> None:
     if settings.part != "all":
         parts = model.moving_and_still(scene_radius(model, viewpoints.static))
         if not parts:
-            unknown = f"nothing moves, or method={model.name} cannot tell what does"
+            unknown = f"nothing moves, or all does, or method={model.name} cannot tell what does"
             raise DevrfError(f"export.part: {unknown}; give export.part=all")
         model = parts[settings.part]
     folder = run.folder / "export" if settings.into is None else Path(settings.into)

@@ -97,7 +97,7 @@ class Renderable(StoredClass, nn.Module, ABC):
     def moving_and_still(self, size: float) -> Mapping[str, Renderable]:
         """What is ``moving`` in a scene of radius ``size`` (docs/stages.md#moving), what ``still``.
 
-        They share this scene's memory. Empty: nothing moves, or the method cannot tell them apart.
+        They share this scene's memory. Empty: nothing moves, all does, or the method cannot tell.
         """
         return {}
 

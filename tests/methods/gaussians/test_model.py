@@ -201,3 +201,5 @@ def test_what_moves_is_apart_from_what_stays(monkeypatch: pytest.MonkeyPatch) ->
     gone = parts["moving"].gaussians_at(0.5).means
     torch.testing.assert_close(gone, torch.tensor([[1.0, 0, 0.1]]))
     assert not model.moving_and_still(10.0)  # where a tenth is little
+    model.cloud.keep(torch.tensor([False, True, False]))
+    assert not model.moving_and_still(1.0)  # nothing stays

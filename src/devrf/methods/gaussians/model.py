@@ -172,8 +172,9 @@ class DeformableGaussians(ImageTrainable):
     def moving_and_still(self, size: float) -> dict[str, Renderable]:
         """The scene with some of its Gaussians alone; the network is shared."""
         moves = moving((self.gaussians_at(time).means for time in self.clock.times), size)
+        apart = bool(moves.any()) and not bool(moves.all())
         parts: dict[str, Renderable] = {}
-        for name, rows in (("moving", moves), ("still", ~moves)) if bool(moves.any()) else ():
+        for name, rows in (("moving", moves), ("still", ~moves)) if apart else ():
             part = copy.deepcopy(self, {id(module): module for module in (self.trunk, self.last)})
             part.cloud.keep(rows)
             parts[name] = part
