@@ -67,7 +67,7 @@ def test_scores_of_what_moves_have_a_column_and_masks_of_two_rules_a_note(table,
     assert "no comparison" not in "".join(table().notes)
     ran("third", ablation="c2f", scores={"psnr_moving": 19.0}, motion_masks="given: /masks")
     notes = "".join(table().notes)
-    differ = "run.motion_masks is exact; given: /masks."
+    differ = "the runs differ in motion masks (exact; given: /masks)."
     assert f"robot: no comparison of PSNR moving: {differ}" in notes
     assert {cell.rank for cell in table().blocks[0].cells["PSNR moving ↑"]} == {0}
     ran("fourth", scores={"psnr_moving": 23.25}, motion_masks="given: /masks")
@@ -119,7 +119,7 @@ def test_a_block_by_hand(table, ran):
     found = table()
     # Of several devices nothing is ranked that depends on them.
     assert not any(ranks(found.blocks[0], TIME))
-    differ = "run.device is a processor; another processor."
+    differ = "the runs differ in device (a processor; another processor)."
     assert f"robot: no comparison of Time: {differ}" in found.notes
 
 
@@ -189,7 +189,7 @@ def test_rows_of_different_benchmarks_are_no_rows_of_one_table(table, ran):
     assert "Benchmark embedded 1: robot. Benchmark devrf 1: lego." in words
     ran("c", scores={"psnr": 20.0})
     assert ranks(table().blocks[0], PSNR) == [0, 0]
-    differ = "run.benchmark is embedded 1; none."
+    differ = "the runs differ in benchmark (embedded 1; none)."
     assert f"robot: no comparison of PSNR, SSIM: {differ}" in table().notes
     ran("d", benchmark="embedded 2", scores={"psnr": 30.0})
     with pytest.raises(DevrfError, match=r"^report.runs: robot .* 1 \(a\) and .* 2 \(d\)"):

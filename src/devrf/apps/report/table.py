@@ -229,7 +229,8 @@ def _incomparable(runs: pd.DataFrame, columns: Sequence[Column]) -> list[str]:
         for key in dict.fromkeys(column.alike for column in unmarked):
             titles = ", ".join(column.title for column in unmarked if column.alike == key)
             differ = "; ".join(same[key].fillna("none").map(str).unique())
-            text = f"no comparison of {titles}: {key} is {differ}."
+            what = key.removeprefix("run.").replace("_", " ")
+            text = f"no comparison of {titles}: the runs differ in {what} ({differ})."
             scenes.setdefault(text, []).append(str(scene))
     return [f"{', '.join(names)}: {text}" for text, names in scenes.items()]
 
