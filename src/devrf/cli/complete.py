@@ -134,7 +134,9 @@ def _of_scenes(
         return Applied()
     readers: list[str | None] = [*values(overrides, "data")]
     readers = readers or (_of_experiments(overrides, config_dir) if roots else [])
-    scenes = [_defaults_of_scene(*scene, overrides) for scene in product(readers, roots)]
+    scenes = [
+        _defaults_of_scene(reader, root, overrides) for reader, root in product(readers, roots)
+    ]
     if any(scene.words != scenes[0].words for scene in scenes):
         needed = " and ".join(dict.fromkeys(" ".join(s.words) or "neither" for s in scenes))
         raise DevrfError(f"data.root: the scenes need {needed}; sweep over those of each apart")
@@ -195,8 +197,8 @@ def _defaults_of_scene(option: str | None, root: str, overrides: Sequence[Overri
     if not values(overrides, "facing") and faces_forward(option, root, space):
         words.append("facing=forward")
     ordered = value(overrides, "data.times") == "order"
-    video = value(overrides, "data.monocular") or str(by_one_camera(option, root, ordered=ordered))
-    if video == "True":
+    video = value(overrides, "data.monocular")
+    if video == "True" or (video is None and by_one_camera(option, root, ordered=ordered)):
         monocular = _for_one_camera(root, overrides)
         words += monocular.words
         remarks += monocular.remarks

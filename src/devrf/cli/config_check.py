@@ -184,13 +184,12 @@ def unknown_key(config: DictConfig, names: Names, others: Iterable[object] = ())
     known = {*there, *others} - {name} if isinstance(there, DictConfig) else others
     group, *path = where.split(".")
     deeper = [k for k in _of_options() if k.startswith(f"{group}.") and k.split(".")[2:] == path]
-    if meant := did_you_mean(name, sorted(map(str, known)), where[: -len(name)]):
-        pass
-    elif where in _of_options():
+    meant = did_you_mean(name, sorted(map(str, known)), where[: -len(name)])
+    if not meant and where in _of_options():
         meant = f"; it belongs to {_of_options()[where]}"
-    elif path and deeper:
+    elif not meant and path and deeper:
         meant = f"; it is {' or '.join(deeper)}"
-    else:
+    if not meant:
         return DevrfError(f"{where}: no part reads it; leave it out (--cfg job shows every key)")
     return DevrfError(f"{where}: no such key{meant}")
 

@@ -55,8 +55,11 @@ class RenderedImage:
         """The rays of one part or more, one part after another."""
         if len(parts) == 1:
             return parts[0]
-        columns = zip(*(vars(part).values() for part in parts), strict=True)
-        return RenderedImage(*map(torch.cat, columns))
+        return RenderedImage(
+            color=torch.cat([part.color for part in parts]),
+            depth=torch.cat([part.depth for part in parts]),
+            opacity=torch.cat([part.opacity for part in parts]),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

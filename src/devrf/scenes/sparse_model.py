@@ -382,8 +382,11 @@ def ndc_holds(model: SparseModel) -> bool:
         return False
     keys = [model.cameras[image.camera] for image in model.images]
     sizes = [(int(camera["w"]), int(camera["h"])) for camera in keys]
-    shots = zip(model.intrinsics, sizes, strict=True)
-    cameras = pinholes(poses, [c.lens(*size, model.folder) for c, size in shots], sizes)
+    lenses = [
+        intrinsics.lens(width, height, model.folder)
+        for intrinsics, (width, height) in zip(model.intrinsics, sizes, strict=True)
+    ]
+    cameras = pinholes(poses, lenses, sizes)
     space = reference_space(cameras, plane)
     try:
         ends = frusta_in(space, cameras, [image.name for image in model.images])

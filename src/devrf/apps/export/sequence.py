@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -63,14 +64,17 @@ def write_files(
     seconds: float,
     index: dict[str, Any],
 ) -> None:
-    """Write a file ``frame….SUFFIX`` for each time, its name and content, and the index last."""
+    """Write a numbered file for each time, its name and content, and the index last.
+
+    Files of an earlier, longer sequence are removed.
+    """
     frames = []
     for time, (name, content) in zip(times, files, strict=True):
         with atomic_write(folder / name) as partial:
             partial.write_bytes(content)
         frames.append({"file": name, "time": time, "seconds": time * seconds})
     write_json(folder / "index.json", index | {"frames": frames})
-    for path in folder.glob(f"frame*[0-9]{Path(name).suffix}"):
+    for path in folder.glob(re.sub(r"\d+", "[0-9]*", name)):
         if path.name not in {frame["file"] for frame in frames}:
             path.unlink()
 

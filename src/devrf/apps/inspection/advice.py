@@ -171,7 +171,8 @@ def _images(scene: Scene) -> Iterator[Advice]:
         size = views.cameras.extents
         fine = (depth <= 0) | shown(pixels, depth, size)
         for k in (~fine).nonzero()[:, 0].tolist():
-            fine[k] = shown(*views.cameras.project_into(k, points.view(-1, 3)), size[k]).any()
+            places, depths = views.cameras.project_into(k, points.view(-1, 3))
+            fine[k] = shown(places, depths, size[k]).any()
         return (~fine).tolist()
 
     pose = "check the pose (camera-to-world, x right, y up, looking along -z), or set data.box"
