@@ -172,7 +172,8 @@ def test_usd_has_a_sample_for_each_time(tmp_path, mesh, frame, around):
 
 @pytest.mark.parametrize("format", ["ply", "obj"])
 def test_a_file_a_time_and_an_index(tmp_path, mesh, format):
-    for name in (f"frame_0009.{format}", "frame_notes.txt"):
+    own = ("frame_notes.txt", f"frame_of_mine_3.{format}")
+    for name in (f"frame_0009.{format}", *own):
         (tmp_path / name).touch()
     write_sequence(tmp_path, format, TIMES, mesh_files(mesh), "surface", SECONDS)
     index = json.loads((tmp_path / "index.json").read_text())
@@ -187,7 +188,7 @@ def test_a_file_a_time_and_an_index(tmp_path, mesh, format):
         assert (read.visual.vertex_colors[:, 1] < 5).all()
     # What an earlier, longer sequence left is gone; what is not its own stays.
     assert not (tmp_path / f"frame_0009.{format}").exists()
-    assert (tmp_path / "frame_notes.txt").exists()
+    assert all((tmp_path / name).exists() for name in own)
 
 
 FAR = (500_000.0, 5_600_000.0, 200.0)
