@@ -86,8 +86,8 @@ class Stopwatch:
         stage = self.stage
         assert stage is not None
         wait(self._device)
-        shape = tuple(stage.resolution)
+        shape = tuple(stage.scene_model.resolution)
         seconds, iterations = self._levels.get(shape, (0.0, 0))
         seconds += time.perf_counter() - self._since
-        self._levels[shape] = seconds, iterations + stage.iteration - self._iteration
-        self._since, self._iteration = time.perf_counter(), stage.iteration
+        self._levels[shape] = seconds, iterations + stage.position.iteration - self._iteration
+        self._since, self._iteration = time.perf_counter(), stage.position.iteration

@@ -120,8 +120,8 @@ def one_phase_of_each_resolution(stage: Stage) -> dict[str, Phase]:
     """The middle one of a stage's phases at each resolution by its name, coarse to fine."""
     phases_by_name: dict[str, list[Phase]] = {}
     start = 0
-    while start < stage.timeline.total:
-        phase = stage.timeline.phase(start)
+    while start < stage.schedule.total:
+        phase = stage.schedule.phase(start)
         name = phase.kind
         if isinstance(phase, CanonicalPhase):
             name += f" {phase.voxels}"
@@ -132,7 +132,7 @@ def one_phase_of_each_resolution(stage: Stage) -> dict[str, Phase]:
 
 def give_fields(stage: Stage, learned: DeVRFModel) -> None:
     """Give a stage learned fields, as at the end of its last phase."""
-    last = stage.timeline.phase(stage.timeline.total)
+    last = stage.schedule.phase(stage.schedule.total)
     model = stage.scene_model
     assert isinstance(model, DeVRFModel)
     model.canonical = learned.canonical
@@ -153,7 +153,7 @@ def measure_phase(stage: Stage, phase: Phase, views: Any, seconds: float) -> Row
     count = min(stage.iterations_per_step, phase.stop - phase.start)
 
     def step() -> None:
-        if stage.iteration + count > phase.stop:
+        if stage.position.iteration + count > phase.stop:
             stage.position.iteration = phase.start
         stage.training_step(views, 0)
         if stage.abort_reason is not None:
@@ -167,7 +167,7 @@ def measure_phase(stage: Stage, phase: Phase, views: Any, seconds: float) -> Row
     timer = Timer("step()", globals={"step": step}, num_threads=torch.get_num_threads())
     timed = timer.blocked_autorange(min_run_time=seconds)
     row = {
-        "grid": "x".join(str(points) for points in stage.resolution),
+        "grid": "x".join(str(points) for points in stage.scene_model.resolution),
         "ms": 1000 * timed.median / count,
         "iqr": 1000 * timed.iqr / count,
     }

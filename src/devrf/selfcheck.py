@@ -209,7 +209,7 @@ def resume(scene: SmallScene, name: str) -> str:
     scene.learn(uninterrupted, EXACT)
 
     def interrupt(*_: Any) -> None:
-        if 0 <= first.iteration - first.timeline.total // 2 < first.iterations_per_step:
+        if 0 <= first.position.iteration - first.schedule.total // 2 < first.iterations_per_step:
             os.kill(os.getpid(), signal.SIGTERM)
 
     with tempfile.TemporaryDirectory() as folder:
@@ -218,11 +218,13 @@ def resume(scene: SmallScene, name: str) -> str:
             sender = LambdaCallback(on_train_batch_start=interrupt)
             scene.learn(first, EXACT, saving, stop, sender)
         files = progress_files(Path(folder), name)
-        stopped = f"stopped at iteration {first.iteration} of {first.timeline.total}"
-        interrupted = stop.number is not None and 0 < first.iteration < first.timeline.total
+        done, total = first.position.iteration, first.schedule.total
+        stopped = f"stopped at iteration {done} of {total}"
+        interrupted = stop.number is not None and 0 < done < total
         require(interrupted and bool(files), f"{stopped}, {len(files)} progress files")
         scene.learn(second, EXACT, resumed_from=str(files[0]))
-    require(second.iteration == uninterrupted.iteration, f"ended at iteration {second.iteration}")
+    ended = second.position.iteration
+    require(ended == uninterrupted.position.iteration, f"ended at iteration {ended}")
     pairs = zip(uninterrupted.state_dict().values(), second.state_dict().values(), strict=True)
     same = all(torch.equal(a, b) for a, b in pairs if isinstance(a, torch.Tensor))
     require(same, f"{stopped}, came to other fields")

@@ -51,9 +51,9 @@ class Spoil(Callback):
         self.drawn: list[tuple[int, Tensor]] = []
 
     def on_before_optimizer_step(self, trainer: Trainer, pl_module: Any, optimizer: Any) -> None:
-        self.rates.append((pl_module.iteration, optimizer.param_groups[0]["lr"]))
-        if pl_module.iteration in self.iterations:
-            self.iterations.remove(pl_module.iteration)
+        self.rates.append((pl_module.position.iteration, optimizer.param_groups[0]["lr"]))
+        if pl_module.position.iteration in self.iterations:
+            self.iterations.remove(pl_module.position.iteration)
             value = optimizer.param_groups[self.group]["params"][0]
             with torch.no_grad():
                 if self.what == "gradient":
@@ -62,7 +62,7 @@ class Spoil(Callback):
                     value.fill_(float(self.what))
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: Any, *_: Any) -> None:
-        self.drawn.append((pl_module.iteration, pl_module.generator.get_state()))
+        self.drawn.append((pl_module.position.iteration, pl_module.generator.get_state()))
 
 
 def finite(state: dict[str, Any]) -> bool:
@@ -75,7 +75,8 @@ def test_the_first_time_is_rolled_back(fit, canonical, caplog, what):
     spoil, guard = Spoil(what, 14), DivergenceGuard(every_iterations=4)
     stage = fit(canonical(**SHORT), TrainingRecord(), spoil, guard)
     assert finite(stage.state_dict())
-    assert (stage.iteration, stage.position.num_rollbacks, stage.position.lr_scale) == (24, 1, 0.5)
+    at = stage.position
+    assert (at.iteration, at.num_rollbacks, at.lr_scale) == (24, 1, 0.5)
     assert stage.provenance.record["num_rollbacks"] == 1
     (said,) = caplog.messages
     # Checked after 18 iterations, or where the phase ended: the phase is learned again.
@@ -107,7 +108,8 @@ def test_the_second_time_ends_the_stage_in_its_last_good_state(fit, canonical, t
         assert finite(read_checkpoint_file(path)["state_dict"])
     # A stage that goes on from there remembers.
     again = fit(canonical(**SHORT), DivergenceGuard(), ckpt_path=newest)
-    assert (again.iteration, again.position.num_rollbacks, again.position.lr_scale) == (24, 2, 0.25)
+    at = again.position
+    assert (at.iteration, at.num_rollbacks, at.lr_scale) == (24, 2, 0.25)
 
 
 def test_a_frame_is_visited_again(fit, moving, caplog):
@@ -115,7 +117,8 @@ def test_a_frame_is_visited_again(fit, moving, caplog):
     phase = MOVING.phase(21, 3)
     assert f"(frame {phase.frame}, " in caplog.text
     assert f"back to iteration {phase.start}," in caplog.text
-    assert (stage.iteration, stage.position.num_rollbacks) == (30, 1) and finite(stage.state_dict())
+    assert (stage.position.iteration, stage.position.num_rollbacks) == (30, 1)
+    assert finite(stage.state_dict())
 
 
 @pytest.mark.parametrize(
@@ -128,7 +131,7 @@ def test_a_field_that_empties_or_fills_is_rolled_back(
     stage = fit(canonical(**LONG, visual_hull_init=carve), Spoil(density, 30), guard)
     assert f"everything has become {words} by iteration" in caplog.text
     assert "data.background" in caplog.text and "data.box" in caplog.text
-    assert stage.position.num_rollbacks == 1 and stage.iteration == 50
+    assert stage.position.num_rollbacks == 1 and stage.position.iteration == 50
 
 
 def test_an_occupancy_that_a_diverged_field_has_narrowed_comes_back(fit, canonical):
@@ -136,8 +139,8 @@ def test_an_occupancy_that_a_diverged_field_has_narrowed_comes_back(fit, canonic
 
     class HalfGone(Callback):
         def on_train_batch_start(self, trainer: Trainer, stage: Any, *_: Any) -> None:
-            masks.append((stage.iteration, stage.scene_model.occupancy.mask))
-            if stage.iteration == 14 and not stage.position.num_rollbacks:
+            masks.append((stage.position.iteration, stage.scene_model.occupancy.mask))
+            if stage.position.iteration == 14 and not stage.position.num_rollbacks:
                 values = stage.scene_model.canonical.density.values.data
                 values[: len(values) // 2] = -100.0
                 values[0, 0, 0] = math.inf
@@ -150,7 +153,7 @@ def test_an_occupancy_that_a_diverged_field_has_narrowed_comes_back(fit, canonic
     assert torch.equal(masks[24][1], masks[10][1]) and masks[34][1].sum() > masks[20][1].sum()
     # Where nothing is left the guard still has its say, not the pixels that meet nothing.
     stage = fit(canonical(**LONG, occupancy_every=4), Spoil("-100", 30), DivergenceGuard(20))
-    assert stage.position.num_rollbacks == 1 and stage.iteration == 50
+    assert stage.position.num_rollbacks == 1 and stage.position.iteration == 50
 
 
 def test_a_stage_that_never_saw_anything_warns(fit, canonical, caplog):
@@ -158,7 +161,7 @@ def test_a_stage_that_never_saw_anything_warns(fit, canonical, caplog):
     guard = DivergenceGuard(every_iterations=20)
     stage = fit(canonical(**{**SHORT, "upsample_at": ()}, **clear), guard)
     assert "canonical: nothing is to be seen at the end (is data.background" in caplog.text
-    assert (stage.iteration, stage.position.num_rollbacks) == (24, 0)
+    assert (stage.position.iteration, stage.position.num_rollbacks) == (24, 0)
     # With a second phase there is nothing to draw pixels from.
     with pytest.raises(DevrfError, match="empty by iteration 10: check data.background"):
         fit(canonical(**SHORT, **clear), guard)

@@ -25,7 +25,7 @@ class Visiting(Stage):
         self.__dict__["provenance"] = Provenance(record={"seconds": 1.0})
         self.__dict__["name"] = "deformation"
 
-    iterate = timeline_of = resolution = enter = restore = None
+    iterate = enter = restore = None
 
 
 Visiting.__abstractmethods__ = frozenset()

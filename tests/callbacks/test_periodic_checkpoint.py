@@ -21,9 +21,12 @@ from devrf.methods.devrf.canonical_stage import CanonicalStage
 
 def at(iteration: int, act: Callable[[], object]) -> Callback:
     """Does something after an iteration, before the callbacks that come later."""
-    return LambdaCallback(
-        on_train_batch_end=lambda trainer, stage, *_: stage.iteration == iteration and act()
-    )
+
+    def act_there(trainer: Any, stage: Any, *_: Any) -> None:
+        if stage.position.iteration == iteration:
+            act()
+
+    return LambdaCallback(on_train_batch_end=act_there)
 
 
 @pytest.fixture
@@ -49,7 +52,7 @@ def test_a_full_disk_does_not_end_the_training(learn, tmp_path, monkeypatch, cap
     usual = module.save_checkpoint
 
     def full(trainer: Trainer, path: Path, **how: Any) -> None:
-        if 4 <= trainer.lightning_module.iteration <= 7:
+        if 4 <= trainer.lightning_module.position.iteration <= 7:
             raise OSError(28, "No space left on device", str(path))
         usual(trainer, path, **how)
 
@@ -58,7 +61,7 @@ def test_a_full_disk_does_not_end_the_training(learn, tmp_path, monkeypatch, cap
     with caplog.at_level(logging.WARNING, logger="devrf"):
         watch = at(7, lambda: lost.append(names(tmp_path)))
         stage = learn(PeriodicCheckpoint(tmp_path, every_seconds=0, share=1.0), watch)
-    assert stage.iteration == 12
+    assert stage.position.iteration == 12
     assert lost == [["canonical-progress-2.ckpt", "canonical-progress-3.ckpt"]]
     (said,) = caplog.messages
     assert said.startswith(f"{tmp_path}/canonical-progress-4.ckpt: No space left on device; ")
@@ -80,4 +83,5 @@ def test_a_signal_stops_the_stage_saved(learn, tmp_path, iteration, left):
     saving = PeriodicCheckpoint(tmp_path, every_seconds=1000)
     with StopOnSignal(saving) as stop:
         stage = learn(at(iteration, lambda: os.kill(os.getpid(), signal.SIGTERM)), saving, stop)
-    assert (stop.number, stage.iteration, names(tmp_path)) == (signal.SIGTERM, iteration, left)
+    assert (stop.number, stage.position.iteration) == (signal.SIGTERM, iteration)
+    assert names(tmp_path) == left

@@ -35,7 +35,7 @@ def watched(steps: list[tuple[int, Any, list[float]]]) -> Callback:
 
     def note(trainer: Trainer, stage: Any, optimizer: Optimizer) -> None:
         rates = [group["lr"] for group in optimizer.param_groups]
-        steps.append((stage.iteration, stage.phase, rates))
+        steps.append((stage.position.iteration, stage.phase, rates))
 
     return LambdaCallback(on_before_optimizer_step=note)
 
@@ -59,7 +59,7 @@ def test_deformation_rates_and_phases_are_the_schedules_at_every_step(fit, rest)
     scale = stage.field.box.longest
     for _, phase, rates in steps:
         assert rates == pytest.approx([2e-3 * scale * 10 ** (-phase.level / 4)])
-    assert stage.resolution == stage.field.box.grid_shape(6**3)
+    assert stage.scene_model.resolution == stage.field.box.grid_shape(6**3)
 
 
 @pytest.mark.parametrize(
@@ -76,7 +76,7 @@ def test_without_a_callback_of_the_schedule_a_stage_says_what_is_missing(
     bare.callbacks.pop(left_out)  # type: ignore[attr-defined]
     with pytest.raises(DevrfError, match=said):
         bare.fit(stage, datamodule=datamodule)
-    assert stage.iteration == 0
+    assert stage.position.iteration == 0
 
 
 def test_the_record_says_what_training_took(fit, canonical):
@@ -86,7 +86,7 @@ def test_the_record_says_what_training_took(fit, canonical):
     assert record["peak_gpu_gb"] is None and record["peak_reserved_gb"] is None
     seconds, speed = record["seconds"], record["iterations_per_second"]
     assert 0 < seconds < 60 and 12 / speed == pytest.approx(seconds, abs=0.01)
-    assert stage.metadata().records["canonical"] == record
+    assert stage.result().metadata.records["canonical"] == record
 
 
 def test_progress_and_curves_name_the_frame_of_a_visit(rest, four_frames, trainer, caplog):
@@ -106,7 +106,7 @@ def test_progress_and_curves_name_the_frame_of_a_visit(rest, four_frames, traine
 def test_the_time_left_knows_that_finer_levels_take_longer(fit, canonical, caplog, monkeypatch):
     stage = canonical(upsample_at=(2, 3, 4))
     # Sides of 6 for two iterations, of 12 for the last eight.
-    costs = (cost(stage.timeline, 0, 2), cost(stage.timeline, 4, 12))
+    costs = (cost(stage.schedule, 0, 2), cost(stage.schedule, 4, 12))
     assert costs == pytest.approx((2 * 6, 8 * 12))
     # Every iteration takes a second so far: each of the last eight will take two.
     clock = SimpleNamespace(perf_counter=map(float, count()).__next__)
@@ -131,7 +131,7 @@ def test_how_long_learning_takes_is_told_from_its_first_seconds(datamodule, monk
     taken = seconds_to_learn(stage, [(moving.total(3), moving.rays)], datamodule, quiet)
     # Half the voxels have 0.7937 of the side: 5 iterations of 12.7 voxels a ray were tried in 10 s.
     # 20 of these, 20 of 16, and 2 for each of 3 frames of 16 with half of the rays.
-    assert stage.iteration == 10
+    assert stage.position.iteration == 10
     assert taken == pytest.approx(
         (20 * 12.699 + 20 * 16 + 6 * 16 / 2) / (5 * 12.699 / 10), rel=1e-3
     )

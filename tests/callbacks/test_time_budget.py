@@ -24,6 +24,7 @@ from devrf.methods.devrf.deformation_schedule import (
 
 # Three frames: frames 1 and 2 are visited at each level, frame 1 for two shares.
 SCHEDULE = DeformationSchedule(levels=(Level(4, 30), Level(6, 10)), rays=16)
+VISITS = Visits(SCHEDULE, frames=3)
 # Seconds to enter a visit, and for an iteration of each level: 90 of the first, 30 of the second.
 ENTER, ITERATION = 0.1, {0: 0.02, 1: 0.06}
 WHOLE = 4 * ENTER + 90 * 0.02 + 30 * 0.06
@@ -40,7 +41,6 @@ class Clocked(Stage):
 
     name = "clocked"
     capture = "dynamic"
-    resolution = ()
 
     def __init__(
         self,
@@ -49,16 +49,13 @@ class Clocked(Stage):
         **attributes: Any,
     ) -> None:
         super().__init__(iterations_per_step=10)
-        self.schedule = SCHEDULE
+        self.schedule = VISITS
         self.weight = torch.nn.Parameter(torch.zeros(1))
         self.optimizer = GridAdam([{"params": [self.weight], "lr": 1.0, "base_lr": 1.0}])
         self.by_batch, self.memory = by_batch, memory
         self.now, self.drawn, self.visits = 0.0, [], Counter[tuple[int, int]]()
         for name, value in attributes.items():
             setattr(self, name, value)
-
-    def timeline_of(self, schedule: DeformationSchedule) -> Visits:
-        return Visits(schedule, 3)
 
     def enter(self, phase: DeformationPhase) -> None:
         self.phase = phase
@@ -68,7 +65,7 @@ class Clocked(Stage):
         raise NotImplementedError
 
     def iterate(self, views: Any) -> Terms:
-        self.drawn.append(self.batch_size.rays(self.schedule.rays))
+        self.drawn.append(self.batch_size.rays(SCHEDULE.rays))
         if self.drawn[-1] > self.memory:
             raise torch.OutOfMemoryError("CUDA out of memory.")
         self.optimise(loss := self.weight.square().sum())
@@ -99,7 +96,7 @@ def test_a_stage_ends_with_its_seconds_and_its_whole_schedule(timed, share: floa
     assert stage.provenance.record["iterations"] == visits.total() == stage.position.iterations_done
     assert list(visits) == [(0, 1), (0, 2), (1, 1), (1, 2)]
     assert visits[0, 1] == pytest.approx(2 * visits[0, 2], rel=0.35)
-    assert stage.schedule == SCHEDULE.scaled(stage.position.schedule_scale)
+    assert stage.schedule == VISITS.scaled(stage.position.schedule_scale)
     assert stage.optimizer.param_groups[0]["lr"] == pytest.approx(10**-0.25)
 
 
@@ -154,7 +151,8 @@ def test_memory_that_runs_out_as_batches_grow_ends_their_growth(timed) -> None:
 
 def test_too_little_time_is_refused_and_none_changes_nothing(timed) -> None:
     stage = timed(None)
-    assert (stage.now, stage.position.iterations_done) == (pytest.approx(WHOLE), stage.iteration)
+    assert stage.now == pytest.approx(WHOLE)
+    assert stage.position.iterations_done == stage.position.iteration
     assert dict(stage.visits) == {(0, 1): 60, (0, 2): 30, (1, 1): 20, (1, 2): 10}
     for seconds in (0.4, 0.1):  # four visits are entered in 0.4 s
         with pytest.raises(DevrfError, match=rf"seconds: {seconds} is too little: .* 4 phases"):

@@ -127,7 +127,7 @@ def test_watching_changes_nothing_of_what_is_learned_and_curves_stand_beside_the
     watched, alone = stage.scene_model.canonical, learn(Album()).scene_model.canonical
     assert torch.equal(watched.density.values, alone.density.values)
     assert torch.equal(watched.color.values, alone.color.values)
-    x, y, z = stage.resolution
+    x, y, z = stage.scene_model.resolution
     rows = [row for row in album.rows if "static/psnr" in row]
     assert [row["step"] for row in rows] == [4, 8, 12]
     for row in rows:

@@ -72,7 +72,7 @@ def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> Path:
 def test_the_canonical_stage_comes_back(canonical, learned, tiny_scene):
     stored = load_checkpoint(canonical, tiny_scene)
     assert_alike(stored.model, learned[0].scene_model, tiny_scene)
-    assert stored.metadata == learned[0].metadata()
+    assert stored.metadata == learned[0].result().metadata
     assert stored.model.deformation is None
     assert [p.name for p in canonical.parent.iterdir()] == ["canonical.ckpt"]
 

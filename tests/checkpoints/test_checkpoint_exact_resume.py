@@ -68,7 +68,7 @@ def leave(path: Path, iteration: int) -> Callback:
     """Leaves the run after an iteration, with a file to go on from."""
 
     def act(trainer: Trainer, stage: Any, *_: Any) -> None:
-        if stage.iteration == iteration:
+        if stage.position.iteration == iteration:
             save_checkpoint(trainer, path, weights_only=False)
             trainer.should_stop = True
 
@@ -84,8 +84,8 @@ def everything(stage: Stage) -> dict[str, Any]:
     return {
         "fields": copy.deepcopy(stage.state_dict()),
         "optimizer": copy.deepcopy(stage.optimizer.state_dict()),
-        "metadata": stage.metadata(),
-        "iteration": stage.iteration,
+        "metadata": stage.result().metadata,
+        "iteration": stage.position.iteration,
         "next": [torch.rand(4), np.random.rand(2).tolist(), random.random()],
     }
 
@@ -130,7 +130,7 @@ def learn(
             fit.strategy.checkpoint_io = ChecksummedCheckpointIO()
             fit.fit(stage, datamodule=data, ckpt_path=left)
             if at is not None:
-                assert stage.iteration == at
+                assert stage.position.iteration == at
                 # Another process would draw other numbers if it were not told where to go on.
                 left = str(path)
                 begin_at(99)

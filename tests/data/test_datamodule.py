@@ -42,23 +42,27 @@ def test_training_views_move_to_the_device_once_for_each_capture(tiny_scene, ser
 
 
 @pytest.mark.parametrize(
-    ("names", "scored", "images", "held_out"),
+    ("names", "capture", "images", "scored", "held_out"),
     [
-        (("static",), "static", (8,), 2),
-        (("static", "dynamic"), "dynamic", (8, 6), 3),
-        (("at_rest",), "static", (10,), 2),
+        (("static",), "static", (8,), "static", 2),
+        (("static", "dynamic"), "both", (8, 6), "dynamic", 3),
+        (("at_rest",), "static", (10,), "static", 2),
     ],
 )
-def test_a_stage_is_served_what_it_learns_from(tiny_scene, serve, names, scored, images, held_out):
+def test_a_stage_is_served_what_it_learns_from_and_what_scores_it(
+    tiny_scene, serve, names, capture, images, scored, held_out
+):
     module, cpu = serve(tiny_scene), torch.device("cpu")
-    stage = SimpleNamespace(images=names, scored_capture=scored)
+    stage = SimpleNamespace(images=names, capture=capture)
     learner: Any = SimpleNamespace(lightning_module=stage)
     module.trainer = learner
     served = module.transfer_batch_to_device(None, cpu, 0)
     views = served if isinstance(served, tuple) else (served,)
     assert tuple(len(one) for one in views) == images
     assert all(one.frames is not None for one in views)
-    assert len(module.test_dataloader()) == held_out
+    assert module.scored_capture == scored and len(module.test_dataloader()) == held_out
+    # Without a validation split the held-out views stand in for it.
+    assert module.validation_views is module.test_views
     assert module.transfer_batch_to_device(1, cpu, 0) == 1
 
 

@@ -13,7 +13,7 @@ from lightning import Callback
 
 from devrf.callbacks import PeriodicCheckpoint
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
-from devrf.engine.schedule import configured_timeline, scale_schedule
+from devrf.engine.schedule import scale_schedule, unscaled
 from devrf.engine.stage import Stage, mean_terms
 from devrf.errors import DevrfError
 from devrf.methods.devrf import canonical_stage, deformation_stage
@@ -113,7 +113,7 @@ def test_a_frame_that_does_not_fit_in_half_either_ends_the_stage_saved(
         fit(stage, PeriodicCheckpoint(tmp_path, every_seconds=1000))
     assert "schedule.deformation.levels.1.side" in str(caught.value)
     assert calls[9:] == [64, 32]
-    assert gradients(stage) == [None] * 2 and stage.iteration == 9
+    assert gradients(stage) == [None] * 2 and stage.position.iteration == 9
     assert [path.name for path in tmp_path.iterdir()] == ["deformation-progress-9.ckpt"]
 
 
@@ -143,7 +143,7 @@ def test_what_is_due_comes_at_multiples_after_its_start(fit):
 
     class Watched(CanonicalStage):
         def opaque(self) -> torch.Tensor:
-            found.append(self.iteration)
+            found.append(self.position.iteration)
             return super().opaque()
 
     schedule = CanonicalSchedule(0, 12, True, 30, 12, (), rays=16, occupancy_every=8)
@@ -158,12 +158,12 @@ def test_a_scaled_schedule_goes_on_at_the_same_place(fit):
 
     class Scale(Callback):
         def on_train_batch_end(self, trainer: Any, stage: Any, *_: Any) -> None:
-            if stage.iteration == 6 and stage.position.schedule_scale == 1:
+            if stage.position.iteration == 6 and stage.position.schedule_scale == 1:
                 scale_schedule(stage, 0.5)
-                assert stage.iteration == 3
-            seen.append(stage.resolution)
+                assert stage.position.iteration == 3
+            seen.append(stage.scene_model.resolution)
 
     stage = fit(CanonicalStage(schedule, SMALL, iterations_per_step=1), Scale())
-    assert stage.position.iterations_done == 6 + 3 and stage.timeline.total == 6
-    assert configured_timeline(stage).total == 12 and stage.is_complete
+    assert stage.position.iterations_done == 6 + 3 and stage.schedule.total == 6
+    assert unscaled(stage).total == 12 and stage.is_complete
     assert seen == sorted(seen) and len(set(seen)) == 3

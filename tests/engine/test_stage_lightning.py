@@ -51,9 +51,9 @@ def test_early_stopping_ends_a_stage_which_then_counts_as_complete(
     fitted = trainer(Previews(times=12), stopping, max_epochs=1, limit_val_batches=1)
     stage = canonical()
     fitted.fit(stage, datamodule=datamodule)
-    assert stage.is_complete and stage.iteration == 2
+    assert stage.is_complete and stage.position.iteration == 2
     assert "canonical: EarlyStopping has ended it at iteration 2 of 12" in caplog.text
-    assert stage.metadata().complete
+    assert stage.result().metadata.complete
 
 
 def test_early_stopping_before_the_last_kind_of_phase_is_no_result(canonical, datamodule, trainer):
@@ -151,7 +151,7 @@ def test_steps_that_are_not_the_stages_own_are_refused(canonical, datamodule, tr
 def test_a_limit_of_time_ends_a_stage_before_its_schedule(canonical, datamodule, trainer):
     stage = canonical()
     trainer(max_time={"seconds": 0}).fit(stage, datamodule=datamodule)
-    assert stage.iteration == 0 and not stage.is_complete
+    assert stage.position.iteration == 0 and not stage.is_complete
 
 
 def test_the_devices_figures_are_logged(canonical, datamodule, trainer, tmp_path):

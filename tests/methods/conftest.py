@@ -91,7 +91,7 @@ def stopped_and_resumed(fit: Callable[..., RayStage], tmp_path: Path) -> Any:
 
         class Stop(Callback):
             def on_train_batch_end(self, fitted: Trainer, *arguments: object) -> None:
-                if fitted.lightning_module.iteration == at:
+                if fitted.lightning_module.position.iteration == at:
                     save_checkpoint(fitted, path, weights_only=False)
                     fitted.should_stop = True
 
@@ -103,7 +103,7 @@ def stopped_and_resumed(fit: Callable[..., RayStage], tmp_path: Path) -> Any:
 
         whole = fit(begin(0))
         stopped = fit(begin(0), Stop())
-        assert stopped.iteration == at
+        assert stopped.position.iteration == at
         resumed = fit(begin(123), ckpt_path=path)
         assert_same_weights(whole, resumed)
         return whole, stopped, resumed

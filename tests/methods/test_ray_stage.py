@@ -37,7 +37,7 @@ def test_a_killed_run_goes_on_to_the_same_weights(
         return ray_stage(HyperNeRF(WHOLE), loss={"render": 1.0, "elastic": 0.01})
 
     _, _, resumed = stopped_and_resumed(stage, at=2)
-    assert resumed.iteration == 4
+    assert resumed.position.iteration == 4
 
 
 def test_dynamic_never_reads_the_static_set(
@@ -71,7 +71,7 @@ def test_the_curriculum_adds_frames(
     ray_stage: Make, fit: Fit, four_frames: SceneDataModule
 ) -> None:
     stage = fit(ray_stage(DNeRF(TINY), "dynamic", curriculum=0.99, rays=400), data=four_frames)
-    views = stage.training_views("dynamic")
+    views = stage.datamodule.training_views("dynamic", stage.device)
     assert views.frames is not None
     for iteration, frames in ((0, 3), (4, 4)):
         stage.position.iteration = iteration
@@ -95,10 +95,10 @@ def test_a_batch_may_have_few_times(
     stage = fit(ray_stage(DNeRF(TINY), step, times_per_batch=times, rays=60), data=four_frames)
     image = stage.draw()[0]
     if step == "joint":
-        static = len(stage.training_views("static"))
+        static = len(stage.datamodule.training_views("static", stage.device))
         assert (image[:30] < static).all()
         image = image[30:] - static
-    frames = stage.training_views("dynamic").frames[image]  # type: ignore[index]
+    frames = stage.datamodule.training_views("dynamic", stage.device).frames[image]  # type: ignore[index]
     # Two times with as many rays each, one after the other.
     first, second = frames.chunk(2)
     assert len(first.unique()) == len(second.unique()) == 1 and first[0] != second[0]
@@ -108,7 +108,7 @@ def test_a_part_of_a_batch_has_fewer_times(
     ray_stage: Make, fit: Fit, four_frames: SceneDataModule
 ) -> None:
     stage = fit(ray_stage(DNeRF(TINY), "dynamic", times_per_batch=2, rays=64), data=four_frames)
-    frames = stage.training_views("dynamic").frames
+    frames = stage.datamodule.training_views("dynamic", stage.device).frames
     assert frames is not None and stage.useful_share == 1 / 2
     for share, times in ((1.0, 2), (1 / 2, 1), (1 / 8, 1)):
         stage.batch_size.share = share
@@ -131,7 +131,7 @@ def test_steps_may_be_smaller_where_no_masks_tell_what_is_empty(ray_stage: Make,
         rates = {"learning_rate": 2e-3, "learning_rate_without_hull": 5e-4}
         stage = fit(ray_stage(DNeRF(replace(TINY, hull=hull)), **rates))
         assert {group["base_lr"] for group in stage.optimizer.param_groups} == {rate}
-        assert stage.timeline.learning_rate_factor(0) == 1
+        assert stage.schedule.learning_rate_factor(0) == 1
 
 
 def test_a_method_may_learn_before_random_colours_where_all_images_have_masks(
@@ -152,16 +152,16 @@ def test_a_method_may_learn_before_random_colours_where_all_images_have_masks(
 def test_rates_decay_exponentially_or_as_half_a_cosine_after_a_warm_up(ray_stage: Make) -> None:
     rates = {"iterations": 101, "learning_rate": 1e-2, "final_learning_rate": 1e-4}
     plain = ray_stage(DNeRF(TINY), **rates)
-    factors = [plain.timeline.learning_rate_factor(n) for n in (0, 50, 100)]
+    factors = [plain.schedule.learning_rate_factor(n) for n in (0, 50, 100)]
     assert factors == pytest.approx([1, 0.1, 0.01])
     rates |= {"final_learning_rate": 0.0, "decay": "cosine"}
     cosine = ray_stage(DNeRF(TINY), **rates)
-    factors = [cosine.timeline.learning_rate_factor(n) for n in (0, 50, 100)]
+    factors = [cosine.schedule.learning_rate_factor(n) for n in (0, 50, 100)]
     assert factors == pytest.approx([1, 0.5, 0])
     warm = ray_stage(DNeRF(TINY), warmup=9 / 101, **rates)  # nine iterations below the decay's rate
     for n in (0, 4, 9, 50):
-        expected = cosine.timeline.learning_rate_factor(n) * min(1, (n + 1) / 10)
-        assert warm.timeline.learning_rate_factor(n) == pytest.approx(expected)
+        expected = cosine.schedule.learning_rate_factor(n) * min(1, (n + 1) / 10)
+        assert warm.schedule.learning_rate_factor(n) == pytest.approx(expected)
     with pytest.raises(DevrfError, match="final_learning_rate: expected more than 0, or decay"):
         ray_stage(DNeRF(TINY), final_learning_rate=0.0)
 

@@ -40,7 +40,7 @@ def test_an_iteration_enters_the_files_that_are_listed_in_their_order(
 
     def noted(stage: Stage, *arguments: Any) -> dict[str, Tensor]:
         before = sys.getprofile()
-        sys.setprofile(note if stage.iteration == 3 else before)
+        sys.setprofile(note if stage.position.iteration == 3 else before)
         try:
             return step(stage, *arguments)
         finally:

@@ -52,12 +52,12 @@ def test_both_stages_take_two_steps(
     module = instantiate(config.data)
     canonical = instantiate(config.canonical, _convert_="all")
     trainer(max_steps=2).fit(canonical, datamodule=module)
-    assert canonical.iteration == 2
+    assert canonical.position.iteration == 2
     assert canonical.scene_model.canonical.color.values.abs().max() > 0
     build = instantiate(config.deformation, _partial_=True, _convert_="all")
     deformation: DeformationStage = build(canonical.result())
     trainer(max_steps=2).fit(deformation, datamodule=module)
-    assert deformation.iteration == 2
+    assert deformation.position.iteration == 2
     assert module.scene.dynamic.train.flow is not None
     assert torch.isfinite(deformation.field.to_canonical).all()
 

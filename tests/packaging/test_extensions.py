@@ -45,5 +45,5 @@ def test_without_it_the_motion_is_learned(
     stage = instantiate(config.deformation, _partial_=True, _convert_="all")(earlier=rest)
     assert isinstance(stage, DeformationStage)
     trainer(max_epochs=1).fit(stage, datamodule=datamodule)
-    assert stage.iteration == stage.timeline.total
+    assert stage.position.iteration == stage.schedule.total
     assert bool(stage.field.to_time.any())

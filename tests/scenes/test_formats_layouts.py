@@ -53,7 +53,7 @@ def test_a_layout_is_read_learned_and_scored(layout, tiny_scene, trainer, tmp_pa
     stage = RayStage(DNeRF(SMALL), schedule, {"render": 1.0}, step, 0.5, None)
     fitted = trainer(max_epochs=1)
     fitted.fit(stage, datamodule=module)
-    assert stage.iteration == 10
+    assert stage.position.iteration == 10
     (scores,) = fitted.test(stage, datamodule=module, verbose=False)
     assert 3 < scores["test/dynamic/psnr"] < 40
     assert len(module.scene.dynamic.test) == 3 and len(module.scene.dynamic.train) == 6

@@ -33,10 +33,10 @@ class Trial(GridUpscaling):
         """Begin to count; stop when the time is over."""
         assert isinstance(pl_module, Stage)
         now = time.perf_counter()
-        done = pl_module.iteration
+        done = pl_module.position.iteration
         began, first = self._began = self._began or (now, done)
         if done > first:
-            self.pace = cost(pl_module.timeline, first, done) / (now - began)
+            self.pace = cost(pl_module.schedule, first, done) / (now - began)
             trainer.should_stop = now - began >= self.most_seconds
 
 
@@ -58,7 +58,8 @@ def seconds_to_learn(
     """
     trial = Trial()
     trainer(callbacks=[trial, LearningRateDecay()], logger=False).fit(stage, datamodule=datamodule)
-    end = stage.timeline.total
-    rays: int = stage.schedule.rays
-    batches = sum(iterations * rays_of_batch for iterations, rays_of_batch in later) / rays
-    return (cost(stage.timeline, 0, end) + batches * stage.timeline.phase(end).cost) / trial.pace
+    schedule: Any = stage.schedule
+    end: int = schedule.total
+    batches = sum(iterations * rays for iterations, rays in later) / schedule.rays
+    seconds: float = (cost(schedule, 0, end) + batches * schedule.phase(end).cost) / trial.pace
+    return seconds

@@ -13,7 +13,7 @@ from lightning import Callback, LightningModule, Trainer
 from torch import Tensor
 
 from devrf.engine.schedule import Phase
-from devrf.engine.stage import Stage
+from devrf.engine.stage import Stage, place_of
 from devrf.errors import DevrfError
 from devrf.system.plain_data import validate
 
@@ -139,10 +139,10 @@ class DivergenceGuard(Callback):
     ) -> None:
         """Keep the step's losses; check, if it is due."""
         assert isinstance(pl_module, Stage) and pl_module.phase is not None
-        done = pl_module.iteration
+        done = pl_module.position.iteration
         if outputs:
             self._steps.append((done, outputs))
-        ends = done >= min(pl_module.phase.stop, pl_module.timeline.total)
+        ends = done >= min(pl_module.phase.stop, pl_module.schedule.total)
         since = pl_module.position.iterations_done - self._checked
         if ends or since >= self.every_iterations:
             self.check(pl_module)
@@ -161,7 +161,7 @@ class DivergenceGuard(Callback):
         assert self._good is not None and stage.phase is not None
         if wrong is not None:
             self._rollback(stage, self._good, wrong)
-        elif stage.phase.stop > stage.iteration >= self._good.iteration + SNAPSHOT_EVERY:
+        elif stage.phase.stop > stage.position.iteration >= self._good.iteration + SNAPSHOT_EVERY:
             self._snapshot(stage)
 
     def _count_from(self, stage: Stage) -> None:
@@ -173,7 +173,7 @@ class DivergenceGuard(Callback):
         values = tuple(value.detach().clone() for value in _trained(stage))
         self._good = Snapshot(
             phase=stage.phase,
-            iteration=stage.iteration,
+            iteration=stage.position.iteration,
             iterations_done=stage.position.iterations_done,
             values=values,
             restore=stage.remember(),
@@ -186,7 +186,7 @@ class DivergenceGuard(Callback):
         # Only alpha masks say what should be seen.
         covered = mean(means["coverage"] for means in late) if "coverage" in late[0] else None
         lowest, highest = self._range
-        where = f"{stage.describe(stage.iteration)} ({BACKGROUND})"
+        where = f"{place_of(stage, stage.position.iteration)} ({BACKGROUND})"
         if since >= MIN_ITERATIONS:
             self._range = [min(lowest, opacity), max(highest, opacity)]
             if covered is not None and collapsed_to_opaque(opacity, lowest, covered):
@@ -197,7 +197,8 @@ class DivergenceGuard(Callback):
                 opacity, highest, highest if covered is None else covered
             ):
                 return f"everything has become empty by {where}"
-        if stage.iteration >= stage.timeline.total and opacity < MAX_GONE * (covered or MIN_SEEN):
+        ends = stage.position.iteration >= stage.schedule.total
+        if ends and opacity < MAX_GONE * (covered or MIN_SEEN):
             log.warning("%s: nothing is to be seen at the end (%s)", stage.name, BACKGROUND)
         return None
 
@@ -209,7 +210,7 @@ class DivergenceGuard(Callback):
         for value, stored in zip(_trained(stage), good.values, strict=True):
             value.copy_(stored)
         scaled = good.phase != stage.phase  # iterations are numbered otherwise since then
-        iteration = stage.iteration if scaled else good.iteration
+        iteration = stage.position.iteration if scaled else good.iteration
         stage.position.roll_back(iteration, good.iterations_done, self.rate_factor)
         stage.optimizer.forget()
         good.restore()
@@ -219,7 +220,7 @@ class DivergenceGuard(Callback):
         if again:
             stage.abort(
                 f"{wrong}, again after learning rates were cut to {scale:g}; what it was at "
-                f"iteration {stage.iteration} is kept; lower {stage.rate_keys}, and begin afresh "
+                f"iteration {iteration} is kept; lower {stage.rate_keys}, and begin afresh "
                 "with resume=false"
             )
             return
@@ -227,7 +228,7 @@ class DivergenceGuard(Callback):
             "%s: %s: back to iteration %d, learning rates at %g of the schedule's",
             stage.name,
             wrong,
-            stage.iteration,
+            iteration,
             stage.position.lr_scale,
         )
 
@@ -263,8 +264,8 @@ def _not_finite(
         for name, value in means.items():
             if not math.isfinite(value):
                 term = "the loss" if name == "loss" else f"the loss term {name}"
-                return f"{term} is {value} by {stage.describe(iteration)}"
+                return f"{term} is {value} by {place_of(stage, iteration)}"
     for name, value in fields.items():
         if not math.isfinite(value):
-            return f"values of {name} are not finite by {stage.describe(stage.iteration)}"
+            return f"values of {name} are not finite by {place_of(stage, stage.position.iteration)}"
     return None

@@ -43,8 +43,8 @@ class Meter(Callback):
         }
         if (peak := peak_host_memory()) is not None:
             values["peak_host_gb"] = peak
-        if pl_module.resolution:
-            values["voxels"] = math.prod(pl_module.resolution)
+        if pl_module.scene_model.resolution:
+            values["voxels"] = math.prod(pl_module.scene_model.resolution)
         for group in groups:
             values[f"lr/{group['name']}"] = group["lr"]
         if pl_module.phase is not None and pl_module.phase.frame is not None:

@@ -73,8 +73,8 @@ class PeriodicCheckpoint(Callback):
 
     def left_at(self, stage: Stage) -> str:
         """Where a stage has ended, and whether it can go on from there, in words."""
-        done = stage.iteration
-        total = stage.timeline.total
+        done = stage.position.iteration
+        total = stage.schedule.total
         where = f"iteration {done} of {total} of the {stage.name} stage"
         if done < total and done != (self.saved or 0):
             last = "there is none" if self.saved is None else f"the last is of {self.saved}"
@@ -85,7 +85,7 @@ class PeriodicCheckpoint(Callback):
         """Start the clock."""
         assert isinstance(pl_module, Stage)
         self._failing = False
-        self.saved = pl_module.iteration or None
+        self.saved = pl_module.position.iteration or None
         self._due = time.monotonic() + self.every_seconds
         self._steps = 0
 
@@ -110,7 +110,7 @@ class PeriodicCheckpoint(Callback):
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Write a file where something else has ended the stage before its schedule."""
         assert isinstance(pl_module, Stage)
-        if not pl_module.is_complete and self.saved != pl_module.iteration:
+        if not pl_module.is_complete and self.saved != pl_module.position.iteration:
             self._write(trainer, pl_module)
 
     def _agreed(self, leads: bool, device: torch.device) -> tuple[bool, bool]:
@@ -130,12 +130,12 @@ class PeriodicCheckpoint(Callback):
             if isinstance(guard, DivergenceGuard):
                 guard.check(stage)  # rolls back first: a diverged state is never written
         if not trainer.is_global_zero:
-            self.saved = stage.iteration  # by rank 0
+            self.saved = stage.position.iteration  # by rank 0
             return
         if trainer.fast_dev_run:  # type: ignore[attr-defined]
             return
         began = time.monotonic()
-        path = progress_file(self.folder, stage.name, stage.iteration)
+        path = progress_file(self.folder, stage.name, stage.position.iteration)
         try:
             save_checkpoint(trainer, path, weights_only=False)
         except OSError as error:
@@ -149,7 +149,7 @@ class PeriodicCheckpoint(Callback):
                 )
             self._failing = True
         else:
-            self.saved = stage.iteration
+            self.saved = stage.position.iteration
             self._failing = False
             files = progress_files(self.folder, stage.name)
             # Files further on are of a course that was rolled back.

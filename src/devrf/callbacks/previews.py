@@ -86,4 +86,4 @@ class Previews(Callback):
                 tracker.show_image(f"{pl_module.capture}/{name}", image, done)
 
     def _due(self, stage: Stage) -> int:
-        return stage.iteration * self.times // stage.timeline.total
+        return stage.position.iteration * self.times // stage.schedule.total

@@ -80,14 +80,14 @@ class Progress(Callback):
             line = in_one_line(outputs or {}, pl_module, speed, share=now[2], pace=self._pace)
             log.info("%s", line)
         else:
-            total = pl_module.timeline.total
-            at = f"{pl_module.iteration}/{total}  {describe(outputs or {}, pl_module, speed)}"
+            place = f"{pl_module.position.iteration}/{pl_module.schedule.total}"
+            at = f"{place}  {describe(outputs or {}, pl_module, speed)}"
             self._bar.update(self._bar.task_ids[0], completed=now[2], state=at)
 
     @staticmethod
     def _now(stage: Stage) -> tuple[float, int, float]:
         done = stage.position.iterations_done
-        return time.perf_counter(), done, share_done(stage.timeline, stage.iteration)
+        return time.perf_counter(), done, share_done(stage.schedule, stage.position.iteration)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Close the bar."""
@@ -115,7 +115,7 @@ def in_one_line(
     """
     left = 1 - share
     ends = f"  {time_left(left / pace)}" if pace > 0 and left > 0 else ""
-    place = f"{stage.capture} {stage.iteration}/{stage.timeline.total}"
+    place = f"{stage.capture} {stage.position.iteration}/{stage.schedule.total}"
     return f"{place}  {describe(means, stage, speed)}{ends}"
 
 
@@ -124,8 +124,8 @@ def describe(means: Mapping[str, Tensor], stage: Stage, speed: float) -> str:
     psnr = means.get("psnr")
     parts = [] if psnr is None else [f"{float(psnr):.1f} dB"]
     parts.append(f"{speed:.0f} it/s" if speed >= 10 else f"{speed:.2g} it/s")
-    if stage.resolution:
-        parts.append("x".join(str(n) for n in stage.resolution))
+    if stage.scene_model.resolution:
+        parts.append("x".join(str(n) for n in stage.scene_model.resolution))
     if stage.phase is not None and stage.phase.frame is not None:
         parts.append(f"frame {stage.phase.frame}")
     return "  ".join(parts)

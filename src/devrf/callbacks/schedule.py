@@ -18,7 +18,7 @@ class GridUpscaling(Callback):
     ) -> None:
         """Enter the phase of the coming iteration, if it is another one."""
         stage = cast(Scheduled, pl_module)
-        phase = stage.timeline.phase(stage.position.iteration)
+        phase = stage.schedule.phase(stage.position.iteration)
         if phase != stage.phase:
             stage.enter(phase)
 
@@ -39,7 +39,7 @@ class LearningRateDecay(Callback):
         """
         stage = cast(Scheduled, pl_module)
         position = stage.position
-        factor = stage.timeline.learning_rate_factor(position.iteration)
+        factor = stage.schedule.learning_rate_factor(position.iteration)
         for group in optimizer.param_groups:
             decayed = factor ** group.get("decay", 1.0)
             group["lr"] = group["base_lr"] * decayed * position.lr_scale

@@ -31,11 +31,11 @@ from lightning import Callback, LightningModule, Trainer
 from devrf.callbacks.training_record import TrainingRecord
 from devrf.engine.schedule import (
     Phase,
-    configured_timeline,
     cost,
     phases,
     same_place,
     scale_schedule,
+    unscaled,
 )
 from devrf.engine.stage import Stage
 from devrf.errors import DevrfError, expect
@@ -131,7 +131,7 @@ class TimeBudget(Callback):
             )
         self._record = records[0]
         self._budget = self.seconds * pl_module.time_share
-        self._phases = phases(configured_timeline(pl_module))
+        self._phases = phases(unscaled(pl_module))
         self._phase = pl_module.phase
         self._most_iterations = pl_module.iterations_per_step
         pl_module.iterations_per_step = 1  # whose time is not known yet
@@ -194,12 +194,12 @@ class TimeBudget(Callback):
                 if not self._is_new_kind:
                     ratio = 1 + LATEST * (ratio - 1)
                 self._pace = Pace(self._pace.fixed * ratio, self._pace.of_batch * ratio)
-        timeline = pl_module.timeline
-        over = self._step_ended >= self._budget and self._phase.stop >= timeline.total
+        schedule = pl_module.schedule
+        over = self._step_ended >= self._budget and self._phase.stop >= schedule.total
         is_due = self._pace is not None and (self._is_new_kind or self._step_ended >= self._next)
         over, self._is_due = trainer.strategy.broadcast((over, is_due))
         if over:
-            pl_module.position.iteration = timeline.total
+            pl_module.position.iteration = schedule.total
             trainer.should_stop = True
 
     def _try(self, trainer: Trainer, stage: Stage, pace: float) -> None:
@@ -244,8 +244,8 @@ class TimeBudget(Callback):
     def _scaling(self, stage: Stage, first: bool) -> tuple[float, float, int] | str:
         """Factor of the schedule, share of batches, iterations of a step; or why nothing fits."""
         assert self._pace is not None and stage.phase is not None
-        configured = configured_timeline(stage)
-        place = same_place(stage.position.iteration, stage.timeline, configured)
+        configured = unscaled(stage)
+        place = same_place(stage.position.iteration, stage.schedule, configured)
         later = [phase for phase in self._phases if phase.start > place]
         entering = self._to_enter(later)
         left = max(self._budget - self._record.seconds - entering, 1e-6 * self._budget)
@@ -267,7 +267,7 @@ class TimeBudget(Callback):
         ``iterations`` are those that are left if a unit of cost took a second.
         """
         assert self._pace is not None
-        total = configured_timeline(stage).total
+        total = unscaled(stage).total
         least = 1.0 if stage.keeps_batches else LEAST_BATCH
         most = min(self.largest_batch, stage.batch_size.largest)
         for share in (part for part in BATCHES if part >= stage.useful_share):
@@ -302,7 +302,7 @@ class TimeBudget(Callback):
             "%s: %d iterations for its %d, on %.3g%% of their rays, in %.1f s of %.1f",
             pl_module.name,
             pl_module.position.iterations_done,
-            configured_timeline(pl_module).total,
+            unscaled(pl_module).total,
             100 * pl_module.batch_size.share,
             self._record.seconds,
             self._budget,

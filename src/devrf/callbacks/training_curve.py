@@ -71,7 +71,7 @@ class TrainingCurve(Callback):
         if psnr is None or not trainer.is_global_zero:
             return
         self._unread.append((done, psnr))
-        shape = "x".join(map(str, pl_module.resolution))
+        shape = "x".join(map(str, pl_module.scene_model.resolution))
         if shape != (self._grids[-1][1] if self._grids else ""):
             self._grids.append((done, shape))
         if len(self._unread) >= AT_ONCE:

@@ -110,7 +110,7 @@ def _fit(run: RunContext, stage: Stage, begin: ResumePoint) -> None:
             iterations=stage.position.iterations_done,
             whole=run.plan(stage.name).iterations(run.scene),
             events={name: count for name, count in stage.events.items() if count},
-            planned=dict(stage.timeline.planned_events),
+            planned=dict(stage.schedule.planned_events),
         )
     where = saving.left_at(stage)
     if stopping:
@@ -119,8 +119,8 @@ def _fit(run: RunContext, stage: Stage, begin: ResumePoint) -> None:
     if run.is_trial:
         run.tried[stage.name] = stage.result()
         if run.is_rank_zero:
-            tried = stage.iteration
-            total = stage.timeline.total
+            tried = stage.position.iteration
+            total = stage.schedule.total
             log.info("%s: a trial, %d of %d iterations; nothing is kept", stage.name, tried, total)
     elif not finished:
         asked = run.config.trainer

@@ -5,13 +5,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Sequence
 from itertools import repeat
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from lightning import LightningDataModule
 
 from devrf.data.priors import Priors, without_priors
-from devrf.scenes.scene import ImagesName, Scene, Views
+from devrf.scenes.scene import CaptureName, ImagesName, Scene, Views
 
 
 class SceneDataModule(LightningDataModule, ABC):
@@ -76,12 +76,11 @@ class SceneDataModule(LightningDataModule, ABC):
 
     def test_dataloader(self) -> Iterable[int]:
         """The positions of the held-out images, one at a time."""
-        return range(len(self.scene.capture(self._stage.scored_capture).test))
+        return range(len(self.test_views))
 
     def val_dataloader(self) -> Sequence[int]:
-        """The positions of the validation views, or held-out ones: the middle one first."""
-        capture = self.scene.capture(self._stage.scored_capture)
-        count = len(capture.test if capture.validation is None else capture.validation)
+        """The positions of the validation views: the middle one first."""
+        count = len(self.validation_views)
         return sorted(range(count), key=lambda index: abs(index - count // 2))
 
     def transfer_batch_to_device(
@@ -105,6 +104,23 @@ class SceneDataModule(LightningDataModule, ABC):
             self._on_device = {k: v for k, v in self._on_device.items() if k[0] in needed}
             self._on_device[key] = self.scene.training_views(images).to(device)
         return self._on_device[key]
+
+    @property
+    def scored_capture(self) -> CaptureName:
+        """The capture whose held-out views measure what the stage learns."""
+        capture: CaptureName | Literal["both"] = self._stage.capture
+        return "dynamic" if capture == "both" else capture
+
+    @property
+    def test_views(self) -> Views:
+        """The held-out views that measure what the stage learns, on the host."""
+        return self.scene.capture(self.scored_capture).test
+
+    @property
+    def validation_views(self) -> Views:
+        """Those of the validation split; the held-out ones where there is none."""
+        views = self.scene.capture(self.scored_capture).validation
+        return self.test_views if views is None else views
 
     @property
     def _stage(self) -> Any:

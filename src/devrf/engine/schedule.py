@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from devrf.engine.position import Position
+from devrf.errors import DevrfError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,6 +55,10 @@ class Schedule(Protocol):
         """Factor of the base learning rates at an iteration."""
         ...
 
+    def scaled(self, factor: float) -> Schedule:
+        """As many phases in ``factor`` times their iterations."""
+        ...
+
 
 class Scheduled(Protocol):
     """A stage as callbacks of the schedule see it (docs/extending.md#schedule-callbacks).
@@ -69,8 +74,8 @@ class Scheduled(Protocol):
     has_scheduled_rates: bool
 
     @property
-    def timeline(self) -> Schedule:
-        """The course of the schedule."""
+    def schedule(self) -> Schedule:
+        """The schedule for the stage's scene."""
         ...
 
     def enter(self, phase: Any) -> None:
@@ -106,35 +111,52 @@ class Scalable(Scheduled, Protocol):
     """A stage whose schedule can be scaled while it learns.
 
     Attributes:
-        schedule: the present settings of the schedule; ``schedule.scaled(factor)`` has as many
-            phases, in ``factor`` times their iterations.
-        configured_schedule: those before it was scaled; None until then.
+        schedule: the present one.
+        configured_schedule: the one before it was scaled; None until then.
     """
 
     schedule: Any
     configured_schedule: Any
 
-    def timeline_of(self, schedule: Any) -> Schedule:
-        """The course of a schedule with the stage's scene."""
-        ...
+
+def unscaled(stage: Scalable) -> Schedule:
+    """A stage's schedule as it was configured."""
+    schedule: Schedule = stage.configured_schedule or stage.schedule
+    return schedule
 
 
-def configured_timeline(stage: Scalable) -> Schedule:
-    """The course of a stage's schedule as it was configured, before it was scaled."""
-    return stage.timeline_of(stage.configured_schedule or stage.schedule)
+def entered_phase(stage: Scheduled) -> Phase:
+    """The present phase of a stage, for whose iterations grids and learning rates are ready.
+
+    Raises:
+        DevrfError: the callback that makes them so is missing.
+    """
+    iteration = stage.position.iteration
+    phase: Phase | None = stage.phase
+    if phase is None or phase != stage.schedule.phase(iteration):
+        raise DevrfError(
+            f"{type(stage).__name__}: the phase of iteration {iteration} was not "
+            "entered: add devrf.callbacks.GridUpscaling to the trainer's callbacks"
+        )
+    if not stage.has_scheduled_rates:
+        raise DevrfError(
+            f"{type(stage).__name__}: the learning rates of its schedule are not set: add "
+            "devrf.callbacks.LearningRateDecay to the trainer's callbacks"
+        )
+    return phase
 
 
 def scale_schedule(stage: Scalable, factor: float) -> None:
     """Have a stage go on at the same place of its schedule in ``factor`` times its iterations."""
-    stage.configured_schedule = stage.configured_schedule or stage.schedule
-    before = stage.timeline
+    before = stage.schedule
+    stage.configured_schedule = unscaled(stage)
     position = stage.position
     entered = stage.phase == before.phase(position.iteration)
     stage.schedule = stage.configured_schedule.scaled(factor)
     position.schedule_scale = factor
-    position.iteration = same_place(position.iteration, before, stage.timeline)
+    position.iteration = same_place(position.iteration, before, stage.schedule)
     if entered:
-        stage.phase = stage.timeline.phase(position.iteration)
+        stage.phase = stage.schedule.phase(position.iteration)
 
 
 def same_place(iteration: int, before: Schedule, after: Schedule) -> int:

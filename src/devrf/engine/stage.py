@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial, reduce
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NoReturn
+from typing import Any, ClassVar, NoReturn
 
 import torch
 from lightning import LightningDataModule, LightningModule, Trainer
@@ -22,7 +22,6 @@ from torch import Tensor
 from devrf.checkpoints.checkpoint import (
     MODEL,
     UNFIT,
-    CheckpointMetadata,
     LoadedCheckpoint,
     Viewpoints,
     check_scene,
@@ -31,6 +30,7 @@ from devrf.checkpoints.checkpoint import (
 )
 from devrf.checkpoints.progress import rng_state, set_rng_state
 from devrf.data.batch import BackgroundColor
+from devrf.data.datamodule import SceneDataModule
 from devrf.engine.batch_size import BatchSize
 from devrf.engine.ddp import (
     assert_replicas_equal,
@@ -42,15 +42,16 @@ from devrf.engine.ddp import (
 from devrf.engine.grid_adam import GridAdam
 from devrf.engine.plan import StagePlan
 from devrf.engine.position import Position
+from devrf.engine.protocol import CaptureChoice
 from devrf.engine.provenance import Provenance
 from devrf.engine.resumed_loops import resumed_fit_loop
-from devrf.engine.schedule import Phase, Schedule, scale_schedule
+from devrf.engine.schedule import Phase, Schedule, entered_phase, scale_schedule
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import HeldOutView, score
-from devrf.evaluation.scoring import log_scores
+from devrf.evaluation.scoring import log_scores, log_validation
 from devrf.rendering.renderable import Renderable
 from devrf.rendering.renderer import Renderer
-from devrf.scenes.scene import CaptureName, ImagesName, Scene, Views
+from devrf.scenes.scene import ImagesName, Scene
 from devrf.system.memory import OutOfMemoryError, is_oom
 from devrf.system.profiling import span
 
@@ -72,6 +73,7 @@ class Stage(LightningModule, ABC):
     Attributes:
         name: the stage's name in files, messages and protocols.
         capture: the part of the scene that is learned from.
+        images: the training views that a batch is drawn from, by name.
         rate_keys: the config keys of what to lower when training diverges.
         keeps_batches: whether a budget of time leaves out iterations before it makes batches
             smaller.
@@ -79,8 +81,8 @@ class Stage(LightningModule, ABC):
         plan: class of the plan, by which needs are forecast before the stage is built.
         iterations_per_step: iterations of a Lightning step at most.
         scene_model: the scene that is learned.
-        schedule: the settings of the schedule.
-        configured_schedule: those before it was scaled (``schedule.seconds``); None until then.
+        schedule: of the iterations, for the scene; once the stage is set up.
+        configured_schedule: the one before it was scaled (``schedule.seconds``); None until then.
         optimizer: steps over everything that is learned; the same object throughout.
         phase: the phase that grids and optimiser are ready for; None before the first.
         position: the place in the schedule.
@@ -98,13 +100,14 @@ class Stage(LightningModule, ABC):
     """
 
     name: str
-    capture: CaptureName | Literal["both"]
+    capture: CaptureChoice
+    images: tuple[ImagesName, ...]
     rate_keys: ClassVar[str] = "the learning rates"
     keeps_batches: bool = False
     useful_share: float = 0.0
     plan: ClassVar[type[StagePlan]] = StagePlan
     scene_model: Renderable
-    schedule: Any
+    schedule: Schedule
     optimizer: GridAdam
     phase: Phase | None
 
@@ -118,7 +121,7 @@ class Stage(LightningModule, ABC):
         self.background = BackgroundColor("white")
         self.provenance = Provenance()
         self.generator = torch.Generator()
-        self.configured_schedule: Any = None
+        self.configured_schedule: Schedule | None = None
         self.has_scheduled_rates = False
         self.began = 0.0
         self.has_begun = False
@@ -140,16 +143,6 @@ class Stage(LightningModule, ABC):
             error, from which the PSNR follows; further terms. The names are the same throughout a
             phase.
         """
-
-    def timeline_of(self, schedule: Any) -> Schedule:
-        """The course of a schedule with the stage's scene: by default the schedule itself."""
-        course: Schedule = schedule
-        return course
-
-    @property
-    @abstractmethod
-    def resolution(self) -> tuple[int, ...]:
-        """Present shape of the grid that is learned; empty where there is none."""
 
     @abstractmethod
     def enter(self, phase: Any) -> None:
@@ -192,7 +185,7 @@ class Stage(LightningModule, ABC):
             empty if memory ran out in the first. ``psnr`` () is that of the batches in dB.
         """
         position = self.position
-        stop = min(self._entered_phase().stop, self.timeline.total)
+        stop = min(entered_phase(self).stop, self.schedule.total)
         count = self.iterations_per_step
         if self.trainer.max_steps > 0:
             count = min(count, self.trainer.max_steps - self.trainer.global_step)
@@ -203,7 +196,7 @@ class Stage(LightningModule, ABC):
             try:
                 losses.append(self.batch_size.attempt(iterate, self.optimizer, self.device))
             except OutOfMemoryError as shortage:
-                self.abort(f"{shortage}; it was at {self.describe(position.iteration)}")
+                self.abort(f"{shortage}; it was at {place_of(self, position.iteration)}")
                 break
             position.advance()
         means = mean_terms(losses, self.batch_size.processes)
@@ -215,14 +208,10 @@ class Stage(LightningModule, ABC):
         if "render" in means:
             means["psnr"] = -10 * means["render"].clamp_min(1e-12).log10()
         if means:
-            self._log(means)
+            curves = {f"{self.capture}/{name}": mean for name, mean in means.items()}
+            by_iterations = {"step": float(position.iterations_done)}
+            self.log_dict({**curves, **by_iterations}, on_step=True, on_epoch=False, batch_size=1)
         return means
-
-    def _log(self, means: Terms) -> None:
-        """Log the means of a step, by iterations."""
-        values: dict[str, Any] = {f"{self.capture}/{name}": value for name, value in means.items()}
-        values["step"] = float(self.position.iterations_done)
-        self.log_dict(values, on_step=True, on_epoch=False, batch_size=1)
 
     def optimise(self, loss: Tensor) -> None:
         """Go back from a loss () to the gradients, and take the optimiser's step.
@@ -242,30 +231,6 @@ class Stage(LightningModule, ABC):
             optimizer.step()
         self.batch_size.is_final = False
 
-    def _entered_phase(self) -> Phase:
-        """The present phase, for whose iterations grids and learning rates are ready.
-
-        Raises:
-            DevrfError: the callback that makes them so is missing.
-        """
-        iteration = self.position.iteration
-        if self.phase is None or self.phase != self.timeline.phase(iteration):
-            raise DevrfError(
-                f"{type(self).__name__}: the phase of iteration {iteration} was not "
-                "entered: add devrf.callbacks.GridUpscaling to the trainer's callbacks"
-            )
-        if not self.has_scheduled_rates:
-            raise DevrfError(
-                f"{type(self).__name__}: the learning rates of its schedule are not set: add "
-                "devrf.callbacks.LearningRateDecay to the trainer's callbacks"
-            )
-        return self.phase
-
-    @property
-    def timeline(self) -> Schedule:
-        """The course of the present schedule."""
-        return self.timeline_of(self.schedule)
-
     def abort(self, why: str) -> None:
         """End the stage after the present step; the fit then raises an error that says ``why``."""
         self.abort_reason = f"{self.name} stage: {why}"
@@ -274,55 +239,27 @@ class Stage(LightningModule, ABC):
     # What a subclass, callbacks and commands ask.
 
     @property
-    def iteration(self) -> int:
-        """The next iteration."""
-        return self.position.iteration
-
-    @property
     def is_complete(self) -> bool:
         """Whether the stage has gone through its whole schedule, or was to end before."""
-        return self.position.ended_early or self.position.iteration >= self.timeline.total
+        return self.position.ended_early or self.position.iteration >= self.schedule.total
+
+    @property
+    def datamodule(self) -> SceneDataModule:
+        """The trainer's datamodule, which serves the views."""
+        datamodule: SceneDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
+        return datamodule
 
     @property
     def scene(self) -> Scene:
-        """The scene of the trainer's datamodule."""
-        scene: Scene = self.trainer.datamodule.scene  # type: ignore[attr-defined]
-        return scene
-
-    @property
-    def images(self) -> tuple[ImagesName, ...]:
-        """The names of the training views that are learned from."""
-        return ("static", "dynamic") if self.capture == "both" else (self.capture,)
-
-    def training_views(self, images: ImagesName) -> Views:
-        """The training views called so, on the stage's device."""
-        views: Views = self.trainer.datamodule.training_views(  # type: ignore[attr-defined]
-            images, self.device
-        )
-        return views
-
-    @property
-    def scored_capture(self) -> CaptureName:
-        """The capture whose held-out views measure what was learned."""
-        return "dynamic" if self.capture == "both" else self.capture
-
-    def describe(self, iteration: int) -> str:
-        """An iteration of the present phase, with its frame and resolution, for messages."""
-        number = None if self.phase is None else self.phase.frame
-        frame = "" if number is None else f"frame {number}"
-        shape = "x".join(str(n) for n in self.resolution)
-        place = ", ".join(part for part in (frame, shape) if part)
-        return f"iteration {iteration} of {self.timeline.total}{place and f' ({place})'}"
-
-    def metadata(self) -> CheckpointMetadata:
-        """The metadata of a checkpoint of this stage."""
-        return self.provenance.metadata(
-            self.name, self.scene_model, self.scene, complete=self.is_complete
-        )
+        """The scene that is learned from, on the host."""
+        return self.datamodule.scene
 
     def result(self) -> LoadedCheckpoint:
         """The learned scene, for a stage that builds on this one."""
-        return LoadedCheckpoint(self.metadata(), self.scene_model)
+        metadata = self.provenance.metadata(
+            self.name, self.scene_model, self.scene, complete=self.is_complete
+        )
+        return LoadedCheckpoint(metadata, self.scene_model)
 
     # Lightning's other hooks, in the order in which they are called.
 
@@ -350,6 +287,7 @@ class Stage(LightningModule, ABC):
         # Lightning moves the stage to this device later.
         self.generator = torch.Generator(self.trainer.strategy.root_device)
         self.background = BackgroundColor(self.scene.background)
+        self.images = ("static", "dynamic") if self.capture == "both" else (self.capture,)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Restore the position in the schedule; tensors are loaded next.
@@ -367,7 +305,7 @@ class Stage(LightningModule, ABC):
             return
         if progress["schedule_scale"] != 1:
             scale_schedule(self, progress["schedule_scale"])
-        total = self.timeline.total
+        total = self.schedule.total
         if (progress["stage"], progress["total"]) != (self.name, total):
             raise DevrfError(
                 f"{path}: left by the {progress['stage']} stage on a schedule of "
@@ -380,7 +318,7 @@ class Stage(LightningModule, ABC):
             checkpoint["loops"]["fit_loop"], self.trainer
         )
         first = progress["phase"]
-        self.phase = None if first is None else self.timeline.phase(first)
+        self.phase = None if first is None else self.schedule.phase(first)
 
     def configure_optimizers(self) -> GridAdam:
         """The optimiser; in a resumed run with the parameters of the phase that was left."""
@@ -411,12 +349,12 @@ class Stage(LightningModule, ABC):
 
         Without the optimiser's state a checkpoint is for rendering, not for resuming.
         """
-        checkpoint["devrf"] = asdict(self.metadata())
+        checkpoint["devrf"] = asdict(self.result().metadata)
         checkpoint["viewpoints"] = asdict(Viewpoints.of(self.scene))
         if "optimizer_states" in checkpoint:
             checkpoint["progress"] = {
                 "stage": self.name,
-                "total": self.timeline.total,
+                "total": self.schedule.total,
                 **self.position.state(),
                 **self.batch_size.state(),
                 "phase": None if self.phase is None else self.phase.start,
@@ -440,21 +378,14 @@ class Stage(LightningModule, ABC):
             assert_replicas_equal({name: t for name, t in state if isinstance(t, Tensor)})
 
     def validation_step(self, index: int, batch_idx: int) -> dict[str, HeldOutView]:
-        """Render and score one validation view, or held-out one, as ``val/psnr``, ``val/ssim``.
+        """Render and score one validation view; the means over all are logged.
 
         Returns:
             ``view``, for callbacks.
         """
-        views = self.scene.capture(self.scored_capture)
-        view = self._score(views.test if views.validation is None else views.validation, index)
-        scores = {"psnr": view.psnr, "ssim": view.ssim}
-        log_means = partial(self.log_dict, on_epoch=True, batch_size=1, sync_dist=True)
-        learning = self.trainer.state.fn == TrainerFn.FITTING
-        # Callbacks find the same name in every stage; curves of stages are apart.
-        log_means({f"val/{name}": value for name, value in scores.items()}, logger=not learning)
-        if learning:
-            curves = {f"{self.capture}/val_{name}": value for name, value in scores.items()}
-            log_means({**curves, "step": float(self.position.iterations_done)})
+        views = self.datamodule.validation_views
+        view = score(Renderer(self.current_model()), views, index, self.scene.background)
+        log_validation(self, view, self.capture, self.position.iterations_done)
         return {"view": view}
 
     def on_validation_end(self) -> None:
@@ -469,8 +400,8 @@ class Stage(LightningModule, ABC):
         reasons.discard(EarlyStoppingReason.NOT_STOPPED)
         if not reasons:
             return
-        where = self.describe(self.position.iteration)
-        last = self.timeline.phase(self.timeline.total).kind
+        where = place_of(self, self.position.iteration)
+        last = self.schedule.phase(self.schedule.total).kind
         if not reasons <= CONVERGED:
             self.abort(f"EarlyStopping has ended it at {where}, as its metric went wrong")
         elif self.phase.kind != last:
@@ -480,17 +411,15 @@ class Stage(LightningModule, ABC):
             log.info("%s: EarlyStopping has ended it at %s", self.name, where)
 
     def test_step(self, index: int, batch_idx: int) -> dict[str, HeldOutView]:
-        """Render and score one held-out image; the means over all images are logged.
+        """Render and score one held-out view; the means over all are logged.
 
         Returns:
             ``view``, for callbacks.
         """
-        view = self._score(self.scene.capture(self.scored_capture).test, index)
-        log_scores(self, self.scored_capture, view)
+        views = self.datamodule.test_views
+        view = score(Renderer(self.current_model()), views, index, self.scene.background)
+        log_scores(self, self.datamodule.scored_capture, view)
         return {"view": view}
-
-    def _score(self, views: Views, index: int) -> HeldOutView:
-        return score(Renderer(self.current_model()), views, index, self.scene.background)
 
     @classmethod
     def load_from_checkpoint(cls, *_: Any, **__: Any) -> NoReturn:
@@ -521,6 +450,15 @@ def fit(
         if progress is None or other:
             raise
         raise unfit(progress, error) from error
+
+
+def place_of(stage: Stage, iteration: int) -> str:
+    """An iteration of the present phase, with its frame and its grid's shape, for messages."""
+    number = None if stage.phase is None else stage.phase.frame
+    frame = "" if number is None else f"frame {number}"
+    shape = "x".join(str(n) for n in stage.scene_model.resolution)
+    place = ", ".join(part for part in (frame, shape) if part)
+    return f"iteration {iteration} of {stage.schedule.total}{place and f' ({place})'}"
 
 
 def mean_terms(iterations: Sequence[Terms], processes: int) -> Terms:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from statistics import fmean
 
 from lightning import LightningModule, Trainer
+from lightning.pytorch.trainer.states import TrainerFn
 
 from devrf.evaluation.held_out import HeldOutView, score
 from devrf.evaluation.motion import flicker
@@ -88,6 +90,21 @@ def log_scores(module: LightningModule, name: str, view: HeldOutView) -> None:
     known = {metric: value for metric, value in view.scores.items() if value is not None}
     means = {f"test/{name}/{metric}": value for metric, value in known.items()}
     module.log_dict(means, on_epoch=True, batch_size=1, sync_dist=True)
+
+
+def log_validation(module: LightningModule, view: HeldOutView, curve: str, step: int) -> None:
+    """Log a view's PSNR and SSIM within ``validation_step``: their means over the views.
+
+    They are ``val/METRIC``, which callbacks monitor, whatever learns. While it learns loggers get
+    them as ``CURVE/val_METRIC``, at iteration ``step``: curves of stages are apart.
+    """
+    scores = {"psnr": view.psnr, "ssim": view.ssim}
+    log_means = partial(module.log_dict, on_epoch=True, batch_size=1, sync_dist=True)
+    learning = module.trainer.state.fn == TrainerFn.FITTING
+    log_means({f"val/{name}": value for name, value in scores.items()}, logger=not learning)
+    if learning:
+        curves = {f"{curve}/val_{name}": value for name, value in scores.items()}
+        log_means({**curves, "step": float(step)})
 
 
 class _HeldOut:

@@ -162,11 +162,6 @@ class Trainable(Renderable, Generic[Batch]):
     def on_iteration(self, step: int, total: int) -> None:
         """Called before iteration ``step`` of ``total``: for encoding windows and curricula."""
 
-    @property
-    def resolution(self) -> tuple[int, ...]:
-        """Present shape of the grid that is learned; empty where there is none."""
-        return ()
-
     def growths(self, total: int) -> Sequence[int]:
         """Iterations, ascending, of a stage of ``total`` at which grids grow."""
         return ()

@@ -14,7 +14,7 @@ from devrf.engine.protocol import ProtocolStage
 from devrf.errors import expect
 from devrf.methods.base import ImageTrainable
 from devrf.methods.ray_plan import REHEARSED_ITERATIONS, RayPlan
-from devrf.methods.ray_schedule import RaySchedule, RayTimeline
+from devrf.methods.ray_schedule import RaySchedule, RayStageSchedule
 from devrf.methods.ray_stage import RayStage
 from devrf.scenes.scene import Views
 
@@ -92,13 +92,13 @@ class ImageStage(RayStage):
         """A pixel for each image."""
         return FrameSortedPixels.of_images(views)
 
-    def _with_method(self) -> RayTimeline:
-        timeline = super()._with_method()
+    def _with_method(self) -> RayStageSchedule:
+        schedule = super()._with_method()
         changes = {WHOLE: self.half_size}
         if self.capture == "both":
             changes[MOVING] = self.static_first
-        at = {name: round(share * timeline.total) for name, share in changes.items() if share}
-        return replace(timeline, milestones={**timeline.milestones, **at})
+        at = {name: round(share * schedule.total) for name, share in changes.items() if share}
+        return replace(schedule, milestones={**schedule.milestones, **at})
 
     def draw_batch(self, views: Views | tuple[Views, ...]) -> ImageBatch:
         """A random image, or some of its rows."""

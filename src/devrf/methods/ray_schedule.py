@@ -88,28 +88,28 @@ class RaySchedule(Options):
 
 
 @dataclass(frozen=True)
-class RayTimeline:
+class RayStageSchedule:
     """The schedule of a stage that learns a method (:class:`~devrf.engine.schedule.Schedule`).
 
     Attributes:
-        schedule: of this stage alone.
+        settings: of this stage alone.
         growths: iterations at which the method's grids grow, ascending.
         milestones: iterations of what happens once, by name.
     """
 
-    schedule: RaySchedule
+    settings: RaySchedule
     growths: tuple[int, ...] = ()
     milestones: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def rays(self) -> int:
         """Rays of a batch."""
-        return self.schedule.rays
+        return self.settings.rays
 
     @property
     def total(self) -> int:
         """Iterations of the stage."""
-        return self.schedule.iterations
+        return self.settings.iterations
 
     @property
     def planned_events(self) -> Mapping[str, int]:
@@ -130,16 +130,16 @@ class RayTimeline:
         return Phase(kind="rays", start=edges[number - 1], stop=edges[number])
 
     def learning_rate_factor(self, iteration: int) -> float:
-        """The schedule's."""
-        return self.schedule.learning_rate_factor(iteration)
+        """That of the settings."""
+        return self.settings.learning_rate_factor(iteration)
 
-    def scaled(self, factor: float) -> RayTimeline:
+    def scaled(self, factor: float) -> RayStageSchedule:
         """As many phases in ``factor`` times the iterations, one each at least."""
         edges = [0]
         for edge in self._edges[1:]:
             edges.append(max(round(edge * factor), edges[-1] + 1))
-        return RayTimeline(
-            replace(self.schedule.scaled(factor), iterations=edges[-1]),
+        return RayStageSchedule(
+            replace(self.settings.scaled(factor), iterations=edges[-1]),
             growths=tuple(edges[1:-1]),
             milestones={name: round(at * factor) for name, at in self.milestones.items()},
         )

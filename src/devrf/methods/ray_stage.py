@@ -19,15 +19,14 @@ from devrf.data.batch import (
     RayBatch,
     concatenated,
 )
-from devrf.data.datamodule import SceneDataModule
 from devrf.engine.grid_adam import GridAdam
 from devrf.engine.protocol import ProtocolStage
-from devrf.engine.schedule import Phase, configured_timeline
+from devrf.engine.schedule import Phase, unscaled
 from devrf.engine.stage import Stage, Terms
 from devrf.methods.base import Trainable
 from devrf.methods.batch import gather_batch
 from devrf.methods.ray_plan import RayPlan
-from devrf.methods.ray_schedule import GROWN, RaySchedule, RayTimeline
+from devrf.methods.ray_schedule import GROWN, RaySchedule, RayStageSchedule
 from devrf.methods.weighted_loss import counted_weights, visibility, weighted_sum
 from devrf.scenes.scene import Views
 from devrf.scenes.space import dynamic_only
@@ -44,7 +43,7 @@ class RayStage(Stage):
     rate_keys = "ray_stage.schedule.learning_rate or the weights of ray_stage.loss"
     plan = RayPlan
     scene_model: Trainable[Any]
-    schedule: RayTimeline
+    schedule: RayStageSchedule
 
     def __init__(
         self,
@@ -72,7 +71,7 @@ class RayStage(Stage):
         self.protocol_stage = protocol_stage
         total = protocol_stage.share_of(schedule.iterations)
         of_stage = replace(schedule, iterations=total)
-        self.schedule = RayTimeline(of_stage)
+        self.schedule = RayStageSchedule(of_stage)
         self.static_share = static_share
         self.scene_model = model
         self._ready = earlier is not None
@@ -139,19 +138,13 @@ class RayStage(Stage):
     @property
     def settings(self) -> RaySchedule:
         """The schedule's settings."""
-        return self.schedule.schedule
-
-    @property
-    def resolution(self) -> tuple[int, ...]:
-        """Present shape of the method's grid, if it has one."""
-        return self.scene_model.resolution
+        return self.schedule.settings
 
     def setup(self, stage: str) -> None:
         """Give the model what it needs of the scene, and make the optimiser."""
         # Before the clock starts: priors are read, or made as a scene's reader makes them.
-        datamodule: SceneDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
-        if datamodule.priors == "all":
-            datamodule.provide(self.scene_model.priors)
+        if self.datamodule.priors == "all":
+            self.datamodule.provide(self.scene_model.priors)
         super().setup(stage)
         if not self._ready:
             # A protocol without a stage that learns from the static set does not look at it.
@@ -173,7 +166,7 @@ class RayStage(Stage):
         first, second = settings.betas
         self.optimizer = GridAdam(groups, betas=(first, second), eps=settings.eps)
 
-    def _with_method(self) -> RayTimeline:
+    def _with_method(self) -> RayStageSchedule:
         """The schedule with what the method itself does in the course of the stage."""
         settings = self.settings
         total = settings.iterations
@@ -185,7 +178,7 @@ class RayStage(Stage):
         if settings.warmup:
             milestones["rate grown"] = math.ceil(settings.warmup * total)
         growths = tuple(sorted({*self.scene_model.growths(total)}))
-        return RayTimeline(settings, growths, milestones)
+        return RayStageSchedule(settings, growths, milestones)
 
     def enter(self, phase: Phase) -> None:
         """Let grids grow; when the stage begins or goes on, gather the pixels to draw from."""
@@ -204,7 +197,7 @@ class RayStage(Stage):
         fewer = self.settings.rays_without_hull
         if fewer is not None and not self.scene_model.has_hull:
             self._rays = fewer
-        views = [self.training_views(images) for images in self.images]
+        views = [self.datamodule.training_views(name, self.device) for name in self.images]
         if self.scene_model.random_background and all(view_set.has_alpha for view_set in views):
             self.background = BackgroundColor("random")
         self.pools = [self.pool_of(view_set) for view_set in views]
@@ -219,7 +212,7 @@ class RayStage(Stage):
     def prepare(self) -> None:
         """Let the model follow the schedule, whose configured iterations it knows."""
         total = self.schedule.total
-        whole = configured_timeline(self).total
+        whole = unscaled(self).total
         iteration = self.position.iteration
         self.scene_model.on_iteration(iteration * whole // total, whole)
         for name, at in self.schedule.milestones.items():

@@ -112,6 +112,11 @@ class Renderable(StoredClass, nn.Module, ABC):
         return True
 
     @property
+    def resolution(self) -> tuple[int, ...]:
+        """Present shape of the grid that is learned; empty where there is none."""
+        return ()
+
+    @property
     def size(self) -> int:
         """Number of learned values."""
         return sum(parameter.numel() for parameter in self.parameters())

@@ -141,7 +141,7 @@ def test_no_tab_of_a_browser_ends_learning(fit, canonical, session, tab, caplog)
     for said in (*HOSTILE, {}):
         tab(**said)
     stage = fit(canonical(iterations=40, upsample_at=()), LiveView(session, 1.0))
-    assert stage.iteration == stage.timeline.total and session.frames > len(HOSTILE)
+    assert stage.position.iteration == stage.schedule.total and session.frames > len(HOSTILE)
     assert not caplog.records
     assert len(session.scheduler._requests) == 5  # of those that have an area and a pose
 
@@ -163,6 +163,6 @@ def test_no_error_of_the_viewer_ends_learning(
 
     monkeypatch.setattr(Drawing, "draw", fails_now_and_then)
     stage = fit(canonical(iterations=20, upsample_at=()), live_view.LiveView(session, 1.0))
-    assert stage.iteration == stage.timeline.total and session.frames > 4
+    assert stage.position.iteration == stage.schedule.total and session.frames > 4
     kind = type(error).__name__
     assert caplog.messages == [f"viewer: {kind}: {error}; it goes on, and says this once"]

@@ -102,8 +102,8 @@ def test_planes_of_both_fields(forward_scene, fit, serve):
     schedule = CanonicalSchedule(0, 8, iterations=10, side=12, upsample_at=(), rays=16)
     sizes, loss = Architecture(4, 16, 0, planes=7), {"render": 1.0, "tv": 1e-3}
     rest = fit(CanonicalStage(schedule, sizes, fine_loss=loss), data=data)
-    group, across = rest.optimizer.param_groups[0], max(rest.resolution[:2])
-    assert rest.resolution[2] == 7 < across
+    group, across = rest.optimizer.param_groups[0], max(rest.scene_model.resolution[:2])
+    assert rest.scene_model.resolution[2] == 7 < across
     # Total variation: by the planes along z, by the longer of the other sides along these.
     assert group["smoothing"] == pytest.approx(1e-3 * across / 128 / 16 / 6)
     assert group["smoothing"] * group["along_z"] == pytest.approx(1e-3 * 7 / 128 / 16 / 6)

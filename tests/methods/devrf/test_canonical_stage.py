@@ -46,7 +46,7 @@ class Watch(Callback):
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, *_: Any) -> None:
         self.loss.append(float(outputs["loss"]))
         decoder = type(pl_module.scene_model.canonical.decoder).__name__
-        self.seen.append((pl_module.phase.kind, pl_module.resolution, decoder))
+        self.seen.append((pl_module.phase.kind, pl_module.scene_model.resolution, decoder))
 
 
 def test_an_iteration_asks_little_of_the_device(canonical, datamodule, trainer):
@@ -89,7 +89,7 @@ def test_the_whole_schedule_is_run_and_the_loss_falls(datamodule, trainer):
     fit = trainer(watch, max_epochs=1)
     fit.fit(stage, datamodule=datamodule)
     # Seven at a time, never across the growth at 20: 7 + 7 + 6, then 5 · 7 + 5.
-    assert len(watch.seen) == 9 and stage.iteration == fit.global_step == 60
+    assert len(watch.seen) == 9 and stage.position.iteration == fit.global_step == 60
     coarse, fine = {seen[1] for seen in watch.seen[:3]}, {seen[1] for seen in watch.seen[3:]}
     box = stage.scene_model.canonical.box
     assert coarse == {box.grid_shape(16**3 // 2)} and fine == {box.grid_shape(16**3)}
@@ -110,8 +110,8 @@ def test_coarse_and_few_pixels_make_a_coarse_grid_and_small_batches(fit):
     resolved = replace(CARVED, side=64, voxels_per_pixel=1.0, rays=4096, **few)
     stages = [fit(CanonicalStage(replace(resolved, epochs=n), SMALL)) for n in (None, 2.0)]
     assert stages[0].scene_model.canonical.base_voxels < 64**3 / 8
-    assert stages[0].resolution == stages[1].resolution
-    assert stages[0].resolution == stages[0].scene_model.canonical.box.grid_shape(
+    assert stages[0].scene_model.resolution == stages[1].scene_model.resolution
+    assert stages[0].scene_model.resolution == stages[0].scene_model.canonical.box.grid_shape(
         stages[0].scene_model.canonical.base_voxels
     )
     pixels = len(stages[1].pool)
@@ -240,7 +240,7 @@ def test_a_grown_grid_is_thinned_and_gets_a_new_optimiser(fit):
 
     class Watched(CanonicalStage):
         def opaque(self) -> torch.Tensor:
-            renewed.append(self.iteration)
+            renewed.append(self.position.iteration)
             return super().opaque()
 
         def enter(self, phase: Any) -> None:

@@ -30,7 +30,7 @@ def test_two_steps_move_the_first_frame_only(rest, datamodule, trainer):
     before = {k: v.clone() for k, v in rest.model.canonical.named_parameters()}
     stage, fit = DeformationStage(rest, SHORT), trainer(max_steps=2)
     fit.fit(stage, datamodule=datamodule)
-    assert stage.iteration == fit.global_step == 2
+    assert stage.position.iteration == fit.global_step == 2
     assert stage.field.to_canonical[1].abs().max() > 0
     # Two steps of Adam move no voxel further than twice the rate, or little more.
     assert stage.field.to_canonical[1].abs().max() < 2.5e-3
@@ -83,8 +83,8 @@ def test_a_whole_schedule_sees_the_motion_better_than_the_rest_pose(
     schedule = DeformationSchedule(levels=(Level(4, 30), Level(8, 15)), rays=128)
     stage = DeformationStage(rest, schedule, FAST)
     trainer(max_epochs=1).fit(stage, datamodule=datamodule)
-    assert stage.iteration == stage.timeline.total == 135
-    assert stage.resolution == stage.scene_model.canonical.box.grid_shape(8**3)
+    assert stage.position.iteration == stage.schedule.total == 135
+    assert stage.scene_model.resolution == stage.scene_model.canonical.box.grid_shape(8**3)
     for frames in (stage.field.to_canonical, stage.field.to_time):
         assert not frames[0].any()
         assert (frames[1:].abs().amax(dim=(1, 2, 3, 4)) > 1e-3).all()
@@ -247,4 +247,4 @@ def test_a_frame_has_a_copy_of_the_frame_before_it(rest, four_frames, trainer):
     watch = LambdaCallback(on_train_batch_start=look)
     trainer(watch, max_epochs=1).fit(stage, datamodule=four_frames)
     assert visited == [(0, 1), (0, 2), (0, 3), (1, 1), (1, 2), (1, 3)]
-    assert stage.iteration == stage.timeline.total == 8 + 4
+    assert stage.position.iteration == stage.schedule.total == 8 + 4

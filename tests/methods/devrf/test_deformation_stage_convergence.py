@@ -31,7 +31,7 @@ def test_a_frame_that_has_converged_is_left_if_asked(rest, datamodule, trainer):
     trainer(max_epochs=1).fit(stage, datamodule=datamodule)
     # No step takes off all of the loss: each visit ends after the three steps that tell.
     assert stage.position.iterations_done == 2 * 2 * 3 * 2
-    assert stage.iteration == stage.timeline.total == 60
+    assert stage.position.iteration == stage.schedule.total == 60
 
 
 def test_a_gain_is_a_share():

@@ -143,7 +143,7 @@ def test_the_loss_falls(fit: Callable[..., ImageStage]) -> None:
 
     for iterations in (2, 40):
         learned = fit(stage(iterations=iterations))
-        views = learned.training_views("dynamic")
+        views = learned.datamodule.training_views("dynamic", learned.device)
         image = Renderer(learned.scene_model).view(views.cameras, 0, float(views.times[0]), 1.0)
         alpha = views.pixels[0].float().flatten(0, 1)[:, 3:] / 255
         truth = 1 + alpha * (views.pixels[0].float().flatten(0, 1)[:, :3] / 255 - 1)

@@ -103,7 +103,7 @@ def test_two_stages_freeze_all_or_all_but_what_ambient_space_enters_by(
     assert {"warp.velocity.bias", "codes.table.weight"} <= changed
     # The scene at time 0 stays as it is.
     assert torch.equal(Renderer(second.scene_model).view(cameras, 1, 0.0, 1.0).color, at_rest)
-    assert set(second.metadata().records) == {"canonical", "deformation"}
+    assert set(second.result().metadata.records) == {"canonical", "deformation"}
 
 
 def test_what_cannot_be_is_said() -> None:

@@ -151,7 +151,7 @@ def test_a_run_that_was_stopped_between_two_growths_goes_on_to_the_same_weights(
         return ray_stage(TiNeuVox(small), loss=LOSS, iterations=8)
 
     whole, stopped, _ = stopped_and_resumed(stage, at=4)
-    assert stopped.resolution < whole.resolution
+    assert stopped.scene_model.resolution < whole.scene_model.resolution
 
 
 def test_two_stages_leave_the_canonical_part_as_it_was(
@@ -175,7 +175,7 @@ def test_scenes_of_every_space_are_learned_and_come_back(
     scene = request.getfixturevalue(name)
     stage = fit(ray_stage(TiNeuVox(TINY), loss=LOSS), data=serve(scene))
     model = stored(stage).model
-    assert model.space == scene.space and model.resolution == stage.resolution
+    assert model.space == scene.space and model.resolution == stage.scene_model.resolution
     cameras = scene.static.test.cameras
     now, then = (Renderer(m).view(cameras, 0, 0.5, 1.0) for m in (stage.scene_model, model))
     assert torch.equal(now.color, then.color)

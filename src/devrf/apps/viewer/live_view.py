@@ -42,7 +42,7 @@ class LiveView(Callback):
         self.seconds = 0.0
         self._began = time.perf_counter()
         self._first = pl_module.position.iterations_done
-        self._share = share_done(pl_module.timeline, pl_module.iteration)
+        self._share = share_done(pl_module.schedule, pl_module.position.iteration)
         with self.session.surviving():
             background = background_value(pl_module.scene.background)
             self.session.present(Drawing(_renderer(pl_module), background))
@@ -62,7 +62,7 @@ class LiveView(Callback):
         with self.session.surviving():
             seconds = now - self._began
             speed = (pl_module.position.iterations_done - self._first) / seconds
-            share = share_done(pl_module.timeline, pl_module.iteration)
+            share = share_done(pl_module.schedule, pl_module.position.iteration)
             pace = (share - self._share) / seconds
             line = in_one_line(outputs or {}, pl_module, speed, share, pace)
             controls.tell(f"**{pl_module.name}**: {line}")
@@ -81,8 +81,8 @@ class LiveView(Callback):
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Say that the stage has ended."""
         assert isinstance(pl_module, Stage)
-        done = pl_module.iteration
-        total = pl_module.timeline.total
+        done = pl_module.position.iteration
+        total = pl_module.schedule.total
         with self.session.surviving():
             self.session.controls.tell(
                 f"**{pl_module.name}** has ended after {done} of {total} iterations. The picture "

@@ -54,7 +54,7 @@ from devrf.ops.photometric import distortion
 from devrf.rendering.occupancy import Occupancy, bounding_box, dilate
 from devrf.rendering.output import VoxelOutput
 from devrf.rendering.sampling import RenderSettings
-from devrf.scenes.scene import CaptureName, ImagesName, Views
+from devrf.scenes.scene import CaptureName, Views
 from devrf.system.profiling import span
 
 log = logging.getLogger(__name__)
@@ -190,19 +190,9 @@ class CanonicalStage(Stage):
         return self.objectives[self.phase.kind]
 
     @property
-    def images(self) -> tuple[ImagesName, ...]:
-        """The static views, with the dynamic ones' first frames if the schedule says so."""
-        return ("at_rest" if self.schedule.first_frames else "static",)
-
-    @property
     def views(self) -> Views:
         """The images that are learned from, on the stage's device."""
-        return self.training_views(self.images[0])
-
-    @property
-    def resolution(self) -> tuple[int, ...]:
-        """Present shape of the density and feature grids."""
-        return self.scene_model.canonical.density.shape
+        return self.datamodule.training_views(self.images[0], self.device)
 
     def _with_distortion(self, loss: Tensor, terms: Terms, output: VoxelOutput) -> Weighted:
         """In unbounded space surfaces are drawn together; distances are in half edges."""
@@ -220,6 +210,8 @@ class CanonicalStage(Stage):
         super().setup(stage)
         device = self.trainer.strategy.root_device
         self.decoder_dtype = decoder_dtype(self.decoder_precision, device)
+        if self.schedule.first_frames:
+            self.images = ("at_rest",)
         if hasattr(self, "scene_model"):
             return
         side = self.schedule.side

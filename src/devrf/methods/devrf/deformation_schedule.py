@@ -232,30 +232,34 @@ class Visits:
     """The schedule of a scene of T frames (:class:`~devrf.engine.schedule.Schedule`).
 
     Attributes:
-        schedule: levels and iterations.
+        settings: levels and iterations.
         frames: T, frame 0 included.
     """
 
-    schedule: DeformationSchedule
+    settings: DeformationSchedule
     frames: int
 
     @property
     def total(self) -> int:
         """Iterations of all levels and frames."""
-        return self.schedule.total(self.frames)
+        return self.settings.total(self.frames)
 
     @property
     def planned_events(self) -> Mapping[str, int]:
         """Numbers of levels, growths of the grid, and visits."""
-        return self.schedule.events(self.frames)
+        return self.settings.events(self.frames)
 
     def phase(self, iteration: int) -> DeformationPhase:
         """The visit of an iteration."""
-        return self.schedule.phase(iteration, self.frames)
+        return self.settings.phase(iteration, self.frames)
 
     def learning_rate_factor(self, iteration: int) -> float:
         """Factor of the iteration's level, and within its visit."""
         return self.phase(iteration).learning_rate_at(iteration)
+
+    def scaled(self, factor: float) -> Visits:
+        """The same visits in ``factor`` times their iterations."""
+        return replace(self, settings=self.settings.scaled(factor))
 
 
 def converged(losses: Sequence[float], min_rel_improvement: float) -> bool:

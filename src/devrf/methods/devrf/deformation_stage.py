@@ -55,14 +55,15 @@ class DeformationStage(Stage):
 
     Attributes:
         scene_model: the canonical field, its occupancy, and how it deforms.
-        schedule: levels, iterations and rays.
+        settings: levels, iterations and rays, as configured.
+        schedule: the visits to the scene's frames.
         motion: learning rate and how batches are drawn.
         motion_loss: the loss terms, and their weights at each level.
         context: model, data, optimiser and active frame, as extensions see them.
     """
 
     scene_model: DeVRFModel
-    schedule: DeformationSchedule
+    schedule: Visits
     context: MotionContext
     phase: DeformationPhase | None
     name = "deformation"
@@ -94,12 +95,12 @@ class DeformationStage(Stage):
             decoder_precision: of the colour network while it learns; ``auto``: as the GPU allows.
         """
         super().__init__(iterations_per_step)
-        self.schedule = schedule or DeformationSchedule()
+        self.settings = schedule or DeformationSchedule()
         self.motion = motion or MotionSettings()
         self.flow_mean = flow_mean
         self.decoder_precision = decoder_precision
         self.extensions = tuple((extensions or {}).values())
-        self.motion_loss = MotionLoss(loss, self.extensions, self.schedule)
+        self.motion_loss = MotionLoss(loss, self.extensions, self.settings)
         canonical = earlier.model
         self.scene_model = DeVRFModel(
             canonical.architecture,
@@ -174,7 +175,7 @@ class DeformationStage(Stage):
             iterations = round((phase.stop - phase.start) / self.position.schedule_scale)
             most = rays_for_epochs(self.motion.epochs, pixels, iterations)
         pool = frame.pools[self.position.iterations_done % len(frame.pools)]
-        return pool.draw(self.batch_size.rays(self.schedule.rays, most), self.generator)
+        return pool.draw(self.batch_size.rays(self.settings.rays, most), self.generator)
 
     @property
     def field(self) -> DeformationField:
@@ -192,15 +193,6 @@ class DeformationStage(Stage):
         """The frame that is trained; None before the first, and after the last."""
         return self.context.active if hasattr(self, "context") else None
 
-    def timeline_of(self, schedule: DeformationSchedule) -> Visits:
-        """The visits to the scene's frames."""
-        return Visits(schedule, len(self.field.clock))
-
-    @property
-    def resolution(self) -> tuple[int, ...]:
-        """Present shape of the motion grids."""
-        return self.field.shape
-
     def setup(self, stage: str) -> None:
         """Build a field of no motion at the coarsest resolution; refuse a scene without motion."""
         super().setup(stage)
@@ -212,8 +204,8 @@ class DeformationStage(Stage):
         self.phase = None  # no frame is active
         self.context = MotionContext(
             model=self.scene_model,
-            datamodule=self.trainer.datamodule,  # type: ignore[attr-defined]
-            schedule=self.schedule,
+            datamodule=self.datamodule,
+            settings=self.settings,
             optimizer=self.optimizer,
             generator=self.generator,
             background=self.background,
@@ -222,6 +214,7 @@ class DeformationStage(Stage):
         )
         if self.scene_model.deformation is None:
             self._build_field()
+            self.schedule = Visits(self.settings, len(self.field.clock))
             for extension in self.extensions:
                 extension.setup(self.context)
         if self.motion.unit == "box":
@@ -232,7 +225,7 @@ class DeformationStage(Stage):
         """The field over the canonical field's box; in contracted space, over the inner box."""
         model = self.scene_model
         box = model.space.inner(model.box)
-        voxels, planes = self.schedule.grid(0)
+        voxels, planes = self.settings.grid(0)
         model.deformation = DeformationField(
             box, self.scene.clock, voxels, planes, zero_outside_box=box != model.box
         )
@@ -240,7 +233,7 @@ class DeformationStage(Stage):
         model.deformation.frames.keep(
             self.motion.store,
             device,
-            shape=box.grid_shape(*self.schedule.grid(-1)),
+            shape=box.grid_shape(*self.settings.grid(-1)),
             half=self.motion.stored_half(device),
         )
 
@@ -277,7 +270,7 @@ class DeformationStage(Stage):
         self.events[LEVELS] += previous is None or previous.level != phase.level
         if previous is not None and previous.level != phase.level:
             self._free()
-            self.field.resize(*self.schedule.grid(phase.level))
+            self.field.resize(*self.settings.grid(phase.level))
             self.events[GROWN] += previous.side != phase.side
         if phase.init_from_previous:
             self.field.frames.copy_previous(phase.frame)

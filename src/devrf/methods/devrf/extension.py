@@ -28,7 +28,7 @@ class MotionContext:
     Attributes:
         model: the scene; its deformation has been built.
         datamodule: serves the scene.
-        schedule: levels and frames.
+        settings: of the schedule: levels and rays.
         optimizer: learns the active frame; extensions add groups.
         generator: of all random numbers.
         background: the colours behind the images' pixels.
@@ -40,7 +40,7 @@ class MotionContext:
 
     model: DeVRFModel
     datamodule: SceneDataModule
-    schedule: DeformationSchedule
+    settings: DeformationSchedule
     optimizer: GridAdam
     generator: torch.Generator
     background: BackgroundColor

@@ -194,6 +194,11 @@ class DeVRFModel(Renderable):
         return self.deformation is not None
 
     @property
+    def resolution(self) -> tuple[int, ...]:
+        """Grid points of the displacements; of the canonical grids before there are any."""
+        return (self.canonical.density if self.deformation is None else self.deformation).shape
+
+    @property
     def size(self) -> int:
         """Values of all fields."""
         motion, residual = self.deformation, self.color_residual

@@ -141,7 +141,7 @@ class ColorResidual(Extension):
             return
         self._scale = self._scale_if_drift if drifting else {}
         # The ablation without levels has one.
-        self._first = min(first, len(context.schedule.levels)) - 1
+        self._first = min(first, len(context.settings.levels)) - 1
         model = context.model
         rate = self._learning_rate
         model.color_residual = ResidualField(model.box, context.field.clock, voxels=self._side**3)
@@ -175,9 +175,9 @@ class ColorResidual(Extension):
         residuals = [grid for name, grid in context.active.further.items() if name == NAME]
         for number, group in enumerate(context.optimizer.param_groups):
             if group["name"] == NAME:
-                group["base_lr"] = self._learning_rate / context.schedule.level_rate_factor(level)
+                group["base_lr"] = self._learning_rate / context.settings.level_rate_factor(level)
                 longest = max([2, *(max(grid.shape) for grid in residuals)])
-                weight = total_variation_weight(self._tv, longest, context.schedule.rays)
+                weight = total_variation_weight(self._tv, longest, context.settings.rays)
                 context.optimizer.replace(number, residuals, smoothing=weight)
 
     def weight_factor(self, term: str, level: int, share: float) -> float:
