@@ -133,7 +133,7 @@ def test_a_checkpoint_is_shown_or_refused(motion, tmp_path):
             camera = stored.viewpoints.held_out.of_height(12)
             for moment in (0.0, 0.3, 1.0):
                 Renderer(stored.model).view(camera, index=0, time=moment, background=1.0)
-            stored.model.forward_map(0.7)(torch.zeros(2, 3))
+            stored.model.forward_warp(0.7)(torch.zeros(2, 3))
             if drawable(stored.model):
                 page(stored.model, stored.viewpoints, "a", "b")
             mesh = ExportSettings(side=8, faces=20, times=[0, 0.7])
@@ -173,7 +173,7 @@ def test_gaussians_are_shown_or_refused(motion, tmp_path):
 
 
 PLACES: list[Place] = [
-    ("state_dict", "scene_model.deformation.frames.to_canonical", "kept"),
+    ("state_dict", "scene_model.deformation.frames.backward_slices", "kept"),
     ("state_dict", "scene_model.canonical.decoder.output.bias"),
     ("viewpoints", "static", "camera_to_world"),
     ("viewpoints", "held_out", "center"),

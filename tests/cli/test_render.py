@@ -256,7 +256,7 @@ def test_the_page_of_a_part_is_not_served_as_the_scene(trained, tmp_path, devrf)
     shutil.copytree(trained[0], run)
     checkpoint = run / "checkpoints" / "deformation.ckpt"
     content = read_checkpoint_file(checkpoint)
-    solid, moving = "canonical.density.values", "deformation.frames.to_time"
+    solid, moving = "canonical.density.values", "deformation.frames.forward_slices"
     for name, number in ((solid, 20.0), (moving, 0.3)):
         content["state_dict"][f"scene_model.{name}"]["kept"].fill_(number)
     write_checkpoint_file(checkpoint, content)

@@ -35,8 +35,8 @@ def block(cube):
         canonical.density.values[~mask] = -400.0
     deformation = DeformationField(cube, FrameClock((0.0, 0.5, 1.0)), voxels=27)
     for frame, way in ((1, 0.2), (2, 0.5)):
-        deformation.to_canonical[frame, ..., 0] = -way
-        deformation.to_time[frame, ..., 0] = way
+        deformation.backward_slices[frame, ..., 0] = -way
+        deformation.forward_slices[frame, ..., 0] = way
     return DeVRFModel(build, canonical, Occupancy.full((GRID,) * 3, cube), SETTINGS, deformation)
 
 

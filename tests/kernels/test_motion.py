@@ -63,8 +63,8 @@ def predicted(
     return MotionPrediction(
         output,
         batch,
-        unwarp=GridWarp((there.requires_grad_(),), BOX, **outside),
-        unwarp_previous=GridWarp((before,), BOX, **outside),
+        forward_warp=GridWarp((there.requires_grad_(),), BOX, **outside),
+        previous_forward_warp=GridWarp((before,), BOX, **outside),
         cameras=cameras,
         previous_image=torch.tensor([2, 0, 1]),
         forward_slice=there,
@@ -83,12 +83,16 @@ def test_values_and_gradients_are_those_of_the_definitions(
 ) -> None:
     prediction = predicted(zero_outside_box, space, flow_mean, rng)
     if not moves:
-        prediction = replace(prediction, unwarp_previous=GridWarp((), BOX))
+        prediction = replace(prediction, previous_forward_warp=GridWarp((), BOX))
     samples = prediction.output.samples
     learned = [samples.canonical, samples.weight, prediction.forward_slice]
     # A function is no grid: it takes the definition.
-    forth, before = prediction.unwarp, prediction.unwarp_previous
-    plain = replace(prediction, unwarp=lambda q: forth(q), unwarp_previous=lambda q: before(q))
+    forth, before = prediction.forward_warp, prediction.previous_forward_warp
+    plain = replace(
+        prediction,
+        forward_warp=lambda q: forth(q),
+        previous_forward_warp=lambda q: before(q),
+    )
     for term, of in ((cycle, [0, 2]), (flow, [0, 1])):
         ours, theirs = term(prediction), term(plain)
         torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-7)

@@ -19,13 +19,13 @@ from devrf.rendering.tracks import track
 
 
 def stub(**maps):
-    nothing = {"gaussians_at": lambda _: None, "forward_map": lambda _: None}
-    return SimpleNamespace(space=WORLD, **{**nothing, "canonical_map": lambda _: None, **maps})
+    nothing = {"gaussians_at": lambda _: None, "forward_warp": lambda _: None}
+    return SimpleNamespace(space=WORLD, **{**nothing, "backward_warp": lambda _: None, **maps})
 
 
 def test_points_are_followed_by_a_map_back_and_by_the_nearest_gaussian():
     points = torch.tensor([[1.0, 0, 0], [0, 2, 0]])
-    back = stub(canonical_map=lambda time: lambda x: x * (1 - 0.4 * time))
+    back = stub(backward_warp=lambda time: lambda x: x * (1 - 0.4 * time))
     places = track(back, points, 0.5, [1.0, 0.0])
     torch.testing.assert_close(places, torch.stack([points * 0.8 / 0.6, points * 0.8]))
     half = math.sqrt(0.5)
@@ -51,7 +51,7 @@ def test_networks_that_know_the_way_back(kind):
     nn.init.zeros_(layers[-1].weight)
     layers[-1].bias.copy_(torch.tensor([0.1, 0, 0]))  # 0.2 where the box's longest edge is 4
     points = torch.rand(5, 3)
-    back = model.canonical_map(0.5)(points)
+    back = model.backward_warp(0.5)(points)
     torch.testing.assert_close(back, points + torch.tensor([0.2, 0, 0]))
     there = points + torch.tensor([0.2 if kind is DNeRF else 0.0, 0, 0])  # its time 0 is at rest
     torch.testing.assert_close(track(model, points, 0.5, [0.0, 0.5]), torch.stack([there, points]))

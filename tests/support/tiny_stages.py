@@ -137,8 +137,8 @@ def moving(learned: tuple[CanonicalStage, Trainer], rng: torch.Generator) -> DeV
     model = copy.deepcopy(learned[0].scene_model)
     box = model.canonical.box
     motion = DeformationField(box, FrameClock((0.0, 0.4, 1.0)), voxels=5**3)
-    shape = motion.to_canonical[1:].shape
-    motion.to_canonical[1:] = 0.1 * box.longest * (torch.rand(shape, generator=rng) - 0.5)
+    shape = motion.backward_slices[1:].shape
+    motion.backward_slices[1:] = 0.1 * box.longest * (torch.rand(shape, generator=rng) - 0.5)
     model.deformation = motion
     model.color_residual = ResidualField(box, motion.clock, voxels=4**3)
     shape = model.color_residual.values[1:].shape

@@ -13,7 +13,7 @@ from safetensors import SafetensorError, safe_open
 from devrf.errors import DevrfError
 from devrf.system.files import UNREADABLE
 
-FORMAT = "5"
+FORMAT = "6"
 # Key of a training config for the digest of the run's canonical checkpoint that is built on.
 OWN_REST = "checkpoints/canonical.ckpt"
 # Bytes of a header at most: usual are 20,000. In memory each may become 50.

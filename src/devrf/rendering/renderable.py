@@ -1,8 +1,8 @@
 """A learned scene of any method, to be rendered from any view at any time.
 
 Everything that shows a learned scene (videos, stills, evaluation) asks for :meth:`Renderable.at`;
-exports also for :meth:`Renderable.surface` and :meth:`Renderable.forward_map`, which a method may
-have, and tracks for :meth:`Renderable.canonical_map`.
+exports also for :meth:`Renderable.surface` and :meth:`Renderable.forward_warp`, which a method may
+have, and tracks for :meth:`Renderable.backward_warp`.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Renderable(StoredClass, nn.Module, ABC):
     def surface(self) -> SurfaceField | None:
         """The scene at rest as a field of which a surface can be taken; None: there is none.
 
-        Of a method that has not this and :meth:`forward_map`, nor :meth:`surface_at`, exports take
+        Of a method that has not this and :meth:`forward_warp`, nor :meth:`surface_at`, exports take
         what :meth:`at` shows.
         """
         return None
@@ -69,7 +69,7 @@ class Renderable(StoredClass, nn.Module, ABC):
     def surface_at(self, time: float) -> SurfaceField | None:
         """The scene at ``time`` as a field of which a surface can be taken; None: there is none.
 
-        Of a method whose surface is not carried through time by :meth:`forward_map`.
+        Of a method whose surface is not carried through time by :meth:`forward_warp`.
         """
         return None
 
@@ -80,14 +80,14 @@ class Renderable(StoredClass, nn.Module, ABC):
         """
         return None
 
-    def forward_map(self, time: float) -> Callable[[Tensor], Tensor] | None:
+    def forward_warp(self, time: float) -> Callable[[Tensor], Tensor] | None:
         """q → x(q, t): where canonical points (M, 3) are at ``time``, both in the fields' space.
 
-        The identity at time 0. None: the method knows only the way back, from x to q, or none.
+        The identity at time 0. None: the method knows only :meth:`backward_warp`, or neither.
         """
         return None
 
-    def canonical_map(self, time: float) -> Callable[[Tensor], Tensor] | None:
+    def backward_warp(self, time: float) -> Callable[[Tensor], Tensor] | None:
         """x → q(x, t): the canonical points of points (M, 3) at ``time``, in the fields' space.
 
         None: the method follows no points.

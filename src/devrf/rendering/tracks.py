@@ -15,7 +15,7 @@ from devrf.ops.splatting import rotations
 from devrf.rendering.renderable import Renderable
 from devrf.rendering.renderer import Renderer, points_at_depth
 
-# Steps by which a map back to the canonical state is inverted.
+# Steps by which a backward warp is inverted.
 STEPS = 30
 # Points whose nearest Gaussians are found at once.
 CHUNK = 1024
@@ -25,23 +25,23 @@ CHUNK = 1024
 def track(model: Renderable, points: Tensor, time: float, times: Sequence[float]) -> Tensor | None:
     """Where ``points`` (M, 3) at ``time`` are at T ``times``: (T, M, 3), all in world units.
 
-    They go to the canonical state and from there by the method's maps (``canonical_map``,
-    ``forward_map``). Of a method that only knows the way back, the point that comes from there is
-    found as a fixed point. In a scene of Gaussians a point goes with the nearest one. None: the
+    They go to the canonical state and from there by the method's warps (``backward_warp``,
+    ``forward_warp``). Of a method that knows the backward warp alone, the point that it leads there
+    is found as a fixed point. In a scene of Gaussians a point goes with the nearest one. None: the
     method has none of these.
     """
     nearest = _with_gaussians(model, points, time, times)
-    to_canonical = model.canonical_map(time)
-    if nearest is not None or to_canonical is None:
+    backward = model.backward_warp(time)
+    if nearest is not None or backward is None:
         return nearest
-    canonical = to_canonical(model.space.from_world(points))
+    canonical = backward(model.space.from_world(points))
     places = []
     for moment in times:
-        forward = model.forward_map(moment)
+        forward = model.forward_warp(moment)
         if forward is None:
-            back = model.canonical_map(moment)
-            assert back is not None
-            forward = partial(_inverse, back)
+            at_moment = model.backward_warp(moment)
+            assert at_moment is not None
+            forward = partial(_inverse, at_moment)
         places.append(model.space.to_world(forward(canonical)))
     return torch.stack(places)
 
@@ -66,12 +66,12 @@ def moving_pixels(
     return mask.masked_scatter(mask, moving(places, size)).view(camera.height, camera.width).cpu()
 
 
-def _inverse(back: Callable[[Tensor], Tensor], canonical: Tensor) -> Tensor:
-    """Points (M, 3) that ``back`` leads as near as can be to ``canonical`` (M, 3)."""
+def _inverse(backward: Callable[[Tensor], Tensor], canonical: Tensor) -> Tensor:
+    """Points (M, 3) that ``backward`` leads as near as can be to ``canonical`` (M, 3)."""
     best = place = canonical
     least = torch.full_like(place[:, 0], torch.inf)
     for _ in range(STEPS):
-        miss = canonical - back(place)
+        miss = canonical - backward(place)
         error = miss.norm(dim=1)
         best = torch.where((error < least)[:, None], place, best)
         least = torch.minimum(least, error)

@@ -60,8 +60,8 @@ def moving_ball(cube):
     points = cube.grid_points(motion.shape, torch.empty(0))
     for frame, time in ((1, 0.5), (2, 1.0)):
         shift = torch.tensor([0.4 * time, 0.0, 0.0])
-        motion.to_time[frame] = 0.2 * time * points + shift
-        motion.to_canonical[frame] = (points - shift) / (1 + 0.2 * time) - points
+        motion.forward_slices[frame] = 0.2 * time * points + shift
+        motion.backward_slices[frame] = (points - shift) / (1 + 0.2 * time) - points
     model.deformation = motion
     return model
 

@@ -100,7 +100,7 @@ def test_gltf_goes_where_the_forward_field_leads(tmp_path, moving_ball, mesh, fr
     assert read.volume == pytest.approx(4 / 3 * math.pi, rel=0.05)
     # 0.8 lies between two exported times, and the forward field goes evenly from one to the other.
     for time in (*TIMES, 0.8):
-        expected = frame.points(moving_ball.forward_map(time)(at_rest)).numpy()
+        expected = frame.points(moving_ball.forward_warp(time)(at_rest)).numpy()
         np.testing.assert_allclose(morphed(whole, array, SECONDS * time), expected, atol=1e-5)
 
 

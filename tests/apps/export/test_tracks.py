@@ -27,8 +27,8 @@ def two_balls(of_distance, cube):
     model = of_distance(lambda points: torch.cdist(points, middles).amin(dim=1) - 0.3, cube, 31)
     motion = DeformationField(cube, FrameClock((0.0, 1.0)), voxels=31**3)
     left = cube.grid_points(motion.shape, torch.empty(0))[..., 0] < -0.01
-    motion.to_time[1, ..., 2] = 0.2 * left
-    motion.to_canonical[1, ..., 2] = -0.2 * left
+    motion.forward_slices[1, ..., 2] = 0.2 * left
+    motion.backward_slices[1, ..., 2] = -0.2 * left
     model.deformation = motion
     return model
 

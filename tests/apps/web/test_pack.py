@@ -151,10 +151,10 @@ def in_motion(rest: DeVRFModel, seed: int) -> DeVRFModel:
     zero_outside_box = not model.space.is_linear
     clock = FrameClock((0.0, 0.4, 1.0))
     motion = DeformationField(box, clock, voxels=5**3, zero_outside_box=zero_outside_box)
-    shape = motion.to_canonical[1:].shape
+    shape = motion.backward_slices[1:].shape
     generator = torch.Generator().manual_seed(seed)
     size = torch.tensor(box.size)
-    motion.to_canonical[1:] = 0.1 * size * (torch.rand(shape, generator=generator) - 0.5)
+    motion.backward_slices[1:] = 0.1 * size * (torch.rand(shape, generator=generator) - 0.5)
     model.deformation = motion
     return model
 
@@ -454,7 +454,7 @@ def test_all_data_are_in_the_file_and_as_large_as_their_textures(moving, tiny_sc
     )
     numbers = np.frombuffer(gzip.decompress(base64.b64decode(packed)), np.float16).astype(float)
     step = described["uniforms"]["motionStep"]
-    true = moving.deformation.to_canonical[1].numpy().flatten()
+    true = moving.deformation.backward_slices[1].numpy().flatten()
     kept = numbers != 0
     assert kept.mean() > 0.5
     assert abs(step * numbers - true)[kept].max() <= step * (0.5 + 2**-11 * abs(numbers).max())

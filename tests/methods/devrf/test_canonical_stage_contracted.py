@@ -45,9 +45,9 @@ def test_displacements_are_zero_outside_where_they_are_asked_to_be():
 def test_a_field_knows_that_what_is_outside_stays():
     clock = FrameClock((0.0, 1.0))
     field = DeformationField(SPACE.inner(), clock, voxels=27, zero_outside_box=True)
-    field.to_canonical[1:] = 0.25
+    field.backward_slices[1:] = 0.25
     outside = torch.tensor([[1.3, 0.0, 0.0]])
-    assert torch.equal(field.warp_at(1.0)(outside), outside)
+    assert torch.equal(field.backward_warp(1.0)(outside), outside)
     again = DeformationField(Box((0.0,) * 3, (1.0,) * 3), clock, voxels=8)
     again.set_extra_state(field.get_extra_state())
     assert again.zero_outside_box and again.box == SPACE.inner()
@@ -67,7 +67,7 @@ def model() -> DeVRFModel:
     motion = DeformationField(
         SPACE.inner(), FrameClock((0.0, 0.5, 1.0)), voxels=8**3, zero_outside_box=True
     )
-    motion.to_canonical[1, ..., 0], motion.to_canonical[2, ..., 0] = -0.1, -0.2
+    motion.backward_slices[1, ..., 0], motion.backward_slices[2, ..., 0] = -0.1, -0.2
     settings = RenderSettings(step=0.5, alpha_threshold=1e-3, near=0.2, far=math.inf)
     return DeVRFModel(BUILD, canonical, Occupancy(solid, SPACE.box), settings, motion, SPACE)
 
@@ -159,5 +159,5 @@ def test_a_room_is_learned_and_moves_inside_the_inner_box(tiny_room, trainer):
     trainer(max_epochs=1).fit(moving, datamodule=data)
     assert moving.field.box == room.space.inner(room.bounds.box) and moving.field.zero_outside_box
     far = torch.tensor([[room.bounds.box.high[0], 0.0, 0.0]])
-    assert torch.equal(moving.scene_model.deformation.warp_at(1.0)(far), far)
-    assert bool(moving.field.to_canonical[1].any())
+    assert torch.equal(moving.scene_model.deformation.backward_warp(1.0)(far), far)
+    assert bool(moving.field.backward_slices[1].any())

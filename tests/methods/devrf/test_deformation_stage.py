@@ -31,10 +31,10 @@ def test_two_steps_move_the_first_frame_only(rest, datamodule, trainer):
     stage, fit = DeformationStage(rest, SHORT), trainer(max_steps=2)
     fit.fit(stage, datamodule=datamodule)
     assert stage.position.iteration == fit.global_step == 2
-    assert stage.field.to_canonical[1].abs().max() > 0
+    assert stage.field.backward_slices[1].abs().max() > 0
     # Two steps of Adam move no voxel further than twice the rate, or little more.
-    assert stage.field.to_canonical[1].abs().max() < 2.5e-3
-    for frames in (stage.field.to_canonical, stage.field.to_time):
+    assert stage.field.backward_slices[1].abs().max() < 2.5e-3
+    for frames in (stage.field.backward_slices, stage.field.forward_slices):
         assert not frames[0].any() and not frames[2].any()
     for name, value in stage.scene_model.canonical.named_parameters():
         assert torch.equal(value, before[name])
@@ -85,7 +85,7 @@ def test_a_whole_schedule_sees_the_motion_better_than_the_rest_pose(
     trainer(max_epochs=1).fit(stage, datamodule=datamodule)
     assert stage.position.iteration == stage.schedule.total == 135
     assert stage.scene_model.resolution == stage.scene_model.canonical.box.grid_shape(8**3)
-    for frames in (stage.field.to_canonical, stage.field.to_time):
+    for frames in (stage.field.backward_slices, stage.field.forward_slices):
         assert not frames[0].any()
         assert (frames[1:].abs().amax(dim=(1, 2, 3, 4)) > 1e-3).all()
     # Two views of three frames: at rest there is nothing to win.
@@ -110,7 +110,7 @@ def test_total_variation_alone_smooths_both_directions(rest, datamodule, trainer
 
     watch = LambdaCallback(on_train_batch_start=peak, on_train_batch_end=look)
     trainer(watch, max_steps=1).fit(stage, datamodule=datamodule)
-    forward, slope = stage.field.to_time[1], torch.zeros_like(before[0])
+    forward, slope = stage.field.forward_slices[1], torch.zeros_like(before[0])
     assert forward[1, 1, 1, 0] < 0.5 and forward[0, 1, 1, 0] > 0
     add_total_variation_gradient(before[0], slope, 1.0)
     # The first step's mean is a tenth of the gradient.
@@ -174,7 +174,7 @@ def test_the_flow_of_a_moving_camera_neither_starts_nor_teaches_a_frame(
         module = serve(replace(tiny_scene, dynamic=replace(tiny_scene.dynamic, train=train)))
         stage = DeformationStage(rest, SHORT, motion, iterations_per_step=1, extensions=tracks)
         trainer(max_steps=1).fit(stage, datamodule=module)
-        assert (stage.field.to_time[1].abs().amax() > 1e-3) is not moving
+        assert (stage.field.forward_slices[1].abs().amax() > 1e-3) is not moving
         assert ("flow" in stage.context.weights) is not moving
 
 
@@ -183,15 +183,15 @@ def test_state_and_model_hold_what_an_active_frame_has_learned(rest, datamodule,
 
     def look(trainer: Trainer, stage: DeformationStage, *_: Any) -> None:
         frame, learned = stage.active.number, stage.active.forward.detach().clone()
-        stored = stage.state_dict()["scene_model.deformation.frames.to_time"][frame]
+        stored = stage.state_dict()["scene_model.deformation.frames.forward_slices"][frame]
         assert learned.any() and torch.equal(stored, learned)
-        assert torch.equal(stage.current_model().deformation.to_time[frame], learned)
+        assert torch.equal(stage.current_model().deformation.forward_slices[frame], learned)
         last[:] = [learned]
 
     watch = LambdaCallback(on_train_batch_end=look)
     trainer(watch, max_epochs=1).fit(stage, datamodule=datamodule)
     # The last frame was written back.
-    assert torch.equal(stage.field.to_time[2], last[0])
+    assert torch.equal(stage.field.forward_slices[2], last[0])
 
 
 def test_where_the_field_is_kept_changes_what_is_learned_by_its_rounding_alone(
@@ -203,8 +203,8 @@ def test_where_the_field_is_kept_changes_what_is_learned_by_its_rounding_alone(
         motion = replace(FAST, store=store, store_half=rounded)
         stage = DeformationStage(rest, TINY, motion)
         trainer(max_epochs=1).fit(stage, datamodule=datamodule)
-        assert stage.field.to_time.dtype == (torch.float16 if rounded else torch.float32)
-        fields.append(stage.field.to_canonical.float())
+        assert stage.field.forward_slices.dtype == (torch.float16 if rounded else torch.float32)
+        fields.append(stage.field.backward_slices.float())
     exact, on_host, in_half = fields
     assert torch.equal(exact, on_host) and not torch.equal(exact, in_half)
     torch.testing.assert_close(exact, in_half, atol=0.05, rtol=0)
@@ -240,8 +240,8 @@ def test_a_frame_has_a_copy_of_the_frame_before_it(rest, four_frames, trainer):
         visit = (stage.phase.level, frame.number)
         if visited[-1:] != [visit]:
             visited.append(visit)
-        neighbour = stage.field.to_time[frame.number - 1]
-        assert torch.equal(frame.before, neighbour)
+        neighbour = stage.field.forward_slices[frame.number - 1]
+        assert torch.equal(frame.previous_forward, neighbour)
         assert bool(neighbour.any()) == (frame.number > 1)
 
     watch = LambdaCallback(on_train_batch_start=look)

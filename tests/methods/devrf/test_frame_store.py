@@ -16,14 +16,14 @@ OTHERS = [0, 1, 3]
 def store() -> FrameStore:
     """Four frames; 1 to 3 filled at random, frame 0 as it was built."""
     store = FrameStore(4, SHAPE)
-    store.to_canonical[1:].normal_()
-    store.to_time[1:].normal_()
+    store.backward_slices[1:].normal_()
+    store.forward_slices[1:].normal_()
     return store
 
 
 def both(store: FrameStore) -> tuple[Tensor, Tensor]:
     """Copies of all frames in both directions."""
-    return store.to_canonical.clone(), store.to_time.clone()
+    return store.backward_slices.clone(), store.forward_slices.clone()
 
 
 def pair() -> tuple[Tensor, Tensor]:
@@ -36,11 +36,11 @@ def test_a_frame_is_read_changed_and_written_back(store):
     store.read(2, frame)
     assert torch.equal(frame[0], backward[2]) and torch.equal(frame[1], forward[2])
     frame[0].add_(1)
-    assert torch.equal(store.to_canonical, backward)  # a copy, until it is written back
+    assert torch.equal(store.backward_slices, backward)  # a copy, until it is written back
     store.write(2, frame)
-    assert torch.equal(store.to_canonical[2], backward[2] + 1)
-    assert torch.equal(store.to_canonical[OTHERS], backward[OTHERS])
-    assert torch.equal(store.to_time, forward)
+    assert torch.equal(store.backward_slices[2], backward[2] + 1)
+    assert torch.equal(store.backward_slices[OTHERS], backward[OTHERS])
+    assert torch.equal(store.forward_slices, forward)
 
 
 def test_a_frame_starts_from_the_one_before_it_in_both_directions(store):
@@ -50,8 +50,8 @@ def test_a_frame_starts_from_the_one_before_it_in_both_directions(store):
         assert torch.equal(now[2], was[1])
         assert torch.equal(now[OTHERS], was[OTHERS])
     # A copy, not a view.
-    store.to_canonical[2] += 1
-    assert torch.equal(store.to_canonical[1], before[0][1])
+    store.backward_slices[2] += 1
+    assert torch.equal(store.backward_slices[1], before[0][1])
 
 
 @pytest.mark.parametrize("half", [False, True])
@@ -59,23 +59,23 @@ def test_offloaded_frames_stay_as_they_are_and_are_read_in_single_precision(stor
     exact, frame = both(store), pair()
     store.offload(on_host=True, half=half)
     dtype = torch.float16 if half else torch.float32
-    assert store.to_time.dtype == store.to_canonical.dtype == dtype
+    assert store.forward_slices.dtype == store.backward_slices.dtype == dtype
     store.read(3, frame)
     for found, whole in zip(frame, exact, strict=True):
         assert found.dtype == torch.float32
         torch.testing.assert_close(found, whole[3], rtol=1 / 2048 if half else 0, atol=1e-7)
-    resting = store.to_time
+    resting = store.forward_slices
     store.to(torch.float64)
-    assert store.to_time is resting and store.here.dtype == torch.float64
+    assert store.forward_slices is resting and store.here.dtype == torch.float64
     store.float().resize((5, 5, 5))
-    assert store.to_time.shape == (4, 5, 5, 5, 3) and store.to_time.dtype == dtype
+    assert store.forward_slices.shape == (4, 5, 5, 5, 3) and store.forward_slices.dtype == dtype
 
 
 def test_a_stored_state_of_another_shape_is_taken(store):
     other = FrameStore(2, (5, 5, 5))
     other.load_state_dict(store.state_dict())
-    assert torch.equal(other.to_time, store.to_time)
-    assert torch.equal(other.to_canonical, store.to_canonical)
+    assert torch.equal(other.forward_slices, store.forward_slices)
+    assert torch.equal(other.backward_slices, store.backward_slices)
 
 
 PAPER = (160, 160, 160)
@@ -104,7 +104,7 @@ def test_frames_on_the_host_come_back_as_they_were(half):
     device = torch.device("cuda", 0)
     store = FrameStore(3, (4, 5, 6)).to(device)
     store.offload(on_host=True, half=half)
-    assert store.to_time.device.type == store.to_canonical.device.type == "cpu"
+    assert store.forward_slices.device.type == store.backward_slices.device.type == "cpu"
     written = tuple(torch.rand(4, 5, 6, 3, device=device) for _ in range(2))
     store.write(1, written)  # type: ignore[arg-type]
     found = torch.empty(4, 5, 6, 3, device=device), torch.empty(4, 5, 6, 3, device=device)
@@ -112,4 +112,5 @@ def test_frames_on_the_host_come_back_as_they_were(half):
     for ours, theirs in zip(found, written, strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1 / 2048 if half else 0, atol=1e-7)
     store.resize((6, 6, 6))
-    assert store.to_time.shape == (3, 6, 6, 6, 3) and store.to_time.device.type == "cpu"
+    assert store.forward_slices.shape == (3, 6, 6, 6, 3)
+    assert store.forward_slices.device.type == "cpu"

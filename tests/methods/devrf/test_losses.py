@@ -244,7 +244,7 @@ def test_cycle_of_an_exact_motion_is_zero_and_of_another_by_hand(by_hand):
     assert cycle(by_hand).item() == pytest.approx(0, abs=1e-12)
     # There by −0.3, back by (0.3, 0.2, −0.1): ½ (0.04 + 0.01) at each sample.
     way = torch.tensor([0.3, 0.2, -0.1])
-    off = replace(by_hand, unwarp=lambda q: q + way)
+    off = replace(by_hand, forward_warp=lambda q: q + way)
     assert cycle(off).item() == pytest.approx(0.025)
 
 
@@ -305,7 +305,7 @@ def test_induced_flow_of_the_exact_motion_is_the_exact_flow(tiny_scene, tiny_rec
     assert batch.flow is not None and len(batch.flow) > 100
     induced = induced_flow(
         output.samples.canonical,
-        prediction.unwarp_previous,
+        prediction.previous_forward_warp,
         prediction.cameras,
         prediction.previous_image[batch.image],
         batch.pixel,

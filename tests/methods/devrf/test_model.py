@@ -38,8 +38,8 @@ def model(cube: Box) -> DeVRFModel:
         canonical.color.values.copy_(torch.tensor([9.0, -9.0, -9.0]).expand(11, 11, 11, 3))
     deformation = DeformationField(cube, FrameClock((0.0, 0.5, 1.0)), voxels=27)
     for frame, way in ((1, 0.2), (2, 0.4)):
-        deformation.to_canonical[frame, ..., 0] = -way
-        deformation.to_time[frame, ..., 0] = way
+        deformation.backward_slices[frame, ..., 0] = -way
+        deformation.forward_slices[frame, ..., 0] = way
     return DeVRFModel(build, canonical, Occupancy(dilate(mask, 1), cube), SETTINGS, deformation)
 
 
@@ -70,7 +70,7 @@ def test_the_block_is_seen_where_it_has_moved(model, time, way):
 
 
 def test_at_rest_nothing_is_warped(model):
-    assert model.warp(0.0) is None and model.occupancy_at(0.0) is model.occupancy
+    assert not model.backward_warp(0.0).slices and model.occupancy_at(0.0) is model.occupancy
     moving, model.deformation = picture(model, looking_down(31), 0.0), None
     still = picture(model, looking_down(31), 0.7)
     assert torch.equal(moving.color, still.color) and torch.equal(moving.depth, still.depth)
@@ -133,14 +133,14 @@ def test_a_model_built_from_its_config_takes_its_state(model, space):
 def test_loaded_displacements_stay_in_half_precision_and_are_read_in_single(model):
     other = DeVRFModel.from_config(model.config())
     other.load_stored_state(model.stored_state())
-    for frames in (other.deformation.to_canonical, other.deformation.to_time):
+    for frames in (other.deformation.backward_slices, other.deformation.forward_slices):
         assert frames.dtype == torch.float16
     points = torch.full((1, 3), 0.1)
     for time in (0.25, 0.6):  # at a frame, and between two
-        assert other.deformation.warp_at(time).displacement.dtype == torch.float32
+        assert other.deformation.backward_warp(time).displacement.dtype == torch.float32
         before, after = (
-            model.deformation.warp_at(time)(points),
-            other.deformation.warp_at(time)(points),
+            model.deformation.backward_warp(time)(points),
+            other.deformation.backward_warp(time)(points),
         )
         torch.testing.assert_close(after, before, atol=1e-3, rtol=0)
 
@@ -171,13 +171,13 @@ def test_a_voxel_has_the_initial_opacity_where_something_may_be(cube):
     assert -math.expm1(-float(depth[0])) == pytest.approx(1e-6, rel=1e-2)
     assert depth[1] == 0
     # Without motion every point stays.
-    assert torch.equal(model.forward_map(0.7)(depth[:, None]), depth[:, None])
+    assert torch.equal(model.forward_warp(0.7)(depth[:, None]), depth[:, None])
 
 
 def test_points_go_where_the_forward_displacements_lead(model):
     points = torch.tensor([[0.1, 0.2, 0.3]])
-    assert torch.equal(model.forward_map(0.0)(points), points)
-    moved = model.forward_map(0.25)(points)
+    assert torch.equal(model.forward_warp(0.0)(points), points)
+    moved = model.forward_warp(0.25)(points)
     torch.testing.assert_close(moved, torch.tensor([[0.2, 0.2, 0.3]]))
     assert not moved.requires_grad
 

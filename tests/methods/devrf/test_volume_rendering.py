@@ -147,7 +147,7 @@ def test_a_picture_is_the_same_as_a_batch(cube: Box, rng: torch.Generator, time:
     with torch.no_grad():
         field.density.values.copy_(4 * draw(*field.density.values.shape))
         field.color.values.copy_(draw(*field.color.values.shape))
-        motion.to_canonical[1:] = 0.1 * draw(2, 4, 4, 4, 3)
+        motion.backward_slices[1:] = 0.1 * draw(2, 4, 4, 4, 3)
     occupancy = Occupancy(torch.rand(9, 9, 9, generator=rng) < 0.1, cube)
     residual = draw(3, 4, 3, 3)
     how = RenderSettings(step=0.5, alpha_threshold=0.02, near=0.2, far=9.0)
@@ -156,7 +156,7 @@ def test_a_picture_is_the_same_as_a_batch(cube: Box, rng: torch.Generator, time:
     d = torch.nn.functional.normalize(0.3 * draw(200, 3) + torch.tensor([1.0, 0.0, 0.0]), dim=1)
     rays = Rays(0.3 * draw(200, 3) - torch.tensor([3.0, 0.0, 0.0]), d, d)
     seen = view.render(rays, WHITE)
-    warp = motion.warp_at(time)
+    warp = motion.backward_warp(time)
     assert len(warp.slices) == (1 if time == 0.5 else 2)
     # While it is learned, gradients flow through the slices, which are blended anew.
     slices = tuple(frame.clone().requires_grad_() for frame in warp.slices)

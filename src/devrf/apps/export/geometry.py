@@ -181,7 +181,7 @@ def carried(surface: Surface, model: Renderable, times: Sequence[float]) -> Movi
     points = surface.points.to(model.device)
     moved = []
     for time in times:
-        forward = model.forward_map(time)
+        forward = model.forward_warp(time)
         assert forward is not None  # every model with a surface has one
         moved.append(model.space.to_world(forward(points)).float().cpu())
     return MovingMesh(tuple(times), torch.stack(moved), surface.faces, surface.colors)

@@ -82,7 +82,7 @@ def export_scene(
 
 def _takes_surface(model: Renderable, settings: ExportSettings) -> bool:
     """Whether a surface is exported, not points; refuses geometry that the method lacks."""
-    carries = model.surface() is not None and model.forward_map(0.0) is not None
+    carries = model.surface() is not None and model.forward_warp(0.0) is not None
     has = carries or model.surface_at(0.0) is not None
     wanted = has if settings.content == "auto" else settings.content != "points"
     if settings.content == "splats" and settings.format not in ("splats", "usd"):

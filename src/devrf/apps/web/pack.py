@@ -142,7 +142,7 @@ def _parts(model: DeVRFModel, cameras: Cameras) -> Iterator[tuple[str, Tensor]]:
         assert motion is not None
         mask = torch.stack(seen[max(k - 1, 0) : k + 1]).any(dim=0)
         near = Occupancy(mask, model.box).points_near(motion.shape, motion.box)
-        kept = near[..., None] * motion.to_canonical[k].to(near.device).float()
+        kept = near[..., None] * motion.backward_slices[k].to(near.device).float()
         yield f"displacement-{k}", (kept / (ROUNDED * model.occupancy.cell)).round().half()
         if residual is not None:
             values = residual.values[k]
@@ -177,16 +177,16 @@ def _seen(
     """
     masks = []
     times = motion.clock.times
-    at_frames = [occupied(motion.warp_at(time)) for time in times]
+    at_frames = [occupied(motion.backward_warp(time)) for time in times]
     for k, (first, second) in enumerate(pairwise(at_frames)):
         mask = first.mask | second.mask
         near = Occupancy(mask, first.box).points_near(motion.shape, motion.box)
-        before, after = (motion.to_canonical[n].to(near.device).float() for n in (k, k + 1))
+        before, after = (motion.backward_slices[n].to(near.device).float() for n in (k, k + 1))
         # Points that move by more than this come from empty space.
         change = min(float(((after - before).norm(dim=-1) * near).amax()), first.box.diagonal)
         steps = math.ceil(change / (2 * cell))
         for time in torch.linspace(times[k], times[k + 1], steps + 1)[1:-1].tolist():
-            mask |= occupied(motion.warp_at(time)).mask
+            mask |= occupied(motion.backward_warp(time)).mask
         masks.append(dilate(mask, 1))
     return masks
 

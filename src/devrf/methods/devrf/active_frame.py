@@ -27,7 +27,7 @@ class ActiveFrame:
         store: the displacements of all frames.
         backward: (X, Y, Z, 3) Δ_b of the frame, a leaf.
         forward: (X, Y, Z, 3) Δ_f of the frame, a leaf.
-        before: (X, Y, Z, 3) Δ_f of the frame before, frozen.
+        previous_forward: (X, Y, Z, 3) Δ_f of the frame before, frozen.
         occupancy: at the frame's time.
         fields: further fields (T, …) whose frames are learned, by name.
         further: the frame's slice of each, a leaf.
@@ -38,7 +38,7 @@ class ActiveFrame:
     store: FrameStore
     backward: Tensor
     forward: Tensor
-    before: Tensor
+    previous_forward: Tensor
     occupancy: Occupancy
     fields: Mapping[str, FrameField]
     further: Mapping[str, Tensor]
@@ -61,7 +61,7 @@ class ActiveFrame:
             store=store,
             backward=zeros.clone().requires_grad_(),
             forward=zeros.clone().requires_grad_(),
-            before=zeros,
+            previous_forward=zeros,
             occupancy=Occupancy(torch.zeros_like(occupancy.mask), occupancy.box),
             fields=fields,
             further={
@@ -80,7 +80,7 @@ class ActiveFrame:
         """Copy a frame out of the fields."""
         self.number = number
         self.store.read(number, self.slices)
-        self.before.copy_(self.store.to_time[number - 1])
+        self.previous_forward.copy_(self.store.forward_slices[number - 1])
         for name, values in self.further.items():
             values.copy_(self.fields[name].values[number])
 

@@ -14,6 +14,7 @@ from devrf.geometry.clock import FrameClock
 from devrf.kernels.trilinear import interpolate
 from devrf.methods.devrf.frame_store import FrameField, FrameStore
 from devrf.ops.trilinear import Shape
+from devrf.system.plain_data import validate
 
 # Far away, in longest edges of a box.
 FAR = 1000.0
@@ -112,30 +113,30 @@ class DeformationField(FrameField):
         self.frames = FrameStore(len(clock), box.grid_shape(voxels, planes))
 
     @property
-    def to_canonical(self) -> Tensor:
+    def backward_slices(self) -> Tensor:
         """(T, X, Y, Z, 3) Δ_b of every frame."""
-        return self.frames.to_canonical
+        return self.frames.backward_slices
 
     @property
-    def to_time(self) -> Tensor:
+    def forward_slices(self) -> Tensor:
         """(T, X, Y, Z, 3) Δ_f of every frame."""
-        return self.frames.to_time
+        return self.frames.forward_slices
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """Grid points along x, y, z."""
         return self.frames.shape
 
-    def unwarp(self, points: Tensor, time: float) -> Tensor:
-        """q + Δ_f(q, t) (M, 3) of canonical ``points`` q (M, 3) at ``time`` t."""
-        return self._at(self.to_time, time)(points)
+    def backward_warp(self, time: float) -> GridWarp:
+        """x → q = x + Δ_b(x, t): points at ``time`` t → canonical points."""
+        return self._at(self.backward_slices, time)
 
-    def warp_at(self, time: float) -> GridWarp:
-        """The map x → x + Δ_b(x, t) at ``time`` t."""
-        return self._at(self.to_canonical, time)
+    def forward_warp(self, time: float) -> GridWarp:
+        """q → q + Δ_f(q, t): canonical points → where they are at ``time`` t."""
+        return self._at(self.forward_slices, time)
 
     def warp_by(self, *slices: Tensor) -> GridWarp:
-        """The map by ``slices`` (X, Y, Z, 3) over the field's box; by none, the identity."""
+        """The warp by ``slices`` (X, Y, Z, 3) over the field's box; by none, the identity."""
         return GridWarp(slices, self.box, zero_outside_box=self.zero_outside_box)
 
     def _at(self, frames: Tensor, time: float) -> GridWarp:
@@ -150,11 +151,10 @@ class DeformationField(FrameField):
         self.frames.resize(self.box.grid_shape(voxels, planes))
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Box and clock as plain numbers; ``zero_outside_box`` by its name in format 5."""
-        outside = {"still_outside": True} if self.zero_outside_box else {}
-        return super().get_extra_state() | outside
+        """Box, clock and ``zero_outside_box``, as plain data."""
+        return {**super().get_extra_state(), "zero_outside_box": self.zero_outside_box}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore the result of :meth:`get_extra_state`."""
         super().set_extra_state(state)
-        self.zero_outside_box = bool(state.get("still_outside"))
+        self.zero_outside_box = validate(bool, state["zero_outside_box"])

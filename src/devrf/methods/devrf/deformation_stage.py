@@ -138,18 +138,18 @@ class DeformationStage(Stage):
             frame.occupancy,
             model.settings,
             batch.background,
-            warp=field.warp_by(frame.backward),
+            backward_warp=field.warp_by(frame.backward),
             precision=self.context.precision,
             color_change=self._color_change(frame),
         )
         # Before frame 1 nothing has moved.
-        unwarp_previous = field.warp_by(frame.before) if frame.number > 1 else field.warp_by()
+        previous = (frame.previous_forward,) if frame.number > 1 else ()
         with span("losses"):
             prediction = MotionPrediction(
                 output=output,
                 batch=batch,
-                unwarp=field.warp_by(frame.forward),
-                unwarp_previous=unwarp_previous,
+                forward_warp=field.warp_by(frame.forward),
+                previous_forward_warp=field.warp_by(*previous),
                 cameras=views.cameras,
                 previous_image=self.previous_images,
                 forward_slice=frame.forward,

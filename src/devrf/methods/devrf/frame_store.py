@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 Directions = tuple[Tensor, Tensor]
 Shape = tuple[int, int, int]
-NAMES = ("to_canonical", "to_time")
+NAMES = ("backward_slices", "forward_slices")
 
 # A displacement: three float32.
 DISPLACEMENT = 12
@@ -71,14 +71,14 @@ class FrameStore(StoredShape):
     """Displacements of T frames in two directions.
 
     Attributes:
-        to_canonical: (T, X, Y, Z, 3) backward: points of the frame → canonical space.
-        to_time: (T, X, Y, Z, 3) forward: canonical points → the frame.
+        backward_slices: (T, X, Y, Z, 3) Δ_b: from points at each frame's time to canonical ones.
+        forward_slices: (T, X, Y, Z, 3) Δ_f: from canonical points to those at each frame's time.
         on_host: whether they stay on the host when the module is moved.
     """
 
     resizable: ClassVar = dict.fromkeys(NAMES, 4)
-    to_canonical: Tensor
-    to_time: Tensor
+    backward_slices: Tensor
+    forward_slices: Tensor
     here: Tensor
 
     def __init__(self, frames: int, shape: Shape) -> None:
@@ -93,13 +93,13 @@ class FrameStore(StoredShape):
     @property
     def shape(self) -> Shape:
         """Grid points along x, y, z."""
-        return shape_of(self.to_canonical[0])
+        return shape_of(self.backward_slices[0])
 
     @torch.no_grad()
     def read(self, frame: int, into: Directions) -> None:
         """Copy a frame's backward and forward displacements ``into`` (X, Y, Z, 3) each."""
-        into[0].copy_(self.to_canonical[frame])
-        into[1].copy_(self.to_time[frame])
+        into[0].copy_(self.backward_slices[frame])
+        into[1].copy_(self.forward_slices[frame])
 
     @torch.no_grad()
     def write(self, frame: int, displacements: Directions) -> None:
@@ -107,15 +107,15 @@ class FrameStore(StoredShape):
 
         Frame 0 is the rest state, and cannot be written.
         """
-        assert 1 <= frame < len(self.to_time), f"frame {frame} cannot be trained"
-        self.to_canonical[frame].copy_(displacements[0])
-        self.to_time[frame].copy_(displacements[1])
+        assert 1 <= frame < len(self.forward_slices), f"frame {frame} cannot be trained"
+        self.backward_slices[frame].copy_(displacements[0])
+        self.forward_slices[frame].copy_(displacements[1])
 
     @torch.no_grad()
     def copy_previous(self, frame: int) -> None:
         """Initialise ``frame`` from the frame before it, in both directions."""
-        self.to_canonical[frame] = self.to_canonical[frame - 1]
-        self.to_time[frame] = self.to_time[frame - 1]
+        self.backward_slices[frame] = self.backward_slices[frame - 1]
+        self.forward_slices[frame] = self.forward_slices[frame - 1]
 
     @torch.no_grad()
     def resize(self, shape: Shape) -> None:
@@ -137,18 +137,18 @@ class FrameStore(StoredShape):
             moved = self._empty(frames.shape, torch.float16 if half else torch.float32)
             setattr(self, name, moved.copy_(frames))
 
-    def take(self, to_canonical: Tensor, to_time: Tensor) -> None:
+    def take(self, backward: Tensor, forward: Tensor) -> None:
         """Hold these (T, X, Y, Z, 3) where they are; on the host they stay there.
 
         Raises:
             ValueError: they are no displacements of the same frames.
         """
-        alike = to_canonical.shape == to_time.shape and to_canonical.dtype == to_time.dtype
-        if not alike or not self.takes("to_time", to_time.shape):
-            raise ValueError(f"displacements of the shape {[*to_time.shape]}")
-        self.to_canonical = to_canonical
-        self.to_time = to_time
-        self.on_host = to_time.device != self.here.device
+        alike = backward.shape == forward.shape and backward.dtype == forward.dtype
+        if not alike or not self.takes("forward_slices", forward.shape):
+            raise ValueError(f"displacements of the shape {[*forward.shape]}")
+        self.backward_slices = backward
+        self.forward_slices = forward
+        self.on_host = forward.device != self.here.device
 
     def keep(
         self,
@@ -171,7 +171,7 @@ class FrameStore(StoredShape):
         on_host = store == "host"
         if store == "auto" and device.type == "cuda":
             free, _ = torch.cuda.mem_get_info(device)
-            frames = len(self.to_time)
+            frames = len(self.forward_slices)
             on_host = not fits_on_device(free, frames, shape, half=half)
             if on_host:
                 log.info(

@@ -61,11 +61,11 @@ PHOTOMETRIC_TERMS: dict[str, Callable[[Prediction], Tensor]] = {
 
 @dataclass(frozen=True)
 class MotionPrediction(Prediction):
-    """A prediction through the warp of one frame t, with the motion terms' inputs.
+    """A prediction through the backward warp of one frame t, with the motion terms' inputs.
 
     Attributes:
-        unwarp: canonical points q (M, 3) → q + Δ_f(q, t).
-        unwarp_previous: q → q + Δ_f(q, t − 1), frozen.
+        forward_warp: canonical points q (M, 3) → q + Δ_f(q, t).
+        previous_forward_warp: q → q + Δ_f(q, t − 1), frozen.
         cameras: the cameras of the images that the batch was drawn from.
         previous_image: (N,) int64, for each image the same view's one frame earlier, or itself.
         forward_slice: (X, Y, Z, 3) Δ_f(·, t) itself, for terms that need no samples.
@@ -74,8 +74,8 @@ class MotionPrediction(Prediction):
         flow_mean: whether the flow loss is a mean over rays or samples.
     """
 
-    unwarp: Warp
-    unwarp_previous: Warp
+    forward_warp: Warp
+    previous_forward_warp: Warp
     cameras: Cameras
     previous_image: Tensor
     forward_slice: Tensor
@@ -86,15 +86,15 @@ class MotionPrediction(Prediction):
 
 def cycle(prediction: MotionPrediction) -> Tensor:
     """L_cycle = mean_i ½ |x_i − (q_i + Δ_f(q_i, t))|² (docs/method.md#cycle)."""
-    samples, unwarp = prediction.output.samples, prediction.unwarp
+    samples, warp = prediction.output.samples, prediction.forward_warp
     if (
-        isinstance(unwarp, GridWarp)
-        and unwarp.displacement is not None
+        isinstance(warp, GridWarp)
+        and warp.displacement is not None
         and is_supported(samples.weight)
     ):
-        outside = unwarp.zero_outside_box
-        return cycle_error(samples, unwarp.displacement, unwarp.box, zero_outside_box=outside)
-    missed = samples.points - unwarp(samples.canonical)
+        outside = warp.zero_outside_box
+        return cycle_error(samples, warp.displacement, warp.box, zero_outside_box=outside)
+    missed = samples.points - warp(samples.canonical)
     error = 0.5 * missed.square().sum(dim=1)
     return error.mean() if len(error) else error.sum()
 
@@ -109,13 +109,13 @@ def flow(prediction: MotionPrediction) -> Tensor:
     valid = batch.flow_valid
     if batch.flow is None or valid is None:
         return samples.weight.new_zeros(())
-    unwarp, space = prediction.unwarp_previous, prediction.space
-    if isinstance(unwarp, GridWarp) and space.is_linear and is_supported(samples.weight):
+    warp, space = prediction.previous_forward_warp, prediction.space
+    if isinstance(warp, GridWarp) and space.is_linear and is_supported(samples.weight):
         return flow_error(
             samples,
-            unwarp.displacement,
-            unwarp.box,
-            zero_outside_box=unwarp.zero_outside_box,
+            warp.displacement,
+            warp.box,
+            zero_outside_box=warp.zero_outside_box,
             cameras=prediction.cameras,
             previous=prediction.previous_image,
             image=batch.image,
@@ -128,7 +128,7 @@ def flow(prediction: MotionPrediction) -> Tensor:
     ray = samples.ray
     induced = induced_flow(
         samples.canonical,
-        unwarp,
+        warp,
         prediction.cameras,
         prediction.previous_image[batch.image][ray],
         batch.pixel[ray],
@@ -141,7 +141,7 @@ def flow(prediction: MotionPrediction) -> Tensor:
 
 def induced_flow(
     canonical: Tensor,
-    unwarp_previous: Warp,
+    forward_warp: Warp,
     cameras: Cameras,
     camera: Tensor,
     pixel: Tensor,
@@ -151,13 +151,13 @@ def induced_flow(
 
     Args:
         canonical: (M, 3) canonical positions q.
-        unwarp_previous: q → q + Δ_f(q, t − 1).
+        forward_warp: q → q + Δ_f(q, t − 1), of the earlier frame.
         cameras: all cameras.
         camera: (M,) int64, the camera π that took the earlier frame.
         pixel: (M, 2) u, the points' pixels now: x, y in pixels.
         space: of the points.
     """
-    position, _ = cameras.project(camera, space.to_world(unwarp_previous(canonical)))
+    position, _ = cameras.project(camera, space.to_world(forward_warp(canonical)))
     return position - pixel
 
 
@@ -186,7 +186,7 @@ def total_variation_weight(weight: float, side: int, rays: int) -> float:
 
 # An unweighted loss term: prediction → ().
 MotionTerm = Callable[[MotionPrediction], Tensor]
-# The terms of the paper that constrain the motion, and the photometric ones through the warp.
+# The terms of the paper that constrain the motion, and the photometric ones of the warped render.
 MOTION_TERMS: dict[str, MotionTerm] = {
     **PHOTOMETRIC_TERMS,
     "cycle": cycle,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
-from functools import partial
 from typing import Any, ClassVar
 
 import torch
@@ -123,19 +122,14 @@ class DeVRFModel(Renderable):
             residual and residual(box, clock, voxels=8),
         )
 
-    def warp(self, time: float) -> GridWarp | None:
-        """x → x + Δ_b(x, t), points (M, 3) at ``time`` → canonical space; None is the identity."""
-        warp = None if self.deformation is None else self.deformation.warp_at(time)
-        return warp if warp is not None and warp.slices else None
-
     def color_change(self, time: float) -> ColorChange | None:
         """q → A_t(q) at ``time``; None where colours are those of the canonical field."""
         return None if self.color_residual is None else self.color_residual.at(time)
 
     def occupancy_at(self, time: float) -> Occupancy:
         """The occupancy at ``time`` in [0, 1]."""
-        warp = self.warp(time)
-        if warp is None:
+        warp = self.backward_warp(time)
+        if not warp.slices:
             return self.occupancy
         return deformed_occupancy(self.canonical, self.occupancy, self.settings, warp)
 
@@ -156,15 +150,15 @@ class DeVRFModel(Renderable):
         """The canonical field."""
         return CanonicalSurface(self.canonical, self.occupancy)
 
-    def forward_map(self, time: float) -> Callable[[Tensor], Tensor]:
+    def forward_warp(self, time: float) -> GridWarp:
         """q → q + Δ_f(q, t) (docs/method.md#warp)."""
-        if self.deformation is None:
-            return lambda points: points
-        return torch.no_grad()(partial(self.deformation.unwarp, time=time))
+        field = self.deformation
+        return GridWarp((), self.box) if field is None else field.forward_warp(time)
 
-    def canonical_map(self, time: float) -> Callable[[Tensor], Tensor]:
-        """x → x + Δ_b(x, t) (docs/method.md#warp)."""
-        return self.warp(time) or (lambda points: points)
+    def backward_warp(self, time: float) -> GridWarp:
+        """x → q = x + Δ_b(x, t) (docs/method.md#warp)."""
+        field = self.deformation
+        return GridWarp((), self.box) if field is None else field.backward_warp(time)
 
     @torch.no_grad()
     def moving_points(self, size: float) -> Tensor:
@@ -173,7 +167,7 @@ class DeVRFModel(Renderable):
         points = self.box.grid_points(self.canonical.density.shape, self.canonical.density.values)
         near = points[moves]
         times = (0.0,) if self.deformation is None else self.deformation.clock.times
-        places = (self.space.to_world(self.forward_map(time)(near)) for time in times)
+        places = (self.space.to_world(self.forward_warp(time)(near)) for time in times)
         return moves.masked_scatter(moves, moving(places, size))
 
     def moving_and_still(self, size: float) -> dict[str, Renderable]:
@@ -202,7 +196,7 @@ class DeVRFModel(Renderable):
     def size(self) -> int:
         """Values of all fields."""
         motion, residual = self.deformation, self.color_residual
-        frames = [] if motion is None else [motion.to_canonical, motion.to_time]
+        frames = [] if motion is None else [motion.backward_slices, motion.forward_slices]
         frames += [] if residual is None else [residual.values]
         return super().size + sum(tensor.numel() for tensor in frames)
 
@@ -226,7 +220,7 @@ class DeVRFModel(Renderable):
             near = [self.occupancy_at(t).points_near(*grid) for t in motion.clock.times]
             # Between two frames both are blended.
             moving = [torch.stack(near[max(k - 1, 0) : k + 2]).any(dim=0) for k in range(len(near))]
-            frames = {"to_canonical": torch.stack(moving), "to_time": at_rest}
+            frames = {"backward_slices": torch.stack(moving), "forward_slices": at_rest}
             for name, keep in frames.items():
                 values = getattr(motion.frames, name)
                 state[f"deformation.frames.{name}"] = pack(values, keep, smooth=True)
@@ -255,7 +249,7 @@ class DeVRFModel(Renderable):
             full |= zip(names, frames, strict=True)
         self.load_state_dict({name: unpack(v, self.device) for name, v in full.items()})
         motion, residual = self.deformation, self.color_residual
-        timed = [(motion.clock, motion.to_canonical)] if motion else []
+        timed = [(motion.clock, motion.backward_slices)] if motion else []
         timed += [(residual.clock, residual.values)] if residual else []
         if any(len(clock) != len(frames) for clock, frames in timed):
             raise ValueError("frames of other times")

@@ -46,7 +46,7 @@ class DeVRFView:
         time: t in [0, 1].
         color_change: the residual of the colours' logits at that time; None: none.
         precision: of the colour network for pictures.
-        at_rest: whether the warp of this time is the identity.
+        at_rest: whether the warps of this time are the identity.
     """
 
     canonical: CanonicalField
@@ -58,7 +58,7 @@ class DeVRFView:
     color_change: ColorChange | None = None
     precision: torch.dtype = torch.float32
     at_rest: bool = field(init=False)
-    _warp: GridWarp | None = field(init=False, default=None)
+    _backward_warp: GridWarp | None = field(init=False, default=None)
 
     @torch.no_grad()
     def __post_init__(self) -> None:
@@ -69,11 +69,11 @@ class DeVRFView:
             return
         with one_thread() if self.canonical.density.values.numel() < MANY else nullcontext():
             # As one grid: one interpolation a point instead of two.
-            moves = motion.warp_at(self.time).displacement
+            moves = motion.backward_warp(self.time).displacement
             assert moves is not None
-            self._warp = motion.warp_by(moves)
+            self._backward_warp = motion.warp_by(moves)
             self.occupancy = deformed_occupancy(
-                self.canonical, self.occupancy, self.picture_settings, self._warp
+                self.canonical, self.occupancy, self.picture_settings, self._backward_warp
             )
             self.occupancy.find_distances()
 
@@ -98,7 +98,7 @@ class DeVRFView:
             self.occupancy,
             self.picture_settings,
             background,
-            self._warp,
+            self._backward_warp,
             precision=self.precision,
             color_change=self.color_change,
         )
@@ -112,15 +112,16 @@ class DeVRFView:
 
         See docs/method.md#flow for φ_i, with ``time`` in place of t − 1.
         """
-        black, motion = torch.zeros(3, device=rays.origins.device), self.motion
-        seen = render(rays, self.canonical, self.occupancy, self.settings, black, self._warp)
-
-        def unwarp(points: Tensor) -> Tensor:
-            return points if motion is None else motion.unwarp(points, time)
-
+        black = torch.zeros(3, device=rays.origins.device)
+        seen = render(
+            rays, self.canonical, self.occupancy, self.settings, black, self._backward_warp
+        )
         ray, weight = seen.samples.ray, seen.samples.weight
+        forward = GridWarp((), self.canonical.box)
+        if self.motion is not None:
+            forward = self.motion.forward_warp(time)
         moved = induced_flow(
-            seen.samples.canonical, unwarp, cameras, torch.zeros_like(ray), pixels[ray], self.space
+            seen.samples.canonical, forward, cameras, torch.zeros_like(ray), pixels[ray], self.space
         )
         mass = sum_by_ray(weight, ray, len(rays))
         total = sum_by_ray(weight[:, None] * moved, ray, len(rays))

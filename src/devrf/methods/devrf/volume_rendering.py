@@ -1,4 +1,4 @@
-"""Volume rendering of a canonical field, at rest or through a warp: batches and pictures alike.
+"""Volume rendering of a canonical field, at rest or warped: batches and pictures alike.
 
 The samples of each ray, docs/method.md#rays, composited: docs/method.md#compositing.
 """
@@ -26,7 +26,7 @@ def render(
     occupancy: Occupancy,
     settings: RenderSettings,
     background: Tensor,
-    warp: GridWarp | None = None,
+    backward_warp: GridWarp | None = None,
     precision: torch.dtype = torch.float32,
     color_change: ColorChange | None = None,
 ) -> VoxelOutput:
@@ -38,15 +38,15 @@ def render(
         occupancy: an upper bound, in the space of the rays.
         settings: step length and thresholds.
         background: (3,) or (R, 3) RGB behind all; the field's own if the space holds infinity.
-        warp: x → q = x + Δ_b(x, t); None is the identity.
+        backward_warp: x → q = x + Δ_b(x, t); None is the identity.
         precision: of the colour network.
         color_change: q → A_t(q), added to the colours' logits; None: nothing is.
 
     Returns:
-        The render; differentiable in the parameters of field, warp and colour change.
+        The render; differentiable in the parameters of field, backward warp and colour change.
     """
     with span("sampling"):
-        samples = march(rays, march_inputs(field, occupancy, settings, warp))
+        samples = march(rays, march_inputs(field, occupancy, settings, backward_warp))
     with span("decoder"):
         residual = None if color_change is None else color_change(samples.canonical)
         color = field.rgb(samples.canonical, rays.viewdirs, samples.ray, precision, residual)
@@ -71,10 +71,11 @@ def march_inputs(
     field: CanonicalField,
     occupancy: Occupancy,
     settings: RenderSettings,
-    warp: GridWarp | None = None,
+    backward_warp: GridWarp | None = None,
 ) -> MarchInputs:
-    """A field, its occupancy and its warp, as the march reads them."""
-    displacement = None if warp is None else warp.displacement
+    """A field, its occupancy and its backward warp, as the march reads them."""
+    warp = backward_warp or GridWarp((), field.box)
+    displacement = warp.displacement
     limits = MarchRange(
         box=field.box,
         distances=occupancy.distances,
@@ -89,14 +90,14 @@ def march_inputs(
         delta=field.step_in_base_voxels(settings.step),
         threshold=settings.alpha_threshold,
         displacement=displacement,
-        motion_box=None if warp is None or displacement is None else warp.box,
-        zero_outside_box=warp is not None and warp.zero_outside_box,
+        motion_box=None if displacement is None else warp.box,
+        zero_outside_box=warp.zero_outside_box,
     )
 
 
 @torch.no_grad()
 def deformed_occupancy(
-    field: CanonicalField, occupancy: Occupancy, settings: RenderSettings, warp: GridWarp
+    field: CanonicalField, occupancy: Occupancy, settings: RenderSettings, backward_warp: GridWarp
 ) -> Occupancy:
     """The occupancy at a time: the points of the density's grid that move to opaque space.
 
@@ -108,10 +109,10 @@ def deformed_occupancy(
         field: the canonical field.
         occupancy: of the scene at rest.
         settings: of the sampling of rays.
-        warp: x → x + Δ_b(x, t).
+        backward_warp: x → x + Δ_b(x, t).
     """
     box, shape, densities = field.box, field.density.shape, field.density.values
-    moved = warp.of_grid(box, shape, densities.device)
+    moved = backward_warp.of_grid(box, shape, densities.device)
     arrived = occupancy.at(moved)
     canonical = moved[arrived]
     x, y, z = box.to_grid(box.nearest(canonical), shape).round().long().unbind(1)
@@ -122,12 +123,12 @@ def deformed_occupancy(
 
 
 @torch.no_grad()
-def possible_occupancy(occupancy: Occupancy, warp: GridWarp) -> Occupancy:
+def possible_occupancy(occupancy: Occupancy, backward_warp: GridWarp) -> Occupancy:
     """The occupancy while a frame is learned, of the grid of that at rest.
 
     It is wider than :func:`deformed_occupancy`, since the displacements go on changing: all that
     may be occupied at rest, grown by one point.
     """
     x, y, z = occupancy.mask.shape
-    arrived = occupancy.at(warp.of_grid(occupancy.box, (x, y, z), occupancy.mask.device))
+    arrived = occupancy.at(backward_warp.of_grid(occupancy.box, (x, y, z), occupancy.mask.device))
     return Occupancy(dilate(arrived.view(x, y, z), 1), occupancy.box)

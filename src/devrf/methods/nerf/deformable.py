@@ -57,7 +57,7 @@ class DeformableField(DensityColorField):
             x′ (S, 3), and the further input of T, (S, ambient) or None.
         """
 
-    def canonical_map(self, time: float) -> Callable[[Tensor], Tensor]:
+    def backward_warp(self, time: float) -> Callable[[Tensor], Tensor]:
         """x → x′, without w."""
 
         def mapped(points: Tensor) -> Tensor:

@@ -129,7 +129,7 @@ class TiNeuVox(DensityColorField):
             displacement = layer(displacement)
         return displacement
 
-    def canonical_map(self, time: float) -> Callable[[Tensor], Tensor]:
+    def backward_warp(self, time: float) -> Callable[[Tensor], Tensor]:
         """x → x + Δ(x, t)."""
 
         def mapped(points: Tensor) -> Tensor:

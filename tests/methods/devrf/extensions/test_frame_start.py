@@ -33,8 +33,8 @@ def stage(cube: Box) -> Any:
         shape=frames.shape,
         clock=range(4),
         box=cube,
-        to_canonical=frames.to_canonical,
-        to_time=frames.to_time,
+        backward_slices=frames.backward_slices,
+        forward_slices=frames.forward_slices,
     )
     return SimpleNamespace(field=field)
 
@@ -66,10 +66,11 @@ def test_the_candidate_of_the_least_error_is_what_the_frame_gets(stage, monkeypa
     monkeypatch.setattr(frame_start, "candidates", lambda *_: starts)
     monkeypatch.setattr(StartFromBest, "_errors", lambda *_: [0.3, 0.1, 0.2])
     StartFromBest(levels=1).initialise(stage, phase(7))  # of the second level
-    assert not stage.field.to_time.any()
+    assert not stage.field.forward_slices.any()
     StartFromBest(levels=2).initialise(stage, phase(7))
-    assert (stage.field.to_canonical[1] == 2).all() and (stage.field.to_time[1] == -2).all()
-    assert not stage.field.to_time[2:].any()
+    assert (stage.field.backward_slices[1] == 2).all()
+    assert (stage.field.forward_slices[1] == -2).all()
+    assert not stage.field.forward_slices[2:].any()
 
 
 def test_a_translation_goes_on_as_it_was(cube: Box):

@@ -120,7 +120,7 @@ def test_what_is_met_nowhere_or_cannot_be_followed_is_no_track(model, views):
 def test_points_are_those_that_had_moved_there(model, views):
     # In frame 2 the whole sheet lies 0.2 further to the right.
     assert model.deformation is not None
-    model.deformation.to_canonical[2, ..., 0] = -0.2
+    model.deformation.backward_slices[2, ..., 0] = -0.2
     met = followed(model, views, MIDDLE, by_color=False)
     assert met.canonical[:, 0].tolist() == pytest.approx([x_of(MIDDLE) - 0.2], abs=0.02)
 
@@ -150,21 +150,21 @@ def test_three_views_of_a_shift_give_the_shift_and_the_way_back():
     tracks = shifted_ball(cameras)
     tracks.pixel[::50] += 40.0  # the wrong flow of a few pixels is outvoted
     start_from_tracks(field, 2, tracks, cameras)
-    moved = field.unwarp(tracks.canonical, 1.0)
+    moved = field.forward_warp(1.0)(tracks.canonical)
     # The shift is more than the ball's radius: no rendered overlap could have shown it.
     assert (moved - tracks.canonical - SHIFT).norm(dim=1).median() < 0.02
-    assert not field.to_canonical[:2].any() and not field.to_time[:2].any()
-    back = field.warp_at(1.0)(tracks.canonical + SHIFT)
+    assert not field.backward_slices[:2].any() and not field.forward_slices[:2].any()
+    back = field.backward_warp(1.0)(tracks.canonical + SHIFT)
     assert (back - tracks.canonical).norm(dim=1).median() < 0.03
 
 
 def test_without_tracks_the_frame_stays_where_the_one_before_is():
     field = DeformationField(BOX, FrameClock((0.0, 0.5, 1.0)), voxels=4**3)
-    field.to_canonical[1] = 0.25
+    field.backward_slices[1] = 0.25
     field.frames.copy_previous(2)
     nothing = Tracks(torch.zeros(0, 3), torch.zeros(0, dtype=torch.long), torch.zeros(0, 2))
     start_from_tracks(field, 2, nothing, three_cameras())
-    assert torch.equal(field.to_canonical[2], field.to_canonical[1])
+    assert torch.equal(field.backward_slices[2], field.backward_slices[1])
 
 
 def test_flow_starts_the_frames_of_the_first_level(tiny_scene):

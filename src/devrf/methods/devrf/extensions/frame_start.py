@@ -63,7 +63,7 @@ class StartFromBest(Extension):
         field = context.field
         field.frames.write(phase.frame, starts[best])
         # Each process has looked at pixels of its own.
-        broadcast([field.to_canonical[phase.frame], field.to_time[phase.frame]])
+        broadcast([field.backward_slices[phase.frame], field.forward_slices[phase.frame]])
 
     @torch.no_grad()
     def _errors(self, context: MotionContext, frame: int, starts: list[Directions]) -> list[float]:
@@ -84,7 +84,7 @@ class StartFromBest(Extension):
                 possible_occupancy(model.occupancy, warp),
                 model.settings,
                 batch.background,
-                warp=warp,
+                backward_warp=warp,
                 precision=context.precision,
             )
             errors.append(float(color_error(output.color, batch.color)))

@@ -86,7 +86,7 @@ class StartAlongFlow(Extension):
         tracks = self._tracks.follow(frame, pool, context.generator, most=most)
         start_from_tracks(context.field, frame, tracks, views.cameras, model.space, steps)
         # Each process has followed pixels of its own.
-        broadcast([context.field.to_canonical[frame], context.field.to_time[frame]])
+        broadcast([context.field.backward_slices[frame], context.field.forward_slices[frame]])
 
 
 @dataclass(frozen=True)
@@ -219,7 +219,7 @@ class FlowTracks:
             self._occupancy(frame, time),
             model.settings,
             torch.ones(3, device=image.device),
-            model.warp(time),
+            model.backward_warp(time),
         )
         count = len(image)
         ray = seen.samples.ray
