@@ -225,7 +225,7 @@ STEPS: dict[str, tuple[float, Callable[[Path], Iterator[Row]]]] = {
         for name, overrides in {
             "as-it-is": [],
             "10-a-step": [f"{key}.iterations_per_step=10" for key in ("canonical", "deformation")],
-            "frames-on-device": ["schedule.motion.store=device"],
+            "frames-on-device": ["schedule.visit.store=device"],
         }.items()
     },
     "tests": (6, tests),

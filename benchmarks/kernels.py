@@ -177,7 +177,7 @@ def ball(
         delta=0.5,
         threshold=1e-4,
         displacement=bends[0].permute(1, 2, 3, 0).contiguous() if moves else None,
-        motion_box=BOX if moves else None,
+        displacement_box=BOX if moves else None,
     )
 
 
@@ -194,7 +194,7 @@ def follow(module: Any, rays: Rays, inputs: MarchInputs, *, backward: bool) -> l
         delta=inputs.delta,
         threshold=inputs.threshold,
         displacement=moves,
-        motion_box=inputs.motion_box,
+        displacement_box=inputs.displacement_box,
     )
     samples = module.march(rays, given)
     depth = torch.zeros_like(samples.transmittance)

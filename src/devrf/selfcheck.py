@@ -35,7 +35,7 @@ from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import PAPER_LEVELS, DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.settings import MotionSettings, Precision, Sampling
+from devrf.methods.devrf.settings import Precision, Sampling, VisitSettings
 from devrf.rendering.renderer import Renderer
 
 log = logging.getLogger(__name__)
@@ -65,7 +65,7 @@ class SmallScene:
         device: where stages learn.
         data: serves the robot at rest, and seen moving by three cameras.
         at_rest: the canonical stage's schedule.
-        in_motion: the deformation stage's schedule.
+        deformation: the deformation stage's schedule.
         architecture: of the canonical field.
         sampling: how rays are sampled.
         seed: of everything that is drawn.
@@ -74,7 +74,7 @@ class SmallScene:
     device: torch.device
     data: ProceduralDataModule
     at_rest: CanonicalSchedule
-    in_motion: DeformationSchedule
+    deformation: DeformationSchedule
     architecture: Architecture
     sampling: Sampling
     seed: int = 0
@@ -97,13 +97,13 @@ class SmallScene:
                 decoder_precision=variant.precision,
                 iterations_per_step=5,
             )
-        settings = MotionSettings(5e-3, unit="box", store="host")
+        settings = VisitSettings(5e-3, unit="box", store="host")
         # Imported here: every command loads this module, and an extension may be taken out.
         from devrf.methods.devrf.extensions.tracks import StartAlongFlow
 
         return DeformationStage(
             copy.deepcopy(self.canonical),
-            self.in_motion,
+            self.deformation,
             settings,
             decoder_precision=variant.precision,
             iterations_per_step=5,
@@ -163,12 +163,12 @@ def small_scene(device: torch.device, seed: int = 0) -> SmallScene:
     if device.type != "cuda":
         data = robot(width=24, height=18, static_views=8, frames=3)
         tiny = CanonicalSchedule(0, search_side=12, side=16, upsample_at=[10], rays=192)
-        in_motion = DeformationSchedule([Level(4, 5), Level(6, 2)], rays=192)
+        deformation = DeformationSchedule([Level(4, 5), Level(6, 2)], rays=192)
         return SmallScene(
             device,
             data,
             at_rest=short(tiny, 20),
-            in_motion=in_motion,
+            deformation=deformation,
             architecture=Architecture(width=16),
             sampling=Sampling(alpha_threshold=3e-3),
             seed=seed,
@@ -182,7 +182,7 @@ def small_scene(device: torch.device, seed: int = 0) -> SmallScene:
         device,
         data,
         at_rest=at_rest,
-        in_motion=DeformationSchedule(levels),
+        deformation=DeformationSchedule(levels),
         architecture=architecture,
         sampling=Sampling(),
         seed=seed,

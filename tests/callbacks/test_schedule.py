@@ -25,7 +25,7 @@ from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.methods.devrf.settings import MotionSettings
+from devrf.methods.devrf.settings import VisitSettings
 
 DEFORMATION = DeformationSchedule(levels=(Level(4, 3), Level(6, 2)), rays=64)
 
@@ -50,8 +50,8 @@ def test_canonical_rates_and_phases_are_the_schedules_at_every_step(fit, canonic
 
 
 def test_deformation_rates_and_phases_are_the_schedules_at_every_step(fit, rest):
-    motion = MotionSettings(learning_rate=2e-3, unit="box")
-    stage = fit(DeformationStage(rest, DEFORMATION, motion), watched(steps := []))
+    visit = VisitSettings(learning_rate=2e-3, unit="box")
+    stage = fit(DeformationStage(rest, DEFORMATION, visit), watched(steps := []))
     assert [step for step, _, _ in steps] == list(range(15))
     # Three frames, shares of 3 and 2; frame 1 has two shares.
     visits = [(phase.level, phase.frame) for _, phase, _ in steps]

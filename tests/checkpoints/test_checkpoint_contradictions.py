@@ -117,7 +117,7 @@ def try_all(path: Path, keys: tuple[str, ...], use: Callable[[], object], count:
 
 
 @pytest.fixture
-def motion(rest, datamodule, trainer, tmp_path) -> Path:
+def moving(rest, datamodule, trainer, tmp_path) -> Path:
     """The checkpoint of a scene that moves."""
     schedule, learner = DeformationSchedule(levels=(Level(4, 2),), rays=64), trainer(max_epochs=1)
     learner.fit(DeformationStage(rest, schedule), datamodule=datamodule)
@@ -126,9 +126,9 @@ def motion(rest, datamodule, trainer, tmp_path) -> Path:
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_a_checkpoint_is_shown_or_refused(motion, tmp_path):
+def test_a_checkpoint_is_shown_or_refused(moving, tmp_path):
     def show() -> None:
-        stored = load_checkpoint(motion)
+        stored = load_checkpoint(moving)
         if stored.viewpoints is not None:
             camera = stored.viewpoints.held_out.of_height(12)
             for moment in (0.0, 0.3, 1.0):
@@ -141,20 +141,20 @@ def test_a_checkpoint_is_shown_or_refused(motion, tmp_path):
                 export_scene(stored.model, stored.viewpoints, mesh, tmp_path / "export")
 
     count = INPUTS * 3 // 4
-    assert try_all(motion, ("devrf", "state_dict", "viewpoints"), show, count) > count // 4
+    assert try_all(moving, ("devrf", "state_dict", "viewpoints"), show, count) > count // 4
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_gaussians_are_shown_or_refused(motion, tmp_path):
+def test_gaussians_are_shown_or_refused(moving, tmp_path):
     model = DeformableGaussians(GaussiansSettings(width=8, depth=2, harmonics=1))
     model.cloud.begin(0.3 * torch.randn(50, 3), torch.rand(50, 3), torch.full((50,), 0.1), 0.5)
-    content = read_checkpoint_file(motion)
+    content = read_checkpoint_file(moving)
     content["devrf"]["model"] = {"class": class_path(DeformableGaussians), **model.config()}
     content["state_dict"] = {f"scene_model.{k}": v for k, v in model.stored_state().items()}
-    write_checkpoint_file(motion, content)
+    write_checkpoint_file(moving, content)
 
     def show() -> None:
-        stored = load_checkpoint(motion)
+        stored = load_checkpoint(moving)
         assert stored.viewpoints is not None
         camera = stored.viewpoints.held_out.of_height(12)
         for moment in (0.0, 0.7):
@@ -164,12 +164,12 @@ def test_gaussians_are_shown_or_refused(motion, tmp_path):
 
     show()
     color = ("state_dict", "scene_model.cloud.color")
-    write_checkpoint_file(motion, changed(content, color, torch.zeros(1, 3)))
+    write_checkpoint_file(moving, changed(content, color, torch.zeros(1, 3)))
     with pytest.raises(DevrfError, match="parts of other numbers of Gaussians"):
         show()
-    write_checkpoint_file(motion, content)
+    write_checkpoint_file(moving, content)
     count = INPUTS // 8
-    assert try_all(motion, ("devrf", "state_dict"), show, count) > count // 4
+    assert try_all(moving, ("devrf", "state_dict"), show, count) > count // 4
 
 
 PLACES: list[Place] = [
@@ -182,37 +182,37 @@ PLACES: list[Place] = [
 ]
 
 
-def test_numbers_that_nothing_can_be_computed_with_are_one_line(motion):
-    content = read_checkpoint_file(motion)
+def test_numbers_that_nothing_can_be_computed_with_are_one_line(moving):
+    content = read_checkpoint_file(moving)
     for place in PLACES:
         part = reduce(lambda whole, key: whole[key], place, content)
         for value in (math.nan, math.inf, -math.inf, 1e30):
             other = part.float() * 0 + value if isinstance(part, Tensor) else value
-            write_checkpoint_file(motion, changed(content, place, other))
+            write_checkpoint_file(moving, changed(content, place, other))
             with pytest.raises(DevrfError, match="its parts do not fit together"):
-                load_checkpoint(motion)
+                load_checkpoint(moving)
             if place[0] == "state_dict":  # as Lightning reads it, to go on
                 with pytest.raises(ValueError, match="a number that is not finite, or too large"):
-                    ChecksummedCheckpointIO().load_checkpoint(motion)
+                    ChecksummedCheckpointIO().load_checkpoint(moving)
 
 
-def test_settings_and_progress_are_looked_at_before_they_are_used(motion):
+def test_settings_and_progress_are_looked_at_before_they_are_used(moving):
     """Settings are compared, and printed as JSON; the place where a stage was left is printed."""
-    content = read_checkpoint_file(motion)
+    content = read_checkpoint_file(moving)
     for value in ({1, 2}, torch.zeros(3)):
-        write_checkpoint_file(motion, changed(content, ("devrf", "training_config"), {"a": value}))
+        write_checkpoint_file(moving, changed(content, ("devrf", "training_config"), {"a": value}))
         with pytest.raises(DevrfError, match="do not fit together .*training_config: a: "):
-            metadata_in(motion, read_checkpoint_file(motion))
-    write_checkpoint_file(motion, {**content, "progress": "half"})
+            metadata_in(moving, read_checkpoint_file(moving))
+    write_checkpoint_file(moving, {**content, "progress": "half"})
     with pytest.raises(DevrfError, match="its parts do not fit together"):
-        unfinished(SimpleNamespace(checkpoint=lambda: motion))
+        unfinished(SimpleNamespace(checkpoint=lambda: moving))
 
 
-def test_frames_of_other_times_do_not_fit(motion):
+def test_frames_of_other_times_do_not_fit(moving):
     clock = ("state_dict", "scene_model.deformation._extra_state", "times")
-    write_checkpoint_file(motion, changed(read_checkpoint_file(motion), clock, [0.0]))
+    write_checkpoint_file(moving, changed(read_checkpoint_file(moving), clock, [0.0]))
     with pytest.raises(DevrfError, match="do not fit together .*: frames of other times"):
-        load_checkpoint(motion)
+        load_checkpoint(moving)
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -36,7 +36,7 @@ from devrf.methods.devrf.extensions.color_residual import ColorResidual
 from devrf.methods.devrf.extensions.frame_start import StartFromBest
 from devrf.methods.devrf.extensions.priors import Elastic
 from devrf.methods.devrf.extensions.tracks import StartAlongFlow
-from devrf.methods.devrf.settings import MotionSettings
+from devrf.methods.devrf.settings import VisitSettings
 
 SMALL = Architecture(channels=4, width=8, frequencies=1, search_alpha_init=1e-2)
 # Search 0–7, then fine 8–19 with upsample_at after 4 and 8 of its iterations.
@@ -54,14 +54,14 @@ SEARCHING = CanonicalSchedule(
 # Three frames. Level 0: frame 1 in 0–11, frame 2 in 12–17; level 1: 18–25 and 26–29.
 MOVING = DeformationSchedule(levels=(Level(4, 6), Level(6, 4)), rays=64)
 # The occupancy is looked up anew in iterations 3, 6, 9 of a visit; frames start along tracks.
-OFTEN = MotionSettings(2e-3, unit="box", views="all", pixels="occupied", occupancy_every=3)
+OFTEN = VisitSettings(2e-3, unit="box", views="all", pixels="occupied", occupancy_every=3)
 # Then once more: 30–35 and 36–38.
 AGAIN = replace(MOVING, levels=(*MOVING.levels, Level(6, 3)))
 
 
 PRIORS = {"render": 1.0, "cycle": 100.0, "tv": 1.0, "elastic": 0.1}
 # The field would not keep exactly what a visit has learned.
-ROUNDED = MotionSettings(occupancy_every=3, store="host", store_half=True)
+ROUNDED = VisitSettings(occupancy_every=3, store="host", store_half=True)
 
 
 def leave(path: Path, iteration: int) -> Callback:

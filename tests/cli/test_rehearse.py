@@ -131,7 +131,7 @@ def test_a_stage_is_rehearsed_alone_and_one_that_does_not_learn_ends_with_status
 ):
     shutil.copytree(paper[0] / "outputs/robot/paper-rehearsal", tmp_path / "run")
     before = (tmp_path / "run/checkpoints/canonical.ckpt").stat().st_mtime_ns
-    still = ("schedule.motion.learning_rate=0", "loss.deformation.flow=0", "stage=deformation")
+    still = ("schedule.visit.learning_rate=0", "loss.deformation.flow=0", "stage=deformation")
     done = devrf(*PAPER, *still, "hydra.run.dir=run")
     assert done.status == 2
     assert "rehearse: the deformation stage has learned no motion: " in done.err

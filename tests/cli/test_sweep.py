@@ -121,7 +121,7 @@ def test_jobs_in_processes_of_their_own(warm, tmp_path, tiny):
 @installed("hydra_optuna_sweeper")
 def test_a_search_maximises_the_objective(devrf, tmp_path, tiny):
     folder = ("hydra.sweep.dir=sweep", "video.frames=1", "evaluation.metrics=[]")
-    typed = "schedule.motion.learning_rate=interval(0.001, 0.002)"
+    typed = "schedule.visit.learning_rate=interval(0.001, 0.002)"
     assert devrf("-m", *tiny, *SEARCH, *folder, typed).status == 0
     found = [json.loads(path.read_text()) for path in tmp_path.glob("sweep/*/metrics.json")]
     runs = sorted(tmp_path.glob("sweep/[01]_robot_cycle_*_learning_rate_0.001*"))

@@ -123,7 +123,7 @@ def test_wandb_holds_the_curves_of_both_stages(watched):
     history = watched.runs[0].history
     for stage, last, losses, groups in (
         ("static", 6, ("render", "entropy"), ("density", "color", "decoder")),
-        ("dynamic", 12, ("render", "cycle", "flow"), ("motion",)),
+        ("dynamic", 12, ("render", "cycle", "flow"), ("displacements",)),
     ):
         for name in ("loss", "iterations_per_second", "voxels", "peak_host_gb", *losses):
             assert history[f"{stage}/{name}"][-1] > 0
@@ -279,7 +279,7 @@ def test_tensorboard_holds_both_stages_and_the_scores(devrf, tmp_path, tiny):
     assert devrf(*common).status == 0
     events = read()
     assert [event.step for event in events.Scalars("static/render")][-1] == 6
-    assert [event.step for event in events.Scalars("dynamic/lr/motion")][-1] == 12
+    assert [event.step for event in events.Scalars("dynamic/lr/displacements")][-1] == 12
     assert [event.step for event in events.Images("static/view")][-1] == 6
     assert {"dynamic/depth", "held_out/static", "held_out/dynamic"} <= set(events.Tags()["images"])
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())
@@ -303,4 +303,4 @@ def test_tensorboard_holds_both_stages_and_the_scores(devrf, tmp_path, tiny):
     assert devrf(*common, "stage=canonical", "resume=false").status == 0
     events = read()
     assert [event.step for event in events.Scalars("static/render")][-1] == 6
-    assert "dynamic/lr/motion" not in events.Tags()["scalars"]
+    assert "dynamic/lr/displacements" not in events.Tags()["scalars"]

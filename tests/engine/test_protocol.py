@@ -40,6 +40,6 @@ def test_what_cannot_be_is_named(stages: dict[str, dict[str, object]], said: str
     ("freeze", "frozen"), [(True, ["canonical"]), (False, []), ("all", ["canonical*"])]
 )
 def test_what_is_frozen_can_be_chosen_at_once(freeze: Any, frozen: list[str]) -> None:
-    protocol = Protocol("mine", {"canonical": STATIC, "motion": MOVING}, freeze=freeze)
-    assert list(protocol["motion"].frozen) == frozen
+    protocol = Protocol("mine", {"canonical": STATIC, "deformation": MOVING}, freeze=freeze)
+    assert list(protocol["deformation"].frozen) == frozen
     assert list(protocol["canonical"].frozen) == []

@@ -33,7 +33,7 @@ class Setting:
 
     rays: Rays
     range: MarchRange
-    motion_box: Box
+    displacement_box: Box
 
 
 def directed(origins: Tensor, targets: Tensor) -> Rays:
@@ -50,16 +50,16 @@ def setting(space: str, count: int, rng: torch.Generator, share: float = 0.4) ->
 
     if space == "world":
         rays, box = directed(2 * draw(count, 3), 0.8 * draw(count, 3)), WORLD_BOX
-        motion, limits = Box((-0.6, -0.3, 0.1), (0.7, 1.1, 0.8)), (0.06, 0.3, 6.0)
+        displaced, limits = Box((-0.6, -0.3, 0.1), (0.7, 1.1, 0.8)), (0.06, 0.3, 6.0)
     elif space == "ndc":
         ahead = torch.tensor([0.0, 0.0, -4.0]) + 2.5 * draw(count, 3) * torch.tensor([1, 1, 0.3])
         rays, box = NDC.rays(directed(0.3 * draw(count, 3), ahead)), Box((-1.2,) * 3, (1.2,) * 3)
-        motion, limits = Box((-0.8, -0.7, -0.9), (0.6, 0.9, 0.8)), (0.031, 0.0, 1.0)
+        displaced, limits = Box((-0.8, -0.7, -0.9), (0.6, 0.9, 0.8)), (0.031, 0.0, 1.0)
     else:
         rays, box = CONTRACTED.rays(directed(1.5 * draw(count, 3), draw(count, 3))), CONTRACTED.box
-        motion, limits = CONTRACTED.inner(), (0.06, 0.1, math.inf)
+        displaced, limits = CONTRACTED.inner(), (0.06, 0.1, math.inf)
     occupancy = Occupancy(torch.rand(9, 8, 7, generator=rng) < share, box)
-    return Setting(rays, MarchRange(box, occupancy.distances, *limits), motion)
+    return Setting(rays, MarchRange(box, occupancy.distances, *limits), displaced)
 
 
 def inputs(
@@ -73,7 +73,7 @@ def inputs(
         delta=0.4,
         threshold=0.01,
         displacement=0.15 * torch.randn(4, 3, 5, 3, generator=rng) if moves else None,
-        motion_box=given.motion_box if moves else None,
+        displacement_box=given.displacement_box if moves else None,
         zero_outside_box=zero_outside_box,
     )
 
@@ -103,7 +103,7 @@ def clear_rays(rays: Rays, limits: MarchRange, moving: MarchInputs | None = None
         canonical = definition.warped(points, exact(moving))
         at = limits.box.to_grid(canonical, shape_of(moving.density))
         unclear |= ((at - at.round()).abs() < CLEAR).any(dim=1) & (canonical != points).any(dim=1)
-        at = moving.motion_box.to_grid(points, shape_of(moving.displacement))
+        at = moving.displacement_box.to_grid(points, shape_of(moving.displacement))
         last = torch.tensor(shape_of(moving.displacement)) - 1
         unclear |= torch.minimum(at.abs(), (at - last).abs()).amin(dim=1) < CLEAR
     kept = torch.ones(len(rays), dtype=torch.bool)
@@ -156,7 +156,7 @@ def test_samples_and_gradients_are_those_of_the_definition(
     # Rays that miss, that end, and that see through.
     left = theirs.transmittance
     assert (left == 1).any() and (left < STOP).any() and ((left > 0.1) & (left < 0.9)).any()
-    inside = moving.motion_box.contains(theirs.points)
+    inside = moving.displacement_box.contains(theirs.points)
     assert inside.any() and not inside.all()
     assert torch.equal(ours.canonical[~inside], ours.points[~inside]) == zero_outside_box
     random_loss(ours).backward()

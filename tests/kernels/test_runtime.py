@@ -110,7 +110,7 @@ def scene(rng: torch.Generator, count: int = 500) -> tuple[Rays, MarchInputs]:
         delta=0.4,
         threshold=0.01,
         displacement=0.15 * torch.randn(7, 3, 5, 3, generator=rng),
-        motion_box=BOX.scaled(0.7),
+        displacement_box=BOX.scaled(0.7),
         zero_outside_box=True,
     )
     return Rays(2 * origins, directions, directions), inputs

@@ -110,7 +110,7 @@ def test_all_are_found() -> None:
     march = ("adjoint_kernel", "keep_significant_kernel", "scatter_kernel")
     names |= {f"march.{one}" for one in march}
     names |= {"compositing.composite_kernel", "photometric.photometric_kernel"}
-    names |= {"motion.cycle_kernel", "motion.flow_kernel"}
+    names |= {"deformation.cycle_kernel", "deformation.flow_kernel"}
     names |= {f"pixels.look_up_kernel_{n}" for n in ALPHAS}
     splatting = ("project", "list", "composite", "composite_adjoint", "project_adjoint")
     names |= {f"splatting.{one}_kernel" for one in splatting}

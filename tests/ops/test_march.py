@@ -132,7 +132,7 @@ def test_no_rays_and_missing_rays_give_no_samples(cube):
 def test_gradients_of_densities_and_displacements(zero_outside_box, rng):
     rays = scattered_rays(24, rng)
     # Smaller than the field's box, so that some samples are outside.
-    motion_box = Box((-0.6, -0.3, 0.1), (0.7, 1.1, 0.8))
+    displacement_box = Box((-0.6, -0.3, 0.1), (0.7, 1.1, 0.8))
     limits = through(Occupancy.full((3, 4, 3), BOX), 0.4, near=0.3, far=6.0)
 
     def outputs(density, displacement):
@@ -143,7 +143,7 @@ def test_gradients_of_densities_and_displacements(zero_outside_box, rng):
             0.8,
             0.05,
             displacement,
-            motion_box,
+            displacement_box,
             zero_outside_box=zero_outside_box,
         )
         samples = march(rays, moving)
@@ -163,7 +163,9 @@ def test_what_is_outside_of_moving_space_may_stay(cube):
     limits = through(Occupancy.full((5, 5, 5), cube), 0.5, near=0.0, far=9.0, box=cube)
     shift = torch.tensor([0.1, 0.2, -0.1], dtype=torch.float64)
     moving = replace(
-        fog(limits), displacement=shift.expand(2, 2, 2, 3), motion_box=Box((-0.5,) * 3, (0.5,) * 3)
+        fog(limits),
+        displacement=shift.expand(2, 2, 2, 3),
+        displacement_box=Box((-0.5,) * 3, (0.5,) * 3),
     )
     moved = march(rays, moving)
     torch.testing.assert_close(moved.canonical - moved.points, shift.expand(5, 3))

@@ -74,7 +74,7 @@ PUBLISHED = {
             "side": 160, "channels": 6, "width": 256, "alpha_init": 1e-3, "strides": [1, 2, 4],
             "upsample_at": [0.1, 0.2, 0.3], "step": 0.5, "weight_threshold": 1e-4, "tv": 0.0,
             "bands": 10, "direction_bands": 4, "time_bands": 8, "feature_bands": 2,
-            "grid_rate": 0.08 / 8e-4, "motion_rate": pytest.approx(6e-4 / 8e-4),
+            "grid_rate": 0.08 / 8e-4, "deformation_rate": pytest.approx(6e-4 / 8e-4),
         },
         "schedule": {
             "iterations": 20_000, "rays": 4096, "learning_rate": 8e-4,
@@ -163,7 +163,8 @@ FORMS = {
     "tineuvox_phone": {
         "settings": {
             "upsample_at": [0.1, 0.2, 0.3, 0.4], "grid_rate": 0.1 / 1e-3,
-            "motion_rate": pytest.approx(7e-4 / 1e-3), "tv": pytest.approx(1e-5 / 4096, rel=1e-2),
+            "deformation_rate": pytest.approx(7e-4 / 1e-3),
+            "tv": pytest.approx(1e-5 / 4096, rel=1e-2),
         },
         "schedule": {"learning_rate": 1e-3, "final_learning_rate": 1e-4},
     },

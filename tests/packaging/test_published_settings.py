@@ -18,8 +18,8 @@ from devrf.methods.devrf.settings import (
     FINE_LOSS,
     SEARCH_LOSS,
     CanonicalRates,
-    MotionSettings,
     Sampling,
+    VisitSettings,
 )
 
 ROOT = "data.root=scene"
@@ -44,12 +44,12 @@ def test_canonical_schedule(paper):
 def test_deformation_schedule(paper):
     schedule = instantiate(paper.schedule.deformation, _convert_="all")
     assert (tuple(schedule.levels), schedule.rays) == (PAPER_LEVELS, 8192)
-    motion = instantiate(paper.schedule.motion)
-    assert (motion.learning_rate, motion.unit) == (1e-3, "world")
+    visit = instantiate(paper.schedule.visit)
+    assert (visit.learning_rate, visit.unit) == (1e-3, "world")
     factors = [schedule.phase(i, frames=50).rate_factor for i in (0, 24_999)]
     assert factors == pytest.approx([1, 0.1])
     # A batch is drawn from all pixels of one view.
-    assert (motion.views, motion.pixels) == ("one", "all")
+    assert (visit.views, visit.pixels) == ("one", "all")
 
 
 def test_rates_field_and_sampling(paper):
@@ -85,7 +85,7 @@ def test_the_code_defaults_to_the_paper(paper, rest):
     assert instantiate(paper.sampling) == Sampling()
     assert instantiate(paper.schedule.rates) == CanonicalRates()
     # The store changes nothing that is learned.
-    assert instantiate(paper.schedule.motion) == MotionSettings(store="host")
+    assert instantiate(paper.schedule.visit) == VisitSettings(store="host")
     assert dict(paper.loss.search) == SEARCH_LOSS
     assert dict(paper.loss.fine) == FINE_LOSS
     # Weights of extensions' terms are beside them in conf alone; they are 0.

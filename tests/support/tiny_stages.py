@@ -136,11 +136,11 @@ def moving(learned: tuple[CanonicalStage, Trainer], rng: torch.Generator) -> DeV
     """
     model = copy.deepcopy(learned[0].scene_model)
     box = model.canonical.box
-    motion = DeformationField(box, FrameClock((0.0, 0.4, 1.0)), voxels=5**3)
-    shape = motion.backward_slices[1:].shape
-    motion.backward_slices[1:] = 0.1 * box.longest * (torch.rand(shape, generator=rng) - 0.5)
-    model.deformation = motion
-    model.color_residual = ResidualField(box, motion.clock, voxels=4**3)
+    deformation = DeformationField(box, FrameClock((0.0, 0.4, 1.0)), voxels=5**3)
+    shape = deformation.backward_slices[1:].shape
+    deformation.backward_slices[1:] = 0.1 * box.longest * (torch.rand(shape, generator=rng) - 0.5)
+    model.deformation = deformation
+    model.color_residual = ResidualField(box, deformation.clock, voxels=4**3)
     shape = model.color_residual.values[1:].shape
     model.color_residual.values[1:] = 2 * torch.rand(shape, generator=rng) - 1
     return model

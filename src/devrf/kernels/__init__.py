@@ -12,7 +12,7 @@ its definition.
 | ``trilinear`` | ``interpolate``: values of a grid between its points |
 | ``compositing`` | ``composite_colors``: colours of rays |
 | ``photometric`` | ``photometric``: the terms that compare rays with images, weighted |
-| ``motion`` | ``cycle_error``, ``flow_error``; defined in ``methods.devrf.losses`` |
+| ``deformation`` | ``cycle_error``, ``flow_error``; defined in ``methods.devrf.losses`` |
 | ``splatting`` | ``splat``: a picture of 3D Gaussians |
 | ``adam`` | ``adam_step``, ``add_total_variation_gradient``: a step of the optimiser |
 | ``grid`` | shared by the kernels: grids, and the cell that holds a point |

@@ -13,8 +13,8 @@ import warp as wp
 from devrf.kernels import (
     adam,
     compositing,
+    deformation,
     march,
-    motion,
     photometric,
     pixels,
     splatting,
@@ -34,7 +34,7 @@ def march_kernels() -> list[wp.Kernel]:
     """The kernels of the march and its adjoints."""
     kernels = [march.march_kernel(False), march.keep_significant_kernel, march.adjoint_kernel]
     kernels += [march.scatter_kernel, pixels.look_up_kernel(True), compositing.composite_kernel]
-    kernels += [photometric.photometric_kernel, motion.cycle_kernel, motion.flow_kernel]
+    kernels += [photometric.photometric_kernel, deformation.cycle_kernel, deformation.flow_kernel]
     kernels.append(adam.total_variation_kernel(1))
     # The last one is for contracted space.
     return [*kernels, adam.adam_kernel(1), march.march_kernel(True)]

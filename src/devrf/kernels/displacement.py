@@ -12,7 +12,7 @@ from devrf.ops.trilinear import Shape
 
 
 @wp.struct
-class Motion:
+class Warp:
     """A warp by displacements.
 
     Attributes:
@@ -27,40 +27,40 @@ class Motion:
 
 
 @lru_cache(maxsize=64)
-def motion_of(box: Box | None, shape: Shape | None, zero_outside_box: bool) -> Motion:
+def warp_of(box: Box | None, shape: Shape | None, zero_outside_box: bool) -> Warp:
     """The warp by displacements of ``shape`` (X, Y, Z) over ``box``; without them, none."""
-    motion = Motion()
+    warp = Warp()
     if box is not None and shape is not None:
-        motion.grid = grid_over(box, shape)
-        motion.moves = 1
-        motion.zero_outside_box = int(zero_outside_box)
-    return motion
+        warp.grid = grid_over(box, shape)
+        warp.moves = 1
+        warp.zero_outside_box = int(zero_outside_box)
+    return warp
 
 
 @wp.func
-def follows(motion: Motion, point: wp.vec3):
+def follows(warp: Warp, point: wp.vec3):
     """Whether a point moves with the displacements around it."""
-    if motion.moves == 0:
+    if warp.moves == 0:
         return False
-    return motion.zero_outside_box == 0 or wp.min(inside(motion.grid, point)) > 0.0
+    return warp.zero_outside_box == 0 or wp.min(inside(warp.grid, point)) > 0.0
 
 
 @wp.func
-def warped(motion: Motion, displacements: wp.array(dtype=wp.vec3), point: wp.vec3):
+def warped(warp: Warp, displacements: wp.array(dtype=wp.vec3), point: wp.vec3):
     """q = x + Δ(x)."""
-    if not follows(motion, point):
+    if not follows(warp, point):
         return point
-    row, fraction = cell(motion.grid, point)
-    return point + interpolate_cell(displacements, motion.grid, row, fraction)
+    row, fraction = cell(warp.grid, point)
+    return point + interpolate_cell(displacements, warp.grid, row, fraction)
 
 
 @wp.func
 def slope_of_warped(
-    motion: Motion, displacements: wp.array(dtype=wp.vec3), point: wp.vec3, given: wp.vec3
+    warp: Warp, displacements: wp.array(dtype=wp.vec3), point: wp.vec3, given: wp.vec3
 ):
     """The gradient of a point x from that of its warped place, ``given``."""
-    if not follows(motion, point):
+    if not follows(warp, point):
         return given
-    row, fraction = cell(motion.grid, point)
-    change = slope(displacements, given, motion.grid, row, fraction)
-    return given + wp.cw_mul(change, inside(motion.grid, point))
+    row, fraction = cell(warp.grid, point)
+    change = slope(displacements, given, warp.grid, row, fraction)
+    return given + wp.cw_mul(change, inside(warp.grid, point))

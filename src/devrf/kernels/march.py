@@ -18,7 +18,7 @@ from devrf.geometry.contraction import INFINITY, ContractedRays, ContractedSpace
 from devrf.geometry.rays import PARALLEL, Rays
 from devrf.kernels.adjoint import with_adjoint
 from devrf.kernels.compositing import first_of
-from devrf.kernels.displacement import Motion, follows, motion_of, warped
+from devrf.kernels.displacement import Warp, follows, warp_of, warped
 from devrf.kernels.grid import (
     Grid,
     add_cell,
@@ -132,7 +132,7 @@ def _geometry(rays: Rays, inputs: MarchInputs) -> Geometry:
         rays.space if isinstance(rays, ContractedRays) else None,
         density=grid_over(inputs.range.box, shape_of(inputs.density)),
         occupancy=grid_over(distances.box, shape_of(distances.cells)),
-        motion=motion_of(inputs.motion_box, shape, inputs.zero_outside_box),
+        warp=warp_of(inputs.displacement_box, shape, inputs.zero_outside_box),
         step=inputs.range.step,
         shift=inputs.shift,
         delta=inputs.delta,
@@ -167,7 +167,7 @@ class Geometry:
     Attributes:
         density: the grid of raw densities.
         occupancy: the grid of distances to occupied cells.
-        motion: the warp.
+        warp: the warp.
         contracted: 1 in contracted space, else 0.
         center: of the contracted space's inner box.
         half: its half edges.
@@ -178,7 +178,7 @@ class Geometry:
 
     density: Grid
     occupancy: Grid
-    motion: Motion
+    warp: Warp
     contracted: int
     center: wp.vec3
     half: wp.vec3
@@ -387,7 +387,7 @@ def march_kernel(contracted: bool) -> wp.Kernel:
             else:
                 distance = ray.entry + float(k) * geometry.step
                 point = position(geometry, ray, distance)
-                canonical = warped(geometry.motion, displacements, point)
+                canonical = warped(geometry.warp, displacements, point)
                 row, fraction = cell(geometry.density, canonical)
                 raw = interpolate_cell(density, geometry.density, row, fraction)[0]
                 if raw >= geometry.faintest:
@@ -493,11 +493,11 @@ def adjoint_kernel(
         # ∂τ/∂v = δ · sigmoid(v + b), and sigmoid = 1 − exp(−softplus).
         slope_of_raw = slope_of_tau * geometry.delta * opacity(tau / geometry.delta)
         sample.tau = slope_of_raw
-        if geometry.motion.moves == 1:
+        if geometry.warp.moves == 1:
             row, fraction = cell(geometry.density, sample.canonical)
             change = slope(density, Density(slope_of_raw), geometry.density, row, fraction)
             slope_of_canonical += wp.cw_mul(change, inside(geometry.density, sample.canonical))
-            if not follows(geometry.motion, position(geometry, ray, sample.distance)):
+            if not follows(geometry.warp, position(geometry, ray, sample.distance)):
                 slope_of_canonical = wp.vec3()
             sample.canonical = slope_of_canonical
         visible[last - back] = sample
@@ -522,9 +522,9 @@ def scatter_kernel(
         sample = visible[k]
         point = position(geometry, ray, sample.distance)
         if of_density.shape[0] > 0:
-            canonical = warped(geometry.motion, displacements, point)
+            canonical = warped(geometry.warp, displacements, point)
             row, fraction = cell(geometry.density, canonical)
             add_cell(of_density, geometry.density, row, fraction, Density(sample.tau))
         if of_displacement.shape[0] > 0:
-            row, fraction = cell(geometry.motion.grid, point)
-            add_cell(of_displacement, geometry.motion.grid, row, fraction, sample.canonical)
+            row, fraction = cell(geometry.warp.grid, point)
+            add_cell(of_displacement, geometry.warp.grid, row, fraction, sample.canonical)

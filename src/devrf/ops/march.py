@@ -76,7 +76,7 @@ class MarchInputs:
         delta: δ, the length of a step in base voxels.
         threshold: the opacity, and then the weight, from which on a sample is worth a colour.
         displacement: (X, Y, Z, 3) Δ of x → q = x + Δ(x); None is the identity.
-        motion_box: the box of the displacements; None without.
+        displacement_box: the box of the displacements; None without.
         zero_outside_box: whether Δ is 0 outside that box; else it is as on its border.
     """
 
@@ -86,7 +86,7 @@ class MarchInputs:
     delta: float
     threshold: float
     displacement: Tensor | None = None
-    motion_box: Box | None = None
+    displacement_box: Box | None = None
     zero_outside_box: bool = False
 
 
@@ -166,11 +166,11 @@ def samples_in_box(rays: Rays, limits: MarchRange) -> tuple[Tensor, Tensor, Tens
 
 def warped(points: Tensor, inputs: MarchInputs) -> Tensor:
     """q = x + Δ(x) (M, 3) of ``points`` x (M, 3)."""
-    if inputs.displacement is None or inputs.motion_box is None:
+    if inputs.displacement is None or inputs.displacement_box is None:
         return points
-    move = interpolate(inputs.displacement, points, inputs.motion_box)
+    move = interpolate(inputs.displacement, points, inputs.displacement_box)
     if inputs.zero_outside_box:
-        move = torch.where(inputs.motion_box.contains(points)[:, None], move, 0.0)
+        move = torch.where(inputs.displacement_box.contains(points)[:, None], move, 0.0)
     return points + move
 
 

@@ -56,13 +56,13 @@ def moving_ball(cube):
     Its motion is linear in space, so that trilinear displacements are exact.
     """
     model = solid(ball, cube, 25)
-    motion = DeformationField(cube, FrameClock((0.0, 0.5, 1.0)), voxels=27)
-    points = cube.grid_points(motion.shape, torch.empty(0))
+    deformation = DeformationField(cube, FrameClock((0.0, 0.5, 1.0)), voxels=27)
+    points = cube.grid_points(deformation.shape, torch.empty(0))
     for frame, time in ((1, 0.5), (2, 1.0)):
         shift = torch.tensor([0.4 * time, 0.0, 0.0])
-        motion.forward_slices[frame] = 0.2 * time * points + shift
-        motion.backward_slices[frame] = (points - shift) / (1 + 0.2 * time) - points
-    model.deformation = motion
+        deformation.forward_slices[frame] = 0.2 * time * points + shift
+        deformation.backward_slices[frame] = (points - shift) / (1 + 0.2 * time) - points
+    model.deformation = deformation
     return model
 
 

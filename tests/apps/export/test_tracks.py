@@ -25,11 +25,11 @@ def two_balls(of_distance, cube):
     """Balls of radius 0.3 about x = 0.5 and x = -0.5; the second rises by 0.2 until t = 1."""
     middles = torch.tensor([[0.5, 0, 0], [-0.5, 0, 0]])
     model = of_distance(lambda points: torch.cdist(points, middles).amin(dim=1) - 0.3, cube, 31)
-    motion = DeformationField(cube, FrameClock((0.0, 1.0)), voxels=31**3)
-    left = cube.grid_points(motion.shape, torch.empty(0))[..., 0] < -0.01
-    motion.forward_slices[1, ..., 2] = 0.2 * left
-    motion.backward_slices[1, ..., 2] = -0.2 * left
-    model.deformation = motion
+    deformation = DeformationField(cube, FrameClock((0.0, 1.0)), voxels=31**3)
+    left = cube.grid_points(deformation.shape, torch.empty(0))[..., 0] < -0.01
+    deformation.forward_slices[1, ..., 2] = 0.2 * left
+    deformation.backward_slices[1, ..., 2] = -0.2 * left
+    model.deformation = deformation
     return model
 
 

@@ -150,12 +150,12 @@ def in_motion(rest: DeVRFModel, seed: int) -> DeVRFModel:
     box = model.space.inner(model.box)
     zero_outside_box = not model.space.is_linear
     clock = FrameClock((0.0, 0.4, 1.0))
-    motion = DeformationField(box, clock, voxels=5**3, zero_outside_box=zero_outside_box)
-    shape = motion.backward_slices[1:].shape
+    deformation = DeformationField(box, clock, voxels=5**3, zero_outside_box=zero_outside_box)
+    shape = deformation.backward_slices[1:].shape
     generator = torch.Generator().manual_seed(seed)
     size = torch.tensor(box.size)
-    motion.backward_slices[1:] = 0.1 * size * (torch.rand(shape, generator=generator) - 0.5)
-    model.deformation = motion
+    deformation.backward_slices[1:] = 0.1 * size * (torch.rand(shape, generator=generator) - 0.5)
+    model.deformation = deformation
     return model
 
 
@@ -453,7 +453,7 @@ def test_all_data_are_in_the_file_and_as_large_as_their_textures(moving, tiny_sc
         packed for kind, number, packed in found if (kind, number) == ("displacement", "-1")
     )
     numbers = np.frombuffer(gzip.decompress(base64.b64decode(packed)), np.float16).astype(float)
-    step = described["uniforms"]["motionStep"]
+    step = described["uniforms"]["displacementStep"]
     true = moving.deformation.backward_slices[1].numpy().flatten()
     kept = numbers != 0
     assert kept.mean() > 0.5

@@ -23,7 +23,7 @@ from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.extensions.tracks import StartAlongFlow
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.settings import MotionSettings
+from devrf.methods.devrf.settings import VisitSettings
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.renderer import Renderer
 from devrf.rendering.sampling import RenderSettings
@@ -64,12 +64,12 @@ def model() -> DeVRFModel:
         canonical.density.values.fill_(-9.0)
         canonical.density.values[solid] = 12.0
         canonical.color.values.copy_(torch.randn(*canonical.color.shape, 4))
-    motion = DeformationField(
+    deformation = DeformationField(
         SPACE.inner(), FrameClock((0.0, 0.5, 1.0)), voxels=8**3, zero_outside_box=True
     )
-    motion.backward_slices[1, ..., 0], motion.backward_slices[2, ..., 0] = -0.1, -0.2
+    deformation.backward_slices[1, ..., 0], deformation.backward_slices[2, ..., 0] = -0.1, -0.2
     settings = RenderSettings(step=0.5, alpha_threshold=1e-3, near=0.2, far=math.inf)
-    return DeVRFModel(BUILD, canonical, Occupancy(solid, SPACE.box), settings, motion, SPACE)
+    return DeVRFModel(BUILD, canonical, Occupancy(solid, SPACE.box), settings, deformation, SPACE)
 
 
 def _views(count: int = 60) -> Rays:
@@ -153,7 +153,7 @@ def test_a_room_is_learned_and_moves_inside_the_inner_box(tiny_room, trainer):
     moving = DeformationStage(
         stage.result(),
         DeformationSchedule(levels=(Level(6, 4),), rays=64),
-        MotionSettings(unit="box", views="all"),
+        VisitSettings(unit="box", views="all"),
         extensions={"tracks": StartAlongFlow("flow")},
     )
     trainer(max_epochs=1).fit(moving, datamodule=data)

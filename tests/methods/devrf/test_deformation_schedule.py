@@ -18,7 +18,7 @@ from devrf.methods.devrf.deformation_schedule import (
     DeformationSchedule,
     Level,
 )
-from devrf.methods.devrf.settings import MotionSettings
+from devrf.methods.devrf.settings import VisitSettings
 
 
 def with_level(number: int, **other: Any) -> list[Level]:
@@ -277,10 +277,10 @@ def test_motion_is_scaled_visit_by_visit_and_reaches_as_far():
         (p.frame, p.level, p.side) for p in before
     ]
     assert [level.iterations for level in scaled.levels] == [20, 10, 10, 5, 5]
-    motion = MotionSettings()
+    visit = VisitSettings()
     # A voxel moves by its rate in each of its iterations, at most; and is looked at as often.
-    assert motion.scaled(0.1).learning_rate * 20 == pytest.approx(motion.learning_rate * 200)
-    assert (motion.occupancy_every, motion.scaled(0.1).occupancy_every) == (25, 2)
+    assert visit.scaled(0.1).learning_rate * 20 == pytest.approx(visit.learning_rate * 200)
+    assert (visit.occupancy_every, visit.scaled(0.1).occupancy_every) == (25, 2)
 
 
 @pytest.mark.parametrize(

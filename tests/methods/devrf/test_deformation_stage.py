@@ -16,14 +16,14 @@ from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.extensions.priors import Elastic
 from devrf.methods.devrf.extensions.tracks import StartAlongFlow
-from devrf.methods.devrf.settings import MotionSettings
+from devrf.methods.devrf.settings import VisitSettings
 from devrf.ops.adam import add_total_variation_gradient
 from devrf.rendering.renderer import Renderer
 from recorder import Entry, by_samples, recording
 
 SHORT = DeformationSchedule(levels=(Level(4, 20), Level(8, 10)), rays=256)
 TINY = DeformationSchedule(levels=(Level(4, 4), Level(6, 2)), rays=64)
-FAST = MotionSettings(learning_rate=5e-3, views="all", pixels="occupied")
+FAST = VisitSettings(learning_rate=5e-3, views="all", pixels="occupied")
 
 
 def test_two_steps_move_the_first_frame_only(rest, datamodule, trainer):
@@ -70,7 +70,7 @@ def test_a_visit_shows_its_pixels_as_often_as_said(rest, fit, views: Any):
             return pixels
 
     schedule = DeformationSchedule(levels=(Level(4, 6),), rays=1500)
-    stage = fit(Watched(rest, schedule, MotionSettings(views=views, epochs=5.0)))
+    stage = fit(Watched(rest, schedule, VisitSettings(views=views, epochs=5.0)))
     pixels = (
         2 * stage.context.views.height * stage.context.views.width
     )  # of two views; the first visit has 12
@@ -122,9 +122,9 @@ def test_each_level_has_its_rates_and_its_factor_of_all_terms_but_render(rest, d
     second = Level(6, 2, lr_factor=0.5, lr_final_factor=0.01, other_terms=0.25)
     schedule = DeformationSchedule((Level(4, 2, other_terms=0), second), rays=16)
     loss = {"render": 1, "elastic": 0.2, "tv": 128 * 16}
-    motion = MotionSettings(learning_rate=0.01)
+    visit = VisitSettings(learning_rate=0.01)
     stage = DeformationStage(
-        rest, schedule, motion, loss, extensions={"e": Elastic()}, iterations_per_step=1
+        rest, schedule, visit, loss, extensions={"e": Elastic()}, iterations_per_step=1
     )
     weights, smoothing, rates = {}, {}, {0: [], 1: []}
 
@@ -167,12 +167,12 @@ def test_the_flow_of_a_moving_camera_neither_starts_nor_teaches_a_frame(
 ):
     train = tiny_scene.dynamic.train
     train = train[(train.view == 0).nonzero()[:, 0]]
-    motion, tracks = MotionSettings(learning_rate=1e-9), {"tracks": StartAlongFlow("flow")}
+    visit, tracks = VisitSettings(learning_rate=1e-9), {"tracks": StartAlongFlow("flow")}
     for moving in (False, True):
         if moving:
             train = replace(train, view=torch.arange(len(train)))
         module = serve(replace(tiny_scene, dynamic=replace(tiny_scene.dynamic, train=train)))
-        stage = DeformationStage(rest, SHORT, motion, iterations_per_step=1, extensions=tracks)
+        stage = DeformationStage(rest, SHORT, visit, iterations_per_step=1, extensions=tracks)
         trainer(max_steps=1).fit(stage, datamodule=module)
         assert (stage.field.forward_slices[1].abs().amax() > 1e-3) is not moving
         assert ("flow" in stage.context.weights) is not moving
@@ -200,8 +200,8 @@ def test_where_the_field_is_kept_changes_what_is_learned_by_its_rounding_alone(
     fields = []
     for store, rounded in (("device", False), ("host", False), ("host", True)):
         torch.manual_seed(0)
-        motion = replace(FAST, store=store, store_half=rounded)
-        stage = DeformationStage(rest, TINY, motion)
+        visit = replace(FAST, store=store, store_half=rounded)
+        stage = DeformationStage(rest, TINY, visit)
         trainer(max_epochs=1).fit(stage, datamodule=datamodule)
         assert stage.field.forward_slices.dtype == (torch.float16 if rounded else torch.float32)
         fields.append(stage.field.backward_slices.float())
@@ -218,8 +218,8 @@ def test_adam_begins_anew_at_each_visit_or_goes_on_above_the_coarsest_level(
 ):
     # Three frames; frame 1 gets the share of frame 0 as well.
     schedule = DeformationSchedule(levels=(Level(4, 2), Level(6, 2)), rays=16)
-    motion = replace(FAST, adam_state=moments)
-    stage = DeformationStage(rest, schedule, motion, iterations_per_step=1)
+    visit = replace(FAST, adam_state=moments)
+    stage = DeformationStage(rest, schedule, visit, iterations_per_step=1)
     steps: dict[int, list[int]] = {0: [], 1: []}
 
     def count(trainer: Trainer, stage: DeformationStage, *_: Any) -> None:

@@ -7,7 +7,7 @@ import pytest
 from devrf.errors import DevrfError
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level, converged
 from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.methods.devrf.settings import MotionSettings
+from devrf.methods.devrf.settings import VisitSettings
 
 SCHEDULE = DeformationSchedule(levels=(Level(4, 12), Level(6, 8)), rays=64)
 
@@ -26,8 +26,8 @@ def test_by_hand(losses, done):
 
 
 def test_a_frame_that_has_converged_is_left_if_asked(rest, datamodule, trainer):
-    motion = MotionSettings(min_rel_improvement=1.0)
-    stage = DeformationStage(rest, SCHEDULE, motion, iterations_per_step=2)
+    visit = VisitSettings(min_rel_improvement=1.0)
+    stage = DeformationStage(rest, SCHEDULE, visit, iterations_per_step=2)
     trainer(max_epochs=1).fit(stage, datamodule=datamodule)
     # No step takes off all of the loss: each visit ends after the three steps that tell.
     assert stage.position.iterations_done == 2 * 2 * 3 * 2
@@ -35,5 +35,5 @@ def test_a_frame_that_has_converged_is_left_if_asked(rest, datamodule, trainer):
 
 
 def test_a_gain_is_a_share():
-    with pytest.raises(DevrfError, match="schedule.motion.min_rel_improvement"):
-        MotionSettings(min_rel_improvement=0.0)
+    with pytest.raises(DevrfError, match="schedule.visit.min_rel_improvement"):
+        VisitSettings(min_rel_improvement=0.0)

@@ -19,7 +19,7 @@ from devrf.geometry.rays import Rays
 from devrf.methods.batch import gather_batch
 from devrf.methods.devrf.losses import (
     PHOTOMETRIC_TERMS,
-    MotionPrediction,
+    DeformationPrediction,
     Prediction,
     batch_loss,
     cycle,
@@ -176,7 +176,7 @@ def test_a_term_of_ones_own_counts_beside_those_of_the_kernel(prediction):
 def seen(
     batch: RayBatch, ray: Tensor, points: Tensor, canonical: Tensor, weight: Tensor
 ) -> VoxelOutput:
-    """An output that holds what the motion terms look at."""
+    """An output that holds what the deformation terms look at."""
     none = torch.zeros(len(batch.rays))
     return VoxelOutput(
         color=torch.zeros(len(none), 3),
@@ -198,7 +198,7 @@ def seen(
 
 
 @pytest.fixture
-def by_hand() -> MotionPrediction:
+def by_hand() -> DeformationPrediction:
     """Two rays of image 1, whose flow leads into image 0; three samples before them.
 
     Both cameras are at the origin and look along −z; image 0 has another lens. The motion: at t
@@ -228,7 +228,7 @@ def by_hand() -> MotionPrediction:
         batch, ray, points, points - torch.tensor([0.3, 0.0, 0.0]), torch.tensor([0.5, 0.25, 1.0])
     )
     forth, before = torch.tensor([0.3, 0.0, 0.0]), torch.tensor([0.1, 0.0, 0.0])
-    return MotionPrediction(
+    return DeformationPrediction(
         output,
         batch,
         lambda q: q + forth,
@@ -271,7 +271,7 @@ def test_without_observed_flow_or_samples_nothing_is_learned(by_hand):
     assert cycle(without).item() == flow(without).item() == 0
 
 
-def exact(scene: Scene, recipe: ProceduralScene, frame: int) -> MotionPrediction:
+def exact(scene: Scene, recipe: ProceduralScene, frame: int) -> DeformationPrediction:
     """Each valid pixel of a frame with its exact surface point and the exact motion."""
     views, shape = scene.dynamic.train, recipe.model()
     assert views.flow is not None and views.depth is not None
@@ -287,7 +287,7 @@ def exact(scene: Scene, recipe: ProceduralScene, frame: int) -> MotionPrediction
     def at(time: float, q: Tensor) -> Tensor:
         return shape.forward(Material(q, material.part), time)
 
-    return MotionPrediction(
+    return DeformationPrediction(
         seen(batch, every, points, material.canonical, torch.ones(len(flat))),
         batch,
         lambda q: at(times[frame], q),

@@ -31,7 +31,7 @@ TINY = GaussiansSettings(
     split_above=0.0, prune_below=0.02, reset_every=0.0, all_decay=True,
 )  # fmt: skip
 STATIC = ProtocolStage("canonical", "static")
-MOTION = ProtocolStage("deformation", "dynamic", frozen=["canonical"], builds_on="canonical")
+DEFORMATION = ProtocolStage("deformation", "dynamic", frozen=["canonical"], builds_on="canonical")
 
 
 def stage(
@@ -131,7 +131,7 @@ def test_in_two_stages_the_cloud_stays_while_motion_is_learned(
     cloud = first.scene_model.cloud
     assert len(cloud) > 150 and first.events["grids grown"] == 3
     before = {name: getattr(cloud, name).detach().clone() for name in Cloud.parts}
-    second = fit(stage(MOTION, first.result()))
+    second = fit(stage(DEFORMATION, first.result()))
     model = second.scene_model
     assert [group["name"] for group in second.optimizer.param_groups] == ["deformation"]
     assert all(torch.equal(getattr(model.cloud, name), value) for name, value in before.items())

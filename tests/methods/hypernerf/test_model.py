@@ -82,12 +82,12 @@ def test_two_stages_freeze_all_or_all_but_what_ambient_space_enters_by(
     tiny_scene: Scene,
 ) -> None:
     model = HyperNeRF(replace(TINY, slicing=slicing))
-    motion = [model.warp, model.slicing]
-    begun = [p.detach().clone() for part in motion for p in part.parameters()]
+    deformation = [model.warp, model.slicing]
+    begun = [p.detach().clone() for part in deformation for p in part.parameters()]
     rest = stored(fit(ray_stage(model, "canonical")))
     # Static images move nothing, and leave ambient space shut.
     assert slicing == "plane" or all(
-        map(torch.equal, begun, (p for part in motion for p in part.parameters()))
+        map(torch.equal, begun, (p for part in deformation for p in part.parameters()))
     )
     assert model.opened.item() == 0
     before = {k: v.clone() for k, v in rest.model.state_dict().items()}

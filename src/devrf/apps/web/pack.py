@@ -133,16 +133,16 @@ def _parts(model: DeVRFModel, cameras: Cameras) -> Iterator[tuple[str, Tensor]]:
     yield "weights", _weights(field.decoder, low, high)
     moves = model.moving_points(scene_radius(model, cameras))
     yield "moving", 255 * moves.to(torch.uint8)
-    motion = model.deformation
+    deformation = model.deformation
     residual = model.color_residual
-    seen = _seen(motion, rest.cell, occupied) if motion else []
+    seen = _seen(deformation, rest.cell, occupied) if deformation else []
     for part, mask in ({"rest": rest.mask} | dict(enumerate(seen))).items():
         yield f"distances-{part}", Occupancy(mask, model.box).distances.cells
-    for k in range(len(motion.clock) if motion else 0):
-        assert motion is not None
+    for k in range(len(deformation.clock) if deformation else 0):
+        assert deformation is not None
         mask = torch.stack(seen[max(k - 1, 0) : k + 1]).any(dim=0)
-        near = Occupancy(mask, model.box).points_near(motion.shape, motion.box)
-        kept = near[..., None] * motion.backward_slices[k].to(near.device).float()
+        near = Occupancy(mask, model.box).points_near(deformation.shape, deformation.box)
+        kept = near[..., None] * deformation.backward_slices[k].to(near.device).float()
         yield f"displacement-{k}", (kept / (ROUNDED * model.occupancy.cell)).round().half()
         if residual is not None:
             values = residual.values[k]
@@ -169,24 +169,24 @@ def _rough(model: DeVRFModel, visible: Tensor, eyes: Tensor) -> Tensor:
 
 
 def _seen(
-    motion: DeformationField, cell: float, occupied: Callable[[GridWarp], Occupancy]
+    deformation: DeformationField, cell: float, occupied: Callable[[GridWarp], Occupancy]
 ) -> list[Tensor]:
     """Occupancy at any time between two consecutive frames: masks (X, Y, Z).
 
     Nothing moves by more than a ``cell`` from the nearest of some times: masks are grown by one.
     """
     masks = []
-    times = motion.clock.times
-    at_frames = [occupied(motion.backward_warp(time)) for time in times]
+    times = deformation.clock.times
+    at_frames = [occupied(deformation.backward_warp(time)) for time in times]
     for k, (first, second) in enumerate(pairwise(at_frames)):
         mask = first.mask | second.mask
-        near = Occupancy(mask, first.box).points_near(motion.shape, motion.box)
-        before, after = (motion.backward_slices[n].to(near.device).float() for n in (k, k + 1))
+        near = Occupancy(mask, first.box).points_near(deformation.shape, deformation.box)
+        before, after = (deformation.backward_slices[n].to(near.device).float() for n in (k, k + 1))
         # Points that move by more than this come from empty space.
         change = min(float(((after - before).norm(dim=-1) * near).amax()), first.box.diagonal)
         steps = math.ceil(change / (2 * cell))
         for time in torch.linspace(times[k], times[k + 1], steps + 1)[1:-1].tolist():
-            mask |= occupied(motion.backward_warp(time)).mask
+            mask |= occupied(deformation.backward_warp(time)).mask
         masks.append(dilate(mask, 1))
     return masks
 
@@ -215,7 +215,7 @@ def _weights(decoder: ColorDecoder, low: Tensor, high: Tensor) -> Tensor:
 def _description(model: DeVRFModel, viewpoints: Viewpoints) -> dict[str, Any]:
     """The page's data beside its textures."""
     field = model.canonical
-    motion = model.deformation
+    deformation = model.deformation
     space = model.space
     sampling = model.at(0.0).picture_settings
     path = march_inputs(field, model.occupancy, sampling).range
@@ -227,7 +227,7 @@ def _description(model: DeVRFModel, viewpoints: Viewpoints) -> dict[str, Any]:
         "FEATURES": math.ceil(decoder.from_feature.in_features / 4),
         "WIDTH": math.ceil(decoder.hidden.in_features / 4),
         "FREQUENCIES": len(decoder.octaves),
-        "MOVES": int(motion is not None),
+        "MOVES": int(deformation is not None),
         "SHADES": int(model.color_residual is not None),
     }
     uniforms: dict[str, Any] = {
@@ -250,15 +250,16 @@ def _description(model: DeVRFModel, viewpoints: Viewpoints) -> dict[str, Any]:
     if isinstance(space, ContractedSpace):
         defines["SPACE"] = 2
         uniforms |= {"innerHalf": [edge / 2 for edge in inner.size], "shell": space.shell}
-    if motion is not None:
-        uniforms |= {"motionLow": motion.box.low, "motionHigh": motion.box.high}
-        uniforms["stillOutside"] = motion.zero_outside_box
-        uniforms["motionStep"] = ROUNDED * model.occupancy.cell
+    if deformation is not None:
+        box = deformation.box
+        uniforms |= {"displacementLow": box.low, "displacementHigh": box.high}
+        uniforms["zeroOutsideBox"] = deformation.zero_outside_box
+        uniforms["displacementStep"] = ROUNDED * model.occupancy.cell
     static = viewpoints.static
     return {
         "defines": defines,
         "uniforms": uniforms,
-        "times": [0.0] if motion is None else motion.clock.times,
+        "times": [0.0] if deformation is None else deformation.clock.times,
         "up": upward(static).tolist(),
         "offset": viewpoints.offset,
         "frustum": frustum_depth(static),

@@ -26,12 +26,12 @@ uniform sampler3D rough;                        // preview colours
 uniform sampler3D moving;                       // 1 where canonical points move
 uniform sampler3D displacement0, displacement1, residual0, residual1; // before, after the time
 uniform usampler3D distances;
-uniform vec3 low, high, motionLow, motionHigh;  // the boxes of all fields, and of displacements
-uniform float shift, delta, threshold, stepLength, near, far, motionStep;
+uniform vec3 low, high, displacementLow, displacementHigh;  // the boxes of all fields, and of displacements
+uniform float shift, delta, threshold, stepLength, near, far, displacementStep;
 uniform vec3 ndc;                    // 2f/W, 2f/H, near plane
 uniform vec3 center, innerHalf;      // of the scene; in contracted space of the inner box
 uniform float reach, shell;          // of depths about the centre; of contracted space
-uniform bool warps, stillOutside;
+uniform bool warps, zeroOutsideBox;
 uniform float share, interval;       // of the frame after; from one to the other
 uniform vec3 eye, right, up, backward, background;
 uniform vec2 slope, middle;          // tangents of half the angles of view, of its middle's angles
@@ -100,11 +100,11 @@ vec3 place(vec3 point, vec3 boxLow, vec3 boxHigh, ivec3 size) {
 }
 
 vec3 displacement(vec3 point, float after) {
-  bool outside = any(lessThan(point, motionLow)) || any(greaterThan(point, motionHigh));
-  if (MOVES == 0 || stillOutside && outside) return vec3(0.0);
-  vec3 p = place(point, motionLow, motionHigh, textureSize(displacement0, 0));
+  bool outside = any(lessThan(point, displacementLow)) || any(greaterThan(point, displacementHigh));
+  if (MOVES == 0 || zeroOutsideBox && outside) return vec3(0.0);
+  vec3 p = place(point, displacementLow, displacementHigh, textureSize(displacement0, 0));
   vec4 steps = mix(textureLod(displacement0, p, 0.0), textureLod(displacement1, p, 0.0), after);
-  return motionStep * steps.xyz;
+  return displacementStep * steps.xyz;
 }
 
 vec3 residual(vec3 canonical) {

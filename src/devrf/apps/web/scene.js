@@ -208,7 +208,7 @@ class Graphics {
 }
 
 /** The fields that change: two frames are on the device, the others stay packed. */
-class Motion {
+class Deformation {
   constructor(graphics, { times, shapes }) {
     Object.assign(this, { graphics, times, interval: -1, packed: {}, moves: times.length > 1 });
     this.kinds = ["displacement", "residual"].filter((kind) => shapes[kind]);
@@ -292,16 +292,16 @@ class Page {
   constructor(scene, graphics) {
     const camera = Camera.of(scene.cameras[0]);
     Object.assign(this, { scene, graphics, camera, time: 0, last: 0, refined: 0, shown: [] });
-    this.motion = new Motion(graphics, scene);
+    this.deformation = new Deformation(graphics, scene);
     this.keys = new Set();
     const frustum = byId("frusta").firstElementChild;
     this.frusta = scene.cameras.map(() => frustum.cloneNode(true));
     byId("frusta").replaceChildren(...this.frusta);
     const starts = !this.follow() && !matchMedia("(prefers-reduced-motion: reduce)").matches;
     this.play(starts);
-    this.turning = starts && !this.motion.moves;
-    for (const id of ["timing", "beside", "part"]) byId(id).hidden = !this.motion.moves;
-    if (!this.motion.moves) byId("channel").lastElementChild.remove();
+    this.turning = starts && !this.deformation.moves;
+    for (const id of ["timing", "beside", "part"]) byId(id).hidden = !this.deformation.moves;
+    if (!this.deformation.moves) byId("channel").lastElementChild.remove();
     byId("full").hidden = !document.fullscreenEnabled;
     this.listen();
     this.listenToPointers(byId("stage"));
@@ -318,7 +318,7 @@ class Page {
   }
 
   play(whether) {
-    this.playing = whether && this.motion.moves;
+    this.playing = whether && this.deformation.moves;
     if (this.playing && this.time >= 1) this.setTime(0);
     byId("play").textContent = this.playing ? "pause" : "play";
   }
@@ -368,7 +368,7 @@ class Page {
     const slope = [(tangent * width) / height / count, tangent];
     const [channel, part] = ["channel", "part"].map((id) => Number(byId(id).value));
     const view = { right, up, backward, eye, slope, middle, channel, part };
-    const now = { ...view, ...this.motion.uniforms(this.time) };
+    const now = { ...view, ...this.deformation.uniforms(this.time) };
     return count > 1 ? [{ ...now, warps: false, distances: REST }, now] : [now];
   }
 
@@ -389,11 +389,11 @@ class Page {
     requestAnimationFrame((next) => this.tick(next));
     this.advance(Math.min((now - this.last) / 1000, 0.5));
     this.last = now;
-    this.motion.load(this.time);
+    this.deformation.load(this.time);
     const { graphics } = this;
     if (!graphics.idle) return;
     const parts = this.parts();
-    const state = JSON.stringify([parts, this.motion.interval, byId("cameras").checked]);
+    const state = JSON.stringify([parts, this.deformation.interval, byId("cameras").checked]);
     if (state !== this.state) {
       Object.assign(this, { state, changed: now });
       const { width, height } = graphics.canvas;
@@ -405,7 +405,7 @@ class Page {
       const seconds = (now - this.shown[0]) / 1000;
       this.report("moving", rows, seconds > 0 ? (this.shown.length - 1) / seconds : 0);
       this.drawFrusta();
-    } else if (now - this.changed > SETTLED && !this.motion.loading) {
+    } else if (now - this.changed > SETTLED && !this.deformation.loading) {
       this.refine(parts);
     }
   }

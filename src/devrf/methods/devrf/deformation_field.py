@@ -1,4 +1,4 @@
-"""The 4D deformation field V_motion, and the warp that it is (docs/method.md#deformation-field)."""
+"""The 4D deformation field V_motion, and its warps (docs/method.md#deformation-field)."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from devrf.engine.schedule import Phase
 from devrf.errors import DevrfError
 from devrf.system.options import Count, NotNegative, Options, Positive, Several
 
-# Motion grids of this side take Adam about as long as a batch of rays takes; estimated.
+# Displacement grids of this side take Adam about as long as a batch of rays takes; estimated.
 FINE_SIDE = 160
 
 # Events of the stage.
@@ -27,10 +27,10 @@ VISITS = "visits of frames"
 
 @pydantic.dataclasses.dataclass(frozen=True)
 class Level(Options):
-    """One resolution of the motion grids, and the settings of the frames' visits at it.
+    """One resolution of the displacement grids, and the settings of the frames' visits at it.
 
     Attributes:
-        side: the motion grids have about side³ voxels, maybe as many as at the level before.
+        side: the displacement grids have about side³ voxels, maybe as many as at the level before.
         iterations: share of each frame.
         lr_factor: of the learning rate; None: the schedule's ``decay`` to the power of how often
             the side has changed.
@@ -60,7 +60,7 @@ class DeformationPhase(Phase):
     Attributes:
         frame: the frame, from 1 on.
         level: 0 is the coarsest resolution.
-        side: the motion grid has about side³ voxels.
+        side: the displacement grid has about side³ voxels.
         rate_factor: of the learning rate at the visit's start.
         lr_final_factor: a further factor of it at the visit's end.
         init_from_previous: whether the frame starts from the result of the frame before it.
@@ -77,11 +77,11 @@ class DeformationPhase(Phase):
 
     @property
     def cost(self) -> float:
-        """A batch of rays, beside which Adam on motion grids counts only if they are fine."""
+        """A batch of rays, beside which Adam on displacement grids counts only if they are fine."""
         return 1 + (self.side / FINE_SIDE) ** 3
 
     def learning_rate_at(self, iteration: int) -> float:
-        """Factor of the learning rate in the visit (docs/method.md#motion-learning-rate)."""
+        """Factor of the learning rate in the visit (docs/method.md#deformation-learning-rate)."""
         return self.rate_factor * math.pow(self.lr_final_factor, self.share(iteration))
 
     def share(self, iteration: int) -> float:
@@ -180,7 +180,7 @@ class DeformationSchedule(Options):
         return {name: count for name, count in counts.items() if count}
 
     def grid(self, level: int) -> tuple[int, int | None]:
-        """The approximate voxels of the motion grids of a level, and their planes, if given."""
+        """About how many voxels a level's displacement grids have, and their planes, if given."""
         side = self.levels[level].side
         finest = self.levels[-1].side
         return side**3, self.planes and round(self.planes * side / finest)
@@ -198,7 +198,7 @@ class DeformationSchedule(Options):
         return sum(self._lengths(frames))
 
     def level_starts(self, frames: int) -> list[int]:
-        """Iterations at which a further level begins; the motion grid grows if its side does."""
+        """Iterations at which a further level begins; displacement grids grow if its side does."""
         return list(accumulate(self._lengths(frames)[:-1]))
 
     def _lengths(self, frames: int) -> list[int]:

@@ -17,6 +17,7 @@ from devrf.errors import DevrfError
 from devrf.methods.batch import gather_batch
 from devrf.methods.devrf.active_frame import ActiveFrame
 from devrf.methods.devrf.deformation_field import DeformationField
+from devrf.methods.devrf.deformation_loss import DeformationLoss
 from devrf.methods.devrf.deformation_schedule import (
     GROWN,
     LEVELS,
@@ -26,17 +27,16 @@ from devrf.methods.devrf.deformation_schedule import (
     Visits,
     converged,
 )
-from devrf.methods.devrf.extension import Extension, MotionContext
+from devrf.methods.devrf.extension import DeformationContext, Extension
 from devrf.methods.devrf.frame_store import FrameField
-from devrf.methods.devrf.losses import FlowMean, MotionPrediction, batch_loss
+from devrf.methods.devrf.losses import DeformationPrediction, FlowMean, batch_loss
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.motion_loss import MotionLoss
 from devrf.methods.devrf.pixel_pools import frame_pools, rays_for_epochs
 from devrf.methods.devrf.plans import DeformationPlan
 from devrf.methods.devrf.settings import (
     DEFORMATION_LOSS,
-    MotionSettings,
     Precision,
+    VisitSettings,
     decoder_dtype,
 )
 from devrf.methods.devrf.volume_rendering import possible_occupancy, render
@@ -57,25 +57,25 @@ class DeformationStage(Stage):
         scene_model: the canonical field, its occupancy, and how it deforms.
         settings: levels, iterations and rays, as configured.
         schedule: the visits to the scene's frames.
-        motion: learning rate and how batches are drawn.
-        motion_loss: the loss terms, and their weights at each level.
+        visit: learning rate and how batches are drawn.
+        deformation_loss: the loss terms, and their weights at each level.
         context: model, data, optimiser and active frame, as extensions see them.
     """
 
     scene_model: DeVRFModel
     schedule: Visits
-    context: MotionContext
+    context: DeformationContext
     phase: DeformationPhase | None
     name = "deformation"
     capture: CaptureName = "dynamic"
-    rate_keys = "schedule.motion.learning_rate or the weights of loss.deformation"
+    rate_keys = "schedule.visit.learning_rate or the weights of loss.deformation"
     plan = DeformationPlan
 
     def __init__(
         self,
         earlier: LoadedCheckpoint,
         schedule: DeformationSchedule | None = None,
-        motion: MotionSettings | None = None,
+        visit: VisitSettings | None = None,
         loss: Mapping[str, float] = DEFORMATION_LOSS,
         flow_mean: FlowMean = "samples",
         extensions: Mapping[str, Extension] | None = None,
@@ -87,7 +87,7 @@ class DeformationStage(Stage):
         Args:
             earlier: the result of the canonical stage; its fields are frozen.
             schedule: resolutions, iterations and frames.
-            motion: learning rate and how batches are drawn.
+            visit: learning rate and how batches are drawn.
             loss: weights of the loss terms; ``tv`` is the total variation of both fields.
             flow_mean: whether the flow loss is a mean over rays or samples (docs/method.md#flow).
             extensions: additions beyond the paper, by name.
@@ -96,11 +96,11 @@ class DeformationStage(Stage):
         """
         super().__init__(iterations_per_step)
         self.settings = schedule or DeformationSchedule()
-        self.motion = motion or MotionSettings()
+        self.visit = visit or VisitSettings()
         self.flow_mean = flow_mean
         self.decoder_precision = decoder_precision
         self.extensions = tuple((extensions or {}).values())
-        self.motion_loss = MotionLoss(loss, self.extensions, self.settings)
+        self.deformation_loss = DeformationLoss(loss, self.extensions, self.settings)
         canonical = earlier.model
         self.scene_model = DeVRFModel(
             canonical.architecture,
@@ -110,8 +110,10 @@ class DeformationStage(Stage):
             space=canonical.space,
         ).requires_grad_(False)
         self.provenance.earlier_records = earlier.metadata.records
-        rate = self.motion.learning_rate
-        self.optimizer = GridAdam([{"params": [], "lr": rate, "base_lr": rate, "name": "motion"}])
+        rate = self.visit.learning_rate
+        self.optimizer = GridAdam(
+            [{"params": [], "lr": rate, "base_lr": rate, "name": "displacements"}]
+        )
         # The state holds what the active frame has learned.
         self.register_state_dict_pre_hook(  # type: ignore[no-untyped-call]
             lambda *_: self._write_back()
@@ -145,7 +147,7 @@ class DeformationStage(Stage):
         # Before frame 1 nothing has moved.
         previous = (frame.previous_forward,) if frame.number > 1 else ()
         with span("losses"):
-            prediction = MotionPrediction(
+            prediction = DeformationPrediction(
                 output=output,
                 batch=batch,
                 forward_warp=field.warp_by(frame.forward),
@@ -157,7 +159,7 @@ class DeformationStage(Stage):
                 space=model.space,
                 flow_mean=self.flow_mean,
             )
-            loss, terms = batch_loss(prediction, self.motion_loss.terms, self.context.weights)
+            loss, terms = batch_loss(prediction, self.deformation_loss.terms, self.context.weights)
         self.optimise(loss)
         return {"loss": loss.detach(), **terms}
 
@@ -170,10 +172,10 @@ class DeformationStage(Stage):
         phase = self.phase
         assert frame is not None and phase is not None
         most = None
-        if self.motion.epochs is not None:
+        if self.visit.epochs is not None:
             pixels = sum(len(pool) for pool in frame.pools)
             iterations = round((phase.stop - phase.start) / self.position.schedule_scale)
-            most = rays_for_epochs(self.motion.epochs, pixels, iterations)
+            most = rays_for_epochs(self.visit.epochs, pixels, iterations)
         pool = frame.pools[self.position.iterations_done % len(frame.pools)]
         return pool.draw(self.batch_size.rays(self.settings.rays, most), self.generator)
 
@@ -194,15 +196,15 @@ class DeformationStage(Stage):
         return self.context.active if hasattr(self, "context") else None
 
     def setup(self, stage: str) -> None:
-        """Build a field of no motion at the coarsest resolution; refuse a scene without motion."""
+        """Build a field of zeros at the coarsest resolution; refuse a scene without motion."""
         super().setup(stage)
         device = self.trainer.strategy.root_device
         if not self.scene.moves:
             raise DevrfError(f"{self.scene.name}: is at rest; the canonical stage is all it takes")
-        if self.scene.dynamic.train.by_moving_camera and self.motion_loss.leave_out("flow"):
+        if self.scene.dynamic.train.by_moving_camera and self.deformation_loss.leave_out("flow"):
             log.info("the camera moves, and so does all that it sees: the flow loss is left out")
         self.phase = None  # no frame is active
-        self.context = MotionContext(
+        self.context = DeformationContext(
             model=self.scene_model,
             datamodule=self.datamodule,
             settings=self.settings,
@@ -217,8 +219,8 @@ class DeformationStage(Stage):
             self.schedule = Visits(self.settings, len(self.field.clock))
             for extension in self.extensions:
                 extension.setup(self.context)
-        if self.motion.unit == "box":
-            rate = self.motion.learning_rate * self.field.box.longest
+        if self.visit.unit == "box":
+            rate = self.visit.learning_rate * self.field.box.longest
             self.optimizer.param_groups[0]["base_lr"] = rate
 
     def _build_field(self) -> None:
@@ -231,10 +233,10 @@ class DeformationStage(Stage):
         )
         device = self.trainer.strategy.root_device
         model.deformation.frames.keep(
-            self.motion.store,
+            self.visit.store,
             device,
             shape=box.grid_shape(*self.settings.grid(-1)),
-            half=self.motion.stored_half(device),
+            half=self.visit.stored_half(device),
         )
 
     def _color_change(self, frame: ActiveFrame) -> ColorChange | None:
@@ -247,15 +249,15 @@ class DeformationStage(Stage):
         phase = self.phase
         assert phase is not None
         share = phase.share(self.position.iteration)
-        self.context.weights = self.motion_loss.weights_at(phase.level, share)
-        every = max(1, round(self.motion.occupancy_every * self.position.schedule_scale))
+        self.context.weights = self.deformation_loss.weights_at(phase.level, share)
+        every = max(1, round(self.visit.occupancy_every * self.position.schedule_scale))
         if self.position.is_due(every, phase.start):
             with span("sampling"):
                 self._update_occupancy()
 
     def converged(self, loss: Tensor) -> bool:
         """Whether the frame's loss has stopped falling, if the schedule asks for that."""
-        gain = self.motion.min_rel_improvement
+        gain = self.visit.min_rel_improvement
         if gain is None:
             return False
         self._losses.append(float(loss))
@@ -283,8 +285,8 @@ class DeformationStage(Stage):
             frame.number,
             self.scene_model,
             frame.occupancy,
-            occupied_only=self.motion.pixels == "occupied",
-            join_views=self.motion.views == "all",
+            occupied_only=self.visit.pixels == "occupied",
+            join_views=self.visit.views == "all",
         )
 
     def _free(self) -> None:
@@ -298,7 +300,7 @@ class DeformationStage(Stage):
         frame = self.active
         if frame is None:
             frame = self._allocate(phase)
-        elif self.motion.adam_state != "carried" or phase.level == 0:
+        elif self.visit.adam_state != "carried" or phase.level == 0:
             self.optimizer.forget()
         frame.check_out(phase.frame)
         self._losses = []
@@ -316,8 +318,8 @@ class DeformationStage(Stage):
             further |= extension.frame_fields(context, level)
         frame = ActiveFrame.of(self.field.frames, self.scene_model.occupancy, further)
         context.active = frame
-        context.weights = self.motion_loss.weights_at(level)
-        smoothing = self.motion_loss.smoothing(level, self.field.shape)
+        context.weights = self.deformation_loss.weights_at(level)
+        smoothing = self.deformation_loss.smoothing(level, self.field.shape)
         self.optimizer.replace(0, frame.slices, smoothing=smoothing)
         for extension in self.extensions:
             extension.begin_level(context, level)
@@ -364,7 +366,7 @@ class DeformationStage(Stage):
         """The state of the active frame, and its losses so far; nothing once all is learned."""
         if self.active is None:
             return {}
-        exact = self.motion.stored_half(self.device)
+        exact = self.visit.stored_half(self.device)
         views = self.context.views
         return {"frame": self.active.state(views, exact=exact), "losses": [*self._losses]}
 

@@ -15,14 +15,14 @@ from devrf.methods.devrf.active_frame import ActiveFrame
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
 from devrf.methods.devrf.frame_store import FrameField
-from devrf.methods.devrf.losses import MotionTerm
+from devrf.methods.devrf.losses import DeformationTerm
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.rendering.output import ColorChange
 from devrf.scenes.scene import Views
 
 
 @dataclass
-class MotionContext:
+class DeformationContext:
     """The parts of the deformation stage that an extension works with.
 
     Attributes:
@@ -72,7 +72,7 @@ class Extension:
     """
 
     @property
-    def terms(self) -> Mapping[str, MotionTerm]:
+    def terms(self) -> Mapping[str, DeformationTerm]:
         """Further loss terms, by name."""
         return {}
 
@@ -86,17 +86,17 @@ class Extension:
         """Names from the config that have to be those of loss terms."""
         return ()
 
-    def setup(self, context: MotionContext) -> None:
+    def setup(self, context: DeformationContext) -> None:
         """Add fields to the model and groups to the optimiser, before learning starts."""
 
-    def initialise(self, context: MotionContext, phase: DeformationPhase) -> None:
+    def initialise(self, context: DeformationContext, phase: DeformationPhase) -> None:
         """Give the phase's frame its first values, in the fields, before a visit."""
 
-    def frame_fields(self, context: MotionContext, level: int) -> Mapping[str, FrameField]:
+    def frame_fields(self, context: DeformationContext, level: int) -> Mapping[str, FrameField]:
         """Fields whose frames are learned at ``level`` as the displacements are, by name."""
         return {}
 
-    def begin_level(self, context: MotionContext, level: int) -> None:
+    def begin_level(self, context: DeformationContext, level: int) -> None:
         """Memory of the active frame is ready; give the optimiser its parameters."""
 
     def weight_factor(self, term: str, level: int, share: float) -> float:

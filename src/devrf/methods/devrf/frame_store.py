@@ -175,7 +175,8 @@ class FrameStore(StoredShape):
             on_host = not fits_on_device(free, frames, shape, half=half)
             if on_host:
                 log.info(
-                    "motion: %.1f GB are free on the GPU: frames are kept on the host", free / 1e9
+                    "schedule.visit.store: frames stay on the host: %.1f GB are free on the GPU",
+                    free / 1e9,
                 )
         self.offload(on_host=on_host, half=half)
 

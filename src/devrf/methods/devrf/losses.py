@@ -1,4 +1,4 @@
-"""The losses: terms and weighted sums (docs/method.md#photometric-losses, #motion-losses)."""
+"""The losses: terms and weighted sums (docs/method.md#photometric-losses, #deformation-losses)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.space import WORLD, Space
-from devrf.kernels.motion import cycle_error, flow_error
+from devrf.kernels.deformation import cycle_error, flow_error
 from devrf.kernels.photometric import photometric
 from devrf.kernels.runtime import is_supported
 from devrf.methods.devrf.deformation_field import GridWarp, Warp
@@ -60,8 +60,8 @@ PHOTOMETRIC_TERMS: dict[str, Callable[[Prediction], Tensor]] = {
 
 
 @dataclass(frozen=True)
-class MotionPrediction(Prediction):
-    """A prediction through the backward warp of one frame t, with the motion terms' inputs.
+class DeformationPrediction(Prediction):
+    """A prediction through the backward warp of one frame t, with the deformation terms' inputs.
 
     Attributes:
         forward_warp: canonical points q (M, 3) → q + Δ_f(q, t).
@@ -84,7 +84,7 @@ class MotionPrediction(Prediction):
     flow_mean: FlowMean = "samples"
 
 
-def cycle(prediction: MotionPrediction) -> Tensor:
+def cycle(prediction: DeformationPrediction) -> Tensor:
     """L_cycle = mean_i ½ |x_i − (q_i + Δ_f(q_i, t))|² (docs/method.md#cycle)."""
     samples, warp = prediction.output.samples, prediction.forward_warp
     if (
@@ -99,7 +99,7 @@ def cycle(prediction: MotionPrediction) -> Tensor:
     return error.mean() if len(error) else error.sum()
 
 
-def flow(prediction: MotionPrediction) -> Tensor:
+def flow(prediction: DeformationPrediction) -> Tensor:
     """L_flow = (1/M) Σ_i w_i m_i |φ_i − φ_i^observed|₁ in pixels (docs/method.md#flow).
 
     M is the number of ``rays`` whose flow is valid, or twice the number of their ``samples``.
@@ -147,7 +147,7 @@ def induced_flow(
     pixel: Tensor,
     space: Space = WORLD,
 ) -> Tensor:
-    """φ = π(q + Δ_f(q, t − 1)) − u (M, 2) in pixels, the flow that the motion implies.
+    """φ = π(q + Δ_f(q, t − 1)) − u (M, 2) in pixels, the flow that the deformation implies.
 
     Args:
         canonical: (M, 3) canonical positions q.
@@ -185,9 +185,9 @@ def total_variation_weight(weight: float, side: int, rays: int) -> float:
 
 
 # An unweighted loss term: prediction → ().
-MotionTerm = Callable[[MotionPrediction], Tensor]
-# The terms of the paper that constrain the motion, and the photometric ones of the warped render.
-MOTION_TERMS: dict[str, MotionTerm] = {
+DeformationTerm = Callable[[DeformationPrediction], Tensor]
+# The paper's terms that constrain the deformation, and the photometric ones of the warped render.
+DEFORMATION_TERMS: dict[str, DeformationTerm] = {
     **PHOTOMETRIC_TERMS,
     "cycle": cycle,
     "flow": flow,

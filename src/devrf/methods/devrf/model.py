@@ -195,8 +195,8 @@ class DeVRFModel(Renderable):
     @property
     def size(self) -> int:
         """Values of all fields."""
-        motion, residual = self.deformation, self.color_residual
-        frames = [] if motion is None else [motion.backward_slices, motion.forward_slices]
+        deformation, residual = self.deformation, self.color_residual
+        frames = [] if deformation is None else [*deformation.frames.buffers()]
         frames += [] if residual is None else [residual.values]
         return super().size + sum(tensor.numel() for tensor in frames)
 
@@ -206,7 +206,7 @@ class DeVRFModel(Renderable):
 
         A grid with a value that half precision cannot hold stays as it is.
         """
-        state, motion, residual = self.state_dict(), self.deformation, self.color_residual
+        state, deformation, residual = self.state_dict(), self.deformation, self.color_residual
         occupied = self.occupancy.points_near(self.canonical.density.shape, self.box)[None]
         if not self.space.is_linear:  # rays end in the field's outer faces
             rim = torch.ones_like(occupied)
@@ -214,15 +214,15 @@ class DeVRFModel(Renderable):
             occupied |= rim
         for name in ("canonical.density.values", "canonical.color.values"):
             state[name] = pack(state[name], occupied, smooth=False)
-        if motion is not None:
-            grid = motion.shape, motion.box
+        if deformation is not None:
+            grid = deformation.shape, deformation.box
             at_rest = self.occupancy.points_near(*grid)[None]
-            near = [self.occupancy_at(t).points_near(*grid) for t in motion.clock.times]
+            near = [self.occupancy_at(t).points_near(*grid) for t in deformation.clock.times]
             # Between two frames both are blended.
             moving = [torch.stack(near[max(k - 1, 0) : k + 2]).any(dim=0) for k in range(len(near))]
             frames = {"backward_slices": torch.stack(moving), "forward_slices": at_rest}
             for name, keep in frames.items():
-                values = getattr(motion.frames, name)
+                values = getattr(deformation.frames, name)
                 state[f"deformation.frames.{name}"] = pack(values, keep, smooth=True)
         if residual is not None:
             values = residual.values
@@ -248,8 +248,8 @@ class DeVRFModel(Renderable):
             self.deformation.frames.take(*frames)
             full |= zip(names, frames, strict=True)
         self.load_state_dict({name: unpack(v, self.device) for name, v in full.items()})
-        motion, residual = self.deformation, self.color_residual
-        timed = [(motion.clock, motion.backward_slices)] if motion else []
+        deformation, residual = self.deformation, self.color_residual
+        timed = [(deformation.clock, deformation.backward_slices)] if deformation else []
         timed += [(residual.clock, residual.values)] if residual else []
         if any(len(clock) != len(frames) for clock, frames in timed):
             raise ValueError("frames of other times")

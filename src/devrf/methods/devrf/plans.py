@@ -17,9 +17,9 @@ from devrf.geometry.ndc import NormalizedDevice
 from devrf.kernels.ahead import grid_kernels, march_kernels
 from devrf.methods.devrf.architecture import Architecture, fitted_to
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
+from devrf.methods.devrf.deformation_loss import DeformationLoss
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
-from devrf.methods.devrf.motion_loss import MotionLoss
-from devrf.methods.devrf.settings import MotionSettings
+from devrf.methods.devrf.settings import VisitSettings
 from devrf.scenes.scene import Scene
 
 # Measured around a free-standing object: the share of a ray's samples that are occupied, and of
@@ -33,7 +33,7 @@ REHEARSED_WIDTH = 64
 REHEARSED_SIDE = 48
 REHEARSED_SEARCH_SIDE = 40
 REHEARSED_FRAME_ITERATIONS = 25
-REHEARSED_MOTION_SIDE = 40
+REHEARSED_DISPLACEMENT_SIDE = 40
 REHEARSED_RATE = 1e-2
 REHEARSED_RAYS = 256
 
@@ -91,7 +91,7 @@ class DeformationPlan(StagePlan):
         """Check the loss, too."""
         super().check()
         extensions = tuple(self.settings.get("extensions", {}).values())
-        MotionLoss(self.settings["loss"], extensions, self.settings["schedule"])
+        DeformationLoss(self.settings["loss"], extensions, self.settings["schedule"])
 
     def iterations(self, scene: Scene) -> int:
         """Of all levels and frames."""
@@ -99,13 +99,13 @@ class DeformationPlan(StagePlan):
         return schedule.total(len(scene.clock))
 
     def needs(self, scene: Scene, earlier: StagePlan | None) -> StageNeeds:
-        """Images, the frozen field, the motion grids, and a batch."""
+        """Images, the frozen field, the displacement grids, and a batch."""
         assert earlier is not None, "it builds on the canonical stage"
         schedule: DeformationSchedule = self.settings["schedule"]
         grid, values, ray = _field(earlier.settings, scene)
         # Displacements of a frame: three numbers in both directions. The active one is learned.
         frame, frames = 24 * schedule.levels[-1].side ** 3, len(scene.clock)
-        on_device = 1 if self.settings["motion"].store == "host" else frames
+        on_device = 1 if self.settings["visit"].store == "host" else frames
         side = f"schedule.deformation.levels.{len(schedule.levels)}.side"
         parts = {
             SIZE: tensor_bytes(scene.dynamic.train),
@@ -116,17 +116,17 @@ class DeformationPlan(StagePlan):
         return StageNeeds(parts, {grid: values, side: frames * frame})
 
     def rehearsed(self) -> DeformationPlan:
-        """Few iterations of each frame, in which voxels move as far, on motion grids of few."""
+        """Few iterations of each frame, in which voxels move as far, on grids of few."""
         schedule: DeformationSchedule = self.settings["schedule"]
         whole = sum(row.iterations for row in schedule.levels)
         factor = min(1.0, REHEARSED_FRAME_ITERATIONS / whole)
-        scaled = schedule.scaled(factor).with_finest(REHEARSED_MOTION_SIDE)
-        motion: MotionSettings = self.settings["motion"].scaled(factor)
-        if motion.unit == "box":  # of which a step is a small part
-            motion = replace(motion, learning_rate=min(motion.learning_rate, REHEARSED_RATE))
+        scaled = schedule.scaled(factor).with_finest(REHEARSED_DISPLACEMENT_SIDE)
+        visit: VisitSettings = self.settings["visit"].scaled(factor)
+        if visit.unit == "box":  # of which a step is a small part
+            visit = replace(visit, learning_rate=min(visit.learning_rate, REHEARSED_RATE))
         return self.with_settings(
             schedule=replace(scaled, rays=min(schedule.rays, REHEARSED_RAYS)),
-            motion=motion,
+            visit=visit,
             iterations_per_step=min(self.settings["iterations_per_step"], 10),
         )
 

@@ -76,7 +76,7 @@ class Sampling(Options):
 
 
 @dataclass(frozen=True)
-class MotionSettings(Options):
+class VisitSettings(Options):
     """Settings of the deformation stage, beside its schedule (docs/method.md#departures).
 
     Attributes:
@@ -92,7 +92,7 @@ class MotionSettings(Options):
         min_rel_improvement: of a visit's loss, in two Lightning steps; with less it ends early.
     """
 
-    key: ClassVar[str] = "schedule.motion"
+    key: ClassVar[str] = "schedule.visit"
 
     learning_rate: float = 1e-3
     unit: Literal["world", "box"] = "world"
@@ -105,7 +105,7 @@ class MotionSettings(Options):
     store_half: bool | Literal["auto"] = "auto"
     min_rel_improvement: Annotated[float, Gt(0), Le(1)] | None = None
 
-    def scaled(self, factor: float) -> MotionSettings:
+    def scaled(self, factor: float) -> VisitSettings:
         """The settings for ``factor`` times the iterations, in which voxels move as far."""
         every = max(1, round(self.occupancy_every * factor))
         return replace(self, learning_rate=self.learning_rate / factor, occupancy_every=every)

@@ -41,7 +41,7 @@ class DeVRFView:
         canonical: the scene's look at rest.
         occupancy: given as of the scene at rest; kept as of the view's time.
         settings: of the sampling of rays.
-        motion: the scene's; None: it is at rest at every time.
+        deformation: the scene's; None: it is at rest at every time.
         space: the space that the fields live in.
         time: t in [0, 1].
         color_change: the residual of the colours' logits at that time; None: none.
@@ -52,7 +52,7 @@ class DeVRFView:
     canonical: CanonicalField
     occupancy: Occupancy
     settings: RenderSettings
-    motion: DeformationField | None
+    deformation: DeformationField | None
     space: Space
     time: float
     color_change: ColorChange | None = None
@@ -63,15 +63,15 @@ class DeVRFView:
     @torch.no_grad()
     def __post_init__(self) -> None:
         """Blend the time's displacements; find its occupancy, and the distances to it."""
-        motion = self.motion
-        self.at_rest = motion is None or motion.clock.at(self.time).after == 0
-        if motion is None or self.at_rest:
+        deformation = self.deformation
+        self.at_rest = deformation is None or deformation.clock.at(self.time).after == 0
+        if deformation is None or self.at_rest:
             return
         with one_thread() if self.canonical.density.values.numel() < MANY else nullcontext():
             # As one grid: one interpolation a point instead of two.
-            moves = motion.backward_warp(self.time).displacement
+            moves = deformation.backward_warp(self.time).displacement
             assert moves is not None
-            self._backward_warp = motion.warp_by(moves)
+            self._backward_warp = deformation.warp_by(moves)
             self.occupancy = deformed_occupancy(
                 self.canonical, self.occupancy, self.picture_settings, self._backward_warp
             )
@@ -118,8 +118,8 @@ class DeVRFView:
         )
         ray, weight = seen.samples.ray, seen.samples.weight
         forward = GridWarp((), self.canonical.box)
-        if self.motion is not None:
-            forward = self.motion.forward_warp(time)
+        if self.deformation is not None:
+            forward = self.deformation.forward_warp(time)
         moved = induced_flow(
             seen.samples.canonical, forward, cameras, torch.zeros_like(ray), pixels[ray], self.space
         )

@@ -90,7 +90,7 @@ def march_inputs(
         delta=field.step_in_base_voxels(settings.step),
         threshold=settings.alpha_threshold,
         displacement=displacement,
-        motion_box=None if displacement is None else warp.box,
+        displacement_box=None if displacement is None else warp.box,
         zero_outside_box=warp.zero_outside_box,
     )
 

@@ -211,8 +211,8 @@ class DeformableGaussians(ImageTrainable):
 
     def parts(self) -> dict[str, Iterable[nn.Parameter]]:
         """The cloud; the network that moves it."""
-        motion = [*self.trunk.parameters(), *self.last.parameters()]
-        return {"canonical": self.cloud.parameters(), "deformation": motion}
+        deformation = [*self.trunk.parameters(), *self.last.parameters()]
+        return {"canonical": self.cloud.parameters(), "deformation": deformation}
 
     def param_groups(self) -> list[dict[str, Any]]:
         """A group for each part of the cloud; the network."""

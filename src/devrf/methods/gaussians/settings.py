@@ -28,7 +28,7 @@ class GaussiansSettings(MethodSettings):
         max_points: Gaussians at most.
         harmonics: highest degree of the spherical harmonics of colours.
         harmonics_every: share of a stage after which their degree grows by 1.
-        width: units of each layer of the network of motion.
+        width: units of each layer of the deformation network.
         depth: its layers; the input enters the fifth once more, if there is one.
         bands: octaves of positions.
         time_bands: octaves of times.

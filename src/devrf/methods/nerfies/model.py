@@ -170,8 +170,8 @@ class Nerfies(DeformableField):
 
     def parts(self) -> dict[str, Iterable[nn.Parameter]]:
         """The radiance fields, the warp, and the frames' codes."""
-        motion = {"warp": self.warp.parameters(), "codes": self.codes.parameters()}
-        return {**self.radiance_parts(), **motion}
+        deformation = {"warp": self.warp.parameters(), "codes": self.codes.parameters()}
+        return {**self.radiance_parts(), **deformation}
 
     def loss_terms(
         self, output: RenderOutput, batch: RayBatch, names: Collection[str]

@@ -171,7 +171,7 @@ class TiNeuVox(DensityColorField):
         """A group of the grid, whose untouched points keep their moments; the other parts."""
         s = self.settings
         values = self.grid.values
-        rates = {"deformation": s.motion_rate}
+        rates = {"deformation": s.deformation_rate}
         groups: list[dict[str, Any]] = []
         for group in super().param_groups():
             name = group["name"]

@@ -33,7 +33,7 @@ class TiNeuVoxSettings(OccupancySettings):
         step: distance between samples, in voxels of the present grid.
         weight_threshold: samples with a lower weight are not coloured.
         grid_rate: factor of the learning rate of the grid.
-        motion_rate: the same of the network of displacements.
+        deformation_rate: the same of the deformation network.
         starts_still: displacements begin at 0, and so does what the time changes in density and
             colour: the first state that is learned is at rest.
         tv: weight of the grid's total variation over the rays of a batch.
@@ -56,7 +56,7 @@ class TiNeuVoxSettings(OccupancySettings):
     step: Step = 0.5
     weight_threshold: NotNegative = 1e-4
     grid_rate: Positive = 100.0
-    motion_rate: Positive = 0.75
+    deformation_rate: Positive = 0.75
     starts_still: bool = False
     tv: NotNegative = 0.0
 

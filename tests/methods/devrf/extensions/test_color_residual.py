@@ -19,13 +19,13 @@ from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.extensions.color_residual import NAME, ColorResidual, ResidualField
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.settings import DEFORMATION_LOSS, MotionSettings
+from devrf.methods.devrf.settings import DEFORMATION_LOSS, VisitSettings
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene, Views
 
 SHORT = DeformationSchedule(levels=(Level(4, 6), Level(6, 6)), rays=128)
 TINY = DeformationSchedule(levels=(Level(4, 1), Level(6, 1, lr_factor=0.25)), rays=16)
-FAST = MotionSettings(learning_rate=5e-3, views="all", pixels="occupied")
+FAST = VisitSettings(learning_rate=5e-3, views="all", pixels="occupied")
 LEARNED: dict[str, Any] = {"learn": "always", "side": 6, "start_level": 1, "learning_rate": 0.1}
 CLOCK = FrameClock((0.0, 0.5, 1.0))
 
@@ -120,7 +120,7 @@ def test_auto_learns_colours_that_drift_early_and_others_late(
     assert learned == [first is not None and level >= first for level in (0, 1)]
     # Where colours drift, terms count less from the level on that learns them.
     factors = [0.25, 0.5] if first == 0 else [1.0, 2.0]
-    assert [stage.motion_loss.weights_at(level)["cycle"] for level in (0, 1)] == factors
+    assert [stage.deformation_loss.weights_at(level)["cycle"] for level in (0, 1)] == factors
 
 
 def test_its_rate_is_its_own_at_every_level(rest, datamodule, trainer):

@@ -1,4 +1,4 @@
-"""The priors on the motion: what they leave alone, and what a strain or a curve costs, by hand."""
+"""The priors on the deformation: what they leave alone, and what strains and curves cost."""
 
 from __future__ import annotations
 

@@ -47,8 +47,8 @@ def model(cube: Box) -> DeVRFModel:
             logits = torch.tensor(color) / 255 * 18 - 9
             canonical.color.values[7 * band : 7 * band + 7] = logits
     settings = RenderSettings(step=0.25, alpha_threshold=1e-3, near=0.0, far=9.0)
-    motion = DeformationField(cube, FrameClock((0.0, 1 / 3, 2 / 3, 1.0)), voxels=27)
-    return DeVRFModel(build, canonical, Occupancy(mask, cube), settings, motion)
+    deformation = DeformationField(cube, FrameClock((0.0, 1 / 3, 2 / 3, 1.0)), voxels=27)
+    return DeVRFModel(build, canonical, Occupancy(mask, cube), settings, deformation)
 
 
 @pytest.fixture

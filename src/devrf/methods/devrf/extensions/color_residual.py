@@ -18,9 +18,13 @@ from devrf.geometry.clock import FrameClock
 from devrf.kernels.trilinear import interpolate
 from devrf.methods.devrf.active_frame import ActiveFrame
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
-from devrf.methods.devrf.extension import Extension, MotionContext
+from devrf.methods.devrf.extension import DeformationContext, Extension
 from devrf.methods.devrf.frame_store import FrameField
-from devrf.methods.devrf.losses import MotionPrediction, MotionTerm, total_variation_weight
+from devrf.methods.devrf.losses import (
+    DeformationPrediction,
+    DeformationTerm,
+    total_variation_weight,
+)
 from devrf.methods.devrf.model import ColorField
 from devrf.rendering.output import ColorChange
 from devrf.scenes.scene import Views
@@ -120,7 +124,7 @@ class ColorResidual(Extension):
         self._scale: Mapping[str, float] = {}
 
     @property
-    def terms(self) -> Mapping[str, MotionTerm]:
+    def terms(self) -> Mapping[str, DeformationTerm]:
         """``residual``, the size of the residuals."""
         return {"residual": squared_residual}
 
@@ -134,7 +138,7 @@ class ColorResidual(Extension):
         """Those that ``loss_scale_if_color_drift`` names."""
         return self._scale_if_drift
 
-    def setup(self, context: MotionContext) -> None:
+    def setup(self, context: DeformationContext) -> None:
         """Build the residuals, zero, and their empty parameter group, if they are learned."""
         first, drifting = self._decide(context.datamodule.scene.dynamic.train)
         if first is None:
@@ -159,13 +163,13 @@ class ColorResidual(Extension):
         log.info("colours %s: their change is %s", how, learned)
         return first, drifting
 
-    def frame_fields(self, context: MotionContext, level: int) -> Mapping[str, FrameField]:
+    def frame_fields(self, context: DeformationContext, level: int) -> Mapping[str, FrameField]:
         """The residuals, if ``level`` learns them."""
         field = context.model.color_residual
         learned = self._first is not None and level >= self._first
         return {NAME: field} if learned and field is not None else {}
 
-    def begin_level(self, context: MotionContext, level: int) -> None:
+    def begin_level(self, context: DeformationContext, level: int) -> None:
         """Let the optimiser learn the active frame's residuals (X, Y, Z, 3).
 
         Their rate falls within a visit as that of the displacements does, but not from level to
@@ -184,7 +188,7 @@ class ColorResidual(Extension):
         """Lower some terms where a texture may slide over the surface."""
         return 1.0 if self._first is None or level < self._first else self._scale.get(term, 1.0)
 
-    def initialise(self, context: MotionContext, phase: DeformationPhase) -> None:
+    def initialise(self, context: DeformationContext, phase: DeformationPhase) -> None:
         """At the first level that learns it, start a frame from the one visited before it."""
         field = context.model.color_residual
         before = phase.frame - phase.step
@@ -199,7 +203,7 @@ class ColorResidual(Extension):
         return partial(interpolate, frame.further[NAME], box=frame.fields[NAME].box)
 
 
-def squared_residual(prediction: MotionPrediction) -> Tensor:
+def squared_residual(prediction: DeformationPrediction) -> Tensor:
     """(1/R) Σ_i w_i |A_t(q_i)|²: colours stay as at rest; 0 without residuals."""
     output = prediction.output
     if output.residual is None:

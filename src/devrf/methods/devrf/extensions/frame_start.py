@@ -15,7 +15,7 @@ from devrf.geometry.box import Box
 from devrf.kernels.trilinear import interpolate
 from devrf.methods.batch import gather_batch
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
-from devrf.methods.devrf.extension import Extension, MotionContext
+from devrf.methods.devrf.extension import DeformationContext, Extension
 from devrf.methods.devrf.frame_store import Directions
 from devrf.methods.devrf.pixel_pools import images_of
 from devrf.methods.devrf.volume_rendering import possible_occupancy, render
@@ -48,7 +48,7 @@ class StartFromBest(Extension):
         self._levels = levels
         self._rays = rays
 
-    def initialise(self, context: MotionContext, phase: DeformationPhase) -> None:
+    def initialise(self, context: DeformationContext, phase: DeformationPhase) -> None:
         """Give the frame the displacements of the best candidate."""
         if phase.level >= self._levels:
             return
@@ -66,7 +66,9 @@ class StartFromBest(Extension):
         broadcast([field.backward_slices[phase.frame], field.forward_slices[phase.frame]])
 
     @torch.no_grad()
-    def _errors(self, context: MotionContext, frame: int, starts: list[Directions]) -> list[float]:
+    def _errors(
+        self, context: DeformationContext, frame: int, starts: list[Directions]
+    ) -> list[float]:
         """Mean squared colour error of each start, on the same pixels of all the frame's images."""
         views = context.views
         model = context.model
@@ -92,7 +94,7 @@ class StartFromBest(Extension):
 
 
 @torch.no_grad()
-def candidates(context: MotionContext, phase: DeformationPhase) -> dict[str, Directions]:
+def candidates(context: DeformationContext, phase: DeformationPhase) -> dict[str, Directions]:
     """Displacements that a visit may start from, by name; the frame's own are the first."""
     field = context.field
     like = field.frames.here.new_empty(*field.shape, 3)

@@ -14,8 +14,8 @@ from torch.nn.functional import adaptive_max_pool3d, max_pool3d
 
 from devrf.errors import expect
 from devrf.geometry.box import Box
-from devrf.methods.devrf.extension import Extension, MotionContext
-from devrf.methods.devrf.losses import MotionPrediction, MotionTerm
+from devrf.methods.devrf.extension import DeformationContext, Extension
+from devrf.methods.devrf.losses import DeformationPrediction, DeformationTerm
 from devrf.rendering.occupancy import Occupancy
 
 # c of docs/method.md#elastic and #bending: beyond it a place counts as torn or jointed, not as
@@ -119,7 +119,7 @@ def occupied_cells(occupancy: Occupancy, box: Box, shape: tuple[int, int, int]) 
     return adaptive_max_pool3d(occupied, [count - 1 for count in shape])[0]
 
 
-class MotionPrior(Extension):
+class DeformationPrior(Extension):
     """Adds an energy of the forward slice to the loss terms, where something is at rest."""
 
     def __init__(self, name: str, energy: Callable[[Tensor, Box, Tensor], Tensor]) -> None:
@@ -132,23 +132,23 @@ class MotionPrior(Extension):
         self._occupied: Tensor | None = None
 
     @property
-    def terms(self) -> Mapping[str, MotionTerm]:
+    def terms(self) -> Mapping[str, DeformationTerm]:
         """The energy, under its name."""
         return {self.name: self._term}
 
-    def begin_level(self, context: MotionContext, level: int) -> None:
+    def begin_level(self, context: DeformationContext, level: int) -> None:
         """Find the cells of the level's grids that are occupied at rest."""
         if self.name in context.weights:
             field = context.field
             occupancy = context.model.occupancy
             self._occupied = occupied_cells(occupancy, field.box, field.shape)
 
-    def _term(self, prediction: MotionPrediction) -> Tensor:
+    def _term(self, prediction: DeformationPrediction) -> Tensor:
         assert self._occupied is not None, "the level has not begun"
         return self.energy(prediction.forward_slice, prediction.box, self._occupied)
 
 
-class Elastic(MotionPrior):
+class Elastic(DeformationPrior):
     """Resists stretching; parts may tear off one another (docs/method.md#elastic)."""
 
     def __init__(self, initial_factor: float = 1.0) -> None:
@@ -168,7 +168,7 @@ class Elastic(MotionPrior):
         return self._initial_factor ** (1 - share) if stiff else 1.0
 
 
-class Bending(MotionPrior):
+class Bending(DeformationPrior):
     """Resists bending; parts may turn against one another (docs/method.md#bending)."""
 
     def __init__(self) -> None:

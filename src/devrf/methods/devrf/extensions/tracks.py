@@ -20,7 +20,7 @@ from devrf.kernels.trilinear import interpolate
 from devrf.methods.batch import gather_batch
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
-from devrf.methods.devrf.extension import Extension, MotionContext
+from devrf.methods.devrf.extension import DeformationContext, Extension
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.pixel_pools import images_of
 from devrf.methods.devrf.volume_rendering import render
@@ -57,11 +57,11 @@ class StartAlongFlow(Extension):
         self._init_from = init_from
         self._tracks: FlowTracks | None = None
 
-    def begin_level(self, context: MotionContext, level: int) -> None:
+    def begin_level(self, context: DeformationContext, level: int) -> None:
         """Forget the tracks of the level before."""
         self._tracks = None
 
-    def changes(self, context: MotionContext, phase: DeformationPhase) -> bool:
+    def changes(self, context: DeformationContext, phase: DeformationPhase) -> bool:
         """Whether a phase starts along the flow: at the coarsest level, where there is one."""
         recorded = context.views
         # A moving camera's image moves with it.
@@ -69,7 +69,7 @@ class StartAlongFlow(Extension):
         asked = self._init_from != "previous" and has_flow
         return asked and phase.level == 0
 
-    def initialise(self, context: MotionContext, phase: DeformationPhase) -> None:
+    def initialise(self, context: DeformationContext, phase: DeformationPhase) -> None:
         """Fit the frame's displacements to the points to which its pixels are followed back."""
         if not self.changes(context, phase):
             return

@@ -1,7 +1,7 @@
 """The cycle and the flow loss through a grid of displacements, and their gradients.
 
-See docs/method.md#motion-losses; ``devrf.methods.devrf.losses`` has the definitions. A thread looks
-at one sample.
+See docs/method.md#deformation-losses; ``devrf.methods.devrf.losses`` has the definitions. A thread
+looks at one sample.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.ndc import BEFORE_INFINITY, NormalizedDevice
 from devrf.kernels.adjoint import with_adjoint
-from devrf.kernels.displacement import Motion, follows, motion_of, slope_of_warped, warped
+from devrf.kernels.displacement import Warp, follows, slope_of_warped, warp_of, warped
 from devrf.kernels.pixels import Axis, Xy
 from devrf.kernels.runtime import launch
 from devrf.kernels.trilinear import add_to_grid
@@ -27,10 +27,10 @@ def cycle_error(
 ) -> Tensor:
     """mean_i ½ |x_i − (q_i + Δ(q_i))|² () of Δ (X, Y, Z, 3) over ``box``."""
     points, canonical = samples.points, samples.canonical.detach()
-    motion = motion_of(box, shape_of(displacement), zero_outside_box)
+    warp = warp_of(box, shape_of(displacement), zero_outside_box)
     errors = torch.empty(len(points), device=points.device)
     gradients = torch.empty_like(points), torch.empty_like(points)
-    inputs = [motion, points, canonical, displacement.detach(), errors, *gradients]
+    inputs = [warp, points, canonical, displacement.detach(), errors, *gradients]
     launch(cycle_kernel, len(points), inputs, points.device)
 
     def adjoint(gradient: Tensor) -> tuple[Tensor, Tensor]:
@@ -80,7 +80,7 @@ def flow_error(
     slopes = wp.vec3() if ndc is None else wp.vec3(*ndc.slopes, ndc.near)
     parts = torch.empty(len(weight), 2, device=weight.device)
     gradients = torch.empty_like(canonical), torch.empty_like(weight)
-    inputs = [motion_of(box, shape, zero_outside_box), slopes, canonical, weight, samples.ray]
+    inputs = [warp_of(box, shape, zero_outside_box), slopes, canonical, weight, samples.ray]
     inputs += [moves, cameras.camera_to_world, cameras.focal, cameras.center]
     inputs += [previous, image, pixel, flow, valid, parts, *gradients]
     launch(flow_kernel, len(weight), inputs, weight.device)
@@ -97,7 +97,7 @@ def flow_error(
 @wp.kernel(module="unique", enable_backward=False)
 def cycle_kernel(
     first: int,
-    motion: Motion,
+    warp: Warp,
     points: wp.array(dtype=wp.vec3),
     canonical: wp.array(dtype=wp.vec3),
     displacements: wp.array(dtype=wp.vec3),
@@ -108,11 +108,11 @@ def cycle_kernel(
     """½ |x − (q + Δ(q))|² of each sample, and the mean's gradients of q and of Δ(q)."""
     sample = first + wp.tid()
     q = canonical[sample]
-    missed = warped(motion, displacements, q) - points[sample]
+    missed = warped(warp, displacements, q) - points[sample]
     error[sample] = 0.5 * wp.dot(missed, missed)
     given = missed / float(points.shape[0])
-    of_canonical[sample] = slope_of_warped(motion, displacements, q, given)
-    of_moved[sample] = wp.where(follows(motion, q), given, wp.vec3())
+    of_canonical[sample] = slope_of_warped(warp, displacements, q, given)
+    of_moved[sample] = wp.where(follows(warp, q), given, wp.vec3())
 
 
 @wp.func
@@ -168,7 +168,7 @@ def signum(x: float):
 @wp.kernel(module="unique", enable_backward=False)
 def flow_kernel(
     first: int,
-    motion: Motion,
+    warp: Warp,
     ndc: wp.vec3,
     canonical: wp.array(dtype=wp.vec3),
     weight: wp.array(dtype=float),
@@ -198,7 +198,7 @@ def flow_kernel(
     if valid[ray]:
         camera = int(previous[int(images[ray])])
         q = canonical[sample]
-        moved = warped(motion, displacements, q)
+        moved = warped(warp, displacements, q)
         local = seen_by(ndc, poses, camera, moved)
         depth = -local[2]
         behind = wp.abs(depth) < 1.0e-8  # as in ``Cameras.project``
@@ -214,4 +214,4 @@ def flow_kernel(
         y = -weight[sample] * signum(missed[1]) * focal[1] / depth
         z = wp.where(behind, 0.0, (x * local[0] + y * local[1]) / depth)
         of_moved = slope_of_seen(ndc, poses, camera, moved, wp.vec3(x, y, z))
-        of_canonical[sample] = slope_of_warped(motion, displacements, q, of_moved)
+        of_canonical[sample] = slope_of_warped(warp, displacements, q, of_moved)

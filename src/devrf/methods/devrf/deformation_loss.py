@@ -9,15 +9,15 @@ from devrf.errors import DevrfError
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.extension import Extension
 from devrf.methods.devrf.losses import (
-    MOTION_TERMS,
-    MotionTerm,
+    DEFORMATION_TERMS,
+    DeformationTerm,
     apart_from_total_variation,
     total_variation_weight,
 )
 from devrf.methods.weighted_loss import counted_weights
 
 
-class MotionLoss:
+class DeformationLoss:
     """Weights of Σ weight · factor · term; the factors are those of a level.
 
     Attributes:
@@ -40,7 +40,7 @@ class MotionLoss:
         Raises:
             DevrfError: a weight, or a factor of an extension, is of no term.
         """
-        self.terms: dict[str, MotionTerm] = dict(MOTION_TERMS)
+        self.terms: dict[str, DeformationTerm] = dict(DEFORMATION_TERMS)
         weights, self._total_variation = apart_from_total_variation(loss, "loss.deformation")
         for extension in extensions:
             self.terms |= extension.terms

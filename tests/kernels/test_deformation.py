@@ -1,4 +1,4 @@
-"""The motion losses by kernels, and their gradients, against their definitions."""
+"""The deformation losses by kernels, and their gradients, against their definitions."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from devrf.geometry.cameras import Cameras
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.space import WORLD, Space
 from devrf.methods.devrf.deformation_field import GridWarp
-from devrf.methods.devrf.losses import MotionPrediction, cycle, flow
+from devrf.methods.devrf.losses import DeformationPrediction, cycle, flow
 from devrf.rendering.output import VoxelOutput
 from random_samples import samples_of
 
@@ -24,8 +24,8 @@ RAYS = 100
 
 def predicted(
     zero_outside_box: bool, space: Space, flow_mean: Any, rng: torch.Generator
-) -> MotionPrediction:
-    """Random samples in and around a box of random motion; half of the rays have flow."""
+) -> DeformationPrediction:
+    """Random samples in and around a box of random displacements; half of the rays have flow."""
     ray = torch.randint(RAYS, (900,), generator=rng).sort().values
     samples = samples_of(ray, RAYS, rng)
     samples = replace(samples, points=torch.rand(900, 3, generator=rng))
@@ -60,7 +60,7 @@ def predicted(
         background=batch.background,
     )
     outside = {"zero_outside_box": zero_outside_box}
-    return MotionPrediction(
+    return DeformationPrediction(
         output,
         batch,
         forward_warp=GridWarp((there.requires_grad_(),), BOX, **outside),
