@@ -32,7 +32,7 @@ from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level, Visits
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.extension import Extension
-from devrf.methods.devrf.extensions.color_residual import ColorResidual
+from devrf.methods.devrf.extensions.color_residual import LearnColorResidual
 from devrf.methods.devrf.extensions.frame_start import StartFromBest
 from devrf.methods.devrf.extensions.priors import Elastic
 from devrf.methods.devrf.extensions.tracks import StartAlongFlow
@@ -186,7 +186,7 @@ def test_starts_from_the_best_and_a_level_backwards_go_on_exactly(learn, rest):
 
 
 def test_colours_that_change_go_on_exactly(learn, rest):
-    colors = ColorResidual("always", side=5, start_level=2)
+    colors = LearnColorResidual("always", side=5, start_level=2)
     build = deformation(rest, MOVING, ROUNDED, color_residual=colors)
     # Mid-visit at both levels, at a frame's end.
     whole = learn(build)

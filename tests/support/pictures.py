@@ -16,8 +16,8 @@ def plain_picture(
     """What rays in the fields' space see of a model at ``time``, by the plain renderer."""
     scene = model.canonical, model.occupancy_at(time), model.settings
     with torch.no_grad():
-        warp, colors = model.backward_warp(time), model.color_change(time)
-        return RenderedImage.of(render(rays, *scene, background, warp, color_change=colors))
+        warp, colors = model.backward_warp(time), model.color_residual_at(time)
+        return RenderedImage.of(render(rays, *scene, background, warp, color_residual=colors))
 
 
 def assert_same_picture(picture: RenderedImage, other: RenderedImage) -> None:

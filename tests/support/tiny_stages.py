@@ -22,7 +22,7 @@ from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_field import DeformationField
-from devrf.methods.devrf.extensions.color_residual import ResidualField
+from devrf.methods.devrf.extensions.color_residual import ColorResidualGrid
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import CanonicalRates
 from devrf.scenes.scene import Scene
@@ -140,7 +140,7 @@ def moving(learned: tuple[CanonicalStage, Trainer], rng: torch.Generator) -> DeV
     shape = deformation.backward_slices[1:].shape
     deformation.backward_slices[1:] = 0.1 * box.longest * (torch.rand(shape, generator=rng) - 0.5)
     model.deformation = deformation
-    model.color_residual = ResidualField(box, deformation.clock, voxels=4**3)
+    model.color_residual = ColorResidualGrid(box, deformation.clock, voxels=4**3)
     shape = model.color_residual.values[1:].shape
     model.color_residual.values[1:] = 2 * torch.rand(shape, generator=rng) - 1
     return model

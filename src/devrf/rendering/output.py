@@ -10,8 +10,8 @@ from torch import Tensor
 
 from devrf.ops.march import Samples
 
-# Canonical points (M, 3) → additions (M, 3) to the logits of their colours.
-ColorChange = Callable[[Tensor], Tensor]
+# Canonical points (M, 3) → A_t there (M, 3), added to the logits of their colours.
+ColorResidual = Callable[[Tensor], Tensor]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,10 +70,10 @@ class VoxelOutput(RenderOutput):
         samples: their positions x_i at the rays' time and q_i in canonical space, and weights w_i.
         sample_color: (K, 3) their colours c_i.
         background: (3,) or (R, 3), behind all.
-        residual: (K, 3) A_t(q_i) in logits; None without one.
+        color_residual: (K, 3) A_t(q_i) in logits; None without one.
     """
 
     samples: Samples
     sample_color: Tensor
     background: Tensor
-    residual: Tensor | None = None
+    color_residual: Tensor | None = None

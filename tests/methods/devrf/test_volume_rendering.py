@@ -151,8 +151,8 @@ def test_a_picture_is_the_same_as_a_batch(cube: Box, rng: torch.Generator, time:
     occupancy = Occupancy(torch.rand(9, 9, 9, generator=rng) < 0.1, cube)
     residual = draw(3, 4, 3, 3)
     how = RenderSettings(step=0.5, alpha_threshold=0.02, near=0.2, far=9.0)
-    color_change = partial(interpolate, residual, box=cube)
-    view = DeVRFView(field, occupancy, how, deformation, WORLD, time, color_change)
+    color_residual = partial(interpolate, residual, box=cube)
+    view = DeVRFView(field, occupancy, how, deformation, WORLD, time, color_residual)
     d = torch.nn.functional.normalize(0.3 * draw(200, 3) + torch.tensor([1.0, 0.0, 0.0]), dim=1)
     rays = Rays(0.3 * draw(200, 3) - torch.tensor([3.0, 0.0, 0.0]), d, d)
     seen = view.render(rays, WHITE)
@@ -167,7 +167,7 @@ def test_a_picture_is_the_same_as_a_batch(cube: Box, rng: torch.Generator, time:
         how,
         WHITE,
         replace(warp, slices=slices),
-        color_change=color_change,
+        color_residual=color_residual,
     )
     assert batch.color.requires_grad and not seen.color.requires_grad
     torch.testing.assert_close(seen.color, batch.color)

@@ -228,7 +228,7 @@ def _description(model: DeVRFModel, viewpoints: Viewpoints) -> dict[str, Any]:
         "WIDTH": math.ceil(decoder.hidden.in_features / 4),
         "FREQUENCIES": len(decoder.octaves),
         "MOVES": int(deformation is not None),
-        "SHADES": int(model.color_residual is not None),
+        "RESIDUAL": int(model.color_residual is not None),
     }
     uniforms: dict[str, Any] = {
         "low": model.box.low,

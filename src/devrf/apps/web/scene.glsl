@@ -2,7 +2,7 @@
 //
 // Defined before: SPACE (0 the world, 1 NDC, 2 contracted); EXACT (1: all samples, their colours by
 // the network; 0, preview: fewer, the same from all sides); FEATURES and WIDTH (vec4s of a sample's
-// features and of a hidden layer); FREQUENCIES (octaves of the direction); MOVES and SHADES
+// features and of a hidden layer); FREQUENCIES (octaves of the direction); MOVES and RESIDUAL
 // (whether there are displacements, and residual colours).
 
 precision highp float;
@@ -92,7 +92,7 @@ vec3 toWorld(vec3 point) {
   return SPACE == 2 ? center + innerHalf * u * (shell / left / m) : point;
 }
 
-// Fields: docs/method.md#canonical-field, #warp, #appearance, #occupancy. A point's place in the
+// Fields: docs/method.md#canonical-field, #warp, #color-residual, #occupancy. A point's place in the
 // texture of a grid whose outer points lie on a box:
 vec3 place(vec3 point, vec3 boxLow, vec3 boxHigh, ivec3 size) {
   vec3 inside = clamp((point - boxLow) / (boxHigh - boxLow), 0.0, 1.0).zyx;
@@ -108,7 +108,7 @@ vec3 displacement(vec3 point, float after) {
 }
 
 vec3 residual(vec3 canonical) {
-  if (SHADES == 0 || !warps) return vec3(0.0);
+  if (RESIDUAL == 0 || !warps) return vec3(0.0);
   vec3 p = place(canonical, low, high, textureSize(residual0, 0));
   return mix(textureLod(residual0, p, 0.0), textureLod(residual1, p, 0.0), share).xyz;
 }

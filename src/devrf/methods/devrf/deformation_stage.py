@@ -40,7 +40,7 @@ from devrf.methods.devrf.settings import (
     decoder_dtype,
 )
 from devrf.methods.devrf.volume_rendering import possible_occupancy, render
-from devrf.rendering.output import ColorChange
+from devrf.rendering.output import ColorResidual
 from devrf.scenes.scene import CaptureName, Views
 from devrf.system.profiling import span
 
@@ -142,7 +142,7 @@ class DeformationStage(Stage):
             batch.background,
             backward_warp=field.warp_by(frame.backward),
             precision=self.context.precision,
-            color_change=self._color_change(frame),
+            color_residual=self._color_residual(frame),
         )
         # Before frame 1 nothing has moved.
         previous = (frame.previous_forward,) if frame.number > 1 else ()
@@ -239,10 +239,10 @@ class DeformationStage(Stage):
             half=self.visit.stored_half(device),
         )
 
-    def _color_change(self, frame: ActiveFrame) -> ColorChange | None:
+    def _color_residual(self, frame: ActiveFrame) -> ColorResidual | None:
         """The addition to the colours' logits by an extension; None: nothing."""
-        changes = (extension.color_change(frame) for extension in self.extensions)
-        return next((change for change in changes if change is not None), None)
+        residuals = (extension.color_residual(frame) for extension in self.extensions)
+        return next((residual for residual in residuals if residual is not None), None)
 
     def prepare(self) -> None:
         """Weigh the terms; update the frame's occupancy every ``occupancy_every`` iterations."""

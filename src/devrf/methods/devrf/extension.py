@@ -17,7 +17,7 @@ from devrf.methods.devrf.deformation_schedule import DeformationPhase, Deformati
 from devrf.methods.devrf.frame_store import FrameField
 from devrf.methods.devrf.losses import DeformationTerm
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.rendering.output import ColorChange
+from devrf.rendering.output import ColorResidual
 from devrf.scenes.scene import Views
 
 
@@ -68,7 +68,7 @@ class Extension:
     both, all else runs as before. The first three are read when the stage is built, then comes
     :meth:`setup`. At each visit of a frame follow :meth:`initialise`, unless the visit is resumed,
     and where a level begins :meth:`frame_fields` and :meth:`begin_level`; in each iteration
-    :meth:`weight_factor` and :meth:`color_change`.
+    :meth:`weight_factor` and :meth:`color_residual`.
     """
 
     @property
@@ -103,6 +103,6 @@ class Extension:
         """Factor of the weight of any loss term at ``level``, a ``share`` of a visit being over."""
         return 1.0
 
-    def color_change(self, frame: ActiveFrame) -> ColorChange | None:
-        """The residual that is added to the colours' logits of an active frame; None: none."""
+    def color_residual(self, frame: ActiveFrame) -> ColorResidual | None:
+        """q → A_t(q), added to the colours' logits, of an active frame; None: nothing is."""
         return None

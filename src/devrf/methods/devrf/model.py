@@ -24,7 +24,7 @@ from devrf.methods.devrf.view import CanonicalSurface, DeVRFView
 from devrf.methods.devrf.volume_rendering import deformed_occupancy
 from devrf.ops.trilinear import shape_of
 from devrf.rendering.occupancy import Occupancy
-from devrf.rendering.output import ColorChange
+from devrf.rendering.output import ColorResidual
 from devrf.rendering.renderable import Renderable
 from devrf.rendering.sampling import RenderSettings
 from devrf.system.plain_data import validate
@@ -36,11 +36,11 @@ SAMPLES = 2**14
 EMPTY = 1e-9
 
 
-class ColorField(StoredClass, FrameField):
-    """A field of frames that changes colours; an extension brings it."""
+class ColorResidualField(StoredClass, FrameField):
+    """The colour residual of all frames; an extension brings it."""
 
-    def at(self, time: float) -> ColorChange | None:
-        """The residual that is added to the colours' logits at ``time`` in [0, 1]; None: none."""
+    def at(self, time: float) -> ColorResidual | None:
+        """q → A_t(q) at ``time`` in [0, 1]; None: it is zero."""
         raise NotImplementedError
 
 
@@ -54,7 +54,7 @@ class DeVRFModel(Renderable):
         deformation: V_motion; None shows the rest state at every time.
         settings: of the sampling of rays.
         space: the space that the fields live in.
-        color_residual: the change of colours over time; None: they do not change.
+        color_residual: A_t, by which colours change over time; None: they do not.
     """
 
     name: ClassVar[str] = "devrf"
@@ -67,7 +67,7 @@ class DeVRFModel(Renderable):
         settings: RenderSettings,
         deformation: DeformationField | None = None,
         space: Space = WORLD,
-        color_residual: ColorField | None = None,
+        color_residual: ColorResidualField | None = None,
     ) -> None:
         super().__init__()
         self.architecture = architecture
@@ -109,9 +109,9 @@ class DeVRFModel(Renderable):
         radiance = config["radiance"]
         clock = FrameClock((0.0, 1.0))
         path = config["color_residual"]
-        residual: Callable[..., ColorField] | None = None
+        residual: Callable[..., ColorResidualField] | None = None
         if path is not None:
-            residual = stored_class(path, ColorField)
+            residual = stored_class(path, ColorResidualField)
         return cls(
             build,
             build.radiance_field(box, 8, 8) if radiance else build.search_field(box, 8),
@@ -122,7 +122,7 @@ class DeVRFModel(Renderable):
             residual and residual(box, clock, voxels=8),
         )
 
-    def color_change(self, time: float) -> ColorChange | None:
+    def color_residual_at(self, time: float) -> ColorResidual | None:
         """q → A_t(q) at ``time``; None where colours are those of the canonical field."""
         return None if self.color_residual is None else self.color_residual.at(time)
 
@@ -142,7 +142,7 @@ class DeVRFModel(Renderable):
             self.deformation,
             self.space,
             time,
-            self.color_change(time),
+            self.color_residual_at(time),
             decoder_dtype("auto" if half else "float32", self.device),
         )
 

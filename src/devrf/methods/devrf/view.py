@@ -18,7 +18,7 @@ from devrf.methods.devrf.losses import induced_flow
 from devrf.methods.devrf.volume_rendering import deformed_occupancy, render
 from devrf.ops.compositing import LEAST_MASS, sum_by_ray
 from devrf.rendering.occupancy import Occupancy
-from devrf.rendering.output import ColorChange, RenderedImage
+from devrf.rendering.output import ColorResidual, RenderedImage
 from devrf.rendering.sampling import RenderSettings
 from devrf.system.threads import one_thread
 
@@ -44,7 +44,7 @@ class DeVRFView:
         deformation: the scene's; None: it is at rest at every time.
         space: the space that the fields live in.
         time: t in [0, 1].
-        color_change: the residual of the colours' logits at that time; None: none.
+        color_residual: q → A_t(q) at that time; None: it is zero.
         precision: of the colour network for pictures.
         at_rest: whether the warps of this time are the identity.
     """
@@ -55,7 +55,7 @@ class DeVRFView:
     deformation: DeformationField | None
     space: Space
     time: float
-    color_change: ColorChange | None = None
+    color_residual: ColorResidual | None = None
     precision: torch.dtype = torch.float32
     at_rest: bool = field(init=False)
     _backward_warp: GridWarp | None = field(init=False, default=None)
@@ -100,7 +100,7 @@ class DeVRFView:
             background,
             self._backward_warp,
             precision=self.precision,
-            color_change=self.color_change,
+            color_residual=self.color_residual,
         )
         return RenderedImage.of(output)
 

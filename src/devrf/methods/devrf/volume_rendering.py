@@ -15,7 +15,7 @@ from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.deformation_field import GridWarp
 from devrf.ops.march import MarchInputs, MarchRange
 from devrf.rendering.occupancy import Occupancy, dilate
-from devrf.rendering.output import ColorChange, VoxelOutput
+from devrf.rendering.output import ColorResidual, VoxelOutput
 from devrf.rendering.sampling import RenderSettings
 from devrf.system.profiling import span
 
@@ -28,7 +28,7 @@ def render(
     background: Tensor,
     backward_warp: GridWarp | None = None,
     precision: torch.dtype = torch.float32,
-    color_change: ColorChange | None = None,
+    color_residual: ColorResidual | None = None,
 ) -> VoxelOutput:
     """Colours Ĉ = Σ w_i c_i + T_end · C_background and depths Σ w_i z_i / Σ w_i of rays.
 
@@ -40,15 +40,15 @@ def render(
         background: (3,) or (R, 3) RGB behind all; the field's own if the space holds infinity.
         backward_warp: x → q = x + Δ_b(x, t); None is the identity.
         precision: of the colour network.
-        color_change: q → A_t(q), added to the colours' logits; None: nothing is.
+        color_residual: q → A_t(q), added to the colours' logits; None: nothing is.
 
     Returns:
-        The render; differentiable in the parameters of field, backward warp and colour change.
+        The render; differentiable in the parameters of field, backward warp and colour residual.
     """
     with span("sampling"):
         samples = march(rays, march_inputs(field, occupancy, settings, backward_warp))
     with span("decoder"):
-        residual = None if color_change is None else color_change(samples.canonical)
+        residual = None if color_residual is None else color_residual(samples.canonical)
         color = field.rgb(samples.canonical, rays.viewdirs, samples.ray, precision, residual)
         ends = rays.ends()
         if ends is not None:
@@ -63,7 +63,7 @@ def render(
         samples=samples,
         sample_color=color,
         background=background,
-        residual=residual,
+        color_residual=residual,
     )
 
 

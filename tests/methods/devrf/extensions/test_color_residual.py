@@ -17,7 +17,11 @@ from devrf.geometry.clock import FrameClock
 from devrf.methods.devrf.canonical_field import ColorDecoder, SigmoidColor
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.methods.devrf.extensions.color_residual import NAME, ColorResidual, ResidualField
+from devrf.methods.devrf.extensions.color_residual import (
+    NAME,
+    ColorResidualGrid,
+    LearnColorResidual,
+)
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import DEFORMATION_LOSS, VisitSettings
 from devrf.rendering.renderer import Renderer
@@ -31,9 +35,9 @@ CLOCK = FrameClock((0.0, 0.5, 1.0))
 
 
 @pytest.fixture
-def field(cube: Box) -> ResidualField:
+def field(cube: Box) -> ColorResidualGrid:
     """A₁ is 1 in red, A₂ is 3 in red."""
-    made = ResidualField(cube, CLOCK, voxels=3**3)
+    made = ColorResidualGrid(cube, CLOCK, voxels=3**3)
     made.values[1, ..., 0], made.values[2, ..., 0] = 1.0, 3.0
     return made
 
@@ -63,7 +67,7 @@ def stage_with(
     loss: Mapping[str, float] = DEFORMATION_LOSS,
     **given: Any,
 ) -> DeformationStage:
-    extension = {NAME: ColorResidual(**{**LEARNED, **given})}
+    extension = {NAME: LearnColorResidual(**{**LEARNED, **given})}
     return DeformationStage(rest, schedule, FAST, loss, iterations_per_step=1, extensions=extension)
 
 
@@ -106,7 +110,7 @@ def test_what_grows_darker_is_learned_by_the_residual(rest, serve, tiny_scene, t
 def test_auto_learns_colours_that_drift_early_and_others_late(
     rest, datamodule, trainer, monkeypatch, drift, if_static, first
 ):
-    monkeypatch.setattr(f"{ColorResidual.__module__}.color_drift", lambda views: drift)
+    monkeypatch.setattr(f"{LearnColorResidual.__module__}.color_drift", lambda views: drift)
     schedule = replace(TINY, levels=(Level(4, 1), Level(6, 1, other_terms=2.0)))
     scale = {"cycle": 0.25}
     given = {"start_level_static_color": if_static, "loss_scale_if_color_drift": scale}
@@ -149,8 +153,8 @@ def test_a_checkpoint_keeps_the_colours(moving, tiny_scene):
 
 def test_wrong_settings_are_told(rest):
     with pytest.raises(DevrfError, match="color_residual.side"):
-        ColorResidual(side=1)
+        LearnColorResidual(side=1)
     with pytest.raises(DevrfError, match="flaw is no term of loss.deformation"):
         stage_with(rest, loss_scale_if_color_drift={"flaw": 0.1})
     with pytest.raises(DevrfError, match="loss_scale_if_color_drift.flow"):
-        ColorResidual(loss_scale_if_color_drift={"flow": -1.0})
+        LearnColorResidual(loss_scale_if_color_drift={"flow": -1.0})

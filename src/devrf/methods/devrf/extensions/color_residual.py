@@ -1,4 +1,4 @@
-"""Colours that change over time: a residual in canonical space (docs/method.md#appearance)."""
+"""The colour residual, by which colours change over time (docs/method.md#color-residual)."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from devrf.methods.devrf.losses import (
     DeformationTerm,
     total_variation_weight,
 )
-from devrf.methods.devrf.model import ColorField
-from devrf.rendering.output import ColorChange
+from devrf.methods.devrf.model import ColorResidualField
+from devrf.rendering.output import ColorResidual
 from devrf.scenes.scene import Views
 
 log = logging.getLogger(__name__)
@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 NAME = "color_residual"
 
 
-class ResidualField(ColorField, StoredShape):
+class ColorResidualGrid(ColorResidualField, StoredShape):
     """Residuals A_t (T, X, Y, Z, 3) over a box: c = sigmoid(decoder(f(q), d) + A_t(q)).
 
     Frame 0 is zero and never trained: the scene at rest looks as the canonical field says.
@@ -55,7 +55,7 @@ class ResidualField(ColorField, StoredShape):
         super().__init__(box, clock)
         self.register_buffer("values", torch.zeros(len(clock), *box.grid_shape(voxels), 3))
 
-    def at(self, time: float) -> ColorChange | None:
+    def at(self, time: float) -> ColorResidual | None:
         """q → A_t(q) at ``time`` in [0, 1], trilinear in space; None where it is zero."""
         moment = self.clock.at(time)
         if moment.after == 0:
@@ -71,7 +71,7 @@ class ResidualField(ColorField, StoredShape):
         self.values[frame] = self.values[source]
 
 
-class ColorResidual(Extension):
+class LearnColorResidual(Extension):
     """Learns residuals beside the displacements, from some level on."""
 
     def __init__(
@@ -148,7 +148,9 @@ class ColorResidual(Extension):
         self._first = min(first, len(context.settings.levels)) - 1
         model = context.model
         rate = self._learning_rate
-        model.color_residual = ResidualField(model.box, context.field.clock, voxels=self._side**3)
+        model.color_residual = ColorResidualGrid(
+            model.box, context.field.clock, voxels=self._side**3
+        )
         context.optimizer.add_param_group({"params": [], "lr": rate, "base_lr": rate, "name": NAME})
 
     def _decide(self, views: Views) -> tuple[int | None, bool]:
@@ -160,7 +162,7 @@ class ColorResidual(Extension):
         first = self._start if drifting else self._start_if_static
         how = "cannot be followed" if drift is None else f"drift by {100 * drift:.1f} %"
         learned = "not learned" if first is None else f"learned from level {first} on"
-        log.info("colours %s: their change is %s", how, learned)
+        log.info("colours %s: their residual is %s", how, learned)
         return first, drifting
 
     def frame_fields(self, context: DeformationContext, level: int) -> Mapping[str, FrameField]:
@@ -192,11 +194,11 @@ class ColorResidual(Extension):
         """At the first level that learns it, start a frame from the one visited before it."""
         field = context.model.color_residual
         before = phase.frame - phase.step
-        if isinstance(field, ResidualField) and phase.level == self._first:
+        if isinstance(field, ColorResidualGrid) and phase.level == self._first:
             if before < len(field.clock):  # backwards, the last frame is the first
                 field.copy(before, phase.frame)
 
-    def color_change(self, frame: ActiveFrame) -> ColorChange | None:
+    def color_residual(self, frame: ActiveFrame) -> ColorResidual | None:
         """q → A_t(q), as learned so far."""
         if NAME not in frame.further:
             return None
@@ -206,7 +208,7 @@ class ColorResidual(Extension):
 def squared_residual(prediction: DeformationPrediction) -> Tensor:
     """(1/R) Σ_i w_i |A_t(q_i)|²: colours stay as at rest; 0 without residuals."""
     output = prediction.output
-    if output.residual is None:
+    if output.color_residual is None:
         return output.color.new_zeros(())
-    large = (output.samples.weight.detach() * output.residual.square().sum(dim=1)).sum()
+    large = (output.samples.weight.detach() * output.color_residual.square().sum(dim=1)).sum()
     return large / len(prediction.batch.rays)
