@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import logging
+import struct
+import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import ExifTags, Image, ImageOps
 
+from devrf.errors import DevrfError
 from devrf.scenes.images import decode, image_size, load_images, read_header
+from devrf.scenes.masks import read_mask, white_in_files
 
 WIDE, HIGH = (24, 16), (16, 24)
 
@@ -25,7 +30,7 @@ def photo(path: Path, orientation: int, size=WIDE, seed: int = 0) -> Path:
 
 
 def pixels(path: Path, camera) -> np.ndarray:
-    return decode(path, read_header(path, camera), "RGB")
+    return decode(path, read_header(path, camera), "RGB")[:]
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -61,6 +66,41 @@ def test_a_set_is_of_one_size_once_it_is_turned(tmp_path, caplog):
     assert loaded.pixels.shape == (2, 24, 24, 3) and loaded.sizes == [WIDE, HIGH]
     assert np.array_equal(loaded.pixels[1, :, :16].numpy(), pixels(paths[1], None))
     assert not bool(loaded.pixels[0, 16:].any() | loaded.pixels[1, :, 16:].any())
+
+
+def peak_of(work: Callable[[], object]) -> int:
+    """Bytes that some work takes at most, but for those of decoded files."""
+    tracemalloc.start()
+    try:
+        work()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("mode", ["L", "RGB", "RGBA"])
+def test_of_a_large_image_few_rows_are_converted_at_a_time(tmp_path, mode):
+    path = tmp_path / "large.png"
+    Image.new(mode, (4000, 3000)).save(path)
+    assert peak_of(lambda: load_images([path], 30)) < 4e6
+    if mode == "L":  # as a mask it is kept whole, a byte a pixel
+        mask = read_mask(path, (4000, 3000), None, "an image", 1)
+        assert not mask.any() and peak_of(lambda: white_in_files([path])) < 30e6
+
+
+def test_a_tiff_of_a_small_image_in_large_tiles(tmp_path):
+    path = tmp_path / "small.tif"
+    for side in (256, 2**14):
+        # Pillow writes no tiles: tags of its own take their names.
+        Image.new("L", (64, 64)).save(path, tiffinfo={65322: side, 65323: side})
+        content = path.read_bytes()
+        for tag in (322, 323):
+            content = content.replace(struct.pack("<H", 65000 + tag), struct.pack("<H", tag))
+        path.write_bytes(content)
+        if side == 256:
+            assert image_size(path) == (64, 64)
+    with pytest.raises(DevrfError, match="its tiles are too large"):
+        read_header(path)
 
 
 def test_nearly_square_images_are_turned_too(tmp_path):

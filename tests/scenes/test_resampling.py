@@ -9,7 +9,13 @@ import torch
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Distortion
 from devrf.scenes.lens import Lens
-from devrf.scenes.resampling import as_pinhole, interpolate_pixels, shrink_pixels
+from devrf.scenes.resampling import (
+    Rows,
+    area_average,
+    as_pinhole,
+    interpolate_pixels,
+    shrink_pixels,
+)
 
 BARREL = Distortion((-0.2, 0.05, 0.0, 0.0), (0.004, -0.006))
 PINCUSHION = Distortion((0.15, 0.02, 0.01, 0.0), (-0.004, 0.003))
@@ -60,6 +66,22 @@ def test_half_of_an_image_by_alpha_and_each_channel_by_itself():
     assert shrink_pixels(image, 1, 1).tolist() == [[[200, 100, 50, 128]]]
     # Whatever is behind a zero alpha counts as much: (200 + 0) / 2, (100 + 255) / 2, 25, 127.5.
     assert shrink_pixels(image, 1, 1, alpha_weighted=False).tolist() == [[[100, 178, 25, 128]]]
+
+
+@pytest.mark.parametrize("size", [(499, 399), (250, 200), (151, 33), (1, 1)])
+def test_a_large_image_is_averaged_a_few_rows_at_a_time(size):
+    image = np.random.default_rng(0).integers(0, 256, (400, 500, 3), dtype=np.uint8)
+    expected = area_average(image.astype(np.float32), *size)
+    asked = []
+
+    def read(first: int, end: int) -> np.ndarray:
+        asked.append(end - first)
+        return image[first:end]
+
+    shrunk = shrink_pixels(Rows(image.shape, read), *size).astype(np.float32)
+    assert np.abs(shrunk - expected).max() < 0.501
+    assert sum(asked) == 400 and max(asked) < 50
+    assert np.array_equal(shrink_pixels(image, *size), shrunk)
 
 
 def test_a_lens_that_folds_is_an_error_that_names_the_image():

@@ -222,7 +222,7 @@ def pictures_in(folder: Path, views: Views) -> Callable[[int], Picture]:
         file = files[index]
         header = read_header(file)
         _check_size((header.width, header.height), views, index, file)
-        return decode(file, header, "RGBA")
+        return decode(file, header, "RGBA")[:]
 
     return picture
 

@@ -18,13 +18,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from PIL import ExifTags, Image
+from PIL.TiffImagePlugin import TILELENGTH, TILEWIDTH
 from torch import Tensor
 
 from devrf.scenes.files import decoding, entries
-from devrf.scenes.resampling import shrink_pixels
+from devrf.scenes.resampling import Pixels, Rows, bands, shrink_pixels
 from devrf.scenes.validation import check_memory, reduced_size, same_shape, scene_error
 
 log = logging.getLogger(__name__)
@@ -53,6 +53,8 @@ TURNS = {
 }
 # Turns that exchange width and height.
 QUARTER_TURNS = (5, 6, 7, 8)
+# The most pixels of a TIFF's tile, which is decoded whole, however small the image.
+LARGEST_TILE = 2**24
 
 Size = tuple[float, float]
 
@@ -88,7 +90,11 @@ def unread(folder: Path) -> str:
 def open_image(path: Path) -> Image.Image:
     """The image at ``path``, its header read, nothing decoded yet."""
     with decoding(path, "image", "replace the file, or make it smaller"):
-        return Image.open(path, formats=FORMATS)
+        image = Image.open(path, formats=FORMATS)
+        tags = getattr(image, "tag_v2", {})
+        if tags.get(TILEWIDTH, 0) * tags.get(TILELENGTH, 0) > LARGEST_TILE:
+            raise ValueError("its tiles are too large")
+        return image
 
 
 def read_header(path: Path, camera: Size | None = None) -> Header:
@@ -143,26 +149,28 @@ def image_size(path: Path, camera: Size | None = None) -> tuple[int, int]:
     return header.width, header.height
 
 
-def decode(path: Path, header: Header, mode: str) -> npt.NDArray[np.uint8]:
+def decode(path: Path, header: Header, mode: str) -> Rows:
     """The pixels (H, W, …) of a file whose header has been read, in Pillow's mode RGB or RGBA.
 
     DevrfError if it is damaged, or contradicts its header.
     """
     with open_image(path) as image, decoding(path, "image", "replace the file"):
-        converted: Image.Image = image.convert(mode)
-        if header.turn in TURNS:
-            converted = converted.transpose(TURNS[header.turn])
-        pixels = np.asarray(converted)
-        if pixels.shape[:2] != (header.height, header.width):
+        image.load()
+        turned = image.transpose(TURNS[header.turn]) if header.turn in TURNS else image
+        if turned.size != (header.width, header.height):
             raise ValueError("its size is not the one that its header claims")
-    return pixels
+
+    def read(first: int, end: int) -> Pixels:
+        return np.asarray(turned.crop((0, first, header.width, end)).convert(mode))
+
+    return Rows((header.height, header.width, len(mode)), read)
 
 
 # Bytes of the images that are decoded at one time, at 8 bytes a pixel each.
 _IN_FLIGHT = 2**30
 
 # (position in the set, RGBA) → RGBA.
-Finish = Callable[[int, npt.NDArray[np.uint8]], npt.NDArray[np.uint8]]
+Finish = Callable[[int, Rows], Rows]
 
 
 @dataclass(frozen=True)
@@ -249,9 +257,11 @@ def load_images(
         image = decode(paths[index], headers[index], "RGBA" if alpha else "RGB")
         image = image if finish is None else finish(index, image)
         columns, rows = sizes[index]
+        own = pixels[index, :rows, :columns]
         if sizes[index] != files[index]:
-            image = shrink_pixels(image, columns, rows, alpha_weighted=alpha_weighted)
-        pixels[index, :rows, :columns] = image
+            own[:] = shrink_pixels(image, columns, rows, alpha_weighted=alpha_weighted)
+        for band in bands(own) if sizes[index] == files[index] else ():
+            own[band] = image[band]
 
     in_threads(fill, range(len(paths)), raster_of(files))
     log.info("read %s from %s in %.1f s", what, paths[0].parent, time.perf_counter() - start)

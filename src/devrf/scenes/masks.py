@@ -26,7 +26,7 @@ from devrf.scenes.images import (
     read_header,
 )
 from devrf.scenes.lens import Lens
-from devrf.scenes.resampling import as_pinhole, shrink_pixels
+from devrf.scenes.resampling import Pixels, Rows, as_pinhole, bands, shrink_pixels
 from devrf.scenes.validation import check_memory, scene_error
 from devrf.system.options import abbreviated
 
@@ -101,18 +101,20 @@ def read_mask(
 def _grey(path: Path, header: Header) -> Grey:
     """The values (H, W) of a mask in its file."""
     pixels = decode(path, header, "RGBA")
-    colors = pixels[..., :3]
-    alpha = pixels[..., 3]
-    if int(alpha.min()) == WHITE:
-        if int(np.ptp(colors, axis=2).max()) > GREY_NOISE:
+    by_alpha = any(int(pixels[band][..., 3].min()) < WHITE for band in bands(pixels))
+    grey = np.empty(pixels.shape[:2], np.uint8)
+    for band in bands(pixels):
+        colors, alpha = np.split(pixels[band], [3], axis=2)
+        grey[band] = (alpha if by_alpha else colors)[..., 0]
+        if not by_alpha and int(np.ptp(colors, axis=2).max()) > GREY_NOISE:
             raise scene_error(path, "a mask with colours; give one channel, black and white")
-        return np.ascontiguousarray(pixels[..., 0])
-    # An alpha mask: its opaque pixels have one colour, or are as light as they are opaque.
-    opaque = colors[alpha > 0]
-    plain = len(opaque) == 0 or int(np.ptp(opaque, axis=0).max()) <= GREY_NOISE
-    if not plain and np.abs(colors - alpha[..., None].astype(np.int16)).max() > GREY_NOISE:
-        raise scene_error(path, "a mask whose colours and alpha channel differ; give one channel")
-    return np.ascontiguousarray(alpha)
+        # An alpha mask: its opaque pixels have one colour, or are as light as they are opaque.
+        opaque = colors[alpha[..., 0] > 0]
+        plain = len(opaque) == 0 or int(np.ptp(opaque, axis=0).max()) <= GREY_NOISE
+        if not plain and np.abs(colors - alpha.astype(np.int16)).max() > GREY_NOISE and by_alpha:
+            what = "a mask whose colours and alpha channel differ; give one channel"
+            raise scene_error(path, what)
+    return grey
 
 
 def cutting_out(
@@ -133,12 +135,16 @@ def cutting_out(
     white = white_in_files(masks)
     log.info("masks of %d images are their alpha masks", len(masks))
 
-    def finish(index: int, image: Grey) -> Grey:
+    def finish(index: int, image: Rows) -> Rows:
         height, width = image.shape[:2]
         mask = read_mask(masks[index], (width, height), cameras[index], names[index], white)
-        cut = image.copy()
-        cut[..., 3] = np.minimum(image[..., 3], mask)
-        return cut
+
+        def read(first: int, end: int) -> Pixels:
+            cut = image[first:end].copy()
+            cut[..., 3] = np.minimum(cut[..., 3], mask[first:end])
+            return cut
+
+        return Rows(image.shape, read)
 
     return finish
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 
 import cv2
@@ -17,6 +18,26 @@ from devrf.scenes.validation import scene_error
 
 Array = npt.NDArray[np.float32]
 Pixels = npt.NDArray[np.uint8]
+# Pixels of some rows: a whole photograph would take a gigabyte in floating point.
+_BAND = 2**14
+
+
+@dataclass(frozen=True)
+class Rows:
+    """An 8-bit image of a ``shape`` (H, W, C), whose rows ``image[a:b]`` are ``read(a, b)``."""
+
+    shape: tuple[int, ...]
+    read: Callable[[int, int], Pixels]
+
+    def __getitem__(self, rows: slice) -> Pixels:
+        return self.read(rows.start or 0, self.shape[0] if rows.stop is None else rows.stop)
+
+
+def bands(image: Rows | Pixels) -> Iterator[slice]:
+    """The rows of an image, a few at a time."""
+    rows, columns = image.shape[:2]
+    step = max(1, _BAND // columns)
+    return (slice(first, min(first + step, rows)) for first in range(0, rows, step))
 
 
 def area_average(image: Array, width: int, height: int) -> Array:
@@ -28,19 +49,27 @@ def area_average(image: Array, width: int, height: int) -> Array:
     return np.asarray(mean, dtype=np.float32).reshape(height, width, image.shape[2])
 
 
-def shrink_pixels(image: Pixels, width: int, height: int, *, alpha_weighted: bool = True) -> Pixels:
+def shrink_pixels(
+    image: Rows | Pixels, width: int, height: int, *, alpha_weighted: bool = True
+) -> Pixels:
     """An 8-bit image averaged over areas, colours ``alpha_weighted`` or each channel by itself.
 
     Images (H, W, 1, 3 or 4) are uint8, their alpha not premultiplied; weighted colours are black
     where alpha is 0.
     """
-
-    def averaged(values: Array) -> Array:
-        return area_average(values, width, height)
-
-    if alpha_weighted:
-        return _weighted_by_alpha(image, averaged)
-    return _rounded(averaged(image.astype(np.float32)))
+    rows, _, channels = image.shape
+    weighted = alpha_weighted and channels == 4
+    mean = np.zeros((height, width, channels), np.float32)
+    for band in bands(image):
+        across = area_average(_values(image[band], weighted), width, band.stop - band.start)
+        # The share of each row of the band in the cells that it lies in.
+        cells = slice(band.start * height // rows, -(-band.stop * height // rows))
+        edges = np.arange(cells.start, cells.stop + 1)[:, None] * (rows / height)
+        row = np.arange(band.start, band.stop)
+        share = (np.minimum(edges[1:], row + 1) - np.maximum(edges[:-1], row)).clip(min=0)
+        share = np.float32(share * (height / rows))
+        mean[cells] += np.tensordot(share, across, axes=1)
+    return _pixels(mean, weighted)
 
 
 def interpolate_pixels(image: Pixels, source: Array) -> Pixels:
@@ -53,29 +82,26 @@ def interpolate_pixels(image: Pixels, source: Array) -> Pixels:
     x = np.ascontiguousarray(source[..., 0] - np.float32(0.5))
     y = np.ascontiguousarray(source[..., 1] - np.float32(0.5))
 
-    def interpolated(values: Array) -> Array:
-        result = cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return np.asarray(result, dtype=np.float32).reshape(*x.shape, image.shape[2])
+    weighted = image.shape[2] == 4
+    result = cv2.remap(
+        _values(image, weighted), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    return _pixels(np.asarray(result, np.float32).reshape(*x.shape, image.shape[2]), weighted)
 
-    return _weighted_by_alpha(image, interpolated)
 
-
-def _weighted_by_alpha(image: Pixels, linear: Callable[[Array], Array]) -> Pixels:
-    """A linear filter of an 8-bit image, rounded."""
+def _values(image: Pixels, weighted: bool) -> Array:
+    """An 8-bit image as numbers, its colours times its alpha if they are ``weighted``."""
     values = image.astype(np.float32)
-    if image.shape[2] != 4:
-        filtered = linear(values)
-    else:
-        # Colours behind a zero alpha are arbitrary: premultiplied, they cannot bleed in.
+    if weighted:  # colours behind a zero alpha are arbitrary: premultiplied, they cannot bleed in
         values[..., :3] *= values[..., 3:]
-        filtered = linear(values)
-        color = filtered[..., :3]
-        alpha = filtered[..., 3:]
-        filtered[..., :3] = np.divide(color, alpha, out=np.zeros_like(color), where=alpha > 0)
-    return _rounded(filtered)
+    return values
 
 
-def _rounded(values: Array) -> Pixels:
+def _pixels(values: Array, weighted: bool) -> Pixels:
+    """The 8-bit image of filtered :func:`_values`, rounded."""
+    if weighted:
+        color, alpha = values[..., :3], values[..., 3:]
+        values[..., :3] = np.divide(color, alpha, out=np.zeros_like(color), where=alpha > 0)
     return (values + 0.5).clip(0, 255).astype(np.uint8)
 
 
