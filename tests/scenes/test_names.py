@@ -211,6 +211,16 @@ def test_a_list_of_one_image(tmp_path, balls, refusal):
     assert message == f"{root}/transforms.json: lists one image; add more, one of them to hold out"
 
 
+def test_an_image_that_is_listed_twice(scene_folder, refusal):
+    def repeat(content):
+        content["frames"] += [{**content["frames"][0], "file_path": "./train/../train/r_000.png"}]
+
+    file = scene_folder.static / "transforms_train.json"
+    scene_folder.edit(file, repeat)
+    said = "lists './train/../train/r_000.png' twice; list each image once"
+    assert refusal(BlenderReader, scene_folder.root) == f"{file}: {said}"
+
+
 def test_a_matrix_that_is_transposed(scene_folder, refusal):
     def transpose(content):
         for frame in content["frames"]:

@@ -19,6 +19,7 @@ from typing import Literal, TypeVar
 from devrf.scenes.files import entries, from_elsewhere, inside
 from devrf.scenes.images import SUFFIXES
 from devrf.scenes.validation import scene_error
+from devrf.system.options import abbreviated
 
 log = logging.getLogger(__name__)
 
@@ -139,7 +140,7 @@ def present_images(
         relative_to: the folder that names are relative to; None: the file's.
 
     Raises:
-        DevrfError: an image is absent and must not be, or all are.
+        DevrfError: an image is absent and must not be, or all are; or one is listed twice.
     """
     root = finder.root
     listed = [inside(root, relative_to or file.parent, name, file) for name in names]
@@ -153,6 +154,10 @@ def present_images(
             f"no such image (looked for {', '.join(SUFFIXES)}); {len(absent)} of the {len(names)} "
             f"images in {file.name} are absent: {add}{skip}",
         )
+    first = dict[Path, int]()
+    for k, image in present.items():
+        if first.setdefault(image, k) != k:  # each takes memory anew
+            raise scene_error(file, f"lists {abbreviated(names[k])} twice; list each image once")
     if absent:
         log.warning(
             "%s: %d of the %d images are absent and left out, %s the first of them",
