@@ -16,7 +16,7 @@ from pydantic import AfterValidator, BaseModel, Field, ValidationError
 
 from devrf.errors import DevrfError
 from devrf.scenes.validation import LARGEST, scene_error
-from devrf.system.files import LARGEST_RECORD, read_record, utf8_path
+from devrf.system.files import read_record, utf8_path
 from devrf.system.options import abbreviated, first_error
 from devrf.system.override import to_type
 from devrf.system.printed import is_shown
@@ -40,6 +40,7 @@ def _distinct(ids: list[str]) -> list[str]:
 
 # Images that a file may list: each takes a tenth of a millisecond to be found, or not.
 MOST_IMAGES = 50_000
+LARGEST_ROW = 17  # numbers of a camera in an array
 Ids = Annotated[
     list[Name], Field(fail_fast=True, max_length=MOST_IMAGES), AfterValidator(_distinct)
 ]
@@ -202,10 +203,10 @@ def read_numbers(path: Path, expected: str) -> Numbers:
     """
     existing_file(path, f"expected {expected}")
     with decoding(path, "npy file", "write it again"):
-        if path.stat().st_size > LARGEST_RECORD:
-            raise ValueError("more than the cameras of a capture")
         # Mapped: an array that is larger than its file is refused before it takes memory.
         values: npt.NDArray[Any] = np.lib.format.open_memmap(path, mode="r")
+        if values.size > LARGEST_ROW * MOST_IMAGES:
+            raise ValueError("more than the cameras of a capture")
     if values.dtype.kind not in "fiu":
         raise scene_error(path, f"holds values of type {values.dtype}, expected {expected}")
     # NaN compares false.
