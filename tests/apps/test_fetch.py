@@ -167,6 +167,18 @@ def test_an_archive_that_expands_beyond_what_scenes_do_is_not_unpacked(tmp_path)
         assert [path.name for path in tmp_path.iterdir()] == ["files"]
 
 
+def test_an_archive_that_lists_any_number_of_files_is_not_opened(tmp_path):
+    archive = written(tmp_path, {"a": b""})
+    content = archive.read_bytes()
+    at, end = content.find(b"PK\1\2"), content.find(b"PK\5\6")
+    times = 2**26 // (end - at) + 1
+    sizes = (times * (end - at)).to_bytes(4, "little")
+    whole = content[:at] + content[at:end] * times + content[end : end + 12] + sizes
+    archive.write_bytes(whole + content[end + 16 :])
+    with pytest.raises(DevrfError, match="it lists too many files"):
+        _unpacked(lego(), tmp_path)
+
+
 def test_an_archive_of_folders_in_one_another_is_refused(tmp_path):
     written(tmp_path, {f"lego/{'a/' * count}f": b"" for count in (800, 1600)})
     with pytest.raises(DevrfError, match=r"archive: cannot be unpacked \(more than 64 folders in"):
@@ -177,7 +189,7 @@ def test_an_archive_of_folders_in_one_another_is_refused(tmp_path):
 def trickle() -> Iterator[str]:
     """The address of a server that sends a part at once, then a byte now and then, for a minute.
 
-    ``/moved`` leads elsewhere, ``/busy`` asks to be asked later.
+    ``/moved`` leads elsewhere, ``/busy`` asks to be asked later, ``/slow`` sends headers alone.
     """
 
     class Handler(BaseHTTPRequestHandler):
@@ -187,11 +199,14 @@ def trickle() -> Iterator[str]:
                 "/moved": (302, "Location", "/there"),
                 "/busy": (503, "Retry-After", "30"),
             }.get(self.path, (200, "Server", ""))
+            if self.path == "/slow":
+                self.wfile.write(b"HTTP/1.0 200 OK\r\n")
             self.send_response(code)
             self.send_header(header, said)
-            self.end_headers()
+            if self.path != "/slow":
+                self.end_headers()
             with suppress(OSError):
-                self.wfile.write(bytes(2000))
+                self.wfile.write(bytes(2000) if self.path != "/slow" else b"X: ")
                 for _ in range(1200):
                     self.wfile.write(b"x")
                     time.sleep(0.05)
@@ -212,6 +227,7 @@ def trickle() -> Iterator[str]:
         ("lego.zip", {"LONGEST": 0.4}, "it comes too slowly"),
         ("lego.zip", {"LARGEST": 1000}, "more than 1.0 kB came"),
         ("moved", {"LONGEST": 0.4}, "it comes too slowly"),
+        ("slow", {"PATIENCE": 0.2}, "it comes too slowly"),
         ("busy", {}, "503 .*"),
     ],
 )

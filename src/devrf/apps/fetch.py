@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import logging
 import os
 import shutil
@@ -11,6 +12,7 @@ import tomllib
 import zipfile
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -61,7 +63,7 @@ LARGEST = 2**34
 LARGEST_CATALOGUE = 2**20
 # Points in a line of a catalogue: time and memory for a name grow with the square of its parts.
 MOST_POINTS = 100
-# Seconds that a scene may take, and that a server may say nothing.
+# Seconds that a scene may take, and that a server may say nothing; five times, nothing of a file.
 LONGEST = 6 * 3600
 PATIENCE = 60
 # The file by which a scene's folder is known, by the layout that reads it.
@@ -226,36 +228,48 @@ def _download(scene: PublishedScene, folder: Path, progress: bool) -> dict[str, 
     import urllib3
 
     files = {name: folder / name for name in scene.downloads}
-    left, until = LARGEST, time.monotonic() + LONGEST
-    console = Console(stderr=True)
-    with requests.Session() as session, Progress(console=console, disable=not progress) as bar:
+    left, heard, until = LARGEST, 0.0, time.monotonic() + LONGEST
+    bar = Progress(console=Console(stderr=True), disable=not progress)
+
+    def take(name: str, url: str) -> None:
+        nonlocal left, heard
+        with (
+            session.get(url, stream=True, timeout=PATIENCE) as answer,
+            atomic_write(files[name]) as begun,
+            begun.open("wb") as file,
+        ):
+            answer.raise_for_status()
+            size = int(answer.headers.get("Content-Length", 0)) or None
+            task = bar.add_task(name, total=size, visible=scene.is_archive)
+            while part := answer.raw.read1(2**20):  # what has come, be it a byte
+                heard = time.monotonic()
+                left -= len(part)
+                if left < 0:
+                    raise ValueError(f"more than {decimal(LARGEST)} came")
+                file.write(part)
+                bar.advance(task, len(part))
+
+    # A thread may be left alone: a server may send headers without end.
+    with requests.Session() as session, bar, ThreadPool(1) as thread:
         # A server may ask for any wait, and send any amount with a redirection, which is read.
         retries = urllib3.Retry(2, respect_retry_after_header=False)
         for scheme in ("http://", "https://"):
             session.mount(scheme, requests.adapters.HTTPAdapter(max_retries=retries))
-        session.hooks["response"].append(_close_redirection)
+        session.hooks["response"].append(lambda a, **_: a.close() if a.is_redirect else None)
         # Some servers refuse the name that Python gives itself.
         session.headers.update({"User-Agent": "devrf", "Accept-Encoding": "identity"})
         for name, url in bar.track(scene.downloads.items(), description=scene.name):
             if files[name].is_file():
                 continue
             try:
-                with (
-                    session.get(url, stream=True, timeout=PATIENCE) as answer,
-                    atomic_write(files[name]) as partial,
-                    partial.open("wb") as file,
-                ):
-                    answer.raise_for_status()
-                    size = int(answer.headers.get("Content-Length", 0)) or None
-                    task = bar.add_task(name, total=size, visible=scene.is_archive)
-                    while part := answer.raw.read1(2**20):  # what has come, be it a byte
-                        left -= len(part)
-                        if left < 0:
-                            raise ValueError(f"more than {decimal(LARGEST)} came")
-                        if time.monotonic() > until:
-                            raise TimeoutError("it comes too slowly")
-                        file.write(part)
-                        bar.advance(task, len(part))
+                heard = time.monotonic()
+                taken = thread.apply_async(take, (name, url))
+                while not taken.ready():
+                    taken.wait(0.2)
+                    if time.monotonic() > min(until, heard + 5 * PATIENCE):
+                        left = 0  # ends the thread, if anything comes
+                        raise TimeoutError("it comes too slowly")
+                taken.get()
             except (OSError, ValueError, urllib3.exceptions.HTTPError) as error:
                 if getattr(error, "errno", None) is not None:  # the disk's
                     raise
@@ -264,12 +278,6 @@ def _download(scene: PublishedScene, folder: Path, progress: bool) -> dict[str, 
                     f"its page {scene.collection.page} names no other address"
                 ) from None
     return files
-
-
-def _close_redirection(answer: Any, **_: object) -> None:
-    """Let nothing be read of an answer that only leads elsewhere."""
-    if answer.is_redirect:
-        answer.close()
 
 
 def _digest(files: dict[str, Path]) -> str:
@@ -284,6 +292,15 @@ def _digest(files: dict[str, Path]) -> str:
     return hashlib.sha256(lines.encode()).hexdigest()
 
 
+class _Archive(io.FileIO):
+    """An archive, the list of whose files is read at once, and takes ten times more in memory."""
+
+    def read(self, size: int | None = -1, /) -> Any:  # noqa: D102
+        if size is not None and size > SMALL:
+            raise ValueError("it lists too many files")
+        return super().read(size)
+
+
 def _unpacked(scene: PublishedScene, work: Path) -> Path:
     """The folder of the archive that holds the scene's marker, without the folders around it.
 
@@ -295,7 +312,7 @@ def _unpacked(scene: PublishedScene, work: Path) -> Path:
     unpacked = work / "unpacked"
     shutil.rmtree(unpacked, ignore_errors=True)
     try:
-        with zipfile.ZipFile(archive) as packed:
+        with _Archive(archive) as file, zipfile.ZipFile(file) as packed:
             if any(name.count("/") > DEEPEST for name in packed.namelist()):
                 raise ValueError(f"more than {DEEPEST} folders in one another")
             # A file takes 4 kB of a disk at least, and so does each folder that it may be the first
