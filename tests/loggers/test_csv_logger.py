@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from devrf.errors import DevrfError
 from devrf.loggers import csv_logger as module
 from devrf.loggers.csv_logger import ResumableCSVLogger
 
@@ -58,6 +59,16 @@ def test_a_line_that_was_cut_off_is_no_row(path):
     path.write_text(whole[:-3])  # the last row's step, 20, has become 2
     again(path).log_metrics({"dynamic/loss": 2.0, "dynamic/flow": 0.5}, 20)
     assert path.read_text().split() == whole.split()
+
+
+@pytest.mark.parametrize(
+    "damage",
+    ["step,loss\n1\n", "step\n1,2\n", f"step{',' * 10**6}\n" + "1\n" * 10**5, "step\n" * 2**21],
+)
+def test_a_table_without_all_cells_or_of_too_many_rows_is_damaged(path, damage):
+    path.write_text(damage)
+    with pytest.raises(DevrfError, match="metrics.csv: damaged; remove it"):
+        again(path)
 
 
 def test_on_a_full_disk_rows_wait(path, monkeypatch, caplog):

@@ -19,8 +19,9 @@ from devrf.system.files import atomic_write, read_record
 
 log = logging.getLogger(__name__)
 
-# Bytes of a table at most.
+# Bytes of a table at most, and its rows, of which each takes some hundred in memory.
 LARGEST = 2**26
+MOST_ROWS = 2**20
 
 
 class ResumableCSVLogger(CSVLogger):
@@ -43,11 +44,14 @@ class ResumableCSVLogger(CSVLogger):
         self.path = Path(self.log_dir) / "metrics.csv"
         try:
             text = read_record(self.path, LARGEST).decode() if self.path.is_file() else ""
-            reader = csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1]))
-            self._columns = list(reader.fieldnames or [])
-            self._rows = [{key: cell for key, cell in row.items() if cell} for row in reader]
-            if any(None in row or math.isnan(float(row.get("step", 0))) for row in self._rows):
-                raise ValueError("cells of no column, or of no step")
+            rows = csv.reader(io.StringIO(text[: text.rfind("\n") + 1]))
+            self._columns = next(rows, [])
+            if text.count("\n") > MOST_ROWS:
+                raise ValueError("too many rows")
+            pairs = (zip(self._columns, row, strict=True) for row in rows if row)
+            self._rows = [{key: cell for key, cell in row if cell} for row in pairs]
+            if any(math.isnan(float(row.get("step", 0))) for row in self._rows):
+                raise ValueError("cells of no step")
         except (ValueError, csv.Error):
             raise DevrfError(f"{self.path}: damaged; remove it, and curves begin anew") from None
         # Rows in the file; None: it has to be written anew.

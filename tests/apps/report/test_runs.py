@@ -154,5 +154,9 @@ def test_curves_are_over_the_dynamic_images_views_of_a_time_averaged(ran, caplog
     ]
     (folder / "frames.csv").write_text(f"capture,time,psnr{',a' * 100_000}\ndynamic,0,3\n")
     assert metric_over_time(folder, "psnr").to_dict() == {0.0: 3.0}  # in pandas it takes minutes
+    (folder / "frames.csv").write_text(
+        f"capture,time,psnr{',' * 10**6}\n" + "dynamic,0,3\n" * 10**4
+    )
+    assert metric_over_time(folder, "psnr").to_dict() == {0.0: 3.0}  # not rows times columns
     (folder / "frames.csv").write_text(f"capture,time,psnr\ndynamic,0,{10**400}\n")
     assert metric_over_time(folder, "psnr").empty and metric_over_time(ran("b"), "psnr").empty

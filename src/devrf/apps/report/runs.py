@@ -131,8 +131,10 @@ def metric_over_time(path: Path, metric: str) -> pd.Series:
     curve = pd.DataFrame({"time": [], metric: []})
     try:
         if file.is_file():  # a pipe would be waited for
-            # pandas would take hours for many columns of one name.
-            rows = csv.DictReader(read_record(file).decode().splitlines())
+            # pandas would take hours for many columns of one name, DictReader for absent cells.
+            table = csv.reader(read_record(file).decode().splitlines())
+            columns = next(table, [])
+            rows = (dict(zip(columns, row, strict=False)) for row in table)
             pairs = [(r["time"], r[metric]) for r in rows if r["capture"] == "dynamic"]
             known = [(float(time), float(value)) for time, value in pairs if value]
             curve = pd.DataFrame(known, columns=["time", metric])
