@@ -12,6 +12,7 @@ import logging
 import re
 import sys
 import threading
+import time
 from functools import cache, partial
 from http import HTTPStatus
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -101,7 +102,14 @@ class PageServer:
 
 
 class _Server(ThreadingHTTPServer):
-    request_queue_size = 64
+    request_queue_size = 64  # clients that wait, and that are answered, at one time
+
+    def verify_request(self, request: Any, client_address: Any) -> bool:
+        """Whether a client is answered, once others are: each may send megabytes of headers."""
+        until = time.monotonic() + PATIENCE
+        while threading.active_count() > self.request_queue_size and time.monotonic() < until:
+            time.sleep(0.05)
+        return threading.active_count() <= self.request_queue_size
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Say nothing of a client that has gone away, or is too slow."""
