@@ -103,6 +103,16 @@ def test_a_tiff_of_a_small_image_in_large_tiles(tmp_path):
         read_header(path)
 
 
+def test_a_jpeg_of_any_number_of_scans(tmp_path):
+    path = tmp_path / "a.jpg"
+    Image.new("RGB", (64, 64)).save(path, progressive=True)
+    content = path.read_bytes()
+    assert image_size(path) == (64, 64)
+    path.write_bytes(content[:-2] + content[content.rfind(b"\xff\xda") : -2] * 100 + content[-2:])
+    with pytest.raises(DevrfError, match="more than 100 scans"):
+        read_header(path)
+
+
 def test_nearly_square_images_are_turned_too(tmp_path):
     path = photo(tmp_path / "a.jpg", 6, (50, 48))
     assert image_size(path, (48, 50)) == (48, 50)

@@ -55,6 +55,8 @@ TURNS = {
 QUARTER_TURNS = (5, 6, 7, 8)
 # The most pixels of a TIFF's tile, which is decoded whole, however small the image.
 LARGEST_TILE = 2**24
+# The most scans of a progressive JPEG, each of which goes through all its pixels; usual are 10.
+MOST_SCANS = 100
 
 Size = tuple[float, float]
 
@@ -94,6 +96,8 @@ def open_image(path: Path) -> Image.Image:
         tags = getattr(image, "tag_v2", {})
         if tags.get(TILEWIDTH, 0) * tags.get(TILELENGTH, 0) > LARGEST_TILE:
             raise ValueError("its tiles are too large")
+        if "progressive" in image.info and path.read_bytes().count(b"\xff\xda") > MOST_SCANS:
+            raise ValueError(f"more than {MOST_SCANS} scans")
         return image
 
 
