@@ -69,6 +69,11 @@ def test_wrong_arrays_are_named(tmp_path):
         read_flow_file(path, width=6, height=4)
 
 
+def test_flow_of_an_image_larger_than_a_films_is_not_read(tmp_path):
+    with pytest.raises(DevrfError, match="flow of 13000x13000 px, expected 8192x4320 at most"):
+        read_flow_file(tmp_path / "a.npz", width=13_000, height=13_000)
+
+
 def test_packed_arrays_larger_than_an_image_are_not_unpacked(tmp_path):
     path = tmp_path / "001_bwd.npz"
     with (

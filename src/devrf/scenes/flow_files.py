@@ -31,6 +31,8 @@ REMEDY = "compute the flow again, or set data.flow=none"
 FlowDirection = Literal["bwd", "fwd"]
 # Bytes a pixel of vectors and mask once they are read.
 _BYTES = 9
+# Pixels of an image with flow: of frames of 8K films. Each takes 25 bytes while flow is read.
+_LARGEST = 8192 * 4320
 # Bytes of the widest numbers, and of the header of an array.
 _WIDEST = 16
 _HEADER = 2**16
@@ -50,6 +52,10 @@ def read_flow_file(
     Raises:
         DevrfError: not an npz, an array is missing, or an array is of another size.
     """
+    if width * height > _LARGEST:
+        raise scene_error(
+            path, f"flow of {width}x{height} px, expected 8192x4320 at most; {REMEDY}"
+        )
     shapes = {"flow": (height, width, 2), "mask": (height, width)}
     arrays = _arrays(path, shapes, REMEDY)
     for name, shape in shapes.items():
