@@ -285,6 +285,9 @@ def test_a_torchvision_for_another_torch_is_one_line(python, tmp_path, monkeypat
     assert done.status == 2 and done.err.count("\n") == 1
     assert done.err.startswith("devrf: torchvision cannot be imported (operator torchvision::nms ")
     assert "run pip uninstall torchvision" in done.err
+    # A misspelt key is named before torch and Lightning are loaded.
+    done = python(tmp_path, "-m", "devrf", "data.widht=3", *run)
+    assert done.err == "devrf: data.widht: no such key; did you mean data.width?\n"
 
 
 def test_a_fault_of_the_program_keeps_its_traceback(devrf, monkeypatch):

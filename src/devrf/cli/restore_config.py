@@ -201,13 +201,12 @@ def of_named_run(typed: Sequence[Override], multirun: bool) -> Applied:
         return Applied([] if sweep is None else [f"report.runs={literal(sweep)}"])
     if not checkpoints and (folder is None or multirun):
         return Applied()
-    with importing():  # it loads torch
-        from devrf.checkpoints.checkpoint import metadata_of
-
     if not checkpoints and (last := latest_checkpoint(Path(str(folder)))):
         checkpoints = [last]
     if not checkpoints or not all(path.is_file() for path in checkpoints):
         return Applied()  # a file that is missing is reported by the step that loads it
+    with importing():  # it loads torch
+        from devrf.checkpoints.checkpoint import metadata_of
     commands = [metadata_of(path).command for path in checkpoints]
     first, *others = map(taken, checkpoints, commands, repeat(typed))
     shared = {k: v for k, v in first.items() if all(other.get(k, ...) == v for other in others)}
