@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
-import pandas as pd
 import torch
 from lightning import Callback, LightningModule, Trainer
 from matplotlib.figure import Figure
@@ -121,6 +120,8 @@ def write_training_curve(
     ``validated`` are the same of a held-out view; at iterations of ``grids`` the grid took that
     size. ``frames`` is the training PSNR of frames 1, 2, … in their last visit: a second plot.
     """
+    import pandas as pd  # slow: commands that draw no curve do without it
+
     panels = 2 if frames else 1
     figure = Figure(figsize=(8.0, 4.2 * panels), dpi=120, layout="constrained")
     axes = figure.subplots(panels, squeeze=False)[0, 0]
