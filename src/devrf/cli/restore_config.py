@@ -13,6 +13,7 @@ import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from itertools import repeat
 from pathlib import Path
 from typing import Any
@@ -161,7 +162,13 @@ def parsed(overrides: Iterable[str]) -> list[Override]:
     """
     words = list(overrides)
     _check_length("the command", words)
-    return list(OverridesParser.create().parse_overrides(words))
+    return [_parsed_word(word) for word in words]
+
+
+@lru_cache(MOST)  # a command's words are read in several places
+def _parsed_word(word: str) -> Override:
+    (override,) = OverridesParser.create().parse_overrides([word])
+    return override
 
 
 def _check_length(where: object, words: Iterable[object]) -> None:
