@@ -45,8 +45,9 @@ def stored_class(path: object, kind: type[Kind]) -> type[Kind]:
         LookupError: there is none of that path.
     """
     module = str(path).rpartition(".")[0]
-    plugins = {point.module for point in entry_points(group=METHODS)}
-    if module.startswith(f"{METHODS}.") or module in plugins:
+    ours = module.startswith(f"{METHODS}.")
+    # Which packages are installed takes a while to find out.
+    if ours or module in {point.module for point in entry_points(group=METHODS)}:
         with suppress(ImportError, ValueError, RecursionError):  # of a module in a thousand others
             import_module(module)
     known = _known.get(str(path))
