@@ -114,13 +114,6 @@ def learning(tiny, often):
     return words
 
 
-@pytest.fixture(scope="module")
-def commands(warm_with, modules):
-    """Commands, in processes of their own that find the module."""
-    with warm_with(modules) as warm:
-        yield warm
-
-
 def by_torchrun(folder, modules, *arguments):
     """Run the command on two nodes of torchrun, here; how each ended."""
     with socket.socket() as free:
@@ -147,7 +140,7 @@ def by_torchrun(folder, modules, *arguments):
 
 
 @pytest.fixture(scope="module")
-def pair(commands, learning, modules, tmp_path_factory):
+def pair(warm, learning, modules, tmp_path_factory):
     """The folder of a run that two processes of a command begin, and how it was interrupted.
 
     Two nodes of torchrun go on with it; how that went.
@@ -155,7 +148,7 @@ def pair(commands, learning, modules, tmp_path_factory):
     folder = tmp_path_factory.mktemp("pair")
     arguments = learning(folder)
     stop = ("trainer.devices=2", "stage=canonical", "+callbacks.stop._target_=witnesses.Stop")
-    interrupted = commands(folder, *arguments, *stop)
+    interrupted = warm(folder, *arguments, *stop, path=str(modules))
     assert (folder / "run" / "checkpoints" / "canonical-progress-3.ckpt").is_file(), interrupted.out
     return folder, interrupted, by_torchrun(folder, modules, *arguments)
 
@@ -220,19 +213,21 @@ def test_one_process_records(pair):
         (True, "trainer.devices: the process of rank 1 ended by SIGKILL; was"),
     ],
 )
-def test_a_failure_of_one_process_ends_both_with_its_line(commands, tiny, tmp_path, killed, line):
+def test_a_failure_of_one_process_ends_both_with_its_line(
+    warm, modules, tiny, tmp_path, killed, line
+):
     arguments = (*(word for word in tiny if word != "trainer=cpu"), *TWO, "stage=canonical")
     # A folder that is another whenever the command line is composed.
     arguments += ("hydra.run.dir=${now:%f}",)
-    own = {}
+    own = {"path": str(modules)}
     if killed:
         (tmp_path / "devrf").mkdir()
         (tmp_path / "devrf" / "__init__.py").touch()
         (tmp_path / "devrf" / "__main__.py").write_text(KILLED)
-        own["environment"] = {"PYTHONPATH": str(tmp_path)}
+        own["path"] = str(tmp_path)
     else:
         arguments += ("+callbacks.trip._target_=witnesses.Trip",)
-    outcome = commands(tmp_path, *arguments, **own)
+    outcome = warm(tmp_path, *arguments, **own)
     assert outcome.status == 2 and "Traceback" not in outcome.out
     lines = [said for said in outcome.out.splitlines() if said.startswith("devrf: ")]
     (said,) = (said for said in lines if "interrupted" not in said)
@@ -240,10 +235,10 @@ def test_a_failure_of_one_process_ends_both_with_its_line(commands, tiny, tmp_pa
 
 
 def test_a_sweeps_job_learns_in_processes_of_its_own_what_others_learn(
-    pair, commands, learning, tmp_path
+    pair, warm, learning, modules, tmp_path
 ):
     arguments = (*learning(tmp_path), "trainer.devices=2", "stage=canonical")
-    outcome = commands(tmp_path, "-m", *arguments, "hydra.sweep.dir=sweep")
+    outcome = warm(tmp_path, "-m", *arguments, "hydra.sweep.dir=sweep", path=str(modules))
     assert outcome.status == 0, outcome.out
     assert (tmp_path / "sweep" / "0_robot" / "checkpoints" / "canonical.ckpt").is_file()
     # Without a break, and without torchrun's nodes.
@@ -265,7 +260,7 @@ def test_where_none_can_be_started_a_line_says_so(tmp_path):
             run_in_each(trainer.strategy, tmp_path)
 
 
-def test_tasks_of_slurm_without_a_common_folder_end_with_a_line_each(commands, tiny, tmp_path):
+def test_tasks_of_slurm_without_a_common_folder_end_with_a_line_each(warm, tiny, tmp_path):
     # What srun sets in the tasks of two nodes.
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -277,7 +272,7 @@ def test_tasks_of_slurm_without_a_common_folder_end_with_a_line_each(commands, t
     command = (*(word for word in tiny if word != "trainer=cpu"), "trainer=ddp")
     command += ("trainer.accelerator=cpu", "trainer.devices=1", "trainer.num_nodes=2")
     folders = [tmp_path / "first", tmp_path / "second"]
-    ended = commands.together(folders, *command, "hydra.run.dir=run", environment=tasks)
+    ended = warm.together(folders, *command, "hydra.run.dir=run", environment=tasks)
     for folder, outcome in zip(folders, ended, strict=True):
         assert outcome.status == 2 and outcome.err.count("\n") == 1
         assert outcome.err.startswith(f"devrf: {folder / 'run'}: not there on every node; give")

@@ -14,6 +14,7 @@ the signal that ended it. The keys, all but the first two optional:
 * ``hangs``: the stage ``prepare`` makes a file ``begun`` in the run's folder and goes on for longer
   than any test.
 * ``environment``: variables to set.
+* ``path``: a folder in which it, and processes that it starts, find modules.
 * ``begins``: the answer, at once, is the number of the process, for which ``{"wait": NUMBER}``
   waits, and which ``{"end": NUMBER}`` kills.
 * ``complaints``: the file for what is said on stderr, instead of ``said.txt``.
@@ -103,6 +104,9 @@ def run(asked: dict[str, Any]) -> int:
         with open(file, "a") as said:
             os.dup2(said.fileno(), descriptor)
     os.environ.update(asked.get("environment", {}))
+    if "path" in asked:
+        sys.path.insert(0, asked["path"])
+        os.environ["PYTHONPATH"] = os.pathsep.join([asked["path"], os.environ["PYTHONPATH"]])
     if "most_bytes" in asked:
         resource.setrlimit(resource.RLIMIT_FSIZE, (asked["most_bytes"],) * 2)
     if "most_memory" in asked:
