@@ -36,7 +36,7 @@ FORWARD = {"forward", "neural_3d_video", "pig_toy", "plant", "rabbit", "procedur
 
 # Options of these groups go together: a config with one of each.
 TOGETHER = ("schedule", "facing", "video", "trainer")
-COLUMNS = [cycle(f"{group}={name}" for name in NAMES[group]) for group in TOGETHER]
+COLUMNS = [cycle([f"{group}={name}" for name in NAMES[group]]) for group in TOGETHER]
 ROWS = [" ".join(map(next, COLUMNS)) for _ in range(max(len(NAMES[group]) for group in TOGETHER))]
 # Other tests compose these, or a choice in another group does.
 OTHERS = ("data", "method", "comparison", "protocol", "profile", "for_scene")
