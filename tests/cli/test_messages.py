@@ -213,31 +213,26 @@ def test_jobs_of_slurm_where_there_is_none(devrf, tmp_path, tiny, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def unread(python, folder, *arguments):
-    """What a command came to whose output nobody reads."""
-    script = (
-        "import os, subprocess, sys\n"
-        "read, write = os.pipe()\n"
-        "os.close(read)\n"
-        f"command = [sys.executable, '-m', 'devrf', *{arguments}]\n"
-        "sys.exit(subprocess.run(command, stdout=write).returncode)\n"
-    )
-    return python(folder, "-c", script)
-
-
 # Python writes what is buffered as it ends; empty is as not set.
 @pytest.mark.parametrize(("argument", "unbuffered"), [("--help", ""), ("--version", "1")])
 def test_output_that_nobody_reads_ends_it_quietly(
     python, tmp_path, monkeypatch, argument, unbuffered
 ):
     monkeypatch.setenv("PYTHONUNBUFFERED", unbuffered)
-    done = unread(python, tmp_path, argument)
+    script = (
+        "import os, subprocess, sys\n"
+        "read, write = os.pipe()\n"
+        "os.close(read)\n"
+        f"command = [sys.executable, '-m', 'devrf', '{argument}']\n"
+        "sys.exit(subprocess.run(command, stdout=write).returncode)\n"
+    )
+    done = python(tmp_path, "-c", script)
     assert (done.status, done.err) == (128 + signal.SIGPIPE, "")
 
 
-def test_a_stage_whose_log_nobody_reads_goes_on(python, tmp_path, tiny_data):
-    done = unread(python, tmp_path, *tiny_data, "stage=inspect", "hydra.run.dir=run")
-    assert done.err == "" and (tmp_path / "run" / "images" / "inspect.png").is_file()
+def test_a_stage_whose_log_nobody_reads_goes_on(warm, tmp_path, tiny_data):
+    done = warm(tmp_path, *tiny_data, "stage=inspect", "hydra.run.dir=run", unread=True)
+    assert done.out == "" and (tmp_path / "run" / "images" / "inspect.png").is_file()
 
 
 def test_names_with_other_letters_where_the_locale_has_but_ascii(

@@ -17,6 +17,7 @@ the signal that ended it. The keys, all but the first two optional:
 * ``path``: a folder in which it, and processes that it starts, find modules.
 * ``begins``: the answer, at once, is the number of the process, for which ``{"wait": NUMBER}``
   waits, and which ``{"end": NUMBER}`` kills.
+* ``unread``: nobody reads what is said on stdout.
 * ``complaints``: the file for what is said on stderr, instead of ``said.txt``.
 """
 
@@ -103,6 +104,10 @@ def run(asked: dict[str, Any]) -> int:
     for file, descriptor in (("said.txt", 1), (asked.get("complaints", "said.txt"), 2)):
         with open(file, "a") as said:
             os.dup2(said.fileno(), descriptor)
+    if "unread" in asked:
+        read, write = os.pipe()
+        os.close(read)
+        os.dup2(write, 1)
     os.environ.update(asked.get("environment", {}))
     if "path" in asked:
         sys.path.insert(0, asked["path"])
