@@ -25,7 +25,7 @@ from devrf.cli.config import config_folder, in_sweep, overrides
 from devrf.cli.messages import report_user_errors
 from devrf.cli.restore_config import parsed
 from devrf.cli.run_folder import working_in
-from devrf.cli.sweep import naming_failures, record_failure
+from devrf.cli.sweep import compare_runs, naming_failures, record_failure
 from devrf.cli.view import serve_page, serves_page
 from devrf.errors import expect
 from devrf.system.files import utf8_path
@@ -86,6 +86,9 @@ def run(config: DictConfig) -> float | None:
             log.info("%s", line)
         if serves_page(parsed(overrides()), folder):
             serve_page(config, folder)
+            return None
+        if config.stage == "report" and config.ckpt is None:  # which is refused below
+            compare_runs(config)
             return None
         chosen = f"{folder}, which hydra.run.dir=FOLDER chooses"
         expect(config.output_dir == str(folder), "output_dir", chosen, config.output_dir)

@@ -21,6 +21,7 @@ from devrf.cli.complete import completed
 from devrf.cli.config import command_line
 from devrf.cli.context import RunContext
 from devrf.cli.memory import forecast, table_of_needs
+from devrf.cli.sweep import compare_runs
 from devrf.data.rendered import ProceduralDataModule
 from devrf.engine.ddp import ManualDDP
 from devrf.engine.needs import SIZE
@@ -119,11 +120,8 @@ def inspect(run: RunContext) -> Advice | None:
 
 
 def report(run: RunContext) -> None:
-    """``stage=report``: tables and plots of the runs below ``report.runs``; needs no scene."""
-    # pandas and matplotlib are slow to import.
-    from devrf.apps.report.write import write_report
-
-    log.info("%s", write_report(instantiate(run.config.report)))
+    """Compare runs, from Python; on the command line this begins before torch has loaded."""
+    compare_runs(run.config)
 
 
 def selfcheck(run: RunContext) -> None:

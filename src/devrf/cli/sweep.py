@@ -14,9 +14,10 @@ from typing import Any
 
 from hydra.experimental.callback import Callback
 from hydra.utils import instantiate
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from devrf.cli.config import SWEEP_RECORD, choices, overrides, scene_name
+from devrf.cli.config_check import ROOT, check_config
 from devrf.cli.messages import is_user_error, one_line
 from devrf.cli.run_folder import FAILURE, FolderLock
 from devrf.errors import DevrfError
@@ -89,6 +90,19 @@ def naming_failures() -> Iterator[None]:
                 raise SystemExit(JOBS_FAILED)
     if problem is not None:
         raise problem
+
+
+def compare_runs(config: DictConfig) -> None:
+    """``stage=report``: tables and plots of the runs below ``report.runs``; needs no scene.
+
+    Raises:
+        DevrfError: a setting of the report is wrong, or there are no runs.
+    """
+    # pandas and matplotlib are slow to import.
+    from devrf.apps.report.write import write_report
+
+    check_config(OmegaConf.masked_copy(config, [*ROOT, "report"]))
+    log.info("%s", write_report(instantiate(config.report)))
 
 
 class SweepReport(Callback):
