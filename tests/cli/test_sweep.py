@@ -108,14 +108,13 @@ def test_a_plugin_that_is_missing_is_named_with_the_remedy(devrf, tmp_path, tiny
 
 @installed("hydra_joblib_launcher")
 def test_jobs_in_processes_of_their_own(warm, tmp_path, tiny):
-    joblib = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "data.frames=3,1")
-    command = (*tiny, *joblib, "stage=inspect", "hydra.sweep.dir=sweep")
-    done = warm(tmp_path, "-m", *command)
+    joblib = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "stage=inspect,report")
+    done = warm(tmp_path, "-m", *tiny, *joblib, "report.runs=gone", "hydra.sweep.dir=sweep")
     assert done.status == 3
-    assert "devrf: job 1_robot_frames_1: data.frames: " in done.out
-    assert "jobs failed: 1_robot_frames_1" in done.out and "Traceback" not in done.out
-    assert (tmp_path / "sweep" / "0_robot_frames_3" / "images").is_dir()
-    assert failure(tmp_path / "sweep" / "1_robot_frames_1")["mistake"] is True
+    assert "devrf: job 1_robot_stage_report: report.runs: no folder gone" in done.out
+    assert "jobs failed: 1_robot_stage_report" in done.out and "Traceback" not in done.out
+    assert (tmp_path / "sweep" / "0_robot_stage_inspect" / "images").is_dir()
+    assert failure(tmp_path / "sweep" / "1_robot_stage_report")["mistake"] is True
 
 
 @installed("hydra_optuna_sweeper")
