@@ -4,18 +4,12 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import socket
-import subprocess
-import sys
-from pathlib import Path
-from typing import NamedTuple
 
 import psutil
 import pytest
 from lightning import Trainer
 
-import devrf as package
 from devrf.cli.processes import run_in_each, starts_processes
 from devrf.engine.ddp import ManualDDP
 from devrf.errors import DevrfError
@@ -80,12 +74,6 @@ os.kill(os.getpid(), signal.SIGKILL) if os.environ["RANK"] == "1" else time.slee
 """
 
 
-class Outcome(NamedTuple):
-    status: int
-    out: str
-    err: str
-
-
 @pytest.fixture(scope="module")
 def modules(tmp_path_factory):
     """A folder with the module ``witnesses``."""
@@ -114,29 +102,18 @@ def learning(tiny, often):
     return words
 
 
-def by_torchrun(folder, modules, *arguments):
+def by_torchrun(warm, folder, modules, *arguments):
     """Run the command on two nodes of torchrun, here; how each ended."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    agent = ("torch.distributed.run", "--nnodes=2", "--nproc-per-node=1")
-    agent += ("--master-addr=127.0.0.1", f"--master-port={port}")
-    learn = ("-m", "devrf", *arguments, "trainer.devices=1", "trainer.num_nodes=2")
-    path = os.pathsep.join([str(Path(package.__file__).parents[1]), str(modules)])
-    own = {"PYTHONPATH": path, "OMP_NUM_THREADS": "1", "HYDRA_FULL_ERROR": "0"}
-    begun = [
-        subprocess.Popen(
-            [sys.executable, "-m", *agent, f"--node-rank={rank}", *learn],
-            cwd=folder,
-            env={**os.environ, **own},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for rank in (0, 1)
-    ]
-    said = [process.communicate(timeout=120) for process in begun]
-    return [Outcome(p.returncode, *words) for p, words in zip(begun, said, strict=True)]
+    nodes = ("--nnodes=2", "--nproc-per-node=1", "--master-addr=127.0.0.1", f"--master-port={port}")
+    return warm.together(
+        [folder / "first", folder / "second"],
+        *(*arguments, "trainer.devices=1", "trainer.num_nodes=2", f"hydra.run.dir={folder}/run"),
+        path=[str(modules)] * 2,
+        torchrun=[[*nodes, f"--node-rank={rank}"] for rank in (0, 1)],
+    )
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +127,7 @@ def pair(warm, learning, modules, tmp_path_factory):
     stop = ("trainer.devices=2", "stage=canonical", "+callbacks.stop._target_=witnesses.Stop")
     interrupted = warm(folder, *arguments, *stop, path=str(modules))
     assert (folder / "run" / "checkpoints" / "canonical-progress-3.ckpt").is_file(), interrupted.out
-    return folder, interrupted, by_torchrun(folder, modules, *arguments)
+    return folder, interrupted, by_torchrun(warm, folder, modules, *arguments)
 
 
 def test_an_interrupted_command_ends_its_processes(pair):

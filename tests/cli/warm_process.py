@@ -15,6 +15,7 @@ the signal that ended it. The keys, all but the first two optional:
   than any test.
 * ``environment``: variables to set.
 * ``path``: a folder in which it, and processes that it starts, find modules.
+* ``torchrun``: arguments of torchrun, which runs the command in further processes.
 * ``begins``: the answer, at once, is the number of the process, for which ``{"wait": NUMBER}``
   waits, and which ``{"end": NUMBER}`` kills.
 * ``unread``: nobody reads what is said on stdout.
@@ -39,6 +40,7 @@ gc.disable()  # what is imported stays
 
 import torch
 from hydra.core.plugins import Plugins
+from torch.distributed import run as torchrun
 
 import devrf.apps.video
 import devrf.callbacks
@@ -124,7 +126,10 @@ def run(asked: dict[str, Any]) -> int:
     sys.argv = ["devrf", *asked["arguments"]]
     status = 0
     try:
-        entry()
+        if "torchrun" in asked:
+            torchrun.main([*asked["torchrun"], "-m", "devrf", *asked["arguments"]])
+        else:
+            entry()
     except SystemExit as stop:
         status = stop.code if isinstance(stop.code, int) else 1
     sys.stdout.flush()
