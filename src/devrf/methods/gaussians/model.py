@@ -68,8 +68,8 @@ class DeformableGaussians(ImageTrainable):
         super().__init__()
         self.settings = s = settings or GaussiansSettings()
         self.cloud = Cloud(s.harmonics)
-        self.encode = SinusoidalEncoding(3, s.bands)
-        self.encode_time = SinusoidalEncoding(1, s.time_bands)
+        self.encode = SinusoidalEncoding(3, s.bands, first=math.pi)
+        self.encode_time = SinusoidalEncoding(1, s.time_bands, first=math.pi)
         inputs = self.encode.size + self.encode_time.size
         self.trunk = Trunk(inputs, s.width, s.depth, skip=4)
         self.last = nn.Linear(s.width, 10)

@@ -16,7 +16,7 @@ from devrf.system.device import multiplies_bfloat16
 
 
 class SinusoidalEncoding(nn.Module):
-    """γ(x) = x ⊕ sin(2^k x) ⊕ cos(2^k x) for k = 0 … bands − 1 (docs/methods/dnerf.md#encoding).
+    """γ(x) = x ⊕ sin(2^k ω x) ⊕ cos(2^k ω x), k = 0 … bands − 1 (docs/methods/dnerf.md#encoding).
 
     Attributes:
         size: length of the encoding of a vector.
@@ -24,10 +24,15 @@ class SinusoidalEncoding(nn.Module):
 
     octaves: Tensor
 
-    def __init__(self, dimensions: int, bands: int, *, identity: bool = True) -> None:
-        """For vectors of so many ``dimensions``, themselves left out without ``identity``."""
+    def __init__(
+        self, dimensions: int, bands: int, *, first: float = 1.0, identity: bool = True
+    ) -> None:
+        """For vectors of so many ``dimensions``, themselves left out without ``identity``.
+
+        ``first`` is ω, the angular frequency of the first octave.
+        """
         super().__init__()
-        self.register_buffer("octaves", 2.0 ** torch.arange(bands), persistent=False)
+        self.register_buffer("octaves", first * 2.0 ** torch.arange(bands), persistent=False)
         self._identity = identity
         self.size = dimensions * (identity + 2 * bands)
 
