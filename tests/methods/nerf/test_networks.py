@@ -27,6 +27,12 @@ def test_two_octaves_of_a_number() -> None:
     assert torch.equal(SinusoidalEncoding(3, 0)(points), points)  # no octaves
 
 
+def test_the_frequency_of_the_first_octave() -> None:
+    encoded = SinusoidalEncoding(1, 2, first=math.pi)(torch.tensor([[0.25]]))[0]
+    half = math.sqrt(0.5)  # an eighth of a turn, then a quarter; the number itself has no factor
+    torch.testing.assert_close(encoded, torch.tensor([0.25, half, 1.0, half, 0.0]))
+
+
 def test_a_layer_by_ray_is_that_of_one_long_input() -> None:
     layer, ray = nn.Linear(9, 4), torch.tensor([0, 0, 2, 2, 2])
     inputs = [torch.randn(5, 2), torch.randn(5, 4), torch.randn(3, 3)]
