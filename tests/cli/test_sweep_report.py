@@ -45,13 +45,15 @@ def test_finished_runs_become_a_report_and_nothing_else_is_left(devrf, tmp_path,
     assert all(float(row["deformation.psnr"]) == psnr for row in rows)
 
 
-def test_outputs_are_reported_by_default_and_no_scene_is_read(
-    devrf, tmp_path, finished, monkeypatch
-):
+def test_a_report_needs_no_torch(devrf, finished, monkeypatch):
     def run_stage(*arguments):
         raise AssertionError("a report needs no torch")
 
     monkeypatch.setattr("devrf.cli.run.run_stage", run_stage)
+    assert devrf("stage=report", "report.runs=mine").status == 0
+
+
+def test_outputs_are_reported_by_default_and_no_scene_is_read(devrf, tmp_path, finished):
     finished.rename(tmp_path / "outputs")
     outcome = devrf("stage=report", "data=lego", "data.root=nowhere")
     assert outcome.out.endswith("report written to outputs/report/report.md\n")
@@ -76,6 +78,8 @@ def test_a_report_is_not_written_through_a_link(devrf, tmp_path, finished, name)
         (["report.runs=nowhere"], "report.runs: no folder nowhere"),
         (["report.runs=empty", "report.into=there"], "report.runs: no finished run below empty"),
         (["ckpt=x"], "ckpt: stage=report starts from nothing"),
+        (["report.runs=empty", "+nosuch=1"], "nosuch: no part reads it"),
+        (["report.runs=empty", "output_dir=there"], "output_dir: expected "),
     ],
 )
 def test_a_mistake_is_one_line_and_leaves_nothing(devrf, tmp_path, arguments, expected):

@@ -25,7 +25,7 @@ from devrf.cli.config import config_folder, in_sweep, overrides
 from devrf.cli.messages import report_user_errors
 from devrf.cli.restore_config import parsed
 from devrf.cli.run_folder import working_in
-from devrf.cli.sweep import compare_runs, naming_failures, record_failure
+from devrf.cli.sweep import compare_runs, compares_runs, naming_failures, record_failure
 from devrf.cli.view import serve_page, serves_page
 from devrf.errors import expect
 from devrf.system.files import utf8_path
@@ -84,10 +84,11 @@ def run(config: DictConfig) -> float | None:
     with guard, working_in(folder, config):
         for line in remarks:
             log.info("%s", line)
-        if serves_page(parsed(overrides()), folder):
+        typed = parsed(overrides())
+        if serves_page(typed, folder):
             serve_page(config, folder)
             return None
-        if config.stage == "report" and config.ckpt is None:  # which is refused below
+        if compares_runs(config, typed):
             compare_runs(config)
             return None
         chosen = f"{folder}, which hydra.run.dir=FOLDER chooses"

@@ -120,7 +120,7 @@ def inspect(run: RunContext) -> Advice | None:
 
 
 def report(run: RunContext) -> None:
-    """Compare runs, from Python; on the command line this begins before torch has loaded."""
+    """The step of ``stage=report``, where the command has not compared runs before torch."""
     compare_runs(run.config)
 
 

@@ -6,12 +6,13 @@ import gc
 import logging
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from hydra.core.override_parser.types import Override
 from hydra.experimental.callback import Callback
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
@@ -92,16 +93,23 @@ def naming_failures() -> Iterator[None]:
         raise problem
 
 
+def compares_runs(config: DictConfig, typed: Sequence[Override]) -> bool:
+    """Whether a command asks for a report, and sets nothing that a whole check alone knows."""
+    keys = [override.key_or_group for override in typed]
+    own = all(key in ("stage", "outputs") or key.startswith("report.") for key in keys)
+    return config.stage == "report" and own
+
+
 def compare_runs(config: DictConfig) -> None:
     """``stage=report``: tables and plots of the runs below ``report.runs``; needs no scene.
 
     Raises:
         DevrfError: a setting of the report is wrong, or there are no runs.
     """
+    check_config(OmegaConf.masked_copy(config, [*ROOT, "report"]))
     # pandas and matplotlib are slow to import.
     from devrf.apps.report.write import write_report
 
-    check_config(OmegaConf.masked_copy(config, [*ROOT, "report"]))
     log.info("%s", write_report(instantiate(config.report)))
 
 
