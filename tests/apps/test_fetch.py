@@ -227,7 +227,7 @@ def trickle() -> Iterator[str]:
         ("lego.zip", {"LONGEST": 0.4}, "it comes too slowly"),
         ("lego.zip", {"LARGEST": 1000}, "more than 1.0 kB came"),
         ("moved", {"LONGEST": 0.4}, "it comes too slowly"),
-        ("slow", {"PATIENCE": 0.2}, "it comes too slowly"),
+        ("slow", {"STALLED": 1.0}, "it comes too slowly"),
         ("busy", {}, "503 .*"),
     ],
 )
@@ -239,6 +239,19 @@ def test_a_download_without_end_is_ended(tmp_path, monkeypatch, trickle, path, l
     with pytest.raises(DevrfError, match=rf"/{path}: cannot be fetched \({said}\)"):
         fetched(scene, FetchSettings(tmp_path), progress=False)
     assert time.monotonic() - began < 20 and not (tmp_path / "lego").exists()
+
+
+def test_a_download_that_is_interrupted_leaves_no_part(tmp_path, monkeypatch, trickle):
+    def interrupted(self: object, seconds: float) -> None:
+        monkeypatch.undo()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("multiprocessing.pool.ApplyResult.wait", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        fetched(
+            published("lego", url=f"{trickle}/lego.zip"), FetchSettings(tmp_path), progress=False
+        )
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
 def test_a_file_in_an_archive_that_holds_more_than_is_said_is_not_unpacked(tmp_path):

@@ -63,9 +63,10 @@ LARGEST = 2**34
 LARGEST_CATALOGUE = 2**20
 # Points in a line of a catalogue: time and memory for a name grow with the square of its parts.
 MOST_POINTS = 100
-# Seconds that a scene may take, and that a server may say nothing; five times, nothing of a file.
+# Seconds that a scene may take; that a server may say nothing; that nothing of a file may come.
 LONGEST = 6 * 3600
 PATIENCE = 60
+STALLED = 5 * PATIENCE
 # The file by which a scene's folder is known, by the layout that reads it.
 MARKERS = {
     "inward": "transforms_train.json",
@@ -261,13 +262,12 @@ def _download(scene: PublishedScene, folder: Path, progress: bool) -> dict[str, 
         for name, url in bar.track(scene.downloads.items(), description=scene.name):
             if files[name].is_file():
                 continue
+            heard = time.monotonic()
+            taken = thread.apply_async(take, (name, url))
             try:
-                heard = time.monotonic()
-                taken = thread.apply_async(take, (name, url))
                 while not taken.ready():
                     taken.wait(0.2)
-                    if time.monotonic() > min(until, heard + 5 * PATIENCE):
-                        left = 0  # ends the thread, if anything comes
+                    if time.monotonic() > min(until, heard + STALLED):
                         raise TimeoutError("it comes too slowly")
                 taken.get()
             except (OSError, ValueError, urllib3.exceptions.HTTPError) as error:
@@ -277,6 +277,10 @@ def _download(scene: PublishedScene, folder: Path, progress: bool) -> dict[str, 
                     f"{url}: cannot be fetched ({error}); see that the network works, and that "
                     f"its page {scene.collection.page} names no other address"
                 ) from None
+            finally:
+                if not taken.ready():  # interrupted, or too slow
+                    left = 0  # ends the thread with the next bytes, and its file is removed
+                    taken.wait(1)
     return files
 
 
@@ -293,9 +297,13 @@ def _digest(files: dict[str, Path]) -> str:
 
 
 class _Archive(io.FileIO):
-    """An archive, the list of whose files is read at once, and takes ten times more in memory."""
+    """An archive whose list of files has at most SMALL bytes.
 
-    def read(self, size: int | None = -1, /) -> Any:  # noqa: D102
+    zipfile reads it at once, and takes ten times that in memory.
+    """
+
+    def read(self, size: int | None = -1, /) -> Any:
+        """The next bytes; ValueError: it is the list, and too long."""
         if size is not None and size > SMALL:
             raise ValueError("it lists too many files")
         return super().read(size)
