@@ -111,6 +111,8 @@ def test_a_jpeg_of_any_number_of_scans(tmp_path):
     path.write_bytes(content[:-2] + content[content.rfind(b"\xff\xda") : -2] * 100 + content[-2:])
     with pytest.raises(DevrfError, match="more than 100 scans"):
         read_header(path)
+    path.write_bytes(content + b"\xff\xda" * 200)  # as the film behind a phone's photograph
+    assert image_size(path) == (64, 64)
 
 
 def test_nearly_square_images_are_turned_too(tmp_path):

@@ -15,6 +15,8 @@ from PIL import Image
 from devrf.apps.inspection.advice import advice_on
 from devrf.errors import DevrfError
 from devrf.scenes.formats.nerfstudio import NerfstudioReader
+from devrf.scenes.images import read_header
+from devrf.scenes.masks import _grey
 
 WIDTH, HEIGHT = 80, 60
 
@@ -158,3 +160,13 @@ def test_masks_that_cut_out_the_subject_are_told_from_others(root):
     found = [a for a in advice_on(NerfstudioReader(root).read()) if "masks" in a.problem]
     assert len(found) == 1 and "set data.masks=alpha" in found[0].remedy
     assert found[0].where.startswith("static training set, ")
+
+
+@pytest.mark.parametrize("columns", [16, 4000])  # read in one piece, in many
+def test_opaque_pixels_of_several_colours_are_told_at_any_width(tmp_path, columns):
+    image = np.zeros((600, columns, 4), np.uint8)
+    image[..., :3] = np.arange(600)[:, None, None] % 200
+    image[:, : columns // 2, 3] = 255
+    Image.fromarray(image).save(tmp_path / "a.png")
+    with pytest.raises(DevrfError, match="colours and alpha channel differ"):
+        _grey(tmp_path / "a.png", read_header(tmp_path / "a.png"))

@@ -10,11 +10,13 @@ from __future__ import annotations
 import logging
 import math
 import os
+import re
 import time
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +59,10 @@ QUARTER_TURNS = (5, 6, 7, 8)
 LARGEST_TILE = 2**24
 # The most scans of a progressive JPEG, each of which goes through all its pixels; usual are 10.
 MOST_SCANS = 100
+# Markers of a JPEG file, but for those within a scan.
+MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
+START_OF_SCAN = b"\xff\xda"
+END_OF_IMAGE = b"\xff\xd9"
 
 Size = tuple[float, float]
 
@@ -94,11 +100,27 @@ def open_image(path: Path) -> Image.Image:
     with decoding(path, "image", "replace the file, or make it smaller"):
         image = Image.open(path, formats=FORMATS)
         tags = getattr(image, "tag_v2", {})
+        fault = ""
         if tags.get(TILEWIDTH, 0) * tags.get(TILELENGTH, 0) > LARGEST_TILE:
-            raise ValueError("its tiles are too large")
-        if "progressive" in image.info and path.read_bytes().count(b"\xff\xda") > MOST_SCANS:
-            raise ValueError(f"more than {MOST_SCANS} scans")
+            fault = "its tiles are too large"
+        elif "progressive" in image.info and _has_many_scans(path):
+            fault = f"more than {MOST_SCANS} scans"
+        if fault:
+            image.close()
+            raise ValueError(fault)
         return image
+
+
+def _has_many_scans(path: Path) -> bool:
+    """Whether a JPEG file has more scans than MOST_SCANS; what follows its end is no part of it."""
+    scans, place = 0, 2
+    with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
+        while scans <= MOST_SCANS and (found := MARKER.search(data, place)):
+            if found[0] == END_OF_IMAGE:
+                break
+            scans += found[0] == START_OF_SCAN
+            place = found.end() + int.from_bytes(data[found.end() : found.end() + 2])
+    return scans > MOST_SCANS
 
 
 def read_header(path: Path, camera: Size | None = None) -> Header:
@@ -262,10 +284,11 @@ def load_images(
         image = image if finish is None else finish(index, image)
         columns, rows = sizes[index]
         own = pixels[index, :rows, :columns]
-        if sizes[index] != files[index]:
+        if sizes[index] == files[index]:
+            for band in bands(own):
+                own[band] = image[band]
+        else:
             own[:] = shrink_pixels(image, columns, rows, alpha_weighted=alpha_weighted)
-        for band in bands(own) if sizes[index] == files[index] else ():
-            own[band] = image[band]
 
     in_threads(fill, range(len(paths)), raster_of(files))
     log.info("read %s from %s in %.1f s", what, paths[0].parent, time.perf_counter() - start)

@@ -102,19 +102,29 @@ def _grey(path: Path, header: Header) -> Grey:
     """The values (H, W) of a mask in its file."""
     pixels = decode(path, header, "RGBA")
     by_alpha = any(int(pixels[band][..., 3].min()) < WHITE for band in bands(pixels))
+    # An alpha mask: its opaque pixels have one colour, or are as light as they are opaque.
+    plain = not by_alpha or _is_plain(pixels)
     grey = np.empty(pixels.shape[:2], np.uint8)
     for band in bands(pixels):
         colors, alpha = np.split(pixels[band], [3], axis=2)
         grey[band] = (alpha if by_alpha else colors)[..., 0]
         if not by_alpha and int(np.ptp(colors, axis=2).max()) > GREY_NOISE:
             raise scene_error(path, "a mask with colours; give one channel, black and white")
-        # An alpha mask: its opaque pixels have one colour, or are as light as they are opaque.
-        opaque = colors[alpha[..., 0] > 0]
-        plain = len(opaque) == 0 or int(np.ptp(opaque, axis=0).max()) <= GREY_NOISE
-        if not plain and np.abs(colors - alpha.astype(np.int16)).max() > GREY_NOISE and by_alpha:
+        if not plain and np.abs(colors - alpha.astype(np.int16)).max() > GREY_NOISE:
             what = "a mask whose colours and alpha channel differ; give one channel"
             raise scene_error(path, what)
     return grey
+
+
+def _is_plain(pixels: Rows) -> bool:
+    """Whether all pixels of an RGBA image that are not transparent have one colour."""
+    least, most = np.full(3, WHITE), np.zeros(3, int)
+    for band in bands(pixels):
+        opaque = pixels[band][pixels[band][..., 3] > 0][:, :3]
+        if len(opaque):
+            least = np.minimum(least, opaque.min(axis=0))
+            most = np.maximum(most, opaque.max(axis=0))
+    return bool((most - least).max() <= GREY_NOISE)
 
 
 def cutting_out(

@@ -10,7 +10,7 @@ import logging
 import os
 import re
 import unicodedata
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from decimal import Decimal
 from functools import cache
 from pathlib import Path
@@ -123,6 +123,17 @@ def _spelling(name: str) -> str:
 Missing = Literal["error", "skip"]
 
 
+def check_each_once(present: Mapping[int, Path], names: Sequence[str], file: Path) -> None:
+    """Refuse an image that ``file`` lists twice among ``names``: each takes memory anew.
+
+    ``present`` has the images that are there, by their positions in the list.
+    """
+    first = dict[Path, int]()
+    for k, image in present.items():
+        if first.setdefault(image, k) != k:
+            raise scene_error(file, f"lists {abbreviated(names[k])} twice; list each image once")
+
+
 def present_images(
     names: Sequence[str],
     file: Path,
@@ -140,7 +151,7 @@ def present_images(
         relative_to: the folder that names are relative to; None: the file's.
 
     Raises:
-        DevrfError: an image is absent and must not be, or all are; or one is listed twice.
+        DevrfError: an image is absent and must not be, or all are.
     """
     root = finder.root
     listed = [inside(root, relative_to or file.parent, name, file) for name in names]
@@ -154,10 +165,6 @@ def present_images(
             f"no such image (looked for {', '.join(SUFFIXES)}); {len(absent)} of the {len(names)} "
             f"images in {file.name} are absent: {add}{skip}",
         )
-    first = dict[Path, int]()
-    for k, image in present.items():
-        if first.setdefault(image, k) != k:  # each takes memory anew
-            raise scene_error(file, f"lists {abbreviated(names[k])} twice; list each image once")
     if absent:
         log.warning(
             "%s: %d of the %d images are absent and left out, %s the first of them",
