@@ -1,4 +1,4 @@
-"""What other programs read: a mesh that goes where the forward field leads, in every format."""
+"""What other programs read: a mesh that goes where the forward warp leads, in every format."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_gltf_goes_where_the_forward_field_leads(tmp_path, moving_ball, mesh, fr
     assert (read.faces == mesh.faces.numpy()).all()
     # y up and twice as large: a ball of radius 1.
     assert read.volume == pytest.approx(4 / 3 * math.pi, rel=0.05)
-    # 0.8 lies between two exported times, and the forward field goes evenly from one to the other.
+    # 0.8 lies between two exported times, and the forward warp goes evenly from one to the other.
     for time in (*TIMES, 0.8):
         expected = frame.points(moving_ball.forward_warp(time)(at_rest)).numpy()
         np.testing.assert_allclose(morphed(whole, array, SECONDS * time), expected, atol=1e-5)

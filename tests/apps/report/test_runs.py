@@ -152,6 +152,8 @@ def test_curves_are_over_the_dynamic_images_views_of_a_time_averaged(ran, caplog
     assert metric_over_time(folder, "psnr").empty and caplog.messages == [
         SKIPPED % (folder / "frames.csv")
     ]
+    (folder / "frames.csv").write_text("capture,time,psnr\ndynamic,0,3\n\ndynamic,1,4\n")
+    assert metric_over_time(folder, "psnr").to_dict() == {0.0: 3.0, 1.0: 4.0}
     (folder / "frames.csv").write_text(f"capture,time,psnr{',a' * 100_000}\ndynamic,0,3\n")
     assert metric_over_time(folder, "psnr").to_dict() == {0.0: 3.0}  # in pandas it takes minutes
     (folder / "frames.csv").write_text(

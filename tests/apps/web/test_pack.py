@@ -314,7 +314,7 @@ def test_the_controls_do_what_they_say(browser, file, tmp_path):
     shown = browser.changed(shown)
     assert psnr(whole, shown) > 60
     part = choice(browser.element("part"))
-    part.select_by_visible_text("moving")  # the forward field of this model moves nothing
+    part.select_by_visible_text("moving")  # the forward warp of this model moves nothing
     nothing = browser.changed(shown)
     assert float(nothing.std()) == 0
     part.select_by_visible_text("still")

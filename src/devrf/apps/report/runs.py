@@ -134,7 +134,7 @@ def metric_over_time(path: Path, metric: str) -> pd.Series:
             # pandas would take hours for many columns of one name, DictReader for absent cells.
             table = csv.reader(read_record(file).decode().splitlines())
             columns = next(table, [])
-            rows = (dict(zip(columns, row, strict=False)) for row in table)
+            rows = (dict(zip(columns, row, strict=False)) for row in table if row)
             pairs = [(r["time"], r[metric]) for r in rows if r["capture"] == "dynamic"]
             known = [(float(time), float(value)) for time, value in pairs if value]
             curve = pd.DataFrame(known, columns=["time", metric])
