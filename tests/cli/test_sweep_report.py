@@ -45,6 +45,11 @@ def test_finished_runs_become_a_report_and_nothing_else_is_left(devrf, tmp_path,
     assert all(float(row["deformation.psnr"]) == psnr for row in rows)
 
 
+def test_a_reports_setting_may_refer_to_another_section(devrf, finished):
+    outcome = devrf("stage=report", "report.runs=${trainer.accelerator}")
+    assert outcome.err.startswith("devrf: report.runs: no folder auto")
+
+
 def test_a_report_needs_no_torch(devrf, finished, monkeypatch):
     def run_stage(*arguments):
         raise AssertionError("a report needs no torch")

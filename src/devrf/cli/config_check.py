@@ -24,6 +24,7 @@ from typing import Annotated, Any, Literal, cast, get_type_hints
 
 import yaml
 from annotated_types import Ge, Lt
+from hydra.core.override_parser.types import Override
 from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 from typing_extensions import TypedDict
@@ -108,6 +109,21 @@ def check_config(config: DictConfig) -> None:
         if issue["type"] in BUILT:
             said = f"expected a section with _target_, not {value!r}"
         raise DevrfError(f"{where}: {said}{did_you_mean(value, choices, f'{where}=')}")
+
+
+def sets_only(typed: Iterable[Override], section: str, *keys: str) -> bool:
+    """Whether a command sets nothing but the ``section`` and these ``keys``."""
+    names = (override.key_or_group for override in typed)
+    return all(name in keys or name.startswith(f"{section}.") for name in names)
+
+
+def check_section(config: DictConfig, section: str) -> None:
+    """As :func:`check_config`, of one section and the root's keys; the other parts are not loaded.
+
+    The section's references are resolved, those to other sections, too.
+    """
+    OmegaConf.resolve(config[section])
+    check_config(OmegaConf.masked_copy(config, [*ROOT, section]))
 
 
 def _issues(values: Node, types: Mapping[str, Any], names: Names) -> list[tuple[Names, Any]]:

@@ -22,6 +22,7 @@ from omegaconf import DictConfig
 import devrf
 from devrf.cli.complete import commands, completed
 from devrf.cli.config import config_folder, in_sweep, overrides
+from devrf.cli.config_check import check_section
 from devrf.cli.messages import report_user_errors
 from devrf.cli.restore_config import parsed
 from devrf.cli.run_folder import working_in
@@ -89,6 +90,7 @@ def run(config: DictConfig) -> float | None:
             serve_page(config, folder)
             return None
         if compares_runs(config, typed):
+            check_section(config, "report")
             compare_runs(config)
             return None
         chosen = f"{folder}, which hydra.run.dir=FOLDER chooses"

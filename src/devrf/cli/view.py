@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 from hydra.core.override_parser.types import Override
 from hydra.utils import instantiate
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from devrf.apps.viewer.page import PageServer, is_current
-from devrf.cli.config_check import ROOT, check_config
+from devrf.cli.config_check import check_section, sets_only
 from devrf.cli.restore_config import value
 from devrf.system.process import handle_signals
 
@@ -22,12 +22,10 @@ if TYPE_CHECKING:
 
 def serves_page(typed: Sequence[Override], run: Path) -> bool:
     """Whether a command asks for the page of a run, and nothing else, and it is up to date."""
-    own_keys = ("stage", "hydra.run.dir")
-    keys = [override.key_or_group for override in typed]
     return (
         value(typed, "stage") == "view"
         and value(typed, "viewer.renderer") != "server"
-        and all(key in own_keys or key.startswith("viewer.") for key in keys)
+        and sets_only(typed, "viewer", "stage", "hydra.run.dir")
         and is_current(run)
     )
 
@@ -38,7 +36,7 @@ def serve_page(config: DictConfig, run: Path) -> None:
     Raises:
         DevrfError: a setting of the viewer is wrong, or its address cannot be had.
     """
-    check_config(OmegaConf.masked_copy(config, [*ROOT, "viewer"]))
+    check_section(config, "viewer")
     serve(PageServer(instantiate(config.viewer), run / "export"))
 
 
