@@ -32,6 +32,7 @@ TINY = GaussiansSettings(
 )  # fmt: skip
 STATIC = ProtocolStage("canonical", "static")
 DEFORMATION = ProtocolStage("deformation", "dynamic", frozen=["canonical"], builds_on="canonical")
+DYNAMIC = ProtocolStage("dynamic", "dynamic")
 
 
 def stage(
@@ -59,6 +60,20 @@ def test_nothing_moves_at_time_0_and_a_frame_later_all_does() -> None:
     for move, begun, value in zip(full, half, expected, strict=True):
         torch.testing.assert_close(move, torch.tensor(value), atol=0.05, rtol=0)
         torch.testing.assert_close(begun, 0.5 * move, atol=0.05, rtol=0)
+
+
+def test_without_static_images_the_cloud_moves_at_time_0_too(
+    fit: Callable[..., ImageStage], stored: Callable[[ImageStage], LoadedCheckpoint]
+) -> None:
+    learned = fit(stage(DYNAMIC))
+    model = learned.scene_model
+    for shown in (model, stored(learned).model):
+        at_first = shown.moved(0.0)
+        assert at_first is not None and at_first[0].abs().max() > 0
+    model.begin_stage(ProtocolStage("joint", "both"))
+    assert model.moved(0.0) is None
+    model.begin_stage(DEFORMATION)
+    assert model.moved(0.0) is None
 
 
 def test_a_view_is_the_splatted_cloud_before_its_background() -> None:

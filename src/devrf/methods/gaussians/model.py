@@ -56,6 +56,7 @@ class DeformableGaussians(ImageTrainable):
         focal: the longest focal length in pixels that was learned from.
         degree: of the harmonics that are used now.
         moves_now: whether the network is asked.
+        moves_at_rest: whether it is asked at time 0, too, when the cloud has no images of its own.
     """
 
     name: ClassVar[str] = "gaussians"
@@ -90,6 +91,7 @@ class DeformableGaussians(ImageTrainable):
         self.extent, self.focal = extent, focal
         self.degree = self.settings.harmonics
         self.moves_now = True
+        self.moves_at_rest = False
 
     def setup(self, scene: Scene) -> None:
         """Take bounds and times; begin the cloud.
@@ -121,6 +123,7 @@ class DeformableGaussians(ImageTrainable):
             "times": list(self.clock.times),
             "extent": self.extent,
             "focal": self.focal,
+            "moves_at_rest": self.moves_at_rest,
         }
 
     @classmethod
@@ -135,14 +138,16 @@ class DeformableGaussians(ImageTrainable):
             validate(float, config["extent"]),
             validate(float, config["focal"]),
         )
+        model.moves_at_rest = validate(bool, config["moves_at_rest"])
         return model
 
     def moved(self, time: float) -> tuple[Tensor, Tensor, Tensor] | None:
         """δ of means (N, 3), quaternions (N, 4) and logarithms of scales (N, 3); None at rest.
 
-        They grow from 0 at time 0 to the network's at the first frame after it.
+        They grow from 0 at time 0 to the network's at the first frame after it, unless it moves the
+        cloud at all times.
         """
-        begun = min(1.0, time * (len(self.clock) - 1))
+        begun = 1.0 if self.moves_at_rest else min(1.0, time * (len(self.clock) - 1))
         if begun == 0 or not self.moves_now:
             return None
         means = self.cloud.means.detach()
@@ -233,6 +238,7 @@ class DeformableGaussians(ImageTrainable):
     def begin_stage(self, stage: ProtocolStage) -> None:
         """Freeze parts; a cloud that learns begins to count its growths."""
         super().begin_stage(stage)
+        self.moves_at_rest = stage.capture == "dynamic" and stage.builds_on is None
         self.cloud.grown.zero_()
 
     def growths(self, total: int) -> Sequence[int]:
