@@ -637,6 +637,31 @@ def test_clients_that_are_slow_or_go_away_hold_nothing_and_are_not_told(port, mo
     assert capfd.readouterr().err == ""
 
 
+def test_threads_that_answer_nobody_are_no_clients(port):
+    ended = threading.Event()
+    idle = [threading.Thread(target=ended.wait) for _ in range(80)]
+    try:
+        for thread in idle:
+            thread.start()
+        request = f"GET /scene.html HTTP/1.0\r\nHost: 127.0.0.1:{port}\r\n\r\n"
+        assert b"<p>a page</p>" in answered(port, request)
+    finally:
+        ended.set()
+
+
+def test_a_server_ends_at_once_while_clients_wait_to_be_answered(tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    served = PageServer(ViewerSettings(port=port), tmp_path)
+    clients = [socket.create_connection(("127.0.0.1", port), timeout=20) for _ in range(66)]
+    time.sleep(0.5)  # 64 have a place
+    began = time.monotonic()
+    served.close()
+    assert time.monotonic() - began < 3
+    for client in clients:
+        client.close()
+
+
 def test_another_page_shows_neither_pictures_nor_the_page(browser, port, tmp_path):
     picture = f"http://127.0.0.1:{port}/pictures/static_0/0.jpg"
     tried = "window.ended = 0; for (const kind of ['onload', 'onerror'])"

@@ -12,7 +12,6 @@ import logging
 import re
 import sys
 import threading
-import time
 from functools import cache, partial
 from http import HTTPStatus
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -82,7 +81,7 @@ class PageServer:
         self.settings = settings
         self._stop = threading.Event()
         handler = partial(_Handler, directory=str(folder.resolve()), names=own_names(settings.host))
-        self._server = _Server((settings.host, settings.port), handler)
+        self._server = _Server((settings.host, settings.port), handler, self._stop)
         threading.Thread(target=self._server.serve_forever, daemon=True).start()
 
     def serve(self) -> None:
@@ -97,6 +96,7 @@ class PageServer:
 
     def close(self) -> None:
         """Take the page from the network."""
+        self.stop()
         self._server.shutdown()
         self._server.server_close()
 
@@ -104,12 +104,22 @@ class PageServer:
 class _Server(ThreadingHTTPServer):
     request_queue_size = 64  # clients that wait, and that are answered, at one time
 
+    def __init__(self, address: tuple[str, int], handler: Any, stop: threading.Event) -> None:
+        self._places = threading.BoundedSemaphore(self.request_queue_size)
+        self._stop = stop
+        super().__init__(address, handler)
+
     def verify_request(self, request: Any, client_address: Any) -> bool:
         """Whether a client is answered, once others are: each may send megabytes of headers."""
-        until = time.monotonic() + PATIENCE
-        while threading.active_count() > self.request_queue_size and time.monotonic() < until:
-            time.sleep(0.05)
-        return threading.active_count() <= self.request_queue_size
+        tries = range(round(10 * PATIENCE))
+        return any(self._places.acquire(timeout=0.1) for _ in tries if not self._stop.is_set())
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Answer a client, and make its place free."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._places.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Say nothing of a client that has gone away, or is too slow."""
