@@ -9,10 +9,12 @@ import time
 
 import pytest
 import torch
+from pydantic import ValidationError
 
 from devrf.apps.keyframes import (
     CameraPath,
     Keyframe,
+    _PathFile,
     cameras_of,
     check_name,
     hermite,
@@ -144,6 +146,7 @@ SCALED = [2 * value for value in MATRIX[:12]] + MATRIX[12:]
     [
         (b"{", "p: not valid JSON"),
         (b" " * (2**24 + 1), "p: larger than 16 MiB"),
+        (b"[" + b"[]," * 2**20, "p: more than 2,097,152 values; expected a path"),
         (content(fps=24), "p: holds no camera path"),
         *[(content(keyframes=[frame()], fps=x), "p: fps: ") for x in (1e-300, 0, -1, 1e30)],
         (content(keyframes=[frame(aspect=1e30)]), "p: keyframes[0].aspect: "),
@@ -155,6 +158,14 @@ SCALED = [2 * value for value in MATRIX[:12]] + MATRIX[12:]
 def test_what_is_no_path_is_refused_in_one_line(data, expected):
     with pytest.raises(DevrfError, match=f"^{re.escape(expected)}"):
         path_from(data, "p")
+
+
+@pytest.mark.parametrize("key", ["camera_path", "keyframes"])
+def test_of_many_wrong_cameras_one_error_is_made(key):
+    """Of 16 MiB of them, the errors took 8 GiB."""
+    with pytest.raises(ValidationError) as raised:
+        _PathFile.model_validate_json(content(**{key: [{"seconds": 1}] * 1000}))
+    assert raised.value.error_count() <= 3  # of the first
 
 
 def test_a_long_path_is_read_in_seconds():

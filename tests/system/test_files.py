@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import pytest
 
 from devrf.errors import DevrfError
-from devrf.system.files import DEEPEST, atomic_write, free_disk, refuse_links, walk, write_json
+from devrf.system.files import (
+    DEEPEST,
+    atomic_write,
+    free_disk,
+    read_record,
+    refuse_links,
+    walk,
+    write_json,
+)
 
 
 def test_a_finished_file_stands_under_its_name_alone(tmp_path: Path) -> None:
@@ -60,6 +69,12 @@ def test_json_takes_the_place_of_what_was_there(tmp_path: Path) -> None:
     path.write_text("{ damaged")
     write_json(path, {"a": 1, "b": {"c": None}})
     assert json.loads(path.read_text()) == {"a": 1, "b": {"c": None}}
+
+
+def test_a_pipe_is_no_record(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.json")
+    with pytest.raises(ValueError, match="no file"):
+        read_record(tmp_path / "a.json")
 
 
 def test_a_disk_is_that_of_the_first_folder_that_exists(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from devrf.geometry.cameras import Cameras
 from devrf.geometry.offset import NO_OFFSET, Offset, added, subtracted
 from devrf.scenes.files import Number, read_json
 from devrf.scenes.validation import check_poses, scene_error
-from devrf.system.files import LARGEST_RECORD, write_json
+from devrf.system.files import bounded, write_json
 from devrf.system.options import first_error
 
 
@@ -187,9 +187,13 @@ class _PathKeyframe(_PathCamera):
     seconds: Annotated[Number, Field(ge=0)]
 
 
+# An error of each camera would take 1 kB.
+Many = Field(fail_fast=True, max_length=MAX_FRAMES)
+
+
 class _PathFile(BaseModel):
-    keyframes: Annotated[list[_PathKeyframe], BeforeValidator(_with_seconds)] = []
-    camera_path: list[_PathCamera] = []
+    keyframes: Annotated[list[_PathKeyframe], Many, BeforeValidator(_with_seconds)] = []
+    camera_path: Annotated[list[_PathCamera], Many] = []
     camera_type: Literal["perspective"] = "perspective"
     fps: Rate = 24.0
 
@@ -214,12 +218,12 @@ def read_path(file: Path, offset: Offset = NO_OFFSET) -> CameraPath:
 
 def path_from(content: bytes, name: str, offset: Offset = NO_OFFSET) -> CameraPath:
     """As :func:`read_path`, from the ``content`` of a file called ``name``."""
-    if len(content) > LARGEST_RECORD:
-        raise scene_error(name, f"larger than {LARGEST_RECORD // 2**20} MiB; expected a path")
     try:
-        return _path(_PathFile.model_validate_json(content), name, offset)
+        return _path(_PathFile.model_validate_json(bounded(content)), name, offset)
     except ValidationError as error:
         raise first_error(error, f"{name}: ") from None
+    except ValueError as error:  # its size
+        raise scene_error(name, f"{error}; expected a path") from None
 
 
 def write_path(file: Path, path: CameraPath, height: int, offset: Offset = NO_OFFSET) -> None:

@@ -38,7 +38,7 @@ from devrf.checkpoints.progress import progress_files
 from devrf.cli.config import command_line, leaves, set_at, stage_section
 from devrf.cli.context import RunContext
 from devrf.errors import DevrfError
-from devrf.system.files import read_record, write_json
+from devrf.system.files import LARGEST_RECORD, read_record, write_json
 from devrf.system.folder_lock import PLACE
 from devrf.system.override import to_type
 
@@ -185,12 +185,13 @@ def _made_with(run: RunContext, step: str) -> str:
     """A digest of all that decides a step's results, and of their names."""
     root = run.config.data.get("root")
     keyframes = Path(str(run.config.video.path))
+    is_path = keyframes.is_file() and keyframes.stat().st_size <= LARGEST_RECORD
     group, results = DECIDES[step]
     made = (
         *(digest_of(run.checkpoint()), devrf.__version__, sorted(run.config.get("logger") or ())),
         *(_values(run.config, "data"), root and Path(root).resolve(), _values(run.config, group)),
         step == "evaluate" and run.datamodule.validation,
-        step == "render" and keyframes.is_file() and keyframes.read_bytes(),
+        step == "render" and is_path and keyframes.read_bytes(),
         sorted(path.name for path in run.folder.glob(results)),
     )
     return sha256(repr(made).encode()).hexdigest()

@@ -19,6 +19,9 @@ from devrf.errors import DevrfError
 # Bytes; the longest records, of footage of two hours, have some ten million. In memory each may
 # become 50.
 LARGEST_RECORD = 2**24
+# Lists, objects, and their values but the first, of which each may take 150 bytes and more: those
+# of 50,000 images are fewer.
+MOST_PARTS = 2**21
 # Bytes of a YAML file, for which Python takes seconds.
 LARGEST_YAML = 200_000
 # Errors of values in a file that are not as devrf writes them.
@@ -152,12 +155,21 @@ def read_record(path: Path, most: int = LARGEST_RECORD) -> bytes:
     """The content of a file of JSON, CSV or YAML.
 
     Raises:
-        ValueError: it has more than so many bytes: than devrf writes, or a scene needs.
+        ValueError: it is a pipe, or larger or of more parts than what devrf writes, or a scene
+            needs.
     """
+    if path.exists() and not path.is_file():
+        raise ValueError("no file")  # a pipe would be waited for
     with path.open("rb") as file:
-        content = file.read(most + 1)
+        return bounded(file.read(most + 1), most)
+
+
+def bounded(content: bytes, most: int = LARGEST_RECORD) -> bytes:
+    """``content`` that came as a record; ValueError if it is too large, or of too many parts."""
     if len(content) > most:
         raise ValueError(f"larger than {most / 2**20:.3g} MiB")
+    if sum(map(content.count, b"[{,")) > MOST_PARTS:
+        raise ValueError(f"more than {MOST_PARTS:,} values")
     return content
 
 

@@ -154,6 +154,12 @@ def test_long_lists_of_absent_images_are_gone_through_once(folder, message_of):
     assert "ids: expected at most 50000 items" in message_of(folder.root)
 
 
+def test_times_that_are_wrong_are_counted_first(folder, message_of):
+    """Of a million and a half, the errors took 2 GiB."""
+    folder.write("metadata.json", dict.fromkeys(map(str, range(50_001)), 0))
+    assert "expected at most 50000 images, not 50001; correct it" in message_of(folder.root)
+
+
 CAMERA = "camera/000004.json"
 
 
