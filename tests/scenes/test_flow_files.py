@@ -96,6 +96,21 @@ def test_packed_arrays_larger_than_an_image_are_not_unpacked(tmp_path):
         tracemalloc.stop()
 
 
+def test_an_array_in_place_of_packed_ones_is_not_read(tmp_path):
+    path = tmp_path / "001_bwd.npz"
+    with path.open("wb") as file:
+        header = {"descr": "<f4", "fortran_order": False, "shape": (2**26,)}
+        np.lib.format.write_array_header_1_0(file, header)
+        file.truncate(2**29)  # of zeros
+    tracemalloc.start()
+    try:
+        with pytest.raises(DevrfError, match=r"001_bwd.npz: not a readable npz"):
+            read_flow_file(path, width=6, height=4)
+        assert tracemalloc.get_traced_memory()[1] < 2**22
+    finally:
+        tracemalloc.stop()
+
+
 @pytest.mark.parametrize("numbers", [1, 2, 3])
 def test_kept_flow_has_two_numbers_a_pixel(tmp_path, numbers):
     arrays = {"vectors": np.zeros((1, 4, 6, numbers)), "valid": np.ones((1, 4, 6), bool)}

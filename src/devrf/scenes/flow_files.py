@@ -78,7 +78,8 @@ def _arrays(path: Path, shapes: Mapping[str, tuple[int, ...]], remedy: str) -> d
 
     Unpacked data may be a thousand times as large as the file. DevrfError if it is no npz.
     """
-    with decoding(path, "npz", remedy), np.load(path, allow_pickle=False) as archive:
+    # Mapped, an array in place of an archive takes no memory.
+    with decoding(path, "npz", remedy), np.load(path, mmap_mode="r") as archive:
         for member in archive.zip.infolist():
             shape = shapes.get(member.filename.removesuffix(".npy"))
             if shape is not None and member.file_size > _WIDEST * math.prod(shape) + _HEADER:
