@@ -9,6 +9,7 @@ import pytest
 
 from devrf.data.recorded import InwardFacingDataModule
 from devrf.errors import DevrfError
+from devrf.scenes import formats
 from devrf.scenes.formats import check_choice, recognise
 
 PARTS = ("cameras", "images", "points3D")
@@ -138,3 +139,16 @@ def test_a_folder_of_what_is_not_read(tmp_path, file, said):
     with pytest.raises(DevrfError) as caught:
         recognise(tmp_path)
     assert str(caught.value).endswith(said)
+
+
+def test_many_folders_in_one_are_looked_at_in_seconds(tmp_path, monkeypatch):
+    """Installed packages, which take longer than a folder, are looked through once."""
+    for number in range(20):
+        (tmp_path / str(number)).mkdir()
+    asked = []
+    monkeypatch.setattr(formats, "entry_points", lambda group: asked.append(group) or [])
+    formats._installed.cache_clear()
+    with pytest.raises(DevrfError, match="no known layout"):
+        recognise(tmp_path)
+    formats._installed.cache_clear()
+    assert asked == ["devrf.layouts"]

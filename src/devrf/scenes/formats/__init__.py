@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, replace
+from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
 
@@ -106,9 +107,12 @@ def _fitting(root: str | Path) -> tuple[Path, list[KnownLayout]]:
 
 def _layouts(folder: Path) -> list[KnownLayout]:
     """The layouts of a folder, the preferred one first; installed packages' come before."""
-    installed = [point.load() for point in entry_points(group="devrf.layouts")]
-    layouts = (*installed, *LAYOUTS)
-    return [layout for layout in layouts if _fits(layout, folder)]
+    return [layout for layout in (*_installed(), *LAYOUTS) if _fits(layout, folder)]
+
+
+@cache  # it takes ten times as long as a look at a folder
+def _installed() -> tuple[KnownLayout, ...]:
+    return tuple(point.load() for point in entry_points(group="devrf.layouts"))
 
 
 def _fits(layout: KnownLayout, folder: Path) -> bool:
