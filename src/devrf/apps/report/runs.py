@@ -25,6 +25,8 @@ SKIPPED = "%s: skipped; it is damaged, or not as devrf writes it"
 # The most values of a record, letters of a name, letters of a text or items of a list; the largest
 # number.
 MOST = 1000
+# The most names of all values: a report has a cell for each in each run.
+MOST_COLUMNS = 5000
 LONGEST_NAME = 255
 LONGEST = 10_000
 LARGEST = 1e9
@@ -48,7 +50,7 @@ KINDS: dict[str, Any] = {
     **dict.fromkeys(("at_rest", "mistake"), bool),
     "error": _Text,
     "dynamic.psnr": int | float | None,
-    "run.overrides": list[_Text] | None,
+    "run.overrides": Annotated[list[_Text], Len(0, MOST)] | None,
     "run.image_size": Annotated[list[int], Len(2, 2)] | None,
     **dict.fromkeys(("run.device", "run.checkpoint", "run.date", "run.git"), _Text | None),
     **dict.fromkeys(("run.devrf", "run.fingerprint", "run.lpips_network"), _Text | None),
@@ -88,6 +90,7 @@ def collect(folder: Path) -> Collection:
         raise DevrfError(f"report.runs: no folder {folder}; give the folder that holds the runs")
     records: dict[str, list[dict[str, Any]]] = {"finished": [], "failed": []}
     skipped: list[str] = []
+    names: set[str] = set()
     rehearsals = 0
     for child, inner, _ in walk(folder):
         inner.sort(key=_natural)
@@ -102,6 +105,9 @@ def collect(folder: Path) -> Collection:
             try:
                 utf8_path(child)  # or no table could be printed
                 record = read(_flat(json.loads(read_record(file))))
+                if len(names | record.keys()) > MOST_COLUMNS:
+                    raise ValueError("names of its own")
+                names |= record.keys()
             except (OSError, *UNREADABLE):
                 skipped.append(shown(SKIPPED % file))
             except DevrfError as error:
