@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import re
 import struct
 import tracemalloc
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -52,6 +54,35 @@ def test_an_image_is_turned_where_only_so_it_fits_its_camera(tmp_path, orientati
     for unknown in (None, (300, 100)):
         assert np.array_equal(pixels(path, unknown), stored)
         assert read_header(path, unknown).ambiguous_orientation == (orientation != 1)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("compression", ["raw", "tiff_lzw"])
+def test_a_tiff_is_turned_as_it_says(tmp_path, orientation, compression):
+    values = np.random.default_rng(0).integers(0, 255, (*WIDE[::-1], 4), dtype=np.uint8)
+    path, tag = tmp_path / "a.tif", {274: orientation}
+    Image.fromarray(values).save(path, compression=compression, tiffinfo=tag)
+    with Image.open(path.open("rb")) as image:
+        seen = np.asarray(image)
+    assert image_size(path) == (HIGH if orientation >= 5 else WIDE)
+    assert np.array_equal(decode(path, read_header(path), "RGBA")[:], seen)
+
+
+@pytest.mark.parametrize("orientation", range(5, 9))
+def test_few_rows_are_turned_at_a_time(tmp_path, orientation, monkeypatch):
+    path = photo(tmp_path / "a.png", orientation, (400, 300))
+    with Image.open(path) as image:
+        seen = np.asarray(ImageOps.exif_transpose(image))
+    turned: list[int] = []
+    transpose = Image.Image.transpose
+    monkeypatch.setattr(
+        Image.Image,
+        "transpose",
+        lambda self, way: turned.append(self.width * self.height) or transpose(self, way),
+    )
+    loaded = load_images([path], 1, [(300, 400)])
+    assert np.array_equal(loaded.pixels[0].numpy(), seen)
+    assert sum(turned) == 400 * 300 and max(turned) <= 2**14
 
 
 def test_a_set_is_of_one_size_once_it_is_turned(tmp_path, caplog):
@@ -112,6 +143,31 @@ def test_a_jpeg_of_any_number_of_scans(tmp_path):
     with pytest.raises(DevrfError, match="more than 100 scans"):
         read_header(path)
     path.write_bytes(content + b"\xff\xda" * 200)  # as the film behind a phone's photograph
+    assert image_size(path) == (64, 64)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "place", "part"),
+    [
+        ("jpg", 2, b"\xff\xfe\x00\x02"),  # a comment without text
+        ("jpg", 2, b"\xff\xd8"),
+        ("jpg", 2, b"\xff\xf0\x00\x02"),
+        ("jpg", 20, b"\0"),
+        ("png", 33, struct.pack(">I4sI", 0, b"prIv", zlib.crc32(b"prIv"))),
+    ],
+)
+def test_an_image_of_any_number_of_parts(tmp_path, suffix, place, part):
+    path = tmp_path / f"a.{suffix}"
+    Image.new("RGB", (64, 64)).save(path)
+    content = path.read_bytes()
+    for count, fault in ((3, ""), (200_000, "not a readable image (too many parts)")):
+        path.write_bytes(content[:place] + part * count + content[place:])
+        if fault:
+            with pytest.raises(DevrfError, match=re.escape(fault)):
+                image_size(path)
+        else:
+            assert image_size(path) == (64, 64)
+    path.write_bytes(content + part * 200_000)  # behind its end
     assert image_size(path) == (64, 64)
 
 

@@ -252,8 +252,8 @@ def _ffmpeg(
 
 
 def _photograph(file: Path) -> Picture:
-    open_image(file).close()  # OpenCV would decode much larger ones than Pillow opens
-    image = cv2.imread(str(file), cv2.IMREAD_COLOR)
+    with open_image(file):  # OpenCV would decode much larger ones than Pillow opens
+        image = cv2.imread(str(file), cv2.IMREAD_COLOR)
     if image is None:
         raise scene_error(file, "not a readable image; convert it to PNG or JPEG")
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)

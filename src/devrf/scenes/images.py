@@ -7,14 +7,16 @@ shape; otherwise it is read as it is stored.
 
 from __future__ import annotations
 
+import io
 import logging
 import math
 import os
 import re
 import time
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
@@ -53,12 +55,16 @@ TURNS = {
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
 }
-# Turns that exchange width and height.
+# Turns that exchange width and height, and those after which the last row, or column, is the first.
 QUARTER_TURNS = (5, 6, 7, 8)
+FROM_THE_END = (3, 4, 7, 8)
 # The most pixels of a TIFF's tile, which is decoded whole, however small the image.
 LARGEST_TILE = 2**24
 # The most scans of a progressive JPEG, each of which goes through all its pixels; usual are 10.
 MOST_SCANS = 100
+# The most parts of a file, and bytes of each of a larger file's: a PNG has two for 8 kB or more.
+MOST_PARTS = 50_000
+PART = 2**10
 # Markers of a JPEG file, but for those within a scan.
 MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
 START_OF_SCAN = b"\xff\xda"
@@ -95,20 +101,35 @@ def unread(folder: Path) -> str:
     return f"; {', '.join(sorted(kinds))} files are there, which are not read: convert them to PNG"
 
 
-def open_image(path: Path) -> Image.Image:
+class _Parts(io.BufferedReader):
+    """A file that is read in so many parts at most, for each of which Pillow takes a while."""
+
+    parts = 0
+
+    def __repr__(self) -> str:
+        return repr(str(self.name))
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """The next bytes; ValueError: they are one part too many."""
+        self.parts += 1
+        if self.parts > MOST_PARTS + self.tell() // PART:
+            raise ValueError("too many parts")
+        return super().read(size)
+
+
+@contextmanager
+def open_image(path: Path) -> Iterator[Image.Image]:
     """The image at ``path``, its header read, nothing decoded yet."""
-    with decoding(path, "image", "replace the file, or make it smaller"):
-        image = Image.open(path, formats=FORMATS)
-        tags = getattr(image, "tag_v2", {})
-        fault = ""
-        if tags.get(TILEWIDTH, 0) * tags.get(TILELENGTH, 0) > LARGEST_TILE:
-            fault = "its tiles are too large"
-        elif "progressive" in image.info and _has_many_scans(path):
-            fault = f"more than {MOST_SCANS} scans"
-        if fault:
-            image.close()
-            raise ValueError(fault)
-        return image
+    # Of a file without a name Pillow maps nothing; of TIFFs that are turned it maps wrong rows.
+    with _Parts(io.FileIO(path)) as file:
+        with decoding(path, "image", "replace the file, or make it smaller"):
+            image = Image.open(file, formats=FORMATS)
+            tags = getattr(image, "tag_v2", {})
+            if tags.get(TILEWIDTH, 0) * tags.get(TILELENGTH, 0) > LARGEST_TILE:
+                raise ValueError("its tiles are too large")
+            if "progressive" in image.info and _has_many_scans(path):
+                raise ValueError(f"more than {MOST_SCANS} scans")
+        yield image
 
 
 def _has_many_scans(path: Path) -> bool:
@@ -182,12 +203,17 @@ def decode(path: Path, header: Header, mode: str) -> Rows:
     """
     with open_image(path) as image, decoding(path, "image", "replace the file"):
         image.load()
-        turned = image.transpose(TURNS[header.turn]) if header.turn in TURNS else image
-        if turned.size != (header.width, header.height):
+        columns = header.turn in QUARTER_TURNS
+        if image.size[:: -1 if columns else 1] != (header.width, header.height):
             raise ValueError("its size is not the one that its header claims")
 
     def read(first: int, end: int) -> Pixels:
-        return np.asarray(turned.crop((0, first, header.width, end)).convert(mode))
+        # Turned part by part: a second whole picture would take as much memory as the first.
+        if header.turn in FROM_THE_END:
+            first, end = header.height - end, header.height - first
+        box = (first, 0, end, image.height) if columns else (0, first, image.width, end)
+        part = image.crop(box).convert(mode)
+        return np.asarray(part.transpose(TURNS[header.turn]) if header.turn in TURNS else part)
 
     return Rows((header.height, header.width, len(mode)), read)
 
