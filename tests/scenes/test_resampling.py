@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 import torch
@@ -89,3 +91,15 @@ def test_a_lens_that_folds_is_an_error_that_names_the_image():
     image = torch.zeros(1, HEIGHT, WIDTH, 3, dtype=torch.uint8)
     with pytest.raises(DevrfError, match=r"view_7\.png"):
         as_pinhole(image, [folded], ["view_7.png"], [(WIDTH, HEIGHT)])
+
+
+def test_of_a_large_image_few_rows_are_interpolated_at_a_time():
+    image = np.zeros((1000, 1000, 3), np.uint8)
+    source = np.full((1000, 1000, 2), 7, np.float32)
+    tracemalloc.start()
+    try:
+        assert not interpolate_pixels(image, source).any()
+        # The image in floating point and the result; 50 MB were all rows taken at once.
+        assert tracemalloc.get_traced_memory()[1] < 18e6
+    finally:
+        tracemalloc.stop()

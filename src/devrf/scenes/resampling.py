@@ -33,7 +33,7 @@ class Rows:
         return self.read(rows.start or 0, self.shape[0] if rows.stop is None else rows.stop)
 
 
-def bands(image: Rows | Pixels) -> Iterator[slice]:
+def bands(image: Rows | Pixels | Array | Tensor) -> Iterator[slice]:
     """The rows of an image, a few at a time."""
     rows, columns = image.shape[:2]
     step = max(1, _BAND // columns)
@@ -79,14 +79,14 @@ def interpolate_pixels(image: Pixels, source: Array) -> Pixels:
     Alpha is not premultiplied; black where it is 0. Positions outside get the nearest pixel of the
     border.
     """
-    x = np.ascontiguousarray(source[..., 0] - np.float32(0.5))
-    y = np.ascontiguousarray(source[..., 1] - np.float32(0.5))
-
     weighted = image.shape[2] == 4
-    result = cv2.remap(
-        _values(image, weighted), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
-    return _pixels(np.asarray(result, np.float32).reshape(*x.shape, image.shape[2]), weighted)
+    values = _values(image, weighted)
+    result = np.empty((*source.shape[:2], image.shape[2]), np.uint8)
+    for band in bands(source):
+        x, y = np.ascontiguousarray(np.moveaxis(source[band] - np.float32(0.5), 2, 0))
+        part = cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        result[band] = _pixels(np.asarray(part, np.float32).reshape(result[band].shape), weighted)
+    return result
 
 
 def _values(image: Pixels, weighted: bool) -> Array:
@@ -171,23 +171,25 @@ def as_pinhole(
 @lru_cache(maxsize=4)
 def _pinhole_view(lens: Lens, width: int, height: int) -> tuple[Lens, Tensor] | None:
     """The pinhole, and the lens's pixel (H, W, 2) of each of its pixels; None: folded."""
-    centres = _centres(width, height)
-    zoom = _zoom(lens, centres)
+    source = _centres(width, height)
+    zoom = _zoom(lens, source)
     if zoom is None:
         return None
     fx, fy = lens.focal
     center = lens.center
     plain = Lens((fx * zoom, fy * zoom), center)
-    directions = _directions(plain, centres)
-    if not bool(lens.distortion.upright(directions).all()):
-        return None
-    return plain, _on_lens(lens, directions).float()
+    for band in bands(source):
+        directions = _directions(plain, source[band].double())
+        if not bool(lens.distortion.upright(directions).all()):
+            return None
+        source[band] = _on_lens(lens, directions).float()
+    return plain, source
 
 
 def _zoom(lens: Lens, centres: Tensor) -> float | None:
     """The least factor ≥ 1 of the focal lengths at which the lens saw the whole border."""
     height, width = centres.shape[:2]
-    border = torch.cat([centres[0], centres[-1], centres[:, 0], centres[:, -1]])
+    border = torch.cat([centres[0], centres[-1], centres[:, 0], centres[:, -1]]).double()
     directions = _directions(Lens(lens.focal, lens.center), border)
     size = border.new_tensor([width, height])
 
@@ -204,10 +206,10 @@ def _zoom(lens: Lens, centres: Tensor) -> float | None:
 
 
 def _centres(width: int, height: int) -> Tensor:
-    """(H, W, 2) float64 x, y of the pixels' centres."""
+    """(H, W, 2) float32 x, y of the pixels' centres."""
     x = torch.arange(width) + 0.5
     y = torch.arange(height) + 0.5
-    return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).double()
+    return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
 
 
 def _directions(pinhole: Lens, pixels: Tensor) -> Tensor:
