@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -179,6 +180,13 @@ def test_what_cannot_be_aligned_is_refused(surveyed):
     for other, offsets in ((still, None), (noise, None), (one, [0, 5])):
         with pytest.raises(DevrfError, match=r"^b\.mp4: "):
             timeline(PATHS, [one, other], 10, offsets)
+
+
+def test_times_that_no_video_has_are_refused(surveyed):
+    one = surveyed(bursts(), 30, 8)
+    jump = replace(one, times=(*one.times[:-1], 1e9))
+    with pytest.raises(DevrfError, match=r"^b\.mp4: its frames span 1000000000 s; convert it"):
+        timeline(PATHS, [one, jump], 10)
 
 
 # Images and their alpha masks.
