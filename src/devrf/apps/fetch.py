@@ -27,6 +27,7 @@ from devrf.system.files import (
     UNREADABLE,
     atomic_write,
     make_folder,
+    read_record,
     refuse_links,
     write_json,
 )
@@ -145,9 +146,7 @@ def catalogue(file: str | Path | None = None) -> list[PublishedScene]:
     """The scenes of a catalogue (None: devrf's own); DevrfError if it cannot be read."""
     path = OWN if file is None else Path(file).expanduser()
     try:
-        if not path.is_file() or path.stat().st_size > LARGEST_CATALOGUE:
-            raise ValueError("no file, or a larger one than a catalogue's")
-        text = path.read_text()
+        text = read_record(path, LARGEST_CATALOGUE).decode()
         if any(line.count(".") > MOST_POINTS for line in text.split("\n")):
             raise ValueError(f"a line of more than {MOST_POINTS} points")
         listed = validate(dict[str, list[Collection]], tomllib.loads(text))
