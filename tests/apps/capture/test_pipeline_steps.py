@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 
+from devrf.apps.capture import images
 from devrf.apps.capture.alignment import offset_between, timeline
 from devrf.apps.capture.images import (
     Chosen,
@@ -41,6 +42,7 @@ from devrf.apps.settings import CaptureSettings
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
+from devrf.scenes.image_folders import listed_images as list_of
 
 SIZE = (64, 48)
 PATHS = [Path("a.mp4"), Path("b.mp4")]
@@ -389,3 +391,14 @@ def test_cameras_that_jump_within_a_video_are_refused(tmp_path):
     (tmp_path / "photographs").mkdir()
     photographs = Chosen(tmp_path / "photographs", "static", tuple(range(6)))
     assert len(checked_model(folder, photographs, {}).images) == 6
+
+
+def test_masks_of_many_photographs_are_listed_once(tmp_path, monkeypatch):
+    for folder in ("walk", "masks/walk"):
+        (tmp_path / folder).mkdir(parents=True)
+        for number in range(20):
+            (tmp_path / folder / f"{number}.png").touch()
+    listed = []
+    monkeypatch.setattr(images, "listed_images", lambda path: listed.append(path) or list_of(path))
+    assert alpha_masks_of(tmp_path / "masks", tmp_path / "walk", 20) == tmp_path / "masks/walk"
+    assert len(listed) == 2

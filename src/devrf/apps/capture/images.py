@@ -150,8 +150,7 @@ def alpha_masks_of(
     # The header of a video of masks may be a little off.
     slack = 0.0 if is_folder(masks) else 0.05 * count
     if is_folder(footage):
-        for photograph in listed_images(footage):
-            _of_photograph(masks, photograph)
+        _of_photographs(masks, footage)
     elif abs(frame_count(masks) - count) > slack:
         raise DevrfError(
             f"{masks}: {frame_count(masks)} alpha masks, but {footage} has {count} frames; "
@@ -187,9 +186,7 @@ def chosen_masks(
         DevrfError: one is no grey image, has another size than its frame, or is missing.
     """
     if is_folder(masks):
-        files = listed_images(masks)
-        if is_folder(footage):
-            files = [_of_photograph(masks, photograph) for photograph in listed_images(footage)]
+        files = _of_photographs(masks, footage) if is_folder(footage) else listed_images(masks)
         white = white_in_files(files)
         for position in positions:
             yield read_mask(files[position], size, None, footage, white)
@@ -226,14 +223,15 @@ def motion_masks(images: Path, footage: Chosen) -> dict[str, Mask]:
     return dict(zip(footage.names, whole, strict=True))
 
 
-def _of_photograph(masks: Path, photograph: Path) -> Path:
-    for mask in listed_images(masks):
-        if mask.stem == photograph.stem:
-            return mask
-    raise DevrfError(
-        f"{masks / photograph.stem}.png: no such alpha mask, of {photograph}; give each photograph "
-        "one of its name"
-    )
+def _of_photographs(masks: Path, footage: Path) -> list[Path]:
+    named = {mask.stem: mask for mask in reversed(listed_images(masks))}
+    photographs = listed_images(footage)
+    if lacking := [photograph for photograph in photographs if photograph.stem not in named]:
+        raise DevrfError(
+            f"{masks / lacking[0].stem}.png: no such alpha mask, of {lacking[0]}; give each "
+            "photograph one of its name"
+        )
+    return [named[photograph.stem] for photograph in photographs]
 
 
 log = logging.getLogger(__name__)
