@@ -44,6 +44,15 @@ def refused(folder: Path, sets) -> str:
     return line
 
 
+def scored(folder: Path, sets) -> dict:
+    """The scored views of the pictures in a folder, by their set."""
+    pictures = read_predictions(folder, "Other", sets, "white")
+    return {
+        name: score_held_out(own, {name: own.views}, "white")[name]
+        for name, own in pictures.items()
+    }
+
+
 def test_own_pictures_score_as_the_model_does(learned, sets, tmp_path):
     """Up to what eight bits of a colour round."""
     model = learned[0].scene_model
@@ -53,7 +62,7 @@ def test_own_pictures_score_as_the_model_does(learned, sets, tmp_path):
             view = score(Renderer(model), views, index, "white", time=time)
             write_image(tmp_path / name / picture_name(views, index), view.prediction)
     own = score_held_out(model, sets, "white")
-    again = score_held_out(read_predictions(tmp_path, "Other", sets, "white"), sets, "white")
+    again = scored(tmp_path, sets)
     for name in sets:
         for first, second in zip(own[name], again[name], strict=True):
             assert (first.name, first.time) == (second.name, second.time)
@@ -69,8 +78,7 @@ def test_every_way_to_say_which_image_it_is(folder, sets, tmp_path):
     here = folder / "dynamic"
 
     def found() -> list[np.ndarray]:
-        scored = score_held_out(read_predictions(folder, "Other", sets, "white"), sets, "white")
-        return [to_bytes(view.prediction).numpy() for view in scored["dynamic"]]
+        return [to_bytes(view.prediction).numpy() for view in scored(folder, sets)["dynamic"]]
 
     def equal() -> bool:
         return all(np.array_equal(a, b) for a, b in zip(found(), expected, strict=True))
@@ -100,9 +108,23 @@ def test_a_film_and_alpha(folder, sets):
     for index in range(len(sets["static"])):
         pixels = sets["static"].single(index).pixels[0].numpy()
         iio.imwrite(folder / "static" / picture_name(sets["static"], index), pixels)
-    scored = score_held_out(read_predictions(folder, "Other", sets, "white"), sets, "white")
-    assert min(view.psnr for view in scored["dynamic"]) > 20  # H.264 halves the colours' size
-    assert min(view.psnr for view in scored["static"]) > 60  # RGBA is put on the background
+    found = scored(folder, sets)
+    assert min(view.psnr for view in found["dynamic"]) > 20  # H.264 halves the colours' size
+    assert min(view.psnr for view in found["static"]) > 60  # RGBA is put on the background
+
+
+def test_two_sets_of_one_pose_and_time_have_pictures_of_their_own(sets, tmp_path):
+    """As those of what one moving camera films: its held-out views at rest are those in motion."""
+    views = sets["static"]
+    for name, share in (("static", 0.5), ("dynamic", 0.9)):
+        for index in range(len(views)):
+            dark = truth_image(views, index, "white") * share
+            write_image(tmp_path / name / picture_name(views, index), dark)
+    found = scored(tmp_path, {"static": views, "dynamic": views})
+    for index, (rest, moved) in enumerate(zip(*found.values(), strict=True)):
+        truth = truth_image(views, index, "white")
+        assert (rest.prediction - truth * 0.5).abs().max() < 0.01
+        assert (moved.prediction - truth * 0.9).abs().max() < 0.01
 
 
 def test_what_does_not_fit_is_said_in_one_line(folder, sets):
@@ -141,4 +163,4 @@ def test_a_motion_that_was_not_learned_is_no_other_order(folder, sets):
     first, *others = sorted((folder / "dynamic").iterdir())
     for other in others:
         other.write_bytes(first.read_bytes())
-    assert read_predictions(folder, "Other", sets, "white").moves
+    assert read_predictions(folder, "Other", sets, "white")["dynamic"].moves

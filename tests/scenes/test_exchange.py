@@ -113,5 +113,5 @@ def test_pictures_under_the_names_of_held_out_images_are_found(tiny_scene, tmp_p
         darker = (views.pixels[k].float() * torch.tensor([0.9, 0.9, 0.9, 1.0])).to(torch.uint8)
         write_image(tmp_path / "rendered" / f"test_{k:05d}.png", darker)
     pictures = read_predictions(tmp_path / "rendered", "Other", {"dynamic": views}, "white")
-    scored = score_held_out(pictures, pictures.sets, "white")["dynamic"]
+    scored = score_held_out(pictures["dynamic"], {"dynamic": views}, "white")["dynamic"]
     assert all(30 < view.psnr < 50 for view in scored)

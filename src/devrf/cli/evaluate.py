@@ -166,10 +166,13 @@ def _evaluate_predictions(run: RunContext) -> None:
     folder = Path(run.config.evaluation.predictions)
     pictures = read_predictions(folder, program, sets, scene.background)
     suite = run.evaluation.suite(run.device)
-    scored, rule = _with_motion_masks(run, pictures.sets)
-    frames = score_held_out(pictures, scored, scene.background, suite)
+    scored, rule = _with_motion_masks(run, {name: own.views for name, own in pictures.items()})
+    frames = {
+        name: score_held_out(own, {name: scored[name]}, scene.background, suite)[name]
+        for name, own in pictures.items()
+    }
     sections = {name: {**mean_scores(v), "images": len(v)} for name, v in frames.items()}
-    _write_scores(run, frames, pictures.sets)
+    _write_scores(run, frames, scored)
     name = f"{program} (pictures)"
     head = {"method": name, "protocol": run.protocol.name}
     given = {"overrides": overrides(), "predictions": str(folder.resolve()), "motion_masks": rule}
@@ -177,7 +180,7 @@ def _evaluate_predictions(run: RunContext) -> None:
     for section, values in sections.items():
         log.info("%s, %s: %s", name, section, in_words(values))
     settings: VideoSettings = instantiate(run.config.video)
-    shown = [*pictures.sets.values()][-1]
-    images = held_out_images(shown, settings.frames)
-    film = held_out_pictures(Renderer(pictures), shown, images, settings, scene.background)
+    shown = [*pictures.values()][-1]
+    images = held_out_images(shown.views, settings.frames)
+    film = held_out_pictures(Renderer(shown), shown.views, images, settings, scene.background)
     write_video(run, Video("held_out", settings.fps, settings.frames, film))

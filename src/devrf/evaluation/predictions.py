@@ -79,26 +79,25 @@ class PredictionsFile(BaseModel):
 class Pictures(Renderable):
     """Pictures by another program in place of a learned scene: what it shows from held-out cameras.
 
+    They are of one set: views of two sets may have the same pose and time.
+
     Attributes:
-        sets: the held-out views that there are pictures of, by the name of their set.
+        views: the held-out views of the set.
     """
 
-    def __init__(self, program: str, sets: Mapping[str, Views]) -> None:
-        """No pictures yet of ``sets`` by a ``program``."""
+    def __init__(self, program: str, views: Views, pictures: Sequence[Tensor]) -> None:
+        """``pictures`` (H, W, 3) in [0, 1] of all ``views``, by a ``program``."""
         super().__init__()
         self.__dict__["name"] = program
         self.space = WORLD
         # Depth, which nobody knows, is drawn in these: any will do.
         self.box = Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
         self.depth_limits = (0.0, 1.0)
-        self.sets = dict(sets)
-        # By the pose of a camera: times and pictures (H, W, 3) in [0, 1].
+        self.views = views
+        # By the pose of a camera: times and pictures.
         self._shots: dict[tuple[float, ...], list[tuple[float, Tensor]]] = {}
-
-    def add(self, views: Views, index: int, picture: Tensor) -> None:
-        """Take a ``picture`` (H, W, 3) in [0, 1] of a held-out image."""
-        pose = _pose(views.cameras, index)
-        self._shots.setdefault(pose, []).append((float(views.times[index]), picture))
+        for index, (time, picture) in enumerate(zip(views.times.tolist(), pictures, strict=True)):
+            self._shots.setdefault(_pose(views.cameras, index), []).append((time, picture))
 
     def config(self) -> dict[str, Any]:
         """None: no checkpoint holds pictures."""
@@ -112,7 +111,7 @@ class Pictures(Renderable):
     @property
     def moves(self) -> bool:
         """Whether there are pictures of several times."""
-        return len({time for shots in self._shots.values() for time, _ in shots}) > 1
+        return bool((self.views.times != self.views.times[0]).any())
 
     def at(self, time: float, *, half: bool = False) -> PicturesAt:
         """The pictures of the nearest time that a camera has one of."""
@@ -152,8 +151,8 @@ def picture_name(views: Views, index: int) -> str:
 
 def read_predictions(
     path: Path, program: str, sets: Mapping[str, Views], background: Background
-) -> Pictures:
-    """The pictures of ``sets`` of held-out views in a folder, or in films (see above).
+) -> dict[str, Pictures]:
+    """The pictures in a folder, or in films (see above), of those ``sets`` that have some, by name.
 
     Raises:
         DevrfError: a picture is missing, of another size than its image, or most like another
@@ -165,15 +164,14 @@ def read_predictions(
     if not places:
         folders = " or ".join(f"{name}/" for name in sets)
         raise scene_error(path, f"has no folder or film {folders}; add one for each set of views")
-    pictures = Pictures(program, {name: sets[name] for name in places})
+    pictures = {}
     for name, place in places.items():
         views = sets[name]
         found = _film(place, views) if os.path.isfile(place) else pictures_in(place, views)
         behind = background_value(background)
         ready = [on_background(torch.tensor(found(k)), behind) for k in range(len(views))]
         _check_order(ready, views, background, place)
-        for k, picture in enumerate(ready):
-            pictures.add(views, k, picture)
+        pictures[name] = Pictures(program, views, ready)
     return pictures
 
 
