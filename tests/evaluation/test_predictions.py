@@ -127,6 +127,18 @@ def test_two_sets_of_one_pose_and_time_have_pictures_of_their_own(sets, tmp_path
         assert (moved.prediction - truth * 0.9).abs().max() < 0.01
 
 
+def test_another_background_is_said_and_scored(folder, sets, caplog):
+    read_predictions(folder, "Other", sets, "white")
+    assert not caplog.records
+    for index in range(len(sets["dynamic"])):
+        on_black = truth_image(sets["dynamic"], index, "black")
+        write_image(folder / "dynamic" / picture_name(sets["dynamic"], index), on_black)
+    assert {*read_predictions(folder, "Other", sets, "white")} == {"static", "dynamic"}
+    (line,) = (record.getMessage() for record in caplog.records)
+    assert line.startswith(f"{folder / 'dynamic'}: the images are white")
+    assert line.endswith("data.background=black")
+
+
 def test_what_does_not_fit_is_said_in_one_line(folder, sets):
     here = folder / "dynamic"
     first, second, third = sorted(here.iterdir())

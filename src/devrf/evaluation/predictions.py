@@ -19,6 +19,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean
 from typing import Annotated, Any
 
 import torch
@@ -50,6 +51,8 @@ SAME_TIME = 1e-3
 # Pictures have changed places if this share of their errors is left when each is compared with the
 # image that it is most like, or less.
 IN_ANOTHER_ORDER = 0.5
+# Pictures have another background if they differ from it by so much, on average.
+OTHER_BACKGROUND = 0.5
 # Pixels of the sides of pictures when they are told apart.
 SMALL = 32
 
@@ -171,6 +174,7 @@ def read_predictions(
         behind = background_value(background)
         ready = [on_background(torch.tensor(found(k)), behind) for k in range(len(views))]
         _check_order(ready, views, background, place)
+        _compare_background(ready, views, background, place)
         pictures[name] = Pictures(program, views, ready)
     return pictures
 
@@ -323,6 +327,24 @@ def _check_order(
             f"the picture of {_in_words(views, first)} shows "
             f"{_in_words(views, int(nearest[first]))}: {len(moved)} are in another order; name "
             "them as the held-out images",
+        )
+
+
+def _compare_background(
+    pictures: Sequence[Tensor], views: Views, background: Background, place: Path
+) -> None:
+    """Say in a line if pictures have something else behind the alpha masks than the images."""
+    behind = background_value(background)
+    errors = []
+    for k, picture in enumerate(pictures if views.has_alpha else ()):
+        clear = views.single(k).pixels[0, ..., 3] == 0
+        if bool(clear.any()):
+            errors.append(float((picture[clear] - behind).abs().mean()))
+    if errors and fmean(errors) > OTHER_BACKGROUND:
+        log.warning(
+            "%s: the images are %s behind the alpha masks, the pictures are not; render them so, "
+            "or score them with data.background=%s",
+            *(place, *(("white", "black") if behind else ("black", "white"))),
         )
 
 
