@@ -54,6 +54,16 @@ def frustum_depth(cameras: Cameras) -> float:
     return float(apart.clamp(MIN_DEPTH * away, MAX_DEPTH * away))
 
 
+def named_cameras(viewpoints: Viewpoints) -> dict[str, Cameras]:
+    """The cameras of the training images by name, each place of the dynamic ones once."""
+    captures = {"static": viewpoints.static, "dynamic": viewpoints.dynamic}
+    return {
+        f"{name}_{k}": cameras.single(k)
+        for name, cameras in captures.items()
+        for k in range(len(cameras))
+    }
+
+
 def thumbnail(scene: Scene, views: Views, index: int) -> Tensor:
     """The image ``index`` of views as a frustum shows it: (H', W', 3) uint8 on the host."""
     image = truth_image(views, index, scene.background)

@@ -12,9 +12,8 @@ from torch import Tensor
 from devrf.data.flow import previous_images
 from devrf.evaluation.held_out import HeldOutView, background_value, on_background
 from devrf.evaluation.predictions import pictures_in
-from devrf.rendering.renderer import Renderer, points_at_depth
-from devrf.rendering.tracks import track
-from devrf.rendering.view import ImageView
+from devrf.rendering.renderer import Renderer
+from devrf.rendering.tracks import shown_points, track
 from devrf.scenes.scene import Background, Capture, Views
 
 # A pixel moves if a channel is further than this from the median of its camera's images, of which
@@ -107,7 +106,7 @@ def pck_t(renderer: Renderer, capture: Capture) -> float | None:
     right, total = 0, 0
     for image in annotated:
         time = float(views.times[image])
-        points = _shown_points(renderer, views, image, places[image])
+        points, _ = shown_points(renderer, views.cameras.single(image), places[image], time)
         tracks = track(renderer.model, points, time, times)
         if tracks is None:
             return None
@@ -122,21 +121,3 @@ def pck_t(renderer: Renderer, capture: Capture) -> float | None:
             right += int((near & both).sum())
             total += int(both.sum())
     return round(right / total, 5) if total else None
-
-
-def _shown_points(renderer: Renderer, views: Views, image: int, places: Tensor) -> Tensor:
-    """World points (K, 3), on the scene's device, at the mean depths of K rays of an image.
-
-    The rays go through ``places`` (K, 2) in pixels; in a scene that renders whole images a place
-    has the depth of its pixel.
-    """
-    time = float(views.times[image])
-    rays = views.cameras.rays(torch.full((len(places),), image), places)
-    if isinstance(renderer.at(time), ImageView):
-        camera = views.cameras.single(image)
-        limits = places.new_tensor([camera.width - 1, camera.height - 1])
-        column, row = places.clamp(min=0).minimum(limits).long().unbind(1)
-        depth = renderer.view(camera, 0, time, 0.0).depth[row * camera.width + column]
-    else:
-        depth = renderer.picture(rays, time, 0.0).depth
-    return points_at_depth(renderer.model.space, rays.to(renderer.device), depth)

@@ -14,6 +14,7 @@ from devrf.metrics.geometric import SOLID
 from devrf.ops.splatting import rotations
 from devrf.rendering.renderable import Renderable
 from devrf.rendering.renderer import Renderer, points_at_depth
+from devrf.rendering.view import ImageView
 
 # Steps by which a backward warp is inverted.
 STEPS = 30
@@ -46,6 +47,27 @@ def track(model: Renderable, points: Tensor, time: float, times: Sequence[float]
     return torch.stack(places)
 
 
+def shown_points(
+    renderer: Renderer, camera: Cameras, pixels: Tensor, time: float
+) -> tuple[Tensor, Tensor]:
+    """World points (K, 3) that ``pixels`` (K, 2) of one camera show at ``time``; opacities (K,).
+
+    A point is at the mean depth of its ray. They are on the scene's device. A method that renders
+    whole images has one depth for all places in a pixel.
+    """
+    rays = camera.rays(torch.zeros(len(pixels), dtype=torch.long), pixels)
+    if isinstance(renderer.at(time), ImageView):
+        image = renderer.view(camera, 0, time, 0.0)
+        limits = pixels.new_tensor([camera.width - 1, camera.height - 1])
+        column, row = pixels.clamp(min=0).minimum(limits).long().unbind(1)
+        at = (row * camera.width + column).to(renderer.device)
+        depth, opacity = image.depth[at], image.opacity[at]
+    else:
+        picture = renderer.picture(rays, time, 0.0)
+        depth, opacity = picture.depth, picture.opacity
+    return points_at_depth(renderer.model.space, rays.to(renderer.device), depth), opacity
+
+
 @torch.no_grad()
 def moving_pixels(
     renderer: Renderer, camera: Cameras, time: float, times: Sequence[float], size: float
@@ -56,11 +78,9 @@ def moving_pixels(
     point moves, or not, over the ``times``, first at rest, in a scene of radius ``size``. None: the
     method follows no points.
     """
-    image = renderer.view(camera, 0, time, 0.0)
-    mask = image.opacity > SOLID
-    rays = camera.to(renderer.device).image_rays(0)[mask]
-    points = points_at_depth(renderer.model.space, rays, image.depth[mask])
-    places = track(renderer.model, points, time, times)
+    points, opacity = shown_points(renderer, camera, camera.pixel_grid(), time)
+    mask = opacity > SOLID
+    places = track(renderer.model, points[mask], time, times)
     if places is None:
         return None
     return mask.masked_scatter(mask, moving(places, size)).view(camera.height, camera.width).cpu()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -14,10 +15,14 @@ from devrf.apps.export.surface import surface_of
 from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError
 from devrf.geometry.clock import FrameClock
+from devrf.geometry.space import WORLD
 from devrf.methods.devrf.deformation_field import DeformationField
+from devrf.rendering.output import RenderedImage
+from devrf.rendering.renderable import Renderable
 from devrf.rendering.renderer import Renderer
 from devrf.rendering.seen_points import scene_radius
 from devrf.rendering.tracks import moving_pixels
+from devrf.scenes.procedural.filming import Filming, extent
 
 
 @pytest.fixture(scope="module")
@@ -93,8 +98,96 @@ def test_tracks_by_hand(moving_ball, around, tmp_path):
         ({"format": "csv", "tracks": None}, r"^export\.tracks: "),
         ({"format": "csv", "tracks": [[0, 0, torch.nan]]}, r"^export\.tracks.*: expected a finite"),
         ({"format": "csv", "content": "surface"}, r"^export\.content: expected tracks"),
-        ({"format": "csv", "part": "still"}, r"^export\.part: expected all beside export\.tracks"),
+        ({"format": "csv", "part": "still"}, r"^export\.part: expected all with tracks"),
+        ({"format": "csv", "pixels": [[1, 1]]}, r"^export\.tracks: .*, or export\.pixels in place"),
         ({"format": "gltf", "content": "auto"}, r"^export\.format: expected csv, json or usd"),
     ):
         with pytest.raises(DevrfError, match=said):
             written(**wrong)
+
+
+class Exact(Renderable):
+    """An embedded scene itself, whose motion is exact, as if it had been learned."""
+
+    name = "exact"
+
+    def __init__(self, recipe):
+        super().__init__()
+        self.shape, reach = recipe.visible_shape(), extent(recipe.model()).reach
+        self.filming = Filming(self.shape, reach, supersample=1)
+        self.space, self.box, self.depth_limits = WORLD, recipe().bounds.box, (0.0, 9.0)
+
+    device = torch.device("cpu")
+
+    def config(self):
+        return {}
+
+    def at(self, time, *, half=False):
+        def image(camera, background, crop):
+            pixels, depth = self.filming.pictures(camera, time)
+            met = depth.isfinite().float().flatten()
+            color = pixels[0, ..., :3].reshape(-1, 3) / 255
+            return RenderedImage(color, depth.nan_to_num(posinf=0.0).flatten(), met)
+
+        return SimpleNamespace(at_rest=time == 0, image=image)
+
+    def backward_warp(self, time):
+        return lambda points: self.shape.material(points, time).canonical
+
+    def forward_warp(self, time):
+        return lambda points: self.shape.forward(self.shape.material(points, 0.0), time)
+
+
+def test_what_a_pixel_shows_is_followed_as_an_embedded_scene_moves(
+    tiny_recipe, tiny_scene, tmp_path
+):
+    """Of each pixel whose flow is known: it comes from where the exact flow says."""
+    train = tiny_scene.dynamic.train
+    image = 5  # of the second camera, the last of three
+    assert (int(train.view[image]), float(train.times[image])) == (1, 1.0)
+    row, column = train.flow.valid[image].nonzero().unbind(1)
+    pixels = torch.stack([column, row], dim=1) + 0.5
+    model, views = Exact(tiny_recipe), Viewpoints.of(tiny_scene)
+    given = {"format": "json", "content": "tracks", "times": [0.0, 0.5, 1.0]}
+    given |= {"pixels": pixels.tolist(), "pixels_view": "dynamic_1", "pixels_time": 1.0}
+    export_scene(model, views, ExportSettings(**given), tmp_path)
+    tracks = json.loads((tmp_path / "tracks.json").read_text())["tracks"]
+    places = torch.tensor([track["positions"] for track in tracks])
+    before, _ = train.cameras.project_into(image, places[:, 1])
+    now, _ = train.cameras.project_into(image, places[:, 2])
+    # Where two parts touch at rest, a place there does not say which of both it belongs to.
+    clear = (now - pixels).norm(dim=1) < 1e-3
+    vectors = train.flow.vectors[image][row, column]
+    assert clear.float().mean() > 0.9 and vectors[clear].norm(dim=1).amax() > 1
+    assert (before - pixels - vectors)[clear].norm(dim=1).amax() < 1e-3
+    first = train.depth[image].isinf().nonzero()[0].flip(0).tolist()  # what sees nothing
+    for wrong, said in (
+        (
+            {"pixels": [[24, 3]]},
+            r"^export\.pixels: \[24, 3\] is outside of .* dynamic_1, of 24x18 px",
+        ),
+        ({"pixels": [[3, -0.5]]}, r"^export\.pixels: \[3, -0\.5\] is outside"),
+        ({"pixels": [first]}, r"^export\.pixels: .* of dynamic_1 shows nothing at time 1; give"),
+        (
+            {"pixels_view": "dynamic_2"},
+            r"^export\.pixels_view: no camera 'dynamic_2'; choose held_out, static_0 to static_7 "
+            r"or dynamic_0 to dynamic_1$",
+        ),
+        ({"pixels_time": 1.5}, r"^export\.pixels_time: "),
+        ({"pixels": [[1, 2, 3]]}, r"^export\.pixels"),
+    ):
+        with pytest.raises(DevrfError, match=said):
+            export_scene(model, views, ExportSettings(**(given | wrong)), tmp_path)
+
+
+def test_a_pixel_of_rays_has_the_depth_of_its_own_place(moving_ball, around, tmp_path):
+    """Places in one pixel differ: the ball's side is met where each ray goes."""
+    given = {"format": "json", "pixels_view": "static_0", "pixels_time": 0.0, "times": [0.0, 1.0]}
+    middle = [[24.0, 18.0], [24.4, 18.0]]
+    export_scene(moving_ball, viewpoints(around), ExportSettings(**given, pixels=middle), tmp_path)
+    tracks = json.loads((tmp_path / "tracks.json").read_text())["tracks"]
+    places = torch.tensor([track["positions"] for track in tracks])
+    assert (places[1, 0] - places[0, 0]).norm() > 0.01
+    torch.testing.assert_close(
+        places[:, 1], places[:, 0] * 1.2 + torch.tensor([0.4, 0, 0]), atol=1e-4, rtol=0
+    )

@@ -26,6 +26,7 @@ Format = Literal["gltf", "html", "ply", "obj", "splats", "usd", "csv", "json"]
 # Formats of nothing but tracks.
 TRACK_FORMATS = ("csv", "json")
 Point = Annotated[Sequence[pydantic.FiniteFloat], Len(3, 3)]
+Pixel = Annotated[Sequence[pydantic.FiniteFloat], Len(2, 2)]
 Up = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
 Factor = Annotated[float, Ge(1e-9), Le(1e9)]
 
@@ -47,6 +48,9 @@ class ExportSettings(Options):
     colors: Literal["normal", "mean"] = "mean"
     points: Count = 20_000
     tracks: Annotated[Sequence[Point], MinLen(1)] | None = None
+    pixels: Annotated[Sequence[Pixel], MinLen(1)] | None = None
+    pixels_view: str = "held_out"
+    pixels_time: Share = 0.0
     times: Annotated[Sequence[float], MinLen(1)] | None = None
     fps: Annotated[float, Gt(0), Le(1000)] | None = None
     seconds: Annotated[float, Ge(0.01), Le(3600)] = 3.0
@@ -59,9 +63,10 @@ class ExportSettings(Options):
             expect(self.content in ("auto", "tracks"), "export.content", "tracks", self.content)
             kinds = (*TRACK_FORMATS, "usd")
             expect(self.format in kinds, "export.format", "csv, json or usd of tracks", self.format)
-            given = self.tracks is not None
-            expect(given, "export.tracks", "points [[x,y,z],...] at rest", self.tracks)
-            expect(self.part == "all", "export.part", "all beside export.tracks", self.part)
+            either = (self.tracks is None) != (self.pixels is None)
+            expected = "points [[x,y,z],...] at rest, or export.pixels in place of them"
+            expect(either, "export.tracks", expected, self.tracks)
+            expect(self.part == "all", "export.part", "all with tracks", self.part)
         if self.times is None:
             return
         if self.fps is not None:
@@ -79,7 +84,7 @@ class ExportSettings(Options):
     def as_tracks(self) -> bool:
         """Whether the ways of points are asked for, by content, format, or these points."""
         of_tracks = self.content == "tracks" or self.format in TRACK_FORMATS
-        return of_tracks or self.tracks is not None
+        return of_tracks or self.tracks is not None or self.pixels is not None
 
     def export_times(self, clock: FrameClock) -> tuple[float, ...]:
         """The times to export, of a scene whose training frames have the clock's times."""

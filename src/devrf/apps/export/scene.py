@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from devrf.apps.captured_cameras import named_cameras
 from devrf.apps.export.geometry import ExportSettings, MovingMesh, UpFrame, carried
 from devrf.apps.export.gltf import write_gltf
 from devrf.apps.export.sequence import Drawn, mesh_files, point_file, write_sequence
@@ -17,7 +18,6 @@ from devrf.apps.export.usd import write_usd
 from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
-from devrf.geometry.cameras import Cameras
 from devrf.rendering.renderable import Renderable
 from devrf.rendering.renderer import Renderer
 from devrf.rendering.seen_points import seen_points
@@ -48,7 +48,7 @@ def export_scene(
     times = settings.export_times(viewpoints.clock) if model.moves else (0.0,)
     if settings.as_tracks:
         path = write_tracks(folder, model, viewpoints, settings, times)
-        points = len(settings.tracks or ())
+        points = len(settings.tracks or settings.pixels or ())
         log.info("tracks: points %d, times %d; written to %s", points, len(times), path)
         return
     own = MovingGaussians.of_model(model, times) if settings.as_splats else None
@@ -133,7 +133,7 @@ def _write_whole(
     writers = SPLATS if isinstance(moving, MovingGaussians) else SINGLE
     name, write = writers[settings.format]
     frame = UpFrame.of(viewpoints.static, settings.up, settings.metres, viewpoints.offset)
-    write(folder / name, moving, _named_cameras(viewpoints), frame, settings.seconds)
+    write(folder / name, moving, named_cameras(viewpoints), frame, settings.seconds)
     return folder / name
 
 
@@ -175,13 +175,3 @@ def _write_points(
     clouds = followed(drawn(), len(times), "points")
     write_sequence(folder, "ply", times, clouds, "points", settings.seconds)
     return max_points
-
-
-def _named_cameras(viewpoints: Viewpoints) -> dict[str, Cameras]:
-    """The cameras of the training images, each place of the dynamic ones once."""
-    captures = {"static": viewpoints.static, "dynamic": viewpoints.dynamic}
-    return {
-        f"{name}_{k}": cameras.single(k)
-        for name, cameras in captures.items()
-        for k in range(len(cameras))
-    }

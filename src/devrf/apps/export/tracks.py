@@ -1,4 +1,4 @@
-"""Tracks of chosen points: CSV, JSON, or USD."""
+"""Tracks of chosen points, or of what chosen pixels show: CSV, JSON, or USD."""
 
 from __future__ import annotations
 
@@ -7,15 +7,20 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
+from devrf.apps.captured_cameras import named_cameras
 from devrf.apps.export.geometry import ExportSettings, UpFrame
 from devrf.apps.export.sequence import FRAME
 from devrf.apps.export.usd import SceneFile
 from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError
+from devrf.metrics.geometric import SOLID
 from devrf.rendering.renderable import Renderable
-from devrf.rendering.tracks import track
+from devrf.rendering.renderer import Renderer
+from devrf.rendering.tracks import shown_points, track
 from devrf.system.files import atomic_write, write_json
+from devrf.system.options import abbreviated
 
 
 def write_tracks(
@@ -25,16 +30,21 @@ def write_tracks(
     settings: ExportSettings,
     times: Sequence[float],
 ) -> Path:
-    """Write where the points ``export.tracks``, given at rest, are at the times; the file.
+    """Write where the chosen points are at the times; the file.
 
-    Points are in the capture's world; those of USD in metres with y up.
+    They are ``export.tracks``, given at rest, or what ``export.pixels`` show. Points are in the
+    capture's world; those of USD in metres with y up.
 
     Raises:
-        DevrfError: the method follows no points.
+        DevrfError: the method follows no points; there is no such view or pixel, or nothing there.
     """
     offset = torch.tensor(viewpoints.offset, dtype=torch.float64)
-    points = torch.tensor(settings.tracks, dtype=torch.float64) - offset
-    tracks = track(model, points.float().to(model.device), 0.0, times)
+    if settings.pixels is None:
+        given = torch.tensor(settings.tracks, dtype=torch.float64) - offset
+        points, since = given.float().to(model.device), 0.0
+    else:
+        points, since = _shown(model, viewpoints, settings), settings.pixels_time
+    tracks = track(model, points, since, times)
     if tracks is None:
         raise DevrfError(f"export.content: method={model.name} follows no points; leave tracks out")
     tracks = tracks.float().cpu()
@@ -62,3 +72,31 @@ def write_tracks(
             shape.CreatePointsAttr().Set(Vt.Vec3fArray.FromNumpy(of_time.numpy()), code)
         scene.write(path, {})
     return path
+
+
+def _shown(model: Renderable, viewpoints: Viewpoints, settings: ExportSettings) -> Tensor:
+    """World points (K, 3) that ``export.pixels`` show, on the scene's device."""
+    pixels, name, time = settings.pixels or (), settings.pixels_view, settings.pixels_time
+    cameras = {"held_out": viewpoints.held_out, **named_cameras(viewpoints)}
+    if name not in cameras:
+        counts = {"static": len(viewpoints.static), "dynamic": len(viewpoints.dynamic)}
+        known = [f"{kind}_0 to {kind}_{count - 1}" for kind, count in counts.items() if count]
+        raise DevrfError(
+            f"export.pixels_view: no camera {abbreviated(name)}; choose held_out, "
+            f"{' or '.join(known)}"
+        )
+    camera = cameras[name].single(0)
+    for x, y in pixels:
+        if not (0 <= x < camera.width and 0 <= y < camera.height):
+            raise DevrfError(
+                f"export.pixels: [{x:g}, {y:g}] is outside of the image of {name}, of "
+                f"{camera.width}x{camera.height} px; give x and y from its top left corner"
+            )
+    points, opacity = shown_points(Renderer(model), camera, torch.tensor(pixels), time)
+    for (x, y), share in zip(pixels, opacity.tolist(), strict=True):
+        if share <= SOLID:
+            raise DevrfError(
+                f"export.pixels: [{x:g}, {y:g}] of {name} shows nothing at time {time:g}; give a "
+                "pixel that shows something"
+            )
+    return points
