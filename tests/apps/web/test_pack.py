@@ -36,6 +36,7 @@ from devrf.apps.settings import ViewerSettings
 from devrf.apps.viewer.page import PageServer
 from devrf.apps.web.pack import page
 from devrf.checkpoints.checkpoint import Viewpoints
+from devrf.cli.render import FRAME
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
 from devrf.geometry.cameras import Cameras
@@ -356,6 +357,26 @@ def test_the_controls_do_what_they_say(browser, file, tmp_path):
         time.sleep(0.1)
     assert iio.imread(saved).shape[:2] == (240, 360)
     assert browser.said() == []
+
+
+def test_a_page_of_ones_own_shows_it_by_the_line_that_export_prints(browser, file):
+    own = file.with_name("index.html")
+    own.write_text(f"<!doctype html><title>mine</title><p>a page of my own</p>{FRAME}")
+    camera = Cameras.looking_at(
+        torch.tensor([[0.0, -4.0, 0.5]]), torch.zeros(1, 3), focal=900.0, width=800, height=500
+    )
+    browser.open(own.as_uri(), 900, 700)
+    browser.driver.switch_to.frame(0)
+    browser.wait("document.body.className === 'ready'")
+    browser.run(f"location.hash = '{link(camera, 0.4)}'")
+    browser.wait("document.getElementById('clock').textContent === '0.400'")
+    framed = browser.canvas()
+    browser.driver.switch_to.default_content()
+    assert browser.run("return document.title") == "mine"
+    browser.open(file.as_uri() + link(camera, 0.4), 800, 500)
+    alone = browser.canvas()
+    assert framed.shape == alone.shape == (500, 800, 3)
+    assert framed.std() > 0.05 and psnr(framed, alone) > LEAST_PSNR
 
 
 def test_fingers_turn_and_pinch(browser, file):
