@@ -7,14 +7,16 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from torch.nn.functional import interpolate, max_pool2d
 
 from devrf.errors import DevrfError
-from devrf.evaluation.motion import changed, flicker, pck_t, with_motion_masks
+from devrf.evaluation.motion import flicker, pck_t, shifted, with_motion_masks
 from devrf.evaluation.predictions import picture_name
 from devrf.evaluation.suite import MEASURES
 from devrf.geometry.motion import moving, radius
 from devrf.pictures.images import write_image
 from devrf.rendering.renderer import Renderer
+from devrf.scenes.procedural import ProceduralScene
 from devrf.scenes.procedural.filming import Filming
 from devrf.scenes.procedural.rigs import dynamic_rig
 from devrf.scenes.procedural.solids import Material
@@ -85,28 +87,59 @@ def made(pixels, times, view=None) -> Views:
     return Views(pixels, train[torch.zeros(count, dtype=torch.long)], times, views, names)
 
 
-def test_without_exact_motion_masks_are_given_or_are_what_differs_from_the_median(tmp_path):
-    pixels = torch.full((3, 12, 16, 3), 100, dtype=torch.uint8)
-    pixels[1, 5, 6, 1] = 127  # 0.106 more
-    pixels[2, 5, 6, 1] = 125  # 0.098 more than the median, which is then 125
-    views = made(pixels, torch.tensor([0.0, 0.5, 1.0]))
-    pixels[2, 11, 15] = 0
-    mask = changed(views, "white")
-    assert mask.nonzero().tolist() == [[2, 11, 15]]
-    pixels[2, 5, 6, 1] = 100
+def textured(height, width, rng) -> torch.Tensor:
+    """A picture (H, W, 3) uint8 of blots of some pixels."""
+    blots = torch.rand(1, 3, height // 4 + 1, width // 4 + 1, generator=rng)
+    smooth = interpolate(blots, (height, width), mode="bilinear")[0]
+    return (smooth.permute(1, 2, 0) * 255).to(torch.uint8)
+
+
+def test_without_exact_motion_masks_are_given_or_are_what_flow_moves(tmp_path, rng):
+    pixels = textured(48, 64, rng).repeat(4, 1, 1, 1)
+    patch, expected = textured(20, 20, rng), torch.zeros(4, 48, 64, dtype=torch.bool)
+    for k in range(4):
+        where = k, slice(14, 34), slice(16 + 4 * k, 36 + 4 * k)
+        pixels[where], expected[where] = patch, True
+    views = made(pixels, torch.linspace(0, 1, 4))
     masked, rule = with_motion_masks(views, "white", None)
-    assert masked.motion_mask.nonzero().tolist() == [[1, 5, 6], [2, 11, 15]]
-    assert rule == "differs by 0.1 from the median of the camera's images"
-    alone = replace(views, view=torch.arange(3))
+    mask = masked.motion_mask
+    assert rule == "optical flow (DIS) longer than 0.025 radii"
+    assert (mask & expected).sum() / (mask | expected).sum() > 0.6
+    # It hardly reaches more than a few pixels beyond the patch.
+    beside = max_pool2d(expected.float(), 11, 1, 5) == 0
+    assert (mask & beside).sum() / mask.sum() < 0.1
+    alpha = torch.where(expected, 255, 0).to(torch.uint8)[..., None]
+    cut_out = shifted(replace(views, pixels=torch.cat([pixels, alpha], dim=3)), "white")
+    assert (cut_out & expected).sum() / expected.sum() > 0.9 and not (cut_out & ~expected).any()
+    # Neither what stands still moves, nor what a camera sees once.
+    still = replace(views, pixels=pixels[:1].repeat(4, 1, 1, 1))
+    alone = replace(views, view=torch.arange(4))
+    assert with_motion_masks(still, "white", None) == (still, None)
     assert with_motion_masks(alone, "white", None) == (alone, None)
-    for k in range(3):
-        write_image(tmp_path / picture_name(views, k), torch.ones(12, 16, 3) * (k == 1))
+    for k in range(4):
+        write_image(tmp_path / picture_name(views, k), torch.ones(48, 64, 3) * (k == 1))
     masked, rule = with_motion_masks(views, "white", tmp_path)
-    assert masked.motion_mask.flatten(1).float().mean(dim=1).tolist() == [0, 1, 0]
+    assert masked.motion_mask.flatten(1).float().mean(dim=1).tolist() == [0, 1, 0, 0]
     assert rule == f"given: {tmp_path}"
     (tmp_path / picture_name(views, 2)).unlink()
     with pytest.raises(DevrfError, match=r"has no picture of 2\.png"):
         with_motion_masks(views, "white", tmp_path)
+
+
+def test_what_flow_moves_is_what_moves_of_the_embedded_robot():
+    views = ProceduralScene(
+        shape="robot", static_views=1, static_test_views=1, train_views=1, frames=7, supersample=1
+    )().dynamic.test
+    mask = shifted(views, "white")
+    assert (mask & views.motion_mask).sum() / (mask | views.motion_mask).sum() > 0.88
+
+
+def test_large_images_are_compared_smaller(rng):
+    pixels = textured(1100, 1280, rng).repeat(2, 1, 1, 1)
+    pixels[1, 400:700, 480:900] = pixels[0, 400:700, 440:860]
+    mask = shifted(made(pixels, torch.tensor([0.0, 1.0])), "white")
+    assert mask.shape == (2, 1100, 1280) and mask[1, 430:670, 510:870].float().mean() > 0.9
+    assert not mask[:, :300].any() and not mask[:, 800:].any()
 
 
 def test_only_pixels_of_the_mask_count(rng):

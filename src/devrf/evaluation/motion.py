@@ -8,20 +8,28 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
+from torch.nn.functional import interpolate, max_pool2d
 
 from devrf.data.flow import previous_images
 from devrf.evaluation.held_out import HeldOutView, background_value, on_background
 from devrf.evaluation.predictions import pictures_in
+from devrf.geometry.motion import MOVED, radius
 from devrf.rendering.renderer import Renderer
 from devrf.rendering.tracks import shown_points, track
+from devrf.scenes.optical_flow import ALPHA_THRESHOLD, estimator
 from devrf.scenes.scene import Background, Capture, Views
+from devrf.system.progress import followed
 
-# A pixel moves if a channel is further than this from the median of its camera's images, of which
-# there must be as many as SEVERAL.
-CHANGED = 0.1
-SEVERAL = 3
-# Rows of all images of a camera whose medians are found at once.
-BAND = 16
+# An image is compared with so many of its camera's, evenly spread over time.
+REFERENCES = 8
+# Pixels of the shorter side of images between which optical flow is found, at least; larger images
+# have less than twice as many.
+SIDE = 256
+# A pixel moves if in most of these pairs flow leads it farther than SHIFTED times the radius of
+# what the image shows (ways look shorter than they are), and a channel changes by more than
+# CHANGED at most a pixel away (flow reaches beyond the edges of what moves).
+SHIFTED = MOVED / 2
+CHANGED = 0.05
 # A point is followed rightly if it comes within this share of the image's larger side (DyCheck).
 NEAR = 0.05
 
@@ -32,7 +40,7 @@ def with_motion_masks(
     """Held-out views with masks of what moves, and the rule by which these were made.
 
     The same masks serve every method (docs/stages.md#moving): the ``given`` ones, else the exact
-    ones that the views have, else those of :func:`changed` pixels. None: no rule gives any.
+    ones that the views have, else those of :func:`shifted` pixels. None: no rule gives any.
 
     Raises:
         DevrfError: a mask is missing in the folder ``given``, or of another size than its image.
@@ -46,24 +54,46 @@ def with_motion_masks(
         return replace(views, motion_mask=mask), f"given: {given.resolve()}"
     if views.motion_mask is not None:
         return views, "exact"
-    mask = changed(views, background)
-    rule = f"differs by {CHANGED:g} from the median of the camera's images"
+    mask = shifted(views, background)
+    rule = f"optical flow (DIS) longer than {SHIFTED:g} radii"
     return (replace(views, motion_mask=mask), rule) if bool(mask.any()) else (views, None)
 
 
-def changed(views: Views, background: Background) -> Tensor:
-    """Mask (N, H, W) of pixels that differ from the median of the images of their fixed camera."""
+def shifted(views: Views, background: Background) -> Tensor:
+    """Mask (N, H, W) of pixels that optical flow between images of their fixed camera moves."""
     mask = torch.zeros_like(views.pixels[..., 0], dtype=torch.bool)
+    opaque = views.pixels[..., 3] > ALPHA_THRESHOLD if views.has_alpha else ~mask
+    between = estimator("dis", least_side=SIDE)
     for camera in {*views.view.tolist()}:
-        images = (views.view == camera).nonzero()[:, 0]
-        if len(images) < SEVERAL:
+        own = (views.view == camera).nonzero()[:, 0]
+        own = own[views.times[own].argsort()]
+        if len(own) < 2:
             continue
-        for first in range(0, views.height, BAND):
-            where = images, slice(first, first + BAND)
-            color = on_background(views.pixels[where], background_value(background))
-            away = (color - color.median(dim=0).values).abs().amax(dim=-1)
-            mask[where] = away > CHANGED
+        images = [_reduced(pixels, background) for pixels in views.pixels[own]]
+        height, width = images[0].shape[:2]
+        scale = views.height / height
+        limit = SHIFTED * radius(opaque[own[0]].nonzero().float()) / scale
+        evenly = torch.linspace(0, len(own) - 1, min(REFERENCES, len(own))).round().long().tolist()
+        for k, image in followed(enumerate(images), len(images), "motion masks"):
+            others = [images[reference] for reference in evenly if reference != k]
+            votes = torch.zeros(height, width)
+            for other in others:
+                change = (image.float() - other.float()).abs().amax(dim=-1)[None] / 255
+                near = max_pool2d(change, 3, 1, 1)[0] > CHANGED
+                votes += near & (between(image, other).norm(dim=-1) > limit)
+            moves = (votes > len(others) / 2).float()[None, None]
+            whole = interpolate(moves, (views.height, views.width))[0, 0] > 0
+            mask[own[k]] = whole & opaque[own[k]]
     return mask
+
+
+def _reduced(pixels: Tensor, background: Background) -> Tensor:
+    """An image (H, W, 3 or 4) as RGB (H', W', 3) uint8 of the size at which flow is found."""
+    color = on_background(pixels, background_value(background)).permute(2, 0, 1)[None]
+    height, width = color.shape[2:]
+    factor = max(min(height, width) // SIDE, 1)
+    small = interpolate(color, (height // factor, width // factor), mode="area")[0]
+    return (small.permute(1, 2, 0) * 255).round().to(torch.uint8)
 
 
 def flicker(views: Views, scored: Sequence[HeldOutView]) -> list[float | None]:

@@ -13,7 +13,7 @@ MOVED = 0.05
 
 
 def radius(points: Tensor) -> float:
-    """The median distance of points (M, 3) from their middle, the median along each axis.
+    """The median distance of points (M, D) from their middle, the median along each axis.
 
     Neither a sky far away nor a few points that float about change it much. Of no points it is
     infinite: nothing moves.

@@ -32,7 +32,7 @@ RAFT_MULTIPLE = 8
 Estimator = Callable[[Tensor, Tensor], Tensor]
 
 
-def estimator(method: str) -> Estimator:
+def estimator(method: str, *, least_side: int = LEAST_SIDE) -> Estimator:
     """A function (image, other) → flow between two images of one size.
 
     Images are (H, W, 3) uint8 on the CPU; the flow is (H, W, 2) float32 on the CPU, pixels, x
@@ -40,19 +40,20 @@ def estimator(method: str) -> Estimator:
 
     Args:
         method: "dis" or "raft".
+        least_side: DIS enlarges images whose shorter side has fewer pixels.
 
     Raises:
         DevrfError: RAFT's library is not installed, or its weights cannot be downloaded.
     """
-    return _dis() if method == "dis" else _raft()
+    return _dis(least_side) if method == "dis" else _raft()
 
 
-def _dis() -> Estimator:
+def _dis(least_side: int) -> Estimator:
     dis: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
 
     def flow(image: Tensor, other: Tensor) -> Tensor:
         height, width = image.shape[:2]
-        factor = max(1.0, LEAST_SIDE / min(height, width))
+        factor = max(1.0, least_side / min(height, width))
         size = (math.ceil(width * factor), math.ceil(height * factor))
         grey = [cv2.cvtColor(i.numpy(), cv2.COLOR_RGB2GRAY) for i in (image, other)]
         if size != (width, height):
