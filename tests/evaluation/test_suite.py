@@ -135,6 +135,7 @@ def test_scores_at_rest_serve_the_same_views_in_motion(moving, tiny_scene) -> No
         ({"metrics": ["lpisp"]}, "evaluation.metrics: no metric 'lpisp'"),
         ({"lpips_weights": "no.pth"}, "evaluation.lpips_weights: no file no.pth"),
         ({"motion_masks": "nowhere"}, "evaluation.motion_masks: no folder nowhere"),
+        ({"predictions": "nowhere"}, "evaluation.predictions: no folder nowhere"),
     ],
 )
 def test_mistakes_are_named(wrong, message):

@@ -161,8 +161,6 @@ def read_predictions(
         DevrfError: a picture is missing, of another size than its image, or most like another
             image.
     """
-    if not os.path.exists(path):
-        raise scene_error(path, "no such folder; evaluation.predictions is that of the pictures")
     places = {name: place for name in sets if (place := _place_of(path, name, sets))}
     if not places:
         folders = " or ".join(f"{name}/" for name in sets)

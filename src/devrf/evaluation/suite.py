@@ -136,7 +136,7 @@ class Evaluation:
     motion_masks: str | Path | None = None
 
     def check(self) -> None:
-        """Check that the metrics, the file of weights and the folder of masks exist.
+        """Check that the metrics, the file of weights and the folders exist.
 
         Raises:
             DevrfError: an unknown metric, or no file or folder where one is given.
@@ -147,10 +147,10 @@ class Evaluation:
                     f"evaluation.metrics: no metric {name!r}; choose from {', '.join(MEASURES)}"
                     f"{did_you_mean(name, MEASURES)}"
                 )
-        if self.motion_masks is not None and not Path(self.motion_masks).is_dir():
-            raise DevrfError(
-                f"evaluation.motion_masks: no folder {self.motion_masks}; give another"
-            )
+        folders = {"predictions": self.predictions, "motion_masks": self.motion_masks}
+        for key, folder in folders.items():
+            if folder is not None and not Path(folder).exists():
+                raise DevrfError(f"evaluation.{key}: no folder {folder}; give another")
         if self.lpips_weights is not None and not Path(self.lpips_weights).is_file():
             raise DevrfError(
                 f"evaluation.lpips_weights: no file {self.lpips_weights}; give the weights of "
