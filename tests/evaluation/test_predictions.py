@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -111,6 +112,10 @@ def test_a_film_and_alpha(folder, sets):
     found = scored(folder, sets)
     assert min(view.psnr for view in found["dynamic"]) > 20  # H.264 halves the colours' size
     assert min(view.psnr for view in found["static"]) > 60  # RGBA is put on the background
+    shutil.rmtree(folder / "static")
+    assert {*scored(folder, sets)} == {"dynamic"}
+    (folder / "dynamic.mp4").rename(folder / "static.mp4")
+    assert "has 3 frames, but 2 images are held out" in refused(folder, sets)
 
 
 def test_two_sets_of_one_pose_and_time_have_pictures_of_their_own(sets, tmp_path):

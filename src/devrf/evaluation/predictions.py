@@ -16,7 +16,7 @@ from __future__ import annotations
 import logging
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -161,12 +161,8 @@ def read_predictions(
         DevrfError: a picture is missing, of another size than its image, or most like another
             image.
     """
-    places = {name: place for name in sets if (place := _place_of(path, name, sets))}
-    if not places:
-        folders = " or ".join(f"{name}/" for name in sets)
-        raise scene_error(path, f"has no folder or film {folders}; add one for each set of views")
     pictures = {}
-    for name, place in places.items():
+    for name, place in _places(path, sets).items():
         views = sets[name]
         found = _film(place, views) if os.path.isfile(place) else pictures_in(place, views)
         behind = background_value(background)
@@ -177,15 +173,13 @@ def read_predictions(
     return pictures
 
 
-def _place_of(path: Path, name: str, sets: Mapping[str, Views]) -> Path | None:
-    """The folder or the film of a set; None: there is none."""
-    candidates = [path / name, *(path / f"{name}{suffix}" for suffix in VIDEOS)]
-    present = [place for place in candidates if os.path.exists(place)]
-    if present:
-        return present[0]
-    apart = any(os.path.exists(path / other) for other in sets)
+def _places(path: Path, sets: Iterable[str]) -> dict[str, Path]:
+    """The folder or the film of each set that has one; else the folder itself, of the last set."""
+    named = {name: [path / f"{name}{suffix}" for suffix in ("", *VIDEOS)] for name in sets}
+    present = {name: [*filter(os.path.exists, places)] for name, places in named.items()}
+    found = {name: places[0] for name, places in present.items() if places}
     # Pictures of one kind are of the scene in motion, if it moves.
-    return None if apart or name != [*sets][-1] else path
+    return found or {[*named][-1]: path}
 
 
 def _film(film: Path, views: Views) -> Callable[[int], Picture]:
@@ -194,13 +188,12 @@ def _film(film: Path, views: Views) -> Callable[[int], Picture]:
     count = header.frames
     for index in range(len(views)):
         _check_size(header.size, views, index, film)
-    frames = dict(frames_at(film, range(min(count, len(views)))))
-    if len(frames) != len(views) or count > len(views):
+    if count != len(views):
         raise scene_error(
             film,
             f"has {count} frames, but {len(views)} images are held out; one for each is needed",
         )
-    return frames.__getitem__
+    return dict(frames_at(film, range(count))).__getitem__
 
 
 def pictures_in(folder: Path, views: Views) -> Callable[[int], Picture]:
