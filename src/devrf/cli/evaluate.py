@@ -114,12 +114,11 @@ def _with_motion_masks(
     run: RunContext, sets: Mapping[str, Views]
 ) -> tuple[dict[str, Views], str | None]:
     """The sets with masks of what moves in the dynamic test views, and the rule of these."""
-    given = run.evaluation.motion_masks
     views = run.scene.dynamic.test
     if "dynamic" not in sets:
         return dict(sets), None
-    folder = None if given is None else Path(given)
-    masked, rule = with_motion_masks(views, run.scene.background, folder)
+    given = run.evaluation.motion_masks
+    masked, rule = with_motion_masks(views, run.scene.background, given)
     # A set of the same views stays one, since its scores at rest serve both.
     return {name: masked if own is views else own for name, own in sets.items()}, rule
 

@@ -35,7 +35,7 @@ NEAR = 0.05
 
 
 def with_motion_masks(
-    views: Views, background: Background, given: Path | None
+    views: Views, background: Background, given: str | Path | None
 ) -> tuple[Views, str | None]:
     """Held-out views with masks of what moves, and the rule by which these were made.
 
@@ -47,11 +47,11 @@ def with_motion_masks(
     """
     if given is not None:
         mask = torch.zeros_like(views.pixels[..., 0], dtype=torch.bool)
-        picture = pictures_in(given, views)
+        picture = pictures_in(Path(given), views)
         for image in range(len(views)):
             white = torch.tensor(picture(image)[..., 0]) > 127
             mask[image, : white.shape[0], : white.shape[1]] = white
-        return replace(views, motion_mask=mask), f"given: {given.resolve()}"
+        return replace(views, motion_mask=mask), f"given: {Path(given).resolve()}"
     if views.motion_mask is not None:
         return views, "exact"
     mask = shifted(views, background)
