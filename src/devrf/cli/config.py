@@ -16,6 +16,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from devrf.apps.settings import ReportSettings
+from devrf.cli.config_source import read_fast
 
 # A value that is another key's.
 REFERENCE = re.compile(r"\$\{([\w.]+)\}")
@@ -146,6 +147,7 @@ def choice(group: str) -> str | None:
 # For ``${devrf.run_folder:}`` in a config.
 for _word in (run_folder, job_folder, output_dir, choice):
     OmegaConf.register_new_resolver(f"devrf.{_word.__name__}", _word, replace=True)
+read_fast(config_folder())
 
 
 def command_line(*words: str) -> str:
