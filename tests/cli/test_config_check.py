@@ -6,7 +6,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Union
+from typing import Annotated, Any, Literal, Union
 
 import pytest
 from omegaconf import DictConfig, OmegaConf
@@ -96,6 +96,7 @@ def test_a_key_whose_only_reader_is_left_out_is_refused(composed):
     ("changes", "message"),
     [
         ({"outer__root": "???"}, "outer.root: required; give outer.root=PATH"),
+        ({"outer__weights": [1, "???"]}, "outer.weights.1: required; give "),
         ({"outer__rot": 1}, "outer.rot: no such key; did you mean outer.root?"),
         ({"sizes__inner__siez": 1}, "did you mean sizes.inner.size?"),
         ({"sizes__innr": {"size": 3}}, "sizes.innr.size: no part reads it; leave it out"),
@@ -129,6 +130,7 @@ def test_the_key_at_fault_is_named(changes, message):
         (Sequence[Sequence[float]], [[[0.0, 1]]], [[0.0]]),
         (Mapping[str, float], [{"color": 1}], [{"color": "high"}]),
         (Any, ["anything"], []),
+        (Annotated[int, []], [3], ["a"]),  # which has no hash
         (Exception, [{"_target_": "pathlib.Path"}], ["x", 1]),  # only a part can have it
     ],
 )

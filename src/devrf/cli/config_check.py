@@ -20,7 +20,7 @@ from functools import cache, reduce
 from importlib.util import find_spec
 from operator import getitem
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_type_hints
 
 import yaml
 from annotated_types import Ge, Lt
@@ -31,6 +31,9 @@ from typing_extensions import TypedDict
 
 from devrf.cli.config import REFERENCE, config_folder, set_at
 from devrf.errors import DevrfError, did_you_mean
+
+if TYPE_CHECKING:
+    from pydantic import TypeAdapter
 
 # Keys of the root.
 ROOT: dict[str, Any] = {
@@ -78,10 +81,10 @@ def check_config(config: DictConfig) -> None:
     # Imported here: --help is answered before it has loaded.
     from devrf.system.options import expectation
 
-    for key in sorted(OmegaConf.missing_keys(config)):
+    raw: Any = OmegaConf.to_container(config)
+    for key in sorted(_missing(raw)):
         value = "PATH" if key.endswith("root") else "VALUE"
         raise DevrfError(f"{key}: required; give {key}={value}")
-    raw: Any = OmegaConf.to_container(config)
     resolved: Any = OmegaConf.to_container(config, resolve=True)
     # A key that is missing is wrong in its type, too.
     issues = _issues(dict.fromkeys(ROOT) | resolved, ROOT | {"**": Any}, ())
@@ -128,20 +131,42 @@ def check_section(config: DictConfig, section: str) -> None:
 
 def _issues(values: Node, types: Mapping[str, Any], names: Names) -> list[tuple[Names, Any]]:
     """Pydantic's errors of the section at ``names``, each with the names that lead to it."""
-    from pydantic import TypeAdapter, ValidationError
+    from pydantic import ValidationError
 
     hints = {key: hint for key, hint in types.items() if key != "**"}
     for key, value in values.items():
         # A part is checked in its own place.
         if _is_part(value) or (key not in types and "**" in types):
             hints[key] = Any
-    kind = cast(Any, TypedDict)("Section", hints, total=False)
-    kind.__pydantic_config__ = {"extra": "forbid", "arbitrary_types_allowed": True}
+    keys = tuple(hints.items())
     try:
-        TypeAdapter(kind).validate_json(json.dumps(values, default=str), strict=True)
+        section = _section(keys)
+    except TypeError:  # a type that has no hash, of a part that is a user's
+        section = _section.__wrapped__(keys)
+    try:
+        section.validate_json(json.dumps(values, default=str), strict=True)
     except ValidationError as error:
         return [(names + issue["loc"], issue) for issue in error.errors()]
     return []
+
+
+@cache
+def _section(hints: tuple[tuple[str, Any], ...]) -> TypeAdapter[Any]:
+    """What checks a section with these keys and types; the jobs of a sweep share it."""
+    from pydantic import TypeAdapter
+
+    kind = cast(Any, TypedDict)("Section", dict(hints), total=False)
+    kind.__pydantic_config__ = {"extra": "forbid", "arbitrary_types_allowed": True}
+    return TypeAdapter(kind)
+
+
+def _missing(node: Any, key: str = "") -> Iterator[str]:
+    """The keys of values that are still to be given."""
+    if node == "???":
+        yield key
+    rows = enumerate(node) if isinstance(node, list) else ()
+    for name, below in node.items() if isinstance(node, Mapping) else rows:
+        yield from _missing(below, f"{key}.{name}".lstrip("."))
 
 
 def _walk(node: Node, names: Names = (), inside: bool = False) -> Iterator[tuple[Names, Any]]:
