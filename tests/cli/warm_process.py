@@ -1,8 +1,8 @@
 """Runs devrf commands in processes of their own that need not import anything first.
 
-A script, not a test: it loads the program once, without using it, and then forks for each
-command. It reads a JSON object a line and answers with the command's exit status, negative for
-the signal that ended it. The keys, all but the first two optional:
+A script, not a test: it loads the program and its kernels and composes its config once, and then
+forks for each command. It reads a JSON object a line and answers with the command's exit status,
+negative for the signal that ended it. The keys, all but the first two optional:
 
 * ``folder``, ``arguments``: where to run what. What the command says is added to ``said.txt``.
 * ``after``: ``[kind, count]``, the moment of the signal. The kind is ``step`` (an optimiser step
@@ -39,7 +39,7 @@ from typing import Any
 gc.disable()  # what is imported stays
 
 import torch
-from hydra.core.plugins import Plugins
+from hydra import compose, initialize_config_dir
 from torch.distributed import run as torchrun
 
 import devrf.apps.video
@@ -47,8 +47,9 @@ import devrf.callbacks
 import devrf.cli.run
 from devrf.__main__ import entry
 from devrf.checkpoints import checkpoint_file
+from devrf.cli.config import config_folder
 from devrf.engine.grid_adam import GridAdam
-from devrf.kernels.runtime import is_supported
+from devrf.kernels.ahead import compile_ahead, grid_kernels, march_kernels
 
 
 class Fuse:
@@ -146,8 +147,9 @@ def hang(context: Any) -> None:
 def main() -> None:
     """Fork for each command that is asked for."""
     torch.set_num_threads(1)
-    assert is_supported(torch.empty(0))  # loads Warp
-    Plugins.instance()
+    compile_ahead([*march_kernels(), *grid_kernels({1, 3, 12})], torch.device("cpu")).join()
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        compose("config")
     gc.freeze()  # what is there stays shared with the children
     gc.enable()
     print("ready", flush=True)
