@@ -80,8 +80,9 @@ def image_stage(**settings: Any) -> ImageStage:
 
 
 def test_a_batch_is_an_image_and_rows_that_stay_keep_their_moments(
-    fit: Callable[..., ImageStage], tiny_scene: Scene
+    fit: Callable[..., ImageStage], tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("devrf.methods.image_stage.LEAST_SIDE", 9)
     stage = fit(image_stage(half_size=0.25, moving_share=0.6))
     seen = stage.scene_model.seen[:8]
     height, width = tiny_scene.static.train.pixels.shape[1:3]
@@ -102,6 +103,15 @@ def test_a_batch_is_an_image_and_rows_that_stay_keep_their_moments(
     assert state["steps"] == 8 and state["mean"].shape == (3, 3)
     # The same slope for all: the first two rows have moments from before.
     assert not torch.equal(state["mean"][2], state["mean"][0])
+
+
+def test_small_images_are_whole_from_the_first(
+    fit: Callable[..., ImageStage], tiny_scene: Scene
+) -> None:
+    stage = fit(image_stage(half_size=0.5))
+    height, width = tiny_scene.static.train.pixels.shape[1:3]
+    seen = stage.scene_model.seen[:8]
+    assert {(b.camera.width, b.camera.height) for b in seen} == {(width, height)}
 
 
 def test_a_larger_image_is_drawn_in_part(fit: Callable[..., ImageStage], tiny_scene: Scene) -> None:

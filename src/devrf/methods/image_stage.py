@@ -21,6 +21,8 @@ from devrf.scenes.scene import Views
 # What happens in the course of a stage.
 WHOLE = "images of whole size"
 MOVING = "moving images shown"
+# Pixels of a side that half an image has at least: from 25 little is learned, as slowly as from 50.
+LEAST_SIDE = 32
 
 
 class ImagePlan(RayPlan):
@@ -76,7 +78,8 @@ class ImageStage(RayStage):
             protocol_stage: which data trains which parts.
             static_share: share of static images in a stage of both captures.
             earlier: the result of an earlier stage, to go on with.
-            half_size: share of the stage in which images have half of their width and height.
+            half_size: share of the stage in which images have half of their width and height, if
+                at least ``LEAST_SIDE`` pixels of each are left.
             moving_share: share of moving images in a stage of both captures; None: as
                 ``static_share`` says.
             static_first: share of such a stage in which all images are static.
@@ -113,7 +116,8 @@ class ImageStage(RayStage):
         background = self.background(chosen, self.generator).view(-1, 3)[0]
         image = int(chosen)
         width, height = drawn.cameras.size_of(image)
-        shrink = 2 if iteration < milestones.get(WHOLE, 0) else 1
+        halved = iteration < milestones.get(WHOLE, 0) and min(width, height) >= 2 * LEAST_SIDE
+        shrink = 2 if halved else 1
         rows = min(max(self.batch_size.rays(self._rays) // width, shrink), height)
         first = 0
         if rows < height:
