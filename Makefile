@@ -4,8 +4,8 @@
 # make house        lines and files of each folder, the longest files, circles of imports
 # make gpu-check    install into .venv and check what this machine's GPU does, in minutes;
 #                   with INSTALL_FIRST=no by $(PYTHON) and the packages that it has
-# make rehearse     rehearse every setting that is made for a GPU, on embedded scenes: an hour on
-#                   two cores
+# make rehearse     rehearse every setting that is made for a GPU, on embedded scenes: 37 minutes
+#                   on two cores
 # make chance       learn small moving scenes by several seeds, and count the frames that are lost
 # make fuzz         what is too long for make test: fuzz tests of files with many inputs
 #                   (make test has 60)

@@ -6,7 +6,7 @@ layouts; ``experiment=best``; each method by each protocol at its published size
 minutes on a GPU; and their other published forms. A line for each says what was learned, or what
 was not.
 
-    make rehearse                                     # an hour on two cores
+    make rehearse                                     # 37 minutes on two cores
     python benchmarks/rehearse.py --only paper peer   # those with one of these words
 """
 
