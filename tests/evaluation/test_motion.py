@@ -132,6 +132,18 @@ def test_what_flow_moves_is_what_moves_of_the_embedded_robot():
     )().dynamic.test
     mask = shifted(views, "white")
     assert (mask & views.motion_mask).sum() / (mask | views.motion_mask).sum() > 0.88
+    # Who comes into view later moves as well.
+    views.pixels[0] = 0
+    assert shifted(views, "white")[1:].any()
+
+
+@pytest.mark.parametrize("deviation", [3, 8])
+def test_noise_does_not_move(rng, deviation):
+    """Where nothing is to be seen, optical flow leads anywhere."""
+    wall = torch.full((5, 200, 280, 3), 115.0)
+    wall[:, :, 140:] += 40
+    noisy = (wall + deviation * torch.randn(wall.shape, generator=rng)).to(torch.uint8)
+    assert shifted(made(noisy, torch.linspace(0, 1, 5)), "white").float().mean() < 0.002
 
 
 def test_large_images_are_compared_smaller(rng):

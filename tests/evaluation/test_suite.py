@@ -135,6 +135,7 @@ def test_scores_at_rest_serve_the_same_views_in_motion(moving, tiny_scene) -> No
         ({"metrics": ["lpisp"]}, "evaluation.metrics: no metric 'lpisp'"),
         ({"lpips_weights": "no.pth"}, "evaluation.lpips_weights: no file no.pth"),
         ({"motion_masks": "nowhere"}, "evaluation.motion_masks: no folder nowhere"),
+        ({"motion_masks": __file__}, "evaluation.motion_masks: no folder "),
         ({"predictions": "nowhere"}, "evaluation.predictions: no folder nowhere"),
     ],
 )

@@ -27,9 +27,11 @@ REFERENCES = 8
 SIDE = 256
 # A pixel moves if in most of these pairs flow leads it farther than SHIFTED times the radius of
 # what the image shows (ways look shorter than they are), and a channel changes by more than
-# CHANGED at most a pixel away (flow reaches beyond the edges of what moves).
+# CHANGED at most a pixel away (flow reaches beyond the edges of what moves), and more than NOISE
+# times the median change: that is the cameras' noise, of which one of 27 values is four deviations.
 SHIFTED = MOVED / 2
 CHANGED = 0.05
+NOISE = 6.0
 # A point is followed rightly if it comes within this share of the image's larger side (DyCheck).
 NEAR = 0.05
 
@@ -72,14 +74,15 @@ def shifted(views: Views, background: Background) -> Tensor:
         images = [_reduced(pixels, background) for pixels in views.pixels[own]]
         height, width = images[0].shape[:2]
         scale = views.height / height
-        limit = SHIFTED * radius(opaque[own[0]].nonzero().float()) / scale
+        limit = SHIFTED * radius(opaque[own].nonzero()[:, 1:].float()) / scale
         evenly = torch.linspace(0, len(own) - 1, min(REFERENCES, len(own))).round().long().tolist()
         for k, image in followed(enumerate(images), len(images), "motion masks"):
             others = [images[reference] for reference in evenly if reference != k]
             votes = torch.zeros(height, width)
             for other in others:
-                change = (image.float() - other.float()).abs().amax(dim=-1)[None] / 255
-                near = max_pool2d(change, 3, 1, 1)[0] > CHANGED
+                change = (image.float() - other.float()).abs() / 255
+                least = max(CHANGED, NOISE * float(change.median()))
+                near = max_pool2d(change.amax(dim=-1)[None], 3, 1, 1)[0] > least
                 votes += near & (between(image, other).norm(dim=-1) > limit)
             moves = (votes > len(others) / 2).float()[None, None]
             whole = interpolate(moves, (views.height, views.width))[0, 0] > 0

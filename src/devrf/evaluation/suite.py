@@ -147,10 +147,12 @@ class Evaluation:
                     f"evaluation.metrics: no metric {name!r}; choose from {', '.join(MEASURES)}"
                     f"{did_you_mean(name, MEASURES)}"
                 )
-        folders = {"predictions": self.predictions, "motion_masks": self.motion_masks}
-        for key, folder in folders.items():
-            if folder is not None and not Path(folder).exists():
-                raise DevrfError(f"evaluation.{key}: no folder {folder}; give another")
+        if self.predictions is not None and not Path(self.predictions).exists():
+            raise DevrfError(f"evaluation.predictions: no folder {self.predictions}; give another")
+        if self.motion_masks is not None and not Path(self.motion_masks).is_dir():
+            raise DevrfError(
+                f"evaluation.motion_masks: no folder {self.motion_masks}; give another"
+            )
         if self.lpips_weights is not None and not Path(self.lpips_weights).is_file():
             raise DevrfError(
                 f"evaluation.lpips_weights: no file {self.lpips_weights}; give the weights of "
