@@ -146,7 +146,7 @@ SCALED = [2 * value for value in MATRIX[:12]] + MATRIX[12:]
     [
         (b"{", "p: not valid JSON"),
         (b" " * (2**24 + 1), "p: larger than 16 MiB"),
-        (b"[" + b"[]," * 2**20, "p: more than 2,097,152 values; expected a path"),
+        (b"[" + b"[]," * 2**21, "p: more than 4,194,304 values; expected a path"),
         (content(fps=24), "p: holds no camera path"),
         *[(content(keyframes=[frame()], fps=x), "p: fps: ") for x in (1e-300, 0, -1, 1e30)],
         (content(keyframes=[frame(aspect=1e30)]), "p: keyframes[0].aspect: "),

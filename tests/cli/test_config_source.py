@@ -6,10 +6,12 @@ from pathlib import Path
 
 import pytest
 import yaml
+from hydra import initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from devrf.cli.config import config_folder
-from devrf.cli.config_source import OwnConfigs
+from devrf.cli.config_source import RULES, OwnConfigs, fastest
 
 
 @pytest.fixture
@@ -34,6 +36,22 @@ def test_numbers_dates_and_keys_are_omegaconfs(source, tmp_path):
     (tmp_path / "a.yaml").write_text("rate: 1\nrate: 2\n")
     with pytest.raises(yaml.YAMLError, match="found duplicate key rate\n .*a.yaml.*line 2"):
         source.load_config("a")
+
+
+def test_where_pyyaml_has_no_libyaml_files_are_read_slowly(source, tmp_path, monkeypatch):
+    assert fastest() is not RULES
+    monkeypatch.setattr(yaml, "__with_libyaml__", False)
+    assert fastest() is RULES
+    (tmp_path / "b.yaml").write_text("rate: 1e-3\n")
+    assert source.load_config("b").config == {"rate": 1e-3}
+
+
+def test_hydra_reads_the_main_folder_by_it():
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        paths = GlobalHydra.instance().config_loader().get_search_path().get_path()
+    assert [path.path for path in paths if path.provider == "main"] == [
+        f"devrf://{config_folder()}"
+    ]
 
 
 def test_a_config_that_is_changed_or_a_file_that_is_leaves_no_trace(source, tmp_path):

@@ -71,6 +71,13 @@ def test_a_table_without_all_cells_or_of_too_many_rows_is_damaged(path, damage):
         again(path)
 
 
+def test_long_and_wide_tables_are_read(path):
+    names = ",".join(f"loss{k}" for k in range(34))
+    path.write_text(f"step,{names}\n" + "".join(f"{k}{',' * 34}\n" for k in range(130_000)))
+    again(path).log_metrics({"static/loss": 1.0}, 130_000)
+    assert path.read_text().count("\n") == 130_002
+
+
 def test_on_a_full_disk_rows_wait(path, monkeypatch, caplog):
     def full(*_: Any) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")

@@ -73,7 +73,7 @@ def test_json_takes_the_place_of_what_was_there(tmp_path: Path) -> None:
 
 def test_a_pipe_is_no_record(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.json")
-    with pytest.raises(ValueError, match="no file"):
+    with pytest.raises(ValueError, match="not a regular file"):
         read_record(tmp_path / "a.json")
 
 

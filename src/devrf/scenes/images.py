@@ -16,7 +16,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
@@ -62,9 +62,8 @@ FROM_THE_END = (3, 4, 7, 8)
 LARGEST_TILE = 2**24
 # The most scans of a progressive JPEG, each of which goes through all its pixels; usual are 10.
 MOST_SCANS = 100
-# The most parts of a file, and bytes of each of a larger file's: a PNG has two for 8 kB or more.
-MOST_PARTS = 50_000
-PART = 2**10
+# The most reads of a file: a PNG has two for 8 kB or more, a BMP two for a run of one colour.
+MOST_READS = 1_000_000
 # Markers of a JPEG file, but for those within a scan.
 MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
 START_OF_SCAN = b"\xff\xda"
@@ -104,15 +103,15 @@ def unread(folder: Path) -> str:
 class _Parts(io.BufferedReader):
     """A file that is read in so many parts at most, for each of which Pillow takes a while."""
 
-    parts = 0
+    reads = 0
 
     def __repr__(self) -> str:
         return repr(str(self.name))
 
     def read(self, size: int | None = -1, /) -> bytes:
         """The next bytes; ValueError: they are one part too many."""
-        self.parts += 1
-        if self.parts > MOST_PARTS + self.tell() // PART:
+        self.reads += 1
+        if self.reads > MOST_READS:
             raise ValueError("too many parts")
         return super().read(size)
 
@@ -120,9 +119,10 @@ class _Parts(io.BufferedReader):
 @contextmanager
 def open_image(path: Path) -> Iterator[Image.Image]:
     """The image at ``path``, its header read, nothing decoded yet."""
-    # Of a file without a name Pillow maps nothing; of TIFFs that are turned it maps wrong rows.
-    with _Parts(io.FileIO(path)) as file:
+    with ExitStack() as opened:
         with decoding(path, "image", "replace the file, or make it smaller"):
+            # Of a file without a name Pillow maps nothing; of turned TIFFs it maps wrong rows.
+            file = opened.enter_context(_Parts(io.FileIO(path)))
             image = Image.open(file, formats=FORMATS)
             tags = getattr(image, "tag_v2", {})
             if tags.get(TILEWIDTH, 0) * tags.get(TILELENGTH, 0) > LARGEST_TILE:

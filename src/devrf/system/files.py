@@ -19,9 +19,11 @@ from devrf.errors import DevrfError
 # Bytes; the longest records, of footage of two hours, have some ten million. In memory each may
 # become 50.
 LARGEST_RECORD = 2**24
-# Lists, objects, and their values but the first, of which each may take 150 bytes and more: those
-# of 50,000 images are fewer.
-MOST_PARTS = 2**21
+# Lists, objects, and their values but the first, of JSON; each may take 150 bytes and more. 50,000
+# images with a pose and a lens each have two million.
+MOST_VALUES = 2**22
+# What JSON may have before its first value.
+BLANK = b"\xef\xbb\xbf \t\r\n"
 # Bytes of a YAML file, for which Python takes seconds.
 LARGEST_YAML = 200_000
 # Errors of values in a file that are not as devrf writes them.
@@ -155,21 +157,22 @@ def read_record(path: Path, most: int = LARGEST_RECORD) -> bytes:
     """The content of a file of JSON, CSV or YAML.
 
     Raises:
-        ValueError: it is a pipe, or larger or of more parts than what devrf writes, or a scene
+        ValueError: it is a pipe, or larger or of more values than what devrf writes, or a scene
             needs.
     """
     if path.exists() and not path.is_file():
-        raise ValueError("no file")  # a pipe would be waited for
+        raise ValueError("not a regular file")  # a pipe would be waited for
     with path.open("rb") as file:
         return bounded(file.read(most + 1), most)
 
 
 def bounded(content: bytes, most: int = LARGEST_RECORD) -> bytes:
-    """``content`` that came as a record; ValueError if it is too large, or of too many parts."""
+    """``content`` that came as a record; ValueError if it is too large, or of too many values."""
     if len(content) > most:
         raise ValueError(f"larger than {most / 2**20:.3g} MiB")
-    if sum(map(content.count, b"[{,")) > MOST_PARTS:
-        raise ValueError(f"more than {MOST_PARTS:,} values")
+    is_json = content.lstrip(BLANK)[:1] in (b"[", b"{")
+    if is_json and sum(map(content.count, b"[{,")) > MOST_VALUES:
+        raise ValueError(f"more than {MOST_VALUES:,} values")
     return content
 
 

@@ -361,11 +361,12 @@ def test_the_controls_do_what_they_say(browser, file, tmp_path):
 
 def test_a_page_of_ones_own_shows_it_by_the_line_that_export_prints(browser, file):
     own = file.with_name("index.html")
-    own.write_text(f"<!doctype html><title>mine</title><p>a page of my own</p>{FRAME}")
+    style = "<style>iframe {width: 320px; height: 200px}</style>"  # each pixel takes its time here
+    own.write_text(f"<!doctype html><title>mine</title>{style}<p>a page of my own</p>{FRAME}")
     camera = Cameras.looking_at(
-        torch.tensor([[0.0, -4.0, 0.5]]), torch.zeros(1, 3), focal=900.0, width=800, height=500
+        torch.tensor([[0.0, -4.0, 0.5]]), torch.zeros(1, 3), focal=360.0, width=320, height=200
     )
-    browser.open(own.as_uri(), 900, 700)
+    browser.open(own.as_uri(), 500, 400)
     browser.driver.switch_to.frame(0)
     browser.wait("document.body.className === 'ready'")
     browser.run(f"location.hash = '{link(camera, 0.4)}'")
@@ -373,9 +374,9 @@ def test_a_page_of_ones_own_shows_it_by_the_line_that_export_prints(browser, fil
     framed = browser.canvas()
     browser.driver.switch_to.default_content()
     assert browser.run("return document.title") == "mine"
-    browser.open(file.as_uri() + link(camera, 0.4), 800, 500)
+    browser.open(file.as_uri() + link(camera, 0.4), 320, 200)
     alone = browser.canvas()
-    assert framed.shape == alone.shape == (500, 800, 3)
+    assert framed.shape == alone.shape == (200, 320, 3)
     assert framed.std() > 0.05 and psnr(framed, alone) > LEAST_PSNR
 
 
@@ -668,6 +669,19 @@ def test_threads_that_answer_nobody_are_no_clients(port):
         assert b"<p>a page</p>" in answered(port, request)
     finally:
         ended.set()
+
+
+def no_thread(self: threading.Thread) -> None:
+    raise RuntimeError("can't start new thread")
+
+
+def test_clients_for_whom_no_thread_begins_have_no_place(port, monkeypatch):
+    request = f"GET /scene.html HTTP/1.0\r\nHost: 127.0.0.1:{port}\r\n\r\n"
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", no_thread)
+        for _ in range(66):
+            assert answered(port, request) == b""
+    assert b"<p>a page</p>" in answered(port, request)
 
 
 def test_a_server_ends_at_once_while_clients_wait_to_be_answered(tmp_path):

@@ -264,6 +264,6 @@ def test_a_file_of_numbers_without_end_is_not_read(tmp_path, message_of):
     with (tmp_path / "transforms.json").open("wb") as file:
         file.truncate(2**33)  # of zeros, which take no room on the disk
     assert message_of(tmp_path) == f"{tmp_path}/transforms.json: larger than 16 MiB; write it again"
-    (tmp_path / "transforms.json").write_bytes(b"[" + b"[]," * 2**20)  # 0.6 GiB, were they read
-    said = "more than 2,097,152 values; write it again"
+    (tmp_path / "transforms.json").write_bytes(b"[" + b"[]," * 2**21)  # 1.2 GiB, were they read
+    said = "more than 4,194,304 values; write it again"
     assert message_of(tmp_path) == f"{tmp_path}/transforms.json: {said}"

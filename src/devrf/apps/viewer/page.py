@@ -114,6 +114,14 @@ class _Server(ThreadingHTTPServer):
         tries = range(round(10 * PATIENCE))
         return any(self._places.acquire(timeout=0.1) for _ in tries if not self._stop.is_set())
 
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answer a client in a thread of its own; without one its place is free again."""
+        try:
+            super().process_request(request, client_address)
+        except RuntimeError:  # no thread can be started
+            self._places.release()
+            raise
+
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         """Answer a client, and make its place free."""
         try:
