@@ -73,6 +73,13 @@ def test_cpu_small_is_best_small_for_forward_facing_scenes(composed):
     assert composed(scene, "experiment=cpu_small") == composed(scene, "experiment=best_small")
 
 
+@pytest.mark.parametrize("profile", [name for name in NAMES["profile"] if "tineuvox" in name])
+def test_adams_epsilon_is_far_below_the_slopes_of_a_faint_density(composed, profile):
+    """They go with its first opacity; with 1e-4 they are about 1e-8 in dark pictures."""
+    stage = composed("method=tineuvox", "protocol=dynamic", f"profile={profile}").ray_stage
+    assert stage.schedule.eps <= 1e-5 * stage.model.settings.alpha_init
+
+
 @pytest.mark.parametrize(("data", "factor"), [("inward", 1), ("colmap", "auto"), ("lego", 2)])
 def test_best_takes_images_at_the_size_that_the_scenes_choice_says(composed, data, factor):
     assert composed(f"data={data}", "data.root=x", "experiment=best").data.downscale == factor
