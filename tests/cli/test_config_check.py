@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, Union
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
-from devrf.cli.config_check import check_config
+from devrf.cli.config_check import check_config, check_extras
 from devrf.errors import DevrfError
 
 
@@ -158,3 +158,11 @@ def test_a_missing_package_is_named_first(devrf, tmp_path, monkeypatch, argument
     said = f'{missing} is not installed; run pip install "devrf[{extra}]", or set {instead}'
     assert (outcome.status, outcome.err) == (2, f"devrf: {said}\n")
     assert not list(tmp_path.iterdir())
+
+
+def test_tracks_need_nothing_that_meshes_do(composed, monkeypatch):
+    monkeypatch.setattr("devrf.cli.config_check.find_spec", lambda package: None)
+    tracks = ("stage=export", "export.content=tracks", "export.tracks=[[0,0,0]]", "logger=csv")
+    check_extras(composed(*tracks, "export.format=csv"))
+    with pytest.raises(DevrfError, match="pxr is not installed"):
+        check_extras(composed(*tracks, "export.format=usd"))

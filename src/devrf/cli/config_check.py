@@ -262,13 +262,14 @@ def check_extras(config: DictConfig) -> None:
     serves = config.stage == "view" and config.viewer.renderer in served
     tensorboard = "tensorboard" in (config.get("logger") or ())
     exports = config.stage == "export" and config.export.format != "html"
-    meshes = "skimage trimesh fast_simplification"
+    meshes = exports and config.export.content != "tracks"
+    for_meshes = "skimage trimesh fast_simplification"
     usd = exports and config.export.format == "usd"
     for is_used, setting, packages, extra, instead in (
         (tensorboard, "logger=tensorboard", "tensorboard", "tensorboard", "logger=csv"),
         (serves, "stage=view", "viser", "viewer", "stage=render"),
         (config.viewer.get("training"), "viewer=true", "viser", "viewer", "viewer=false"),
-        (exports, "stage=export", meshes, "export", "stage=render"),
+        (meshes, "stage=export", for_meshes, "export", "stage=render"),
         (usd, "export.format=usd", "pxr", "export", "export.format=gltf"),
     ):
         for package in packages.split():
