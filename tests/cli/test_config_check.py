@@ -164,5 +164,6 @@ def test_tracks_need_nothing_that_meshes_do(composed, monkeypatch):
     monkeypatch.setattr("devrf.cli.config_check.find_spec", lambda package: None)
     tracks = ("stage=export", "export.content=tracks", "export.tracks=[[0,0,0]]", "logger=csv")
     check_extras(composed(*tracks, "export.format=csv"))
+    check_extras(composed(*tracks, "export.format=json", "export.content=auto"))
     with pytest.raises(DevrfError, match="pxr is not installed"):
         check_extras(composed(*tracks, "export.format=usd"))

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_type_hints
 import yaml
 from annotated_types import Ge, Lt
 from hydra.core.override_parser.types import Override
-from hydra.utils import get_object
+from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, OmegaConf
 from typing_extensions import TypedDict
 
@@ -262,7 +262,7 @@ def check_extras(config: DictConfig) -> None:
     serves = config.stage == "view" and config.viewer.renderer in served
     tensorboard = "tensorboard" in (config.get("logger") or ())
     exports = config.stage == "export" and config.export.format != "html"
-    meshes = exports and config.export.content != "tracks"
+    meshes = exports and not instantiate(config.export).as_tracks
     for_meshes = "skimage trimesh fast_simplification"
     usd = exports and config.export.format == "usd"
     for is_used, setting, packages, extra, instead in (

