@@ -9,6 +9,8 @@
 # make chance       learn small moving scenes by several seeds, and count the frames that are lost
 # make fuzz         what is too long for make test: fuzz tests of files with many inputs
 #                   (make test has 60)
+# make splat-viewer install a free viewer of splats into build/, by npm, and open an exported file
+#                   in it: needs chromium and its driver
 # make format       format the code and mend what the linter can
 # make shell        a shell in which .venv is active
 # make clean        remove .venv and everything that tools leave behind
@@ -18,6 +20,8 @@ VENV ?= .venv
 # `make CONSTRAINTS=` takes the newest releases that pyproject.toml allows.
 CONSTRAINTS ?= constraints.txt
 
+SPLAT_VIEWER := @mkkellogg/gaussian-splats-3d@0.4.7 three@0.187.0
+
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --disable-pip-version-check \
 	$(if $(CONSTRAINTS),--constraint $(CONSTRAINTS)) --editable
@@ -25,7 +29,7 @@ INSTALL := $(BIN)/python -m pip install --disable-pip-version-check \
 PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile \
 	--no-loadscope-reorder --durations 15
 
-.PHONY: quickstart test docs house gpu-check rehearse chance fuzz format shell clean
+.PHONY: quickstart test docs house gpu-check rehearse chance fuzz splat-viewer format shell clean
 
 quickstart: $(VENV)/.installed
 	$(BIN)/python -m devrf experiment=quickstart
@@ -61,6 +65,10 @@ chance: $(VENV)/.installed
 fuzz: $(VENV)/.installed-dev
 	DEVRF_FUZZ_INPUTS=100000 $(PYTEST) tests/scenes/test_formats_damaged.py
 	DEVRF_FUZZ_INPUTS=5000 $(PYTEST) tests/checkpoints/test_checkpoint_contradictions.py
+
+splat-viewer: $(VENV)/.installed-dev
+	npm install --prefix build/splat_viewer --no-audit --no-fund $(SPLAT_VIEWER)
+	$(BIN)/python -m pytest tests/apps/export/test_free_viewer.py
 
 format: $(VENV)/.installed-dev
 	$(BIN)/ruff check --fix .

@@ -21,7 +21,7 @@ from hypothesis import settings
 
 from devrf.geometry.box import Box
 
-pytest_plugins = ["composed_configs", "tiny_scenes", "tiny_stages"]  # in support/
+pytest_plugins = ["browser", "composed_configs", "tiny_scenes", "tiny_stages"]  # in support/
 
 logging.getLogger(lightning.pytorch.__name__).setLevel(logging.ERROR)
 
