@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -13,7 +14,6 @@ from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import ImageBatch
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.protocol import ProtocolStage
-from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.methods.gaussians.cloud import Cloud
@@ -103,6 +103,19 @@ def test_a_view_is_the_splatted_cloud_before_its_background() -> None:
     assert opacity[2, 4] == 0 and opacity[2, 7].item() == pytest.approx(0.8)
 
 
+def test_pictures_begin_where_cameras_saw_what_was_learned() -> None:
+    model = DeformableGaussians(replace(TINY, harmonics=0))
+    model.depth_limits = (1.0, math.inf)
+    places = torch.tensor([[0.0, -3.1, 0.0], [0.0, -2.9, 0.0]])
+    camera = Cameras.looking_at(
+        torch.tensor([[0.0, -4.0, 0.0]]), torch.zeros(1, 3), focal=20.0, width=9, height=5
+    )
+    for place, seen in zip(places, (0.0, 0.8), strict=True):
+        model.cloud.begin(place[None], torch.ones(1, 3), torch.tensor([1e-4]), 0.8)
+        opacity = Renderer(model).view(camera, 0, 0.0, 0.0).opacity.view(5, 9)
+        assert opacity[2, 4].item() == pytest.approx(seen)
+
+
 def test_a_longer_lens_shows_gaussians_as_wide() -> None:
     model = DeformableGaussians(replace(TINY, harmonics=0))
     model.cloud.begin(torch.zeros(1, 3), torch.ones(1, 3), torch.tensor([1e-4]), 0.8)
@@ -187,13 +200,41 @@ def test_memory_is_that_of_as_many_as_there_may_be() -> None:
     assert model.most_bytes == 4 * (network + 1002 * (11 + 3 * 4))
 
 
-def test_what_is_not_in_world_space_is_refused(
-    fit: Callable[..., ImageStage], serve: Callable[[Scene], SceneDataModule], tiny_toy: Scene
+@pytest.mark.parametrize("space", ["ndc", "contracted"])
+def test_unbounded_scenes_are_learned_in_the_world(
+    fit: Callable[..., ImageStage],
+    serve: Callable[[Scene], SceneDataModule],
+    stored: Callable[[ImageStage], LoadedCheckpoint],
+    tiny_toy: Scene,
+    tiny_room: Scene,
+    space: str,
 ) -> None:
-    with pytest.raises(
-        DevrfError, match="gaussians needs a scene in world space, and .* use another"
-    ):
-        fit(stage(), data=serve(tiny_toy))
+    scene = {"ndc": tiny_toy, "contracted": tiny_room}[space]
+    bare = DeformableGaussians(TINY)
+    bare.setup(scene)
+    # They begin as densely as samples lie, but for where infinity is.
+    places = scene.space.from_world(bare.cloud.means)
+    half, whole = scene.bounds.whole.scaled(0.45), scene.bounds.whole.scaled(0.901)
+    assert whole.contains(places).all()
+    assert half.contains(places).float().mean().item() == pytest.approx(1 / 8, abs=0.08)
+    learned = fit(stage(iterations=160), data=serve(scene))
+    views = scene.dynamic.train
+    time, truth = float(views.times[-1]), views.pixels[-1, ..., :3].float().view(-1, 3) / 255
+
+    def error(model: DeformableGaussians) -> float:
+        picture = Renderer(model).view(views.cameras, len(views) - 1, time, 1.0).color
+        return (picture - truth).abs().mean().item()
+
+    assert error(learned.scene_model) < 0.75 * error(bare)
+    model = stored(learned).model
+    with torch.no_grad():
+        model.cloud.means[0, 2] = 0.0  # where NDC has no place
+        assert all(move.isfinite().all() for move in model.moved(1.0))
+    ours, theirs = (
+        Renderer(m).view(scene.dynamic.test.cameras, 0, 0.7, 1.0)
+        for m in (learned.scene_model, stored(learned).model)
+    )
+    assert torch.equal(ours.color, theirs.color)
 
 
 def test_what_moves_is_apart_from_what_stays(monkeypatch: pytest.MonkeyPatch) -> None:

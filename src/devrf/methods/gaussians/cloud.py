@@ -12,6 +12,7 @@ from torch.nn.functional import normalize, one_hot, pad
 from devrf.checkpoints.stored_grids import StoredShape
 from devrf.engine.ddp import average, world_size
 from devrf.geometry.box import Box
+from devrf.geometry.space import WorldSpace
 from devrf.methods.gaussians.settings import GaussiansSettings
 from devrf.ops.spherical_harmonics import FACTORS
 from devrf.ops.splatting import Gaussians, rotations
@@ -27,6 +28,8 @@ SPLIT = 1 / 1.6
 HALVED = 1 / 1.8
 # How far from the middle the halves lie, in standard deviations.
 APART = 0.6
+# Of an unbounded scene's box, whose faces are infinitely far away, so much holds the first points.
+NOT_FAR = 0.9
 # Points whose distances are computed at once.
 CHUNK = 1024
 
@@ -181,8 +184,10 @@ def first_points(scene: Scene, settings: GaussiansSettings) -> tuple[Tensor, Ten
     if side > 1 and views.cut_out:
         points = hull_surface(views, box, side)
     if len(points) == 0:
-        low, high = scene.bounds.whole.corners(points)
+        world = isinstance(scene.space, WorldSpace)
+        low, high = scene.bounds.whole.scaled(1.0 if world else NOT_FAR).corners(points)
         points = low + torch.rand(settings.start_points, 3) * (high - low)
+        points = scene.space.to_world(points)
     points = points[torch.randperm(len(points))[: settings.start_points]]
     sizes = settings.start_size * neighbour_distances(points)
     return points, median_colors(points, views), sizes

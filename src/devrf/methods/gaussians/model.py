@@ -16,18 +16,18 @@ from warp import Kernel
 from devrf.data.batch import ImageBatch
 from devrf.engine.needs import tensor_bytes
 from devrf.engine.protocol import ProtocolStage
-from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.motion import moving
-from devrf.geometry.space import WORLD, WorldSpace
+from devrf.geometry.space import WORLD, space_config, space_from
 from devrf.kernels.ahead import splatting_kernels
 from devrf.kernels.splatting import splat
 from devrf.methods.base import ImageTrainable
 from devrf.methods.gaussians.cloud import Cloud, first_points
 from devrf.methods.gaussians.settings import GaussiansSettings
 from devrf.methods.nerf.networks import SinusoidalEncoding, Trunk
+from devrf.methods.nerf.placement import Placement
 from devrf.metrics.image import ssim_map
 from devrf.ops.compositing import LEAST_MASS
 from devrf.ops.spherical_harmonics import spherical_harmonics
@@ -37,9 +37,9 @@ from devrf.rendering.renderable import Renderable
 from devrf.scenes.scene import Scene
 from devrf.system.plain_data import validate
 
-# The least depth of a Gaussian's mean in pictures, as a share of the scene's near limit; it is that
-# limit while they are learned: before each lens they would explain its picture, and spoil others.
-NEAREST = 0.1
+# Normalised places are at most this: in NDC those that come to lie before the near plane would be
+# infinite.
+OUTERMOST = 8.0
 # Standard deviation of the weights of the network's last layer at first: nothing moves.
 STILL = 1e-3
 
@@ -50,8 +50,10 @@ class DeformableGaussians(ImageTrainable):
     See docs/methods/gaussians.md.
 
     Attributes:
-        cloud: the Gaussians at rest.
-        box: what held them at first.
+        cloud: the Gaussians at rest, in world units whatever the fields' space is.
+        placement: what held them at first; the network is told places in its normalised space.
+        space: the world's, where pictures have their depths.
+        box: of the world, about where the subject is.
         extent: the unit of lengths in the settings, world units.
         focal: the longest focal length in pixels that was learned from.
         degree: of the harmonics that are used now.
@@ -77,49 +79,49 @@ class DeformableGaussians(ImageTrainable):
         nn.init.normal_(self.last.weight, std=STILL)
         nn.init.zeros_(self.last.bias)
         self.space = WORLD
-        self._place(Box((-1.0,) * 3, (1.0,) * 3), (0.1, 1.0), (0.0, 1.0), 1.0, 1.0)
+        unit = Placement(Box((-1.0,) * 3, (1.0,) * 3), WORLD)
+        self._place(unit, near=0.1, times=(0.0, 1.0), extent=1.0, focal=1.0)
 
     def _place(
         self,
-        box: Box,
-        limits: tuple[float, float],
+        placement: Placement,
+        *,
+        near: float,
         times: Sequence[float],
         extent: float,
         focal: float,
     ) -> None:
-        self.box, self.depth_limits, self.clock = box, limits, FrameClock(tuple(times))
+        self.placement, self.clock = placement, FrameClock(tuple(times))
+        self.box = placement.subject
+        self.depth_limits = (near, math.inf)  # nothing is sampled: nothing is too far away
         self.extent, self.focal = extent, focal
         self.degree = self.settings.harmonics
         self.moves_now = True
         self.moves_at_rest = False
 
     def setup(self, scene: Scene) -> None:
-        """Take bounds and times; begin the cloud.
-
-        Raises:
-            DevrfError: the scene is not in world space.
-        """
-        if not isinstance(scene.space, WorldSpace):
-            raise DevrfError(
-                f"method: gaussians needs a scene in world space, and {scene.name} is unbounded or "
-                "seen from one side; give data.space=world, or use another method"
-            )
-        bounds = scene.bounds
-        cameras = scene.static.train.cameras
-        middle = cameras.positions.mean(dim=0)
-        extent = 1.1 * float((cameras.positions - middle).norm(dim=1).max())
-        extent = max(extent, bounds.whole.longest / 2)
-        focal = max(float(c.train.cameras.focal.max()) for c in scene.captures.values())
-        limits = (bounds.near, bounds.far)
-        self._place(bounds.whole, limits, scene.clock.times, extent, focal)
+        """Take bounds and times; begin the cloud."""
+        placement = Placement(scene.bounds.whole, scene.space)
+        at_rest = scene.static.train.cameras.positions
+        extent = 1.1 * float((at_rest - at_rest.mean(dim=0)).norm(dim=1).max())
+        captures = [capture.train.cameras for capture in scene.captures.values()]
+        everyone = torch.cat([cameras.positions for cameras in captures])
+        self._place(
+            placement,
+            near=placement.near(scene.bounds.near, everyone),
+            times=scene.clock.times,
+            extent=max(extent, placement.unit),
+            focal=max(float(cameras.focal.max()) for cameras in captures),
+        )
         self.cloud.begin(*first_points(scene, self.settings), self.settings.start_opacity)
 
     def config(self) -> dict[str, Any]:
         """Settings, place and times, and the units of lengths."""
         return {
             "settings": asdict(self.settings),
-            "box": [list(self.box.low), list(self.box.high)],
-            "limits": list(self.depth_limits),
+            "box": [list(self.placement.box.low), list(self.placement.box.high)],
+            "space": space_config(self.placement.space),
+            "near": self.depth_limits[0],
             "times": list(self.clock.times),
             "extent": self.extent,
             "focal": self.focal,
@@ -131,12 +133,13 @@ class DeformableGaussians(ImageTrainable):
         """A network of the same size in the same place, and a cloud of one."""
         model = cls(validate(GaussiansSettings, config["settings"]))
         low, high = config["box"]
+        box = validate(Box, {"low": low, "high": high})
         model._place(
-            validate(Box, {"low": low, "high": high}),
-            validate(tuple[float, float], config["limits"]),
-            validate(FrameClock, config).times,
-            validate(float, config["extent"]),
-            validate(float, config["focal"]),
+            Placement(box, space_from(validate(dict[str, Any], config["space"]))),
+            near=validate(float, config["near"]),
+            times=validate(FrameClock, config).times,
+            extent=validate(float, config["extent"]),
+            focal=validate(float, config["focal"]),
         )
         model.moves_at_rest = validate(bool, config["moves_at_rest"])
         return model
@@ -151,7 +154,8 @@ class DeformableGaussians(ImageTrainable):
         if begun == 0 or not self.moves_now:
             return None
         means = self.cloud.means.detach()
-        place = (means - means.new_tensor(self.box.middle)) * (2 / self.box.longest)
+        place = self.placement.normalised(self.placement.space.from_world(means))
+        place = place.nan_to_num(0.0).clamp(-OUTERMOST, OUTERMOST)
         encoded = self.encode_time(means.new_full((1, 1), time)).expand(len(means), -1)
         values = self.trunk(torch.cat([self.encode(place), encoded], dim=1))
         mean, quaternion, scale = (begun * self.last(values)).split([3, 4, 3], dim=1)
@@ -318,7 +322,7 @@ class GaussiansView:
             hidden = LOW_PASS * (1 / model.focal**2 - 1 / focal**2)
             wide = gaussians.scales.square() + hidden * depth.square()[:, None]
             gaussians = replace(gaussians, scales=wide.sqrt())
-        image = splat(gaussians, camera, NEAREST * model.depth_limits[0])
+        image = splat(gaussians, camera, model.depth_limits[0])
         opacity = 1 - image.transmittance
         color = image.color + image.transmittance[:, None] * background
         offset = (camera.pixel_grid() - camera.center[0]) / camera.focal[0]
