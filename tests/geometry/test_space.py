@@ -12,6 +12,7 @@ from devrf.geometry.contraction import ContractedSpace
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import WORLD, space_config, space_from
+from devrf.rendering.renderer import points_at_depth
 
 # Inner half edges 1, 2, 4 about (1, 0, 0): not a cube, so that a swap of axes shows.
 SPACE = ContractedSpace((0.0, -2.0, -4.0), (2.0, 2.0, 4.0), shell=1.0)
@@ -121,6 +122,24 @@ def test_points_of_a_world_ray_lie_on_its_ndc_ray(rng):
     # With o on the near plane and o + d at infinity, the point at depth z is at 1 − n/z.
     share = 1 - NDC.near / depth
     torch.testing.assert_close(rays.at(torch.arange(50), share), device)
+
+
+def test_world_distances_are_depths_of_the_same_points(rng):
+    distance = 0.5 + 5 * torch.rand(50, generator=rng)
+    ahead = torch.tensor([0.0, 0.0, -4.0])
+    for space, rays in (
+        (WORLD, _rays(rng, 50, 1.0)),
+        (CUBE, _rays(rng, 50, 1.0)),
+        (NDC, _rays(rng, 50, 0.1)),
+    ):
+        if space is NDC:
+            away = torch.nn.functional.normalize(rays.directions + ahead, dim=1)
+            rays = Rays(rays.origins, away, away)
+        depth = space.depths(rays, distance)
+        expected = rays.at(torch.arange(50), distance)
+        torch.testing.assert_close(
+            points_at_depth(space, rays, depth), expected, atol=1e-3, rtol=1e-3
+        )
 
 
 def test_infinity_in_ndc_is_far_away_and_its_pixel_stays():

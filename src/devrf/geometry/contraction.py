@@ -83,7 +83,7 @@ class ContractedSpace:
         gap = (1 + self.shell - m).clamp(min=INFINITY * self.shell)
         return torch.where(m > 1, center + half * (self.shell / gap / m) * u, points)
 
-    def rays(self, rays: Rays) -> Rays:
+    def rays(self, rays: Rays) -> ContractedRays:
         """World rays, whose points are in contracted space (:class:`ContractedRays`)."""
         center, half = self._frame(rays.origins)
         origin = (rays.origins - center) / half
@@ -102,6 +102,10 @@ class ContractedSpace:
             self,
             torch.stack([start, pace[:, 0].abs(), stretch], dim=-1),
         )
+
+    def depths(self, rays: Rays, distance: Tensor) -> Tensor:
+        """Distances s (M,) of points so far along M world rays (:class:`ContractedRays`)."""
+        return self.rays(rays).own_distance(distance)
 
     def depth_range(
         self, box: Box, limits: tuple[float, float], position: Tensor
@@ -159,7 +163,7 @@ class ContractedRays(Rays):
 
         The fields' box holds all of space, so its corners do not matter.
         """
-        return self._own(near), self._own(far)
+        return self.own_distance(near), self.own_distance(far)
 
     def longest(
         self, low: Sequence[float], high: Sequence[float], near: float, far: float
@@ -176,11 +180,11 @@ class ContractedRays(Rays):
     def ends(self) -> Tensor:
         """The points (M, 3) of the outer faces that rays lead to."""
         every = torch.arange(len(self), device=self.origins.device)
-        return self.at(every, self._own(math.inf))
+        return self.at(every, self.own_distance(math.inf))
 
-    def _own(self, world: float) -> Tensor:
-        """s (M,) of a world distance."""
+    def own_distance(self, world: Tensor | float) -> Tensor:
+        """s (M,) of world distances (M,), or of one of all rays."""
         start, pace, stretch = self.course.unbind(-1)
         x = start + pace * world
         y = x.sign() * (1 + stretch * (1 - 1 / x.abs().clamp(min=1)))
-        return torch.where(x.abs() > 1, (y - start) / pace, torch.full_like(x, world))
+        return torch.where(x.abs() > 1, (y - start) / pace, world)

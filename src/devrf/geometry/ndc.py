@@ -81,6 +81,12 @@ class NormalizedDevice:
         z = -2 * self.near / start[:, 2]
         return Rays(origin, torch.stack([x, y, z], dim=-1), rays.viewdirs)
 
+    def depths(self, rays: Rays, distance: Tensor) -> Tensor:
+        """Shares (M,) of the way from the near plane to infinity of points so far along M rays."""
+        points = rays.origins + distance[:, None] * rays.directions
+        field_rays = self.rays(rays)
+        return (self.from_world(points) - field_rays.origins)[:, 2] / field_rays.directions[:, 2]
+
     def depth_range(
         self, box: Box, limits: tuple[float, float], position: Tensor
     ) -> tuple[float, float]:

@@ -50,6 +50,10 @@ class Space(Protocol):
         """World rays in the fields' space; their view directions stay those of the world."""
         ...
 
+    def depths(self, rays: Rays, distance: Tensor) -> Tensor:
+        """Distances (M,) along :meth:`rays` of points so far (M,) along M world rays."""
+        ...
+
     def depth_range(
         self, box: Box, limits: tuple[float, float], position: Tensor
     ) -> tuple[float, float]:
@@ -85,6 +89,10 @@ class WorldSpace:
     def rays(self, rays: Rays) -> Rays:
         """The rays themselves."""
         return rays
+
+    def depths(self, rays: Rays, distance: Tensor) -> Tensor:
+        """The distances themselves."""
+        return distance
 
     def depth_range(
         self, box: Box, limits: tuple[float, float], position: Tensor

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -78,7 +77,7 @@ def test_without_static_images_the_cloud_moves_at_time_0_too(
 
 def test_a_view_is_the_splatted_cloud_before_its_background() -> None:
     model = DeformableGaussians(replace(TINY, harmonics=0))
-    model.depth_limits = (1.0, 9.0)
+    model.near = 1.0
     model.cloud.begin(
         torch.tensor([[0.0, 0.0, 0.0], [0.6, 0.0, 0.0]]),
         torch.tensor([[1.0, 0.5, 0.0], [0.0, 0.0, 1.0]]),
@@ -105,7 +104,7 @@ def test_a_view_is_the_splatted_cloud_before_its_background() -> None:
 
 def test_pictures_begin_where_cameras_saw_what_was_learned() -> None:
     model = DeformableGaussians(replace(TINY, harmonics=0))
-    model.depth_limits = (1.0, math.inf)
+    model.near = 1.0
     places = torch.tensor([[0.0, -3.1, 0.0], [0.0, -2.9, 0.0]])
     camera = Cameras.looking_at(
         torch.tensor([[0.0, -4.0, 0.0]]), torch.zeros(1, 3), focal=20.0, width=9, height=5
@@ -235,6 +234,7 @@ def test_unbounded_scenes_are_learned_in_the_world(
         for m in (learned.scene_model, stored(learned).model)
     )
     assert torch.equal(ours.color, theirs.color)
+    assert model.space == scene.space and model.box == scene.bounds.whole
 
 
 def test_what_moves_is_apart_from_what_stays(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,17 +23,6 @@ def test_ndc_becomes_euclidean_by_hand() -> None:
     torch.testing.assert_close(ndc.euclidean(point), expected)
 
 
-def test_where_the_subject_is_by_hand() -> None:
-    # z' = ±1/2 is at z = 2 n / (z' − 1); there x = ±1/2 z W / 2f.
-    ndc = Placement(CUBE, NormalizedDevice(width=40, height=20, focal=(20.0, 20.0), near=3.0))
-    subject = Box((-6.0, -3.0, -12.0), (6.0, 3.0, -4.0))
-    for found, expected in ((ndc.subject.low, subject.low), (ndc.subject.high, subject.high)):
-        assert found == pytest.approx(expected)
-    assert Placement(CUBE, WORLD).subject == CUBE
-    room = ContractedSpace((0.0, 0.0, 0.0), (1.0, 2.0, 1.0))
-    assert Placement(room.box, room).subject == room.inner()
-
-
 def test_the_near_limit_is_as_far_as_the_foremost_camera_leaves_it() -> None:
     ndc = Placement(CUBE, NormalizedDevice(width=40, height=20, focal=(20.0, 20.0), near=3.0))
     # Cameras look along −z; the near plane is at z = −3.

@@ -51,9 +51,10 @@ class DeformableGaussians(ImageTrainable):
 
     Attributes:
         cloud: the Gaussians at rest, in world units whatever the fields' space is.
-        placement: what held them at first; the network is told places in its normalised space.
-        space: the world's, where pictures have their depths.
-        box: of the world, about where the subject is.
+        placement: what held them at first, in the fields' space; the network is told places in its
+            normalised space.
+        box, space: the placement's.
+        near: the least depth of a Gaussian's mean in a picture, world units.
         extent: the unit of lengths in the settings, world units.
         focal: the longest focal length in pixels that was learned from.
         degree: of the harmonics that are used now.
@@ -78,13 +79,13 @@ class DeformableGaussians(ImageTrainable):
         self.last = nn.Linear(s.width, 10)
         nn.init.normal_(self.last.weight, std=STILL)
         nn.init.zeros_(self.last.bias)
-        self.space = WORLD
         unit = Placement(Box((-1.0,) * 3, (1.0,) * 3), WORLD)
-        self._place(unit, near=0.1, times=(0.0, 1.0), extent=1.0, focal=1.0)
+        self._place(unit, (0.1, 1.0), near=0.1, times=(0.0, 1.0), extent=1.0, focal=1.0)
 
     def _place(
         self,
         placement: Placement,
+        limits: tuple[float, float],
         *,
         near: float,
         times: Sequence[float],
@@ -92,8 +93,8 @@ class DeformableGaussians(ImageTrainable):
         focal: float,
     ) -> None:
         self.placement, self.clock = placement, FrameClock(tuple(times))
-        self.box = placement.subject
-        self.depth_limits = (near, math.inf)  # nothing is sampled: nothing is too far away
+        self.box, self.space = placement.box, placement.space
+        self.depth_limits, self.near = limits, near
         self.extent, self.focal = extent, focal
         self.degree = self.settings.harmonics
         self.moves_now = True
@@ -108,6 +109,7 @@ class DeformableGaussians(ImageTrainable):
         everyone = torch.cat([cameras.positions for cameras in captures])
         self._place(
             placement,
+            (scene.bounds.near, scene.bounds.far),
             near=placement.near(scene.bounds.near, everyone),
             times=scene.clock.times,
             extent=max(extent, placement.unit),
@@ -119,9 +121,10 @@ class DeformableGaussians(ImageTrainable):
         """Settings, place and times, and the units of lengths."""
         return {
             "settings": asdict(self.settings),
-            "box": [list(self.placement.box.low), list(self.placement.box.high)],
-            "space": space_config(self.placement.space),
-            "near": self.depth_limits[0],
+            "box": [list(self.box.low), list(self.box.high)],
+            "space": space_config(self.space),
+            "limits": list(self.depth_limits),
+            "near": self.near,
             "times": list(self.clock.times),
             "extent": self.extent,
             "focal": self.focal,
@@ -136,6 +139,7 @@ class DeformableGaussians(ImageTrainable):
         box = validate(Box, {"low": low, "high": high})
         model._place(
             Placement(box, space_from(validate(dict[str, Any], config["space"]))),
+            validate(tuple[float, float], config["limits"]),
             near=validate(float, config["near"]),
             times=validate(FrameClock, config).times,
             extent=validate(float, config["extent"]),
@@ -154,7 +158,7 @@ class DeformableGaussians(ImageTrainable):
         if begun == 0 or not self.moves_now:
             return None
         means = self.cloud.means.detach()
-        place = self.placement.normalised(self.placement.space.from_world(means))
+        place = self.placement.normalised(self.space.from_world(means))
         place = place.nan_to_num(0.0).clamp(-OUTERMOST, OUTERMOST)
         encoded = self.encode_time(means.new_full((1, 1), time)).expand(len(means), -1)
         values = self.trunk(torch.cat([self.encode(place), encoded], dim=1))
@@ -200,7 +204,7 @@ class DeformableGaussians(ImageTrainable):
             shift.register_hook(  # type: ignore[no-untyped-call]
                 lambda slopes: self.cloud.note(slopes * half)
             )
-        image = splat(gaussians, camera, self.depth_limits[0], shift)
+        image = splat(gaussians, camera, self.near, shift)
         color = image.color + image.transmittance[:, None] * batch.background
         depth = image.depth / (1 - image.transmittance).clamp(min=LEAST_MASS)
         return RenderOutput(color=color, depth=depth, transmittance=image.transmittance)
@@ -313,7 +317,7 @@ class GaussiansView:
         model = self.model
         gaussians = model.gaussians(self.time, camera.positions[0])
         if crop is not None:
-            keep = crop.contains(gaussians.means)
+            keep = crop.contains(model.space.from_world(gaussians.means))
             gaussians = Gaussians(*(value[keep] for value in vars(gaussians).values()))
         focal = float(camera.focal.max())
         if focal > model.focal:
@@ -322,9 +326,10 @@ class GaussiansView:
             hidden = LOW_PASS * (1 / model.focal**2 - 1 / focal**2)
             wide = gaussians.scales.square() + hidden * depth.square()[:, None]
             gaussians = replace(gaussians, scales=wide.sqrt())
-        image = splat(gaussians, camera, model.depth_limits[0])
+        image = splat(gaussians, camera, model.near)
         opacity = 1 - image.transmittance
         color = image.color + image.transmittance[:, None] * background
         offset = (camera.pixel_grid() - camera.center[0]) / camera.focal[0]
         slant = (1 + offset.square().sum(dim=1)).sqrt()  # of a ray, to the camera's axis
-        return RenderedImage(color, slant * image.depth / opacity.clamp(min=LEAST_MASS), opacity)
+        distance = slant * image.depth / opacity.clamp(min=LEAST_MASS)
+        return RenderedImage(color, model.space.depths(camera.image_rays(0), distance), opacity)

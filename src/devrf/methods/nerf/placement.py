@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from devrf.geometry.box import Box, constant
@@ -40,17 +39,6 @@ class Placement:
         if isinstance(self.space, NormalizedDevice):
             return self.space.near
         return self.space.inner(self.box).longest / 2
-
-    @property
-    def subject(self) -> Box:
-        """A box of the world about where the subject is: all of it if the fields live there."""
-        inner = self.space.inner(self.box)
-        if not isinstance(self.space, NormalizedDevice):
-            return inner
-        # The middle half of NDC's box: infinity is in none of it.
-        corners = inner.scaled(0.5).grid_points((2, 2, 2), torch.empty(0, device="cpu"))
-        world = self.space.to_world(corners.view(-1, 3))
-        return Box(tuple(world.amin(dim=0).tolist()), tuple(world.amax(dim=0).tolist()))
 
     def near(self, limit: float, positions: Tensor) -> float:
         """The least distance of the scene from cameras at ``positions`` (N, 3), in world units.
