@@ -30,9 +30,8 @@ def mill(tmp_path) -> None:
 
 def test_a_capture_by_one_camera_needs_one_word_beside_its_folder(devrf, mill, tmp_path) -> None:
     small = (
-        "ray_stage.model.settings.side=12",
+        "ray_stage.model.settings.start_points=60",
         "ray_stage.schedule.iterations=4",
-        "ray_stage.schedule.rays=64",
         "video.frames=1",
         "video.height=24",
     )
@@ -46,7 +45,7 @@ def test_a_capture_by_one_camera_needs_one_word_beside_its_folder(devrf, mill, t
     assert "mill: the layout of DyCheck (data=dycheck)" in run.out
     (folder,) = (tmp_path / "outputs/mill").iterdir()
     metrics = json.loads((folder / "metrics.json").read_text())
-    assert metrics["method"] == "tineuvox" and metrics["protocol"] == "dynamic"
+    assert metrics["method"] == "gaussians" and metrics["protocol"] == "dynamic"
 
 
 @pytest.mark.parametrize(

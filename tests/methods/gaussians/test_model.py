@@ -32,6 +32,7 @@ TINY = GaussiansSettings(
 STATIC = ProtocolStage("canonical", "static")
 DEFORMATION = ProtocolStage("deformation", "dynamic", frozen=["canonical"], builds_on="canonical")
 DYNAMIC = ProtocolStage("dynamic", "dynamic")
+PARTS = ("means", "scales", "quaternions", "opacity", "color")  # whose rates a profile sets
 
 
 def stage(
@@ -259,3 +260,16 @@ def test_what_moves_is_apart_from_what_stays(monkeypatch: pytest.MonkeyPatch) ->
     assert not model.moving_and_still(10.0)  # where a tenth is little
     model.cloud.keep(torch.tensor([False, True, False]))
     assert not model.moving_and_still(1.0)  # nothing stays
+
+
+def test_for_one_camera_the_network_alone_learns_more_slowly(composed: Callable[..., Any]) -> None:
+    rates = {}
+    for profile in ("gaussians_small", "gaussians_phone_small"):
+        stage = composed("method=gaussians", f"profile={profile}").ray_stage
+        network, settings = stage.schedule.learning_rate, stage.model.settings
+        own = (network * settings[f"{part}_rate"] for part in PARTS)
+        fall = stage.schedule.final_learning_rate / network
+        rates[profile] = (network, fall, *own)
+    usual, phone = rates.values()
+    assert phone[0] == pytest.approx(usual[0] / 3)
+    assert phone[1:] == pytest.approx(usual[1:], rel=0.03)
