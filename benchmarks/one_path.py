@@ -21,7 +21,7 @@ import tempfile
 from pathlib import Path
 from statistics import median
 
-HERE = Path(__file__).resolve().parent.parent
+HERE = Path(__file__).resolve()
 # What a worker prints its result behind.
 MARK = "result: "
 PICTURE = 400
@@ -40,7 +40,7 @@ def main() -> None:
     if options.worker is not None:
         print(MARK + json.dumps(measured(options.worker)))
         return
-    trees = {"this": HERE}
+    trees = {"this": HERE.parent.parent}
     if options.other is not None:
         trees["other"] = options.other.resolve()
     rows = []
@@ -63,10 +63,10 @@ def main() -> None:
 
 def in_process(tree: Path, threads: int) -> dict[str, float]:
     """What a source tree takes, measured in a process of its own."""
-    path = os.pathsep.join([str(tree / "src"), str(tree / "benchmarks")])
-    environment = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": str(threads)}
+    environment = {**os.environ, "PYTHONPATH": str(tree / "src"), "OMP_NUM_THREADS": str(threads)}
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, str(Path(__file__).resolve()), "--worker", folder]
+        # Its own copy of this script, which knows its names.
+        command = [sys.executable, str(tree / "benchmarks" / HERE.name), "--worker", folder]
         done = subprocess.run(command, env=environment, cwd=folder, capture_output=True, text=True)
     lines = [line for line in done.stdout.splitlines() if line.startswith(MARK)]
     if not lines:
@@ -77,13 +77,11 @@ def in_process(tree: Path, threads: int) -> dict[str, float]:
 
 def measured(folder: Path) -> dict[str, float]:
     """Milliseconds by name, of the source tree that is on the path."""
-    from harness import open_run  # of that tree
-
-    # isort: split
     import time
     from typing import Any
 
     import torch
+    from harness import open_run
     from hydra.utils import instantiate
     from lightning import Callback
     from torch.optim.optimizer import register_optimizer_step_post_hook
