@@ -68,7 +68,8 @@ fuzz: $(VENV)/.installed-dev
 
 splat-viewer: $(VENV)/.installed-dev
 	npm install --prefix build/splat_viewer --no-audit --no-fund $(SPLAT_VIEWER)
-	$(BIN)/python -m pytest tests/apps/export/test_free_viewer.py
+	$(BIN)/python -m pytest -rs tests/apps/export/test_free_viewer.py | tee build/splat_viewer/tests
+	grep -q "1 passed" build/splat_viewer/tests  # not skipped
 
 format: $(VENV)/.installed-dev
 	$(BIN)/ruff check --fix .

@@ -76,7 +76,7 @@ class Browser:
     @property
     def message(self) -> str:
         """What the page says in place of the picture."""
-        return str(self.run("return document.getElementById('message').textContent"))
+        return str(self.run("return document.getElementById('message')?.textContent"))
 
     def said(self) -> list[str]:
         """Errors and warnings in the page's console."""

@@ -20,8 +20,8 @@ from devrf.methods.gaussians.model import DeformableGaussians
 from devrf.methods.gaussians.settings import GaussiansSettings
 from devrf.methods.image_stage import ImageStage
 from devrf.methods.ray_schedule import RaySchedule
-from devrf.rendering.renderer import Renderer
-from devrf.scenes.scene import Scene
+from devrf.rendering.renderer import Renderer, points_at_depth
+from devrf.scenes.scene import Scene, Views
 
 TINY = GaussiansSettings(
     start_points=150, hull_side=16, start_opacity=0.5, start_size=0.7, max_points=220, harmonics=1,
@@ -101,6 +101,44 @@ def test_a_view_is_the_splatted_cloud_before_its_background() -> None:
     cropped = renderer.view(camera, 0, 0.0, 0.5, Box((0.3, -1.0, -1.0), (1.0, 1.0, 1.0)))
     opacity = cropped.opacity.view(5, 9)
     assert opacity[2, 4] == 0 and opacity[2, 7].item() == pytest.approx(0.8)
+
+
+@pytest.mark.parametrize("space", ["ndc", "contracted"])
+def test_depths_and_crops_are_in_the_fields_space(
+    tiny_toy: Scene, tiny_room: Scene, space: str
+) -> None:
+    scene = {"ndc": tiny_toy, "contracted": tiny_room}[space]
+    model = DeformableGaussians(replace(TINY, harmonics=0))
+    model.setup(scene)
+    camera = scene.static.test.cameras.single(0)
+    rays = camera.image_rays(0)
+    number = camera.width * (camera.height // 2) + camera.width // 2
+    point = rays.at(torch.tensor([number]), torch.tensor([3.0]))
+    model.cloud.begin(point, torch.ones(1, 3), torch.tensor([1e-4]), 0.8)
+    renderer = Renderer(model)
+    image = renderer.view(camera, 0, 0.0, 0.0)
+    assert image.opacity[number] > 0.5 and image.opacity[0] == 0 and image.depth[0] == 0
+    found = points_at_depth(scene.space, rays, image.depth)[number]
+    torch.testing.assert_close(found, point[0], atol=0.02, rtol=0)
+    place = scene.space.from_world(point)[0]
+    here = Box.of((place - 1e-3).tolist(), (place + 1e-3).tolist())
+    for crop, seen in ((here, True), (here.moved((0.1, 0.0, 0.0)), False)):
+        opacity = renderer.view(camera, 0, 0.0, 0.0, crop).opacity
+        assert bool(opacity[number] > 0.5) == seen
+
+
+def test_in_ndc_the_cloud_begins_before_the_cameras_with_masks_too(tiny_toy: Scene) -> None:
+    masked = replace(tiny_toy.static, train=_with_masks(tiny_toy.static.train))
+    model = DeformableGaussians(TINY)
+    model.setup(replace(tiny_toy, static=masked))
+    assert (model.cloud.means[:, 2] < -0.9 * tiny_toy.space.near).all()
+
+
+def _with_masks(views: Views) -> Views:
+    """The views with an alpha channel that is 0 in a corner."""
+    alpha = torch.full_like(views.pixels[..., :1], 255)
+    alpha[:, :2, :2] = 0
+    return replace(views, pixels=torch.cat([views.pixels[..., :3], alpha], dim=-1))
 
 
 def test_pictures_begin_where_cameras_saw_what_was_learned() -> None:
@@ -228,7 +266,7 @@ def test_unbounded_scenes_are_learned_in_the_world(
     assert error(learned.scene_model) < 0.75 * error(bare)
     model = stored(learned).model
     with torch.no_grad():
-        model.cloud.means[0, 2] = 0.0  # where NDC has no place
+        model.cloud.means[0] = 0.0  # where NDC has no place
         assert all(move.isfinite().all() for move in model.moved(1.0))
     ours, theirs = (
         Renderer(m).view(scene.dynamic.test.cameras, 0, 0.7, 1.0)

@@ -29,6 +29,7 @@ def test_the_near_limit_is_as_far_as_the_foremost_camera_leaves_it() -> None:
     assert ndc.near(0.0, torch.tensor([[0.0, 0.0, 1.0], [5.0, 0.0, -0.5]])) == pytest.approx(2.5)
     assert ndc.near(0.0, torch.tensor([[0.0, 0.0, -4.0]])) == pytest.approx(0.3)
     assert Placement(CUBE, WORLD).near(0.2, torch.zeros(1, 3)) == 0.2
+    assert Placement(CUBE, WORLD).near(0.0, torch.zeros(1, 3)) == pytest.approx(1e-3)
 
 
 def test_what_a_flow_leads_beyond_infinity_stays_before_it() -> None:

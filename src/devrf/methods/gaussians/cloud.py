@@ -12,6 +12,7 @@ from torch.nn.functional import normalize, one_hot, pad
 from devrf.checkpoints.stored_grids import StoredShape
 from devrf.engine.ddp import average, world_size
 from devrf.geometry.box import Box
+from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.space import WorldSpace
 from devrf.methods.gaussians.settings import GaussiansSettings
 from devrf.ops.spherical_harmonics import FACTORS
@@ -28,7 +29,7 @@ SPLIT = 1 / 1.6
 HALVED = 1 / 1.8
 # How far from the middle the halves lie, in standard deviations.
 APART = 0.6
-# Of an unbounded scene's box, whose faces are infinitely far away, so much holds the first points.
+# Of an unbounded scene's box, on whose faces infinity is, so much holds the first points.
 NOT_FAR = 0.9
 # Points whose distances are computed at once.
 CHUNK = 1024
@@ -181,7 +182,7 @@ def first_points(scene: Scene, settings: GaussiansSettings) -> tuple[Tensor, Ten
     views, box = scene.at_rest, scene.bounds.box
     side = settings.hull_side
     points = torch.empty(0, 3)
-    if side > 1 and views.cut_out:
+    if side > 1 and views.cut_out and not isinstance(scene.space, NormalizedDevice):
         points = hull_surface(views, box, side)
     if len(points) == 0:
         world = isinstance(scene.space, WorldSpace)

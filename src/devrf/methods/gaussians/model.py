@@ -35,6 +35,7 @@ from devrf.ops.splatting import LOW_PASS, Gaussians
 from devrf.rendering.output import RenderedImage, RenderOutput
 from devrf.rendering.renderable import Renderable
 from devrf.scenes.scene import Scene
+from devrf.system.options import Positive
 from devrf.system.plain_data import validate
 
 # Normalised places are at most this: in NDC those that come to lie before the near plane would be
@@ -140,7 +141,7 @@ class DeformableGaussians(ImageTrainable):
         model._place(
             Placement(box, space_from(validate(dict[str, Any], config["space"]))),
             validate(tuple[float, float], config["limits"]),
-            near=validate(float, config["near"]),
+            near=validate(Positive, config["near"]),
             times=validate(FrameClock, config).times,
             extent=validate(float, config["extent"]),
             focal=validate(float, config["focal"]),
@@ -332,4 +333,5 @@ class GaussiansView:
         offset = (camera.pixel_grid() - camera.center[0]) / camera.focal[0]
         slant = (1 + offset.square().sum(dim=1)).sqrt()  # of a ray, to the camera's axis
         distance = slant * image.depth / opacity.clamp(min=LEAST_MASS)
-        return RenderedImage(color, model.space.depths(camera.image_rays(0), distance), opacity)
+        depth = model.space.depths(camera.image_rays(0), distance)
+        return RenderedImage(color, depth.where(opacity > 0, 0.0), opacity)

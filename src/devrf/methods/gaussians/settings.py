@@ -17,7 +17,8 @@ class GaussiansSettings(MethodSettings):
     """Sizes and growth; the defaults are the published ones (docs/methods/gaussians.md).
 
     Lengths are in units of the scene's extent, 1.1 times the distance of the farthest static camera
-    from their middle; rates are factors of the network's learning rate.
+    from their middle, or the size of the near scene, if that is more; rates are factors of the
+    network's learning rate.
 
     Attributes:
         start_points: Gaussians at first, at most.

@@ -14,6 +14,8 @@ from devrf.geometry.space import Space
 FURTHEST = 0.99
 # The least distance of a camera from what NDC holds, in those of the near plane from the origin.
 NEAREST = 0.1
+# The least near limit, in :attr:`Placement.unit`: files and options may say 0.
+LEAST_LIMIT = 1e-3
 
 
 @dataclass(frozen=True)
@@ -43,12 +45,14 @@ class Placement:
     def near(self, limit: float, positions: Tensor) -> float:
         """The least distance of the scene from cameras at ``positions`` (N, 3), in world units.
 
+        It is above 0.
+
         Args:
             limit: that of the fields' space, where samples begin along a ray.
             positions: of the cameras, in the world.
         """
         if not isinstance(self.space, NormalizedDevice):
-            return limit
+            return max(limit, LEAST_LIMIT * self.unit)
         plane = self.space.near
         return max(plane + float(positions[:, 2].min()), NEAREST * plane)
 
