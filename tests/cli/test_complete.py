@@ -134,7 +134,10 @@ def scenes(tmp_path_factory) -> Path:
         ("data.root=hook experiment=phone", "data=inward"),
         ("stage=inspect data.root=hook schedule.seconds=60", "data=inward"),
         ("data.root=hook data.static_until=0.3", "data=inward"),
-        ("data.root=hook experiment=phone method=tineuvox profile=tineuvox_light", "data=inward"),
+        (
+            "data.root=hook experiment=phone method=tineuvox profile=tineuvox_light",
+            "data=inward protocol=dynamic",
+        ),
         ("data.root=hook stage=canonical", "data=inward"),
         ("data.root=hook profile=devrf_small", "data=inward"),
         ("data.root=hook method=dnerf", "data=inward protocol=dynamic"),
