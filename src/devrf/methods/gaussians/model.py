@@ -330,8 +330,8 @@ class GaussiansView:
         image = splat(gaussians, camera, model.near)
         opacity = 1 - image.transmittance
         color = image.color + image.transmittance[:, None] * background
-        offset = (camera.pixel_grid() - camera.center[0]) / camera.focal[0]
-        slant = (1 + offset.square().sum(dim=1)).sqrt()  # of a ray, to the camera's axis
-        distance = slant * image.depth / opacity.clamp(min=LEAST_MASS)
-        depth = model.space.depths(camera.image_rays(0), distance)
+        rays = camera.image_rays(0)
+        ahead = rays.directions @ camera.forwards[0]  # cosine of a ray and the camera's axis
+        distance = image.depth / (ahead * opacity.clamp(min=LEAST_MASS))
+        depth = model.space.depths(rays, distance)
         return RenderedImage(color, depth.where(opacity > 0, 0.0), opacity)
