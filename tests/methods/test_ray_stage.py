@@ -40,6 +40,14 @@ def test_a_killed_run_goes_on_to_the_same_weights(
     assert resumed.position.iteration == 4
 
 
+def test_a_checkpoint_is_there_to_be_shown_and_a_later_stage_learns_it(
+    ray_stage: Make, fit: Fit, stored: Callable[[RayStage], LoadedCheckpoint]
+) -> None:
+    rest = stored(fit(ray_stage(DNeRF(TINY), "canonical")))
+    assert not rest.model.training
+    assert ray_stage(DNeRF(TINY), "dynamic", earlier=rest).scene_model.training
+
+
 def test_dynamic_never_reads_the_static_set(
     ray_stage: Make,
     fit: Fit,

@@ -154,7 +154,8 @@ class LoadedCheckpoint:
 
     Attributes:
         metadata: the scene, and the settings that it was learned with.
-        model: a :class:`~devrf.rendering.renderable.Renderable`.
+        model: a :class:`~devrf.rendering.renderable.Renderable`, to be shown: what goes on learning
+            it calls ``train``.
         viewpoints: the cameras that saw the scene; None if the file does not say.
     """
 
@@ -223,7 +224,7 @@ def load_checkpoint(
     try:
         _check_numbers((metadata.model, data["state_dict"], data.get("viewpoints")))
         state = {k.removeprefix(MODEL): v for k, v in data["state_dict"].items() if MODEL in k}
-        model = _build_checked(model_class, metadata.model, state).to(device)
+        model = _build_checked(model_class, metadata.model, state).to(device).eval()
         model.load_stored_state(state)
         viewpoints = Viewpoints.stored(data.get("viewpoints", {}))
         if viewpoints is not None:

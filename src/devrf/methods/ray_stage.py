@@ -76,7 +76,7 @@ class RayStage(Stage):
         self.scene_model = model
         self._ready = earlier is not None
         if earlier is not None:
-            self.scene_model = earlier.model
+            self.scene_model = earlier.model.train()
             self.provenance.earlier_records = earlier.metadata.records
         self.keeps_batches = self.scene_model.keeps_batches
         if schedule.times_per_batch is not None:

@@ -82,6 +82,23 @@ def test_a_scene_of_any_space_is_learned_and_comes_back(
     torch.testing.assert_close(images[1].opacity, torch.ones_like(images[1].opacity))
 
 
+def test_it_is_shown_without_the_noise_and_the_precision_that_it_learns_with(
+    tiny: NSFFSettings, tiny_scene: Scene
+) -> None:
+    settings = replace(tiny, density_noise=1.0, precision="bfloat16")
+    torch.manual_seed(0)
+    model = NSFF(settings)
+    model.setup(tiny_scene)
+    exact = NSFF(replace(settings, density_noise=0.0, precision="float32"))
+    exact.setup(tiny_scene)
+    exact.load_state_dict(model.state_dict())
+    cameras = tiny_scene.dynamic.test.cameras
+    # While it is learned, too: the viewer and previews show it then.
+    assert model.training
+    images = [Renderer(one).view(cameras, 0, 0.5, 1.0) for one in (model, exact)]
+    assert torch.equal(images[0].color, images[1].color)
+
+
 def test_a_scene_that_says_nothing_has_nothing_to_learn(
     tiny: NSFFSettings, ray_stage: Make, fit: Fit, serve: Callable[[Scene], SceneDataModule],
     tiny_scene: Scene,

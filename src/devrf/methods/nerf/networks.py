@@ -245,7 +245,8 @@ class RadianceField(nn.Module):
         precision = self._settings.precision
         device = self.density.weight.device
         reduced = multiplies_bfloat16(device) if precision == "auto" else precision == "bfloat16"
-        if not (reduced and self.training):
+        # A stage shows what it learns in between, without gradients.
+        if not (reduced and torch.is_grad_enabled()):
             return nullcontext()
         return torch.autocast(device.type, torch.bfloat16)
 

@@ -194,8 +194,8 @@ class TwoFields(nn.Module):
         self._noise = settings.density_noise
 
     def noise(self, raw: Tensor) -> Tensor | float:
-        """Noise for densities like ``raw`` (S,) while they are learned; 0 otherwise."""
-        return self._noise * torch.randn_like(raw) if self.training and self._noise else 0.0
+        """Noise for densities like ``raw`` (S,), to learn from them; 0 if none is configured."""
+        return self._noise * torch.randn_like(raw) if self._noise else 0.0
 
     def optical_depth(self, raw: Tensor, length: Tensor | float, noise: Tensor | float) -> Tensor:
         """τ = σ δ (S,) with σ = scale · softplus(raw + noise); ``length`` in normalised units."""

@@ -149,7 +149,7 @@ class NSFF(NeuralField):
         points = samples.points
         static = fields.static.at(points, rays.viewdirs, ray)
         dynamic = fields.dynamic.at(points, time.index_select(0, ray), rays.viewdirs, ray)
-        noise = fields.noise(static.raw)
+        noise = fields.noise(static.raw) if jitter else 0.0
         dynamic_depth = fields.optical_depth(dynamic.raw, samples.length, noise)
         static_depth = fields.optical_depth(static.raw, samples.length, noise)
         blend = fields.blended(
