@@ -146,6 +146,15 @@ def test_noise_does_not_move(rng, deviation):
     assert shifted(made(noisy, torch.linspace(0, 1, 5)), "white").float().mean() < 0.002
 
 
+def test_the_radius_of_what_many_images_show_is_that_of_a_few(rng, monkeypatch):
+    measured = []
+    monkeypatch.setattr(
+        "devrf.evaluation.motion.radius", lambda points: measured.append(points) or radius(points)
+    )
+    shifted(made(textured(32, 40, rng).repeat(20, 1, 1, 1), torch.linspace(0, 1, 20)), "white")
+    assert [len(points) for points in measured] == [8 * 32 * 40]
+
+
 def test_large_images_are_compared_smaller(rng):
     pixels = textured(1100, 1280, rng).repeat(2, 1, 1, 1)
     pixels[1, 400:700, 480:900] = pixels[0, 400:700, 440:860]

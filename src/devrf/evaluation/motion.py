@@ -74,8 +74,9 @@ def shifted(views: Views, background: Background) -> Tensor:
         images = [_reduced(pixels, background) for pixels in views.pixels[own]]
         height, width = images[0].shape[:2]
         scale = views.height / height
-        limit = SHIFTED * radius(opaque[own].nonzero()[:, 1:].float()) / scale
         evenly = torch.linspace(0, len(own) - 1, min(REFERENCES, len(own))).round().long().tolist()
+        # Of these alone: a pixel's place takes 32 bytes, of hundreds of images 13 GB.
+        limit = SHIFTED * radius(opaque[own[evenly]].nonzero()[:, 1:].float()) / scale
         for k, image in followed(enumerate(images), len(images), "motion masks"):
             others = [images[reference] for reference in evenly if reference != k]
             votes = torch.zeros(height, width)
