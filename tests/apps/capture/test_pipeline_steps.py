@@ -19,11 +19,11 @@ from devrf.apps.capture import images
 from devrf.apps.capture.alignment import offset_between, timeline
 from devrf.apps.capture.images import (
     Chosen,
-    alpha_masks_of,
     box_of_motion,
     chosen_masks,
     common_size,
     fitted,
+    masks_of,
     motion_masks,
     write_frames,
 )
@@ -226,14 +226,14 @@ def written(footage, into, size=SIZE):
 
 
 def test_masks_of_a_video_are_a_folder_or_a_video(walk, masks, tmp_path, film):
-    folder = alpha_masks_of(masks, walk, 4)
+    folder = masks_of(masks, walk, 4)
     one, other = written(Chosen(walk, "static", (1, 3), folder), tmp_path / "images")
     assert (one[..., 3] == mask(1)).all() and (other[..., 3] == mask(3)).all()
     small = written(Chosen(walk, "static", (2,), folder), tmp_path / "images", (32, 24))[0]
     assert small.shape == (24, 32, 4) and (small[:, :15, 3] == 255).all()
     (tmp_path / "cut").mkdir()
     film("cut/walk.mp4", [np.full((48, 64, 3), level, np.uint8) for level in (0, 80, 160, 240)])
-    video = alpha_masks_of(tmp_path / "cut", walk, 4)
+    video = masks_of(tmp_path / "cut", walk, 4)
     shown = written(Chosen(walk, "static", (1, 3), video), tmp_path / "images")
     for image, level in zip(shown, (80, 240), strict=True):
         assert image[..., 3].astype(float).mean() == pytest.approx(level, abs=3)
@@ -243,37 +243,37 @@ def test_films_of_one_name_have_masks_of_their_own(walk, masks, tmp_path):
     left, right, top = (tmp_path / name / "walk.mp4" for name in ("left", "right", "top"))
     films = (left, right, top)
     with pytest.raises(DevrfError, match=r"masks/walk: masks of .*left/walk\.mp4 or of ") as both:
-        alpha_masks_of(masks, left, 4, others=films)
+        masks_of(masks, left, 4, others=films)
     assert f"give {masks}/left/walk and {masks}/right/walk" in str(both.value)
     shutil.copytree(masks / "walk", masks / "left" / "walk")
     (masks / "right").mkdir()
     shutil.copy(walk, masks / "right" / "walk.MOV")
-    found = [alpha_masks_of(masks, path, 4, others=films) for path in films]
+    found = [masks_of(masks, path, 4, others=films) for path in films]
     assert found == [masks / "left/walk", masks / "right/walk.MOV", masks / "walk"]
-    with pytest.raises(DevrfError, match=r"walk\.MOV: 4 alpha masks, but .* has 8 frames"):
-        alpha_masks_of(masks, right, 8)
+    with pytest.raises(DevrfError, match=r"walk\.MOV: 4 masks, but .* has 8 frames"):
+        masks_of(masks, right, 8)
 
 
 def test_photographs_have_masks_of_their_names(tmp_path, textured, masks):
     (tmp_path / "walk").mkdir()
     for k in (1, 3):
         cv2.imwrite(str(tmp_path / "walk" / f"{k}.jpg"), textured(k))
-    folder = alpha_masks_of(masks, tmp_path / "walk", 2)
+    folder = masks_of(masks, tmp_path / "walk", 2)
     shown = written(Chosen(tmp_path / "walk", "static", (0, 1), folder), tmp_path / "images")
     assert [int(image[0, -1, 3]) for image in shown] == [1, 3]
     (masks / "walk" / "3.png").unlink()
     with pytest.raises(DevrfError, match=r"masks/walk/3\.png: "):
-        alpha_masks_of(masks, tmp_path / "walk", 2)
+        masks_of(masks, tmp_path / "walk", 2)
 
 
 def test_masks_that_do_not_fit_are_refused(walk, masks, tmp_path):
     for folder, footage, count, named in (
         (tmp_path / "nowhere", walk, 4, "nowhere: "),
-        (masks, Path("left.mp4"), 4, "masks/left: "),
-        (masks, walk, 5, "walk: 4 alpha masks"),
+        (masks, Path("left.mp4"), 4, r"masks/left: .*the masks of left\.mp4 \(capture\.masks\)"),
+        (masks, walk, 5, "walk: 4 masks"),
     ):
         with pytest.raises(DevrfError, match=named):
-            alpha_masks_of(folder, footage, count)
+            masks_of(folder, footage, count, "capture.masks")
     cv2.imwrite(str(masks / "walk" / "2.png"), mask(0, (32, 24)))
     with pytest.raises(DevrfError, match=r"2\.png: 32x24 px"):
         written(Chosen(walk, "static", (2,), masks / "walk"), tmp_path / "images")
@@ -402,5 +402,5 @@ def test_masks_of_many_photographs_are_listed_once(tmp_path, monkeypatch):
             (tmp_path / folder / f"{number}.png").touch()
     listed = []
     monkeypatch.setattr(images, "listed_images", lambda path: listed.append(path) or list_of(path))
-    assert alpha_masks_of(tmp_path / "masks", tmp_path / "walk", 20) == tmp_path / "masks/walk"
+    assert masks_of(tmp_path / "masks", tmp_path / "walk", 20) == tmp_path / "masks/walk"
     assert len(listed) == 2

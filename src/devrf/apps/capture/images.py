@@ -111,14 +111,14 @@ def fitted(picture: Picture, size: Size) -> Picture:
 Mask = npt.NDArray[np.uint8]
 
 
-def alpha_masks_of(
+def masks_of(
     folder: Path,
     footage: Path,
     count: int,
     key: str = "capture.alpha_masks",
     others: Iterable[Path] = (),
 ) -> Path:
-    """The alpha masks of some footage: ``<folder>/<its name without suffix>``, a folder or a video.
+    """The masks of some footage: ``<folder>/<its name without suffix>``, a folder or a video.
 
     ``<folder>/<name of the footage's folder>/<its name without suffix>`` is looked for first.
 
@@ -127,7 +127,7 @@ def alpha_masks_of(
         footage: of photographs the masks are a folder with a file of each one's name; of a video
             a folder of as many images, in the order of their names, or a video of as many frames.
         count: the number of its frames.
-        key: the setting that gives ``folder``: masks of motion are laid out in the same way.
+        key: the setting that gives ``folder``.
         others: all footage, whose masks these may not be, too.
 
     Raises:
@@ -139,7 +139,7 @@ def alpha_masks_of(
     masks = _masks_at(folder, footage)
     if masks is None:
         raise DevrfError(
-            f"{plain}: no such folder, expected the alpha masks of {footage}; add it with an "
+            f"{plain}: no such folder, expected the masks of {footage} ({key}); add it with an "
             f"image for each {'photograph' if is_folder(footage) else 'frame'}"
         )
     for other in others:
@@ -153,7 +153,7 @@ def alpha_masks_of(
         _of_photographs(masks, footage)
     elif abs(frame_count(masks) - count) > slack:
         raise DevrfError(
-            f"{masks}: {frame_count(masks)} alpha masks, but {footage} has {count} frames; "
+            f"{masks}: {frame_count(masks)} masks, but {footage} has {count} frames; "
             "give an image for each frame, in the order of their names"
         )
     return masks
@@ -180,7 +180,7 @@ def _masks_at(folder: Path, footage: Path) -> Path | None:
 def chosen_masks(
     masks: Path, footage: Path, positions: Sequence[int], size: Size
 ) -> Iterator[Mask]:
-    """The alpha masks, as :func:`alpha_masks_of` found them, of frames at ascending ``positions``.
+    """The masks, as :func:`masks_of` found them, of frames at ascending ``positions``.
 
     Raises:
         DevrfError: one is no grey image, has another size than its frame, or is missing.
@@ -228,7 +228,7 @@ def _of_photographs(masks: Path, footage: Path) -> list[Path]:
     photographs = listed_images(footage)
     if lacking := [photograph for photograph in photographs if photograph.stem not in named]:
         raise DevrfError(
-            f"{masks / lacking[0].stem}.png: no such alpha mask, of {lacking[0]}; give each "
+            f"{masks / lacking[0].stem}.png: no such mask, of {lacking[0]}; give each "
             "photograph one of its name"
         )
     return [named[photograph.stem] for photograph in photographs]

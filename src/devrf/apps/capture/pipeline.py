@@ -16,9 +16,9 @@ from torch import Tensor
 from devrf.apps.capture.alignment import Timeline, timeline
 from devrf.apps.capture.images import (
     Chosen,
-    alpha_masks_of,
     box_of_motion,
     common_size,
+    masks_of,
     write_frames,
 )
 from devrf.apps.capture.structure import MODELS, checked_model, reconstruct
@@ -85,13 +85,13 @@ def scene_from_footage(settings: CaptureSettings) -> Path:
     if settings.alpha_masks is not None and not settings.subtracts:
         folder = Path(settings.alpha_masks).expanduser()
         masks = {
-            path: alpha_masks_of(folder, path, len(s.times), others=surveys)
+            path: masks_of(folder, path, len(s.times), others=surveys)
             for path, s in surveys.items()
         }
     motion_masks = None
     if settings.masks is not None:
         folder = Path(settings.masks).expanduser()
-        motion_masks = alpha_masks_of(folder, static, len(sharp), "capture.masks", surveys)
+        motion_masks = masks_of(folder, static, len(sharp), "capture.masks", surveys)
     moving = Chosen(static, "static", tuple(picked), masks.get(static), motion_masks)
     clock = Timeline((), ())
     if views:
