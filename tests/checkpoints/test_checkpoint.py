@@ -74,6 +74,8 @@ def test_the_canonical_stage_comes_back(canonical, learned, tiny_scene):
     assert_alike(stored.model, learned[0].scene_model, tiny_scene)
     assert stored.metadata == learned[0].result().metadata
     assert stored.model.deformation is None
+    # Lightning warns of parts of a stage that do not learn.
+    assert not stored.model.training and all(m.training for m in DeformationStage(stored).modules())
     assert [p.name for p in canonical.parent.iterdir()] == ["canonical.ckpt"]
 
 

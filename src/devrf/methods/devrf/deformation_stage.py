@@ -101,7 +101,7 @@ class DeformationStage(Stage):
         self.decoder_precision = decoder_precision
         self.extensions = tuple((extensions or {}).values())
         self.deformation_loss = DeformationLoss(loss, self.extensions, self.settings)
-        canonical = earlier.model
+        canonical = earlier.model.train()
         self.scene_model = DeVRFModel(
             canonical.architecture,
             canonical.canonical,
