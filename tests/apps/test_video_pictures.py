@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import imageio.v3 as iio
 import numpy as np
@@ -117,10 +118,16 @@ def test_a_film_that_fails_leaves_nothing_behind(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def filmed(model, views, images, settings):
+    """The pictures of a film of held-out images beside a learned scene."""
+    shown = partial(still, Renderer(model))
+    return [*held_out_pictures(shown, model.moves, views, images, settings, background="white")]
+
+
 def test_held_out_pictures_are_rendered_in_the_films_size_beside_the_truth(moving, tiny_scene):
     views, film = tiny_scene.dynamic.test, VideoSettings(height=36)
     images = held_out_images(views, 3)
-    shown = list(held_out_pictures(Renderer(moving), views, images, film, "white"))
+    shown = filmed(moving, views, images, film)
     large = views.cameras.of_height(36)
     assert [tuple(image.shape) for image in shown] == [(18 + 36, 3 * 48 + 8, 3)] * 3
     for image, index, time in zip(shown, images, (0.0, 0.5, 1.0), strict=True):
@@ -137,7 +144,7 @@ def test_held_out_images_of_a_moving_camera_are_shown_at_their_own_times(moving,
     renderer = Renderer(moving)
     images = held_out_images(walked, 2 * len(walked))
     film = VideoSettings(height=18)
-    shown = list(held_out_pictures(renderer, walked, images, film, "white"))
+    shown = filmed(moving, walked, images, film)
     for image, picture in zip(images, shown, strict=True):
         color, _ = still(renderer, walked.cameras, float(walked.times[image]), 1.0, image)
         assert torch.equal(picture[18:, 28:52], to_bytes(color))
@@ -148,7 +155,7 @@ def test_held_out_images_of_a_moving_camera_are_shown_at_their_own_times(moving,
 def test_pictures_of_two_sizes_have_their_own_within_a_video_of_one(moving, two_sizes, tmp_path):
     views, renderer = two_sizes.dynamic.test, Renderer(moving)
     film = VideoSettings(height=18)
-    shown = list(held_out_pictures(renderer, views, [0, 1], film, "white"))
+    shown = filmed(moving, views, [0, 1], film)
     assert [picture.shape for picture in shown] == [(36, 3 * 24 + 2 * 4, 3)] * 2
     for image, picture in enumerate(shown):
         truth = to_bytes(truth_image(views, image, "white"))
@@ -177,9 +184,9 @@ def test_a_video_of_cameras_of_several_sizes_has_the_commonest(two_sizes):
 def test_films_of_a_scene_at_rest_speak_of_no_time(learned, tiny_scene, monkeypatch):
     headings = []
     monkeypatch.setattr("devrf.apps.video.image_grid", lambda _, heads: headings.extend(heads))
-    renderer, views = Renderer(learned[0].scene_model), tiny_scene.dynamic.test
-    list(path_pictures(renderer, views.cameras[[0]], 1.0))
-    list(held_out_pictures(renderer, views, [1], VideoSettings(height=18), "white"))
+    model, views = learned[0].scene_model, tiny_scene.dynamic.test
+    list(path_pictures(Renderer(model), views.cameras[[0]], 1.0))
+    filmed(model, views, [1], VideoSettings(height=18))
     depth = "depth: near is bright"
     assert headings == ["rendered", depth, "truth (24x18)", "rendered", depth]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,10 +14,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from devrf.apps.records import frame_rows
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import score, truth_image
 from devrf.evaluation.predictions import picture_name, pictures_in, read_predictions
-from devrf.evaluation.scoring import score_held_out
+from devrf.evaluation.scoring import score_held_out, score_pictures
+from devrf.evaluation.suite import MetricSuite
 from devrf.pictures.images import to_bytes, write_image
 from devrf.pictures.video_file import write_pictures
 from devrf.rendering.renderer import Renderer
@@ -39,7 +42,7 @@ def folder(tmp_path, sets) -> Path:
 
 def refused(folder: Path, sets) -> str:
     with pytest.raises(DevrfError) as caught:
-        read_predictions(folder, "Other", sets, "white")
+        read_predictions(folder, sets, "white")
     line = str(caught.value)
     assert len(line.splitlines()) == 1 and line.startswith(str(folder))
     return line
@@ -47,10 +50,9 @@ def refused(folder: Path, sets) -> str:
 
 def scored(folder: Path, sets) -> dict:
     """The scored views of the pictures in a folder, by their set."""
-    pictures = read_predictions(folder, "Other", sets, "white")
     return {
-        name: score_held_out(own, {name: own.views}, "white")[name]
-        for name, own in pictures.items()
+        name: score_pictures(name, picture, sets[name], "white", MetricSuite())
+        for name, picture in read_predictions(folder, sets, "white").items()
     }
 
 
@@ -99,6 +101,24 @@ def test_every_way_to_say_which_image_it_is(folder, sets, tmp_path):
     assert equal()
 
 
+def test_pictures_in_their_order_whose_numbers_are_names_of_some_images(folder, sets):
+    """As those of Neural 3D Video's images 0, 7 and 14, counted from 0 on."""
+    numbered = ("view3/00000.png", "view3/00007.png", "view3/00014.png")
+    views = replace(sets["dynamic"], names=numbered)
+    for k in range(3):
+        (folder / "dynamic" / picture_name(views, k)).rename(folder / "dynamic" / f"{k:05d}.png")
+    found = scored(folder, {"dynamic": views})["dynamic"]
+    assert [view.name for view in found] == list(numbered) and min(v.psnr for v in found) > 28
+    (folder / "dynamic" / "00002.png").unlink()
+    line = refused(folder, {"dynamic": views})
+    assert "no picture of view3/00007.png" in line and "2 of 3 are missing" in line
+
+
+def test_pictures_have_no_score_of_a_scene_at_rest(folder, sets):
+    rows = frame_rows(scored(folder, sets))
+    assert [{*row} & {"psnr", "rest_pose_psnr"} for row in rows] == [{"psnr"}] * len(rows)
+
+
 def test_a_film_and_alpha(folder, sets):
     views = sets["dynamic"]
     for file in (folder / "dynamic").iterdir():
@@ -133,12 +153,12 @@ def test_two_sets_of_one_pose_and_time_have_pictures_of_their_own(sets, tmp_path
 
 
 def test_another_background_is_said_and_scored(folder, sets, caplog):
-    read_predictions(folder, "Other", sets, "white")
+    read_predictions(folder, sets, "white")
     assert not caplog.records
     for index in range(len(sets["dynamic"])):
         on_black = truth_image(sets["dynamic"], index, "black")
         write_image(folder / "dynamic" / picture_name(sets["dynamic"], index), on_black)
-    assert {*read_predictions(folder, "Other", sets, "white")} == {"static", "dynamic"}
+    assert {*read_predictions(folder, sets, "white")} == {"static", "dynamic"}
     (line,) = (record.getMessage() for record in caplog.records)
     assert line.startswith(f"{folder / 'dynamic'}: the images are white")
     assert line.endswith("data.background=black")
@@ -179,4 +199,4 @@ def test_a_motion_that_was_not_learned_is_no_other_order(folder, sets):
     first, *others = sorted((folder / "dynamic").iterdir())
     for other in others:
         other.write_bytes(first.read_bytes())
-    assert read_predictions(folder, "Other", sets, "white")["dynamic"].moves
+    assert {*read_predictions(folder, sets, "white")} == {"static", "dynamic"}

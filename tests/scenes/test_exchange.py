@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from devrf.evaluation.predictions import read_predictions
-from devrf.evaluation.scoring import score_held_out
+from devrf.evaluation.scoring import score_pictures
+from devrf.evaluation.suite import MetricSuite
 from devrf.scenes.exchange import write_for_others
 from devrf.scenes.export import write_image
 from devrf.scenes.formats.blender import BlenderReader
@@ -112,6 +113,6 @@ def test_pictures_under_the_names_of_held_out_images_are_found(tiny_scene, tmp_p
     for k in range(len(views)):
         darker = (views.pixels[k].float() * torch.tensor([0.9, 0.9, 0.9, 1.0])).to(torch.uint8)
         write_image(tmp_path / "rendered" / f"test_{k:05d}.png", darker)
-    pictures = read_predictions(tmp_path / "rendered", "Other", {"dynamic": views}, "white")
-    scored = score_held_out(pictures["dynamic"], {"dynamic": views}, "white")["dynamic"]
+    found = read_predictions(tmp_path / "rendered", {"dynamic": views}, "white")["dynamic"]
+    scored = score_pictures("dynamic", found, views, "white", MetricSuite())
     assert all(30 < view.psnr < 50 for view in scored)

@@ -42,7 +42,7 @@ def mean_scores(views: Sequence[HeldOutView]) -> dict[str, float | None]:
         values = [view.scores[name] for view in views]
         finite = [value for value in values if value is not None and not math.isnan(value)]
         means[name] = round(fmean(finite), 5) if finite else None
-    del means["rest_pose_psnr"]
+    means.pop("rest_pose_psnr", None)
     return means
 
 
@@ -114,8 +114,8 @@ def tracked_scores(sections: Mapping[str, Mapping[str, Any]]) -> dict[str, float
 
 
 def _with_rest_pose(views: Sequence[HeldOutView]) -> dict[str, float | None]:
-    rest_pose = round(fmean(view.rest_pose_psnr for view in views), 4)
-    return {**mean_scores(views), "rest_pose_psnr": rest_pose}
+    values = [view.rest_pose_psnr for view in views if view.rest_pose_psnr is not None]
+    return {**mean_scores(views), "rest_pose_psnr": round(fmean(values), 4)}
 
 
 def write_frames(path: Path, captures: Mapping[str, Sequence[HeldOutView]]) -> None:

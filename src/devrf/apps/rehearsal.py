@@ -91,13 +91,15 @@ def learned(model: Renderable, scene: Scene, capture: CaptureName) -> Learned:
     mean = torch.stack([truth.mean(dim=(0, 1)) for truth in truths]).mean(dim=0)
     background = torch.full((3,), background_value(scene.background))
 
+    rest_pose = [view.rest_pose_psnr for view in scored if view.rest_pose_psnr is not None]
+
     def of_color(color: Tensor) -> float:
         return fmean(psnr(color.expand_as(truth), truth) for truth in truths)
 
     return Learned(
         psnr=fmean(view.psnr for view in scored),
         blank=max(of_color(mean), of_color(background)),
-        rest_pose=fmean(v.rest_pose_psnr for v in scored) if capture == "dynamic" else None,
+        rest_pose=fmean(rest_pose) if capture == "dynamic" else None,
     )
 
 

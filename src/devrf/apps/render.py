@@ -6,6 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -103,7 +104,9 @@ def videos(
     if held_out is not None:
         images = held_out_images(held_out, settings.frames)
         background = viewpoints.background
-        pictures = held_out_pictures(renderer, held_out, images, settings, background)
+        pictures = held_out_pictures(
+            partial(still, renderer), renderer.model.moves, held_out, images, settings, background
+        )
         yield video("held_out", pictures)
     name = settings.path or default_path(space)
     if name == SWING or (viewpoints.followed and not settings.path and name != "orbit"):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import groupby
 from typing import Annotated, ClassVar
@@ -20,6 +20,10 @@ from devrf.pictures.images import centred, image_grid, scaled
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Background, Views
 from devrf.system.options import Options, Positive, Share
+
+# Cameras, a time in [0, 1], a grey level behind, and the number of a camera → colour and depth as
+# colours (H, W, 3) in [0, 1] of what that camera sees, in the size of its image.
+Shown = Callable[[Cameras, float, float, int], tuple[Tensor, Tensor]]
 
 # More frames than this are a mistake: an hour at 25 a second.
 MAX_FRAMES = 90_000
@@ -82,18 +86,19 @@ def path_pictures(
 
 
 def held_out_pictures(
-    renderer: Renderer,
+    shown: Shown,
+    moves: bool,
     views: Views,
     images: Sequence[int],
     settings: VideoSettings,
     background: Background,
 ) -> Iterator[Tensor]:
-    """Truth, rendering and depth (H', W', 3) side by side.
+    """Truth, what is ``shown`` of it, and depth (H', W', 3) side by side.
 
-    Images of several sizes are at one scale, in tiles for the widest and the highest.
-    ``images`` are those of the ``views`` to show, one a frame (:func:`held_out_images`). Where a
-    camera took several, time runs from 0 to 1. An image with a pose of its own is shown at its
-    own time.
+    Images of several sizes are at one scale, in tiles for the widest and the highest. Headings say
+    times if the scene ``moves``. ``images`` are those of the ``views`` to show, one a frame
+    (:func:`held_out_images`). Where a camera took several, time runs from 0 to 1. An image with a
+    pose of its own is shown at its own time.
     """
     rows = max(views.height, READABLE) if settings.height is None else settings.height
     cameras = views.cameras.of_height(rows)
@@ -104,14 +109,14 @@ def held_out_pictures(
         times = views.times[images].tolist()
     shots = zip(images, times, strict=True)
     for (image, time), frames in groupby(shots):
-        color, depth = still(renderer, cameras, time, behind, image)
+        color, depth = shown(cameras, time, behind, image)
         # Resized from its own size, not rendered: it is the truth to compare with.
         truth = truth_image(views, image, background)
         size = f"({truth.shape[1]}x{truth.shape[0]}{larger})"
         truth = scaled(truth, color.shape[0], color.shape[1])
         at = ""
         at_time = ""
-        if renderer.model.moves:
+        if moves:
             at = f" at {float(views.times[image]):.2f}"
             at_time = f" at time {time:.2f}"
         headings = [f"truth{at} {size}", f"rendered{at_time}", DEPTH]

@@ -7,7 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
 from hydra.utils import instantiate
+from torch import Tensor
 
 from devrf.apps.benchmarks import followed
 from devrf.apps.records import (
@@ -36,9 +38,10 @@ from devrf.evaluation.held_out import HeldOutView
 from devrf.evaluation.motion import pck_t, with_motion_masks
 from devrf.evaluation.objective import VALIDATION, objective
 from devrf.evaluation.predictions import picture_name, read_predictions
-from devrf.evaluation.scoring import score_held_out
+from devrf.evaluation.scoring import score_held_out, score_pictures
+from devrf.geometry.cameras import Cameras
 from devrf.pictures.held_out import write_contact_sheet
-from devrf.pictures.images import write_image
+from devrf.pictures.images import scaled, write_image
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Views
 from devrf.system.files import write_json
@@ -163,12 +166,12 @@ def _evaluate_predictions(run: RunContext) -> None:
         sets["dynamic"] = scene.dynamic.test
     program = foreign_program(run.config)
     folder = Path(run.config.evaluation.predictions)
-    pictures = read_predictions(folder, program, sets, scene.background)
+    pictures = read_predictions(folder, sets, scene.background)
     suite = run.evaluation.suite(run.device)
-    scored, rule = _with_motion_masks(run, {name: own.views for name, own in pictures.items()})
+    scored, rule = _with_motion_masks(run, {name: sets[name] for name in pictures})
     frames = {
-        name: score_held_out(own, {name: scored[name]}, scene.background, suite)[name]
-        for name, own in pictures.items()
+        name: score_pictures(name, picture, scored[name], scene.background, suite)
+        for name, picture in pictures.items()
     }
     sections = {name: {**mean_scores(v), "images": len(v)} for name, v in frames.items()}
     _write_scores(run, frames, scored)
@@ -179,7 +182,15 @@ def _evaluate_predictions(run: RunContext) -> None:
     for section, values in sections.items():
         log.info("%s, %s: %s", name, section, in_words(values))
     settings: VideoSettings = instantiate(run.config.video)
-    shown = [*pictures.values()][-1]
-    images = held_out_images(shown.views, settings.frames)
-    film = held_out_pictures(Renderer(shown), shown.views, images, settings, scene.background)
+    last, picture = [*pictures.items()][-1]
+    views = sets[last]
+
+    def shown(cameras: Cameras, _time: float, _behind: float, image: int) -> tuple[Tensor, Tensor]:
+        camera = cameras.single(image)
+        color = scaled(picture(image), camera.height, camera.width)
+        return color, torch.ones_like(color)  # nobody knows its depth
+
+    images = held_out_images(views, settings.frames)
+    moves = bool((views.times != views.times[0]).any())
+    film = held_out_pictures(shown, moves, views, images, settings, scene.background)
     write_video(run, Video("held_out", settings.fps, settings.frames, film))

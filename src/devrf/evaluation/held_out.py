@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -16,17 +16,18 @@ from devrf.scenes.scene import Background, Views
 
 @dataclass(frozen=True)
 class HeldOutView:
-    """A held-out image, the model's prediction of it, and metrics over the valid pixels.
+    """A held-out image, a prediction of it, and metrics over the valid pixels.
 
     Attributes:
         truth: (H, W, 3) RGB in [0, 1].
         prediction: (H, W, 3) RGB in [0, 1].
         psnr: dB.
-        rest_pose_psnr: PSNR in dB of the canonical scene, in place of the prediction.
+        rest_pose_psnr: PSNR in dB of the canonical scene, in place of the prediction; None of
+            another program's picture.
         further: other metrics by name; None where a view has no truth to compare with.
         compared: (H, W, 3) RGB in [0, 1], the prediction at valid pixels, else the truth.
         depth: (H, W) mean distance of the visible samples, in the space of the fields.
-        opacity: (H, W) in [0, 1], 1 − transmittance.
+        opacity: (H, W) in [0, 1], 1 − transmittance; 0 where depth is unknown.
     """
 
     name: str
@@ -35,7 +36,7 @@ class HeldOutView:
     prediction: Tensor
     psnr: float
     ssim: float
-    rest_pose_psnr: float
+    rest_pose_psnr: float | None = None
     further: dict[str, float | None] = field(default_factory=dict)
     compared: Tensor = field(kw_only=True)
     depth: Tensor = field(kw_only=True)
@@ -44,8 +45,35 @@ class HeldOutView:
     @property
     def scores(self) -> dict[str, float | None]:
         """Every metric by name."""
-        metrics = {"psnr": self.psnr, "ssim": self.ssim, "rest_pose_psnr": self.rest_pose_psnr}
-        return {**metrics, **self.further}
+        rest = self.rest_pose_psnr
+        of_rest = {} if rest is None else {"rest_pose_psnr": rest}
+        return {"psnr": self.psnr, "ssim": self.ssim, **of_rest, **self.further}
+
+
+def compared_with_truth(
+    color: Tensor, views: Views, index: int, background: Background
+) -> HeldOutView:
+    """Compare a picture (H, W, 3) in [0, 1] of image ``index`` of held-out ``views`` with it.
+
+    Only valid pixels are compared, for SSIM in windows of valid pixels alone. For other metrics
+    over neighbourhoods the prediction at other pixels is the truth. The prediction gets the image's
+    own exposure first, if a part of the image is there to estimate it. All is on the host.
+    """
+    truth = truth_image(views, index, background)
+    prediction = exposed(color, truth, views, index)
+    valid_mask = views.valid_mask_of(index)
+    compared = compare(prediction, truth, valid_mask)
+    return HeldOutView(
+        name=views.names[index],
+        time=float(views.times[index]),
+        truth=truth,
+        prediction=prediction,
+        psnr=_psnr(compared, truth, valid_mask),
+        ssim=_ssim(compared, truth, valid_mask),
+        compared=compared,
+        depth=torch.zeros(truth.shape[:2]),
+        opacity=torch.zeros(truth.shape[:2]),
+    )
 
 
 def score(
@@ -58,54 +86,41 @@ def score(
     time: float | None = None,
     rest_pose_psnr: float | None = None,
 ) -> HeldOutView:
-    """Render image ``index`` of held-out ``views`` and compare it with the truth.
-
-    Only valid pixels are compared, for SSIM in windows of valid pixels alone. For other metrics
-    over neighbourhoods the prediction at other pixels is the truth. The prediction gets the image's
-    own exposure first, if a part of the image is there to estimate it.
+    """Render image ``index`` of held-out ``views`` and compare it as :func:`compared_with_truth`.
 
     ``views`` are on the host. ``suite`` has metrics beside PSNR and SSIM. ``time`` in [0, 1] is
     rendered; None: the image's own. ``rest_pose_psnr`` is the image's, if it
     was computed before; None: the canonical scene is rendered, too.
     """
-    own_time = float(views.times[index])
-    time = own_time if time is None else time
-    truth = truth_image(views, index, background)
+    time = float(views.times[index]) if time is None else time
     behind = background_value(background)
     camera = views.cameras.single(index)
     rendered = renderer.view(camera, 0, time, behind)
-    prediction = exposed(_image(rendered, truth), truth, views, index)
-    valid_mask = views.valid_mask_of(index)
-    compared = compare(prediction, truth, valid_mask)
-    psnr = _psnr(compared, truth, valid_mask)
+    shape = (camera.height, camera.width)
+    view = compared_with_truth(_color(rendered, shape), views, index, background)
     if rest_pose_psnr is None:
-        rest_pose_psnr = psnr
+        rest_pose_psnr = view.psnr
         if not renderer.at(time).at_rest:
-            canonical = _image(renderer.view(camera, 0, 0.0, behind), truth)
-            canonical = compare(exposed(canonical, truth, views, index), truth, valid_mask)
-            rest_pose_psnr = _psnr(canonical, truth, valid_mask)
-    further: dict[str, float | None] = {}
-    opacity = rendered.opacity.cpu().view(truth.shape[:2])
-    if suite is not None and suite.metrics:
-        rays = camera.image_rays(0)
-        points = points_at_depth(renderer.model.space, rays, rendered.depth.cpu())
-        distance = (points - rays.origins).norm(dim=1).view(truth.shape[:2])
-        further = suite.scores(
-            MetricInput(renderer, views, index, compared, truth, distance, opacity, suite.lpips)
-        )
-    return HeldOutView(
-        name=views.names[index],
-        time=own_time,
-        truth=truth,
-        prediction=prediction,
-        psnr=psnr,
-        ssim=_ssim(compared, truth, valid_mask),
+            valid_mask = views.valid_mask_of(index)
+            canonical = _color(renderer.view(camera, 0, 0.0, behind), shape)
+            canonical = exposed(canonical, view.truth, views, index)
+            canonical = compare(canonical, view.truth, valid_mask)
+            rest_pose_psnr = _psnr(canonical, view.truth, valid_mask)
+    view = replace(
+        view,
         rest_pose_psnr=rest_pose_psnr,
-        further=further,
-        compared=compared,
-        depth=rendered.depth.cpu().view(truth.shape[:2]),
-        opacity=opacity,
+        depth=rendered.depth.cpu().view(shape),
+        opacity=rendered.opacity.cpu().view(shape),
     )
+    if suite is None or not suite.metrics:
+        return view
+    rays = camera.image_rays(0)
+    points = points_at_depth(renderer.model.space, rays, rendered.depth.cpu())
+    distance = (points - rays.origins).norm(dim=1).view(shape)
+    inputs = MetricInput(
+        renderer, views, index, view.compared, view.truth, distance, view.opacity, suite.lpips
+    )
+    return replace(view, further=suite.scores(inputs))
 
 
 def compare(prediction: Tensor, truth: Tensor, valid_mask: Tensor | None) -> Tensor:
@@ -179,5 +194,5 @@ def background_value(background: Background) -> float:
     return 0.0 if background == "black" else 1.0
 
 
-def _image(image: RenderedImage, truth: Tensor) -> Tensor:
-    return image.color.view(truth.shape).clamp(0, 1).cpu()
+def _color(image: RenderedImage, shape: tuple[int, int]) -> Tensor:
+    return image.color.view(*shape, 3).clamp(0, 1).cpu()

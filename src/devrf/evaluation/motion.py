@@ -122,6 +122,14 @@ def flicker(views: Views, scored: Sequence[HeldOutView]) -> list[float | None]:
     return values
 
 
+def with_flicker(views: Views, scored: Sequence[HeldOutView]) -> list[HeldOutView]:
+    """The scored ``views``, each with its :func:`flicker`."""
+    return [
+        replace(view, further={**view.further, "flicker": value})
+        for view, value in zip(scored, flicker(views, scored), strict=True)
+    ]
+
+
 @torch.no_grad()
 def pck_t(renderer: Renderer, capture: Capture) -> float | None:
     """The share of key points that the model's field carries rightly to images at other times.

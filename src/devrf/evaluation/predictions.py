@@ -16,11 +16,11 @@ from __future__ import annotations
 import logging
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from statistics import fmean
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from pydantic import BaseModel, Field
@@ -28,11 +28,6 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from devrf.evaluation.held_out import background_value, on_background, truth_image
-from devrf.geometry.box import Box
-from devrf.geometry.cameras import Cameras
-from devrf.geometry.space import WORLD
-from devrf.rendering.output import RenderedImage
-from devrf.rendering.renderable import Renderable
 from devrf.scenes.files import MOST_IMAGES, Name, Number, inside, read_json
 from devrf.scenes.footage import VIDEOS, Picture, footage_header, frames_at
 from devrf.scenes.image_folders import listed_images
@@ -79,73 +74,6 @@ class PredictionsFile(BaseModel):
     images: Annotated[list[Listed], Field(fail_fast=True, min_length=1, max_length=MOST_IMAGES)]
 
 
-class Pictures(Renderable):
-    """Pictures by another program in place of a learned scene: what it shows from held-out cameras.
-
-    They are of one set: views of two sets may have the same pose and time.
-
-    Attributes:
-        views: the held-out views of the set.
-    """
-
-    def __init__(self, program: str, views: Views, pictures: Sequence[Tensor]) -> None:
-        """``pictures`` (H, W, 3) in [0, 1] of all ``views``, by a ``program``."""
-        super().__init__()
-        self.__dict__["name"] = program
-        self.space = WORLD
-        # Depth, which nobody knows, is drawn in these: any will do.
-        self.box = Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
-        self.depth_limits = (0.0, 1.0)
-        self.views = views
-        # By the pose of a camera: times and pictures.
-        self._shots: dict[tuple[float, ...], list[tuple[float, Tensor]]] = {}
-        for index, (time, picture) in enumerate(zip(views.times.tolist(), pictures, strict=True)):
-            self._shots.setdefault(_pose(views.cameras, index), []).append((time, picture))
-
-    def config(self) -> dict[str, Any]:
-        """None: no checkpoint holds pictures."""
-        return {}
-
-    @property
-    def device(self) -> torch.device:
-        """The host."""
-        return torch.device("cpu")
-
-    @property
-    def moves(self) -> bool:
-        """Whether there are pictures of several times."""
-        return bool((self.views.times != self.views.times[0]).any())
-
-    def at(self, time: float, *, half: bool = False) -> PicturesAt:
-        """The pictures of the nearest time that a camera has one of."""
-        return PicturesAt(self._shots, time)
-
-
-@dataclass(frozen=True)
-class PicturesAt:
-    """The pictures of one time (an :class:`~devrf.rendering.view.ImageView`)."""
-
-    shots: Mapping[tuple[float, ...], Sequence[tuple[float, Tensor]]]
-    time: float
-    # There is no canonical scene to compare with.
-    at_rest: bool = True
-
-    def image(self, camera: Cameras, background: Tensor, crop: Box | None) -> RenderedImage:
-        """The picture by a held-out camera, resized to its number of pixels; without depth."""
-        _, picture = min(self.shots[_pose(camera, 0)], key=lambda shot: abs(shot[0] - self.time))
-        size = (camera.height, camera.width)
-        if picture.shape[:2] != size:
-            picture = interpolate(picture.permute(2, 0, 1)[None], size, mode="bilinear")[0]
-            picture = picture.permute(1, 2, 0)
-        flat = picture.reshape(-1, 3)
-        nothing = torch.zeros(len(flat))
-        return RenderedImage(color=flat, depth=nothing, opacity=nothing)
-
-
-def _pose(cameras: Cameras, index: int) -> tuple[float, ...]:
-    return tuple(cameras.camera_to_world[index].flatten().tolist())
-
-
 def picture_name(views: Views, index: int) -> str:
     """A name by which :func:`read_predictions` knows the picture of a held-out image."""
     number = sorted({*views.view.tolist()}).index(int(views.view[index]))
@@ -153,24 +81,29 @@ def picture_name(views: Views, index: int) -> str:
 
 
 def read_predictions(
-    path: Path, program: str, sets: Mapping[str, Views], background: Background
-) -> dict[str, Pictures]:
+    path: Path, sets: Mapping[str, Views], background: Background
+) -> dict[str, Callable[[int], Tensor]]:
     """The pictures in a folder, or in films (see above), of those ``sets`` that have some, by name.
+
+    Each is read anew when it is asked for, by the position of its image: (H, W, 3) in [0, 1].
 
     Raises:
         DevrfError: a picture is missing, of another size than its image, or most like another
             image.
     """
-    pictures = {}
+    pictures: dict[str, Callable[[int], Tensor]] = {}
     for name, place in _places(path, sets).items():
         views = sets[name]
         found = _film(place, views) if os.path.isfile(place) else pictures_in(place, views)
-        behind = background_value(background)
-        ready = [on_background(torch.tensor(found(k)), behind) for k in range(len(views))]
-        _check_order(ready, views, background, place)
-        _compare_background(ready, views, background, place)
-        pictures[name] = Pictures(program, views, ready)
+        picture = partial(_color, found, background_value(background))
+        _check_order(picture, views, background, place)
+        _compare_background(picture, views, background, place)
+        pictures[name] = picture
     return pictures
+
+
+def _color(found: Callable[[int], Picture], behind: float, index: int) -> Tensor:
+    return on_background(torch.tensor(found(index)), behind)
 
 
 def _places(path: Path, sets: Iterable[str]) -> dict[str, Path]:
@@ -208,7 +141,8 @@ def pictures_in(folder: Path, views: Views) -> Callable[[int], Picture]:
         raise scene_error(
             folder,
             f"has no picture of {_in_words(views, lacking[0])}; {len(lacking)} of {len(views)} are "
-            "missing: add them",
+            "missing: add them; pictures are called as the images "
+            f"({Path(views.names[0]).stem}.png) or view0_time0.250.png, or {LIST} lists them",
         )
 
     def picture(index: int) -> Picture:
@@ -255,17 +189,12 @@ def _named(folder: Path, views: Views) -> dict[int, Path]:
     by_place = {
         k: path for path, match in placed for k in _at(views, int(match[1]), float(match[2]))
     }
-    best = max((by_name, by_place), key=len)
-    if not best and len(images) == len(views):
+    in_order = dict(enumerate(images if len(images) == len(views) else ()))
+    # Names may be those of some images by chance: numbers are.
+    files = max((by_name, by_place, in_order), key=len)
+    if files is in_order:
         log.info("%s: %d pictures are taken in the order of their names", folder, len(images))
-        return dict(enumerate(images))
-    if not best:
-        raise scene_error(
-            folder,
-            f"has {len(images)} pictures, but {len(views)} images are held out; call them as those "
-            f"({Path(views.names[0]).stem}.png), view0_time0.250.png, or list them in {LIST}",
-        )
-    return best
+    return files
 
 
 def _at(views: Views, view: int, time: float) -> list[int]:
@@ -296,7 +225,7 @@ def _check_size(size: tuple[int, int], views: Views, index: int, where: Path) ->
 
 
 def _check_order(
-    pictures: Sequence[Tensor], views: Views, background: Background, place: Path
+    picture: Callable[[int], Tensor], views: Views, background: Background, place: Path
 ) -> None:
     """DevrfError if pictures have changed places: some, in another order, show one another's image.
 
@@ -304,7 +233,7 @@ def _check_order(
     like one, or one like an image that another picture shows well.
     """
     truths = torch.stack([_small(truth_image(views, k, background)) for k in range(len(views))])
-    shown = torch.stack([_small(picture) for picture in pictures])
+    shown = torch.stack([_small(picture(k)) for k in range(len(views))])
     errors = torch.cdist(shown, truths).square()
     least, nearest = errors.min(dim=1)
     moved = (nearest != torch.arange(len(views))).nonzero()[:, 0]
@@ -322,15 +251,15 @@ def _check_order(
 
 
 def _compare_background(
-    pictures: Sequence[Tensor], views: Views, background: Background, place: Path
+    picture: Callable[[int], Tensor], views: Views, background: Background, place: Path
 ) -> None:
     """Say in a line if pictures have something else behind the alpha masks than the images."""
     behind = background_value(background)
     errors = []
-    for k, picture in enumerate(pictures if views.has_alpha else ()):
+    for k in range(len(views) if views.has_alpha else 0):
         clear = views.single(k).pixels[0, ..., 3] == 0
         if bool(clear.any()):
-            errors.append(float((picture[clear] - behind).abs().mean()))
+            errors.append(float((picture(k)[clear] - behind).abs().mean()))
     if errors and fmean(errors) > OTHER_BACKGROUND:
         log.warning(
             "%s: the images are %s behind the alpha masks, the pictures are not; render them so, "

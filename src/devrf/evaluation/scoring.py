@@ -1,18 +1,19 @@
-"""Scores sets of held-out views by Lightning's ``trainer.test``."""
+"""Scores sets of held-out views: a learned scene's by Lightning's ``trainer.test``."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from statistics import fmean
 
 from lightning import LightningModule, Trainer
 from lightning.pytorch.trainer.states import TrainerFn
+from torch import Tensor
 
-from devrf.evaluation.held_out import HeldOutView, score
-from devrf.evaluation.motion import flicker
-from devrf.evaluation.suite import MetricSuite
+from devrf.evaluation.held_out import HeldOutView, compared_with_truth, score
+from devrf.evaluation.motion import with_flicker
+from devrf.evaluation.suite import MetricInput, MetricSuite
 from devrf.rendering.renderable import Renderable
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Background, Views
@@ -53,11 +54,8 @@ class HeldOutScores(LightningModule):
     def on_test_epoch_end(self) -> None:
         """Add what compares consecutive images: :func:`~devrf.evaluation.motion.flicker`."""
         for name in (name for name in self.sets if name != STATIC):
-            values = flicker(self.sets[name], self.scored[name])
-            pairs = zip(self.scored[name], values, strict=True)
-            self.scored[name] = [
-                replace(view, further={**view.further, "flicker": value}) for view, value in pairs
-            ]
+            self.scored[name] = with_flicker(self.sets[name], self.scored[name])
+            values = [view.further["flicker"] for view in self.scored[name]]
             known = [value for value in values if value is not None]
             if known:
                 self.log(f"test/{name}/flicker", fmean(known))
@@ -141,3 +139,24 @@ def score_held_out(
     scores = HeldOutScores(model, sets, background, suite)
     trainer.test(scores, verbose=False)
     return scores.scored
+
+
+def score_pictures(
+    name: str,
+    picture: Callable[[int], Tensor],
+    views: Views,
+    background: Background,
+    suite: MetricSuite,
+) -> list[HeldOutView]:
+    """The scores of another program's pictures of all ``views`` of the held-out set ``name``.
+
+    ``picture(k)`` is that of image ``k``, (H, W, 3) in [0, 1] on the host.
+    """
+    scored = []
+    for k in followed(range(len(views)), len(views), f"held-out images, {name}"):
+        view = compared_with_truth(picture(k), views, k, background)
+        inputs = MetricInput(
+            None, views, k, view.compared, view.truth, view.depth, view.opacity, suite.lpips
+        )
+        scored.append(replace(view, further=suite.scores(inputs)))
+    return scored if name == STATIC else with_flicker(views, scored)

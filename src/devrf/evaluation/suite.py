@@ -24,6 +24,7 @@ class MetricInput:
     """One held-out image, to be compared with the truth; on the host.
 
     Attributes:
+        renderer: of the learned scene; None: the prediction is another program's.
         prediction: (H, W, 3) RGB in [0, 1]; the truth where pixels are not valid.
         truth: (H, W, 3) RGB in [0, 1].
         depth: (H, W) rendered distance along each pixel's ray, world units.
@@ -31,7 +32,7 @@ class MetricInput:
         lpips: the perceptual metric, or None without its weights.
     """
 
-    renderer: Renderer
+    renderer: Renderer | None
     views: Views
     index: int
     prediction: Tensor
@@ -187,13 +188,13 @@ class MetricSuite:
         return {name: MEASURES[name](inputs) for name in self.metrics}
 
 
-def flow_error(renderer: Renderer, views: Views, index: int) -> float | None:
+def flow_error(renderer: Renderer | None, views: Views, index: int) -> float | None:
     """Mean end-point error in pixels of image ``index``'s backward flow, where that is known.
 
     Rendered flow is 0 where opacity is below 0.5. None without flow or an earlier frame, or if the
-    method's views have no motion.
+    method's views have no motion, or nothing is rendered.
     """
-    if views.flow is None:
+    if renderer is None or views.flow is None:
         return None
     before = int(previous_images(views)[index])
     # On the raster of all images: flow beside an image is not valid.
