@@ -14,8 +14,6 @@ from devrf.errors import DevrfError, expect
 
 # The scores and events of a rehearsal; a run's are in metrics.json.
 REHEARSAL = "rehearsal.json"
-# capture.alpha_masks=subtract
-SUBTRACT = "subtract"
 
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"]
 
@@ -39,11 +37,6 @@ class CaptureSettings:
     holdout: int = 8
     alpha_masks: str | Path | None = None
     masks: str | Path | None = None
-
-    @property
-    def subtracts(self) -> bool:
-        """Whether the background of the fixed views is to be subtracted."""
-        return str(self.alpha_masks) == SUBTRACT
 
     @property
     def monocular(self) -> bool:
@@ -72,11 +65,6 @@ class CaptureSettings:
             raise DevrfError(
                 f"capture.offsets: {len(self.offsets)} offsets for {views} views; give one of "
                 "each, 0 for the first, or null"
-            )
-        if self.subtracts and (views < 2 or self.monocular):
-            raise DevrfError(
-                "capture.alpha_masks: subtract needs at least 2 views by cameras that stand still; "
-                "give capture.alpha_masks=FOLDER, or leave it out"
             )
         if self.test_view == 0 or (views > 1 and not -views <= self.test_view <= views):
             raise DevrfError(

@@ -165,14 +165,6 @@ def test_alpha_masks_make_a_world_of_the_thing_and_are_found_again(
     assert not (tmp_path / "scene" / "transforms.json").exists()
 
 
-def test_subtraction_gives_the_box_of_what_moves(capture):
-    scene = capture(alpha_masks="subtract")
-    assert not scene.static.train.has_alpha and not scene.space.is_linear
-    assert scene.bounds.box_source == "scene_bounds in transforms.json"
-    # Its box is another than that of all sparse points, 1.2 units wide and their margin.
-    assert Box.of(scene.space.low, scene.space.high).longest > 2
-
-
 # What is wrong is said in one line, and nothing is left behind.
 
 
@@ -201,7 +193,6 @@ def test_settings_that_do_not_go_together(into):
         ("offsets", {**two, "offsets": [0]}),
         ("test_view", {**two, "test_view": 3}),
         ("frames", {**two, "frames": 2}),
-        ("alpha_masks", {**one, "alpha_masks": "subtract"}),
     ):
         assert refused(into, **settings).startswith(f"capture.{key}: ")
     assert CaptureSettings(static="a.mp4", views=["a.mp4"]).monocular

@@ -1,4 +1,4 @@
-"""The steps of a capture: survey, alignment, images with alpha masks, structure, box of motion."""
+"""The steps of a capture: survey, alignment, images with alpha masks, structure."""
 
 from __future__ import annotations
 
@@ -13,13 +13,11 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-import torch
 
 from devrf.apps.capture import images
 from devrf.apps.capture.alignment import offset_between, timeline
 from devrf.apps.capture.images import (
     Chosen,
-    box_of_motion,
     chosen_masks,
     common_size,
     fitted,
@@ -40,8 +38,6 @@ from devrf.apps.capture.survey import (
 )
 from devrf.apps.settings import CaptureSettings
 from devrf.errors import DevrfError
-from devrf.geometry.box import Box
-from devrf.geometry.cameras import Cameras
 from devrf.scenes.image_folders import listed_images as list_of
 
 SIZE = (64, 48)
@@ -312,39 +308,6 @@ def test_frames_are_cropped_to_common_proportions_and_shrunk(textured):
     picture = textured(0)
     assert (fitted(picture, (48, 48)) == picture[:, 8:56]).all()
     assert fitted(picture, (32, 24)).shape == (24, 32, 3)
-
-
-# What moves.
-
-
-def test_what_moves_says_where_the_box_is(tmp_path):
-    angle = torch.arange(4) * torch.pi / 2 + 0.4
-    around = torch.stack([4 * angle.cos(), 4 * angle.sin(), torch.full_like(angle, 1.5)], dim=1)
-    ring = Cameras.looking_at(around, torch.zeros_like(around), focal=100.0, width=96, height=96)
-    names, generator = [], np.random.default_rng(0)
-    for v in range(4):
-        wall = generator.integers(0, 180, (24, 24, 3), dtype=np.uint8)
-        wall = cv2.resize(wall, (96, 96), interpolation=cv2.INTER_LINEAR)
-        names.append([f"view{v}/{t}.png" for t in range(8)])
-        (tmp_path / f"view{v}").mkdir()
-        for t, name in enumerate(names[-1]):
-            # A white ball of radius 0.3 before the wall.
-            center = torch.tensor([[2 * t / 7 - 1, 0.0, 0.2]])
-            place, depth = ring.project(torch.tensor([v]), center)
-            at = tuple((place[0].numpy() * 16).round().astype(int).tolist())
-            radius, white = round(16 * 0.3 * 100 / float(depth)), (255, 255, 255)
-            picture = cv2.circle(wall.copy(), at, radius, white, -1, cv2.LINE_8, 4)
-            noise = generator.integers(-2, 3, wall.shape)
-            cv2.imwrite(str(tmp_path / name), (picture + noise).clip(0, 255).astype(np.uint8))
-    lens = {"fl_x": 100.0, "fl_y": 100.0, "cx": 48.0, "cy": 48.0, "w": 96, "h": 96}
-    area, poses = Box.of([-2.0] * 3, [2.0] * 3), ring.camera_to_world.double()
-    box = box_of_motion(tmp_path, names, poses, [lens] * 4, area)
-    exact = [(-1.3, 1.3), (-0.3, 0.3), (-0.1, 0.5)]
-    for low, high, (least, most) in zip(box.low, box.high, exact, strict=True):
-        assert least - 0.35 < low <= least + 0.1 and most - 0.1 <= high < most + 0.35
-    still = [[view[0]] * 3 for view in names]
-    with pytest.raises(DevrfError, match=r"^capture\.alpha_masks: "):
-        box_of_motion(tmp_path, still, poses, [lens] * 4, area)
 
 
 # Structure from motion.

@@ -1,8 +1,7 @@
-"""Chosen frames of all footage as image files of one size, their masks, and their motion."""
+"""Chosen frames of all footage as image files of one size, and their masks."""
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import repeat
@@ -12,18 +11,12 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
-import torch
-from torch import Tensor
 
 from devrf.errors import DevrfError
-from devrf.geometry.box import Box
-from devrf.geometry.cameras import Cameras
 from devrf.scenes.files import entries
 from devrf.scenes.footage import VIDEOS, Picture, frame_count, frames_at, is_folder, pictures
 from devrf.scenes.image_folders import listed_images
 from devrf.scenes.masks import HALF, WHITE, read_mask, white_in, white_in_files
-from devrf.scenes.scene import Views
-from devrf.scenes.silhouettes import motion_box
 
 Size = tuple[int, int]
 
@@ -232,93 +225,6 @@ def _of_photographs(masks: Path, footage: Path) -> list[Path]:
             "photograph one of its name"
         )
     return [named[photograph.stem] for photograph in photographs]
-
-
-log = logging.getLogger(__name__)
-
-# Longer side, in pixels, of the images in which silhouettes are found: a box needs no more.
-LONGER_SIDE = 320
-# A pixel moves from this squared distance to the background on, in units of its variance.
-_FAR = 25.0
-# The least variance of a pixel, in grey levels squared (compression).
-_LEAST_VARIANCE = 16.0
-# A pixel's content in at least this share of the pictures is background.
-_MOST_OF_THE_TIME = 0.5
-# Connected pixels that are a smaller share of the image are noise.
-_SPECK = 5e-4
-
-
-def silhouettes(pictures: Sequence[Picture]) -> list[Mask]:
-    """Masks (H, W) of the foreground, 0 or 255, in each picture of a static camera.
-
-    The background is learned from all pictures, at least two (Zivkovic's mixtures of Gaussians,
-    OpenCV's MOG2). A thing that rests for most of the time is background.
-    """
-    model = cv2.createBackgroundSubtractorMOG2(len(pictures), _FAR, detectShadows=False)
-    model.setVarMin(_LEAST_VARIANCE)
-    model.setVarInit(_LEAST_VARIANCE)
-    model.setBackgroundRatio(_MOST_OF_THE_TIME)
-    for picture in pictures:
-        # All pictures have equal weight, whatever their order.
-        model.apply(picture, learningRate=1 / len(pictures))
-    return [_without_specks(model.apply(picture, learningRate=0)) for picture in pictures]
-
-
-def _without_specks(mask: npt.NDArray[Any]) -> Mask:
-    opened = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(opened)
-    large = stats[:, cv2.CC_STAT_AREA] >= _SPECK * mask.size
-    large[0] = False
-    return np.where(large[labels], 255, 0).astype(np.uint8)
-
-
-def box_of_motion(
-    images: Path,
-    names: Sequence[Sequence[str]],
-    poses: Tensor,
-    lenses: Sequence[dict[str, float]],
-    around: Box,
-) -> Box:
-    """The box of all that moves, carved from the silhouettes of the fixed views.
-
-    Args:
-        images: the folder of images.
-        names: the T images of each of V ≥ 2 views, relative to the folder.
-        poses: (V, 3, 4) camera-to-world, OpenGL axes, world units.
-        lenses: ``fl_x``, ``cx`` … of each view, in pixels; distortion is left alone.
-        around: the box of the search, which is half as large again.
-
-    Raises:
-        DevrfError: nothing moves in what two views see.
-    """
-    masks: list[Mask] = []
-    for view_names in names:
-        pictures = [cv2.imread(str(images / name), cv2.IMREAD_COLOR) for name in view_names]
-        masks += silhouettes([shrunk(np.asarray(p, np.uint8), LONGER_SIDE) for p in pictures])
-    count = len(names[0])
-    height, width = masks[0].shape
-    keys = ("fl_x", "fl_y", "cx", "cy")
-    intrinsics = [[lens[key] * (width / lens["w"]) for key in keys] for lens in lenses]
-    focal, center = torch.split(torch.tensor(intrinsics, dtype=torch.float32), 2, dim=1)
-    view = torch.arange(len(names)).repeat_interleave(count)
-    alpha = torch.from_numpy(np.stack(masks))[..., None]
-    views = Views(
-        alpha.expand(-1, -1, -1, 4),
-        Cameras(poses.float(), focal, center, width, height)[view],
-        torch.linspace(0, 1, count).repeat(len(names)),
-        view,
-        tuple(name for view_names in names for name in view_names),
-    )
-    # A coarse search first, then one with a finer grid.
-    coarse = motion_box(views, around)
-    box = None if coarse is None else motion_box(views, coarse)
-    if box is None:
-        raise DevrfError(
-            "capture.alpha_masks: subtract needs at least 2 fixed views that see something move at "
-            "one time; leave capture.alpha_masks out"
-        )
-    log.info("moving objects are in %s", box)
-    return box
 
 
 def shrunk(image: npt.NDArray[Any], longer: int) -> npt.NDArray[Any]:

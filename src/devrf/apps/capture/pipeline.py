@@ -16,7 +16,6 @@ from torch import Tensor
 from devrf.apps.capture.alignment import Timeline, timeline
 from devrf.apps.capture.images import (
     Chosen,
-    box_of_motion,
     common_size,
     masks_of,
     write_frames,
@@ -25,12 +24,10 @@ from devrf.apps.capture.structure import MODELS, checked_model, reconstruct
 from devrf.apps.capture.survey import Survey, check_sharp, sharpest, survey
 from devrf.apps.settings import CaptureSettings
 from devrf.errors import DevrfError
-from devrf.geometry.box import Box
 from devrf.scenes.files import inside
 from devrf.scenes.footage import frame_count, is_folder, pictures
 from devrf.scenes.formats.nerfstudio import FILE
 from devrf.scenes.sparse_model import (
-    AROUND,
     LEFT_OUT,
     LEFT_OUT_OF_VIDEO,
     SparseModel,
@@ -82,7 +79,7 @@ def scene_from_footage(settings: CaptureSettings) -> Path:
     picked = list(range(len(sharp))) if is_folder(static) else sharpest(sharp, settings.frames)
     check_sharp(static, sharp, picked)
     masks: dict[Path, Path] = {}
-    if settings.alpha_masks is not None and not settings.subtracts:
+    if settings.alpha_masks is not None:
         folder = Path(settings.alpha_masks).expanduser()
         masks = {
             path: masks_of(folder, path, len(s.times), others=surveys)
@@ -112,8 +109,6 @@ def scene_from_footage(settings: CaptureSettings) -> Path:
     if settings.facing == "auto":
         facing = "forward" if bounds.space == "ndc" else "inward"
         log.info("cameras look %s-facing; capture.facing says otherwise", facing)
-    if settings.subtracts:
-        bounds = _around_motion(poses, bounds, model, into / IMAGES, fixed)
     frame_seconds = surveys[static].times if settings.monocular else None
     frames, test = _frames(model, poses, moving, fixed, clock, settings, frame_seconds)
     names = [frame["file_path"] for frame in frames]
@@ -244,24 +239,6 @@ def _model(
     file = work / "structure.json"
     name = kept(file, [images, options, settings.size], dict[Literal["model"], str], make)["model"]
     return checked_model(inside(work / MODELS, work / MODELS, name, file), moving, first)
-
-
-def _around_motion(
-    poses: Tensor, bounds: SceneBounds, model: SparseModel, images: Path, fixed: Sequence[Chosen]
-) -> SceneBounds:
-    """The bounds with the box of moving objects, if they have a box."""
-    if bounds.space != "contracted":
-        log.warning(
-            "capture.alpha_masks=subtract: a forward-facing scene has no box, it changes nothing"
-        )
-        return bounds
-    index = {image.name: k for k, image in enumerate(model.images)}
-    first = [index[video.names[0]] for video in fixed]
-    lenses = [model.cameras[model.images[k].camera] for k in first]
-    around = Box.of([-AROUND] * 3, [AROUND] * 3)
-    names = [video.names for video in fixed]
-    box = box_of_motion(images, names, poses[first], lenses, around)
-    return bounds.model_copy(update={"box": (box.low, box.high)})
 
 
 def _frames(
