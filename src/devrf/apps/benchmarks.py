@@ -10,9 +10,7 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
-
-from pydantic import BaseModel, ConfigDict
+from typing import Any
 
 from devrf.data.datamodule import SceneDataModule
 from devrf.data.recorded import READERS
@@ -29,38 +27,15 @@ SAME_COLOR = 2e-3
 ALL = "all"
 
 
-class Facts(BaseModel):
-    """What a protocol fixes of a scene; None, or a key that is not there, is left open.
-
-    Attributes:
-        data: the option of ``data=`` that reads it, or ``embedded``.
-        image_size: of held-out images in pixels, the shorter side first.
-        downscale: the factor by which images are made smaller.
-        frames: times of the training images in motion.
-        train_views: views that are learned from at one time.
-        static_images: training images of the static capture.
-        test_frames: held-out images in motion.
-        masked: whether some held-out pixels are not scored.
-        background: what is behind the alpha masks of held-out images.
-        lpips_network: that of LPIPS.
-        mean_color: mean of the held-out images' channels in [0, 1]: a checksum of what they show.
-        options: of the scene's reader, in ``conf/data``; ``all`` stands for null.
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    data: str | None = None
-    image_size: tuple[int, int] | None = None
-    downscale: int | None = None
-    frames: int | None = None
-    train_views: int | None = None
-    static_images: int | None = None
-    test_frames: int | None = None
-    masked: bool | None = None
-    background: Literal["white", "black"] | None = None
-    lpips_network: Literal["vgg", "alex"] | None = None
-    mean_color: tuple[float, ...] | None = None
-    options: dict[str, str | int | bool] = {}
+# What a protocol fixes of a scene; a key that is not there is left open. ``data``: the option of
+# ``data=`` that reads it, or EMBEDDED; ``image_size`` of held-out images in pixels, the shorter
+# side first; ``downscale``: the factor by which images are made smaller; ``frames``: times of the
+# training images in motion; ``train_views`` that are learned from at one time; ``static_images``:
+# training images of the static capture; ``test_frames``: held-out images in motion; ``masked``:
+# whether some held-out pixels are not scored; ``background`` behind the alpha masks of held-out
+# images; ``lpips_network``; ``mean_color`` of the held-out images' channels in [0, 1], a checksum
+# of what they show; ``options`` of the scene's reader, in ``conf/data``, with ALL for null.
+Facts = dict[str, Any]
 
 
 @cache
@@ -74,8 +49,7 @@ def benchmarks() -> dict[str, dict[str, Facts]]:
     for file in sorted(FILES.glob("*.toml")):
         shared = tomllib.loads(file.read_text("utf-8"))
         version, scenes, own = shared.pop("version"), shared.pop("scenes"), shared.pop("own", {})
-        facts = {scene: Facts(**(shared | own.get(scene, {}))) for scene in scenes}
-        found[f"{file.stem} {version}"] = facts
+        found[f"{file.stem} {version}"] = {scene: shared | own.get(scene, {}) for scene in scenes}
     return found
 
 
@@ -92,7 +66,7 @@ def followed(
     seen = {
         **record,
         "data": layout,
-        "image_size": tuple(sorted(record["image_size"])),
+        "image_size": sorted(record["image_size"]),
         "downscale": datamodule.downscale,
         "static_images": len(scene.static.train),
         "masked": scene.dynamic.test.valid_mask is not None,
@@ -102,7 +76,7 @@ def followed(
     }
     differing: dict[str, list[str]] = {}
     for name, scenes in benchmarks().items():
-        if scene.name in scenes and scenes[scene.name].data == layout:
+        if scene.name in scenes and scenes[scene.name]["data"] == layout:
             differing[name] = [*_differences(scenes[scene.name], seen, source)]
             if not differing[name]:
                 return name
@@ -118,17 +92,16 @@ def _differences(facts: Facts, seen: Mapping[str, Any], source: object) -> Itera
 
     ``seen`` has pixels in place of their mean, which many real ones take too much memory for.
     """
-    stated = facts.model_dump(exclude_none=True)
-    for option, value in stated.pop("options").items():
+    for option, value in facts.get("options", {}).items():
         has = getattr(source, option, None)
         if (ALL if has is None else has) != value:
             yield f"data.{option} is {has}, not {value}"
-    for key, value in stated.items():
+    for key, value in facts.items():
         if key == "mean_color":
             pairs = zip(seen[key].float().mean(dim=(0, 1, 2)) / 255, value, strict=False)
             if any(abs(here - there) > SAME_COLOR for here, there in pairs):
                 yield "held-out images show something else"
-        elif seen[key] != value:
+        elif key != "options" and seen[key] != value:
             yield f"{key} is {seen[key]}, not {value}"
     if "exposure" in seen:
         yield "held-out images have an exposure of their own"
