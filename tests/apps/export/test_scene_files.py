@@ -15,7 +15,7 @@ from pxr import Gf, Usd, UsdGeom
 
 from devrf.apps.export.geometry import ExportSettings, MovingMesh, UpFrame, carried
 from devrf.apps.export.gltf import write_gltf
-from devrf.apps.export.sequence import mesh_files, point_file, write_sequence
+from devrf.apps.export.sequence import mesh_files, point_file, write_files
 from devrf.apps.export.surface import surface_of
 from devrf.apps.export.usd import write_usd
 from devrf.rendering.renderer import Renderer
@@ -175,7 +175,7 @@ def test_a_file_a_time_and_an_index(tmp_path, mesh, format):
     own = ("frame_notes.txt", f"frame_of_mine_3.{format}")
     for name in (f"frame_0009.{format}", *own):
         (tmp_path / name).touch()
-    write_sequence(tmp_path, format, TIMES, mesh_files(mesh), "surface", SECONDS)
+    write_files(tmp_path, f"frame_{{:04d}}.{format}", mesh_files(mesh, format), TIMES, SECONDS, {})
     index = json.loads((tmp_path / "index.json").read_text())
     assert [(one["time"], one["seconds"]) for one in index["frames"]] == [
         (time, 2 * time) for time in TIMES
@@ -196,9 +196,10 @@ FAR = (500_000.0, 5_600_000.0, 200.0)
 
 @pytest.mark.parametrize("format", ["ply", "obj"])
 def test_files_far_from_the_origin_keep_their_digits(tmp_path, mesh, format):
-    write_sequence(tmp_path, format, TIMES, mesh_files(mesh, FAR), "surface", SECONDS)
-    read = trimesh.load_mesh(tmp_path / f"frame_0003.{format}", process=False)
-    expected = mesh.vertices[3].double().numpy() + FAR
+    *_, last = mesh_files(mesh, format, FAR)
+    (tmp_path / f"mesh.{format}").write_bytes(last)
+    read = trimesh.load_mesh(tmp_path / f"mesh.{format}", process=False)
+    expected = mesh.vertices[-1].double().numpy() + FAR
     np.testing.assert_allclose(read.vertices, expected, rtol=0, atol=1e-6)
     assert (read.faces == mesh.faces.numpy()).all()
     assert (read.visual.vertex_colors[:, 0] > 250).all()
@@ -207,8 +208,8 @@ def test_files_far_from_the_origin_keep_their_digits(tmp_path, mesh, format):
 def test_points_far_from_the_origin_keep_their_digits(tmp_path):
     points = torch.rand(5, 3)
     colors = torch.tensor([[1.0, 0.0, 0.0]]).expand(5, 3)
-    write_sequence(tmp_path, "ply", (0.0,), [point_file(points, colors, FAR)], "points", SECONDS)
-    read = trimesh.load(tmp_path / "frame_0000.ply")
+    (tmp_path / "points.ply").write_bytes(point_file(points, colors, FAR))
+    read = trimesh.load(tmp_path / "points.ply")
     np.testing.assert_allclose(read.vertices, points.double().numpy() + FAR, rtol=0, atol=1e-9)
     assert (read.colors == [255, 0, 0, 255]).all()
 

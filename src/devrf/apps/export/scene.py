@@ -10,7 +10,7 @@ from typing import Any
 from devrf.apps.captured_cameras import named_cameras
 from devrf.apps.export.geometry import ExportSettings, MovingMesh, UpFrame, carried
 from devrf.apps.export.gltf import write_gltf
-from devrf.apps.export.sequence import Drawn, mesh_files, point_file, write_sequence
+from devrf.apps.export.sequence import FRAME, mesh_files, point_file, write_files
 from devrf.apps.export.splats import MovingGaussians, write_splats, write_usd_splats
 from devrf.apps.export.surface import surface_of
 from devrf.apps.export.tracks import write_tracks
@@ -25,6 +25,8 @@ from devrf.system.progress import followed
 
 log = logging.getLogger(__name__)
 
+# What index.json says of files of meshes.
+SURFACE = {"content": "surface", "frame": FRAME}
 # Formats that move one mesh: the name of what is written, and how.
 SINGLE: dict[str, tuple[str, Any]] = {
     "gltf": ("scene.glb", write_gltf),
@@ -67,7 +69,8 @@ def export_scene(
     elif (field := model.surface()) is None:
         path = folder / settings.format
         meshes = followed(_meshes(model, viewpoints, settings, times), len(times), "meshes")
-        write_sequence(path, settings.format, times, meshes, "surface", settings.seconds)
+        name = "frame_{:04d}." + settings.format
+        write_files(path, name, meshes, times, settings.seconds, SURFACE)
         log.info("a mesh of its own at %d times written to %s", len(times), path)
     else:
         surface = surface_of(model, field, viewpoints.static, settings)
@@ -118,8 +121,9 @@ def _write_mesh(
     if settings.format in SINGLE:
         return _write_whole(folder, mesh, viewpoints, settings)
     path = folder / settings.format
-    drawn = mesh_files(mesh, viewpoints.offset)
-    write_sequence(path, settings.format, mesh.times, drawn, "surface", settings.seconds)
+    files = mesh_files(mesh, settings.format, viewpoints.offset)
+    name = "frame_{:04d}." + settings.format
+    write_files(path, name, files, mesh.times, settings.seconds, SURFACE)
     return path
 
 
@@ -142,15 +146,15 @@ def _meshes(
     viewpoints: Viewpoints,
     settings: ExportSettings,
     times: tuple[float, ...],
-) -> Iterator[Drawn]:
-    """The surface at each time, of a method that carries none through time."""
+) -> Iterator[bytes]:
+    """A file of the surface at each time, of a method that carries none through time."""
     for time in times:
         field = model.surface_at(time)
         assert field is not None
         surface = surface_of(model, field, viewpoints.static, settings)
         vertices = model.space.to_world(surface.points)[None]
         mesh = MovingMesh((time,), vertices, surface.faces, surface.colors)
-        yield from mesh_files(mesh, viewpoints.offset)
+        yield from mesh_files(mesh, settings.format, viewpoints.offset)
 
 
 def _write_points(
@@ -165,13 +169,14 @@ def _write_points(
     behind = background_value(viewpoints.background)
     max_points = 0
 
-    def drawn() -> Iterator[Drawn]:
+    def files() -> Iterator[bytes]:
         nonlocal max_points
         for time in times:
             points, colors = seen_points(renderer, viewpoints.static, time, behind, settings.points)
             max_points = max(max_points, len(points))
             yield point_file(points, colors, viewpoints.offset)
 
-    clouds = followed(drawn(), len(times), "points")
-    write_sequence(folder, "ply", times, clouds, "points", settings.seconds)
+    clouds = followed(files(), len(times), "points")
+    index = {"content": "points", "frame": FRAME}
+    write_files(folder, "frame_{:04d}.ply", clouds, times, settings.seconds, index)
     return max_points

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,71 +14,63 @@ from devrf.geometry.offset import NO_OFFSET, Offset
 from devrf.pictures.images import to_bytes
 from devrf.system.files import atomic_write, write_json
 
+# What index.json says of positions.
 FRAME = "world: the axes and the unit of the capture"
 
-# The content of one time's file: a mesh or points of trimesh.
-Drawn = Any
 
-
-def mesh_files(mesh: MovingMesh, offset: Offset = NO_OFFSET) -> Iterable[Drawn]:
-    """The mesh at each of its times, moved by ``offset`` to the capture's world."""
+def mesh_files(mesh: MovingMesh, format: str, offset: Offset = NO_OFFSET) -> Iterator[bytes]:
+    """Files of the mesh at each of its times, moved by ``offset`` to the capture's world."""
     import trimesh  # an extra
 
     colors = to_bytes(mesh.colors).numpy()
     faces = mesh.faces.numpy()
     for vertices in mesh.vertices:
         placed = vertices.double().numpy() + offset
-        yield trimesh.Trimesh(placed, faces, vertex_colors=colors, process=False)
+        drawn = trimesh.Trimesh(placed, faces, vertex_colors=colors, process=False)
+        yield _content(drawn, format)
 
 
-def point_file(points: Tensor, colors: Tensor, offset: Offset = NO_OFFSET) -> Drawn:
-    """The points (N, 3) of a time, moved by ``offset``, with their colours (N, 3) in [0, 1]."""
+def point_file(points: Tensor, colors: Tensor, offset: Offset = NO_OFFSET) -> bytes:
+    """A PLY of points (N, 3), moved by ``offset``, with their colours (N, 3) in [0, 1]."""
     import trimesh
 
-    return trimesh.PointCloud(points.double().numpy() + offset, colors=to_bytes(colors).numpy())
-
-
-def write_sequence(
-    folder: Path,
-    format: str,
-    times: tuple[float, ...],
-    drawn: Iterable[Drawn],
-    content: str,
-    seconds: float,
-) -> None:
-    """Write ``frame_0000.ply`` and so on, and ``index.json`` last.
-
-    Files of an earlier, longer sequence there are removed. They are in the capture's world, and
-    colours are sRGB. The index says that ``content`` is a surface or points, and how many
-    ``seconds`` time 0 to 1 takes.
-    """
-    files = ((f"frame_{k:04d}.{format}", _content(g, format)) for k, g in enumerate(drawn))
-    write_files(folder, files, times, seconds, {"content": content, "frame": FRAME})
+    placed = points.double().numpy() + offset
+    return _content(trimesh.PointCloud(placed, colors=to_bytes(colors).numpy()), "ply")
 
 
 def write_files(
     folder: Path,
-    files: Iterable[tuple[str, bytes]],
+    pattern: str,
+    files: Iterable[bytes],
     times: tuple[float, ...],
     seconds: float,
-    index: dict[str, Any],
+    index: Mapping[str, Any],
+    first: int = 0,
 ) -> None:
-    """Write a numbered file for each time, its name and content, and the index last.
+    """Write a file for each time, and ``index.json`` last; those of a longer sequence go.
 
-    Files of an earlier, longer sequence are removed.
+    Args:
+        folder: of the files.
+        pattern: the names of files, ``frame_{:04d}.ply``, numbered from ``first`` on.
+        files: the content of each.
+        times: of the files, in [0, 1].
+        seconds: of the way from time 0 to 1.
+        index: what ``index.json`` says beside the files, their times and seconds.
+        first: the number of the first file.
     """
     frames = []
-    for time, (name, content) in zip(times, files, strict=True):
+    for number, (time, content) in enumerate(zip(times, files, strict=True), start=first):
+        name = pattern.format(number)
         with atomic_write(folder / name) as partial:
             partial.write_bytes(content)
         frames.append({"file": name, "time": time, "seconds": time * seconds})
-    write_json(folder / "index.json", index | {"frames": frames})
-    for path in folder.glob(re.sub(r"\d+", "[0-9]*", name)):
+    write_json(folder / "index.json", {**index, "frames": frames})
+    for path in folder.glob(pattern.replace("{:04d}", "[0-9]*")):
         if path.name not in {frame["file"] for frame in frames}:
             path.unlink()
 
 
-def _content(geometry: Drawn, format: str) -> bytes:
+def _content(geometry: Any, format: str) -> bytes:
     """A file; positions in a PLY are doubles where float32, which trimesh writes, rounds them."""
     written = geometry.export(file_type=format)
     content: bytes = written.encode() if isinstance(written, str) else written

@@ -135,12 +135,11 @@ def write_splats(
     :func:`~devrf.apps.export.gltf.write_gltf`, but y points down. Files of an earlier, longer
     sequence there are removed.
     """
-    files = enumerate(map(ply, moving.placed(frame, DOWN)), start=1)
+    files = map(ply, moving.placed(frame, DOWN))
     index: dict[str, Any] = {"content": "splats", "frame": "y down, metres"}
     if any(frame.offset):
         index["origin"] = [sign * v for sign, v in zip(DOWN, frame.origin, strict=True)]
-    named = ((f"frame{number:04d}.ply", content) for number, content in files)
-    write_files(folder, named, moving.times, seconds, index)
+    write_files(folder, "frame{:04d}.ply", files, moving.times, seconds, index, first=1)
 
 
 def write_usd_splats(
