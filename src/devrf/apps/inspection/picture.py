@@ -16,6 +16,7 @@ from matplotlib.patheffects import withStroke
 from PIL import Image
 from torch import Tensor
 
+from devrf.apps.captured_cameras import frustum_depth
 from devrf.apps.inspection.layout import box_middle, box_points, common_up, horizontal_axes
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
@@ -33,8 +34,6 @@ CAPTION = 0.45
 TALLEST = 2.8
 COLUMNS = 6
 MOST_VIEWS = 4
-# Cameras whose distance to the next one is measured.
-MEASURED = 500
 STYLE: dict[Any, Any] = {
     "font.size": 13,
     "text.color": "0.15",
@@ -238,7 +237,7 @@ def compass(scene: Scene) -> Tensor:
 
 def scene_lines(scene: Scene) -> list[Lines]:
     """Boxes and cameras as lines; each fixed camera once, not once a frame."""
-    size = _camera_size(scene)
+    size = frustum_depth(scene.static.train.cameras)
     bounds = scene.bounds
     unbounded = scene.kind == "forward"
     lines = [
@@ -299,13 +298,3 @@ def _fixed_views(scene: Scene) -> list[tuple[str, int, Tensor, str]]:
         if len(first := first_images(views)) < len(views)
         for number, image in first.items()
     ]
-
-
-def _camera_size(scene: Scene) -> float:
-    """Height of the drawn pyramids, world units: visible, and less than neighbours are apart."""
-    positions = scene.static.train.cameras.positions
-    distance = max(float((positions - box_middle(scene)).norm(dim=1).mean()), 1e-6)
-    between = torch.cdist(positions[evenly(len(positions), MEASURED)], positions)
-    # The nearest is the camera itself.
-    apart = float(between.kthvalue(2, dim=1).values.median()) if len(positions) > 1 else distance
-    return min(0.13 * distance, max(0.8 * apart, 0.05 * distance))
