@@ -246,7 +246,7 @@ class RadianceField(nn.Module):
         device = self.density.weight.device
         reduced = multiplies_bfloat16(device) if precision == "auto" else precision == "bfloat16"
         # A stage shows what it learns in between, without gradients.
-        if not (reduced and torch.is_grad_enabled()):
+        if not (reduced and self.training and torch.is_grad_enabled()):
             return nullcontext()
         return torch.autocast(device.type, torch.bfloat16)
 
