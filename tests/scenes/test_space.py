@@ -22,7 +22,7 @@ from devrf.scenes.bounds import (
     depth_range,
     inward_bounds,
 )
-from devrf.scenes.scene import Bounds, Capture, Scene, Views
+from devrf.scenes.scene import Bounds, Capture, GivenBounds, Scene, Views
 from devrf.scenes.space import NEAR_SHARE, SHELL, dynamic_only, inward_space
 
 
@@ -123,7 +123,7 @@ def test_parallel_axes_ask_for_a_box():
 
 
 def bounds_of(views: Views, **options: Any) -> Bounds:
-    return inward_bounds(views, views, [views], **options)
+    return inward_bounds(views, views, [views], GivenBounds(**options))
 
 
 def test_source_says_where_the_motion_box_came_from(ball_views):
@@ -131,7 +131,7 @@ def test_source_says_where_the_motion_box_came_from(ball_views):
     views = ball_views(places, 0.4)
     carved = bounds_of(views)
     assert carved.motion is not None and carved.source == "silhouettes of 4 views x 3 frames"
-    fixed = bounds_of(views, bound_scale=1.5)
+    fixed = bounds_of(views, scale=1.5)
     assert fixed.motion is None and fixed.source == "canonical box x bound scale 1.5"
     plain = bounds_of(ball_views(places, 0.4, channels=3))
     assert plain.motion is None and f"bound scale {FALLBACK_BOUND_SCALE}" in plain.source
@@ -140,7 +140,7 @@ def test_source_says_where_the_motion_box_came_from(ball_views):
 def test_near_and_far_hold_for_what_moves_beyond_the_box(ball_views):
     views = ball_views(torch.tensor([[0.0, 0, 0], [0.9, 0, 0]]), 0.3)
     small = Box((-0.4, -0.4, -0.4), (0.4, 0.4, 0.4)).scaled(2.0)
-    carved, plain = bounds_of(views, box=small), bounds_of(views, box=small, bound_scale=1.0)
+    carved, plain = bounds_of(views, box=small), bounds_of(views, box=small, scale=1.0)
     assert carved.motion is not None and carved.motion.high[0] > small.high[0]
     assert carved.near < plain.near and carved.far > plain.far
 
@@ -150,7 +150,7 @@ BOX = Box((-0.5, -0.4, -0.3), (0.6, 0.7, 0.8))
 
 
 def chosen(views: Views, choice: Any = "auto", **options: Any) -> tuple[Space, Bounds]:
-    return inward_space(choice, views, views, [views], **options)
+    return inward_space(choice, views, views, [views], GivenBounds(**options))
 
 
 def test_alpha_masks_and_a_given_box_mean_the_world(ball_views: Callable[..., Views]) -> None:
@@ -159,7 +159,7 @@ def test_alpha_masks_and_a_given_box_mean_the_world(ball_views: Callable[..., Vi
     space, bounds = chosen(ball_views(PLACES, 0.4, channels=3), box=BOX)
     assert space == WORLD and bounds.reason == "data.box is given"
     assert bounds.box == BOX and bounds.limited and "data.box" in bounds.source
-    assert bounds.box_given and not chosen(ball_views(PLACES, 0.4))[1].box_given
+    assert bounds.given.box == BOX and chosen(ball_views(PLACES, 0.4))[1].given.box is None
 
 
 def test_without_alpha_masks_the_scene_is_unbounded(ball_views: Callable[..., Views]) -> None:
@@ -178,11 +178,11 @@ def test_a_given_box_is_the_inner_box(ball_views: Callable[..., Views]) -> None:
     views = ball_views(PLACES, 0.4)
     space, bounds = chosen(views, "contracted", box=BOX, near=0.2)
     assert space.inner(bounds.box) == BOX and bounds.near == 0.2
-    wider = chosen(ball_views(PLACES, 0.4, channels=3), bound_scale=2.0)[1].box
+    wider = chosen(ball_views(PLACES, 0.4, channels=3), scale=2.0)[1].box
     assert wider.longest == pytest.approx(
         2 * chosen(ball_views(PLACES, 0.4, channels=3))[1].box.longest
     )
-    space, bounds = chosen(views, "contracted", box=BOX, bound_scale=2.0)
+    space, bounds = chosen(views, "contracted", box=BOX, scale=2.0)
     assert space.inner(bounds.box) == BOX.scaled(2.0) and bounds.box_source.endswith("x 2")
     with pytest.raises(DevrfError, match="data.near"):
         chosen(views, "contracted", near=math.inf)
@@ -202,7 +202,7 @@ def test_without_its_static_set_a_scene_keeps_bounds_that_it_does_not_owe_to_it(
     ball_views: Callable[..., Views],
 ) -> None:
     views = ball_views(PLACES, 0.4, channels=3)
-    scene = film(views, bound_scale=2.0)
+    scene = film(views, scale=2.0)
     alone = dynamic_only(scene)
     assert alone.bounds == scene.bounds and alone.space == scene.space
     assert alone.static.train.times.tolist() == [0.0] * 4
@@ -217,6 +217,24 @@ def test_without_its_static_set_a_scene_keeps_bounds_that_it_does_not_owe_to_it(
     assert dynamic_only(found).space == film(views).space != found.space
     given = replace(film(farther, box=BOX, near=0.2), dynamic=scene.dynamic)
     assert dynamic_only(given).bounds == given.bounds
+
+
+@pytest.mark.parametrize("choice", ["world", "contracted"])
+def test_without_its_static_set_a_scene_keeps_what_is_given(
+    ball_views: Callable[..., Views], choice: str
+) -> None:
+    views = ball_views(PLACES, 0.4)
+    given = GivenBounds(scale=2.0, near=0.5, far=20.0)
+    space, bounds = inward_space(choice, views, views, [views], given)
+    static = Capture(
+        train=replace(views, names=tuple(f"static {n}" for n in views.names)), test=views
+    )
+    scene = Scene("ball", "inward", static, Capture(views, views), bounds, "white", space)
+    alone = dynamic_only(scene)
+    assert alone.bounds == scene.bounds and alone.space == scene.space
+    assert alone.bounds.near == 0.5 and alone.bounds.far == (
+        20.0 if choice == "world" else math.inf
+    )
 
 
 def test_cameras_that_look_in_one_direction_need_not_tell_where_a_given_box_is(

@@ -13,7 +13,7 @@ from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.ndc import NormalizedDevice
-from devrf.scenes.scene import Bounds, Views
+from devrf.scenes.scene import Bounds, GivenBounds, Views
 from devrf.scenes.silhouettes import motion_box
 from devrf.scenes.validation import FARTHEST, scene_error
 
@@ -226,27 +226,20 @@ def inward_bounds(
     static: Views,
     dynamic: Views | None,
     everyone: list[Views],
-    *,
-    bound_scale: float | str = "auto",
-    near: float | None = None,
-    far: float | None = None,
-    box: Box | None = None,
+    given: GivenBounds,
 ) -> Bounds:
     """Bounds in the world of an inward-facing scene.
 
-    Arguments and errors are those of :func:`devrf.scenes.space.inward_space`. With
-    ``bound_scale="auto"`` the room for motion is that of the silhouettes of alpha masks; without
-    masks it is the given box, or a fixed scale.
+    Arguments and errors are those of :func:`devrf.scenes.space.inward_space`.
     """
-    box_is_given = box is not None
-    scale = FALLBACK_BOUND_SCALE if bound_scale == "auto" else float(bound_scale)
-    box = box or box_from_cameras(static.cameras)
+    scale = FALLBACK_BOUND_SCALE if given.scale == "auto" else float(given.scale)
+    box = given.box or box_from_cameras(static.cameras)
     motion = None
     source = f"canonical box x bound scale {scale:g}"
-    if dynamic is None and bound_scale == "auto":
+    if dynamic is None and given.scale == "auto":
         scale = STATIC_BOUND_SCALE
         source = NO_MOTION
-    elif dynamic is not None and bound_scale == "auto":
+    elif dynamic is not None and given.scale == "auto":
         motion = motion_box(dynamic, box)
         if motion is None:
             source += " (no alpha masks from two cameras at every time)"
@@ -254,22 +247,22 @@ def inward_bounds(
             views = len(set(dynamic.view.tolist()))
             frames = len(set(dynamic.times.tolist()))
             source = f"silhouettes of {views} views x {frames} frames"
-    limited = box_is_given and motion is None and bound_scale == "auto"
+    limited = given.box is not None and motion is None and given.scale == "auto"
     if limited:
         source = "data.box (no alpha masks from two cameras at every time)"
     reach = box if motion is None else box.union(motion)
     ranges = [depth_range(views.cameras, reach) for views in everyone]
     nearest = min(r[0] for r in ranges)
     farthest = max(r[1] for r in ranges)
-    near = nearest if near is None else float(near)
-    far = farthest if far is None else float(far)
+    near = nearest if given.near is None else float(given.near)
+    far = farthest if given.far is None else float(given.far)
     if not 0 <= near < far <= 4 * FARTHEST:
         raise scene_error(
             "data.near, data.far",
             f"expected 0 <= near < far, not {near:g} and {far:g}; the cameras say "
             f"data.near={nearest:.3g} data.far={farthest:.3g}",
         )
-    return Bounds(box, near, far, motion, scale, source, limited, box_given=box_is_given)
+    return Bounds(box, near, far, motion, scale, source, limited, given)
 
 
 # Cosine of the steepest angle, about 84 degrees, to −z: beyond it the box grows without bound.

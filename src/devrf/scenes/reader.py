@@ -18,7 +18,7 @@ from devrf.scenes.flow_files import FlowDirection
 from devrf.scenes.image_folders import Downscale, SizeAt, whole_factor
 from devrf.scenes.layout import Layout, fewer, load_layout
 from devrf.scenes.names import Missing
-from devrf.scenes.scene import Background, Capture, OpticalFlow, Scene, Views
+from devrf.scenes.scene import Background, Capture, GivenBounds, OpticalFlow, Scene, Views
 from devrf.scenes.space import SpaceChoice, centred, forward_facing_scene, inward_space
 from devrf.scenes.splits import Split
 from devrf.scenes.transforms import SceneBounds
@@ -232,10 +232,7 @@ class InwardReader(LayoutReader):
             static.train,
             dynamic.train if len(FrameClock.from_times(dynamic.train.times)) > 1 else None,
             [static.train, static.test, dynamic.train, dynamic.test],
-            bound_scale=self.bound_scale,
-            near=self.near,
-            far=self.far,
-            box=box,
+            GivenBounds(scale=self.bound_scale, near=self.near, far=self.far, box=box),
         )
         return Scene(name, "inward", static, dynamic, bounds, self.background, space, offset)
 

@@ -201,6 +201,25 @@ def both_mapped(
 
 
 @dataclass(frozen=True)
+class GivenBounds:
+    """What options or files say of a scene's bounds; None: the cameras tell it.
+
+    Attributes:
+        scale: ``auto``: the room for motion is that of the silhouettes of alpha masks; without them
+            it is the given box, or a fixed scale. A number: that of :class:`Bounds`; it makes the
+            inner box of contracted space so much larger.
+        near: distance in world units.
+        far: distance in world units; contracted space is unbounded.
+        box: the scene's box, world units.
+    """
+
+    scale: float | Literal["auto"] = "auto"
+    near: float | None = None
+    far: float | None = None
+    box: Box | None = None
+
+
+@dataclass(frozen=True)
 class Bounds:
     """The bounds of a scene, in the space of its fields (world units, or NDC).
 
@@ -214,7 +233,7 @@ class Bounds:
             not used when ``motion`` is known.
         source: the source of the motion box, in words, for the log.
         limited: whether motion has no more room than the box, which was given.
-        box_given: whether options or files gave the box, not the cameras.
+        given: what options or files said of them.
         reason: the reason for the scene's space, in words.
         box_source: the source of the box, in words.
     """
@@ -226,7 +245,7 @@ class Bounds:
     scale: float
     source: str
     limited: bool = False
-    box_given: bool = False
+    given: GivenBounds = GivenBounds()
     reason: str = ""
     box_source: str = ""
 

@@ -9,7 +9,6 @@ from typing import Literal
 
 import torch
 
-from devrf.geometry.box import Box
 from devrf.geometry.contraction import ContractedSpace
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.poses import average_pose, relative_to
@@ -21,7 +20,15 @@ from devrf.scenes.bounds import (
     inward_bounds,
     reference_space,
 )
-from devrf.scenes.scene import Background, Bounds, Capture, Scene, Views, both_mapped
+from devrf.scenes.scene import (
+    Background,
+    Bounds,
+    Capture,
+    GivenBounds,
+    Scene,
+    Views,
+    both_mapped,
+)
 from devrf.scenes.silhouettes import motion_box
 from devrf.scenes.validation import scene_error
 
@@ -42,36 +49,27 @@ def inward_space(
     static: Views,
     dynamic: Views | None,
     everyone: list[Views],
-    *,
-    bound_scale: float | str = "auto",
-    near: float | None = None,
-    far: float | None = None,
-    box: Box | None = None,
+    given: GivenBounds,
 ) -> tuple[Space, Bounds]:
     """The space of an inward-facing scene, and its bounds there.
 
     Args:
-        choice: the space, or ``auto``: contracted without alpha masks and ``box``, else the world.
+        choice: the space, or ``auto``: contracted without alpha masks and a box, else the world.
         static: static training views, whose cameras give the box.
         dynamic: dynamic training views; None: the scene never moves.
         everyone: all views, test included.
-        bound_scale: as for :func:`~devrf.scenes.bounds.inward_bounds`; a number makes the inner
-            box of contracted space so much larger.
-        near: distance in world units; None: from the cameras.
-        far: distance in world units, or None; contracted space is unbounded.
-        box: the scene's box, or None.
+        given: what options or files say of the bounds.
 
     Raises:
         DevrfError: the cameras do not determine the bounds, or near is not before far.
     """
-    given = "data.box is given" if box else ""
-    where = given or "the common view of the static cameras"
+    box = given.box
+    box_given = "data.box is given" if box else ""
+    where = box_given or "the common view of the static cameras"
     masks = "the images have alpha masks" if static.cut_out else "the images have no alpha masks"
     if choice == "world" or (choice == "auto" and (static.cut_out or box)):
-        bounds = inward_bounds(
-            static, dynamic, everyone, bound_scale=bound_scale, near=near, far=far, box=box
-        )
-        why = "data.space=world" if choice == "world" else given or masks
+        bounds = inward_bounds(static, dynamic, everyone, given)
+        why = "data.space=world" if choice == "world" else box_given or masks
         return WORLD, replace(bounds, reason=why, box_source=where)
     inner = box or box_from_cameras(static.cameras)
     if box is None:
@@ -79,10 +77,11 @@ def inward_space(
         if motion is not None:
             inner = inner.union(motion)
             where += ", and the silhouettes' motion"
-    if bound_scale != "auto":
-        inner = inner.scaled(float(bound_scale))
-        where += f" x {float(bound_scale):g}"
+    if given.scale != "auto":
+        inner = inner.scaled(float(given.scale))
+        where += f" x {float(given.scale):g}"
     space = ContractedSpace(inner.low, inner.high, SHELL)
+    near = given.near
     if near is None:
         middle = static.cameras.positions.new_tensor(inner.middle)
         distances = [(views.cameras.positions - middle).norm(dim=1).min() for views in everyone]
@@ -97,7 +96,7 @@ def inward_space(
         motion=None,
         scale=1.0,
         source="the box",
-        box_given=box is not None,
+        given=given,
         reason=why,
         box_source=where,
     )
@@ -152,8 +151,8 @@ def dynamic_only(scene: Scene) -> Scene:
     """The scene without its static set: the dynamic images of time 0 stand in for it.
 
     Bounds from the static cameras are replaced by bounds from the dynamic training cameras alone;
-    DevrfError if these do not determine them. The bounds of a video stay, and so do a given box and
-    its near and far.
+    DevrfError if these do not determine them. The bounds of a video stay, those with a given box,
+    and all that is given.
     """
     views = scene.dynamic.train
     held_out = scene.dynamic.test
@@ -161,10 +160,10 @@ def dynamic_only(scene: Scene) -> Scene:
     if isinstance(scene.space, NormalizedDevice):
         bounds = forward_bounds([views], scene.space, "all that the dynamic cameras see")
         return replace(scene, static=static, bounds=bounds)
-    if scene.is_monocular or scene.bounds.box_given:
+    if scene.is_monocular or scene.bounds.given.box:
         return replace(scene, static=static)
     choice: SpaceChoice = "world" if scene.space.is_linear else "contracted"
-    space, bounds = inward_space(choice, views, views, [views, held_out])
+    space, bounds = inward_space(choice, views, views, [views, held_out], scene.bounds.given)
     return replace(scene, static=static, bounds=bounds, space=space)
 
 

@@ -21,7 +21,7 @@ def searched_box(scene: Scene, *, carve: bool) -> Box:
     carved (``carve``) by a visual hull.
     """
     bounds = scene.bounds
-    if carve or bounds.box_given or scene.kind != "inward" or not scene.space.is_linear:
+    if carve or bounds.given.box or scene.kind != "inward" or not scene.space.is_linear:
         return bounds.box
     return box_of_frusta(scene.static.train.cameras, bounds.near, bounds.far).union(bounds.box)
 

@@ -29,7 +29,7 @@ from devrf.scenes.procedural.rigs import (
 from devrf.scenes.procedural.robot import Robot
 from devrf.scenes.procedural.solids import Body, Shape
 from devrf.scenes.procedural.surroundings import REACH, Backdrop, Room, Surrounded
-from devrf.scenes.scene import Bounds, Capture, Scene
+from devrf.scenes.scene import Bounds, Capture, GivenBounds, Scene
 from devrf.scenes.space import inward_space
 from devrf.scenes.splits import every_nth
 from devrf.scenes.validation import MIN_SIDE, scene_error
@@ -147,7 +147,9 @@ class ProceduralScene(Recipe):
         dynamic = filming.dynamic(watching, unseen, self.frames, self.unseen_frames)
         if inside:
             everyone = [static.train, static.test, dynamic.train, dynamic.test]
-            space, bounds = inward_space("auto", static.train, dynamic.train, everyone)
+            space, bounds = inward_space(
+                "auto", static.train, dynamic.train, everyone, GivenBounds()
+            )
             return Scene(f"{self.shape}_room", "inward", static, dynamic, bounds, "white", space)
         bounds = Bounds(
             box=where.canonical,
