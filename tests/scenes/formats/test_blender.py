@@ -215,15 +215,18 @@ def test_a_film_keeps_its_bounds_where_a_method_has_no_static_set(single_folder,
 
 
 @pytest.mark.parametrize(("name", "images"), [("lego", 2), ("other", 3)])
-def test_lego_of_dnerf_is_scored_on_its_val_split(single_folder, caplog, name, images):
+def test_lego_of_dnerf_is_scored_on_its_val_split(single_folder, caplog, monkeypatch, name, images):
     root = single_folder.rename(single_folder.with_name(name))
     val = with_val(root)
     content = json.loads(val.read_text())
     val.write_text(json.dumps({**content, "frames": content["frames"][:2]}))
-    with caplog.at_level("INFO"):
-        scene = BlenderReader(root).read()
-    assert len(scene.dynamic.test) == images
-    assert ("test split shows another scene" in caplog.text) == (name == "lego")
+    monkeypatch.chdir(root)
+    for typed in (root, "."):
+        caplog.clear()
+        with caplog.at_level("INFO"):
+            scene = BlenderReader(typed).read()
+        assert len(scene.dynamic.test) == images
+        assert ("test split shows another scene" in caplog.text) == (name == "lego")
 
 
 def shifted(content: dict[str, Any], meters: float) -> None:
