@@ -6,6 +6,7 @@ import logging
 import re
 import struct
 import tracemalloc
+import warnings
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -97,6 +98,14 @@ def test_a_set_is_of_one_size_once_it_is_turned(tmp_path, caplog):
     assert loaded.pixels.shape == (2, 24, 24, 3) and loaded.sizes == [WIDE, HIGH]
     assert np.array_equal(loaded.pixels[1, :, :16].numpy(), pixels(paths[1], None))
     assert not bool(loaded.pixels[0, 16:].any() | loaded.pixels[1, :, 16:].any())
+
+
+def test_headers_are_read_without_a_change_of_the_filters_of_warnings(tmp_path, monkeypatch):
+    """They belong to all threads: what one puts back is what another has changed."""
+    path = photo(tmp_path / "a.jpg", 6, HIGH)
+    with monkeypatch.context() as patched:
+        patched.setattr(warnings, "catch_warnings", None)
+        assert read_header(path, WIDE).turn == 6
 
 
 def peak_of(work: Callable[[], object]) -> int:

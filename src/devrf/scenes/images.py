@@ -165,14 +165,12 @@ def _orientation(image: Image.Image) -> int:
     if not isinstance(stored, bytes):
         return 1
     exif = Image.Exif()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            exif.load(stored)
-            value = exif.get(ExifTags.Base.Orientation)
-        # Any exception, as in decoding(); but damaged EXIF data do not spoil the picture.
-        except Exception:
-            return 1
+    try:
+        exif.load(stored)
+        value = exif.get(ExifTags.Base.Orientation)
+    # Any exception, as in decoding(); but damaged EXIF data do not spoil the picture.
+    except Exception:
+        return 1
     return value if isinstance(value, int) and value in TURNS else 1
 
 
