@@ -281,6 +281,14 @@ def test_images_that_are_learned_from_or_tested_on_are_no_validation(scene_folde
     assert len(scene.dynamic.test) == 5 and scene.dynamic.validation is None
 
 
+def test_a_validation_split_without_an_image_is_none(single_folder):
+    """Blender's add-ons write all three files, and some people keep the training images alone."""
+    with_val(single_folder)
+    shutil.rmtree(single_folder / "test")
+    scene = BlenderReader(single_folder, validation=True).read()
+    assert len(scene.dynamic.test) == 1 and scene.dynamic.validation is None
+
+
 NAN = float("nan")
 TRAIN = "static/transforms_train.json"
 MOVING = "dynamic_2views/transforms_train.json"

@@ -83,7 +83,7 @@ class BlenderReader(InwardReader):
             layout = two_captures(static_pair, _train_and_test(files, moving))
         test_file = layout.dynamic_test.transforms.file
         val = test_file.with_name(VAL)
-        if self.validation and val != test_file and os.path.isfile(val):
+        if self.validation and val != test_file and files.any_image(val):
             _, validation = files.read(val)
             check_timed_alike(layout.dynamic_train.transforms, validation)
             layout = layout.with_validation(validation)
