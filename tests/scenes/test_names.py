@@ -114,6 +114,18 @@ def test_other_spellings_of_a_name(scene_folder, spell):
     assert BlenderReader(scene_folder.root).read().static.train.names == names
 
 
+@pytest.mark.parametrize("relative", [False, True])
+def test_an_absolute_path_below_the_scene_is_not_from_elsewhere(
+    scene_folder, caplog, monkeypatch, relative
+):
+    root = scene_folder.root
+    monkeypatch.chdir(root.parent)
+    _listed_as(scene_folder, lambda name: str(root / "static" / name))
+    with caplog.at_level(logging.INFO):
+        BlenderReader(root.name if relative else root).read()
+    assert "taken from below" not in caplog.text
+
+
 @pytest.mark.parametrize("outside", ["/etc/passwd", "C:\\x\\y.png", "..\\..\\..\\a.png"])
 def test_what_leads_outside_is_refused(scene_folder, refusal, outside):
     _listed_as(scene_folder, lambda name: outside)

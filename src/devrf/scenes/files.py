@@ -161,7 +161,7 @@ _DRIVE = re.compile(r"[A-Za-z]:[/\\]")
 
 def from_elsewhere(root: Path, name: str) -> bool:
     """Whether ``name`` is an absolute path, of any system, that does not lead below ``root``."""
-    below = os.path.normpath(name).startswith(os.path.join(os.path.normpath(root), ""))
+    below = os.path.normpath(name).startswith(os.path.join(os.path.abspath(root), ""))
     return bool(_DRIVE.match(name)) or (name[:1] in ("/", "\\") and not below)
 
 
