@@ -88,36 +88,6 @@ def _arrays(path: Path, shapes: Mapping[str, tuple[int, ...]], remedy: str) -> d
         return {name: np.asarray(archive[name]) for name in shapes if name in archive}
 
 
-def read_flow(
-    folder: Path,
-    index: Sequence[int],
-    expected: Sequence[bool],
-    source_sizes: Sequence[tuple[int, int]],
-    cameras: Cameras,
-    direction: FlowDirection = "bwd",
-) -> OpticalFlow | None:
-    """The backward flow (``fwd``: forward) of N images in ``<index>_<direction>.npz``.
-
-    Args:
-        folder: the files' folder.
-        index: N positions in the list of frames, which number the files.
-        expected: N flags: whether the image has an earlier frame (a later one), and so a file.
-        source_sizes: N (width, height) of the images before downscaling.
-        cameras: N, of the images after downscaling: the flow's pixels.
-        direction: backward or forward.
-
-    Returns:
-        None if no expected file exists.
-    """
-    files = {
-        row: folder / f"{number:03d}_{direction}.npz"
-        for row, (number, wanted) in enumerate(zip(index, expected, strict=True))
-        if wanted
-    }
-    present = {row: path for row, path in files.items() if os.path.isfile(path)}
-    return stacked_flow(present, len(files), folder / f"NNN_{direction}.npz", source_sizes, cameras)
-
-
 def stacked_flow(
     files: Mapping[int, Path],
     expected: int,

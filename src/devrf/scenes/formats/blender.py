@@ -11,7 +11,7 @@ from typing import ClassVar
 from pydantic.dataclasses import dataclass
 
 from devrf.scenes.files import existing_folder
-from devrf.scenes.flow_files import FlowDirection, read_flow
+from devrf.scenes.flow_files import FlowDirection, stacked_flow
 from devrf.scenes.image_folders import Downscale
 from devrf.scenes.layout import Layout, Pair, one_capture, static_alone, two_captures
 from devrf.scenes.reader import InwardReader, Time
@@ -100,15 +100,14 @@ class BlenderReader(InwardReader):
                 "flow files in %s left out: they are for images before undistortion", folder
             )
             return None
+        # The first times have no backward flow, the last ones no forward flow.
         end = split.times.min() if direction == "bwd" else split.times.max()
-        return read_flow(
-            folder,
-            split.index.tolist(),
-            ((views.times - end).abs() > 1e-6).tolist(),
-            file_sizes(split, views),
-            views.cameras,
-            direction,
-        )
+        rows = ((views.times - end).abs() > 1e-6).nonzero()[:, 0].tolist()
+        numbers = split.index.tolist()
+        files = {row: folder / f"{numbers[row]:03d}_{direction}.npz" for row in rows}
+        present = {row: file for row, file in files.items() if os.path.isfile(file)}
+        pattern = folder / f"NNN_{direction}.npz"
+        return stacked_flow(present, len(files), pattern, file_sizes(split, views), views.cameras)
 
 
 def _train_and_test(files: TransformsFiles, folder: Path) -> Pair:
