@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Collection
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from devrf.data.datamodule import SceneDataModule
@@ -76,7 +75,7 @@ class RecordedDataModule(SceneDataModule):
             if scene.moves:
                 log.info("%s: room for motion: %s", scene.name, bounds.source)
         scene = with_equal_exposure(scene, self.reader.exposure)
-        return with_flow(scene, self.reader.flow, self._cache)
+        return with_flow(scene, self.reader.flow, self.reader.flow_cache)
 
     def provide(self, priors: Collection[str]) -> None:
         """Read or estimate forward flow, if a method needs it."""
@@ -86,13 +85,7 @@ class RecordedDataModule(SceneDataModule):
             files = None
             if reader.wants_flow_files:
                 files = reader.forward_flow(scene.dynamic.train)
-            self.replace(with_forward_flow(scene, reader.flow, self._cache, files))
-
-    @property
-    def _cache(self) -> Path | None:
-        """The file of estimated flow."""
-        cache = self.reader.flow_cache
-        return None if cache is None else Path(cache)
+            self.replace(with_forward_flow(scene, reader.flow, reader.flow_cache, files))
 
 
 class InwardFacingDataModule(RecordedDataModule):

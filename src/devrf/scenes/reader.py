@@ -76,7 +76,7 @@ class SceneReader(Options, ABC):
     downscale: Downscale = "auto"
     background: Background = "white"
     flow: FlowSource = "auto"
-    flow_cache: str | Path | None = None
+    flow_cache: Path | None = None
     exposure: Exposure = "auto"
     frames: Several | None = None
     validation: bool = False
