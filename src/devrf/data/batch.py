@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from devrf.geometry.box import constant
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.rays import Rays
 from devrf.scenes.scene import Views
@@ -274,7 +275,6 @@ class BackgroundColor:
     def __init__(self, name: str) -> None:
         """``name``: ``white``, ``black`` or ``random``."""
         self.name = name
-        self._plain: Tensor | None = None
 
     def __call__(self, image: Tensor, generator: torch.Generator) -> Tensor:
         """The colour (3,) behind the pixels of ``image`` (R,), always the same tensor.
@@ -284,10 +284,8 @@ class BackgroundColor:
         device = generator.device
         if self.name == "random":
             return torch.rand(len(image), 3, device=device, generator=generator)
-        if self._plain is None or self._plain.device != image.device:
-            value = 0.0 if self.name == "black" else 1.0
-            self._plain = torch.full((3,), value, device=image.device)
-        return self._plain
+        value = 0.0 if self.name == "black" else 1.0
+        return constant((value,) * 3, torch.float32, image.device)
 
 
 def concatenated(batches: Sequence[RayBatch]) -> RayBatch:
