@@ -28,7 +28,7 @@ from devrf.scenes.procedural import (
 from devrf.scenes.procedural.assembled import Assembled
 from devrf.scenes.procedural.filming import Filming, covisible, extent
 from devrf.scenes.procedural.march import HIT
-from devrf.scenes.procedural.plush import BASE
+from devrf.scenes.procedural.plush import BASE, REACH
 from devrf.scenes.procedural.random_bodies import drawn_body, random_body
 from devrf.scenes.procedural.rigs import STUDIO, dynamic_rig, facing_dynamic_rig, facing_static_rig
 from devrf.scenes.procedural.solids import Body
@@ -280,7 +280,7 @@ MAKERS: dict[str, Callable[[], Shape]] = {
     "flower": lambda: Flower(2.0),
     "random": lambda: random_body(3, 1.0, True),
     "loop": lambda: random_body(5),
-    "plush": lambda: Surrounded(Plush(2.0), Backdrop()),
+    "plush": lambda: Surrounded(Plush(2.0), Backdrop(), REACH, BASE),
     "hung": lambda: HUNG.visible_shape(),
 }
 each_alone = pytest.mark.parametrize("shape", list(MAKERS)[:4], indirect=True)
@@ -372,7 +372,7 @@ def test_a_hung_body_touches_neither_wall_nor_floor(seed: int) -> None:
     hung = replace(HUNG, scene_seed=seed).visible_shape()
     assert isinstance(hung, Surrounded) and hung.surroundings.parts == 2
     body = hung.shape
-    assert isinstance(body, Assembled) and hung.reach is not None
+    assert isinstance(body, Assembled)
     where = extent(body)
     assert where.motion.low[1] > FLOOR and where.motion.low[2] > WALL
     outline = body.outline()

@@ -13,8 +13,8 @@ from devrf.scenes.procedural.solids import Material, Paint, Rgb, Solid, SolidTab
 
 # The toy's base: x right, y up, the cameras look along −z from about the origin.
 BASE: Xyz = (0.0, -0.72, -2.6)
-# Radius of a ball about the base that holds the canonical toy.
-REACH = 1.5
+# Radius of a ball about the base that holds the toy at all times, at speeds of up to 2.
+REACH = 1.8
 
 
 ROSE: Rgb = (0.93, 0.55, 0.62)
@@ -72,20 +72,12 @@ class Plush:
     speed: float = 1.0
 
     def distance(self, points: Tensor, time: float) -> Tensor:
-        """A lower bound (M,): canonical distances over the largest stretch of the motion.
-
-        Far from the toy it is the distance to a ball around it, which is cheap.
-        """
-        base = points.new_tensor(BASE)
-        reach = self.reach(time)
-        ball: Tensor = (points - base).norm(dim=-1) - reach
-        near = (ball < 0.1 * reach).nonzero().squeeze(-1)
-        local = self._canonical(points[near] - base, time)
+        """A lower bound (M,): canonical distances over the largest stretch of the motion."""
+        local = self._canonical(points - points.new_tensor(BASE), time)
         # Lengths grow by no more than 1/s up and √s across, back to the canonical state.
         height = self._height(time)
         longer = _BENDING.stretch(self.speed, time) * max(1 / height, math.sqrt(height))
-        ball[near] = 1 / longer * TABLE.distances_of(local).amin(dim=0)
-        return ball
+        return 1 / longer * TABLE.distances_of(local).amin(dim=0)
 
     def material(self, points: Tensor, time: float) -> Material:
         """The nearest solid's material."""
@@ -104,11 +96,6 @@ class Plush:
     def color(self, material: Material) -> Tensor:
         """The solids' paints."""
         return TABLE.painted.color(material)
-
-    def reach(self, time: float) -> float:
-        """Radius of a ball about the base that holds the toy at ``time``, world units."""
-        height = self._height(time)
-        return REACH * max(height, 1 / math.sqrt(height))
 
     def _height(self, time: float) -> float:
         """s: the toy's height, relative to the canonical one."""

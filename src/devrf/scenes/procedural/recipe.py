@@ -15,6 +15,8 @@ from devrf.scenes.procedural.cushion import REACH as CUSHION_REACH
 from devrf.scenes.procedural.cushion import Cushion
 from devrf.scenes.procedural.filming import Filming, extent
 from devrf.scenes.procedural.flower import Flower
+from devrf.scenes.procedural.plush import BASE as PLUSH_BASE
+from devrf.scenes.procedural.plush import REACH as PLUSH_REACH
 from devrf.scenes.procedural.plush import Plush
 from devrf.scenes.procedural.random_bodies import placed, random_body
 from devrf.scenes.procedural.rigs import (
@@ -243,7 +245,7 @@ class ProceduralForwardScene(Recipe):
         """The moving shape and its stage."""
         weave = self.texture == "fine"
         if self.shape == "plush":
-            return Surrounded(Plush(self.speed), Backdrop(weave))
+            return Surrounded(Plush(self.speed), Backdrop(weave), PLUSH_REACH, PLUSH_BASE)
         if self.shape == "cushion":
             pale = Backdrop(weave, contrast=_PALE)
             return Surrounded(Cushion(self.speed), pale, CUSHION_REACH, CUSHION_MIDDLE)

@@ -27,33 +27,24 @@ class Surrounded:
     """A :class:`~devrf.scenes.procedural.solids.Shape` in static surroundings.
 
     The first parts are those of the surroundings; the shape's own follow. ``reach`` is the radius
-    of a ball about ``center`` that holds the moving shape at all times, world units; None: its
-    distance is cheap enough everywhere.
+    of a ball about ``center`` that holds the moving shape at all times, world units.
     """
 
     shape: Shape
     surroundings: Backdrop | Room
-    reach: float | None = None
+    reach: float
     center: Xyz = (0.0, 0.0, 0.0)
 
     def distance(self, points: Tensor, time: float) -> Tensor:
-        """The smaller of the shape's distance bound and the surroundings' (M,).
-
-        Far from the shape its bound is the distance to the ball around it, where there is one.
-        """
+        """The smaller of the shape's distance bound and the surroundings' (M,)."""
         static = self.surroundings.distances(points).amin(dim=0)
-        if self.reach is None:
-            return torch.minimum(static, self.shape.distance(points, time))
-        ball = (points - points.new_tensor(self.center)).norm(dim=-1) - self.reach
-        near = (ball < 0.1 * self.reach).nonzero().squeeze(-1)
-        ball[near] = self.shape.distance(points[near], time)
-        return torch.minimum(static, ball)
+        return torch.minimum(static, self._bound(points, time))
 
     def material(self, points: Tensor, time: float) -> Material:
         """The nearest surface's material; that of the surroundings does not move."""
         static, part = self.surroundings.distances(points).min(dim=0)
         own = self.shape.material(points, time)
-        nearer = self.shape.distance(points, time) < static
+        nearer = self._bound(points, time) < static
         return Material(
             torch.where(nearer[:, None], own.canonical, points),
             torch.where(nearer, own.part + self.surroundings.parts, part),
@@ -68,6 +59,13 @@ class Surrounded:
         """The shape's paint, or that of its surroundings."""
         own = self.shape.color(self._of_shape(material))
         return torch.where(self._is_shape(material), own, self.surroundings.color(material))
+
+    def _bound(self, points: Tensor, time: float) -> Tensor:
+        """The shape's distance bound (M,); far from it that to the ball around it."""
+        ball: Tensor = (points - points.new_tensor(self.center)).norm(dim=-1) - self.reach
+        near = (ball < 0.1 * self.reach).nonzero().squeeze(-1)
+        ball[near] = self.shape.distance(points[near], time)
+        return ball
 
     def _is_shape(self, material: Material) -> Tensor:
         """Mask (M, 1) of the shape's material."""
