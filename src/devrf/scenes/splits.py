@@ -129,15 +129,12 @@ MANY_AGAIN = 0.25
 
 
 def standing(poses: Tensor) -> str | None:
-    """``4 cameras stand still for 6 images each``, by poses (N, 3, 4); None where few do."""
+    """``24 of 32 images are by cameras that stand still``, by poses (N, 3, 4); None: too few."""
     images = torch.bincount(distinct_poses(poses))
-    again = images[images > 1]
-    if int(again.sum()) < MANY_AGAIN * len(poses) or not len(again):
+    again = int(images[images > 1].sum())
+    if again == 0 or again < MANY_AGAIN * len(poses):
         return None
-    cameras = "a camera stands" if len(again) == 1 else f"{len(again)} cameras stand"
-    least, most = int(again.min()), int(again.max())
-    count = f"{most} images each" if least == most else f"{least} to {most} images each"
-    return f"{cameras} still for {count.removesuffix(' each') if len(again) == 1 else count}"
+    return f"{again} of {len(poses)} images are by cameras that stand still"
 
 
 def check_timed_alike(*sets: Transforms) -> None:
