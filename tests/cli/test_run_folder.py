@@ -52,8 +52,10 @@ def test_the_second_process_is_refused_until_the_first_is_killed(
 
 
 def test_files_that_a_killed_process_had_begun_are_removed(devrf, tiny, tmp_path):
-    begun = [".partial-metrics.json", "checkpoints/.partial-canonical.ckpt", "logs/a/.partial-x"]
-    for name in (*begun, "export/.partial-scene.glb", "notes/.partial-mine"):
+    files = (".partial-metrics.json", "checkpoints/.partial-canonical.ckpt", "logs/a/.partial-x")
+    files += ("export/.partial-scene.glb", "images/held_out/dynamic/.partial-0.png")
+    files += ("images/motion_masks/.partial-0.png", ".devrf/.partial-tasks.json")
+    for name in (*files, "export/.partial-pictures/static_0/0.jpg", "notes/.partial-mine"):
         (tmp_path / "run" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "run" / name).write_text("half")
     assert devrf("stage=inspect", *tiny, "hydra.run.dir=run").status == 0

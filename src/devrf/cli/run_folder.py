@@ -19,11 +19,14 @@ from devrf.cli.config import SWEEP_RECORD, in_sweep
 from devrf.cli.messages import is_user_error, report_user_errors
 from devrf.errors import DevrfError
 from devrf.system.files import (
+    PARTIAL,
     close_logs,
     holds_at_most,
     make_folder,
     refuse_links,
+    remove,
     remove_if_only,
+    walk,
 )
 from devrf.system.folder_lock import PLACE, lock_folder, release_folder
 
@@ -31,8 +34,8 @@ log = logging.getLogger(__name__)
 
 # Made in the folder before the config is checked.
 AT_FIRST = {".hydra", PLACE}
-# Folders in which a killed process may have left files that it had begun.
-BEGUN = (".", "checkpoints", "images", "videos", "logs/*", "export", "export/*", "paths")
+# Folders in a run's in which a killed process may have left what it had begun.
+BEGUN = (PLACE, "checkpoints", "images", "videos", "logs", "export", "paths")
 # Why a sweep's job failed.
 FAILURE = "failure.json"
 # Stages that leave .hydra alone: they look at other runs, or are none.
@@ -112,8 +115,9 @@ def working_in(folder: Path, config: DictConfig) -> Iterator[None]:
     is_rank_zero = not _is_worker(config)
     if is_rank_zero and config.stage not in UNRECORDED:
         lock_folder(folder, "hydra.sweep.dir" if in_sweep() else "hydra.run.dir")
-        for path in (path for part in BEGUN for path in folder.glob(f"{part}/.partial-*")):
-            path.unlink(missing_ok=True)
+        below = (walked for name in BEGUN for walked, *_ in walk(folder / name))
+        for begun in (path for walked in (folder, *below) for path in walked.glob(f"{PARTIAL}*")):
+            remove(begun)
     was_new = is_rank_zero and not in_sweep() and holds_at_most(folder, AT_FIRST)
     try:
         yield

@@ -30,6 +30,8 @@ LARGEST_YAML = 200_000
 UNREADABLE = (LookupError, TypeError, ValueError, ArithmeticError, AttributeError, RecursionError)
 # Folders in one another, at most: Python's recursion ends at some hundreds.
 DEEPEST = 64
+# How the name of what is not whole yet begins.
+PARTIAL = ".partial-"
 # Errors of a disk, its permissions, or a path that was given. A missing file may be a fault of the
 # program instead.
 REFUSED = {
@@ -98,7 +100,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
     """
     make_folder(path.parent)
     # The suffix stays last: writers choose the format by it.
-    partial = path.with_name(f".partial-{path.name}")
+    partial = path.with_name(PARTIAL + path.name)
     partial.unlink(missing_ok=True)  # it may be a link
     try:
         yield partial
@@ -121,7 +123,7 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
     Raises:
         OSError: it cannot be written.
     """
-    partial = folder.with_name(f".{folder.name}.partial")
+    partial = folder.with_name(PARTIAL + folder.name)
     shutil.rmtree(partial, ignore_errors=True)  # of a killed process
     partial.mkdir(parents=True)
     try:
@@ -207,6 +209,14 @@ def walk(folder: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
         yield path, inner, names
 
 
+def remove(path: Path) -> None:
+    """Remove a file, a link, or a folder and what is in it; none need be there."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
+
+
 def free_disk(folder: Path) -> int:
     """Bytes that can be written to ``folder``, which need not exist yet."""
     existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
@@ -226,11 +236,8 @@ def remove_if_only(folder: Path, names: set[str]) -> None:
     if not holds_at_most(folder, names):
         return
     close_logs()
-    for path in map(folder.joinpath, names):
-        if path.is_dir():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink(missing_ok=True)
+    for name in names:
+        remove(folder / name)
     working_folder, folder = Path.cwd(), folder.resolve()
     if working_folder.is_relative_to(folder):
         return

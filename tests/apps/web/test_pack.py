@@ -438,7 +438,7 @@ def test_the_server_gives_page_and_pictures_to_its_own_page_alone(tiny_scene, tm
     pictures = tmp_path / "export" / "pictures"
     (pictures / "static_0").mkdir(parents=True)
     (pictures / "static_0" / "0.jpg").symlink_to(log)
-    (tmp_path / "export" / ".pictures.partial").mkdir()  # by a process that was killed
+    (tmp_path / "export" / ".partial-pictures").mkdir()  # by a process that was killed
     write_thumbnails(pictures, tiny_scene, Viewpoints.of(tiny_scene))
     assert {*os.listdir(tmp_path / "export")} == {"scene.html", "pictures"}
     assert log.read_text() == "a log"
