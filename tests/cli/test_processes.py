@@ -9,6 +9,7 @@ import socket
 import psutil
 import pytest
 from lightning import Trainer
+from torch.distributed import run as torchrun
 
 from devrf.cli.processes import run_in_each, starts_processes
 from devrf.engine.ddp import ManualDDP
@@ -225,6 +226,12 @@ def test_a_sweeps_job_learns_in_processes_of_its_own_what_others_learn(
         for rank in (0, 1)
     ]
     assert fields == fields[:1] * 4
+
+
+def test_a_sweep_of_rehearsals_in_several_processes_has_no_objective(devrf, tiny, monkeypatch):
+    monkeypatch.setattr(torchrun, "run", lambda started: None)
+    outcome = devrf("-m", *tiny, *TWO, "rehearse=true", "hydra.sweep.dir=sweep")
+    assert outcome.status == 0, outcome.err
 
 
 def test_where_none_can_be_started_a_line_says_so(tmp_path):

@@ -121,9 +121,11 @@ def _run_plan(run: RunContext) -> float | None:
         steps = REHEARSED_STEPS
     with shortage_in_words(config.stage, run.device, None):  # of networks that are too wide
         _check(run, learning, steps)
+    foreign = config.evaluation.predictions is not None
+    scored = "evaluate" in steps and run.is_rank_zero and not (run.rehearses or foreign)
     if learning and starts_processes(run.strategy):
         run_in_each(run.strategy, run.folder)
-        return _objective(run, ()) if in_sweep() and "evaluate" in steps else None
+        return _objective(run, ()) if scored and in_sweep() else None
     if learning:
         with connected(run.strategy):
             _learn(run, learning, steps)
@@ -132,8 +134,6 @@ def _run_plan(run: RunContext) -> float | None:
             _run_step(run, name, AFTER_LEARNING.get(name) or STEPS[name])
     if learning and run.rehearses and run.is_rank_zero:
         conclude(run)
-    foreign = config.evaluation.predictions is not None
-    scored = "evaluate" in steps and run.is_rank_zero and not (run.rehearses or foreign)
     return _objective(run, steps) if scored and unfinished(run) is None else None
 
 
