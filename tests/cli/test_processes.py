@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import socket
+import sys
 
 import psutil
 import pytest
+from hydra.core.hydra_config import HydraConfig
 from lightning import Trainer
 from torch.distributed import run as torchrun
 
+from devrf.cli import processes
 from devrf.cli.processes import run_in_each, starts_processes
 from devrf.engine.ddp import ManualDDP
 from devrf.errors import DevrfError
@@ -232,6 +236,21 @@ def test_a_sweep_of_rehearsals_in_several_processes_has_no_objective(devrf, tiny
     monkeypatch.setattr(torchrun, "run", lambda started: None)
     outcome = devrf("-m", *tiny, *TWO, "rehearse=true", "hydra.sweep.dir=sweep")
     assert outcome.status == 0, outcome.err
+
+
+def test_the_environment_of_the_processes_is_theirs_alone(monkeypatch, tmp_path):
+    given: dict[str, str] = {}
+    monkeypatch.setattr(torchrun, "run", lambda started: given.update(os.environ))
+    monkeypatch.setattr(processes, "in_sweep", lambda: False)
+    monkeypatch.setattr(HydraConfig, "initialized", lambda: True)
+    monkeypatch.setattr(sys, "argv", ["devrf"])
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")  # as the entry point does
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    trainer = Trainer(accelerator="cpu", devices=2, strategy=ManualDDP(), logger=False)
+    before = dict(os.environ)
+    run_in_each(trainer.strategy, tmp_path)
+    assert (given["HYDRA_FULL_ERROR"], given["OMP_NUM_THREADS"]) == ("0", "1")
+    assert dict(os.environ) == before
 
 
 def test_where_none_can_be_started_a_line_says_so(tmp_path):

@@ -81,6 +81,7 @@ def run_in_each(strategy: Strategy, folder: Path) -> None:
     if not HydraConfig.initialized():
         raise DevrfError("trainer=ddp: needs the command line, python -m devrf trainer=ddp")
     count = strategy.num_processes
+    own_environment = os.environ.copy()
     os.environ["HYDRA_FULL_ERROR"] = str(int(FULL_ERRORS))
     os.environ.setdefault("OMP_NUM_THREADS", str(max(torch.get_num_threads() // count, 1)))
     release_folder(folder)
@@ -100,6 +101,8 @@ def run_in_each(strategy: Strategy, folder: Path) -> None:
         raise DevrfError(f"trainer.devices: the process of rank {rank} {ended}") from None
     finally:
         logging.disable(logging.NOTSET)
+        os.environ.clear()
+        os.environ.update(own_environment)  # the next job of a sweep has its own processes
 
 
 def _words(folder: Path) -> list[str]:
