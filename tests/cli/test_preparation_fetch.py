@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
+from filelock import FileLock
 
 PICTURE = b"not really a picture" * 500
 
@@ -133,6 +134,18 @@ def test_an_archive_is_unpacked_if_its_checksum_is_as_expected(devrf, web, tmp_p
     files = {path.relative_to(lego).as_posix() for path in lego.rglob("*") if path.is_file()}
     assert files == {"transforms_train.json", "train/r_0.png", "fetched.json"}
     assert record(lego)["compared"] is True and "as expected" in outcome.out
+
+
+def test_a_scene_that_another_process_fetches_is_left_to_it(devrf, web, tmp_path, published):
+    lock = tmp_path / "scenes" / ".fox.fetch" / ".devrf" / "lock"
+    lock.parent.mkdir(parents=True)
+    with FileLock(lock):
+        outcome = devrf(*published, "scene=fox")
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert ".fox.fetch: another devrf process works in this folder" in outcome.err
+    assert "or use fetch.into=FOLDER" in outcome.err and web.asked == []
+    assert devrf(*published, "scene=fox").status == 0
+    assert {path.name for path in (tmp_path / "scenes").iterdir()} == {"fox"}
 
 
 def test_files_that_came_before_an_interruption_are_kept(devrf, web, tmp_path, published):

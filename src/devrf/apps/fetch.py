@@ -26,11 +26,11 @@ from devrf.system.files import (
     DEEPEST,
     UNREADABLE,
     atomic_write,
-    make_folder,
     read_record,
     refuse_links,
     write_json,
 )
+from devrf.system.folder_lock import lock_folder, release_folder
 from devrf.system.plain_data import Line, validate
 
 log = logging.getLogger(__name__)
@@ -178,7 +178,8 @@ def fetched(scene: PublishedScene, settings: FetchSettings, progress: bool) -> P
     there: the same command goes on with the others.
 
     Raises:
-        DevrfError: it cannot be fetched, or is not what was expected, or something else is there.
+        DevrfError: it cannot be fetched, or is not what was expected, something else is there, or
+            another process fetches it.
         OSError: the disk refuses.
     """
     into, source = Path(settings.into).expanduser(), scene.collection
@@ -193,7 +194,24 @@ def fetched(scene: PublishedScene, settings: FetchSettings, progress: bool) -> P
     log.info("%s: %s; from %s; licence: %s", scene.name, scene.about, source.page, source.licence)
     expected = settings.sha256.lower() if settings.sha256 else source.sha256.get(scene.name)
     refuse_links(work, itself=True)
-    make_folder(work)
+    lock_folder(work, "fetch.into")
+    try:
+        digest = _fetch(scene, work, path, expected, progress)
+    finally:
+        release_folder(work)
+    remark = f": none was known to compare it with; kept in {path / RECORD}"
+    log.info("%s: in %s", scene.name, path)
+    log.info("SHA-256 %s%s", digest, remark if expected is None else ", as expected")
+    return path
+
+
+def _fetch(
+    scene: PublishedScene, work: Path, path: Path, expected: str | None, progress: bool
+) -> str:
+    """Download a scene to ``work``, and move it to ``path`` whole; its SHA-256.
+
+    DevrfError if that is not the ``expected`` one.
+    """
     files = _download(scene, work / "files", progress)
     digest = _digest(files)
     if expected is not None and digest != expected:
@@ -205,9 +223,9 @@ def fetched(scene: PublishedScene, settings: FetchSettings, progress: bool) -> P
     ready = _unpacked(scene, work) if scene.is_archive else work / "files"
     record = {
         "scene": scene.name,
-        "page": source.page,
-        "url": source.filled(source.url, scene.name),
-        "licence": source.licence,
+        "page": scene.collection.page,
+        "url": scene.collection.filled(scene.collection.url, scene.name),
+        "licence": scene.collection.licence,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "files": len(files),
         "sha256": digest,
@@ -216,10 +234,7 @@ def fetched(scene: PublishedScene, settings: FetchSettings, progress: bool) -> P
     write_json(ready / RECORD, record)
     ready.rename(path)
     shutil.rmtree(work, ignore_errors=True)
-    remark = f": none was known to compare it with; kept in {path / RECORD}"
-    log.info("%s: in %s", scene.name, path)
-    log.info("SHA-256 %s%s", digest, remark if expected is None else ", as expected")
-    return path
+    return digest
 
 
 def _download(scene: PublishedScene, folder: Path, progress: bool) -> dict[str, Path]:
