@@ -129,15 +129,29 @@ def test_little_memory_refuses_what_is_not_finished_and_changes_nothing(
     assert not (tmp_path / "run" / "previous-1").exists()
 
 
-def test_running_out_of_memory_is_one_line(devrf, tiny, monkeypatch) -> None:
+@pytest.mark.parametrize(
+    ("words", "where", "stage", "rays"),
+    [
+        ((), "devrf.canonical_stage.CanonicalStage", "canonical", "schedule.canonical.rays"),
+        (
+            ("method=dnerf", "profile=dnerf_small", "protocol=joint"),
+            "ray_stage.RayStage",
+            "joint",
+            "ray_stage.schedule.rays",
+        ),
+    ],
+)
+def test_running_out_of_memory_is_one_line(
+    devrf, tiny_data, monkeypatch, words, where, stage, rays
+) -> None:
     def enter(stage: object, phase: object) -> None:
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 3.00 GiB.")
 
-    monkeypatch.setattr("devrf.methods.devrf.canonical_stage.CanonicalStage.enter", enter)
-    outcome = devrf(*tiny)
+    monkeypatch.setattr(f"devrf.methods.{where}.enter", enter)
+    outcome = devrf(*tiny_data, "trainer=cpu", *words)
     assert outcome.status == 2 and outcome.err.count("\n") == 1
-    assert outcome.err.startswith("devrf: stage=canonical: out of memory (3.0 GiB more asked, ")
-    assert "lower schedule.canonical.rays" in outcome.err
+    assert outcome.err.startswith(f"devrf: stage={stage}: out of memory (3.0 GiB more asked, ")
+    assert f"lower {rays}; " in outcome.err
 
 
 def test_networks_too_wide_to_build_are_one_line(devrf, tiny_data) -> None:

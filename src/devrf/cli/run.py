@@ -13,12 +13,19 @@ from pathlib import Path
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from lightning import seed_everything
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from devrf.apps.render import camera_path
 from devrf.apps.settings import ViewerSettings
 from devrf.apps.viewer.page import PAGE
-from devrf.cli.config import OF_A_CHECKPOINT, PIPELINE, SCENELESS_STAGES, in_sweep
+from devrf.cli.config import (
+    OF_A_CHECKPOINT,
+    PIPELINE,
+    SCENELESS_STAGES,
+    in_sweep,
+    set_at,
+    stage_section,
+)
 from devrf.cli.config_check import check_config, check_extras
 from devrf.cli.context import RunContext
 from devrf.cli.evaluate import evaluate
@@ -205,9 +212,9 @@ def _learn(run: RunContext, learning: Names, steps: Names) -> None:
 
 def _run_step(run: RunContext, name: str, step: Step) -> None:
     seed_everything(run.config.seed, verbose=False)
-    rays = f"schedule.{name}.rays"
-    has_rays = OmegaConf.select(run.config, rays) is not None
-    with shortage_in_words(name, run.device, rays if has_rays else None):
+    learns = name in run.learning_stages
+    rays = set_at(run.config, (stage_section(run.config, name), "schedule", "rays"))
+    with shortage_in_words(name, run.device, rays if learns else None):
         whole = step(run)
     # Leftovers of a step, as a trainer held in circles, would count as the next step's memory.
     free_cache(run.device)
