@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import re
 from dataclasses import replace
-from functools import partial
 from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,13 +15,9 @@ from lightning import Callback, Trainer
 from lightning.pytorch.callbacks import LambdaCallback
 from torch.optim import Optimizer
 
-from devrf.apps.trial import seconds_to_learn
 from devrf.callbacks import Meter, Progress, TrainingRecord
 from devrf.engine.schedule import cost
 from devrf.errors import DevrfError
-from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
-from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.settings import VisitSettings
@@ -116,25 +111,6 @@ def test_the_time_left_knows_that_finer_levels_take_longer(fit, canonical, caplo
     first = next(line for line in caplog.messages if line.startswith("static 1/12"))
     # (6 + 7.6 + 9.5 + 8 · 12) / 6, not 11 s
     assert first.endswith("  about 20 s left")
-
-
-def test_how_long_learning_takes_is_told_from_its_first_seconds(datamodule, monkeypatch):
-    schedule = CanonicalSchedule(
-        search_iterations=0, iterations=40, side=16, upsample_at=(20,), rays=64
-    )
-    stage = CanonicalStage(schedule, Architecture(width=16), iterations_per_step=5)
-    seconds = count(step=10)
-    monkeypatch.setattr("devrf.apps.trial.time.perf_counter", lambda: float(next(seconds)))
-    moving = DeformationSchedule(levels=(Level(4, 2),), rays=32)
-    plain = {"enable_checkpointing": False, "enable_progress_bar": False, "max_epochs": 1}
-    quiet = partial(Trainer, accelerator="cpu", **plain)
-    taken = seconds_to_learn(stage, [(moving.total(3), moving.rays)], datamodule, quiet)
-    # Half the voxels have 0.7937 of the side: 5 iterations of 12.7 voxels a ray were tried in 10 s.
-    # 20 of these, 20 of 16, and 2 for each of 3 frames of 16 with half of the rays.
-    assert stage.position.iteration == 10
-    assert taken == pytest.approx(
-        (20 * 12.699 + 20 * 16 + 6 * 16 / 2) / (5 * 12.699 / 10), rel=1e-3
-    )
 
 
 def test_a_callback_of_ones_own_sets_the_rates_as_the_page_shows(canonical, datamodule, trainer):

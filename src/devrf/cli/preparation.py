@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import sys
-from functools import partial
 from pathlib import Path
 from typing import get_args
 
@@ -16,7 +15,6 @@ from devrf.apps.fetch import FetchSettings, fetched, published_scene
 from devrf.apps.inspection.advice import Advice, image_sets
 from devrf.apps.inspection.report import inspection_text, show
 from devrf.apps.settings import CaptureSettings
-from devrf.apps.trial import seconds_to_learn
 from devrf.cli.complete import completed
 from devrf.cli.config import command_line
 from devrf.cli.context import RunContext
@@ -30,7 +28,6 @@ from devrf.scenes.exchange import Exchange, PrepareSettings, write_for_others
 from devrf.scenes.export import export
 from devrf.system.files import write_json
 from devrf.system.override import literal, to_type
-from devrf.system.progress import duration
 
 log = logging.getLogger(__name__)
 
@@ -60,24 +57,9 @@ def capture(run: RunContext) -> None:
     for line in applied.remarks:
         log.info("%s", line)
     config = compose("config", [*applied.words, *how])
-    captured = RunContext(config, run.folder)
-    shortage = inspect(captured)
-    command = [to_type("data.root", folder), *how]
-    if shortage is not None:  # nothing can be tried out
-        say_next(command + [f"{SIZE}=auto"] * (shortage.where == SIZE))
-        return
-    seconds = config.schedule.seconds
-    if seconds is None:
-        log.info("learning is tried out for some seconds, to estimate its duration")
-        first, *others = captured.stages_with_images
-        stage = captured.plan(first).build()
-        later = [captured.plan(name) for name in others]
-        batches = [(plan.iterations(captured.scene), plan.rays) for plan in later]
-        trainer = partial(instantiate, config.trainer)
-        seconds = seconds_to_learn(stage, batches, captured.datamodule, trainer)
-    if seconds is not None:
-        log.info("learning takes %s on this machine", duration(seconds))
-    say_next(command)
+    shortage = inspect(RunContext(config, run.folder))
+    fits = [f"{SIZE}=auto"] if shortage is not None and shortage.where == SIZE else []
+    say_next([to_type("data.root", folder), *how, *fits])
 
 
 def prepare(run: RunContext) -> None:

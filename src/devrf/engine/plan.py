@@ -53,12 +53,6 @@ class StagePlan:
         """Kernels that the stage launches, to be compiled before it learns."""
         return ()
 
-    @property
-    def rays(self) -> int:
-        """Rays of a batch."""
-        rays: int = self.settings["schedule"].rays
-        return rays
-
     def iterations(self, scene: Scene) -> int:
         """Iterations for a scene."""
         total: int = self.settings["schedule"].total

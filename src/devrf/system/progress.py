@@ -37,18 +37,13 @@ def followed(
 
 
 def time_left(seconds: float) -> str:
-    """A :func:`duration` that is left."""
-    return f"{duration(seconds)} left"
-
-
-def duration(seconds: float) -> str:
-    """``about 40 s``, ``about 12 min``, ``about 3 h 20 min``: no more digits."""
+    """``about 40 s left``, ``about 12 min left``, ``about 3 h 20 min left``: no more digits."""
     if seconds < 60:
-        return f"about {max(round(seconds), 1)} s"
+        return f"about {max(round(seconds), 1)} s left"
     minutes = round(seconds / 60)
     if minutes <= 60:
-        return f"about {minutes} min"
+        return f"about {minutes} min left"
     hours, minutes = divmod(minutes, 60)
     if hours >= 10 or not minutes:
-        return f"about {round(seconds / 3600)} h"
-    return f"about {hours} h {minutes} min"
+        return f"about {round(seconds / 3600)} h left"
+    return f"about {hours} h {minutes} min left"

@@ -58,7 +58,7 @@ class CanonicalPlan(StagePlan):
         parts = {
             SIZE: tensor_bytes(scene.static.train),
             grid: LEARNED * values,
-            "schedule.canonical.rays": self.rays * ray,
+            "schedule.canonical.rays": self.settings["schedule"].rays * ray,
         }
         return StageNeeds(parts, {grid: values})
 
@@ -111,7 +111,7 @@ class DeformationPlan(StagePlan):
             SIZE: tensor_bytes(scene.dynamic.train),
             grid: values,
             side: frame * (on_device + LEARNED),
-            "schedule.deformation.rays": self.rays * COLOURED * ray,
+            "schedule.deformation.rays": schedule.rays * COLOURED * ray,
         }
         return StageNeeds(parts, {grid: values, side: frames * frame})
 
