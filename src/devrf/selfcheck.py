@@ -12,11 +12,11 @@ import math
 import os
 import signal
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from lightning import Callback, Trainer, seed_everything
@@ -27,13 +27,14 @@ from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, LoadedCheckpoi
 from devrf.checkpoints.progress import progress_files
 from devrf.data.rendered import ProceduralDataModule
 from devrf.engine.stage import Stage
-from devrf.errors import DevrfError, did_you_mean
+from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import PAPER_LEVELS, DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
+from devrf.methods.devrf.extensions.tracks import StartAlongFlow
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import Precision, Sampling, VisitSettings
 from devrf.rendering.renderer import Renderer
@@ -43,18 +44,6 @@ log = logging.getLogger(__name__)
 
 class CheckSkippedError(Exception):
     """The device cannot do the check; the text says why."""
-
-
-class Variant(NamedTuple):
-    """Settings of iterations: config keys of the same names."""
-
-    precision: Precision = "float32"
-    deterministic: bool = False
-
-
-PLAIN = Variant()
-# What ``python -m devrf deterministic=true`` runs.
-EXACT = Variant("auto", deterministic=True)
 
 
 @dataclass
@@ -82,30 +71,28 @@ class SmallScene:
     @cached_property
     def canonical(self) -> LoadedCheckpoint:
         """The robot at rest, learned in PyTorch."""
-        stage = self.stage("canonical", PLAIN)
+        stage = self.stage("canonical")
         assert isinstance(stage, CanonicalStage)
-        self.learn(stage, PLAIN)
+        self.learn(stage)
         return stage.result()
 
-    def stage(self, name: str, variant: Variant) -> Stage:
-        """The canonical or the deformation stage."""
+    def stage(self, name: str, *, exact: bool = False) -> Stage:
+        """The canonical or the deformation stage; ``exact`` is what deterministic=true runs."""
+        precision: Precision = "auto" if exact else "float32"
         if name == "canonical":
             return CanonicalStage(
                 self.at_rest,
                 self.architecture,
                 sampling=self.sampling,
-                decoder_precision=variant.precision,
+                decoder_precision=precision,
                 iterations_per_step=5,
             )
         settings = VisitSettings(5e-3, unit="box", store="host")
-        # Imported here: every command loads this module, and an extension may be taken out.
-        from devrf.methods.devrf.extensions.tracks import StartAlongFlow
-
         return DeformationStage(
             copy.deepcopy(self.canonical),
             self.deformation,
             settings,
-            decoder_precision=variant.precision,
+            decoder_precision=precision,
             iterations_per_step=5,
             flow_mean="rays",
             extensions={"tracks": StartAlongFlow("flow")},
@@ -114,8 +101,8 @@ class SmallScene:
     def learn(
         self,
         stage: Stage,
-        variant: Variant,
         *callbacks: Callback,
+        exact: bool = False,
         resumed_from: str | None = None,
     ) -> None:
         """Learn all of ``stage``, from the same random state each time."""
@@ -124,7 +111,7 @@ class SmallScene:
         trainer = Trainer(
             accelerator="gpu" if gpu else "cpu",
             devices=[self.device.index or 0] if gpu else 1,
-            deterministic=variant.deterministic,
+            deterministic=exact,
             max_epochs=1,
             callbacks=[GridUpscaling(), LearningRateDecay(), *callbacks],
             logger=False,
@@ -203,10 +190,8 @@ def require_gpu(scene: SmallScene, reason: str) -> None:
 
 def resume(scene: SmallScene, name: str) -> str:
     """Whether a stage that SIGTERM stops goes on to equal bits with ``deterministic=true``."""
-    uninterrupted = scene.stage(name, EXACT)
-    first = scene.stage(name, EXACT)
-    second = scene.stage(name, EXACT)
-    scene.learn(uninterrupted, EXACT)
+    uninterrupted, first, second = (scene.stage(name, exact=True) for _ in range(3))
+    scene.learn(uninterrupted, exact=True)
 
     def interrupt(*_: Any) -> None:
         if 0 <= first.position.iteration - first.schedule.total // 2 < first.iterations_per_step:
@@ -216,13 +201,13 @@ def resume(scene: SmallScene, name: str) -> str:
         saving = PeriodicCheckpoint(folder, every_seconds=math.inf)
         with StopOnSignal(saving) as stop:
             sender = LambdaCallback(on_train_batch_start=interrupt)
-            scene.learn(first, EXACT, saving, stop, sender)
+            scene.learn(first, saving, stop, sender, exact=True)
         files = progress_files(Path(folder), name)
         done, total = first.position.iteration, first.schedule.total
         stopped = f"stopped at iteration {done} of {total}"
         interrupted = stop.number is not None and 0 < done < total
         require(interrupted and bool(files), f"{stopped}, {len(files)} progress files")
-        scene.learn(second, EXACT, resumed_from=str(files[0]))
+        scene.learn(second, exact=True, resumed_from=str(files[0]))
     ended = second.position.iteration
     require(ended == uninterrupted.position.iteration, f"ended at iteration {ended}")
     pairs = zip(uninterrupted.state_dict().values(), second.state_dict().values(), strict=True)
@@ -239,8 +224,8 @@ PICTURE_LIMIT = 1e-3
 def rendering(scene: SmallScene) -> str:
     """Whether the device shows what a CPU shows."""
     require_gpu(scene, "it is compared with a CPU")
-    stage = scene.stage("deformation", PLAIN)
-    scene.learn(stage, PLAIN)
+    stage = scene.stage("deformation")
+    scene.learn(stage)
     model = stage.current_model()
     assert isinstance(model, DeVRFModel)
     views = scene.data.scene.dynamic.test
@@ -264,33 +249,19 @@ CHECKS: dict[str, Callable[[SmallScene], str]] = {
 }
 
 
-def run_checks(
-    device: torch.device, seed: int, only: Sequence[str] | None = None
-) -> Iterator[tuple[str, str, str]]:
+def run_checks(device: torch.device, seed: int) -> Iterator[tuple[str, str, str]]:
     """Name, verdict (passed, skipped or failed), and figures or reason of each check.
 
     Args:
         device: what is checked.
         seed: of what is learned.
-        only: first words of the checks to make; None: all.
-
-    Raises:
-        DevrfError: no check begins with one of the words of ``only``.
     """
-    for start in only or ():
-        if not any(name.startswith(start) for name in CHECKS):
-            kinds = dict.fromkeys(name.split()[0] for name in CHECKS)
-            raise DevrfError(
-                f"selfcheck.only: expected the first words of a check ({', '.join(kinds)}), "
-                f"not {start!r}{did_you_mean(start, [*kinds, *CHECKS])}"
-            )
     scene = small_scene(device, seed)
     for name, check in CHECKS.items():
-        if only is None or name.startswith(tuple(only)):
-            try:
-                yield name, "passed", check(scene)
-            except CheckSkippedError as reason:
-                yield name, "skipped", str(reason)
-            except Exception as error:
-                log.debug("%s", name, exc_info=True)
-                yield name, "failed", " ".join(f"{type(error).__name__}: {error}".split())
+        try:
+            yield name, "passed", check(scene)
+        except CheckSkippedError as reason:
+            yield name, "skipped", str(reason)
+        except Exception as error:
+            log.debug("%s", name, exc_info=True)
+            yield name, "failed", " ".join(f"{type(error).__name__}: {error}".split())

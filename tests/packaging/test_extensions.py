@@ -38,8 +38,6 @@ def test_without_it_the_motion_is_learned(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(sys.modules, f"{EXTENSIONS}.{file}", None)  # importing it fails
-    # What the check of the config loads is loaded anew.
-    monkeypatch.delitem(sys.modules, "devrf.selfcheck", raising=False)
     config = composed("data=procedural", *removed, *QUICK, "schedule.deformation.rays=64")
     check_config(config)
     stage = instantiate(config.deformation, _partial_=True, _convert_="all")(earlier=rest)

@@ -42,7 +42,7 @@ from devrf.system.process import importing
 # Keys that say what to do with a run, on which machine, and what to log, not what the run is.
 OF_A_COMMAND = {"stage", "ckpt", "resume", "memory_check", "objective", "hparams_search"}
 OF_A_COMMAND |= {"hydra", "report", "still", "export", "trainer", "logger", "callbacks"}
-OF_A_COMMAND |= {"viewer", "fetch", "capture", "prepare", "selfcheck", "scene", "defaults"}
+OF_A_COMMAND |= {"viewer", "fetch", "capture", "prepare", "scene", "defaults"}
 # Paths that a command writes to, and downloads.
 PLACES = {"data.flow_cache", "evaluation.download"}
 # Of another method's run these are taken over.
