@@ -23,7 +23,7 @@ from lightning import Callback, Trainer, seed_everything
 from lightning.pytorch.callbacks import LambdaCallback
 
 from devrf.callbacks import GridUpscaling, LearningRateDecay, PeriodicCheckpoint, StopOnSignal
-from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, LoadedCheckpoint
+from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.checkpoints.progress import progress_files
 from devrf.data.rendered import ProceduralDataModule
 from devrf.engine.stage import Stage
@@ -119,7 +119,6 @@ class SmallScene:
             enable_progress_bar=False,
             enable_model_summary=False,
         )
-        trainer.strategy.checkpoint_io = ChecksummedCheckpointIO()
         try:
             trainer.fit(stage, datamodule=self.data, ckpt_path=resumed_from)
         finally:

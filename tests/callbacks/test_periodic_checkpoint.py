@@ -14,7 +14,6 @@ from lightning import Callback, Trainer
 from lightning.pytorch.callbacks import LambdaCallback
 
 from devrf.callbacks import PeriodicCheckpoint, StopOnSignal
-from devrf.callbacks import periodic_checkpoint as module
 from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 
@@ -49,14 +48,14 @@ def test_the_last_two_are_kept_and_none_is_written_before_its_time(learn, tmp_pa
 
 
 def test_a_full_disk_does_not_end_the_training(learn, tmp_path, monkeypatch, caplog):
-    usual = module.save_checkpoint
+    usual = Trainer.save_checkpoint
 
     def full(trainer: Trainer, path: Path, **how: Any) -> None:
         if 4 <= trainer.lightning_module.position.iteration <= 7:
             raise OSError(28, "No space left on device", str(path))
         usual(trainer, path, **how)
 
-    monkeypatch.setattr(module, "save_checkpoint", full)
+    monkeypatch.setattr(Trainer, "save_checkpoint", full)
     lost: list[list[str]] = []
     with caplog.at_level(logging.WARNING, logger="devrf"):
         watch = at(7, lambda: lost.append(names(tmp_path)))

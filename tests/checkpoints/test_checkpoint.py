@@ -14,7 +14,7 @@ import pytest
 import torch
 from lightning import Trainer
 
-from devrf.checkpoints.checkpoint import load_checkpoint, save_checkpoint
+from devrf.checkpoints.checkpoint import load_checkpoint
 from devrf.checkpoints.checkpoint_file import (
     _digest,
     _header,
@@ -38,7 +38,7 @@ from devrf.system.memory import own_memory
 def canonical(learned: tuple[CanonicalStage, Trainer], tmp_path: Path) -> Path:
     """A checkpoint of the canonical stage."""
     path = tmp_path / "run" / "canonical.ckpt"
-    save_checkpoint(learned[1], path)
+    learned[1].save_checkpoint(path, weights_only=True)
     return path
 
 
@@ -85,7 +85,7 @@ def test_the_deformation_stage_comes_back_and_alone_suffices(
     schedule = DeformationSchedule(levels=(Level(4, 4), Level(6, 2)), rays=128)
     stage, fit = DeformationStage(rest, schedule), trainer(max_epochs=1)
     fit.fit(stage, datamodule=datamodule)
-    save_checkpoint(fit, tmp_path / "deformation.ckpt")
+    fit.save_checkpoint(tmp_path / "deformation.ckpt", weights_only=True)
     stored = load_checkpoint(tmp_path / "deformation.ckpt", tiny_scene)
     assert_alike(stored.model, stage.scene_model, tiny_scene)
     assert stored.model.deformation is not None

@@ -31,7 +31,6 @@ from devrf.checkpoints.checkpoint import (
     ChecksummedCheckpointIO,
     load_checkpoint,
     metadata_in,
-    save_checkpoint,
 )
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file, write_checkpoint_file
 from devrf.cli.resume import unfinished
@@ -121,7 +120,7 @@ def moving(rest, datamodule, trainer, tmp_path) -> Path:
     """The checkpoint of a scene that moves."""
     schedule, learner = DeformationSchedule(levels=(Level(4, 2),), rays=64), trainer(max_epochs=1)
     learner.fit(DeformationStage(rest, schedule), datamodule=datamodule)
-    save_checkpoint(learner, tmp_path / "deformation.ckpt")
+    learner.save_checkpoint(tmp_path / "deformation.ckpt", weights_only=True)
     return tmp_path / "deformation.ckpt"
 
 
@@ -230,11 +229,10 @@ def test_a_progress_file_goes_on_or_is_refused(rest, datamodule, trainer, tmp_pa
     def learn(progress: Path | None, *further: Callback) -> None:
         watching = (TrainingRecord(), Previews(), DivergenceGuard(), *further)
         learner = trainer(*watching, max_epochs=1)
-        learner.strategy.checkpoint_io = ChecksummedCheckpointIO()
         fit(learner, stage(), datamodule, progress)
 
     def leave(learner: Trainer, learns: Stage, *_: Any) -> None:
-        save_checkpoint(learner, path, weights_only=False)
+        learner.save_checkpoint(path)
         learner.should_stop = True
 
     path = tmp_path / "progress.ckpt"

@@ -16,10 +16,8 @@ from lightning import Callback, Trainer
 from lightning.pytorch.callbacks import LambdaCallback
 
 from devrf.checkpoints.checkpoint import (
-    ChecksummedCheckpointIO,
     LoadedCheckpoint,
     load_checkpoint,
-    save_checkpoint,
 )
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file, write_checkpoint_file
 from devrf.data.datamodule import SceneDataModule
@@ -69,7 +67,7 @@ def leave(path: Path, iteration: int) -> Callback:
 
     def act(trainer: Trainer, stage: Any, *_: Any) -> None:
         if stage.position.iteration == iteration:
-            save_checkpoint(trainer, path, weights_only=False)
+            trainer.save_checkpoint(path)
             trainer.should_stop = True
 
     return LambdaCallback(on_train_batch_end=act)
@@ -127,7 +125,6 @@ def learn(
         for at in [*leaves, None]:
             stage, path = build(), tmp_path / f"{at}.ckpt"
             fit = trainer(*([] if at is None else [leave(path, at)]), max_epochs=1)
-            fit.strategy.checkpoint_io = ChecksummedCheckpointIO()
             fit.fit(stage, datamodule=data, ckpt_path=left)
             if at is not None:
                 assert stage.position.iteration == at
@@ -207,7 +204,7 @@ def test_only_what_is_to_be_gone_on_from_holds_the_way_there(
     stage, path = canonical(), tmp_path / "left.ckpt"
     fit = trainer(leave(path, 10), max_epochs=1)
     fit.fit(stage, datamodule=datamodule)
-    save_checkpoint(fit, tmp_path / "shown.ckpt")
+    fit.save_checkpoint(tmp_path / "shown.ckpt", weights_only=True)
     assert read_checkpoint_file(path)["progress"]["iteration"] == 10
     assert "progress" not in read_checkpoint_file(tmp_path / "shown.ckpt")
     # What is left half-way can be looked at all the same.
@@ -218,7 +215,6 @@ def test_another_schedule_is_refused(datamodule, trainer, tmp_path):
     path, longer = tmp_path / "left.ckpt", CanonicalStage(replace(SEARCHING, iterations=13), SMALL)
     trainer(leave(path, 2), max_epochs=1).fit(canonical(), datamodule=datamodule)
     fit = trainer(max_epochs=1)
-    fit.strategy.checkpoint_io = ChecksummedCheckpointIO()
     with pytest.raises(DevrfError, match=f"^{path}.*a schedule of 20 iterations, .* one of 21"):
         fit.fit(longer, datamodule=datamodule, ckpt_path=str(path))
 
@@ -230,6 +226,5 @@ def test_a_file_of_an_earlier_version_is_refused(datamodule, trainer, tmp_path):
     del content["progress"]["batch_share"]
     write_checkpoint_file(path, content)
     fit = trainer(max_epochs=1)
-    fit.strategy.checkpoint_io = ChecksummedCheckpointIO()
     with pytest.raises(DevrfError, match=rf"^{path}: .*batch_share: Field required.*resume=false"):
         fit.fit(canonical(), datamodule=datamodule, ckpt_path=str(path))

@@ -17,7 +17,7 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from devrf.callbacks import Previews
-from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, load_checkpoint
+from devrf.checkpoints.checkpoint import load_checkpoint
 from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
@@ -70,7 +70,6 @@ def test_model_checkpoint_keeps_the_best(canonical, datamodule, trainer, tmp_pat
     fitted = trainer(
         Previews(times=6), keeping, max_epochs=1, limit_val_batches=1, enable_checkpointing=True
     )
-    fitted.strategy.checkpoint_io = ChecksummedCheckpointIO()
     stage = canonical(rays=512)
     fitted.fit(stage, datamodule=datamodule)
     best = float(keeping.best_model_score)

@@ -10,7 +10,7 @@ import pytest
 import torch
 from lightning import Callback, Trainer
 
-from devrf.checkpoints.checkpoint import LoadedCheckpoint, load_checkpoint, save_checkpoint
+from devrf.checkpoints.checkpoint import LoadedCheckpoint, load_checkpoint
 from devrf.data.batch import RayBatch
 from devrf.engine.protocol import ProtocolStage
 from devrf.engine.stage import Stage
@@ -92,7 +92,7 @@ def stopped_and_resumed(fit: Callable[..., RayStage], tmp_path: Path) -> Any:
         class Stop(Callback):
             def on_train_batch_end(self, fitted: Trainer, *arguments: object) -> None:
                 if fitted.lightning_module.position.iteration == at:
-                    save_checkpoint(fitted, path, weights_only=False)
+                    fitted.save_checkpoint(path)
                     fitted.should_stop = True
 
         def begin(seed: int) -> RayStage:
@@ -117,7 +117,7 @@ def stored(tmp_path: Path) -> Callable[[Stage], LoadedCheckpoint]:
 
     def store(stage: Stage) -> LoadedCheckpoint:
         path = tmp_path / f"{stage.name}.ckpt"
-        save_checkpoint(stage.trainer, path)
+        stage.trainer.save_checkpoint(path, weights_only=True)
         return load_checkpoint(path, stage.scene)
 
     return store

@@ -14,7 +14,7 @@ import torch
 from lightning import Callback, Trainer
 
 from devrf.callbacks import GridUpscaling, LearningRateDecay
-from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, LoadedCheckpoint
+from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.stage import Stage
 from devrf.geometry.clock import FrameClock
@@ -64,7 +64,6 @@ def fit(datamodule: SceneDataModule, trainer: Callable[..., Trainer]) -> Callabl
         every: int = 1000,
     ) -> Stage:
         fitted = trainer(*callbacks, max_epochs=1, log_every_n_steps=every)
-        fitted.strategy.checkpoint_io = ChecksummedCheckpointIO()
         fitted.fit(stage, datamodule=data, ckpt_path=ckpt_path and str(ckpt_path))
         return stage
 

@@ -18,7 +18,6 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 
 from devrf.callbacks.divergence_guard import DivergenceGuard
-from devrf.checkpoints.checkpoint import save_checkpoint
 from devrf.checkpoints.progress import progress_file, progress_files
 from devrf.engine.ddp import largest
 from devrf.engine.stage import Stage
@@ -137,7 +136,7 @@ class PeriodicCheckpoint(Callback):
         began = time.monotonic()
         path = progress_file(self.folder, stage.name, stage.position.iteration)
         try:
-            save_checkpoint(trainer, path, weights_only=False)
+            trainer.save_checkpoint(path)
         except OSError as error:
             if not self._failing:
                 good = "there is none yet" if self.saved is None else f"iteration {self.saved}"

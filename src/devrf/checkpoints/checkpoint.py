@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lightning import Trainer
 from lightning.fabric.plugins import CheckpointIO
 from pydantic import JsonValue, ValidationError
 
@@ -190,19 +189,6 @@ class ChecksummedCheckpointIO(CheckpointIO):
     def remove_checkpoint(self, path: str | Path) -> None:
         """Remove the file."""
         Path(path).unlink(missing_ok=True)
-
-
-def save_checkpoint(trainer: Trainer, path: Path, *, weights_only: bool = True) -> None:
-    """Write the model of the trainer's stage; an earlier file stays until the new is whole.
-
-    ``weights_only=False`` adds all that is needed to go on learning from there. From now on the
-    trainer writes and reads files of this format.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    trainer.strategy.checkpoint_io = ChecksummedCheckpointIO()
-    trainer.save_checkpoint(path, weights_only=weights_only)
 
 
 def load_checkpoint(

@@ -24,7 +24,6 @@ from devrf.callbacks import (
     StopOnSignal,
     TrainingRecord,
 )
-from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, save_checkpoint
 from devrf.cli.context import RunContext
 from devrf.cli.resume import ResumePoint, beginning, remove_progress
 from devrf.engine.stage import Stage, fit
@@ -92,7 +91,6 @@ def _fit(run: RunContext, stage: Stage, begin: ResumePoint) -> None:
             default_root_dir=str(run.folder),
             enable_checkpointing=any(isinstance(hook, ModelCheckpoint) for hook in callbacks),
         )
-        trainer.strategy.checkpoint_io = ChecksummedCheckpointIO()
         for logger in run.loggers:
             if isinstance(logger, ResumableCSVLogger):
                 logger.drop_rows_beyond(stage.capture, begin.iterations_done)
@@ -160,7 +158,7 @@ def _save_final(run: RunContext, trainer: Trainer, stage: Stage) -> None:
     # Goes into the checkpoint, so without the time of writing it.
     stage.provenance.record["wall_seconds"] = run.step_seconds
     try:
-        save_checkpoint(trainer, path)
+        trainer.save_checkpoint(path, weights_only=True)
         with atomic_write(path.with_name("config.yaml")) as partial:
             OmegaConf.save(run.config, partial, resolve=True)
     except OSError as error:

@@ -22,6 +22,7 @@ from torch import Tensor
 from devrf.checkpoints.checkpoint import (
     MODEL,
     UNFIT,
+    ChecksummedCheckpointIO,
     LoadedCheckpoint,
     Viewpoints,
     check_scene,
@@ -264,7 +265,7 @@ class Stage(LightningModule, ABC):
     # Lightning's other hooks, in the order in which they are called.
 
     def setup(self, stage: str) -> None:
-        """Check the trainer and make the generator.
+        """Check the trainer, make the generator, and have checkpoints in devrf's format.
 
         Raises:
             DevrfError: there is no datamodule, the precision is not 32 bit, or several processes
@@ -281,6 +282,8 @@ class Stage(LightningModule, ABC):
                 f"{type(self).__name__}: it learns from the scene of a datamodule; give "
                 "datamodule=… to the trainer"
             )
+        # Before Lightning reads the one to resume from.
+        self.trainer.strategy.checkpoint_io = ChecksummedCheckpointIO()
         self.began = time.perf_counter()
         self.position.seed = torch.initial_seed()
         self.batch_size.processes = self.trainer.world_size
