@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, Union
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
-from devrf.cli.config_check import check_config, check_extras
+from devrf.cli.config_check import check_config
 from devrf.errors import DevrfError
 
 
@@ -141,29 +141,3 @@ def test_values_of_each_type(monkeypatch, hint, fitting, wrong):
     for value in wrong:
         with pytest.raises(DevrfError, match="^sizes.inner.size"):
             check_config(config(sizes__inner__size=value))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        (["logger=tensorboard"], ("logger=tensorboard: tensorboard", "tensorboard", "logger=csv")),
-        (["stage=export"], ("stage=export: skimage", "export", "stage=render")),
-        (["viewer=true"], ("viewer=true: viser", "viewer", "viewer=false")),
-    ],
-)
-def test_a_missing_package_is_named_first(devrf, tmp_path, monkeypatch, arguments, expected):
-    monkeypatch.setattr("devrf.cli.config_check.find_spec", lambda package: None)
-    outcome = devrf(*arguments)
-    missing, extra, instead = expected
-    said = f'{missing} is not installed; run pip install "devrf[{extra}]", or set {instead}'
-    assert (outcome.status, outcome.err) == (2, f"devrf: {said}\n")
-    assert not list(tmp_path.iterdir())
-
-
-def test_tracks_need_nothing_that_meshes_do(composed, monkeypatch):
-    monkeypatch.setattr("devrf.cli.config_check.find_spec", lambda package: None)
-    tracks = ("stage=export", "export.content=tracks", "export.tracks=[[0,0,0]]", "logger=csv")
-    check_extras(composed(*tracks, "export.format=csv"))
-    check_extras(composed(*tracks, "export.format=json", "export.content=auto"))
-    with pytest.raises(DevrfError, match="pxr is not installed"):
-        check_extras(composed(*tracks, "export.format=usd"))

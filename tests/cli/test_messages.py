@@ -285,8 +285,22 @@ def test_a_torchvision_for_another_torch_is_one_line(python, tmp_path, monkeypat
     assert done.err == "devrf: data.widht: no such key; did you mean data.width?\n"
 
 
+@pytest.mark.parametrize(
+    ("argument", "package", "extra"),
+    [("logger=tensorboard", "tensorboard", "tensorboard"), ("viewer=true", "viser", "viewer")],
+)
+def test_a_missing_package_is_named_before_anything_is_learned(
+    devrf, tmp_path, monkeypatch, argument, package, extra
+):
+    monkeypatch.setitem(sys.modules, package, None)  # importing it fails
+    outcome = devrf(argument)
+    said = f'devrf: {package} is not installed; run pip install "devrf[{extra}]"\n'
+    assert (outcome.status, outcome.err) == (2, said)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_fault_of_the_program_keeps_its_traceback(devrf, monkeypatch):
-    monkeypatch.setattr("devrf.cli.run.check_extras", lambda config: 1 / 0)
+    monkeypatch.setattr("devrf.cli.run.check_config", lambda config: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         devrf("stage=prepare")
 

@@ -7,6 +7,7 @@ import os
 import shutil
 import signal
 import socket
+import sys
 import threading
 import time
 
@@ -137,6 +138,20 @@ def test_what_cannot_be_exported_is_said_in_one_line(of_run, tmp_path, arguments
     assert outcome.status == 2
     assert outcome.err.count("\n") == 1 and expected in outcome.err
     assert not (tmp_path / "run" / "export").exists()
+
+
+@pytest.mark.parametrize("package", ["skimage", "trimesh", "pxr"])
+def test_an_export_needs_the_packages_of_its_format_alone(of_run, tmp_path, monkeypatch, package):
+    monkeypatch.setitem(sys.modules, package, None)  # importing it fails
+    usd = ["export.format=usd"] if package == "pxr" else []
+    outcome = of_run("stage=export", FAINT, *usd)
+    said = f'devrf: {package} is not installed; run pip install "devrf[export]"\n'
+    assert (outcome.status, outcome.err) == (2, said)
+    assert not (tmp_path / "run").exists()
+    assert of_run("stage=export", "export.tracks=[[0,0,0]]", "export.format=csv").status == 0
+    # Gaussians of a method's own are written by nothing but devrf.
+    monkeypatch.setattr("devrf.cli.render.export_scene", lambda *arguments: None)
+    assert of_run("stage=export", "export.format=splats").status == 0
 
 
 # Without the scene

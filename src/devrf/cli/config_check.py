@@ -17,7 +17,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import is_dataclass
 from functools import cache, reduce
-from importlib.util import find_spec
 from operator import getitem
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_type_hints
@@ -25,7 +24,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_type_hints
 import yaml
 from annotated_types import Ge, Lt
 from hydra.core.override_parser.types import Override
-from hydra.utils import get_object, instantiate
+from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 from typing_extensions import TypedDict
 
@@ -253,28 +252,3 @@ def _of_options() -> Mapping[str, str]:
             if isinstance(node, Mapping):
                 nodes += [((*names, str(name)), below) for name, below in node.items()]
     return keys
-
-
-def check_extras(config: DictConfig) -> None:
-    """Refuse by a DevrfError settings for which an extra of devrf is not installed."""
-    # A browser draws DeVRF's scenes by itself.
-    served = ("server",) if config.method == "devrf" else ("server", "auto")
-    serves = config.stage == "view" and config.viewer.renderer in served
-    tensorboard = "tensorboard" in (config.get("logger") or ())
-    exports = config.stage == "export" and config.export.format != "html"
-    meshes = exports and not instantiate(config.export).as_tracks
-    for_meshes = "skimage trimesh fast_simplification"
-    usd = exports and config.export.format == "usd"
-    for is_used, setting, packages, extra, instead in (
-        (tensorboard, "logger=tensorboard", "tensorboard", "tensorboard", "logger=csv"),
-        (serves, "stage=view", "viser", "viewer", "stage=render"),
-        (config.viewer.get("training"), "viewer=true", "viser", "viewer", "viewer=false"),
-        (meshes, "stage=export", for_meshes, "export", "stage=render"),
-        (usd, "export.format=usd", "pxr", "export", "export.format=gltf"),
-    ):
-        for package in packages.split():
-            if is_used and find_spec(package) is None:
-                raise DevrfError(
-                    f"{setting}: {package} is not installed; run pip install "
-                    f'"devrf[{extra}]", or set {instead}'
-                )

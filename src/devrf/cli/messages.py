@@ -22,6 +22,10 @@ from devrf.system.printed import shown
 # Read at import: the entry point sets the variable, so that Hydra raises its errors.
 FULL_ERRORS = os.environ.get("HYDRA_FULL_ERROR", "0") != "0"
 
+# Packages of devrf's extras that are imported where they are used, and their extras.
+EXTRAS = dict.fromkeys(("fast_simplification", "pxr", "skimage", "trimesh"), "export")
+EXTRAS |= {"tensorboard": "tensorboard", "viser": "viewer"}
+
 
 @contextmanager
 def report_user_errors() -> Iterator[None]:
@@ -40,9 +44,12 @@ def report_user_errors() -> Iterator[None]:
 
 
 def is_user_error(error: BaseException) -> bool:
-    """Whether the user can correct it: input, config, or a disk that refuses."""
-    if isinstance(_cause(error), DevrfError):
+    """Whether the user can correct it: input, config, a missing extra, or a disk that refuses."""
+    cause = _cause(error)
+    if isinstance(cause, DevrfError):
         return True
+    if isinstance(cause, ModuleNotFoundError):
+        return cause.name in EXTRAS
     if isinstance(error, OSError) and not isinstance(error, HydraException):
         return error.errno in REFUSED
     # Another error in a constructor of devrf is a fault of the program.
@@ -73,6 +80,9 @@ def one_line(error: BaseException) -> str:
     text = str(cause)
     if isinstance(cause, DevrfError):
         pass
+    elif isinstance(cause, ModuleNotFoundError) and cause.name in EXTRAS:
+        extra = EXTRAS[cause.name]
+        text = f'{cause.name} is not installed; run pip install "devrf[{extra}]"'
     elif isinstance(error, MissingConfigException) and "/" in str(error.missing_cfg_file):
         group, _, option = str(error.missing_cfg_file).rpartition("/")
         of_hydra = group.startswith("hydra/")

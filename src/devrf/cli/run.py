@@ -8,6 +8,7 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
@@ -26,7 +27,7 @@ from devrf.cli.config import (
     set_at,
     stage_section,
 )
-from devrf.cli.config_check import check_config, check_extras
+from devrf.cli.config_check import check_config
 from devrf.cli.context import RunContext
 from devrf.cli.evaluate import evaluate
 from devrf.cli.memory import forecast
@@ -112,7 +113,6 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
         config.output_dir = str(folder)
         with importing():  # the parts that the config names
             check_config(config)
-            check_extras(config)
         runtime.choose(config.kernels, deterministic=config.deterministic)
         with RunContext(config, folder) as run:
             return _run_plan(run)
@@ -250,3 +250,5 @@ def _check(run: RunContext, learning: Names, steps: Names) -> None:
     viewer: ViewerSettings = instantiate(config.viewer)
     if run.is_rank_zero and ("view" in steps or (viewer.training and learning)):
         viewer.check_free()
+    if viewer.training and learning:
+        import_module("viser")  # an extra: without it nothing is begun

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
+from importlib import import_module
 from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol, cast, runtime_checkable
@@ -53,6 +54,7 @@ class TensorBoardTracker(TensorBoardLogger):
 
     def __init__(self, save_dir: str | Path, name: str = "tensorboard") -> None:
         """Choose a folder in the run's; the first file is written when something is logged."""
+        import_module("tensorboard")  # or Lightning would ask for another package, too
         super().__init__(save_dir=save_dir, name=name, version="", default_hp_metric=False)
 
     def log_hyperparams(self, params: dict[str, Any], *args: Any, **kwargs: Any) -> None:  # type: ignore[override]
