@@ -238,8 +238,9 @@ def test_a_stage_whose_log_nobody_reads_goes_on(warm, tmp_path, tiny_data):
 def test_names_with_other_letters_where_the_locale_has_but_ascii(
     python, tmp_path, tiny_data, monkeypatch
 ):
-    for name, value in (("LC_ALL", "C"), ("PYTHONUTF8", "0"), ("PYTHONCOERCECLOCALE", "0")):
-        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("LC_ALL", "C")
+    for name in ("PYTHONUTF8", "PYTHONCOERCECLOCALE"):
+        monkeypatch.delenv(name, raising=False)
     typed = *tiny_data, "stage=prepare", "prepare.into=szöne", "hydra.run.dir=läufe"
     done = python(tmp_path, "-m", "devrf", *typed)
     assert (done.status, done.err) == (0, "")

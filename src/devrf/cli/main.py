@@ -38,7 +38,6 @@ from devrf.system.process import (
     importing,
     quiet_if_unread,
     tune_for_cpu,
-    use_utf8,
 )
 
 log = logging.getLogger(__name__)
@@ -55,7 +54,6 @@ def entry() -> None:
     their names and status 3. A signal ends it with one line and 128 plus its number: 130 for
     Ctrl-C, 143 for SIGTERM, 141 for output that nobody reads.
     """
-    use_utf8()
     # Hydra would print a traceback of its own and exit with 1 if it were not told to raise.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     if "--version" in sys.argv:  # Hydra would print its own

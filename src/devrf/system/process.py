@@ -105,17 +105,6 @@ def _check_torchvision() -> None:
         ) from None
 
 
-def use_utf8() -> None:
-    """Begin the program again in Python's UTF-8 mode, where file names may only be ASCII.
-
-    Under such a locale Python chooses that mode itself, unless it is told not to. Names with other
-    letters could neither be typed nor written to files.
-    """
-    if sys.getfilesystemencoding() == "ascii" and os.environ.get("PYTHONUTF8") != "1":
-        os.environ["PYTHONUTF8"] = "1"  # for processes that this one starts, too
-        os.execv(sys.executable, [sys.executable, "-X", "utf8", *sys.orig_argv[1:]])
-
-
 @contextmanager
 def quiet_if_unread() -> Iterator[None]:
     """When nobody reads the output any more (``| head -1``), end as SIGPIPE ends a program.
