@@ -164,6 +164,18 @@ def test_the_deformation_stage_goes_on_exactly(learn, rest, each, leaves):
     assert_same(learn(build, *leaves), learn(build))
 
 
+def test_a_fit_that_ended_by_its_steps_goes_on_exactly(learn, rest, datamodule, trainer, tmp_path):
+    build, path = deformation(rest, MOVING, ROUNDED), tmp_path / "left.ckpt"
+    begin_at(3)
+    first, second = trainer(max_steps=5), trainer(max_epochs=1)
+    first.fit(build(), datamodule=datamodule)
+    first.save_checkpoint(path)  # mid-visit, after the frame was let go
+    begin_at(99)
+    stage = build()
+    second.fit(stage, datamodule=datamodule, ckpt_path=str(path))
+    assert_same(everything(stage), learn(build))
+
+
 def test_frames_that_are_left_early_go_on_exactly(learn, rest):
     # A visit ends after three steps, as their losses tell.
     early = replace(ROUNDED, min_rel_improvement=1.0)

@@ -123,6 +123,8 @@ class DeformationStage(Stage):
         )
         # Of the Lightning steps of the present visit.
         self._losses: list[float] = []
+        # The phase's state where a fit ended before the schedule.
+        self._left: dict[str, Any] = {}
 
     def iterate(self, views: Views) -> Terms:
         """Learn the present frame from one batch (docs/method.md#deformation-stage)."""
@@ -204,6 +206,7 @@ class DeformationStage(Stage):
         if self.scene.dynamic.train.by_moving_camera and self.deformation_loss.leave_out("flow"):
             log.info("the camera moves, and so does all that it sees: the flow loss is left out")
         self.phase = None  # no frame is active
+        self._left = {}
         self.context = DeformationContext(
             model=self.scene_model,
             datamodule=self.datamodule,
@@ -357,15 +360,17 @@ class DeformationStage(Stage):
         return self.scene_model
 
     def on_train_end(self) -> None:
-        """Write the last frame back."""
+        """Write the last frame back; a file that is written later still holds the way on."""
         self._write_back()
+        if not self.is_complete:
+            self._left = self.phase_state()
         self.context.active = None
         super().on_train_end()
 
     def phase_state(self) -> dict[str, Any]:
         """The state of the active frame, and its losses so far; nothing once all is learned."""
         if self.active is None:
-            return {}
+            return self._left
         exact = self.visit.stored_half(self.device)
         views = self.context.views
         return {"frame": self.active.state(views, exact=exact), "losses": [*self._losses]}
