@@ -26,7 +26,6 @@ def on_the_left(points: Tensor, time: Tensor) -> Tensor:
 
 def looked(steps: int, opacity_at: object, cube: Box) -> LearnedOccupancy:
     """5 × 3 × 3 cells (x = −1, −½, 0, ½, 1), looked at through ``steps`` iterations."""
-    torch.manual_seed(0)
     cells = LearnedOccupancy((5, 3, 3))
     for step in range(steps):
         cells.follow(step, steps, 0.0, cube, opacity_at)  # type: ignore[arg-type]
@@ -38,6 +37,17 @@ def test_cells_are_occupied_where_the_field_is(cube: Box) -> None:
     torch.testing.assert_close(cells.opacity[:2], torch.full((2, 3, 3), 0.5))
     assert (cells.opacity[3:] == 0).all()
     assert looked(0, on_the_left, cube).occupied(torch.arange(45)).all()  # type: ignore[union-attr]
+
+
+def test_all_processes_look_at_the_same_places_and_times(cube: Box) -> None:
+    def anywhere(points: Tensor, time: Tensor) -> Tensor:
+        return (points.sum(dim=1) + time).sin().abs()
+
+    # Each has drawn other numbers, and other numbers of them.
+    torch.manual_seed(1)
+    first = looked(3 * EVERY, anywhere, cube)
+    torch.manual_seed(2)
+    assert torch.equal(looked(3 * EVERY, anywhere, cube).opacity, first.opacity)
 
 
 def test_nothing_is_left_out_before_the_start(cube: Box) -> None:

@@ -87,24 +87,29 @@ class LearnedOccupancy(StoredShape):
         if step < start or step // EVERY == previous // EVERY:
             return
         flat = self.opacity.view(-1)
+        # Of its own: processes draw differently from the global one, and have to agree here.
+        generator = torch.Generator(flat.device).manual_seed(step)
         if previous // EVERY * EVERY < start:
             flat.zero_()
             looks = [torch.arange(len(flat), device=flat.device)] * FIRST
         else:
-            looks = [(torch.rand(len(flat), device=flat.device) < SHARE).nonzero()[:, 0]]
+            chosen = torch.rand(len(flat), device=flat.device, generator=generator) < SHARE
+            looks = [chosen.nonzero()[:, 0]]
         for cells in looks:
             for part in torch.split(cells, CHUNK):
-                points = self._points(part, box)
+                points = self._points(part, box, generator)
+                time = torch.rand(len(part), device=flat.device, generator=generator)
                 # A field that has diverged leaves nothing out.
-                opacity = opacity_at(points, torch.rand_like(points[:, 0])).nan_to_num(nan=1.0)
+                opacity = opacity_at(points, time).nan_to_num(nan=1.0)
                 flat[part] = torch.maximum(DECAY * flat[part], opacity)
 
-    def _points(self, cells: Tensor, box: Box) -> Tensor:
+    def _points(self, cells: Tensor, box: Box, generator: torch.Generator) -> Tensor:
         """A random point (S, 3) nearest to each of the grid points of numbers (S,)."""
         index = torch.stack(torch.unravel_index(cells, self.opacity.shape), dim=1)
         low, high = box.corners(self.opacity)
         last = torch.tensor(self.opacity.shape, device=cells.device) - 1
-        jittered = index + torch.rand(len(cells), 3, device=cells.device) - 0.5
+        random = torch.rand(len(cells), 3, device=cells.device, generator=generator)
+        jittered = index + random - 0.5
         return box.nearest(low + jittered / last * (high - low))
 
 
