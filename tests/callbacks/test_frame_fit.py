@@ -31,9 +31,11 @@ class Visiting(Stage):
 Visiting.__abstractmethods__ = frozenset()
 
 
-def visit(fit: FrameFit, stage: Stage, start: int, frame: int | None, *errors: float) -> None:
-    """Steps of these errors in the visit of ``frame`` that begins at ``start``."""
-    stage.__dict__["phase"] = Phase(kind="", start=start, stop=start + 10, frame=frame)
+def visit(
+    fit: FrameFit, stage: Stage, level: int, frame: int | None, *errors: float, stop: int = 10
+) -> None:
+    """Steps of these errors in the visit of ``frame`` at a level."""
+    stage.__dict__["phase"] = Phase(kind=f"level {level}", start=0, stop=stop, frame=frame)
     for error in errors:
         fit.on_train_batch_end(TRAINER, stage, {"render": torch.tensor(error)}, None, 0)
 
@@ -42,11 +44,11 @@ def test_a_frame_is_measured_by_the_mean_error_of_its_last_visit(caplog):
     fit, stage = FrameFit(), Visiting()
     fit.setup(TRAINER, stage, "fit")
     fit.on_train_start(TRAINER, stage)
-    visit(fit, stage, 0, 1, 0.1, 0.1)
-    visit(fit, stage, 10, 2, 0.5)
-    visit(fit, stage, 20, 1, 0.003, 0.001)  # backwards would do as well
-    visit(fit, stage, 30, 2, 1e-3)
-    visit(fit, stage, 40, 3, 0.01)
+    visit(fit, stage, 1, 1, 0.1, 0.1)
+    visit(fit, stage, 1, 2, 0.5)
+    visit(fit, stage, 2, 1, 0.003, 0.001)  # backwards would do as well
+    visit(fit, stage, 2, 2, 1e-3)
+    visit(fit, stage, 2, 3, 0.01)
     assert fit.psnr == {1: pytest.approx(26.9897), 2: pytest.approx(30), 3: pytest.approx(20)}
     with caplog.at_level(logging.WARNING):
         fit.on_train_end(TRAINER, stage)
@@ -62,24 +64,31 @@ def test_a_frame_is_measured_by_the_mean_error_of_its_last_visit(caplog):
 def test_a_visit_that_was_interrupted_goes_on():
     whole, stage = FrameFit(), Visiting()
     whole.on_train_start(TRAINER, stage)
-    visit(whole, stage, 0, 1, 0.1)
-    visit(whole, stage, 10, 1, 0.02, 0.01)
+    visit(whole, stage, 1, 1, 0.1)
+    visit(whole, stage, 2, 1, 0.02, 0.01)
 
     first, second = FrameFit(), FrameFit()
     stage = Visiting()
     first.on_train_start(TRAINER, stage)
-    visit(first, stage, 0, 1, 0.1)
-    visit(first, stage, 10, 1, 0.02)
+    visit(first, stage, 1, 1, 0.1)
+    visit(first, stage, 2, 1, 0.02)
     second.setup(TRAINER, stage, "fit")
     second.load_state_dict(first.state_dict())
     second.on_train_start(TRAINER, stage)  # the phase was restored
-    visit(second, stage, 10, 1, 0.01)
+    visit(second, stage, 2, 1, 0.01)
     assert second.psnr == pytest.approx(whole.psnr) == {1: pytest.approx(18.2391)}
+
+
+def test_a_visit_that_a_budget_cuts_short_keeps_what_it_had():
+    fit, stage = FrameFit(), Visiting()
+    visit(fit, stage, 1, 1, 0.02)
+    visit(fit, stage, 1, 1, 0.01, stop=7)
+    assert fit.psnr == {1: pytest.approx(18.2391)}
 
 
 def test_times_that_are_learned_at_once_have_no_figures():
     fit, stage = FrameFit(), Visiting()
-    visit(fit, stage, 0, None, 0.1)
+    visit(fit, stage, 1, None, 0.1)
     fit.on_train_end(TRAINER, stage)
     assert fit.psnr == {} and stage.provenance.record == {"seconds": 1.0}
 

@@ -13,7 +13,6 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 from torch import Tensor
 
-from devrf.engine.schedule import Phase
 from devrf.engine.stage import Stage
 
 log = logging.getLogger(__name__)
@@ -34,7 +33,8 @@ class FrameFit(Callback):
         self._forget()
 
     def _forget(self) -> None:
-        self._visit: Phase | None = None
+        # Kind of the phase, and frame: a budget changes the iterations of a visit on its way.
+        self._visit: tuple[str, int | None] | None = None
         # Of each frame's last visit so far: the sum () of its steps' errors, and their number.
         self._errors: dict[int, tuple[Tensor, int]] = {}
 
@@ -56,7 +56,8 @@ class FrameFit(Callback):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Go on with the visit that was interrupted, if one was."""
         assert isinstance(pl_module, Stage)
-        self._visit = pl_module.phase
+        phase = pl_module.phase
+        self._visit = None if phase is None else (phase.kind, phase.frame)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -67,8 +68,8 @@ class FrameFit(Callback):
         error = (outputs or {}).get("render")
         if phase is None or phase.frame is None or error is None:
             return
-        if phase != self._visit:
-            self._visit = phase
+        if (phase.kind, phase.frame) != self._visit:
+            self._visit = (phase.kind, phase.frame)
             self._errors.pop(phase.frame, None)
         total, steps = self._errors.get(phase.frame, (torch.zeros_like(error), 0))
         self._errors[phase.frame] = (total.to(error.device) + error.detach(), steps + 1)
