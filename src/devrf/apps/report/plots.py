@@ -1,4 +1,4 @@
-"""Plots of finished runs, and of a stage while it learns."""
+"""Plots of finished runs."""
 
 from __future__ import annotations
 
