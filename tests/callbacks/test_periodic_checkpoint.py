@@ -7,6 +7,7 @@ import os
 import signal
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -66,6 +67,18 @@ def test_a_full_disk_does_not_end_the_training(learn, tmp_path, monkeypatch, cap
     assert said.startswith(f"{tmp_path}/canonical-progress-4.ckpt: No space left on device; ")
     assert "the last good progress file stays (iteration 3)" in said
     assert names(tmp_path) == ["canonical-progress-10.ckpt", "canonical-progress-11.ckpt"]
+
+
+def test_every_process_knows_the_file_that_the_first_has_written(canonical, tmp_path):
+    said = SimpleNamespace(broadcast=lambda saved: 7)  # the last that was not lost to a full disk
+    trainer: Any = SimpleNamespace(
+        is_global_zero=False, callbacks=[], fast_dev_run=False, strategy=said
+    )
+    saving, stage = PeriodicCheckpoint(tmp_path), canonical()
+    stage.position.iteration = 9
+    saving.on_train_end(trainer, stage)
+    assert saving.saved == 7
+    assert "the last is of 7" in saving.left_at(stage)
 
 
 def test_senseless_times_are_refused(tmp_path):

@@ -128,11 +128,13 @@ class PeriodicCheckpoint(Callback):
         for guard in callbacks:
             if isinstance(guard, DivergenceGuard):
                 guard.check(stage)  # rolls back first: a diverged state is never written
-        if not trainer.is_global_zero:
-            self.saved = stage.position.iteration  # by rank 0
-            return
         if trainer.fast_dev_run:  # type: ignore[attr-defined]
             return
+        if trainer.is_global_zero:
+            self._write_file(trainer, stage)
+        self.saved = trainer.strategy.broadcast(self.saved)
+
+    def _write_file(self, trainer: Trainer, stage: Stage) -> None:
         began = time.monotonic()
         path = progress_file(self.folder, stage.name, stage.position.iteration)
         try:
