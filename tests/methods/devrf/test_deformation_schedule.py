@@ -198,7 +198,7 @@ def test_rows_of_a_config_are_levels_in_the_order_of_their_numbers():
     }
     schedule = DeformationSchedule.from_rows(rows, rays=64)
     assert schedule == DeformationSchedule([Level(4, 6), Level(6, 4)], rays=64)
-    for wrong in ({"1": None}, {"2": {"side": 6}}):
+    for wrong in ({"1": None}, {"2": {"side": 6}}, {"2": 5}):
         with pytest.raises(DevrfError, match="expected rows 1 to"):
             DeformationSchedule.from_rows({**rows, **wrong})
 

@@ -126,8 +126,8 @@ class DeformationSchedule(Options):
         rows: dict[str, Any] = {str(name): row for name, row in levels.items() if row is not None}
         numbered = []
         for number in range(1, len(rows) + 1):
-            row = rows.get(str(number), {})
-            if not {"side", "iterations"} <= set(row):
+            row = rows.get(str(number))
+            if not isinstance(row, Mapping) or not {"side", "iterations"} <= set(row):
                 raise DevrfError(
                     f"schedule.deformation.levels: expected rows 1 to {len(rows)} with side and "
                     f"iterations, which row {number} has not; there are {', '.join(sorted(rows))}"
