@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
@@ -18,16 +18,14 @@ from devrf.engine.needs import tensor_bytes
 from devrf.engine.protocol import ProtocolStage
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
-from devrf.geometry.clock import FrameClock
 from devrf.geometry.motion import moving
-from devrf.geometry.space import WORLD, space_config, space_from
 from devrf.kernels.ahead import splatting_kernels
 from devrf.kernels.splatting import splat
 from devrf.methods.base import ImageTrainable
 from devrf.methods.gaussians.cloud import Cloud, first_points
 from devrf.methods.gaussians.settings import GaussiansSettings
 from devrf.methods.nerf.networks import SinusoidalEncoding, Trunk
-from devrf.methods.nerf.placement import Placement
+from devrf.methods.nerf.placed_model import PlacedModel
 from devrf.metrics.image import ssim_map
 from devrf.ops.compositing import LEAST_MASS
 from devrf.ops.spherical_harmonics import spherical_harmonics
@@ -36,7 +34,6 @@ from devrf.rendering.output import RenderedImage, RenderOutput
 from devrf.rendering.renderable import Renderable
 from devrf.scenes.scene import Scene
 from devrf.system.options import Positive
-from devrf.system.plain_data import validate
 
 # Normalised places are at most this: in NDC those that come to lie before the near plane would be
 # infinite.
@@ -45,16 +42,14 @@ OUTERMOST = 8.0
 STILL = 1e-3
 
 
-class DeformableGaussians(ImageTrainable):
+class DeformableGaussians(PlacedModel[ImageBatch], ImageTrainable):
     """Gaussians at rest, of which a network tells how each has moved at a time.
 
     See docs/methods/gaussians.md.
 
     Attributes:
         cloud: the Gaussians at rest, in world units whatever the fields' space is.
-        placement: what held them at first, in the fields' space; the network is told places in its
-            normalised space.
-        box, space: the placement's.
+        placement: of what held them at first; the network is told places in its normalised space.
         near: the least depth of a Gaussian's mean in a picture, world units.
         extent: the unit of lengths in the settings, world units.
         focal: the longest focal length in pixels that was learned from.
@@ -67,11 +62,19 @@ class DeformableGaussians(ImageTrainable):
     losses: ClassVar[tuple[str, ...]] = ("l1", "ssim")
     random_background: ClassVar[bool] = True
     unbuilt: ClassVar[tuple[str, ...]] = ("start_points", "max_points")
+    settings_class = GaussiansSettings
+    checkpointed_attributes: ClassVar[Mapping[str, Any]] = {
+        "near": Positive,
+        "extent": Positive,
+        "focal": Positive,
+        "moves_at_rest": bool,
+    }
+    settings: GaussiansSettings
 
     def __init__(self, settings: GaussiansSettings | None = None) -> None:
         """Build the network, and a cloud of one; of published sizes if no settings are given."""
-        super().__init__()
-        self.settings = s = settings or GaussiansSettings()
+        s = settings or GaussiansSettings()
+        super().__init__(s)
         self.cloud = Cloud(s.harmonics)
         self.encode = SinusoidalEncoding(3, s.bands, first=math.pi)
         self.encode_time = SinusoidalEncoding(1, s.time_bands, first=math.pi)
@@ -80,74 +83,25 @@ class DeformableGaussians(ImageTrainable):
         self.last = nn.Linear(s.width, 10)
         nn.init.normal_(self.last.weight, std=STILL)
         nn.init.zeros_(self.last.bias)
-        unit = Placement(Box((-1.0,) * 3, (1.0,) * 3), WORLD)
-        self._place(unit, (0.1, 1.0), near=0.1, times=(0.0, 1.0), extent=1.0, focal=1.0)
-
-    def _place(
-        self,
-        placement: Placement,
-        limits: tuple[float, float],
-        *,
-        near: float,
-        times: Sequence[float],
-        extent: float,
-        focal: float,
-    ) -> None:
-        self.placement, self.clock = placement, FrameClock(tuple(times))
-        self.box, self.space = placement.box, placement.space
-        self.depth_limits, self.near = limits, near
-        self.extent, self.focal = extent, focal
-        self.degree = self.settings.harmonics
+        self.near, self.extent, self.focal = 0.1, 1.0, 1.0
+        self.degree = s.harmonics
         self.moves_now = True
         self.moves_at_rest = False
+        self.place()
 
     def setup(self, scene: Scene) -> None:
         """Take bounds and times; begin the cloud."""
-        placement = Placement(scene.bounds.whole, scene.space)
+        bounds = scene.bounds
+        self.set_place(bounds.whole, scene.space, (bounds.near, bounds.far))
+        self.set_times(scene.clock.times)
         at_rest = scene.static.train.cameras.positions
         extent = 1.1 * float((at_rest - at_rest.mean(dim=0)).norm(dim=1).max())
         captures = [capture.train.cameras for capture in scene.captures.values()]
         everyone = torch.cat([cameras.positions for cameras in captures])
-        self._place(
-            placement,
-            (scene.bounds.near, scene.bounds.far),
-            near=placement.near(scene.bounds.near, everyone),
-            times=scene.clock.times,
-            extent=max(extent, placement.unit),
-            focal=max(float(cameras.focal.max()) for cameras in captures),
-        )
+        self.near = self.placement.near(bounds.near, everyone)
+        self.extent = max(extent, self.placement.unit)
+        self.focal = max(float(cameras.focal.max()) for cameras in captures)
         self.cloud.begin(*first_points(scene, self.settings), self.settings.start_opacity)
-
-    def config(self) -> dict[str, Any]:
-        """Settings, place and times, and the units of lengths."""
-        return {
-            "settings": asdict(self.settings),
-            "box": [list(self.box.low), list(self.box.high)],
-            "space": space_config(self.space),
-            "limits": list(self.depth_limits),
-            "near": self.near,
-            "times": list(self.clock.times),
-            "extent": self.extent,
-            "focal": self.focal,
-            "moves_at_rest": self.moves_at_rest,
-        }
-
-    @classmethod
-    def from_config(cls, config: Mapping[str, Any]) -> DeformableGaussians:
-        """A network of the same size in the same place, and a cloud of one."""
-        model = cls(validate(GaussiansSettings, config["settings"]))
-        low, high = config["box"]
-        box = validate(Box, {"low": low, "high": high})
-        model._place(
-            Placement(box, space_from(validate(dict[str, Any], config["space"]))),
-            validate(tuple[float, float], config["limits"]),
-            near=validate(Positive, config["near"]),
-            times=validate(FrameClock, config).times,
-            extent=validate(float, config["extent"]),
-            focal=validate(float, config["focal"]),
-        )
-        model.moves_at_rest = validate(bool, config["moves_at_rest"])
-        return model
 
     def moved(self, time: float) -> tuple[Tensor, Tensor, Tensor] | None:
         """δ of means (N, 3), quaternions (N, 4) and logarithms of scales (N, 3); None at rest.
@@ -279,10 +233,6 @@ class DeformableGaussians(ImageTrainable):
         self.moves_now = step >= s.still * total
         if s.harmonics_every:
             self.degree = min(s.harmonics, int(step / (s.harmonics_every * total)))
-
-    def rehearsed(self, factor: float) -> DeformableGaussians:
-        """A small cloud and a small network."""
-        return type(self)(self.settings.rehearsed(factor))
 
     @property
     def most_bytes(self) -> int:

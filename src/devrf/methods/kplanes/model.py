@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
-from typing import ClassVar, cast
+from typing import Any, ClassVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -21,6 +21,7 @@ from devrf.methods.nerf.samples import limits
 from devrf.ops.compositing import composite
 from devrf.ops.photometric import distortion
 from devrf.rendering.output import RenderOutput
+from devrf.system.options import Share
 
 # Proposals learn in the first iterations, then ever less often, in the end in one of so many.
 FIRST = 10
@@ -45,7 +46,7 @@ class KPlanes(DensityColorField):
     random_background: ClassVar[bool] = True
     keeps_batches: ClassVar[bool] = True  # large steps need whole ones
     settings_class = KPlanesSettings
-    checkpointed_attributes: ClassVar[tuple[str, ...]] = ("sharpness",)
+    checkpointed_attributes: ClassVar[Mapping[str, Any]] = {"sharpness": Share}
     settings: KPlanesSettings
 
     def __init__(self, settings: KPlanesSettings | None = None) -> None:

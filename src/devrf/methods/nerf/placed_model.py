@@ -1,4 +1,4 @@
-"""The peers' common base: networks placed in a scene, whose empty space rays skip."""
+"""The peers' common base: methods placed in a scene, and networks whose empty space rays skip."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Generic, Self
 
 import torch
 from torch import Tensor
@@ -16,7 +16,7 @@ from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import WORLD, Space, space_config, space_from
-from devrf.methods.base import RayTrainable
+from devrf.methods.base import Batch, RayTrainable, Trainable
 from devrf.methods.nerf.occupancy import OccupancyFrames
 from devrf.methods.nerf.placement import Placement
 from devrf.methods.nerf.samples import RaySamples, accumulated
@@ -34,26 +34,24 @@ ON_GPU = 2**14
 SURFACE_SIDE = 128
 
 
-class PlacedModel(RayTrainable):
+class PlacedModel(Trainable[Batch], Generic[Batch]):
     """A method with settings, placed in a box of the scene, whose frames it knows.
 
     Attributes:
         settings_class: the class of :attr:`settings`: sizes and sampling.
-        checkpointed_attributes: the names of further attributes that a checkpoint holds.
+        checkpointed_attributes: further attributes that a checkpoint holds, with their types.
         placement: the maps from the fields' space (world units, NDC or contracted) to normalised
             space, where the box's longest edge is 2, and back.
-        occupancy: an upper bound at each frame.
         clock: the frames' times.
     """
 
     settings_class: ClassVar[type[Any]]
-    checkpointed_attributes: ClassVar[tuple[str, ...]] = ()
+    checkpointed_attributes: ClassVar[Mapping[str, Any]] = {}
     settings: Any
 
     def __init__(self, settings: Any) -> None:
         super().__init__()
         self.settings = settings
-        self.occupancy = OccupancyFrames(1, (2, 2, 2))
 
     def place(self) -> None:
         """Build the parts that depend on the scene, for one at rest in a cube around the origin."""
@@ -75,11 +73,6 @@ class PlacedModel(RayTrainable):
         """The method with smaller settings."""
         return type(self)(self.settings.rehearsed(factor))
 
-    @property
-    def has_hull(self) -> bool:
-        """Whether the occupancy was carved from alpha masks."""
-        return self.occupancy.has_hull
-
     def config(self) -> dict[str, Any]:
         """Settings, and the scene's box, space, depth limits and times."""
         return {
@@ -93,19 +86,40 @@ class PlacedModel(RayTrainable):
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
-        """Networks of the same sizes in the same place."""
+        """Networks of the same sizes in the same place.
+
+        Raises:
+            ValueError | KeyError: a value is missing, or of another type.
+        """
         model = cls(validate(cls.settings_class, config["settings"]))
         low, high = config["box"]
         box = validate(Box, {"low": low, "high": high})
         depths = validate(tuple[float, float], config["limits"])
         model.set_place(box, space_from(config["space"]), depths)
         model.set_times(validate(FrameClock, config).times)
-        for name in cls.checkpointed_attributes:
-            setattr(model, name, config[name])
+        for name, kind in cls.checkpointed_attributes.items():
+            setattr(model, name, validate(kind, config[name]))
         return model
 
 
-class NeuralField(PlacedModel):
+class PlacedRays(PlacedModel[RayBatch], RayTrainable):
+    """One that renders rays.
+
+    Attributes:
+        occupancy: an upper bound at each frame.
+    """
+
+    def __init__(self, settings: Any) -> None:
+        super().__init__(settings)
+        self.occupancy = OccupancyFrames(1, (2, 2, 2))
+
+    @property
+    def has_hull(self) -> bool:
+        """Whether the occupancy was carved from alpha masks."""
+        return self.occupancy.has_hull
+
+
+class NeuralField(PlacedRays):
     """Networks that are evaluated point by point, in normalised space."""
 
     def setup(self, scene: Scene) -> None:
@@ -301,7 +315,7 @@ class RayView:
 
     def __init__(
         self,
-        model: PlacedModel,
+        model: PlacedRays,
         render_rays: Callable[[Rays, Tensor, Tensor], RenderOutput],
         time: float,
         *,

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
-from typing import ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import torch
 from pydantic.dataclasses import dataclass
@@ -116,7 +116,7 @@ class Nerfies(DeformableField):
     name: ClassVar[str] = "nerfies"
     losses: ClassVar[tuple[str, ...]] = ("render", "elastic")
     settings_class: ClassVar[type[FieldSettings]] = NerfiesSettings
-    checkpointed_attributes: ClassVar[tuple[str, ...]] = ("rest_is_canonical",)
+    checkpointed_attributes: ClassVar[Mapping[str, Any]] = {"rest_is_canonical": bool}
     settings: NerfiesSettings
 
     def __init__(self, settings: NerfiesSettings | None = None, ambient: int = 0) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from devrf.data.batch import RayBatch
 from devrf.geometry.rays import Rays
 from devrf.methods.nerf.occupancy import OccupancyFrames
-from devrf.methods.nerf.placed_model import PlacedModel, RayView
+from devrf.methods.nerf.placed_model import PlacedRays, RayView
 from devrf.methods.nerf.samples import accumulated
 from devrf.methods.neural_volumes.capture import check_scene, encoder_images
 from devrf.methods.neural_volumes.networks import (
@@ -37,7 +37,7 @@ from devrf.scenes.scene import Scene
 MOMENTS = 16
 
 
-class NeuralVolumes(PlacedModel):
+class NeuralVolumes(PlacedRays):
     """z from the images of a moment; a template and a warp from z, seen by adding up opacity."""
 
     name: ClassVar[str] = "neural_volumes"

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterable, Sequence
-from typing import ClassVar
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -49,7 +49,7 @@ class NSFF(NeuralField):
     protocols: ClassVar[tuple[str, ...]] = ("joint", "dynamic")
     priors: ClassVar[tuple[str, ...]] = ("forward_flow",)
     settings_class = NSFFSettings
-    checkpointed_attributes: ClassVar[tuple[str, ...]] = ("cut_out",)
+    checkpointed_attributes: ClassVar[Mapping[str, Any]] = {"cut_out": bool}
     settings: NSFFSettings
     times: Tensor
 
