@@ -36,7 +36,7 @@ from devrf.methods.devrf.deformation_schedule import PAPER_LEVELS, DeformationSc
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.extensions.tracks import StartAlongFlow
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.settings import Precision, Sampling, VisitSettings
+from devrf.methods.devrf.settings import Sampling, VisitSettings
 from devrf.rendering.renderer import Renderer
 
 log = logging.getLogger(__name__)
@@ -76,15 +76,13 @@ class SmallScene:
         self.learn(stage)
         return stage.result()
 
-    def stage(self, name: str, *, exact: bool = False) -> Stage:
-        """The canonical or the deformation stage; ``exact`` is what deterministic=true runs."""
-        precision: Precision = "auto" if exact else "float32"
+    def stage(self, name: str) -> Stage:
+        """The canonical or the deformation stage."""
         if name == "canonical":
             return CanonicalStage(
                 self.at_rest,
                 self.architecture,
                 sampling=self.sampling,
-                decoder_precision=precision,
                 iterations_per_step=5,
             )
         settings = VisitSettings(5e-3, unit="box", store="host")
@@ -92,7 +90,6 @@ class SmallScene:
             copy.deepcopy(self.canonical),
             self.deformation,
             settings,
-            decoder_precision=precision,
             iterations_per_step=5,
             flow_mean="rays",
             extensions={"tracks": StartAlongFlow("flow")},
@@ -105,7 +102,10 @@ class SmallScene:
         exact: bool = False,
         resumed_from: str | None = None,
     ) -> None:
-        """Learn all of ``stage``, from the same random state each time."""
+        """Learn all of ``stage``, from the same random state each time.
+
+        ``exact`` is what deterministic=true runs.
+        """
         seed_everything(self.seed, verbose=False)
         gpu = self.device.type == "cuda"
         trainer = Trainer(
@@ -189,7 +189,7 @@ def require_gpu(scene: SmallScene, reason: str) -> None:
 
 def resume(scene: SmallScene, name: str) -> str:
     """Whether a stage that SIGTERM stops goes on to equal bits with ``deterministic=true``."""
-    uninterrupted, first, second = (scene.stage(name, exact=True) for _ in range(3))
+    uninterrupted, first, second = (scene.stage(name) for _ in range(3))
     scene.learn(uninterrupted, exact=True)
 
     def interrupt(*_: Any) -> None:

@@ -46,7 +46,6 @@ outputs: outputs
 method: devrf
 facing: inward
 objective: dynamic.psnr
-decoder_precision: auto
 kernels: auto
 sizes: {{inner: {{_target_: {__name__}.Inner, size: 2}}}}
 loss: {{fine: {{render: 1.0}}}}

@@ -315,7 +315,7 @@ def test_a_fault_of_the_program_keeps_its_traceback(devrf, monkeypatch):
         ("experiment=quickstrat", "experiment=quickstart"),
         ("experiment=papr", "experiment=paper"),
         ("stage=evalute", "stage=evaluate"),
-        ("decoder_precision=flot32", "decoder_precision=float32"),
+        ("kernels=trch", "kernels=torch"),
         ("evaluation.metrics=[lpisp]", "lpips"),
     ],
 )
@@ -329,7 +329,7 @@ def test_the_closest_is_named(devrf, tmp_path, argument, meant):
 
 
 def test_nothing_is_guessed_from_afar(devrf):
-    outcome = devrf("decoder_precision=xyzzy")
+    outcome = devrf("kernels=xyzzy")
     assert outcome.status == 2 and "did you mean" not in outcome.err
 
 

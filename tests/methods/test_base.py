@@ -37,7 +37,7 @@ class Toy(RayTrainable):
             "deformation": self.deformation.parameters(),
         }
 
-    def at(self, time: float, *, half: bool = False) -> View:
+    def at(self, time: float) -> View:
         raise NotImplementedError
 
 

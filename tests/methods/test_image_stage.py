@@ -60,7 +60,7 @@ class Columns(StoredShape, ImageTrainable):
         self.rows = nn.Parameter(torch.cat([self.rows.detach(), torch.ones(1, 3)]))
         return {"rows": torch.tensor([0, 1, -1])}
 
-    def at(self, time: float, *, half: bool = False) -> Columns:
+    def at(self, time: float) -> Columns:
         return self
 
     at_rest = True

@@ -132,7 +132,7 @@ class Walls:
     def __init__(self, space=WORLD):
         self.space = space
 
-    def at(self, time, *, half=False):
+    def at(self, time):
         return self
 
     def render(self, rays, background):
@@ -150,7 +150,7 @@ class Frames:
     device = CPU
     at_rest = False
 
-    def at(self, time, *, half=False):
+    def at(self, time):
         return self
 
     def image(self, camera, background, crop):

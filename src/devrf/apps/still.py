@@ -40,7 +40,6 @@ class StillSettings(Options):
     view: Literal["held_out"] | int = "held_out"
     time: Share = 0.5
     height: Annotated[int, Ge(1), Le(MAX_ROWS)] | None = None
-    half: bool = True
 
     def name(self, moves: bool) -> str:
         """The name of the image's file, without its suffix: ``still_held_out_t0.5_h800``.

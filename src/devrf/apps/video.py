@@ -48,7 +48,6 @@ class VideoSettings(Options):
     orbit_elevation: Annotated[float, Ge(-90), Le(90)] | None = None
     height: Annotated[int, Ge(MIN_HEIGHT), Le(MAX_ROWS)] | None = None
     max_seconds: Positive | None = None
-    half: bool = True
     path: str | None = None
     time: Share = 0.5
     motion_masks: bool = False

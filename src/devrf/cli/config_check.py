@@ -50,7 +50,6 @@ ROOT: dict[str, Any] = {
     "objective": str,
     "scene": str | None,
     "outputs": str | Path,
-    "decoder_precision": Literal["auto", "float32", "bfloat16"],
     "kernels": Literal["auto", "torch"],
 }
 # A part that cannot be loaded ends the command with one line; Hydra would log it before.

@@ -63,7 +63,7 @@ def render(run: RunContext) -> bool:
     without = "held_out.mp4, which shows its images, is left out"
     if settings.path is None and (scene := _with_images(run, without)) is not None:
         held_out = (scene.dynamic if scene.moves else scene.static).test
-    renderer = Renderer(model, half=settings.half)
+    renderer = Renderer(model)
     for video in videos(renderer, viewpoints, settings, held_out):
         write_video(run, video)
     return settings.path is not None or held_out is not None
@@ -109,7 +109,7 @@ def still(run: RunContext) -> None:
     model, viewpoints = _learned(run)
     camera = settings.camera(viewpoints)
     behind = background_value(viewpoints.background)
-    renderer = Renderer(model, half=settings.half)
+    renderer = Renderer(model)
     color, depth = rendered(renderer, camera, settings.time, behind)
     write_still(run.folder / "images" / f"{settings.name(model.moves)}.png", color, depth)
 

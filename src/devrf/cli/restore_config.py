@@ -48,7 +48,7 @@ PLACES = {"data.flow_cache", "evaluation.download"}
 # Of another method's run these are taken over.
 OF_A_SCENE = {"data", "facing", "seed"}
 # Keys without a section.
-ALONE = {"seed", "priors", "deterministic", "decoder_precision", "rehearse"}
+ALONE = {"seed", "priors", "deterministic", "rehearse"}
 # Groups whose options may sweep.
 SWEEPERS = ("experiment", "hparams_search", "hydra/sweeper")
 # An option's name leads to no other folder than its group's; a key is a path of plain names.

@@ -274,7 +274,7 @@ class Stage(LightningModule, ABC):
         if self.trainer.precision != "32-true":
             raise DevrfError(
                 f"trainer.precision: expected 32-true, not {self.trainer.precision}: positions "
-                "need all their digits; decoder_precision=bfloat16 takes fewer for colours alone"
+                "need all their digits"
             )
         check_strategy(self.trainer)
         if getattr(self.trainer, "datamodule", None) is None:

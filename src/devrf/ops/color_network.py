@@ -48,7 +48,6 @@ def decode(
     viewdirs: Tensor,
     ray: Tensor,
     network: ColorNetwork,
-    precision: torch.dtype = torch.float32,
     residual: Tensor | None = None,
 ) -> Tensor:
     """RGB (S, 3) in [0, 1] of samples.
@@ -58,8 +57,6 @@ def decode(
         viewdirs: (R, 3) unit directions of the rays, in world space.
         ray: (S,) int64, ascending, the ray of each sample.
         network: the network.
-        precision: type of the hidden layers and their gradients. Weights, sums and the last layer,
-            and so colours, stay in single precision.
         residual: (S, 3) added before the sigmoid; None: nothing.
     """
     # The directions' part of the first layer is the same for all samples of a ray.
@@ -71,14 +68,11 @@ def decode(
     encoded = _encode(viewdirs, network.octaves)
     along = linear(encoded, network.direction_weight, network.feature_bias)
     if torch.is_grad_enabled() or not features.is_cpu or len(ray) <= TILE:
-        return _color(features, along.index_select(0, row), network, precision, residual)
+        return _color(features, along.index_select(0, row), network, residual)
     added = repeat(None) if residual is None else torch.split(residual, TILE)
     tiles = zip(torch.split(features, TILE), torch.split(row, TILE), added, strict=False)
     return torch.cat(
-        [
-            _color(tile, along.index_select(0, at), network, precision, further)
-            for tile, at, further in tiles
-        ]
+        [_color(tile, along.index_select(0, at), network, further) for tile, at, further in tiles]
     )
 
 
@@ -86,15 +80,11 @@ def _color(
     features: Tensor,
     along: Tensor,
     network: ColorNetwork,
-    precision: torch.dtype,
     residual: Tensor | None,
 ) -> Tensor:
     """RGB (S, 3) of features (S, C) and directions' part of the first layer (S, H), overwritten."""
-    if precision != torch.float32:
-        along = along.to(precision)
-    weight = network.feature_weight.to(along.dtype)
     # In place: no gradient needs a layer's output before its activation.
-    x = along.addmm_(features.to(along.dtype), weight.t()).relu_()
+    x = along.addmm_(features, network.feature_weight.t()).relu_()
     logits = _logits(x, network)
     if residual is not None:
         logits += residual
@@ -108,13 +98,12 @@ def _logits(x: Tensor, network: ColorNetwork) -> Tensor:
     compile anew, in 0.2 ms, for any other number of samples.
     """
     weight, bias = network.output_weight, network.output_bias
-    tile = len(x) == TILE and x.is_cpu and x.dtype == weight.dtype == torch.float32
+    tile = len(x) == TILE and x.is_cpu and weight.dtype == torch.float32
     if tile and LAYER is not None and not torch.is_grad_enabled():
         hidden = LAYER(x, network.hidden_weight, network.hidden_bias, "relu", [], "")
         logits: Tensor = LAYER(hidden, weight, bias, "none", [], "")
         return logits
-    x = linear(x, network.hidden_weight.to(x.dtype), network.hidden_bias.to(x.dtype)).relu_()
-    return linear(x.to(weight.dtype), weight, bias)
+    return linear(linear(x, network.hidden_weight, network.hidden_bias).relu_(), weight, bias)
 
 
 def _encode(viewdirs: Tensor, octaves: Tensor) -> Tensor:

@@ -50,13 +50,8 @@ class Renderable(StoredClass, nn.Module, ABC):
         return cls(**config)
 
     @abstractmethod
-    def at(self, time: float, *, half: bool = False) -> View | ImageView:
-        """The scene at ``time`` in [0, 1], ready to be looked at from anywhere.
-
-        Args:
-            time: in [0, 1].
-            half: let networks work in half precision where device and method can.
-        """
+    def at(self, time: float) -> View | ImageView:
+        """The scene at ``time`` in [0, 1], ready to be looked at from anywhere."""
 
     def surface(self) -> SurfaceField | None:
         """The scene at rest as a field of which a surface can be taken; None: there is none.

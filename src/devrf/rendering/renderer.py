@@ -42,14 +42,14 @@ class Renderer:
         at: time in [0, 1] → the view of that time (:mod:`devrf.rendering.view`), cached.
     """
 
-    def __init__(self, model: Renderable, *, times: int = 4, half: bool = False) -> None:
+    def __init__(self, model: Renderable, *, times: int = 4) -> None:
         """Prepare to render a scene, which is not to be moved to another device afterwards.
 
-        ``times`` are cached; ``half`` runs networks in half precision, on a CUDA device only.
+        So many ``times`` are cached.
         """
         self.model = model
         self.device = model.device
-        self.at = lru_cache(maxsize=times)(partial(model.at, half=half))
+        self.at = lru_cache(maxsize=times)(model.at)
 
     @torch.no_grad()
     def picture(

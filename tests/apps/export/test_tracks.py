@@ -122,7 +122,7 @@ class Exact(Renderable):
     def config(self):
         return {}
 
-    def at(self, time, *, half=False):
+    def at(self, time):
         def image(camera, background, crop):
             pixels, depth = self.filming.pictures(camera, time)
             met = depth.isfinite().float().flatten()

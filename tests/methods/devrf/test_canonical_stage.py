@@ -15,7 +15,6 @@ from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.canonical_field import ColorDecoder
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.free_space import possibly_occupied, view_count, view_count_weight
@@ -60,22 +59,6 @@ def test_an_iteration_asks_little_of_the_device(canonical, datamodule, trainer):
     # Nothing but the number of samples and the numbers of the step differs from the one before.
     assert by_samples(iterations[-2]) == by_samples(entries)
     assert any("K" in entry for entry in by_samples(entries))
-
-
-def test_the_color_network_learns_in_the_chosen_precision(datamodule, trainer, monkeypatch):
-    used, forward = [], ColorDecoder.forward
-
-    def watched(self: ColorDecoder, *args: Any) -> torch.Tensor:
-        used.append(args[3])
-        return forward(self, *args)
-
-    monkeypatch.setattr(ColorDecoder, "forward", watched)
-    for precision, expected in (("auto", torch.float32), ("bfloat16", torch.bfloat16)):
-        stage = CanonicalStage(CARVED, SMALL, iterations_per_step=1, decoder_precision=precision)
-        trainer(max_steps=1).fit(stage, datamodule=datamodule)
-        assert used == [expected]
-        assert {p.dtype for p in stage.scene_model.canonical.parameters()} == {torch.float32}
-        used.clear()
 
 
 def test_all_in_reduced_precision_is_refused(datamodule, trainer):

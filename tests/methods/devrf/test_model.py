@@ -12,7 +12,6 @@ from devrf.geometry.clock import FrameClock
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import WORLD
-from devrf.methods.devrf import settings
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.deformation_field import DeformationField, GridWarp
 from devrf.methods.devrf.model import DeVRFModel
@@ -143,20 +142,6 @@ def test_loaded_displacements_stay_in_half_precision_and_are_read_in_single(mode
             other.deformation.backward_warp(time)(points),
         )
         torch.testing.assert_close(after, before, atol=1e-3, rtol=0)
-
-
-def test_pictures_colours_are_computed_in_reduced_precision_where_that_is_asked_for_and_fast(
-    learned, tiny_scene, monkeypatch
-):
-    model = learned[0].scene_model
-    assert model.at(0.0, half=True).precision == torch.float32  # a CPU gains nothing
-    monkeypatch.setattr(settings, "multiplies_bfloat16", lambda device: True)
-    single, half = (model.at(0.0, half=half) for half in (False, True))
-    assert (single.precision, half.precision) == (torch.float32, torch.bfloat16)
-    rays = tiny_scene.static.test.cameras.image_rays(0)
-    colors = [view.render(rays, torch.ones(3)).color for view in (single, half)]
-    difference = (colors[0] - colors[1]).abs().max()
-    assert 0 < difference < 2 / 255
 
 
 def test_a_voxel_has_the_initial_opacity_where_something_may_be(cube):

@@ -65,7 +65,6 @@ class SigmoidColor(nn.Module):
         features: Tensor,
         viewdirs: Tensor,
         ray: Tensor,
-        precision: torch.dtype = torch.float32,
         residual: Tensor | None = None,
     ) -> Tensor:
         """RGB (S, 3) in [0, 1] of ``features`` (S, 3), whatever the direction."""
@@ -112,11 +111,10 @@ class ColorDecoder(nn.Module):
         features: Tensor,
         viewdirs: Tensor,
         ray: Tensor,
-        precision: torch.dtype = torch.float32,
         residual: Tensor | None = None,
     ) -> Tensor:
         """RGB (S, 3) in [0, 1], as :func:`~devrf.ops.color_network.decode` gives it."""
-        return decode(features, viewdirs, ray, self.network, precision, residual)
+        return decode(features, viewdirs, ray, self.network, residual)
 
 
 class CanonicalField(nn.Module):
@@ -149,7 +147,7 @@ class CanonicalField(nn.Module):
     ) -> None:
         """Build an empty field with C = ``channels`` features per voxel.
 
-        The ``decoder`` maps (features, viewdirs, ray, precision, residual) to RGB; ``base_voxels``
+        The ``decoder`` maps (features, viewdirs, ray, residual) to RGB; ``base_voxels``
         None is ``voxels``. Each of ``planes`` starts with an equal share of every ray.
         """
         super().__init__()
@@ -220,7 +218,6 @@ class CanonicalField(nn.Module):
         points: Tensor,
         viewdirs: Tensor,
         ray: Tensor,
-        precision: torch.dtype = torch.float32,
         residual: Tensor | None = None,
     ) -> Tensor:
         """RGB (S, 3) at ``points`` (S, 3) on rays ``ray`` (S,) with ``viewdirs`` (R, 3).
@@ -228,7 +225,7 @@ class CanonicalField(nn.Module):
         ``residual`` (S, 3) is added before the sigmoid.
         """
         features = self.color(points, self.box)
-        color: Tensor = self.decoder(features, viewdirs, ray, precision, residual)
+        color: Tensor = self.decoder(features, viewdirs, ray, residual)
         return color
 
     def forget_directions(self) -> None:

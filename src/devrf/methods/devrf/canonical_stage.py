@@ -44,9 +44,7 @@ from devrf.methods.devrf.settings import (
     FINE_LOSS,
     SEARCH_LOSS,
     CanonicalRates,
-    Precision,
     Sampling,
-    decoder_dtype,
 )
 from devrf.methods.devrf.volume_rendering import render
 from devrf.methods.weighted_loss import counted_weights
@@ -107,7 +105,6 @@ class CanonicalStage(Stage):
         search_loss: Mapping[str, float] = SEARCH_LOSS,
         fine_loss: Mapping[str, float] = FINE_LOSS,
         iterations_per_step: int = 10,
-        decoder_precision: Precision = "auto",
     ) -> None:
         """Build the stage; the defaults are the paper's for inward-facing scenes.
 
@@ -119,7 +116,6 @@ class CanonicalStage(Stage):
             search_loss: weights of the geometry search's terms; ``tv`` is that of both grids.
             fine_loss: of the radiance field's.
             iterations_per_step: optimiser iterations in one Lightning step.
-            decoder_precision: of the colour network while it learns; ``auto``: as the GPU allows.
         """
         super().__init__(iterations_per_step)
         self.batch_size.keys = ("schedule.canonical.side", "schedule.canonical.rays")
@@ -127,7 +123,6 @@ class CanonicalStage(Stage):
         self.architecture = architecture or Architecture()
         self.rates = rates or CanonicalRates()
         self.sampling = sampling or Sampling()
-        self.decoder_precision = decoder_precision
         self.objectives = {
             kind: self._objective(kind, loss)
             for kind, loss in (("search", search_loss), ("fine", fine_loss))
@@ -147,7 +142,6 @@ class CanonicalStage(Stage):
             model.occupancy,
             model.settings,
             batch.background,
-            precision=self.decoder_dtype,
         )
         with span("losses"):
             prediction = Prediction(output=output, batch=batch)
@@ -208,8 +202,6 @@ class CanonicalStage(Stage):
     def setup(self, stage: str) -> None:
         """Build the field of the first phase in the scene's box."""
         super().setup(stage)
-        device = self.trainer.strategy.root_device
-        self.decoder_dtype = decoder_dtype(self.decoder_precision, device)
         if self.schedule.first_frames:
             self.images = ("at_rest",)
         if hasattr(self, "scene_model"):

@@ -33,12 +33,7 @@ from devrf.methods.devrf.losses import DeformationPrediction, FlowMean, batch_lo
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.pixel_pools import frame_pools, rays_for_epochs
 from devrf.methods.devrf.plans import DeformationPlan
-from devrf.methods.devrf.settings import (
-    DEFORMATION_LOSS,
-    Precision,
-    VisitSettings,
-    decoder_dtype,
-)
+from devrf.methods.devrf.settings import DEFORMATION_LOSS, VisitSettings
 from devrf.methods.devrf.volume_rendering import possible_occupancy, render
 from devrf.rendering.output import ColorResidual
 from devrf.scenes.scene import CaptureName, Views
@@ -80,7 +75,6 @@ class DeformationStage(Stage):
         flow_mean: FlowMean = "samples",
         extensions: Mapping[str, Extension] | None = None,
         iterations_per_step: int = 10,
-        decoder_precision: Precision = "auto",
     ) -> None:
         """Build the stage; the defaults are the paper's for inward-facing scenes.
 
@@ -92,13 +86,11 @@ class DeformationStage(Stage):
             flow_mean: whether the flow loss is a mean over rays or samples (docs/method.md#flow).
             extensions: additions beyond the paper, by name.
             iterations_per_step: optimiser iterations in one Lightning step.
-            decoder_precision: of the colour network while it learns; ``auto``: as the GPU allows.
         """
         super().__init__(iterations_per_step)
         self.settings = schedule or DeformationSchedule()
         self.visit = visit or VisitSettings()
         self.flow_mean = flow_mean
-        self.decoder_precision = decoder_precision
         self.extensions = tuple((extensions or {}).values())
         self.deformation_loss = DeformationLoss(loss, self.extensions, self.settings)
         canonical = earlier.model.train()
@@ -143,7 +135,6 @@ class DeformationStage(Stage):
             model.settings,
             batch.background,
             backward_warp=field.warp_by(frame.backward),
-            precision=self.context.precision,
             color_residual=self._color_residual(frame),
         )
         # Before frame 1 nothing has moved.
@@ -200,7 +191,6 @@ class DeformationStage(Stage):
     def setup(self, stage: str) -> None:
         """Build a field of zeros at the coarsest resolution; refuse a scene without motion."""
         super().setup(stage)
-        device = self.trainer.strategy.root_device
         if not self.scene.moves:
             raise DevrfError(f"{self.scene.name}: is at rest; the canonical stage is all it takes")
         if self.scene.dynamic.train.by_moving_camera and self.deformation_loss.leave_out("flow"):
@@ -215,7 +205,6 @@ class DeformationStage(Stage):
             generator=self.generator,
             background=self.background,
             batch_size=self.batch_size,
-            precision=decoder_dtype(self.decoder_precision, device),
         )
         if self.scene_model.deformation is None:
             self._build_field()

@@ -33,7 +33,6 @@ class DeformationContext:
         generator: of all random numbers.
         background: the colours behind the images' pixels.
         batch_size: the share of the schedule's rays that is drawn.
-        precision: of the colour network.
         weights: of the loss terms that count at the present iteration.
         active: the frame that is trained; None before the first, and after the last.
     """
@@ -45,7 +44,6 @@ class DeformationContext:
     generator: torch.Generator
     background: BackgroundColor
     batch_size: BatchSize
-    precision: torch.dtype
     weights: Mapping[str, float] = field(default_factory=dict)
     active: ActiveFrame | None = None
 

@@ -19,7 +19,6 @@ from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField, ColorDecoder
 from devrf.methods.devrf.deformation_field import DeformationField, GridWarp
 from devrf.methods.devrf.frame_store import NAMES, FrameField, fits_on_device
-from devrf.methods.devrf.settings import decoder_dtype
 from devrf.methods.devrf.view import CanonicalSurface, DeVRFView
 from devrf.methods.devrf.volume_rendering import deformed_occupancy
 from devrf.ops.trilinear import shape_of
@@ -133,7 +132,7 @@ class DeVRFModel(Renderable):
             return self.occupancy
         return deformed_occupancy(self.canonical, self.occupancy, self.settings, warp)
 
-    def at(self, time: float, *, half: bool = False) -> DeVRFView:
+    def at(self, time: float) -> DeVRFView:
         """The scene at ``time``: its occupancy and its displacements, ready."""
         return DeVRFView(
             self.canonical,
@@ -143,7 +142,6 @@ class DeVRFModel(Renderable):
             self.space,
             time,
             self.color_residual_at(time),
-            decoder_dtype("auto" if half else "float32", self.device),
         )
 
     def surface(self) -> CanonicalSurface:

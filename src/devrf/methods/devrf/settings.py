@@ -10,20 +10,9 @@ from annotated_types import Ge, Gt, Le, Lt
 from pydantic.dataclasses import dataclass
 
 from devrf.rendering.sampling import Step
-from devrf.system.device import multiplies_bfloat16
 from devrf.system.options import NotNegative, Options, Positive
 
 Opacity = Annotated[float, Ge(0), Lt(1)]
-# The colour network's precision.
-Precision = Literal["auto", "float32", "bfloat16"]
-
-
-def decoder_dtype(precision: Precision, device: torch.device) -> torch.dtype:
-    """The colour network's precision on ``device``; ``auto``: bfloat16 where it is fast."""
-    if precision == "auto":
-        precision = "bfloat16" if multiplies_bfloat16(device) else "float32"
-    return torch.bfloat16 if precision == "bfloat16" else torch.float32
-
 
 SEARCH_LOSS = {"render": 1.0, "per_sample_color": 0.1, "entropy": 0.01}
 FINE_LOSS = {

@@ -45,7 +45,6 @@ class DeVRFView:
         space: the space that the fields live in.
         time: t in [0, 1].
         color_residual: q → A_t(q) at that time; None: it is zero.
-        precision: of the colour network for pictures.
         at_rest: whether the warps of this time are the identity.
     """
 
@@ -56,7 +55,6 @@ class DeVRFView:
     space: Space
     time: float
     color_residual: ColorResidual | None = None
-    precision: torch.dtype = torch.float32
     at_rest: bool = field(init=False)
     _backward_warp: GridWarp | None = field(init=False, default=None)
 
@@ -99,7 +97,6 @@ class DeVRFView:
             self.picture_settings,
             background,
             self._backward_warp,
-            precision=self.precision,
             color_residual=self.color_residual,
         )
         return RenderedImage.of(output)

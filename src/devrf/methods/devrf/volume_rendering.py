@@ -27,7 +27,6 @@ def render(
     settings: RenderSettings,
     background: Tensor,
     backward_warp: GridWarp | None = None,
-    precision: torch.dtype = torch.float32,
     color_residual: ColorResidual | None = None,
 ) -> VoxelOutput:
     """Colours Ĉ = Σ w_i c_i + T_end · C_background and depths Σ w_i z_i / Σ w_i of rays.
@@ -39,7 +38,6 @@ def render(
         settings: step length and thresholds.
         background: (3,) or (R, 3) RGB behind all; the field's own if the space holds infinity.
         backward_warp: x → q = x + Δ_b(x, t); None is the identity.
-        precision: of the colour network.
         color_residual: q → A_t(q), added to the colours' logits; None: nothing is.
 
     Returns:
@@ -49,11 +47,11 @@ def render(
         samples = march(rays, march_inputs(field, occupancy, settings, backward_warp))
     with span("decoder"):
         residual = None if color_residual is None else color_residual(samples.canonical)
-        color = field.rgb(samples.canonical, rays.viewdirs, samples.ray, precision, residual)
+        color = field.rgb(samples.canonical, rays.viewdirs, samples.ray, residual)
         ends = rays.ends()
         if ends is not None:
             every = torch.arange(len(rays), device=ends.device)
-            background = field.rgb(ends, rays.viewdirs, every, precision)
+            background = field.rgb(ends, rays.viewdirs, every)
     with span("compositing"):
         image = composite_colors(samples, color, background)
     return VoxelOutput(

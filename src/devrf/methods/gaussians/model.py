@@ -245,7 +245,7 @@ class DeformableGaussians(PlacedModel[ImageBatch], ImageTrainable):
         """Those of splatting."""
         return splatting_kernels()
 
-    def at(self, time: float, *, half: bool = False) -> GaussiansView:
+    def at(self, time: float) -> GaussiansView:
         """The scene at ``time``."""
         return GaussiansView(self, time)
 

@@ -186,9 +186,9 @@ class NeuralField(PlacedRays):
             rays, (before, after), self.box, self.depth_limits, step, jitter=jitter
         )
 
-    def at(self, time: float, *, half: bool = False) -> RayView:
+    def at(self, time: float) -> RayView:
         """The scene at ``time``."""
-        return RayView(self, self.render_rays, time, half=half)
+        return RayView(self, self.render_rays, time)
 
 
 # Points (S, 3) in normalised space, times (R,) of rays, and the ray (S,) int64 of each point →
@@ -318,8 +318,6 @@ class RayView:
         model: PlacedRays,
         render_rays: Callable[[Rays, Tensor, Tensor], RenderOutput],
         time: float,
-        *,
-        half: bool,
     ) -> None:
         """Render ``model`` at one time.
 
@@ -327,12 +325,10 @@ class RayView:
             model: the model.
             render_rays: as :meth:`NeuralField.render_rays`.
             time: in [0, 1].
-            half: networks in half precision, on a CUDA device.
         """
         on_gpu = model.device.type == "cuda"
         self._render_rays = render_rays
         self._time = time
-        self._half = half and on_gpu
         self.at_rest = model.clock.at(time).after == 0
         self.chunk = ON_GPU if on_gpu else ON_CPU
 
@@ -340,6 +336,4 @@ class RayView:
     def render(self, rays: Rays, background: Tensor) -> RenderedImage:
         """The render of R rays in the fields' space."""
         time = torch.full_like(rays.origins[:, 0], self._time)
-        with torch.autocast(time.device.type, torch.float16, enabled=self._half):
-            out = self._render_rays(rays, time, background)
-        return RenderedImage(out.color.float(), out.depth.float(), 1 - out.transmittance.float())
+        return RenderedImage.of(self._render_rays(rays, time, background))

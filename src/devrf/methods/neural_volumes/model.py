@@ -183,7 +183,7 @@ class NeuralVolumes(PlacedRays):
         return torch.lerp(mean[:1], mean[1:], moment.weight)
 
     @torch.no_grad()
-    def at(self, time: float, *, half: bool = False) -> RayView:
+    def at(self, time: float) -> RayView:
         """The scene at ``time``; its volume is decoded here, once for all pictures."""
         moment = self.clock.at(time)
         volumes = self.decoded(self.code_at(time))
@@ -193,7 +193,7 @@ class NeuralVolumes(PlacedRays):
             frames = (first + moment.before, first + moment.after)
             return self.render(rays, volumes, first, frames, background)
 
-        return RayView(self, render_rays, time, half=half)
+        return RayView(self, render_rays, time)
 
 
 @torch.no_grad()

@@ -169,9 +169,9 @@ class NSFF(NeuralField):
             blend=blend,
         )
 
-    def at(self, time: float, *, half: bool = False) -> FlowingView:
+    def at(self, time: float) -> FlowingView:
         """The scene at ``time``."""
-        return FlowingView(self, time, half=half)
+        return FlowingView(self, time)
 
     def loss_terms(
         self, output: RenderOutput, batch: RayBatch, names: Collection[str]
@@ -206,9 +206,9 @@ class NSFF(NeuralField):
 class FlowingView(RayView):
     """NSFF at one time: dynamic points follow their flows, the rest stays."""
 
-    def __init__(self, model: NSFF, time: float, *, half: bool) -> None:
+    def __init__(self, model: NSFF, time: float) -> None:
         """As for every method."""
-        super().__init__(model, model.render_rays, time, half=half)
+        super().__init__(model, model.render_rays, time)
         self._model = model
 
     @torch.no_grad()

@@ -87,7 +87,6 @@ class StartFromBest(Extension):
                 model.settings,
                 batch.background,
                 backward_warp=warp,
-                precision=context.precision,
             )
             errors.append(float(color_error(output.color, batch.color)))
         return errors
