@@ -27,26 +27,6 @@ def learner(settings: HyperNeRFSettings, scene: Scene) -> HyperNeRF:
     return model
 
 
-def test_the_field_alone_learns_in_bfloat16_if_asked_to(
-    tiny_scene: Scene, some_rays: RayBatch
-) -> None:
-    exact = learner(SMALL, tiny_scene)(some_rays)
-    model = learner(replace(SMALL, precision="bfloat16"), tiny_scene)
-    output = model(some_rays)
-    assert output.color.dtype == torch.float32
-    assert torch.equal(output.extras["points"], exact.extras["points"])
-    torch.testing.assert_close(output.color, exact.color, atol=0.02, rtol=0)
-    assert not torch.equal(output.color, exact.color)
-    model.loss_terms(output, some_rays, ["render"])["render"].backward()
-    for parameter in model.canonical.parameters():
-        assert parameter.grad is not None and parameter.grad.isfinite().all()
-    # What was learned is shown in all its digits.
-    shown = model.eval()(some_rays).color
-    assert torch.equal(shown, learner(SMALL, tiny_scene).eval()(some_rays).color)
-    with torch.autocast("cpu", torch.bfloat16), torch.no_grad():  # or nearly, if asked to
-        torch.testing.assert_close(model(some_rays).color, shown, atol=0.03, rtol=0)
-
-
 def test_without_hulls_all_of_the_box_is_sampled(tiny_scene: Scene, some_rays: RayBatch) -> None:
     without = learner(replace(SMALL, hull=False), tiny_scene)
     assert without.occupancy.mask.all()

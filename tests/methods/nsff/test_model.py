@@ -61,16 +61,16 @@ def test_batches_have_further_rays_where_something_moves(
 
 
 @pytest.mark.parametrize(
-    ("where", "sampling", "precision"),
-    [("forward", "stratified", "bfloat16"), ("room", "occupancy", "float32")],
+    ("where", "sampling"),
+    [("forward", "stratified"), ("room", "occupancy")],
 )
 def test_a_scene_of_any_space_is_learned_and_comes_back(
-    where: str, sampling: Any, precision: Any, tiny: NSFFSettings, ray_stage: Make, fit: Fit,
+    where: str, sampling: Any, tiny: NSFFSettings, ray_stage: Make, fit: Fit,
     stored: Callable[[RayStage], LoadedCheckpoint], serve: Callable[[Scene], SceneDataModule],
     facing: Scene, tiny_room: Scene,
 ) -> None:  # fmt: skip
     scene = {"forward": facing, "room": tiny_room}[where]
-    model = NSFF(replace(tiny, sampling=sampling, precision=precision))
+    model = NSFF(replace(tiny, sampling=sampling))
     loaded = stored(fit(ray_stage(model, loss=EVERY), data=serve(scene))).model
     assert isinstance(loaded, NSFF) and loaded.settings == model.settings
     assert loaded.fields.dynamic.reach == (1.0 if where == "forward" else 0.2)
@@ -82,14 +82,14 @@ def test_a_scene_of_any_space_is_learned_and_comes_back(
     torch.testing.assert_close(images[1].opacity, torch.ones_like(images[1].opacity))
 
 
-def test_it_is_shown_without_the_noise_and_the_precision_that_it_learns_with(
+def test_it_is_shown_without_the_noise_that_it_learns_with(
     tiny: NSFFSettings, tiny_scene: Scene
 ) -> None:
-    settings = replace(tiny, density_noise=1.0, precision="bfloat16")
+    settings = replace(tiny, density_noise=1.0)
     torch.manual_seed(0)
     model = NSFF(settings)
     model.setup(tiny_scene)
-    exact = NSFF(replace(settings, density_noise=0.0, precision="float32"))
+    exact = NSFF(replace(settings, density_noise=0.0))
     exact.setup(tiny_scene)
     exact.load_state_dict(model.state_dict())
     cameras = tiny_scene.dynamic.test.cameras

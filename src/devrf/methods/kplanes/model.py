@@ -132,7 +132,7 @@ class KPlanes(DensityColorField):
             samples = intervals(rays, edges).normalised(self.placement)
             where = self.coordinates(samples.points, time.index_select(0, samples.ray))
             with torch.set_grad_enabled(torch.is_grad_enabled() and self._teaches):
-                depth = proposal(where).float() * samples.length
+                depth = proposal(where) * samples.length
                 proposed, _ = composite(depth, samples.ray, samples.rays)
             rounds.append((edges, proposed.view(len(rays), count)))
             weight = rounds[-1][1].detach() ** self.sharpness

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
 from itertools import pairwise
 
 import torch
@@ -12,7 +11,6 @@ from torch import Tensor, nn
 
 from devrf.geometry.clock import FrameClock
 from devrf.methods.nerf.settings import Initialisation, PlacedSettings
-from devrf.system.device import multiplies_bfloat16
 
 
 class SinusoidalEncoding(nn.Module):
@@ -94,8 +92,7 @@ def linear_by_ray(
     """
     sizes = [part.shape[1] for part in (*values, of_rays)]
     *weights, of_ray = torch.split(layer.weight, sizes, dim=1)
-    # In single precision: the gradient of a ray is the sum of its samples'.
-    total = nn.functional.linear(of_rays, of_ray, layer.bias).float().index_select(0, ray)
+    total = nn.functional.linear(of_rays, of_ray, layer.bias).index_select(0, ray)
     for part, weight in zip(values, weights, strict=True):
         total = torch.addmm(total, part, weight.t())
     return total
@@ -240,16 +237,6 @@ class RadianceField(nn.Module):
         self.color = ColorBranch(s.width, s.direction_bands)
         initialise(self, s.initialisation)
 
-    def reduced(self) -> AbstractContextManager[None]:
-        """A block in which the field computes in bfloat16 while it learns, if so configured."""
-        precision = self._settings.precision
-        device = self.density.weight.device
-        reduced = multiplies_bfloat16(device) if precision == "auto" else precision == "bfloat16"
-        # A stage shows what it learns in between, without gradients.
-        if not (reduced and self.training and torch.is_grad_enabled()):
-            return nullcontext()
-        return torch.autocast(device.type, torch.bfloat16)
-
     def hidden(self, points: Tensor, ambient: Tensor | None = None) -> Tensor:
         """Hidden features (S, width), from which density and colour come.
 
@@ -262,13 +249,10 @@ class RadianceField(nn.Module):
 
     def sigma(self, points: Tensor, ambient: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """σ (S,) ≥ 0 per unit of normalised space, and its hidden features; arguments likewise."""
-        with self.reduced():
-            x = self.hidden(points, ambient)
-            raw = self.density(x)[:, 0]
-            return (nn.functional.softplus(raw) * self._settings.density_scale).float(), x
+        x = self.hidden(points, ambient)
+        raw = self.density(x)[:, 0]
+        return nn.functional.softplus(raw) * self._settings.density_scale, x
 
     def rgb(self, hidden: Tensor, viewdirs: Tensor, ray: Tensor) -> Tensor:
         """RGB (S, 3) in [0, 1] of samples of the rays ``ray`` (S,), whose directions are (R, 3)."""
-        with self.reduced():
-            logits = self.color(hidden, viewdirs, ray)
-        return torch.sigmoid(logits.float())
+        return torch.sigmoid(self.color(hidden, viewdirs, ray))

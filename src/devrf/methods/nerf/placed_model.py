@@ -246,14 +246,14 @@ class DensityColorField(NeuralField):
             samples = samples.unbounded()
         samples = samples.normalised(self.placement)
         density, features = (sigma or self.sigma)(samples.points, time, samples.ray)
-        depth = density.float() * samples.length
+        depth = density * samples.length
         weight, transmittance = composite(depth, samples.ray, samples.rays)
         if self.least_weight > 0:
             visible = (weight > self.least_weight).nonzero()[:, 0]
             samples = samples[visible]
             weight = weight.index_select(0, visible)
             features = features.index_select(0, visible)
-        color = (rgb or self.rgb)(features, rays.viewdirs, samples.ray).float()
+        color = (rgb or self.rgb)(features, rays.viewdirs, samples.ray)
         output = accumulated(samples, weight, weight[:, None] * color, transmittance, background)
         extras = {
             "points": samples.points,

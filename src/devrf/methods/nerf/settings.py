@@ -12,7 +12,6 @@ from devrf.errors import expect
 from devrf.system.options import Options, Several, Share
 
 Initialisation = Literal["uniform", "glorot"]
-Precision = Literal["auto", "float32", "bfloat16"]
 
 # Samples of a ray; octaves of an encoding.
 Samples = Annotated[int, Ge(2), Le(1024)]
@@ -67,8 +66,6 @@ class PlacedSettings(OccupancySettings):
         direction_bands: octaves of viewing directions.
         density_scale: density of a softplus of 1, per half of the box's longest edge.
         initialisation: of all layers: ``uniform`` (PyTorch's) or ``glorot``.
-        precision: of a radiance field while it learns: float32, bfloat16, or
-            ``auto`` (bfloat16 on a GPU that multiplies it). All else is in float32.
         steps: samples along the box's diagonal (occupancy).
     """
 
@@ -79,7 +76,6 @@ class PlacedSettings(OccupancySettings):
     direction_bands: Bands = 4
     density_scale: float = 10.0
     initialisation: Initialisation = "uniform"
-    precision: Precision = "float32"
     steps: Samples = 128
 
     def rehearsed(self, factor: float) -> Self:

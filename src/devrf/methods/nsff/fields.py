@@ -131,11 +131,8 @@ class HeadedField(RadianceField):
 
     def heads(self, points: Tensor, viewdirs: Tensor, ray: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Raw density (S,), RGB (S, 3), and the further numbers of points (S, inputs)."""
-        with self.reduced():
-            x = self.hidden(points)
-            raw = self.density(x)[:, 0]
-            further = self.further(x)
-        return raw.float(), self.rgb(x, viewdirs, ray), further.float()
+        x = self.hidden(points)
+        return self.density(x)[:, 0], self.rgb(x, viewdirs, ray), self.further(x)
 
 
 class StaticField(HeadedField):
