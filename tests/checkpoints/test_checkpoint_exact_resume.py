@@ -176,14 +176,6 @@ def test_a_fit_that_ended_by_its_steps_goes_on_exactly(learn, rest, datamodule, 
     assert_same(everything(stage), learn(build))
 
 
-def test_frames_that_are_left_early_go_on_exactly(learn, rest):
-    # A visit ends after three steps, as their losses tell.
-    early = replace(ROUNDED, min_rel_improvement=1.0)
-    build = deformation(rest, MOVING, early, tracks=StartAlongFlow("tracks"))
-    # Mid-visit at both levels.
-    assert_same(learn(build, 2, 19), learn(build))
-
-
 def test_starts_from_the_best_and_a_level_backwards_go_on_exactly(learn, rest):
     rows = (Level(4, 6), Level(6, 4, backwards=True), Level(6, 3))
     schedule = replace(MOVING, levels=rows)

@@ -15,7 +15,7 @@ class Position:
     """A place in a schedule; a progress file holds these numbers by name.
 
     Attributes:
-        iteration: the next iteration; a phase that has converged is left for the next.
+        iteration: the next iteration.
         iterations_done: optimiser iterations that were carried out.
         seed: of the whole run.
         num_rollbacks: number of times that training diverged and was rolled back.

@@ -160,10 +160,6 @@ class Stage(LightningModule, ABC):
     def prepare(self) -> None:
         """Renew what follows from the iteration's number, before it; may wait for the device."""
 
-    def converged(self, loss: Tensor) -> bool:
-        """Whether what is left of the phase can be skipped, by the mean ``loss`` () of a step."""
-        return False
-
     def remember(self) -> Callable[[], None]:
         """Keep what iterations change beside the optimiser's parameters, such as the occupancy.
 
@@ -201,8 +197,6 @@ class Stage(LightningModule, ABC):
                 break
             position.advance()
         means = mean_terms(losses, self.batch_size.processes)
-        if losses and position.iteration < stop and self.converged(means["loss"]):
-            position.iteration = stop
         position.seed_generator(self.generator, self.global_rank)
         if self.is_complete:
             self.trainer.should_stop = True

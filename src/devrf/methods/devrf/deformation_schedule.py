@@ -260,17 +260,3 @@ class Visits:
     def scaled(self, factor: float) -> Visits:
         """The same visits in ``factor`` times their iterations."""
         return replace(self, settings=self.settings.scaled(factor))
-
-
-def converged(losses: Sequence[float], min_rel_improvement: float) -> bool:
-    """Whether the last two steps of a visit lowered its best loss by too little.
-
-    Two, since one may have drawn difficult pixels; fewer than three steps never tell.
-
-    Args:
-        losses: mean loss of each Lightning step of a visit.
-        min_rel_improvement: the least decrease, a share of the loss in (0, 1].
-    """
-    if len(losses) < 3:
-        return False
-    return min(losses[-2:]) > (1 - min_rel_improvement) * min(losses[:-2])

@@ -25,7 +25,6 @@ from devrf.methods.devrf.deformation_schedule import (
     DeformationPhase,
     DeformationSchedule,
     Visits,
-    converged,
 )
 from devrf.methods.devrf.extension import DeformationContext, Extension
 from devrf.methods.devrf.frame_store import FrameField
@@ -113,8 +112,6 @@ class DeformationStage(Stage):
         self.register_load_state_dict_post_hook(  # type: ignore[no-untyped-call]
             lambda *_: self._check_out_again()
         )
-        # Of the Lightning steps of the present visit.
-        self._losses: list[float] = []
         # The phase's state where a fit ended before the schedule.
         self._left: dict[str, Any] = {}
 
@@ -247,14 +244,6 @@ class DeformationStage(Stage):
             with span("sampling"):
                 self._update_occupancy()
 
-    def converged(self, loss: Tensor) -> bool:
-        """Whether the frame's loss has stopped falling, if the schedule asks for that."""
-        gain = self.visit.min_rel_improvement
-        if gain is None:
-            return False
-        self._losses.append(float(loss))
-        return converged(self._losses, gain)
-
     def enter(self, phase: DeformationPhase) -> None:
         """Go to the phase's frame: grow the grids if a level begins, fresh Adam if asked for."""
         previous = self.phase
@@ -295,7 +284,6 @@ class DeformationStage(Stage):
         elif self.visit.adam_state != "carried" or phase.level == 0:
             self.optimizer.forget()
         frame.check_out(phase.frame)
-        self._losses = []
         side = f"schedule.deformation.levels.{phase.level + 1}.side"
         self.batch_size.keys = (side, "schedule.deformation.rays")
         return frame
@@ -325,13 +313,8 @@ class DeformationStage(Stage):
         frame.occupancy.refill(possible_occupancy(self.scene_model.occupancy, warp))
 
     def remember(self) -> Callable[[], None]:
-        """Nothing: the frame's occupancy is found anew, and its losses are judged afresh."""
-
-        def restore() -> None:
-            self._losses = []
-            self._update_occupancy()
-
-        return restore
+        """Nothing: the frame's occupancy is found anew."""
+        return self._update_occupancy
 
     def _write_back(self) -> None:
         """Copy what was learned of the active frame into the fields; learning may go on."""
@@ -357,16 +340,14 @@ class DeformationStage(Stage):
         super().on_train_end()
 
     def phase_state(self) -> dict[str, Any]:
-        """The state of the active frame, and its losses so far; nothing once all is learned."""
+        """The state of the active frame; nothing once all is learned."""
         if self.active is None:
             return self._left
         exact = self.visit.stored_half(self.device)
-        views = self.context.views
-        return {"frame": self.active.state(views, exact=exact), "losses": [*self._losses]}
+        return self.active.state(self.context.views, exact=exact)
 
     def restore(self, phase: DeformationPhase, state: dict[str, Any]) -> None:
         """Go on with the frame of ``phase``, the field being loaded."""
         frame = self._activate(phase)
         if state:
-            frame.load_state(state["frame"], self.context.views)
-            self._losses = [float(loss) for loss in state["losses"]]
+            frame.load_state(state, self.context.views)

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Annotated, ClassVar, Literal
 
 import torch
-from annotated_types import Ge, Gt, Le, Lt
+from annotated_types import Ge, Lt
 from pydantic.dataclasses import dataclass
 
 from devrf.rendering.sampling import Step
@@ -78,7 +78,6 @@ class VisitSettings(Options):
         store: the memory of the frames while one is learned; ``auto``: the device's if they fit.
         store_half: whether they are kept in half precision; ``auto``: on a GPU.
         adam_state: ``fresh`` at each visit, or above the coarsest level ``carried`` over.
-        min_rel_improvement: of a visit's loss, in two Lightning steps; with less it ends early.
     """
 
     key: ClassVar[str] = "schedule.visit"
@@ -92,7 +91,6 @@ class VisitSettings(Options):
     adam_state: Literal["fresh", "carried"] = "fresh"
     store: Literal["auto", "device", "host"] = "auto"
     store_half: bool | Literal["auto"] = "auto"
-    min_rel_improvement: Annotated[float, Gt(0), Le(1)] | None = None
 
     def scaled(self, factor: float) -> VisitSettings:
         """The settings for ``factor`` times the iterations, in which voxels move as far."""
