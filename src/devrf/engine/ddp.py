@@ -6,8 +6,7 @@ The functions that average are for several processes; with one, the others chang
 from __future__ import annotations
 
 import signal
-import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import torch
@@ -160,27 +159,3 @@ def broadcast(tensors: Iterable[Tensor]) -> None:
         # As bytes: not every backend supports every type.
         distributed.broadcast(dense.reshape(-1).view(torch.uint8), src=0)
         tensor.copy_(dense)
-
-
-def assert_replicas_equal(tensors: Mapping[str, Tensor]) -> None:
-    """Check that all processes hold the same tensors, bit for bit.
-
-    Raises:
-        DevrfError: they differ; the message names the tensors.
-    """
-    if world_size() == 1:
-        return
-    sums = {name: _checksum(tensor) for name, tensor in tensors.items()}
-    everyone: list[Any] = [None] * world_size()
-    distributed.all_gather_object(everyone, sums)
-    differing = sorted({name for other in everyone for name, _ in other.items() ^ sums.items()})
-    if differing:
-        raise DevrfError(
-            f"trainer: the processes have learned different fields ({', '.join(differing)}); give "
-            "them devices of one kind, or use trainer=auto"
-        )
-
-
-def _checksum(tensor: Tensor) -> tuple[tuple[int, ...], int]:
-    bits = tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8)
-    return tuple(tensor.shape), zlib.crc32(bits.numpy().data)

@@ -33,13 +33,7 @@ from devrf.checkpoints.progress import rng_state, set_rng_state
 from devrf.data.batch import BackgroundColor
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.batch_size import BatchSize
-from devrf.engine.ddp import (
-    assert_replicas_equal,
-    average,
-    average_gradients,
-    broadcast,
-    check_strategy,
-)
+from devrf.engine.ddp import average, average_gradients, broadcast, check_strategy
 from devrf.engine.grid_adam import GridAdam
 from devrf.engine.plan import StagePlan
 from devrf.engine.position import Position
@@ -363,16 +357,13 @@ class Stage(LightningModule, ABC):
             checkpoint["state_dict"] = {f"{MODEL}{k}": v for k, v in compact.items()}
 
     def on_fit_end(self) -> None:
-        """Check the result.
+        """Refuse the result of a stage that was aborted.
 
         Raises:
-            DevrfError: the stage was aborted, or the processes hold different tensors.
+            DevrfError: it was.
         """
         if self.abort_reason is not None:
             raise DevrfError(self.abort_reason)
-        if self.is_complete:
-            state = self.state_dict().items()
-            assert_replicas_equal({name: t for name, t in state if isinstance(t, Tensor)})
 
     def validation_step(self, index: int, batch_idx: int) -> dict[str, HeldOutView]:
         """Render and score one validation view; the means over all are logged.
