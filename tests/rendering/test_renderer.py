@@ -10,7 +10,7 @@ from devrf.geometry.cameras import Cameras
 from devrf.geometry.contraction import ContractedSpace
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import WORLD
-from devrf.methods.devrf import view as module
+from devrf.methods.devrf import model as module
 from devrf.rendering.output import RenderedImage
 from devrf.rendering.renderer import MIN_CHUNK, Renderer, in_chunks
 from pictures import assert_same_picture, plain_picture

@@ -19,9 +19,10 @@ from devrf.kernels.trilinear import interpolate
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.deformation_field import DeformationField, GridWarp
-from devrf.methods.devrf.view import DeVRFView
+from devrf.methods.devrf.model import ColorResidualField, DeVRFModel
 from devrf.methods.devrf.volume_rendering import render
 from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.output import ColorResidual
 from devrf.rendering.sampling import RenderSettings
 
 SIDE = 21
@@ -152,7 +153,13 @@ def test_a_picture_is_the_same_as_a_batch(cube: Box, rng: torch.Generator, time:
     residual = draw(3, 4, 3, 3)
     how = RenderSettings(step=0.5, alpha_threshold=0.02, near=0.2, far=9.0)
     color_residual = partial(interpolate, residual, box=cube)
-    view = DeVRFView(field, occupancy, how, deformation, WORLD, time, color_residual)
+
+    class Residual(ColorResidualField):
+        def at(self, time: float) -> ColorResidual:
+            return color_residual
+
+    changing = Residual(cube, deformation.clock)
+    view = DeVRFModel(sizes, field, occupancy, how, deformation, WORLD, changing).at(time)
     d = torch.nn.functional.normalize(0.3 * draw(200, 3) + torch.tensor([1.0, 0.0, 0.0]), dim=1)
     rays = Rays(0.3 * draw(200, 3) - torch.tensor([3.0, 0.0, 0.0]), d, d)
     seen = view.render(rays, WHITE)

@@ -1,10 +1,11 @@
-"""DeVRF's model: a canonical voxel field, its occupancy, and its deformation."""
+"""DeVRF's model: a canonical voxel field, its occupancy, and its deformation; and its views."""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from contextlib import nullcontext
+from dataclasses import asdict, replace
 from typing import Any, ClassVar
 
 import torch
@@ -12,27 +13,41 @@ from torch import Tensor
 
 from devrf.checkpoints.stored_grids import pack, unpack
 from devrf.geometry.box import Box
+from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.motion import moving
+from devrf.geometry.rays import Rays
 from devrf.geometry.space import WORLD, Space, space_config, space_from
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField, ColorDecoder
 from devrf.methods.devrf.deformation_field import DeformationField, GridWarp
 from devrf.methods.devrf.frame_store import NAMES, FrameField, fits_on_device
-from devrf.methods.devrf.view import CanonicalSurface, DeVRFView
-from devrf.methods.devrf.volume_rendering import deformed_occupancy
+from devrf.methods.devrf.losses import induced_flow
+from devrf.methods.devrf.surface import CanonicalSurface
+from devrf.methods.devrf.volume_rendering import deformed_occupancy, render
+from devrf.ops.compositing import LEAST_MASS, sum_by_ray
 from devrf.ops.trilinear import shape_of
 from devrf.rendering.occupancy import Occupancy
-from devrf.rendering.output import ColorResidual
+from devrf.rendering.output import ColorResidual, RenderedImage
 from devrf.rendering.renderable import Renderable
 from devrf.rendering.sampling import RenderSettings
 from devrf.system.plain_data import validate
 from devrf.system.stored_class import StoredClass, class_path, stored_class
+from devrf.system.threads import one_thread
 
 # Samples of a ray, at most, before empty space is skipped.
 SAMPLES = 2**14
 # Opacity of a base voxel that is left out.
 EMPTY = 1e-9
+# Rays at once: on a CPU so many that the cost of a chunk by itself, 0.8 ms, is small
+# (docs/notebook/costs.md#tiles); a GPU is kept busy, and they fit.
+ON_CPU = 2**14
+ON_GPU = 2**15
+# Points of a grid that are worth several threads.
+MANY = 2**20
+# Samples of unbounded scenes' pictures are so much further apart than in training: far things are
+# blurred over many voxels. Their PSNR stays, and a fifth of the time is saved.
+UNBOUNDED_STEP = 1.5
 
 
 class ColorResidualField(StoredClass, FrameField):
@@ -134,15 +149,7 @@ class DeVRFModel(Renderable):
 
     def at(self, time: float) -> DeVRFView:
         """The scene at ``time``: its occupancy and its displacements, ready."""
-        return DeVRFView(
-            self.canonical,
-            self.occupancy,
-            self.settings,
-            self.deformation,
-            self.space,
-            time,
-            self.color_residual_at(time),
-        )
+        return DeVRFView(self, time)
 
     def surface(self) -> CanonicalSurface:
         """The canonical field."""
@@ -256,6 +263,89 @@ class DeVRFModel(Renderable):
             raise ValueError("a grid of another size than its description says")
         if field.box.diagonal > SAMPLES * field.step_length(self.settings.step):
             raise ValueError("a ray of more samples than any grid has")
+
+
+class DeVRFView:
+    """The occupancy and the displacements of one time t; it shares the fields' memory.
+
+    Attributes:
+        occupancy: as of the view's time.
+        at_rest: whether the warps of this time are the identity.
+    """
+
+    @torch.no_grad()
+    def __init__(self, model: DeVRFModel, time: float) -> None:
+        """Blend the displacements of ``time``; find its occupancy, and the distances to it."""
+        self._model = model
+        self._color_residual = model.color_residual_at(time)
+        self._backward_warp: GridWarp | None = None
+        self.occupancy = model.occupancy
+        deformation = model.deformation
+        self.at_rest = deformation is None or deformation.clock.at(time).after == 0
+        if deformation is None or self.at_rest:
+            return
+        with one_thread() if model.canonical.density.values.numel() < MANY else nullcontext():
+            # As one grid: one interpolation a point instead of two.
+            moves = deformation.backward_warp(time).displacement
+            assert moves is not None
+            self._backward_warp = deformation.warp_by(moves)
+            self.occupancy = deformed_occupancy(
+                model.canonical, model.occupancy, self.picture_settings, self._backward_warp
+            )
+            self.occupancy.find_distances()
+
+    @property
+    def chunk(self) -> int:
+        """Rays that are best rendered at once."""
+        return ON_GPU if self._model.device.type == "cuda" else ON_CPU
+
+    @property
+    def picture_settings(self) -> RenderSettings:
+        """The settings by which rays of pictures are sampled."""
+        settings = self._model.settings
+        if self._model.space.is_linear:
+            return settings
+        return replace(settings, step=UNBOUNDED_STEP * settings.step)
+
+    @torch.no_grad()
+    def render(self, rays: Rays, background: Tensor) -> RenderedImage:
+        """The render of R rays in the fields' space."""
+        output = render(
+            rays,
+            self._model.canonical,
+            self.occupancy,
+            self.picture_settings,
+            background,
+            self._backward_warp,
+            color_residual=self._color_residual,
+        )
+        return RenderedImage.of(output)
+
+    @torch.no_grad()
+    def induced_flow(
+        self, rays: Rays, pixels: Tensor, cameras: Cameras, time: float
+    ) -> tuple[Tensor, Tensor]:
+        """Σ w_i φ_i / Σ w_i (R, 2) of R rays back to ``time``, and Σ w_i (R,).
+
+        See docs/method.md#flow for φ_i, with ``time`` in place of t − 1.
+        """
+        model = self._model
+        black = torch.zeros(3, device=rays.origins.device)
+        seen = render(
+            rays, model.canonical, self.occupancy, model.settings, black, self._backward_warp
+        )
+        ray, weight = seen.samples.ray, seen.samples.weight
+        moved = induced_flow(
+            seen.samples.canonical,
+            model.forward_warp(time),
+            cameras,
+            torch.zeros_like(ray),
+            pixels[ray],
+            model.space,
+        )
+        mass = sum_by_ray(weight, ray, len(rays))
+        total = sum_by_ray(weight[:, None] * moved, ray, len(rays))
+        return total / mass.clamp(min=LEAST_MASS)[:, None], mass
 
 
 def _device_of_frames(backward: Any, device: torch.device) -> torch.device:
