@@ -75,6 +75,8 @@ class Stage(LightningModule, ABC):
         useful_share: the smallest share of a batch that is worth drawing: less saves no time.
         plan: class of the plan, by which needs are forecast before the stage is built.
         iterations_per_step: iterations of a Lightning step at most.
+        datamodule: the trainer's, which serves the views; once the stage is set up, as ``scene``.
+        scene: the scene that is learned from, on the host.
         scene_model: the scene that is learned.
         schedule: of the iterations, for the scene; once the stage is set up.
         configured_schedule: the one before it was scaled (``schedule.seconds``); None until then.
@@ -101,6 +103,8 @@ class Stage(LightningModule, ABC):
     keeps_batches: bool = False
     useful_share: float = 0.0
     plan: ClassVar[type[StagePlan]] = StagePlan
+    datamodule: SceneDataModule
+    scene: Scene
     scene_model: Renderable
     schedule: Schedule
     optimizer: GridAdam
@@ -124,7 +128,6 @@ class Stage(LightningModule, ABC):
         self.abort_reason: str | None = None
         self.events: Counter[str] = Counter()
         self._progress: dict[str, Any] | None = None
-        self._finished: dict[str, Any] | None = None
 
     # What a subclass says.
 
@@ -232,17 +235,6 @@ class Stage(LightningModule, ABC):
         """Whether the stage has gone through its whole schedule, or was to end before."""
         return self.position.ended_early or self.position.iteration >= self.schedule.total
 
-    @property
-    def datamodule(self) -> SceneDataModule:
-        """The trainer's datamodule, which serves the views."""
-        datamodule: SceneDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
-        return datamodule
-
-    @property
-    def scene(self) -> Scene:
-        """The scene that is learned from, on the host."""
-        return self.datamodule.scene
-
     def result(self) -> LoadedCheckpoint:
         """The learned scene, for a stage that builds on this one."""
         metadata = self.provenance.metadata(
@@ -265,13 +257,16 @@ class Stage(LightningModule, ABC):
                 "need all their digits"
             )
         check_strategy(self.trainer)
-        if getattr(self.trainer, "datamodule", None) is None:
+        datamodule = getattr(self.trainer, "datamodule", None)
+        if datamodule is None:
             raise DevrfError(
                 f"{type(self).__name__}: it learns from the scene of a datamodule; give "
                 "datamodule=… to the trainer"
             )
         # Before Lightning reads the one to resume from.
         self.trainer.strategy.checkpoint_io = ChecksummedCheckpointIO()
+        self.datamodule = datamodule
+        self.scene = datamodule.scene
         self.began = time.perf_counter()
         self.position.seed = torch.initial_seed()
         self.batch_size.processes = self.trainer.world_size
@@ -322,18 +317,12 @@ class Stage(LightningModule, ABC):
 
         Nothing but iterations draws from it any more.
         """
-        self._finished = None
         broadcast([*self.parameters(), *self.buffers()])
         if self._progress is not None:
             set_rng_state(self._progress["random"], self.device)
             self._progress = None
         self.position.seed_generator(self.generator, self.global_rank)
         self.has_begun = True
-
-    def on_train_end(self) -> None:
-        """Pack what was learned while it is on its GPU: Lightning moves the stage to the host."""
-        if self.device.type == "cuda" and self.is_complete and self.global_rank == 0:
-            self._finished = self.current_model().stored_state()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add the state that is not in tensors.
@@ -353,7 +342,7 @@ class Stage(LightningModule, ABC):
                 "random": rng_state(self.device),
             }
         elif self.is_complete:
-            compact = self._finished or self.current_model().stored_state()
+            compact = self.current_model().stored_state()
             checkpoint["state_dict"] = {f"{MODEL}{k}": v for k, v in compact.items()}
 
     def on_fit_end(self) -> None:

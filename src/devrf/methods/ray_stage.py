@@ -143,8 +143,9 @@ class RayStage(Stage):
     def setup(self, stage: str) -> None:
         """Give the model what it needs of the scene, and make the optimiser."""
         # Before the clock starts: priors are read, or made as a scene's reader makes them.
-        if self.datamodule.priors == "all":
-            self.datamodule.provide(self.scene_model.priors)
+        datamodule = getattr(self.trainer, "datamodule", None)
+        if datamodule is not None and datamodule.priors == "all":
+            datamodule.provide(self.scene_model.priors)
         super().setup(stage)
         if not self._ready:
             # A protocol without a stage that learns from the static set does not look at it.
