@@ -63,8 +63,8 @@ def predicted(
     return DeformationPrediction(
         output,
         batch,
-        forward_warp=GridWarp((there.requires_grad_(),), BOX, **outside),
-        previous_forward_warp=GridWarp((before,), BOX, **outside),
+        forward_warp=GridWarp(there.requires_grad_(), BOX, **outside),
+        previous_forward_warp=GridWarp(before, BOX, **outside),
         cameras=cameras,
         previous_image=torch.tensor([2, 0, 1]),
         forward_slice=there,
@@ -83,7 +83,7 @@ def test_values_and_gradients_are_those_of_the_definitions(
 ) -> None:
     prediction = predicted(zero_outside_box, space, flow_mean, rng)
     if not moves:
-        prediction = replace(prediction, previous_forward_warp=GridWarp((), BOX))
+        prediction = replace(prediction, previous_forward_warp=GridWarp(None, BOX))
     samples = prediction.output.samples
     learned = [samples.canonical, samples.weight, prediction.forward_slice]
     # A function is no grid: it takes the definition.

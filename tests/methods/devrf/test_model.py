@@ -69,7 +69,9 @@ def test_the_block_is_seen_where_it_has_moved(model, time, way):
 
 
 def test_at_rest_nothing_is_warped(model):
-    assert not model.backward_warp(0.0).slices and model.occupancy_at(0.0) is model.occupancy
+    assert (
+        model.backward_warp(0.0).displacement is None and model.occupancy_at(0.0) is model.occupancy
+    )
     moving, model.deformation = picture(model, looking_down(31), 0.0), None
     still = picture(model, looking_down(31), 0.7)
     assert torch.equal(moving.color, still.color) and torch.equal(moving.depth, still.depth)
@@ -77,7 +79,7 @@ def test_at_rest_nothing_is_warped(model):
 
 def moved_by(model: DeVRFModel, shift: torch.Tensor) -> GridWarp:
     """x → x + ``shift`` (3,)."""
-    return GridWarp((shift.expand(2, 2, 2, 3).contiguous(),), model.box)
+    return GridWarp(shift.expand(2, 2, 2, 3).contiguous(), model.box)
 
 
 def test_deformed_occupancy_by_hand(model):

@@ -107,7 +107,7 @@ def test_a_warp_looks_up_samples_elsewhere_but_leaves_them_in_place(cube: Box) -
     with torch.no_grad():
         field.color.values.copy_(ramp.expand(-1, -1, -1, 3))
     shift = torch.tensor([0.3, 0.1, 0.0])
-    warp = GridWarp((shift.expand(2, 2, 2, 3),), cube)
+    warp = GridWarp(shift.expand(2, 2, 2, 3), cube)
     out = render(along_x(0.0), field, slab(cube), settings(1e-3), WHITE, warp)
     torch.testing.assert_close(out.samples.canonical, out.samples.points + shift)
     x = -1 + FIRST * STEP
@@ -129,7 +129,7 @@ def test_gradients_of_field_and_warp(cube: Box, rng: torch.Generator) -> None:
     def seen(density: Tensor, move: Tensor) -> tuple[Tensor, Tensor]:
         del field.density.values
         field.density.values = density  # type: ignore[assignment]
-        out = render(rays, field, full, settings(), d.new_ones(3), GridWarp((move,), cube))
+        out = render(rays, field, full, settings(), d.new_ones(3), GridWarp(move, cube))
         return out.color, out.transmittance
 
     density = torch.randn(3, 3, 3, 1, generator=rng, dtype=torch.float64, requires_grad=True)
@@ -164,16 +164,15 @@ def test_a_picture_is_the_same_as_a_batch(cube: Box, rng: torch.Generator, time:
     rays = Rays(0.3 * draw(200, 3) - torch.tensor([3.0, 0.0, 0.0]), d, d)
     seen = view.render(rays, WHITE)
     warp = deformation.backward_warp(time)
-    assert len(warp.slices) == (1 if time == 0.5 else 2)
-    # While it is learned, gradients flow through the slices, which are blended anew.
-    slices = tuple(frame.clone().requires_grad_() for frame in warp.slices)
+    # While it is learned, gradients flow into the displacement.
+    displacement = warp.displacement.clone().requires_grad_()
     batch = render(
         rays,
         field,
         view.occupancy,
         how,
         WHITE,
-        replace(warp, slices=slices),
+        replace(warp, displacement=displacement),
         color_residual=color_residual,
     )
     assert batch.color.requires_grad and not seen.color.requires_grad
@@ -182,4 +181,4 @@ def test_a_picture_is_the_same_as_a_batch(cube: Box, rng: torch.Generator, time:
     torch.testing.assert_close(seen.opacity, 1 - batch.transmittance)
     assert 0.2 < (seen.opacity > 0.5).float().mean() < 0.9
     batch.color.sum().backward()
-    assert all(frame.grad.any() for frame in slices)
+    assert displacement.grad.any()

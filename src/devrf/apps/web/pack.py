@@ -117,7 +117,7 @@ def _parts(model: DeVRFModel, cameras: Cameras) -> Iterator[tuple[str, Tensor]]:
     field = model.canonical
     sampling = model.at(0.0).picture_settings
     occupied = partial(deformed_occupancy, field, model.occupancy, sampling)
-    rest = occupied(GridWarp((), model.box))
+    rest = occupied(GridWarp(None, model.box))
     visible = rest.points_near(field.density.shape, model.box)
     raw = field.density.values[..., 0]
     yield "density", torch.where(visible, raw, raw.min()).half()

@@ -24,35 +24,23 @@ Warp = Callable[[Tensor], Tensor]
 
 @dataclass(frozen=True)
 class GridWarp:
-    """x → x + Δ(x, t), Δ = (1 − λ) Δ_k + λ Δ_{k+1}, each Δ_k trilinear in space.
+    """x → x + Δ(x), Δ trilinear in space.
 
     Attributes:
-        slices: Δ_k (X, Y, Z, 3) in the box's units: one frame's, or those of the two frames
-            between which t lies; none is the identity.
-        box: of the grids.
-        weight: λ in [0, 1].
+        displacement: Δ (X, Y, Z, 3) in the box's units; None is the identity.
+        box: of the grid.
         zero_outside_box: whether Δ is 0 outside the box; else it is as on the border.
     """
 
-    slices: tuple[Tensor, ...]
+    displacement: Tensor | None
     box: Box
-    weight: float = 0.0
     zero_outside_box: bool = False
 
-    @property
-    def displacement(self) -> Tensor | None:
-        """Δ as one grid (X, Y, Z, 3): one look-up a point; None: the identity."""
-        if not self.slices:
-            return None
-        first, *second = self.slices
-        return first.lerp(second[0], self.weight) if second else first
-
     def __call__(self, points: Tensor) -> Tensor:
-        """The points (M, 3) moved, (M, 3); differentiable in the slices and the points."""
-        if not self.slices:
+        """The points (M, 3) moved, (M, 3); differentiable in the displacement and the points."""
+        if self.displacement is None:
             return points
-        moves = [interpolate(frame, points, self.box) for frame in self.slices]
-        move = moves[0] if len(moves) == 1 else moves[0].lerp(moves[1], self.weight)
+        move = interpolate(self.displacement, points, self.box)
         if self.zero_outside_box:
             move = torch.where(self.box.contains(points)[:, None], move, 0.0)
         return points + move
@@ -135,15 +123,19 @@ class DeformationField(FrameField):
         """q → q + Δ_f(q, t): canonical points → where they are at ``time`` t."""
         return self._at(self.forward_slices, time)
 
-    def warp_by(self, *slices: Tensor) -> GridWarp:
-        """The warp by ``slices`` (X, Y, Z, 3) over the field's box; by none, the identity."""
-        return GridWarp(slices, self.box, zero_outside_box=self.zero_outside_box)
+    def warp_by(self, displacement: Tensor | None) -> GridWarp:
+        """The warp by a grid (X, Y, Z, 3) over the field's box; by none, the identity."""
+        return GridWarp(displacement, self.box, self.zero_outside_box)
 
     def _at(self, frames: Tensor, time: float) -> GridWarp:
+        """By Δ = (1 − λ) Δ_k + λ Δ_{k+1}, t lying between frames k and k + 1; at rest by none."""
         moment, here = self.clock.at(time), self.frames.here
-        numbers = [moment.before, moment.after] if moment.weight else [moment.before]
-        slices = () if numbers == [0] else tuple(frames[k].to(here) for k in numbers)
-        return GridWarp(slices, self.box, moment.weight, self.zero_outside_box)
+        if moment.after == 0:
+            return self.warp_by(None)
+        displacement = frames[moment.before].to(here)
+        if moment.weight:
+            displacement = displacement.lerp(frames[moment.after].to(here), moment.weight)
+        return self.warp_by(displacement)
 
     @torch.no_grad()
     def resize(self, voxels: int, planes: int | None = None) -> None:

@@ -135,13 +135,13 @@ class DeformationStage(Stage):
             color_residual=self._color_residual(frame),
         )
         # Before frame 1 nothing has moved.
-        previous = (frame.previous_forward,) if frame.number > 1 else ()
+        previous = frame.previous_forward if frame.number > 1 else None
         with span("losses"):
             prediction = DeformationPrediction(
                 output=output,
                 batch=batch,
                 forward_warp=field.warp_by(frame.forward),
-                previous_forward_warp=field.warp_by(*previous),
+                previous_forward_warp=field.warp_by(previous),
                 cameras=views.cameras,
                 previous_image=self.previous_images,
                 forward_slice=frame.forward,

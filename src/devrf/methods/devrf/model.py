@@ -143,7 +143,7 @@ class DeVRFModel(Renderable):
     def occupancy_at(self, time: float) -> Occupancy:
         """The occupancy at ``time`` in [0, 1]."""
         warp = self.backward_warp(time)
-        if not warp.slices:
+        if warp.displacement is None:
             return self.occupancy
         return deformed_occupancy(self.canonical, self.occupancy, self.settings, warp)
 
@@ -158,12 +158,12 @@ class DeVRFModel(Renderable):
     def forward_warp(self, time: float) -> GridWarp:
         """q → q + Δ_f(q, t) (docs/method.md#warp)."""
         field = self.deformation
-        return GridWarp((), self.box) if field is None else field.forward_warp(time)
+        return GridWarp(None, self.box) if field is None else field.forward_warp(time)
 
     def backward_warp(self, time: float) -> GridWarp:
         """x → q = x + Δ_b(x, t) (docs/method.md#warp)."""
         field = self.deformation
-        return GridWarp((), self.box) if field is None else field.backward_warp(time)
+        return GridWarp(None, self.box) if field is None else field.backward_warp(time)
 
     @torch.no_grad()
     def moving_points(self, size: float) -> Tensor:
@@ -285,10 +285,7 @@ class DeVRFView:
         if deformation is None or self.at_rest:
             return
         with one_thread() if model.canonical.density.values.numel() < MANY else nullcontext():
-            # As one grid: one interpolation a point instead of two.
-            moves = deformation.backward_warp(time).displacement
-            assert moves is not None
-            self._backward_warp = deformation.warp_by(moves)
+            self._backward_warp = deformation.backward_warp(time)
             self.occupancy = deformed_occupancy(
                 model.canonical, model.occupancy, self.picture_settings, self._backward_warp
             )

@@ -72,7 +72,7 @@ def march_inputs(
     backward_warp: GridWarp | None = None,
 ) -> MarchInputs:
     """A field, its occupancy and its backward warp, as the march reads them."""
-    warp = backward_warp or GridWarp((), field.box)
+    warp = backward_warp or GridWarp(None, field.box)
     displacement = warp.displacement
     limits = MarchRange(
         box=field.box,
