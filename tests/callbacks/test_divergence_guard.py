@@ -18,7 +18,7 @@ from devrf.callbacks.divergence_guard import collapsed_to_empty, collapsed_to_op
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file
 from devrf.errors import DevrfError
-from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level, Visits
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.settings import CanonicalRates
 
@@ -114,7 +114,7 @@ def test_the_second_time_ends_the_stage_in_its_last_good_state(fit, canonical, t
 
 def test_a_frame_is_visited_again(fit, moving, caplog):
     stage = fit(moving(), Spoil("nan", 21), DivergenceGuard())
-    phase = MOVING.phase(21, 3)
+    phase = Visits(MOVING, 3).phase(21)
     assert f"(frame {phase.frame}, " in caplog.text
     assert f"back to iteration {phase.start}," in caplog.text
     assert (stage.position.iteration, stage.position.num_rollbacks) == (30, 1)

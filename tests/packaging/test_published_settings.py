@@ -11,7 +11,7 @@ from hydra.utils import instantiate
 from devrf.geometry.box import Box
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
-from devrf.methods.devrf.deformation_schedule import PAPER_LEVELS
+from devrf.methods.devrf.deformation_schedule import PAPER_LEVELS, Visits
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.settings import (
     DEFORMATION_LOSS,
@@ -46,7 +46,7 @@ def test_deformation_schedule(paper):
     assert (tuple(schedule.levels), schedule.rays) == (PAPER_LEVELS, 8192)
     visit = instantiate(paper.schedule.visit)
     assert (visit.learning_rate, visit.unit) == (1e-3, "world")
-    factors = [schedule.phase(i, frames=50).rate_factor for i in (0, 24_999)]
+    factors = [Visits(schedule, 50).phase(i).rate_factor for i in (0, 24_999)]
     assert factors == pytest.approx([1, 0.1])
     # A batch is drawn from all pixels of one view.
     assert (visit.views, visit.pixels) == ("one", "all")
@@ -145,7 +145,8 @@ def test_each_forward_scene_has_its_published_schedule(
     config = composed("experiment=paper", f"data={scene}", ROOT)
     schedule = instantiate(config.schedule.deformation, _convert_="all")
     assert (config.data.name, [level.side for level in schedule.levels]) == (scene, sides)
-    assert (schedule.level_starts(frames), schedule.total(frames)) == (growths, total)
+    visits = Visits(schedule, frames)
+    assert (visits.level_starts, visits.total) == (growths, total)
     # 128 planes at the end, halved from level to level downwards.
     cube = Box((-1.0,) * 3, (1.0,) * 3)
     shapes = [cube.grid_shape(*schedule.grid(k)) for k in range(len(sides))]

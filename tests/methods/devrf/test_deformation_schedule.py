@@ -17,6 +17,7 @@ from devrf.methods.devrf.deformation_schedule import (
     DeformationPhase,
     DeformationSchedule,
     Level,
+    Visits,
 )
 from devrf.methods.devrf.settings import VisitSettings
 
@@ -39,7 +40,8 @@ def in_order(phase: Callable[[int], Any], total: int) -> list[Any]:
 
 
 def deformation_phases(schedule: DeformationSchedule, frames: int) -> list[DeformationPhase]:
-    return in_order(lambda at: schedule.phase(at, frames), schedule.total(frames))
+    visits = Visits(schedule, frames)
+    return in_order(visits.phase, visits.total)
 
 
 def test_canonical_defaults_are_the_papers():
@@ -75,8 +77,8 @@ def test_canonical_rates_fall_to_a_tenth_in_each_part_or_begin_again_at_each_gro
 
 def test_deformation_defaults_are_the_papers_inward():
     schedule, frames = DeformationSchedule(), 50
-    assert schedule.total(frames) == 25000
-    assert schedule.level_starts(frames) == [10000, 15000, 20000, 22500]
+    assert Visits(schedule, frames).total == 25000
+    assert Visits(schedule, frames).level_starts == [10000, 15000, 20000, 22500]
     phases = deformation_phases(schedule, frames)
     assert len(phases) == 5 * 49
     assert [p.side for p in phases[::49]] == [10, 20, 40, 80, 160]
@@ -92,12 +94,12 @@ def test_deformation_defaults_are_the_papers_inward():
 
 def test_forward_facing_and_without_coarse_to_fine():
     forward = DeformationSchedule(with_level(2, iterations=200), rays=4096)
-    assert forward.total(40) == 24000
-    assert forward.level_starts(40) == [8000, 16000, 20000, 22000]
+    assert Visits(forward, 40).total == 24000
+    assert Visits(forward, 40).level_starts == [8000, 16000, 20000, 22000]
     # Every share goes to the finest grid, where each frame starts from the one before it.
     schedule = DeformationSchedule(coarse_to_fine=False)
     phases = deformation_phases(schedule, 50)
-    assert schedule.total(50) == 25000 and schedule.level_starts(50) == []
+    assert Visits(schedule, 50).total == 25000 and Visits(schedule, 50).level_starts == []
     assert {(p.side, p.level, p.rate_factor) for p in phases} == {(160, 0, 1.0)}
     assert [p.frame for p in phases] == list(range(1, 50))
     assert [p.init_from_previous for p in phases] == [False] + [True] * 48
@@ -119,7 +121,7 @@ def test_frames_are_visited_one_after_another():
         (1, 2, 32, 36),
         (1, 3, 36, 40),
     ]
-    assert schedule.total(4) == 40 and schedule.level_starts(4) == [24]
+    assert Visits(schedule, 4).total == 40 and Visits(schedule, 4).level_starts == [24]
     phases = deformation_phases(schedule, 4)
     assert [p.init_from_previous for p in phases] == [False, True, True, False, False, False]
 
@@ -145,13 +147,13 @@ def test_deformation_phases_tile_every_schedule(levels, frames, coarse_to_fine):
         Level(side, iterations, backwards=level > 0 and backwards)
         for level, (side, iterations, backwards) in enumerate(levels)
     ]
-    schedule = DeformationSchedule(rows, coarse_to_fine)
-    phases = deformation_phases(schedule, frames)
-    assert phases[0].start == 0 and phases[-1].stop == schedule.total(frames)
+    schedule = Visits(DeformationSchedule(rows, coarse_to_fine), frames)
+    phases = deformation_phases(schedule.settings, frames)
+    assert phases[0].start == 0 and phases[-1].stop == schedule.total
     for phase, after in zip(phases, phases[1:], strict=False):
         assert phase.stop == after.start
     for phase in phases:
-        assert {schedule.phase(k, frames) for k in range(phase.start, phase.stop)} == {phase}
+        assert {schedule.phase(k) for k in range(phase.start, phase.stop)} == {phase}
     depth = len(levels) if coarse_to_fine else 1
     visits = [
         (level, frame)
@@ -160,8 +162,8 @@ def test_deformation_phases_tile_every_schedule(levels, frames, coarse_to_fine):
     ]
     assert [(p.level, p.frame) for p in phases] == visits
     begun = [[p.start for p in phases if p.level == level][0] for level in range(depth)]
-    assert begun == [0, *schedule.level_starts(frames)]
-    assert schedule.phase(schedule.total(frames) + 3, frames) == phases[-1]
+    assert begun == [0, *schedule.level_starts]
+    assert schedule.phase(schedule.total + 3) == phases[-1]
 
 
 @pytest.mark.parametrize(
@@ -206,7 +208,7 @@ def test_rows_of_a_config_are_levels_in_the_order_of_their_numbers():
 def test_a_level_may_have_a_rate_of_its_own():
     last = Level(8, 2, lr_factor=0.3, lr_final_factor=0.1)
     schedule = DeformationSchedule((Level(4, 2), Level(8, 2, lr_factor=0.5), last))
-    phases = [schedule.phase(i, frames=2) for i in (0, 4, 8)]
+    phases = [Visits(schedule, 2).phase(i) for i in (0, 4, 8)]
     rates = [(p.rate_factor, p.lr_final_factor) for p in phases]
     assert rates == [(1, 1), (0.5, 1), (0.3, 0.1)]
     assert phases[2].learning_rate_at(phases[2].stop) == pytest.approx(0.03)
@@ -237,7 +239,7 @@ def test_events_of_the_papers_schedule():
         "view dependence begun": 1,
         "total variation of touched voxels alone": 1,
     }
-    events = DeformationSchedule().events(frames=50)
+    events = Visits(DeformationSchedule(), 50).planned_events
     assert events == {"levels begun": 5, "grids grown": 4, "visits of frames": 5 * 49}
 
 

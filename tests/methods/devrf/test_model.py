@@ -69,9 +69,8 @@ def test_the_block_is_seen_where_it_has_moved(model, time, way):
 
 
 def test_at_rest_nothing_is_warped(model):
-    assert (
-        model.backward_warp(0.0).displacement is None and model.occupancy_at(0.0) is model.occupancy
-    )
+    assert model.backward_warp(0.0).displacement is None
+    assert model.occupancy_at(0.0) is model.occupancy
     moving, model.deformation = picture(model, looking_down(31), 0.0), None
     still = picture(model, looking_down(31), 0.7)
     assert torch.equal(moving.color, still.color) and torch.equal(moving.depth, still.depth)

@@ -172,13 +172,6 @@ class DeformationSchedule(Options):
         planes = self.planes and max(2, round(self.planes * side / finest))
         return replace(self, levels=rows, planes=planes)
 
-    def events(self, frames: int) -> dict[str, int]:
-        """Counts of the schedule's events, by name, as in :attr:`Stage.events`."""
-        levels = len(self.levels)
-        grown = sum(a.side != b.side for a, b in pairwise(self.levels))
-        counts = {LEVELS: levels, GROWN: grown, VISITS: levels * (frames - 1)}
-        return {name: count for name, count in counts.items() if count}
-
     def grid(self, level: int) -> tuple[int, int | None]:
         """About how many voxels a level's displacement grids have, and their planes, if given."""
         side = self.levels[level].side
@@ -192,39 +185,6 @@ class DeformationSchedule(Options):
             return factor
         sides = [row.side for row in self.levels[: level + 1]]
         return self.decay ** sum(a != b for a, b in pairwise(sides))
-
-    def total(self, frames: int) -> int:
-        """Iterations of the whole stage for T = ``frames`` frames, frame 0 included."""
-        return sum(self._lengths(frames))
-
-    def level_starts(self, frames: int) -> list[int]:
-        """Iterations at which a further level begins; displacement grids grow if its side does."""
-        return list(accumulate(self._lengths(frames)[:-1]))
-
-    def _lengths(self, frames: int) -> list[int]:
-        """Iterations of each level."""
-        return [row.iterations * frames for row in self.levels]
-
-    def phase(self, iteration: int, frames: int) -> DeformationPhase:
-        """The visit that ``iteration`` belongs to; the last one from the end on."""
-        begins = [0, *self.level_starts(frames)]
-        level = bisect_right(begins, iteration) - 1
-        row = self.levels[level]
-        # The frame that is visited first takes the share of frame 0, too.
-        share = (iteration - begins[level]) // row.iterations
-        number = min(max(share, 1), frames - 1)
-        return DeformationPhase(
-            kind=f"level {level + 1}",
-            start=begins[level] + (number if number > 1 else 0) * row.iterations,
-            stop=begins[level] + (number + 1) * row.iterations,
-            frame=frames - number if row.backwards else number,
-            level=level,
-            side=row.side,
-            rate_factor=self.level_rate_factor(level),
-            lr_final_factor=row.lr_final_factor,
-            init_from_previous=level == 0 and number > 1,
-            step=-1 if row.backwards else 1,
-        )
 
 
 @dataclass(frozen=True)
@@ -241,17 +201,47 @@ class Visits:
 
     @property
     def total(self) -> int:
-        """Iterations of all levels and frames."""
-        return self.settings.total(self.frames)
+        """Iterations of the whole stage."""
+        return sum(self._lengths)
+
+    @property
+    def level_starts(self) -> list[int]:
+        """Iterations at which a further level begins; displacement grids grow if its side does."""
+        return list(accumulate(self._lengths[:-1]))
+
+    @property
+    def _lengths(self) -> list[int]:
+        """Iterations of each level."""
+        return [row.iterations * self.frames for row in self.settings.levels]
 
     @property
     def planned_events(self) -> Mapping[str, int]:
         """Numbers of levels, growths of the grid, and visits."""
-        return self.settings.events(self.frames)
+        levels = self.settings.levels
+        grown = sum(a.side != b.side for a, b in pairwise(levels))
+        counts = {LEVELS: len(levels), GROWN: grown, VISITS: len(levels) * (self.frames - 1)}
+        return {name: count for name, count in counts.items() if count}
 
     def phase(self, iteration: int) -> DeformationPhase:
-        """The visit of an iteration."""
-        return self.settings.phase(iteration, self.frames)
+        """The visit that ``iteration`` belongs to; the last one from the end on."""
+        begins = [0, *self.level_starts]
+        level = bisect_right(begins, iteration) - 1
+        row = self.settings.levels[level]
+        # The frame that is visited first takes the share of frame 0, too.
+        share = (iteration - begins[level]) // row.iterations
+        number = min(max(share, 1), self.frames - 1)
+        return DeformationPhase(
+            kind=f"level {level + 1}",
+            start=begins[level] + (number if number > 1 else 0) * row.iterations,
+            stop=begins[level] + (number + 1) * row.iterations,
+            frame=self.frames - number if row.backwards else number,
+            level=level,
+            side=row.side,
+            rate_factor=self.settings.level_rate_factor(level),
+            lr_final_factor=row.lr_final_factor,
+            init_from_previous=level == 0 and number > 1,
+            step=-1 if row.backwards else 1,
+        )
 
     def learning_rate_factor(self, iteration: int) -> float:
         """Factor of the iteration's level, and within its visit."""

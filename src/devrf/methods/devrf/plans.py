@@ -18,7 +18,7 @@ from devrf.kernels.ahead import grid_kernels, march_kernels
 from devrf.methods.devrf.architecture import Architecture, fitted_to
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.deformation_loss import DeformationLoss
-from devrf.methods.devrf.deformation_schedule import DeformationSchedule
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Visits
 from devrf.methods.devrf.settings import VisitSettings
 from devrf.scenes.scene import Scene
 
@@ -96,7 +96,7 @@ class DeformationPlan(StagePlan):
     def iterations(self, scene: Scene) -> int:
         """Of all levels and frames."""
         schedule: DeformationSchedule = self.settings["schedule"]
-        return schedule.total(len(scene.clock))
+        return Visits(schedule, len(scene.clock)).total
 
     def needs(self, scene: Scene, earlier: StagePlan | None) -> StageNeeds:
         """Images, the frozen field, the displacement grids, and a batch."""

@@ -10,7 +10,12 @@ import torch
 
 from devrf.geometry.box import Box
 from devrf.kernels.trilinear import interpolate
-from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule, Level
+from devrf.methods.devrf.deformation_schedule import (
+    DeformationPhase,
+    DeformationSchedule,
+    Level,
+    Visits,
+)
 from devrf.methods.devrf.extensions import frame_start
 from devrf.methods.devrf.extensions.frame_start import (
     StartFromBest,
@@ -21,7 +26,7 @@ from devrf.methods.devrf.extensions.frame_start import (
 from devrf.methods.devrf.frame_store import FrameStore
 
 # Four frames. Level 0: 1, 2, 3 in iterations 0, 2, 3; level 1: 3, 2, 1 in 4, 6, 7.
-BACK = DeformationSchedule((Level(2, 1), Level(2, 1, backwards=True)))
+BACK = Visits(DeformationSchedule((Level(2, 1), Level(2, 1, backwards=True))), frames=4)
 
 
 @pytest.fixture
@@ -40,7 +45,7 @@ def stage(cube: Box) -> Any:
 
 
 def phase(iteration: int) -> DeformationPhase:
-    return BACK.phase(iteration, 4)
+    return BACK.phase(iteration)
 
 
 @pytest.mark.parametrize(

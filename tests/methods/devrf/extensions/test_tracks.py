@@ -15,7 +15,7 @@ from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.deformation_field import DeformationField
-from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level, Visits
 from devrf.methods.devrf.extensions.tracks import (
     FlowTracks,
     StartAlongFlow,
@@ -169,7 +169,7 @@ def test_without_tracks_the_frame_stays_where_the_one_before_is():
 
 def test_flow_starts_the_frames_of_the_first_level(tiny_scene):
     schedule = DeformationSchedule((Level(5, 4), Level(6, 4)))
-    phases = [schedule.phase(at, 4) for at in (0, 8, 16)]
+    phases = [Visits(schedule, 4).phase(at) for at in (0, 8, 16)]
     assert [(phase.level, phase.frame) for phase in phases] == [(0, 1), (0, 2), (1, 1)]
     context: Any = SimpleNamespace(views=tiny_scene.dynamic.train)
     assert [StartAlongFlow("flow").changes(context, phase) for phase in phases] == [
