@@ -97,3 +97,11 @@ def test_gradients(rng: torch.Generator) -> None:
         return image.color, image.depth, image.transmittance
 
     assert gradcheck(pictures, [each.requires_grad_() for each in tensors])
+
+
+def test_a_quaternion_of_zero_is_no_rotation_and_a_long_one_is_normalised() -> None:
+    assert torch.equal(rotations(torch.zeros(4)), torch.eye(3))
+    # A quarter turn about z, three times as long as a unit quaternion: x becomes y.
+    half = 3 * math.sqrt(0.5)
+    turned = rotations(torch.tensor([half, 0, 0, half])) @ torch.tensor([1.0, 0, 0])
+    torch.testing.assert_close(turned, torch.tensor([0.0, 1.0, 0.0]))

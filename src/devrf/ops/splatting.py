@@ -111,13 +111,16 @@ def splat(
     return SplatImage(weight @ gaussians.color[order], weight @ depth, transmittance[:, -1])
 
 
-def rotations(quaternions: Tensor) -> Tensor:
-    """The rotations (N, 3, 3) of quaternions (N, 4), w first, of any length but 0."""
-    w, x, y, z = normalize(quaternions, dim=1).unbind(1)
+def rotations(quaternions: Tensor, least: float = 1e-12) -> Tensor:
+    """The rotations (..., 3, 3) of quaternions (..., 4), w first, of any length.
+
+    They are divided by their length or by ``least``, whichever is more: 0 is no rotation.
+    """
+    w, x, y, z = normalize(quaternions, dim=-1, eps=least).unbind(-1)
     rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
     rows += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
     rows += [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
-    return torch.stack(rows, dim=1).view(-1, 3, 3)
+    return torch.stack(rows, dim=-1).view(*quaternions.shape[:-1], 3, 3)
 
 
 def _transmittances(alpha: Tensor) -> Tensor:

@@ -18,7 +18,6 @@ from devrf.methods.neural_volumes.networks import (
     TimeEncoder,
     doubling,
     identity_grid,
-    rotation_matrices,
 )
 from devrf.methods.neural_volumes.settings import NeuralVolumesSettings
 from devrf.methods.neural_volumes.volumes import (
@@ -125,14 +124,6 @@ def test_each_point_is_looked_up_in_its_own_moment() -> None:
     assert found[:, 3].tolist() == [0.75, 0.25, 0.25, 0.5]
     beyond = Volumes(torch.ones(1, 4, 2, 2, 2), identity_grid(2)[None] + 5)  # the template
     assert beyond.at(torch.zeros(1, 3), torch.zeros(1, dtype=torch.long)).abs().max() == 0
-
-
-def test_a_quaternion_of_zero_is_no_rotation_and_a_long_one_is_normalised() -> None:
-    assert torch.equal(rotation_matrices(torch.zeros(4)), torch.eye(3))
-    # A quarter turn about z, three times as long as a unit quaternion: x becomes y.
-    half = 3 * math.sqrt(0.5)
-    turned = rotation_matrices(torch.tensor([half, 0, 0, half])) @ torch.tensor([1.0, 0, 0])
-    torch.testing.assert_close(turned, torch.tensor([0.0, 1.0, 0.0]))
 
 
 def test_opacity_adds_up_and_stops_at_one() -> None:

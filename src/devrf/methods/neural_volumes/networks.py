@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn.functional import grid_sample
 
 from devrf.methods.neural_volumes.settings import NeuralVolumesSettings
+from devrf.ops.splatting import rotations
 
 LEAK = 0.2
 Layer = TypeVar("Layer", nn.Linear, nn.Conv2d)
@@ -174,7 +175,7 @@ class AffineMixWarp(nn.Module):
         count = len(code)
         side = self.side
         scale = self.scale(code).view(count, self.maps, 3, 1)
-        rotation = rotation_matrices(self.rotation(code).view(count, self.maps, 4))
+        rotation = rotations(self.rotation(code).view(count, self.maps, 4), least=LEAST_NORM)
         shift = 0.1 * self.shift(code).view(count, self.maps, 3, 1)
         moved = scale * (rotation @ (self.grid.flatten(1) - shift))  # (M, K, 3, side³)
         weight = self.weight(code).exp().view(count * self.maps, 1, side, side, side)
@@ -183,15 +184,3 @@ class AffineMixWarp(nn.Module):
         mixing = mixing.view(count, self.maps, 1, -1)
         mixed: Tensor = (mixing * moved).sum(dim=1) / mixing.sum(dim=1).clamp(min=1e-3)
         return mixed.view(count, 3, side, side, side)
-
-
-def rotation_matrices(quaternion: Tensor) -> Tensor:
-    """Rotations (..., 3, 3) of quaternions (..., 4), w first, of any length; 0 is no rotation."""
-    length = quaternion.square().sum(dim=-1, keepdim=True).clamp(min=LEAST_NORM**2).sqrt()
-    w, x, y, z = (quaternion / length).unbind(-1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
