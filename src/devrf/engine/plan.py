@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 from warp import Kernel
@@ -13,6 +14,7 @@ from devrf.errors import expect
 from devrf.scenes.scene import Scene
 
 
+@dataclass(frozen=True)
 class StagePlan:
     """The class and the arguments of a stage; a stage class names its own as ``plan``.
 
@@ -23,17 +25,10 @@ class StagePlan:
         name: the stage's name there.
     """
 
-    def __init__(
-        self,
-        stage: Callable[..., Any],
-        settings: Mapping[str, Any],
-        protocol: Protocol,
-        name: str,
-    ) -> None:
-        self.stage = stage
-        self.settings = {**settings}
-        self.protocol = protocol
-        self.name = name
+    stage: Callable[..., Any]
+    settings: Mapping[str, Any]
+    protocol: Protocol
+    name: str
 
     def check(self) -> None:
         """Find errors in the arguments before what the stage builds on has been learned.
@@ -77,4 +72,4 @@ class StagePlan:
 
     def with_settings(self, **changed: Any) -> Self:
         """The plan with other arguments."""
-        return type(self)(self.stage, {**self.settings, **changed}, self.protocol, self.name)
+        return replace(self, settings={**self.settings, **changed})
