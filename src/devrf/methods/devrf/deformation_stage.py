@@ -109,9 +109,6 @@ class DeformationStage(Stage):
         self.register_state_dict_pre_hook(  # type: ignore[no-untyped-call]
             lambda *_: self._write_back()
         )
-        self.register_load_state_dict_post_hook(  # type: ignore[no-untyped-call]
-            lambda *_: self._check_out_again()
-        )
         # The phase's state where a fit ended before the schedule.
         self._left: dict[str, Any] = {}
 
@@ -192,8 +189,9 @@ class DeformationStage(Stage):
             raise DevrfError(f"{self.scene.name}: is at rest; the canonical stage is all it takes")
         if self.scene.dynamic.train.by_moving_camera and self.deformation_loss.leave_out("flow"):
             log.info("the camera moves, and so does all that it sees: the flow loss is left out")
-        self.phase = None  # no frame is active
+        self.phase = None
         self._left = {}
+        # No frame is active: what is loaded next is checked out when its phase is restored.
         self.context = DeformationContext(
             model=self.scene_model,
             datamodule=self.datamodule,
@@ -320,11 +318,6 @@ class DeformationStage(Stage):
         """Copy what was learned of the active frame into the fields; learning may go on."""
         if self.active is not None:
             self.active.write_back()
-
-    def _check_out_again(self) -> None:
-        """Copy the active frame out of the fields, which were loaded."""
-        if self.active is not None and self.active.number:
-            self.active.check_out(self.active.number)
 
     def current_model(self) -> DeVRFModel:
         """The moving scene, the active frame written back."""
