@@ -107,23 +107,23 @@ class WandbTracker(WandbLogger):
         *,
         offline: bool = True,
         log_model: bool | Literal["all"] = False,
-        project: str = "devrf",
+        project: str | None = None,
         name: str | None = None,
         group: str | None = None,
         tags: Sequence[str | None] = (),
         id: str | None = None,
-        resume: bool | Literal["allow", "must", "never", "auto"] | None = "allow",
+        resume: bool | Literal["allow", "must", "never", "auto"] | None = None,
         dir: str | Path | None = None,
         **init: Any,
     ) -> None:
         """Name the run; it begins when something is logged first.
 
-        None as ``name`` is that of the run's folder ``save_dir``, as ``group`` that of the one that
-        it lies in, the scene's or the sweep's, as ``id`` the one kept in the folder, as ``dir`` the
-        folder itself, for ``wandb/``. ``WANDB_MODE`` takes precedence over ``offline``; a trial of
-        ``wandb agent`` is sent without it. ``WANDB_TAGS`` come beside ``tags``. ``log_model`` keeps
-        the checkpoints of a run that ended well as an artifact. ``init`` is whatever else
-        ``wandb.init`` takes.
+        Each None is left to wandb's variable in the environment, else it is: the project
+        ``devrf``; the name of the run's folder ``save_dir``, and as group of the one that it lies
+        in, the scene's or the sweep's; the id kept in the folder; ``allow``; the folder itself,
+        for ``wandb/``. ``WANDB_MODE`` takes precedence over ``offline``; a trial of ``wandb agent``
+        is sent without it. ``WANDB_TAGS`` come beside ``tags``. ``log_model`` keeps the checkpoints
+        of a run that ended well as an artifact. ``init`` is whatever else ``wandb.init`` takes.
 
         Raises:
             DevrfError: it takes no such argument.
@@ -136,19 +136,23 @@ class WandbTracker(WandbLogger):
                 kept = read_record(self._id_file, LONGEST_NAME + 1).decode().strip()
             except ValueError:
                 raise DevrfError(f"{self._id_file}: no run's id; remove it") from None
-        labels = [*tags, *os.environ.get("WANDB_TAGS", "").split(",")]
-        usual = "offline" if offline and SWEEP not in os.environ else "online"
+        mode = "offline" if offline and SWEEP not in os.environ else "online"
         settings = init | {
-            "project": project,
-            "name": name or self._folder.name[:LONGEST_NAME],
-            "group": group or self._folder.parent.name[:LONGEST_NAME],
-            "id": id or kept,
-            "resume": resume,
-            "tags": list(dict.fromkeys(filter(None, labels))),
-            # Not as Lightning's `offline`, which changes WANDB_MODE.
-            "mode": init.get("mode") or os.environ.get("WANDB_MODE") or usual,
+            key: value if value is not None or os.environ.get(variable) else usual
+            for key, value, variable, usual in (
+                ("project", project, "WANDB_PROJECT", "devrf"),
+                ("name", name, "WANDB_NAME", self._folder.name[:LONGEST_NAME]),
+                ("group", group, "WANDB_RUN_GROUP", self._folder.parent.name[:LONGEST_NAME]),
+                ("id", id, "WANDB_RUN_ID", kept),
+                ("resume", resume, "WANDB_RESUME", "allow"),
+                ("dir", dir, "WANDB_DIR", self._folder),
+                # Not as Lightning's `offline`, which changes WANDB_MODE.
+                ("mode", init.get("mode"), "WANDB_MODE", mode),
+            )
         }
-        if settings["mode"] in OFFLINE:
+        labels = [*tags, *os.environ.get("WANDB_TAGS", "").split(",")]
+        settings["tags"] = list(dict.fromkeys(filter(None, labels)))
+        if (settings["mode"] or os.environ["WANDB_MODE"]) in OFFLINE:
             # Read when wandb is first imported. It reports on itself even when offline.
             os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
         import wandb
@@ -157,7 +161,7 @@ class WandbTracker(WandbLogger):
         for key in settings.keys() - known:
             meant = did_you_mean(key, known, "logger.wandb.")
             raise DevrfError(f"logger.wandb.{key}: wandb.init takes no such argument{meant}")
-        super().__init__(save_dir=dir or self._folder, log_model=log_model, **settings)
+        super().__init__(save_dir=settings.pop("dir"), log_model=log_model, **settings)
         # wandb ignores it and warns where it is given.
         self._wandb_init.pop("anonymous", None)
 
