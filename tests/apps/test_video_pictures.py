@@ -12,7 +12,13 @@ import pytest
 import torch
 
 from devrf.apps.still import StillSettings, sized, still
-from devrf.apps.video import VideoSettings, held_out_images, held_out_pictures, path_pictures
+from devrf.apps.video import (
+    VideoSettings,
+    held_out_images,
+    held_out_pictures,
+    held_out_times,
+    path_pictures,
+)
 from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import HeldOutView, score, truth_image
@@ -121,7 +127,11 @@ def test_a_film_that_fails_leaves_nothing_behind(tmp_path):
 def filmed(model, views, images, settings):
     """The pictures of a film of held-out images beside a learned scene."""
     shown = partial(still, Renderer(model))
-    return [*held_out_pictures(shown, model.moves, views, images, settings, background="white")]
+    times = held_out_times(views, images)
+    pictures = held_out_pictures(
+        shown, model.moves, views, images, times, settings, background="white"
+    )
+    return [*pictures]
 
 
 def test_held_out_pictures_are_rendered_in_the_films_size_beside_the_truth(moving, tiny_scene):

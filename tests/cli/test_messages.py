@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from lightning_utilities.core.imports import RequirementCache
 from omegaconf import OmegaConf
 
 import devrf as package
@@ -298,6 +299,13 @@ def test_a_missing_package_is_named_before_anything_is_learned(
     said = f'devrf: {package} is not installed; run pip install "devrf[{extra}]"\n'
     assert (outcome.status, outcome.err) == (2, said)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_part_of_another_package_that_lacks_its_own_is_one_line(devrf, monkeypatch):
+    lacking = RequirementCache("no-such-package")
+    monkeypatch.setattr("lightning.pytorch.loggers.mlflow._MLFLOW_AVAILABLE", lacking)
+    outcome = devrf("+logger.mine._target_=lightning.pytorch.loggers.MLFlowLogger")
+    assert outcome.status == 2 and outcome.err.count("\n") == 1 and "no-such-package" in outcome.err
 
 
 def test_a_fault_of_the_program_keeps_its_traceback(devrf, monkeypatch):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import time
 from pathlib import Path
 
 import pytest
@@ -58,9 +59,13 @@ def test_files_that_a_killed_process_had_begun_are_removed(devrf, tiny, tmp_path
     for name in (*files, "export/.partial-pictures/static_0/0.jpg", "notes/.partial-mine"):
         (tmp_path / "run" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "run" / name).write_text("half")
+    for path in tmp_path.rglob(".partial-*"):
+        os.utime(path, (time.time() - 100,) * 2)
+    # A viewer, which takes no lock, is writing it.
+    (tmp_path / "run" / "export" / ".partial-scene.html").write_text("half")
     assert devrf("stage=inspect", *tiny, "hydra.run.dir=run").status == 0
-    left = [str(path.relative_to(tmp_path)) for path in tmp_path.rglob(".partial-*")]
-    assert left == ["run/notes/.partial-mine"]
+    left = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob(".partial-*")}
+    assert left == {"run/notes/.partial-mine", "run/export/.partial-scene.html"}
 
 
 def test_a_sweep_and_its_jobs_have_their_folders_to_themselves(devrf, hanging, tiny, tmp_path):

@@ -114,6 +114,17 @@ def test_pictures_in_their_order_whose_numbers_are_names_of_some_images(folder, 
     assert "no picture of view3/00007.png" in line and "2 of 3 are missing" in line
 
 
+def test_a_name_that_is_misspelt_is_no_order(folder, sets):
+    views = replace(sets["dynamic"], names=("r_10.png", "r_1.png", "r_2.png"))
+    for k, name in enumerate(("r_10", "r_1", "r_02")):
+        (folder / "dynamic" / picture_name(views, k)).rename(folder / "dynamic" / f"{name}.png")
+    assert "no picture of r_2.png" in refused(folder, {"dynamic": views})
+    placed = picture_name(sets["dynamic"], 0).replace("time0", "time7")
+    for k, path in enumerate(sorted((folder / "dynamic").iterdir())):
+        path.rename(path.with_name(placed if k == 0 else f"other{k}.png"))
+    assert "3 of 3 are missing" in refused(folder, sets)
+
+
 def test_pictures_have_no_score_of_a_scene_at_rest(folder, sets):
     rows = frame_rows(scored(folder, sets))
     assert [{*row} & {"psnr", "rest_pose_psnr"} for row in rows] == [{"psnr"}] * len(rows)

@@ -76,7 +76,7 @@ def followed(
     }
     differing: dict[str, list[str]] = {}
     for name, scenes in benchmarks().items():
-        if scene.name in scenes and scenes[scene.name]["data"] == layout:
+        if scene.name in scenes and scenes[scene.name].get("data") == layout:
             differing[name] = [*_differences(scenes[scene.name], seen, source)]
             if not differing[name]:
                 return name
@@ -101,7 +101,7 @@ def _differences(facts: Facts, seen: Mapping[str, Any], source: object) -> Itera
             pairs = zip(seen[key].float().mean(dim=(0, 1, 2)) / 255, value, strict=False)
             if any(abs(here - there) > SAME_COLOR for here, there in pairs):
                 yield "held-out images show something else"
-        elif key != "options" and seen[key] != value:
-            yield f"{key} is {seen[key]}, not {value}"
+        elif key != "options" and seen.get(key) != value:
+            yield f"{key} is {seen.get(key)}, not {value}"
     if "exposure" in seen:
         yield "held-out images have an exposure of their own"

@@ -196,6 +196,8 @@ def fetched(scene: PublishedScene, settings: FetchSettings, progress: bool) -> P
     refuse_links(work, itself=True)
     lock_folder(work, "fetch.into")
     try:
+        if (path / RECORD).is_file():  # another process has just fetched it
+            return path
         digest = _fetch(scene, work, path, expected, progress)
     finally:
         release_folder(work)

@@ -29,6 +29,7 @@ from devrf.apps.video import (
     VideoSettings,
     held_out_images,
     held_out_pictures,
+    held_out_times,
     path_pictures,
 )
 from devrf.checkpoints.checkpoint import Viewpoints
@@ -105,7 +106,13 @@ def videos(
         images = held_out_images(held_out, settings.frames)
         background = viewpoints.background
         pictures = held_out_pictures(
-            partial(still, renderer), renderer.model.moves, held_out, images, settings, background
+            partial(still, renderer),
+            renderer.model.moves,
+            held_out,
+            images,
+            held_out_times(held_out, images),
+            settings,
+            background,
         )
         yield video("held_out", pictures)
     name = settings.path or default_path(space)

@@ -84,11 +84,19 @@ def path_pictures(
         yield image_grid([[color, depth]], [heading, DEPTH])
 
 
+def held_out_times(views: Views, images: Sequence[int]) -> list[float]:
+    """The time of each frame: from 0 to 1, but an image with a pose of its own has its own."""
+    if views.by_moving_camera and len(views) > 1:
+        return views.times[images].tolist()
+    return torch.linspace(0, 1, len(images)).tolist()
+
+
 def held_out_pictures(
     shown: Shown,
     moves: bool,
     views: Views,
     images: Sequence[int],
+    times: Sequence[float],
     settings: VideoSettings,
     background: Background,
 ) -> Iterator[Tensor]:
@@ -96,16 +104,12 @@ def held_out_pictures(
 
     Images of several sizes are at one scale, in tiles for the widest and the highest. Headings say
     times if the scene ``moves``. ``images`` are those of the ``views`` to show, one a frame
-    (:func:`held_out_images`). Where a camera took several, time runs from 0 to 1. An image with a
-    pose of its own is shown at its own time.
+    (:func:`held_out_images`), at ``times`` (:func:`held_out_times`).
     """
     rows = max(views.height, READABLE) if settings.height is None else settings.height
     cameras = views.cameras.of_height(rows)
     behind = background_value(background)
     larger = ", enlarged" if cameras.height > views.height else ""
-    times = torch.linspace(0, 1, len(images)).tolist()
-    if views.by_moving_camera and len(views) > 1:
-        times = views.times[images].tolist()
     shots = zip(images, times, strict=True)
     for (image, time), frames in groupby(shots):
         color, depth = shown(cameras, time, behind, image)

@@ -192,5 +192,6 @@ def _evaluate_predictions(run: RunContext) -> None:
 
     images = held_out_images(views, settings.frames)
     moves = bool((views.times != views.times[0]).any())
-    film = held_out_pictures(shown, moves, views, images, settings, scene.background)
+    times = views.times[images].tolist()
+    film = held_out_pictures(shown, moves, views, images, times, settings, scene.background)
     write_video(run, Video("held_out", settings.fps, settings.frames, film))

@@ -48,8 +48,8 @@ def is_user_error(error: BaseException) -> bool:
     cause = _cause(error)
     if isinstance(cause, DevrfError):
         return True
-    if isinstance(cause, ModuleNotFoundError):
-        return cause.name in EXTRAS
+    if isinstance(cause, ModuleNotFoundError) and cause.name in EXTRAS:
+        return True
     if isinstance(error, OSError) and not isinstance(error, HydraException):
         return error.errno in REFUSED
     # Another error in a constructor of devrf is a fault of the program.

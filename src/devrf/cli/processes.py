@@ -101,8 +101,10 @@ def run_in_each(strategy: Strategy, folder: Path) -> None:
         raise DevrfError(f"trainer.devices: the process of rank {rank} {ended}") from None
     finally:
         logging.disable(logging.NOTSET)
-        os.environ.clear()
-        os.environ.update(own_environment)  # the next job of a sweep has its own processes
+        # The next job of a sweep has its own processes.
+        for name in os.environ.keys() - own_environment.keys():
+            del os.environ[name]
+        os.environ.update(own_environment)
 
 
 def _words(folder: Path) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -36,6 +37,8 @@ log = logging.getLogger(__name__)
 AT_FIRST = {".hydra", PLACE}
 # Folders in a run's in which a killed process may have left what it had begun.
 BEGUN = (PLACE, "checkpoints", "images", "videos", "logs", "export", "paths")
+# What was written in these last seconds may be a viewer's, which works in the folder beside others.
+WRITING = 60.0
 # Why a sweep's job failed.
 FAILURE = "failure.json"
 # Stages that leave .hydra alone: they look at other runs, or are none.
@@ -116,8 +119,10 @@ def working_in(folder: Path, config: DictConfig) -> Iterator[None]:
     if is_rank_zero and config.stage not in UNRECORDED:
         lock_folder(folder, "hydra.sweep.dir" if in_sweep() else "hydra.run.dir")
         below = (walked for name in BEGUN for walked, *_ in walk(folder / name))
+        recent = time.time() - WRITING
         for begun in (path for walked in (folder, *below) for path in walked.glob(f"{PARTIAL}*")):
-            remove(begun)
+            if begun.lstat().st_mtime < recent:
+                remove(begun)
     was_new = is_rank_zero and not in_sweep() and holds_at_most(folder, AT_FIRST)
     try:
         yield

@@ -14,7 +14,7 @@ from devrf.errors import expect
 from devrf.scenes.scene import Scene
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StagePlan:
     """The class and the arguments of a stage; a stage class names its own as ``plan``.
 

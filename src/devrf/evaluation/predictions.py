@@ -189,12 +189,11 @@ def _named(folder: Path, views: Views) -> dict[int, Path]:
     by_place = {
         k: path for path, match in placed for k in _at(views, int(match[1]), float(match[2]))
     }
-    in_order = dict(enumerate(images if len(images) == len(views) else ()))
-    # Names may be those of some images by chance: numbers are.
-    files = max((by_name, by_place, in_order), key=len)
-    if files is in_order:
+    # Some names may be those of images by chance: numbers are.
+    if not placed and 2 * len(by_name) < len(images) == len(views):
         log.info("%s: %d pictures are taken in the order of their names", folder, len(images))
-    return files
+        return dict(enumerate(images))
+    return max(by_name, by_place, key=len)
 
 
 def _at(views: Views, view: int, time: float) -> list[int]:

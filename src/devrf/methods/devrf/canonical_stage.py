@@ -466,6 +466,7 @@ class CanonicalStage(Stage):
         self._clear_unobserved()
         self._keep_occupied(self.opaque())
         self.scene_model.canonical.clear(~self.scene_model.occupancy.mask, alpha=1e-6)
+        super().on_train_end()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Take a radiance field in place of the search's, if that is what was stored."""

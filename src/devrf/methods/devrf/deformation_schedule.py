@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import accumulate, pairwise
 from typing import Annotated, Any, ClassVar
 
@@ -127,6 +127,8 @@ class DeformationSchedule(Options):
         numbered = []
         for number in range(1, len(rows) + 1):
             row = rows.get(str(number))
+            if isinstance(row, Level):
+                row = asdict(row)
             if not isinstance(row, Mapping) or not {"side", "iterations"} <= set(row):
                 raise DevrfError(
                     f"schedule.deformation.levels: expected rows 1 to {len(rows)} with side and "

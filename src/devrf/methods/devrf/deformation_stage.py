@@ -330,6 +330,7 @@ class DeformationStage(Stage):
         if not self.is_complete:
             self._left = self.phase_state()
         self.context.active = None
+        super().on_train_end()
 
     def phase_state(self) -> dict[str, Any]:
         """The state of the active frame; nothing once all is learned."""

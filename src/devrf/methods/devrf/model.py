@@ -6,6 +6,7 @@ import copy
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import asdict, replace
+from functools import lru_cache
 from typing import Any, ClassVar
 
 import torch
@@ -277,6 +278,8 @@ class DeVRFView:
     def __init__(self, model: DeVRFModel, time: float) -> None:
         """Blend the displacements of ``time``; find its occupancy, and the distances to it."""
         self._model = model
+        self._canonical, self._settings = model.canonical, model.settings
+        self._forward_warp = lru_cache(maxsize=1)(model.forward_warp)  # of all chunks of an image
         self._color_residual = model.color_residual_at(time)
         self._backward_warp: GridWarp | None = None
         self.occupancy = model.occupancy
@@ -299,7 +302,7 @@ class DeVRFView:
     @property
     def picture_settings(self) -> RenderSettings:
         """The settings by which rays of pictures are sampled."""
-        settings = self._model.settings
+        settings = self._settings
         if self._model.space.is_linear:
             return settings
         return replace(settings, step=UNBOUNDED_STEP * settings.step)
@@ -309,7 +312,7 @@ class DeVRFView:
         """The render of R rays in the fields' space."""
         output = render(
             rays,
-            self._model.canonical,
+            self._canonical,
             self.occupancy,
             self.picture_settings,
             background,
@@ -326,19 +329,18 @@ class DeVRFView:
 
         See docs/method.md#flow for φ_i, with ``time`` in place of t − 1.
         """
-        model = self._model
         black = torch.zeros(3, device=rays.origins.device)
         seen = render(
-            rays, model.canonical, self.occupancy, model.settings, black, self._backward_warp
+            rays, self._canonical, self.occupancy, self._settings, black, self._backward_warp
         )
         ray, weight = seen.samples.ray, seen.samples.weight
         moved = induced_flow(
             seen.samples.canonical,
-            model.forward_warp(time),
+            self._forward_warp(time),
             cameras,
             torch.zeros_like(ray),
             pixels[ray],
-            model.space,
+            self._model.space,
         )
         mass = sum_by_ray(weight, ray, len(rays))
         total = sum_by_ray(weight[:, None] * moved, ray, len(rays))

@@ -69,8 +69,8 @@ class BlenderReader(InwardReader):
         if not os.path.isdir(static) and not dynamic_folders(folder):
             train, test = _train_and_test(files, folder)
             val = folder / VAL
-            is_lego = folder.resolve().name == SCORED_ON_VAL
-            if is_lego and not one_moment(train, test) and os.path.isfile(val):
+            is_lego = Path(os.path.abspath(folder)).name == SCORED_ON_VAL
+            if is_lego and not one_moment(train, test) and files.any_image(val):
                 log.info("%s: scored on its val split: its test split shows another scene", folder)
                 _, test = files.read(val)
                 check_timed_alike(train, test)
