@@ -98,11 +98,11 @@ def test_no_rows_and_no_numbers_are_no_step(rng: torch.Generator) -> None:
 def test_the_gradient_of_the_total_variation(
     channels: int, touched_only: bool, rng: torch.Generator
 ) -> None:
-    # Differences on both sides of 1, where the penalty changes.
+    # Differences on both sides of the bound, where the penalty changes.
     grid = 1.5 * torch.randn(*SHAPE, channels, generator=rng)
     gradient = state(rng, *SHAPE, channels)[1]
     ours, theirs = gradient.clone(), gradient.double()
-    options = {"along_z": 0.3, "touched_only": touched_only}
+    options = {"along_z": 0.3, "bound": 0.8, "touched_only": touched_only}
     add_total_variation_gradient(grid, ours, 0.7, **options)
     definition.add_total_variation_gradient(grid.double(), theirs, 0.7, **options)
     torch.testing.assert_close(ours.double(), theirs, atol=1e-5, rtol=0)

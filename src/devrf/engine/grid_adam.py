@@ -29,6 +29,7 @@ class GridAdam(torch.optim.Optimizer):
     * ``per_voxel_lr``: None, or a tensor (X, Y, Z, 1) of factors of the learning rate.
     * ``smoothing``: weight of the total variation of each grid, whose gradient is added to that
       of the backward pass; ``along_z`` times as much between neighbours along z.
+    * ``bound``: of differences between neighbours, beyond which it grows linearly.
     * ``touched_only``: add it only to entries that have a gradient.
 
     Callbacks read ``name``, ``base_lr`` and ``decay`` (the power of the schedule's factor of the
@@ -51,6 +52,7 @@ class GridAdam(torch.optim.Optimizer):
             "rows": None,
             "smoothing": 0.0,
             "along_z": 1.0,
+            "bound": 1.0,
             "touched_only": False,
         }
         super().__init__(params, defaults)
@@ -81,6 +83,7 @@ class GridAdam(torch.optim.Optimizer):
                     parameter.grad,
                     group["smoothing"],
                     along_z=group["along_z"],
+                    bound=group["bound"],
                     touched_only=group["touched_only"],
                 )
         if group["skip_zero"] or group["per_voxel_lr"] is not None:

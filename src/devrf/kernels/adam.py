@@ -55,17 +55,18 @@ def add_total_variation_gradient(
     weight: float,
     *,
     along_z: float = 1.0,
+    bound: float = 1.0,
     touched_only: bool = False,
 ) -> None:
     """As :func:`devrf.ops.adam.add_total_variation_gradient`; both tensors are contiguous."""
     if not is_supported(grid):
         definition.add_total_variation_gradient(
-            grid, gradient, weight, along_z=along_z, touched_only=touched_only
+            grid, gradient, weight, along_z=along_z, bound=bound, touched_only=touched_only
         )
         return
     x, y, z, channels = grid.shape
     tables = [each.view(-1, channels) for each in (grid, gradient)]
-    inputs = [x, y, z, weight, along_z, int(touched_only), *tables]
+    inputs = [x, y, z, weight, along_z, bound, int(touched_only), *tables]
     kernel = total_variation_kernel(channels)
     launch(kernel, x * y * z, inputs, grid.device, grain=GRAIN_OF_VOXELS)
 
@@ -141,6 +142,7 @@ def total_variation_kernel(channels: int) -> wp.Kernel:
         z: int,
         weight: float,
         along_z: float,
+        bound: float,
         touched_only: int,
         grid: wp.array(dtype=numbers),
         gradient: wp.array(dtype=numbers),
@@ -151,8 +153,8 @@ def total_variation_kernel(channels: int) -> wp.Kernel:
         j = (row / z) % y
         i = row / (y * z)
         next_x = y * z
-        low = numbers(-1.0)
-        high = numbers(1.0)
+        low = numbers(-bound)
+        high = numbers(bound)
         value = grid[row]
         slope = numbers()
         if i > 0:

@@ -68,25 +68,27 @@ def add_total_variation_gradient(
     weight: float,
     *,
     along_z: float = 1.0,
+    bound: float = 1.0,
     touched_only: bool = False,
 ) -> None:
     """Add ``weight`` times the gradient of a grid's total variation to ``gradient`` in place.
 
     The total variation is Σ over pairs of neighbours of h(v − v'), with the Huber penalty
-    h(d) = d²/2 for |d| ≤ 1 and |d| − 1/2 beyond. Its derivative at a voxel is
-    Σ_neighbours clamp(v − v', −1, 1).
+    h(d) = d²/2 for |d| ≤ b and b |d| − b²/2 beyond. Its derivative at a voxel is
+    Σ_neighbours clamp(v − v', −b, b).
 
     Args:
         grid: (X, Y, Z, C).
         gradient: the same shape.
         weight: factor of the penalty.
         along_z: further factor between neighbours along z.
+        bound: b.
         touched_only: add only to entries that are not zero.
     """
     slopes = torch.zeros_like(grid)
     for axis in range(3):
         factor = weight * along_z if axis == 2 else weight
-        slope = factor * grid.diff(dim=axis).clamp(-1, 1)
+        slope = factor * grid.diff(dim=axis).clamp(-bound, bound)
         length = grid.shape[axis] - 1
         slopes.narrow(axis, 1, length).add_(slope)
         slopes.narrow(axis, 0, length).sub_(slope)

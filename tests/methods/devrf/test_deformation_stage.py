@@ -12,6 +12,7 @@ from lightning.pytorch.callbacks import LambdaCallback
 
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import score
+from devrf.geometry.box import Box
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.extensions.priors import Elastic
@@ -19,6 +20,7 @@ from devrf.methods.devrf.extensions.tracks import StartAlongFlow
 from devrf.methods.devrf.settings import VisitSettings
 from devrf.ops.adam import add_total_variation_gradient
 from devrf.rendering.renderer import Renderer
+from devrf.scenes.scene import Scene, Views, both_mapped
 from recorder import Entry, by_samples, recording
 
 SHORT = DeformationSchedule(levels=(Level(4, 20), Level(8, 10)), rays=256)
@@ -94,6 +96,52 @@ def test_a_whole_schedule_sees_the_motion_better_than_the_rest_pose(
     gains = [view.psnr - view.rest_pose_psnr for view in views]
     assert gains[:2] == [0.0, 0.0]
     assert min(gains[2:]) > 0.5 and sum(gains[2:]) / 4 > 1
+
+
+def enlarged(scene: Scene, factor: float) -> Scene:
+    """The same images of a scene in another unit."""
+
+    def seen(views: Views) -> Views:
+        poses = views.cameras.camera_to_world.clone()
+        poses[:, :, 3] *= factor
+        return replace(views, cameras=replace(views.cameras, camera_to_world=poses))
+
+    def large(box: Box) -> Box:
+        return Box(tuple(factor * x for x in box.low), tuple(factor * x for x in box.high))
+
+    bounds = scene.bounds
+    assert bounds.motion is not None
+    bounds = replace(
+        bounds,
+        box=large(bounds.box),
+        motion=large(bounds.motion),
+        near=factor * bounds.near,
+        far=factor * bounds.far,
+    )
+    static, dynamic = both_mapped(scene.static, scene.dynamic, seen)
+    return replace(scene, static=static, dynamic=dynamic, bounds=bounds)
+
+
+def test_motion_in_edges_of_the_box_is_the_same_in_any_unit(
+    canonical, fit, serve, tiny_scene, caplog
+):
+    box = VisitSettings(learning_rate=5e-3, unit="box", views="all")
+    schedule = DeformationSchedule(levels=(Level(4, 20), Level(6, 10)), rays=128)
+    loss = {"render": 1.0, "cycle": 100.0, "tv": 1.0}
+    moved = {}
+    for factor in (1.0, 1024.0, 1 / 1024):  # of which numbers are rounded alike
+        data = serve(enlarged(tiny_scene, factor))
+        torch.manual_seed(0)
+        rest = fit(canonical(iterations=60), data=data).result()
+        stage = fit(DeformationStage(rest, schedule, box, loss), data=data)
+        moved[factor] = stage.field.backward_slices[1:] / factor
+    length = tiny_scene.bounds.whole.longest
+    assert moved[1.0].abs().max() > 0.01 * length
+    for factor in (1024.0, 1 / 1024):
+        assert (moved[factor] - moved[1.0]).abs().mean() < 0.1 * moved[1.0].abs().mean()
+    assert "world units" not in caplog.text
+    fit(DeformationStage(rest, TINY), data=data)
+    assert "give schedule.visit.unit=box, or scale the cameras" in caplog.text
 
 
 def test_total_variation_alone_smooths_both_directions(rest, datamodule, trainer):

@@ -48,6 +48,25 @@ def stage(
     return ImageStage(model, schedule, {"l1": 1.0, "ssim": 0.2}, step, earlier=rest, half_size=0.25)
 
 
+def test_moves_are_as_large_as_the_scene_in_any_unit() -> None:
+    model = DeformableGaussians(TINY)
+    model.cloud.begin(torch.rand(9, 3), torch.rand(9, 3), torch.ones(9), 0.5)
+    moved = []
+    for factor in (1.0, 1024.0, 1 / 1024):
+        with torch.no_grad():
+            model.cloud.means *= factor
+            box = Box((-2 * factor,) * 3, (2 * factor,) * 3)
+            model.set_place(box, model.space, (0.1 * factor, 9 * factor))
+            moves = model.moved(1.0)
+            model.cloud.means /= factor
+        assert moves is not None
+        moved.append([moves[0] / factor, *moves[1:]])
+    assert moved[0][0].abs().max() > 1e-4
+    for others in moved[1:]:
+        for move, other in zip(moved[0], others, strict=True):
+            torch.testing.assert_close(other, move)
+
+
 def test_nothing_moves_at_time_0_and_a_frame_later_all_does() -> None:
     model = DeformableGaussians(TINY)
     model.clock = type(model.clock)((0.0, 0.5, 1.0))

@@ -22,6 +22,8 @@ class DeformationLoss:
 
     Attributes:
         terms: all terms, by name.
+        unit: the length in world units that ``cycle`` and ``tv`` count as 1
+            (docs/method.md#deformation-learning-rate).
     """
 
     def __init__(
@@ -40,6 +42,7 @@ class DeformationLoss:
         Raises:
             DevrfError: a weight, or a factor of an extension, is of no term.
         """
+        self.unit = 1.0
         self.terms: dict[str, DeformationTerm] = dict(DEFORMATION_TERMS)
         weights, self._total_variation = apart_from_total_variation(loss, "loss.deformation")
         for extension in extensions:
@@ -72,10 +75,12 @@ class DeformationLoss:
     def _factor(self, term: str, level: int, share: float) -> float:
         scaled = term in self._scaled_by_level
         of_level = self._schedule.levels[level].other_terms if scaled else 1.0
+        if term == "cycle":
+            of_level /= self.unit**2
         factors = (extension.weight_factor(term, level, share) for extension in self._extensions)
         return math.prod(factors, start=of_level)
 
     def smoothing(self, level: int, shape: tuple[int, int, int]) -> float:
         """The optimiser's weight of the total variation of grids of ``shape`` at ``level``."""
-        weight = self._total_variation * self._schedule.levels[level].other_terms
+        weight = self._total_variation * self._schedule.levels[level].other_terms / self.unit**2
         return total_variation_weight(weight, max(shape), self._schedule.rays)

@@ -14,6 +14,7 @@ from devrf.data.flow import previous_images
 from devrf.engine.grid_adam import GridAdam
 from devrf.engine.stage import Stage, Terms
 from devrf.errors import DevrfError
+from devrf.geometry.space import WorldSpace
 from devrf.methods.batch import gather_batch
 from devrf.methods.devrf.active_frame import ActiveFrame
 from devrf.methods.devrf.deformation_field import DeformationField
@@ -39,6 +40,11 @@ from devrf.scenes.scene import CaptureName, Views
 from devrf.system.profiling import span
 
 log = logging.getLogger(__name__)
+
+# The longest edge in world units of the box of the robot, on which the loss's weights were chosen.
+USUAL_EDGE = 2.3
+# Where world units are so many times smaller or larger, the user is told.
+FAR_FROM_USUAL = 5.0
 
 
 class DeformationStage(Stage):
@@ -206,9 +212,21 @@ class DeformationStage(Stage):
             self.schedule = Visits(self.settings, len(self.field.clock))
             for extension in self.extensions:
                 extension.setup(self.context)
+        edge = self.field.box.longest
+        # Other spaces have a unit of their own.
+        unit = edge / USUAL_EDGE if isinstance(self.scene_model.space, WorldSpace) else 1.0
         if self.visit.unit == "box":
-            rate = self.visit.learning_rate * self.field.box.longest
-            self.optimizer.param_groups[0]["base_lr"] = rate
+            self.optimizer.param_groups[0]["base_lr"] = self.visit.learning_rate * edge
+            self.deformation_loss.unit = unit
+            # Gradients by lengths are as much smaller.
+            self.optimizer.param_groups[0]["eps"] = self.optimizer.defaults["eps"] / unit
+        elif not 1 / FAR_FROM_USUAL < unit < FAR_FROM_USUAL:
+            log.warning(
+                "the box has edges of %.3g world units, and schedule.visit.unit=world is meant for "
+                "some %g: little may move; give schedule.visit.unit=box, or scale the cameras",
+                edge,
+                USUAL_EDGE,
+            )
 
     def _build_field(self) -> None:
         """The field over the canonical field's box; in contracted space, over the inner box."""
@@ -298,7 +316,8 @@ class DeformationStage(Stage):
         context.active = frame
         context.weights = self.deformation_loss.weights_at(level)
         smoothing = self.deformation_loss.smoothing(level, self.field.shape)
-        self.optimizer.replace(0, frame.slices, smoothing=smoothing)
+        bound = self.deformation_loss.unit
+        self.optimizer.replace(0, frame.slices, smoothing=smoothing, bound=bound)
         for extension in self.extensions:
             extension.begin_level(context, level)
         return frame

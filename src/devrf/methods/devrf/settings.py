@@ -70,7 +70,8 @@ class VisitSettings(Options):
 
     Attributes:
         learning_rate: base rate, in ``unit`` per step: a voxel moves by no more.
-        unit: ``world`` for world units; ``box`` for the longest edge of the fields' box.
+        unit: ``world`` for world units; ``box`` for the longest edge of the fields' box, by which
+            ``cycle`` and ``tv`` of the loss are measured then, too.
         views: a batch shows ``one`` of the frame's views, in turn, or ``all``.
         pixels: ``all``, or ``occupied``: of the alpha mask, and where rays hit the present field.
         epochs: batches are smaller if a visit would show each pixel more often.

@@ -118,7 +118,7 @@ class DeformableGaussians(PlacedModel[ImageBatch], ImageTrainable):
         encoded = self.encode_time(means.new_full((1, 1), time)).expand(len(means), -1)
         values = self.trunk(torch.cat([self.encode(place), encoded], dim=1))
         mean, quaternion, scale = (begun * self.last(values)).split([3, 4, 3], dim=1)
-        return mean, quaternion, scale
+        return self.placement.unit * mean, quaternion, scale
 
     def gaussians(self, time: float, eye: Tensor) -> Gaussians:
         """The cloud at a time, as it looks from a point (3,)."""
