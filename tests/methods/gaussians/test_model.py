@@ -16,7 +16,7 @@ from devrf.engine.protocol import ProtocolStage
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.methods.gaussians.cloud import Cloud
-from devrf.methods.gaussians.model import DeformableGaussians
+from devrf.methods.gaussians.model import USUAL_UNIT, DeformableGaussians
 from devrf.methods.gaussians.settings import GaussiansSettings
 from devrf.methods.image_stage import ImageStage
 from devrf.methods.ray_schedule import RaySchedule
@@ -75,7 +75,7 @@ def test_nothing_moves_at_time_0_and_a_frame_later_all_does() -> None:
     assert model.moved(0.0) is None
     full, half = model.moved(0.5), model.moved(0.25)
     assert full is not None and half is not None
-    expected = [[[0.0, 1, 2]], [[3.0, 4, 5, 6]], [[7.0, 8, 9]]]
+    expected = [[[0.0, 1 / USUAL_UNIT, 2 / USUAL_UNIT]], [[3.0, 4, 5, 6]], [[7.0, 8, 9]]]
     for move, begun, value in zip(full, half, expected, strict=True):
         torch.testing.assert_close(move, torch.tensor(value), atol=0.05, rtol=0)
         torch.testing.assert_close(begun, 0.5 * move, atol=0.05, rtol=0)

@@ -38,6 +38,8 @@ from devrf.system.options import Positive
 # Normalised places are at most this: in NDC those that come to lie before the near plane would be
 # infinite.
 OUTERMOST = 8.0
+# Half of the longest edge, in world units, of the box of the robot, on which rates were chosen.
+USUAL_UNIT = 1.15
 # Standard deviation of the weights of the network's last layer at first: nothing moves.
 STILL = 1e-3
 
@@ -118,7 +120,7 @@ class DeformableGaussians(PlacedModel[ImageBatch], ImageTrainable):
         encoded = self.encode_time(means.new_full((1, 1), time)).expand(len(means), -1)
         values = self.trunk(torch.cat([self.encode(place), encoded], dim=1))
         mean, quaternion, scale = (begun * self.last(values)).split([3, 4, 3], dim=1)
-        return self.placement.unit * mean, quaternion, scale
+        return self.placement.unit / USUAL_UNIT * mean, quaternion, scale
 
     def gaussians(self, time: float, eye: Tensor) -> Gaussians:
         """The cloud at a time, as it looks from a point (3,)."""
