@@ -42,7 +42,25 @@ def test_a_runs_own_pictures_come_back_as_another_programs(devrf, tmp_path, tiny
     pictures = sorted((tmp_path / "outputs" / "run" / "images" / "held_out" / "dynamic").iterdir())
     assert [mask.name for mask in masks] == [picture.name for picture in pictures]
     assert iio.imread(masks[-1]).shape == iio.imread(pictures[-1]).shape
+    scored = devrf(*tiny, "stage=evaluate", folder, "evaluation.program=Splats")
+    assert (scored.status, scored.err) == (0, "")  # pictures may be scored again
     report = devrf("stage=report")
     assert report.status == 0 and "Splats (pictures)" in report.out and "Ours" in report.out
     lacking = devrf(*tiny, "stage=evaluate", "evaluation.predictions=outputs/run/images")
     assert lacking.status == 2 and lacking.err.count("\n") == 1 and "pictures" in lacking.err
+
+
+def test_the_results_of_a_learned_run_stay(devrf, tmp_path, tiny, trained):
+    run = tmp_path / "outputs" / "run"
+    shutil.copytree(trained[0], run)
+    (tmp_path / "pictures").mkdir()
+    kept = {path: path.read_bytes() for path in (run / "metrics.json", run / "frames.csv")}
+    asked = (*tiny, "evaluation.predictions=pictures", "hydra.run.dir=outputs/run")
+    needs = "of a run that has learned; evaluation.predictions needs a folder of its own"
+    for _ in range(2):
+        refused = devrf(*asked, "stage=evaluate")
+        assert refused.status == 2 and refused.err.count("\n") == 1 and needs in refused.err
+        shutil.rmtree(run / "checkpoints", ignore_errors=True)  # the scores alone say so
+    refused = devrf(*tiny, "evaluation.predictions=pictures")
+    assert refused.status == 2 and "score pictures by stage=evaluate" in refused.err
+    assert {path: path.read_bytes() for path in kept} == kept

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +46,7 @@ from devrf.pictures.held_out import write_contact_sheet
 from devrf.pictures.images import scaled, write_image
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Views
-from devrf.system.files import write_json
+from devrf.system.files import UNREADABLE, read_record, write_json
 from devrf.system.override import to_type
 
 log = logging.getLogger(__name__)
@@ -156,6 +158,22 @@ def _write_record(
     }
     at_rest = {} if run.scene.moves else {"at_rest": True}
     write_json(run.folder / name, {"scene": run.scene.name, **scores, **at_rest, "run": origin})
+
+
+def check_pictures_folder(folder: Path) -> None:
+    """Check that the scores of another program's pictures would overwrite no learned run's.
+
+    Raises:
+        DevrfError: a run has learned in the folder.
+    """
+    learned = any((folder / "checkpoints").glob("*.ckpt"))
+    with suppress(FileNotFoundError, *UNREADABLE):
+        learned |= "predictions" not in json.loads(read_record(folder / "metrics.json"))["run"]
+    if learned:
+        raise DevrfError(
+            f"{folder}: of a run that has learned; evaluation.predictions needs a folder of its "
+            "own: leave hydra.run.dir out, or give hydra.run.dir=FOLDER"
+        )
 
 
 def _evaluate_predictions(run: RunContext) -> None:

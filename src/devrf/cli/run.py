@@ -29,7 +29,7 @@ from devrf.cli.config import (
 )
 from devrf.cli.config_check import check_config
 from devrf.cli.context import RunContext
-from devrf.cli.evaluate import evaluate
+from devrf.cli.evaluate import check_pictures_folder, evaluate
 from devrf.cli.memory import forecast
 from devrf.cli.preparation import capture, fetch, inspect, prepare, report, say_next, selfcheck
 from devrf.cli.processes import connected, run_in_each, starts_processes
@@ -239,6 +239,13 @@ def _check(run: RunContext, learning: Names, steps: Names) -> None:
     if learning or "evaluate" in steps:
         run.evaluation.check()
         check_objective(config.objective, run.evaluation.metrics)
+    if "evaluate" in steps and config.evaluation.predictions is not None:
+        if learning:
+            raise DevrfError(
+                f"evaluation.predictions: stage={config.stage} scores what it learns; score "
+                "pictures by stage=evaluate"
+            )
+        check_pictures_folder(run.folder)
     # A sweeper with a direction optimises, and so needs the objective of each job.
     if in_sweep() and "direction" in HydraConfig.get().sweeper and "evaluate" not in steps:
         lacks = f"which stage={config.stage} does not score"
