@@ -16,6 +16,7 @@ from pxr import Gf, Usd, UsdGeom
 from devrf.apps.export.geometry import ExportSettings, MovingMesh, UpFrame, carried
 from devrf.apps.export.gltf import write_gltf
 from devrf.apps.export.sequence import mesh_files, point_file, write_files
+from devrf.apps.export.splats import MovingGaussians, write_usd_splats
 from devrf.apps.export.surface import surface_of
 from devrf.apps.export.usd import write_usd
 from devrf.rendering.renderer import Renderer
@@ -168,6 +169,22 @@ def test_usd_has_a_sample_for_each_time(tmp_path, mesh, frame, around):
     x, y, _ = shown.Transform(Gf.Vec3d(*frame.points(mesh.vertices[0, 7]).tolist()))
     seen, _ = around.project_into(1, mesh.vertices[0, 7:8])
     assert [(x + 1) * 24, (1 - y) * 18] == pytest.approx(seen[0].tolist(), abs=1e-2)
+
+
+@pytest.mark.parametrize("metres", [0.1, 1000.0])
+@pytest.mark.parametrize("write", [write_usd, write_usd_splats])
+def test_usd_cameras_see_the_whole_ball_in_any_unit(tmp_path, mesh, around, write, metres):
+    frame = UpFrame.of(around, "auto", metres)
+    content = mesh if write is write_usd else MovingGaussians.on_surface(mesh)
+    write(tmp_path / "ball.usdc", content, {"static_0": around[[0]]}, frame, SECONDS)
+    stage = Usd.Stage.Open(str(tmp_path / "ball.usdc"))
+    camera = UsdGeom.Camera(stage.GetPrimAtPath("/scene/cameras/static_0")).GetCamera(0)
+    near, far = camera.clippingRange.min, camera.clippingRange.max
+    points = frame.points(mesh.vertices.flatten(0, 1)).tolist()
+    view = camera.frustum.ComputeViewMatrix()
+    depths = [-view.Transform(Gf.Vec3d(*point))[2] for point in points]
+    assert 0 < near < min(depths) / 100 and max(depths) < far / 100
+    assert all(camera.frustum.Intersects(Gf.Vec3d(*point)) for point in points)
 
 
 @pytest.mark.parametrize("format", ["ply", "obj"])

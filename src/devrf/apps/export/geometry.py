@@ -29,6 +29,8 @@ Point = Annotated[Sequence[pydantic.FiniteFloat], Len(3, 3)]
 Pixel = Annotated[Sequence[pydantic.FiniteFloat], Len(2, 2)]
 Up = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
 Factor = Annotated[float, Ge(1e-9), Le(1e9)]
+# The cameras' near plane, as a share of the scene's size.
+NEAREST = 1e-3
 
 
 @pydantic.dataclasses.dataclass(frozen=True)
@@ -190,6 +192,11 @@ def carried(surface: Surface, model: Renderable, times: Sequence[float]) -> Movi
         assert forward is not None  # every model with a surface has one
         moved.append(model.space.to_world(forward(points)).float().cpu())
     return MovingMesh(tuple(times), torch.stack(moved), surface.faces, surface.colors)
+
+
+def nearest(points: Tensor) -> float:
+    """The distance of cameras' near plane that suits points (T, V, 3) of a frame, in its units."""
+    return NEAREST * float((points.amax(dim=(0, 1)) - points.amin(dim=(0, 1))).norm())
 
 
 def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:

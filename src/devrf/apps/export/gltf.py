@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 import devrf
-from devrf.apps.export.geometry import MovingMesh, UpFrame, vertex_normals
+from devrf.apps.export.geometry import MovingMesh, UpFrame, nearest, vertex_normals
 from devrf.geometry.cameras import Cameras
 from devrf.system.files import atomic_write
 
@@ -34,8 +34,6 @@ KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 JSON = 0x4E4F534A
 BIN = 0x004E4942
 MAGIC = 0x46546C67
-# The cameras' near plane, as a share of the scene's size.
-NEAREST = 1e-3
 
 Array = npt.NDArray[Any]
 
@@ -57,7 +55,6 @@ def write_gltf(
     content = _Content()
     vertices = frame.points(mesh.vertices)
     normals = torch.stack([vertex_normals(placed, mesh.faces) for placed in vertices])
-    size = float((vertices.amax(dim=(0, 1)) - vertices.amin(dim=(0, 1))).norm())
     names = [f"t={time:.4g}" for time in mesh.times[1:]]
     # The standard's vertex colours are linear, with alpha, in 16 bits.
     rgba = torch.cat([linear(mesh.colors), torch.ones(len(mesh.colors), 1)], dim=1)
@@ -104,8 +101,9 @@ def write_gltf(
         mesh_entry |= {"weights": [0.0] * len(names), "extras": {"targetNames": names}}
         document["animations"] = [_animation(content, mesh.times, seconds)]
     if cameras:
+        near = nearest(vertices)
         document["cameras"] = [
-            {"name": name, "type": "perspective", "perspective": _lens(camera, NEAREST * size)}
+            {"name": name, "type": "perspective", "perspective": _lens(camera, near)}
             for name, camera in cameras.items()
         ]
         for index, (name, camera) in enumerate(cameras.items()):
@@ -126,12 +124,12 @@ def _animation(content: _Content, times: tuple[float, ...], seconds: float) -> d
     return {"name": "motion", "samplers": [sampler], "channels": [channel]}
 
 
-def _lens(camera: Cameras, nearest: float) -> dict[str, float]:
+def _lens(camera: Cameras, near: float) -> dict[str, float]:
     fx, fy = camera.focal[0].tolist()
     return {
         "yfov": 2 * math.atan(camera.height / (2 * fy)),
         "aspectRatio": (camera.width / fx) / (camera.height / fy),
-        "znear": nearest,
+        "znear": near,
     }
 
 

@@ -172,4 +172,5 @@ def write_usd_splats(
     factors = Vt.Vec3fArray.FromNumpy(_factors(splats).contiguous().numpy())
     field.CreateRadianceSphericalHarmonicsCoefficientsAttr(factors)
     field.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(splats.opacity.numpy()))
-    file.write(path, cameras)
+    means = torch.stack([gaussians.means for gaussians in moving.of_time])
+    file.write(path, cameras, frame.points(means))

@@ -68,9 +68,10 @@ def write_tracks(
         scene = SceneFile(times, frame, settings.seconds)
         shape = UsdGeom.Points.Define(scene.stage, "/scene/tracks")
         scene.move_to_origin(shape)
-        for code, of_time in zip(scene.codes, frame.points(tracks), strict=True):
+        points = frame.points(tracks)
+        for code, of_time in zip(scene.codes, points, strict=True):
             shape.CreatePointsAttr().Set(Vt.Vec3fArray.FromNumpy(of_time.numpy()), code)
-        scene.write(path, {})
+        scene.write(path, {}, points)
     return path
 
 

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from torch import Tensor
 
-from devrf.apps.export.geometry import MovingMesh, UpFrame, vertex_normals
+from devrf.apps.export.geometry import MovingMesh, UpFrame, nearest, vertex_normals
 from devrf.apps.export.gltf import linear
 from devrf.geometry.cameras import Cameras
 from devrf.system.files import atomic_write
@@ -17,6 +18,8 @@ from devrf.system.files import atomic_write
 RATE = 24.0
 # Width of a camera's film, in tenths of a unit; only its ratio to the focal length is seen.
 FILM = 20.955
+# The cameras' far plane, in distances of the near one: as that of USD's own default.
+FARTHEST = 1e6
 
 
 class SceneFile:
@@ -56,10 +59,11 @@ class SceneFile:
         if any(self._frame.offset):
             shape.AddTranslateOp().Set(Gf.Vec3d(self._frame.origin))
 
-    def write(self, path: Path, cameras: Mapping[str, Cameras]) -> None:
-        """Write the stage, with the ``cameras`` by their names."""
+    def write(self, path: Path, cameras: Mapping[str, Cameras], points: Tensor) -> None:
+        """Write the stage, with the ``cameras`` by their names, which see ``points`` (T, V, 3)."""
         from pxr import Gf, Sdf, UsdGeom
 
+        near = nearest(points)
         for name, camera in cameras.items():
             lens = UsdGeom.Camera.Define(self.stage, Sdf.Path(f"/scene/cameras/{name}"))
             fx, fy = camera.focal[0].tolist()
@@ -67,6 +71,7 @@ class SceneFile:
             lens.CreateHorizontalApertureAttr(FILM)
             lens.CreateVerticalApertureAttr(focal * camera.height / fy)
             lens.CreateFocalLengthAttr(focal)
+            lens.CreateClippingRangeAttr(Gf.Vec2f(near, FARTHEST * near))
             # Gf multiplies rows from the left.
             lens.AddTransformOp().Set(Gf.Matrix4d(self._frame.pose(camera).T.tolist()))
         with atomic_write(path) as partial:
@@ -89,14 +94,15 @@ def write_usd(
     shape.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces))
     colors = Vt.Vec3fArray.FromNumpy(linear(mesh.colors).numpy())
     shape.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(colors)
-    points = shape.CreatePointsAttr()
+    samples = shape.CreatePointsAttr()
     extent = shape.CreateExtentAttr()
     normals = shape.CreateNormalsAttr()
     shape.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-    for code, vertices in zip(file.codes, frame.points(mesh.vertices), strict=True):
+    points = frame.points(mesh.vertices)
+    for code, vertices in zip(file.codes, points, strict=True):
         placed = Vt.Vec3fArray.FromNumpy(vertices.contiguous().numpy())
-        points.Set(placed, code)
+        samples.Set(placed, code)
         turned = vertex_normals(vertices, mesh.faces)
         normals.Set(Vt.Vec3fArray.FromNumpy(turned.contiguous().numpy()), code)
         extent.Set(UsdGeom.PointBased.ComputeExtent(placed), code)
-    file.write(path, cameras)
+    file.write(path, cameras, points)
