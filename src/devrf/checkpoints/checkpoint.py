@@ -192,7 +192,7 @@ class ChecksummedCheckpointIO(CheckpointIO):
 
 
 def load_checkpoint(
-    path: Path, scene: Scene | None = None, device: torch.device | str = "cpu"
+    path: str | Path, scene: Scene | None = None, device: torch.device | str = "cpu"
 ) -> LoadedCheckpoint:
     """Read a learned scene onto ``device`` from a checkpoint of any stage; None takes any scene.
 
@@ -200,6 +200,7 @@ def load_checkpoint(
         DevrfError: no such file, a damaged one, not a devrf checkpoint, one of another format, or
             of another scene.
     """
+    path = Path(path)
     if not path.is_file():
         raise DevrfError(f"{path}: no such checkpoint; run the stage that makes it, or set ckpt")
     data = read_checkpoint_file(path)
