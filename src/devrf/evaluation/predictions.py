@@ -261,9 +261,10 @@ def _compare_background(
             errors.append(float((picture(k)[clear] - behind).abs().mean()))
     if errors and fmean(errors) > OTHER_BACKGROUND:
         log.warning(
-            "%s: the images are %s behind the alpha masks, the pictures are not; render them so, "
-            "or score them with data.background=%s",
-            *(place, *(("white", "black") if behind else ("black", "white"))),
+            "%s: the images are %s behind the alpha masks, the pictures are not: scores count it; "
+            "render the pictures so",
+            place,
+            "white" if behind else "black",
         )
 
 
