@@ -106,6 +106,8 @@ def test_in_a_time_freeze_time_runs_then_the_camera_then_time():
     for k in (1, 2, 6, 7, 8):
         torch.testing.assert_close(cameras.positions[k], start)
     torch.testing.assert_close(cameras.positions[3:6], around)
+    # The shortest film, too, shows the end.
+    assert time_freeze(circle, 0.5, VideoSettings(frames=5))[1] == [0, 0.5, 0.5, 0.5, 1]
     # In bullet time the camera alone moves.
     cameras, times = bullet_time(circle, 0.3, VideoSettings(frames=3))
     assert times == [0.3] * 3

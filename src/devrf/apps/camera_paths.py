@@ -279,7 +279,8 @@ def _thirds(stop: float, frames: int) -> tuple[Tensor, int, Tensor]:
     """Times up to ``stop``, the number of frames for which time stops, and times from there."""
     third = frames // 3
     before = torch.linspace(0, stop, third + 1)[:-1]
-    return before, frames - 2 * third, torch.linspace(stop, 1, third)
+    # From the end on: a single time is the last.
+    return before, frames - 2 * third, torch.linspace(1, stop, third).flip(0)
 
 
 def swing(cameras: Cameras, seen_at: Sequence[float], settings: VideoSettings) -> Shots:
