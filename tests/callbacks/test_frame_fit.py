@@ -99,6 +99,18 @@ def test_lost_frames_are_four_decibels_below_the_median():
     assert lost({1: 20.0}) == []
 
 
+def test_visits_that_met_the_background_alone_are_no_measure(caplog):
+    fit, stage = FrameFit(), Visiting()
+    for frame, error in enumerate((0.05, 0.0, 1e-9, 0.0), start=1):
+        visit(fit, stage, 1, frame, error)
+    fit.on_train_end(TRAINER, stage)
+    assert stage.provenance.record["frame_psnr"] == [13.01, 60.0, 60.0, 60.0]
+    assert stage.provenance.record["lost_frames"] == 0 and not caplog.records
+    psnr = {1: 13.0, 2: 60.0, 3: 60.0, 4: 30.0, 5: 32.0}
+    assert lost(psnr) == [1] and complaint(psnr, [1]).endswith("13.0 dB, the others 31.0")
+    assert lost({1: 60.0}) == []
+
+
 def test_frames_in_words():
     assert in_ranges([3]) == "3"
     assert in_ranges([1, 2, 5, 20, 21, 22]) == "1 to 2, 5, 20 to 22"

@@ -19,6 +19,8 @@ log = logging.getLogger(__name__)
 
 # A frame is lost if its images are fitted by so many dB less than those of the median frame.
 LOST = 4.0
+# Images of 8 bits are rounded by 59 dB: what is fitted so well has met the background alone.
+BEST = 60.0
 
 
 class FrameFit(Callback):
@@ -90,23 +92,27 @@ class FrameFit(Callback):
 
     @property
     def psnr(self) -> dict[int, float]:
-        """The training PSNR in dB of each frame, in order."""
+        """The training PSNR in dB of each frame, in order; :data:`BEST` at most."""
         return {
-            frame: -10 * math.log10(max(float(total) / steps, 1e-12))
+            frame: min(-10 * math.log10(max(float(total) / steps, 1e-12)), BEST)
             for frame, (total, steps) in sorted(self._errors.items())
         }
 
 
 def lost(psnr: Mapping[int, float]) -> list[int]:
-    """The frames that are fitted by more than :data:`LOST` dB less than the median frame."""
-    middle = median(psnr.values())
-    return [frame for frame, value in psnr.items() if value < middle - LOST]
+    """The frames that are fitted by more than :data:`LOST` dB less than the median frame.
+
+    Frames of which the last visit, of a few rays, met the background alone are not compared.
+    """
+    measured = {frame: value for frame, value in psnr.items() if value < BEST}
+    middle = median(measured.values()) if measured else BEST
+    return [frame for frame, value in measured.items() if value < middle - LOST]
 
 
 def complaint(psnr: Mapping[int, float], frames: Sequence[int]) -> str:
     """``frames 20 to 35 fit worse than the rest: 25.0 dB, the others 37.0``."""
     worse = fmean(psnr[frame] for frame in frames)
-    others = fmean(value for frame, value in psnr.items() if frame not in frames)
+    others = fmean(v for frame, v in psnr.items() if frame not in frames and v < BEST)
     noun, verb = ("frame", "fits") if len(frames) == 1 else ("frames", "fit")
     where = f"{noun} {in_ranges(frames)} {verb} worse than the rest"
     return f"{where}: {worse:.1f} dB, the others {others:.1f}"
