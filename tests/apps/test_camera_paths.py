@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
@@ -80,6 +82,30 @@ def test_the_captured_path_follows_the_cameras_smoothly_in_any_order(shuffled):
     assert float(cameras.positions[:, 2].diff(n=2, dim=0).abs().max()) < 0.01
     rotations = cameras.camera_to_world[:, :, :3]
     torch.testing.assert_close(torch.linalg.det(rotations), torch.ones(48))
+
+
+@pytest.mark.parametrize("frames", [48, 240])
+def test_between_cameras_far_apart_the_captured_path_shows_what_they_looked_at(frames):
+    turns = 137.5 * torch.arange(16.0)  # evenly over the upper half of a sphere
+    around = looking_in(turns % 360, torch.rad2deg(torch.asin((torch.arange(16) + 0.5) / 16)))
+    # Half a turn apart, the mean of two positions is the target itself.
+    for cameras in (FOUR, around, FOUR[[0, 2]]):
+        path = captured(cameras, ORIGIN, VideoSettings(frames=frames))
+        away = path.positions.norm(dim=1)
+        torch.testing.assert_close(away, torch.full((frames,), 2.0), atol=1e-3, rtol=0)
+        torch.testing.assert_close(path.forwards, -path.positions / 2, atol=1e-3, rtol=0)
+        up = path.camera_to_world[:, :, 1]
+        assert float((up[1:] * up[:-1]).sum(dim=1).min()) > math.cos(math.radians(400 / frames))
+
+
+def test_the_captured_path_is_straight_between_cameras_that_look_the_same_way():
+    places = torch.tensor([[-2.0, -3, 0], [0.5, -3, 0], [2, -3, 0]])
+    walk = Cameras.looking_at(
+        places, places + torch.tensor([0.0, 1, 0]), focal=20.0, width=15, height=10
+    )
+    path = captured(walk, ORIGIN, VideoSettings(frames=24))
+    torch.testing.assert_close(path.positions[:, 1:], places[:1, 1:].expand(24, 2))
+    torch.testing.assert_close(path.forwards, walk.forwards[:1].expand(24, 3))
 
 
 def test_a_tour_is_shorter_than_always_going_to_the_nearest():

@@ -8,6 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from kornia.geometry.conversions import (
+    quaternion_to_rotation_matrix,
+    rotation_matrix_to_quaternion,
+)
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -131,16 +135,37 @@ def captured(cameras: Cameras, target: Tensor, settings: VideoSettings) -> Camer
     apart = torch.cdist(places, places).numpy()
     seconds = settings.frames / settings.fps
     stops = in_order(apart, PACE * seconds)
-    poses = cameras.camera_to_world[stops].double().flatten(1)
     even = torch.linspace(0, 1, POINTS, dtype=torch.float64)
-    poses = _resampled(poses, places[stops], even)
+    views = _resampled(_views(cameras[stops], target), places[stops], even)
     share = max(SMOOTH_SECONDS / seconds, SMOOTH_STOPS / len(stops))
     nearness = (even[:, None] - even) / min(share, SMOOTH_MOST)
-    poses = torch.softmax(-0.5 * nearness**2, dim=1) @ poses
+    views = torch.softmax(-0.5 * nearness**2, dim=1) @ views
     # Smoothing has slowed the camera down where it turned.
-    passed = torch.cat([poses[:, 3::4] / reach, -poses[:, 2::4]], dim=1)
+    poses = _poses(views)
+    passed = torch.cat([poses[:, :, 3] / reach, -poses[:, :, 2]], dim=1)
     frames = torch.linspace(0, 1, settings.frames, dtype=torch.float64)
-    return _with_one_lens(cameras, _rigid(_resampled(poses, passed, frames)))
+    return _with_one_lens(cameras, _poses(_resampled(views, passed, frames)).float())
+
+
+def _views(cameras: Cameras, target: Tensor) -> Tensor:
+    """Poses of N cameras as (N, 8) numbers whose means are poses that show the same.
+
+    They are a quaternion, with the sign that is nearer to that of the camera before, the point
+    ahead of the camera where it is nearest to ``target`` (3,), and its distance. Between cameras
+    around a point, a mean is as far from it, where a mean of positions would cut the chord.
+    """
+    turns = rotation_matrix_to_quaternion(cameras.camera_to_world[:, :, :3].contiguous())
+    same = (turns[1:] * turns[:-1]).sum(dim=1, keepdim=True) >= 0
+    turns = torch.cat([turns[:1], turns[1:] * (2.0 * same - 1).cumprod(dim=0)])
+    ahead = ((target - cameras.positions) * cameras.forwards).sum(dim=1, keepdim=True).clamp(min=0)
+    return torch.cat([turns, cameras.positions + ahead * cameras.forwards, ahead], dim=1).double()
+
+
+def _poses(views: Tensor) -> Tensor:
+    """Camera-to-world transforms (N, 3, 4) of means of :func:`_views` (N, 8)."""
+    rotation = quaternion_to_rotation_matrix(views[:, :4])
+    positions = views[:, 4:7] + views[:, 7:] * rotation[:, :, 2]
+    return torch.cat([rotation, positions[:, :, None]], dim=2)
 
 
 def in_order(apart: np.ndarray, longest: float) -> list[int]:
