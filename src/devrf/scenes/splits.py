@@ -172,25 +172,33 @@ def in_motion(transforms: Transforms) -> Split:
 
     Cameras are fixed (:func:`are_fixed`), or one camera moves and each image is its own view.
     Without times in the file, the images of V fixed views are time-major (frame = position // V;
-    DevrfError if the views do not take turns) and those of a moving camera consecutive.
+    DevrfError if the views do not take turns) and those of a moving camera consecutive; images that
+    are absent count.
     """
     order = torch.arange(len(transforms.images))
     camera = distinct_poses(transforms.poses)
+    if transforms.times is not None:
+        times, fixed = torch.tensor(transforms.times), are_fixed(camera)
+    else:
+        times, fixed = _by_turns(transforms)
+    return Split(transforms, times.float(), camera if fixed else order, fixed, order)
+
+
+def _by_turns(transforms: Transforms) -> tuple[Tensor, bool]:
+    """Times (N,) by the positions in the file, and whether its cameras are fixed."""
+    poses, positions = transforms.listed or (transforms.poses, range(len(transforms.images)))
+    order = torch.arange(len(poses))
+    camera = distinct_poses(poses)
     views = int(camera.max()) + 1
     fixed = are_fixed(camera)
-    if transforms.times is not None:
-        times = torch.tensor(transforms.times)
-    else:
-        step = views if fixed else 1
-        if fixed and (len(order) % views or bool((camera != order % views).any())):
-            raise scene_error(
-                transforms.file,
-                f"no times, and its {views} fixed views do not take turns; add a "
-                "time to every frame, or list all views of frame 0, then all of frame 1 …",
-            )
-        frames = order // step
-        times = frames / frames.max().clamp(min=1)
-    return Split(transforms, times.float(), camera if fixed else order, fixed, order)
+    if fixed and (len(order) % views or bool((camera != order % views).any())):
+        raise scene_error(
+            transforms.file,
+            f"no times, and its {views} fixed views do not take turns; add a "
+            "time to every frame, or list all views of frame 0, then all of frame 1 …",
+        )
+    frames = order // (views if fixed else 1)
+    return (frames / frames.max().clamp(min=1))[list(positions)], fixed
 
 
 def first_views(split: Split, count: int | None) -> Split:

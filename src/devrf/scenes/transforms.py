@@ -135,6 +135,8 @@ class Transforms:
         cut_out: whether pixels that masks leave out are background; else they are ignored.
         downscale: the factor by which the images are yet to be made smaller; None: not chosen yet.
         skipped: number of images of the file that are absent, and left out.
+        listed: (M, 3, 4) the poses of all images of the file, absent ones too, and the positions of
+            the N among them; None: the N are all, or have times.
         bounds: the scene's bounds in the world of the file, if it states them.
         offset: the offset that is subtracted from positions (:mod:`devrf.geometry.offset`).
     """
@@ -148,6 +150,7 @@ class Transforms:
     cut_out: bool = False
     downscale: int | None = None
     skipped: int = 0
+    listed: tuple[Tensor, tuple[int, ...]] | None = None
     bounds: SceneBounds | None = None
     offset: Offset = NO_OFFSET
 
@@ -160,6 +163,7 @@ class Transforms:
             poses=self.poses[list(index)],
             times=self.times and tuple(self.times[i] for i in index),
             masks=self.masks and tuple(self.masks[i] for i in index),
+            listed=self.listed and (self.listed[0], tuple(self.listed[1][i] for i in index)),
         )
 
 
@@ -257,7 +261,7 @@ class TransformsFiles:
         names = [frame.file_path for frame in listing.frames]
         images = present_images(names, file, self._finder, self._missing)
         check_each_once(images, names, file)
-        poses = poses[[*images]]
+        every_pose, poses = poses, poses[[*images]]
         frames = [listing.frames[index] for index in images]
         where = [f"{file}: frames[{index}]" for index in images]
         times = [frame.time for frame in frames]
@@ -275,6 +279,7 @@ class TransformsFiles:
         lenses = [frame_intrinsics(listing, f, at) for f, at in zip(frames, where, strict=True)]
         shared = cache(lambda: intrinsics_of(listing, file))  # only if it is needed
         masked = self._masks != "none"
+        gaps = len(images) < len(listing.frames) and not stated
         transforms = Transforms(
             file,
             tuple(own or shared() for own in lenses),
@@ -284,6 +289,7 @@ class TransformsFiles:
             tuple(self._mask(frame.mask_path, file) for frame in frames) if masked else None,
             cut_out=self._masks == "alpha",
             skipped=len(listing.frames) - len(frames),
+            listed=(subtracted(every_pose, self._offset).float(), (*images,)) if gaps else None,
             bounds=listing.scene_bounds,
             offset=self._offset,
         )

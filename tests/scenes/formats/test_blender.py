@@ -379,6 +379,23 @@ def test_fixed_views_without_times_have_to_take_turns(scene_folder, message_of):
     assert str(path) in message and "2 fixed views do not take turns" in message
 
 
+def test_absent_images_of_fixed_views_without_times_have_their_turn(scene_folder):
+    def untimed(content: dict[str, Any]) -> None:
+        for frame in content["frames"]:
+            del frame["time"]
+
+    for name in ("train", "test"):
+        scene_folder.edit(scene_folder.dynamic / f"transforms_{name}.json", untimed)
+    whole = BlenderReader(scene_folder.root).read().dynamic.train
+    for k in (0, 3):  # then the images that are there take turns no more
+        (scene_folder.dynamic / f"train/r_{k:03d}.png").unlink()
+    train = BlenderReader(scene_folder.root, missing="skip").read().dynamic.train
+    kept = torch.tensor([1, 2, 4, 5])
+    assert train.names == whole[kept].names
+    assert train.times.tolist() == whole.times[kept].tolist()
+    assert train.view.tolist() == [0, 1, 1, 0]
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
