@@ -159,6 +159,19 @@ def test_a_lens_is_undistorted_and_its_flow_files_are_left_out(scene_folder, cap
     assert float(train.cameras.focal[0, 0]) > 16 / math.tan(0.4) + 0.5
 
 
+def test_beside_absent_images_flow_files_are_left_out_where_there_are_some(scene_folder, caplog):
+    caplog.set_level(logging.INFO)
+    (scene_folder.dynamic / "train/r_003.png").unlink()
+    reader = BlenderReader(scene_folder.root, missing="skip")
+    assert reader.read().dynamic.train.flow is None
+    assert "flow files" not in caplog.text and "no optical flow: no " in caplog.text
+    flow = scene_folder.dynamic / "train_flow"
+    flow.mkdir()
+    np.savez(flow / "002_bwd.npz", flow=np.zeros((24, 32, 2)), mask=np.ones((24, 32)))
+    assert reader.read().dynamic.train.flow is None
+    assert f"flow files in {flow} left out: they number images that are left out" in caplog.text
+
+
 def test_frames_keeps_the_first_and_the_last_time(scene_folder, caplog):
     caplog.set_level(logging.INFO)
     scene = BlenderReader(scene_folder.root, frames=2).read()

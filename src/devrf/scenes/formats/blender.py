@@ -92,8 +92,10 @@ class BlenderReader(InwardReader):
     def flow_of(self, split: Split, views: Views, direction: FlowDirection) -> OpticalFlow | None:
         """See :meth:`devrf.scenes.reader.LayoutReader.flow_of`."""
         folder = split.transforms.file.with_name("train_flow")
-        if split.transforms.skipped:
-            log.info("flow files dropped: images that number them are left out")
+        if split.transforms.skipped and any(folder.glob(f"*_{direction}.npz")):
+            log.warning(
+                "flow files in %s left out: they number images that are left out, too", folder
+            )
             return None
         if any(not camera.distortion.none for camera in split.transforms.intrinsics):
             log.warning(
