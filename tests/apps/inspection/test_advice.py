@@ -146,3 +146,17 @@ def test_large_motion_without_flow_is_said(healthy, pixels, far):
     scene = replace(healthy, dynamic=replace(healthy.dynamic, train=moving))
     said = [advice for advice in advice_on(scene) if advice.where == "optical flow"]
     assert [f"{pixels} px" in advice.problem for advice in said] == [True] * far
+
+
+def test_fixed_cameras_that_face_another_place_than_the_static_ones(tiny_toy):
+    def moved(views):
+        poses = views.cameras.camera_to_world.clone()
+        poses[..., 2, 3] += 3.1
+        return replace(views, cameras=replace(views.cameras, camera_to_world=poses))
+
+    def found(scene):
+        return [str(advice) for advice in advice_on(scene) if "another world" in advice.problem]
+
+    assert not found(tiny_toy)
+    (line,) = found(replace(tiny_toy, dynamic=tiny_toy.dynamic.mapped(moved)))
+    assert line.startswith(", ".join(tiny_toy.dynamic.train.names[:3]))

@@ -12,10 +12,12 @@ from torch import Tensor
 from devrf.apps.inspection.layout import box_points, widest_gap
 from devrf.errors import DevrfError
 from devrf.geometry.clock import FrameClock
+from devrf.geometry.ndc import NormalizedDevice
 from devrf.pictures.images import evenly
 from devrf.scenes.bounds import box_from_cameras
 from devrf.scenes.optical_flow import estimator, flow_between, frame_pairs
 from devrf.scenes.scene import Scene, Views
+from devrf.scenes.space import earliest
 from devrf.scenes.splits import distinct_poses, standing
 
 # Largest gap between neighbouring static views, as seen from the box's middle, in degrees.
@@ -29,6 +31,8 @@ MIN_FLOW = 0.02
 # Motion from a frame to the next, as a share of the image's longer side, that a frame's learning
 # may not follow without optical flow.
 FAR = 0.05
+# Of a forward-facing scene, a fixed camera looks at what is so many near planes before it.
+AHEAD = 2.0
 # Pairs of frames in which motion is looked for.
 SAMPLED_PAIRS = 6
 # Masks of passers-by rarely leave out more than this share of the pixels.
@@ -52,6 +56,7 @@ def advice_on(scene: Scene) -> list[Advice]:
         _held_out,
         _box_unknown,
         _one_side,
+        _elsewhere,
         _images,
         _alpha,
         _masks,
@@ -135,6 +140,33 @@ def _one_side(scene: Scene) -> Iterator[Advice]:
         )
 
 
+def _elsewhere(scene: Scene) -> Iterator[Advice]:
+    """Fixed cameras that face another place than the static ones: their files' worlds differ."""
+    if not isinstance(scene.space, NormalizedDevice) or not scene.moves or scene.is_monocular:
+        return
+    static = scene.static.train.cameras
+    images = torch.arange(len(static))
+    names = []
+    for views in map(earliest, (scene.dynamic.train, scene.dynamic.test)):
+        poses = views.cameras.camera_to_world
+        ahead = poses[:, :, 3] - AHEAD * scene.space.near * poses[:, :, 2]
+        for name, point in zip(views.names, ahead, strict=True):
+            pixels, depth = static.project(images, point.expand(len(static), 3))
+            if not bool(_shown(pixels, depth, static.extents).any()):
+                names.append(name)
+    if names:
+        yield Advice(
+            listed(names),
+            "looks at a place that is in no static image, as if its camera were of another world",
+            "give both captures' cameras in one world and unit (docs/data.md, data=forward: Axes)",
+        )
+
+
+def _shown(pixels: Tensor, depth: Tensor, size: Tensor) -> Tensor:
+    """(...): whether points at ``pixels`` (..., 2) and ``depth`` are in images of ``size``."""
+    return (depth > 0) & ((pixels >= 0) & (pixels <= size)).all(dim=-1)
+
+
 def mean_share(masks: Iterable[Tensor]) -> float:
     """Mean of masks (H, W), read one by one: those of a large scene at once would be copied."""
     shares = [float(mask.float().mean()) for mask in masks]
@@ -160,19 +192,16 @@ def _images(scene: Scene) -> Iterator[Advice]:
         middle = points[4, 4, 4].expand(len(views), 3)
         return views.cameras.project(torch.arange(len(views)), middle)
 
-    def shown(pixels: Tensor, depth: Tensor, size: Tensor) -> Tensor:
-        return (depth > 0) & ((pixels >= 0) & (pixels <= size)).all(dim=-1)
-
     def away(views: Views) -> list[bool]:
         return (of_middle(views)[1] <= 0).tolist()
 
     def beside(views: Views) -> list[bool]:
         pixels, depth = of_middle(views)
         size = views.cameras.extents
-        fine = (depth <= 0) | shown(pixels, depth, size)
+        fine = (depth <= 0) | _shown(pixels, depth, size)
         for k in (~fine).nonzero()[:, 0].tolist():
             places, depths = views.cameras.project_into(k, points.view(-1, 3))
-            fine[k] = shown(places, depths, size[k]).any()
+            fine[k] = _shown(places, depths, size[k]).any()
         return (~fine).tolist()
 
     pose = "check the pose (camera-to-world, x right, y up, looking along -z), or set data.box"
