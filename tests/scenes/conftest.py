@@ -318,7 +318,7 @@ class LlffFolder:
         poses = np.zeros((5, 3, 5))
         poses[:, :, :3] = np.eye(3)
         # Two of the static cameras come first; the last three are the fixed ones.
-        poses[:, 0, 3] = [7, 8, -0.5, 0, 0.5]
+        poses[:, 0, 3] = [-4, -3, -0.5, 0, 0.5]
         poses[:, :, 4] = [32, 48, 40]
         self.save("dynamic_3views/poses.npy", poses)
         self.save("dynamic_3views/bds.npy", np.tile([1.2, 9.0], (5, 1)))

@@ -175,12 +175,66 @@ def test_beside_fixed_views_a_stray_point_sets_the_unit_as_in_their_file(llff_fo
     rows = llff_folder.static_rows()
     rows[4, 15] = 2.7  # the least depth of the others is 6: LLFF's own unit is 0.75 · 2.7
     llff_folder.save(STATIC, rows)
+    for file in (POSES, BOUNDS):  # without the static cameras, which would tell their unit
+        llff_folder.save(file, stored(llff_folder, file)[-3:])
     scene = LlffReader(llff_folder.root).read()
     static, moving = (capture.train.cameras for capture in (scene.static, scene.dynamic))
     torch.testing.assert_close(static.positions, before.static.train.cameras.positions * (6 / 2.7))
     # What is in LLFF's unit already is taken as it is.
     torch.testing.assert_close(moving.positions, before.dynamic.train.cameras.positions)
     assert "stray" not in caplog.text
+
+
+def in_raw_world(folder: Any, count: int, views: int = 3) -> np.ndarray:
+    """Rows of poses.npy in the world of poses_bounds.npy: ``count`` static cameras, then views."""
+    poses = np.zeros((count + views, 3, 5))
+    # The same axes for all: right, up, back along world y, z, x; the middle camera is at y = 38.
+    poses[:, :, :3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
+    places = [*range(-4, count - 4), -0.5, 0, 0.5]
+    poses[:, :, 3] = [[10, 38 + 4.5 * x, 30] for x in places]
+    poses[:, :, 4] = stored(folder, POSES)[0, :, 4]
+    folder.save(BOUNDS, np.tile([1.2, 9.0], (len(poses), 1)))
+    return poses
+
+
+@pytest.mark.parametrize("count", [1, 2, 9])
+def test_fixed_views_in_the_world_of_the_static_cameras(llff_folder, count):
+    expected = LlffReader(llff_folder.root).read().dynamic.train.cameras
+    poses = in_raw_world(llff_folder, count)
+    # The static ones in any order.
+    llff_folder.save(POSES, np.concatenate([poses[:count][::-1], poses[count:]]))
+    cameras = LlffReader(llff_folder.root).read().dynamic.train.cameras
+    torch.testing.assert_close(cameras.camera_to_world, expected.camera_to_world)
+
+
+@pytest.mark.parametrize("count", [2, 9])
+def test_fixed_views_in_another_world_that_the_static_cameras_tell(llff_folder, count):
+    expected = LlffReader(llff_folder.root).read().dynamic.train.cameras
+    poses = in_raw_world(llff_folder, count)
+    cosine, sine = np.cos(2), np.sin(2)
+    poses[:, :, :4] = (
+        np.array([[cosine, sine, 0], [0, 0, -1], [-sine, cosine, 0]]) @ poses[:, :, :4]
+    )
+    poses[:, :, 3] = 300 * poses[:, :, 3] + [5, -7, 11]
+    llff_folder.save(POSES, poses)
+    cameras = LlffReader(llff_folder.root).read().dynamic.train.cameras
+    torch.testing.assert_close(cameras.camera_to_world, expected.camera_to_world)
+
+
+def test_rows_before_the_fixed_views_that_are_no_static_cameras(llff_folder, message_of):
+    poses = in_raw_world(llff_folder, 3)
+    poses[1, 2, 3] += 20
+    llff_folder.save(POSES, poses)
+    message = message_of(llff_folder.root)
+    assert f"{POSES}: its first 3 cameras are not those of poses_bounds.npy" in message
+
+
+def test_without_such_rows_fixed_views_are_in_llffs_normalised_world(llff_folder):
+    expected = LlffReader(llff_folder.root).read().dynamic.train.cameras
+    llff_folder.save(POSES, stored(llff_folder, POSES)[-3:])
+    llff_folder.save(BOUNDS, stored(llff_folder, BOUNDS)[-3:])
+    cameras = LlffReader(llff_folder.root).read().dynamic.train.cameras
+    assert torch.equal(cameras.camera_to_world, expected.camera_to_world)
 
 
 def test_the_cameras_that_nr_nerf_publishes(llff_folder):

@@ -20,6 +20,7 @@ from devrf.scenes.formats.llff_poses import (
     read_precomputed_poses,
     read_static_poses,
 )
+from devrf.scenes.formats.llff_world import in_static_world
 from devrf.scenes.image_folders import ImageFolder, folder_size, image_folder, listed_images
 from devrf.scenes.layout import Layout, static_alone, without_static_set
 from devrf.scenes.names import in_order
@@ -75,10 +76,11 @@ class LlffReader(FixedViewsReader):
                 "data.monocular", f"{folder} has fixed views, so it is no video; leave it null"
             )
         factor = self.choose_factor(folder_size(static))
-        # The cameras of fixed views have LLFF's own unit, so the static ones need it, too.
+        # The cameras of fixed views may have LLFF's own unit: then the static ones need it, too.
         alone = os.path.isfile(static / PRECOMPUTED) and not os.path.isfile(static / POSES)
         read = read_precomputed_poses if alone else read_static_poses
-        posed = read(static).normalised(with_strays=moving is not None)
+        stated = read(static)
+        posed = stated.normalised(with_strays=moving is not None)
         images = _posed_images(posed, image_folder(static, factor))
         video = self.monocular
         if video is None:
@@ -102,7 +104,7 @@ class LlffReader(FixedViewsReader):
             (train, test),
             views,
             posed_by=cameras.file,
-            poses=cameras.poses[-count:],
+            poses=in_static_world(cameras, count, stated, posed),
             lenses=cameras.intrinsics[-count:],
             test=held_out_view(count, self.test_view),
         )
