@@ -10,7 +10,6 @@ from torch import Tensor
 from devrf.geometry.poses import relative_to
 from devrf.scenes.formats.llff_poses import PosedSet
 from devrf.scenes.splits import distinct_poses
-from devrf.scenes.validation import scene_error
 
 log = logging.getLogger(__name__)
 
@@ -24,8 +23,8 @@ def in_static_world(moving: PosedSet, views: int, static: PosedSet, world: Posed
 
     The fixed cameras are the last rows of ``moving``; rows before them are static cameras again,
     and tell the world that they are in: ``world``, that of ``static``, or another, moved and
-    scaled, if they are the first rows of ``static`` in its order. Without them it is ``world``.
-    DevrfError if they fit none.
+    scaled, if they are the first rows of ``static`` in its order. Without them, or where they fit
+    none, as a warning says, it is ``world``.
     """
     shared, fixed = moving.poses[:-views], moving.poses[-views:]
     if len(shared) == 0 or _are_among(shared, world.poses):
@@ -45,12 +44,15 @@ def in_static_world(moving: PosedSet, views: int, static: PosedSet, world: Posed
                 "%s: in a world of its own, brought to that of its static cameras", moving.file
             )
             return relative_to(other[0], fixed, other[1])
-    raise scene_error(
+    log.warning(
+        "%s: its first %d cameras are not those of %s, neither in one world with them nor moved "
+        "and scaled; the others are taken to be in LLFF's normalised world. Else write the static "
+        "cameras first, in that file's order",
         moving.file,
-        f"its first {len(shared)} cameras are not those of {static.file.name}, neither in one "
-        "world with them nor moved and scaled; write the static cameras first, in that file's "
-        "order, or none of them and the others in LLFF's normalised world",
+        len(shared),
+        static.file.name,
     )
+    return fixed
 
 
 def similarity(poses: Tensor, targets: Tensor) -> tuple[Tensor, float] | None:
