@@ -60,7 +60,8 @@ class Stop(Callback):
         periodic_checkpoint.AGREE_EVERY = 2
 
     def on_train_batch_end(self, trainer, stage, outputs, batch, batch_idx):
-        if trainer.global_rank == 0 and batch_idx == 1:
+        second = stage.capture == "static" and stage.position.iteration == 2
+        if trainer.global_rank == 0 and second:
             os.kill(os.getppid(), signal.SIGINT)
             time.sleep(2)
 
@@ -132,7 +133,7 @@ def pair(warm, learning, modules, tmp_path_factory):
     stop = ("trainer.devices=2", "stage=canonical", "+callbacks.stop._target_=witnesses.Stop")
     interrupted = warm(folder, *arguments, *stop, path=str(modules))
     assert (folder / "run" / "checkpoints" / "canonical-progress-3.ckpt").is_file(), interrupted.out
-    return folder, interrupted, by_torchrun(warm, folder, modules, *arguments)
+    return folder, interrupted, by_torchrun(warm, folder, modules, *arguments, stop[-1])
 
 
 def test_an_interrupted_command_ends_its_processes(pair):

@@ -161,3 +161,12 @@ def test_a_run_left_with_another_config_is_refused(devrf, cut_short):
     assert outcome.status == 2
     assert outcome.err.startswith("devrf: sampling.step: ")
     assert "canonical-progress-4.ckpt was made with 0.5, now it is 0.4" in outcome.err
+
+
+def test_a_run_left_with_another_decay_is_refused(devrf, cut_short):
+    command, _ = cut_short
+    decay = "devrf.callbacks.schedule.LearningRateDecay"
+    outcome = devrf(*command, f"callbacks.learning_rate_decay._target_={decay}")
+    assert outcome.status == 2
+    assert outcome.err.startswith("devrf: callbacks.learning_rate_decay._target_: ")
+    assert "canonical-progress-4.ckpt was made with nothing, now it is" in outcome.err

@@ -7,7 +7,8 @@ Each checkpoint holds the settings that decided its result:
 * either with other settings: the run is refused, naming the first that differs;
 * a deformation on top of another canonical field than the run's: it is learned anew.
 
-Settings of logging, scoring, rendering, the device and the place of the data may differ.
+Settings of logging, scoring, rendering, the device, callbacks that only look, and the place of the
+data may differ.
 
 A pipeline does not score and render again either: a step notes what decided its results
 (checkpoint, settings, data, loggers, version).
@@ -37,6 +38,7 @@ from devrf.checkpoints.file_metadata import OWN_REST, digest_of
 from devrf.checkpoints.progress import progress_files
 from devrf.cli.config import command_line, leaves, set_at, stage_section
 from devrf.cli.context import RunContext
+from devrf.cli.deciding_callbacks import deciding_callbacks
 from devrf.errors import DevrfError
 from devrf.system.files import LARGEST_RECORD, read_record, write_json
 from devrf.system.folder_lock import PLACE
@@ -77,6 +79,7 @@ def deciding_settings(config: DictConfig, stage: str) -> dict[str, Any]:
     for key, usual in (("schedule.seconds", None), ("priors", "all"), ("rehearse", False)):
         if (value := OmegaConf.select(config, key)) != usual:
             settings[key] = value
+    settings |= deciding_callbacks(config)
     # As a checkpoint's JSON gives it back.
     plain: dict[str, Any] = json.loads(json.dumps(settings, sort_keys=True))
     return plain

@@ -123,7 +123,8 @@ def _fit(run: RunContext, stage: Stage, begin: ResumePoint) -> None:
     elif not finished:
         asked = run.config.trainer
         limits = [f"trainer.{k}={asked[k]}" for k, v in LIMITS.items() if asked.get(k, v) != v]
-        ended = f"learning has ended at {where}; the same command without it goes on"
+        again = "goes on" if limits else "goes on, or asks for resume=false"
+        ended = f"learning has ended at {where}; the same command without it {again}"
         raise DevrfError(f"{', '.join(limits) or 'callbacks'}: {ended}")
 
 

@@ -99,6 +99,18 @@ def test_two_different_runs_never_share_a_row(rows, ran, one, other, count):
     assert folders == [[["a", "a/previous-1"]], [["a"], ["a/previous-1"]]][count - 1]
 
 
+def test_callbacks_that_decide_are_rows_of_their_own_and_in_their_names(rows, ran):
+    usual = {"loss.tv": 1.0}
+    ran("a", settings=usual)
+    ran("b", settings={**usual, "callbacks.learning_rate_decay._target_": "ramp.RampedDecay"})
+    ran("c", settings={**usual, "callbacks.es.patience": 1, "callbacks.divergence_guard": None})
+    assert rows() == [
+        ("robot", FULL, ["a"]),
+        ("robot", f"{FULL}; callbacks.learning_rate_decay._target_=ramp.RampedDecay", ["b"]),
+        ("robot", f"{FULL}; callbacks.es.patience=1; callbacks.divergence_guard=null", ["c"]),
+    ]
+
+
 def test_a_scene_at_rest_is_one_of_its_own_without_ablations(rows, ran):
     ran("a", ablation="base", at_rest=True, settings={})
     ran("b", ablation="c2f", at_rest=True, settings={})

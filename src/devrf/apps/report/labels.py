@@ -44,6 +44,8 @@ ABLATIONS = {
 }
 CHOICES = "run.choices."
 SETTINGS = "run.settings."
+# Of those that decide what is learned, where they are not the usual ones.
+CALLBACKS = f"{SETTINGS}callbacks."
 # A run without an experiment has the config of this one.
 DEFAULT_EXPERIMENT = "quickstart"
 # Groups of settings that may be typed beside those that have a part of the name of their own.
@@ -108,6 +110,12 @@ def row_name(run: Mapping[str, Any]) -> str:
         is_setting = setting == setting and key not in NOT_LEARNED  # null is None, absent is NaN
         if key not in OF_TITLE and (is_setting or key in GROUPS and value != method):
             parts.append(f"{key}={value}")
+    # Typed as code, which no checkpoint keeps among what was typed.
+    callbacks = {key: value for key, value in run.items() if key.startswith(CALLBACKS)}
+    for key, value in callbacks.items():
+        if value == value:
+            said = "null" if value is None else value
+            parts.append(f"{key.removeprefix(SETTINGS)}={said}")
     name = shown("; ".join(filter(None, parts)))
     return name if len(name) <= LONGEST_NAME else f"{name[:LONGEST_NAME]}..."
 
