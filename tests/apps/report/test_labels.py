@@ -53,6 +53,14 @@ def test_methods_have_rows_of_their_own_after_ours(labels, ran):
     ]
 
 
+def test_pictures_of_another_program_say_which_images_they_are_of(labels, ran):
+    method = "Splats (pictures)"
+    typed = ["stage=evaluate", "data.root=/a", "evaluation.predictions=/b", "+data.downscale=8"]
+    ran("a", method=method, predictions="/b", settings={}, overrides=typed[:3])
+    ran("b", method=method, predictions="/b", settings={}, overrides=typed)
+    assert labels() == [method, f"{method}; data.downscale=8"]
+
+
 SETTINGS = {"data.frames": 14, "loss.tv": 0.5, "data.near": None, "seed": 0, "schedule.seconds": 9}
 
 

@@ -196,6 +196,35 @@ def test_rows_of_different_benchmarks_are_no_rows_of_one_table(table, ran):
         table()
 
 
+@pytest.mark.parametrize(
+    ("key", "values", "said"),
+    [
+        ("image_size", ([48, 40], [24, 20]), "image size ([48, 40]; [24, 20])"),
+        ("test_frames", (20, 10), "test frames (20; 10)"),
+    ],
+)
+def test_scores_of_other_images_are_not_ranked(table, ran, key, values, said):
+    one, other = values
+    for scene in ("robot", "flower", "bush"):
+        ran(f"{scene}_a", scene, scores={"psnr": 20.0}, **{key: one})
+        ran(f"{scene}_b", scene, scores={"psnr": 22.0}, ablation="base", **{key: other})
+    found = table()
+    # Nor are their averages, and none gains over the other.
+    assert [block.title for block in found.blocks][3:] == ["average over 3 scenes"]
+    assert {rank for block in found.blocks for rank in ranks(block, PSNR)} == {0}
+    differ = f"no comparison of PSNR, SSIM: the runs differ in {said}."
+    assert f"bush, flower, robot: {differ}" in found.notes
+
+
+def test_scenes_with_other_numbers_of_images_are_averaged_and_ranked(table, ran):
+    for scene, frames in (("robot", 20), ("flower", 10)):
+        ran(f"{scene}_a", scene, scores={"psnr": 20.0}, test_frames=frames)
+        ran(f"{scene}_b", scene, scores={"psnr": 22.0}, ablation="base", test_frames=frames)
+    found = table()
+    assert ranks(found.blocks[-1], PSNR) == [2, 1]
+    assert not any("no comparison" in note for note in found.notes)
+
+
 def test_rows_of_one_name_stay_apart_and_a_note_says_in_what_they_differ(table, ran):
     for k, (psnr, device) in enumerate(((20.0, "CPU"), (22.0, "CPU"), (30.0, "GPU"))):
         ran(str(k), scores={"psnr": psnr}, seed=k, device=device)

@@ -100,14 +100,16 @@ def row_name(run: Mapping[str, Any]) -> str:
             parts = [ABLATIONS[ablation]]
         elif ablation != "full":
             parts = [f"{parts[0]} ({ablation})"]
-    # Another program did not follow devrf's protocol.
-    unsaid = method == DEFAULT_METHOD or isinstance(run.get("run.predictions"), str)
+    # Another program did not follow devrf's protocol, and has no settings but those of the data.
+    foreign = isinstance(run.get("run.predictions"), str)
+    unsaid = method == DEFAULT_METHOD or foreign
     usual = (DEFAULT_PROTOCOL, DEFAULT_EXPERIMENT) if unsaid else ()
     parts += [p for p in (run["protocol"], _option(run, "experiment")) if p not in usual]
     for text in run["run.overrides"]:
         key, _, value = text.lstrip("+").partition("=")
         setting = run.get(SETTINGS + key, float("nan"))
         is_setting = setting == setting and key not in NOT_LEARNED  # null is None, absent is NaN
+        is_setting |= foreign and key.startswith("data.")
         if key not in OF_TITLE and (is_setting or key in GROUPS and value != method):
             parts.append(f"{key}={value}")
     # Typed as code, which no checkpoint keeps among what was typed.

@@ -21,6 +21,8 @@ from devrf.errors import DevrfError
 UNKNOWN = "–"
 # Keys that a note names of those in which rows of one name differ.
 MOST_DIFFERENCES = 3
+# What scores depend on: the protocol, and size and number of the held-out images.
+OF_SCORES = ("run.benchmark", "run.image_size", "run.test_frames")
 
 
 @dataclass(frozen=True)
@@ -28,14 +30,14 @@ class Column:
     """A column of the tables, and the ``key`` of its values in a collection; times in seconds.
 
     A value without ``digits`` is a time in the unit that reads best. Values compare only among runs
-    that agree in the column ``alike`` of the collection.
+    of a scene that agree in the columns ``alike`` of the collection.
     """
 
     title: str
     key: str
     higher_is_better: bool
     digits: int | None
-    alike: str = "run.benchmark"
+    alike: tuple[str, ...] = OF_SCORES
     why_missing: str = "it was not recorded"
 
     @property
@@ -50,16 +52,16 @@ NO_WEIGHTS = (
 )
 PSNR = Column("PSNR", "dynamic.psnr", True, 2)
 SSIM = Column("SSIM", "dynamic.ssim", True, 3)
-LPIPS = Column("LPIPS", "dynamic.lpips", False, 4, "run.benchmark", NO_WEIGHTS)
+LPIPS = Column("LPIPS", "dynamic.lpips", False, 4, OF_SCORES, NO_WEIGHTS)
 NO_GPU = "no run is known to have used a GPU"
-GPU = Column("GPU (GB)", "peak_gpu_gb", False, 1, "run.device", NO_GPU)
-TIME = Column("Time", "train_seconds", False, None, "run.device")
+GPU = Column("GPU (GB)", "peak_gpu_gb", False, 1, ("run.device",), NO_GPU)
+TIME = Column("Time", "train_seconds", False, None, ("run.device",))
 COLUMNS = (PSNR, SSIM, LPIPS, GPU, TIME)
 TITLES = [column.title for column in COLUMNS]
 # Shown if a run was scored on what moves, or at times that no training view has; the paper has no
 # such columns.
 FURTHER = (
-    Column("PSNR moving", "dynamic.psnr_moving", True, 2, "run.motion_masks"),
+    Column("PSNR moving", "dynamic.psnr_moving", True, 2, (*OF_SCORES, "run.motion_masks")),
     Column("PSNR at training times", "dynamic.training_times.psnr", True, 2),
     Column("PSNR at novel times", "dynamic.novel_times.psnr", True, 2),
 )
@@ -135,8 +137,8 @@ class Table:
             title; NaN unless all runs of the row have the value.
         published: the scenes whose data are those of the paper's rows.
         blocks: one for each scene, then the average if there is more than one, then the gains over
-            three scenes or more, if they are alike: PSNR, its mean and its least, and its gain over
-            the first row's; seconds as a multiple of that row's.
+            three scenes or more, if they are alike and PSNR compares: PSNR, its mean and its least,
+            and its gain over the first row's; seconds as a multiple of that row's.
         notes: remarks on columns and rows, a sentence each.
     """
 
@@ -183,7 +185,7 @@ def tabulate(collection: Collection) -> Table:
         averaged = runs[runs["label"].isin(average.index)]
         measured = _cells(average, average[titles] * math.nan, columns, averaged)
         blocks.append(Block(f"average over {len(scenes)} scenes", measured))
-        if len(average) > 1 and len(scenes) > 2:
+        if len(average) > 1 and len(scenes) > 2 and not _differing(averaged, PSNR):
             blocks.append(Block("gains over all scenes", _gains(rows.reset_index(), average)))
     left_out = [scene for scene in scenes if scene in papers - same]
     for why, names in (
@@ -216,21 +218,25 @@ def _check_benchmarks(runs: pd.DataFrame) -> None:
             )
 
 
-def _is_comparable(runs: pd.DataFrame, column: Column) -> bool:
-    """Whether the runs that have values of a column agree in what these depend on."""
-    return bool(runs.loc[runs[column.title].notna(), column.alike].nunique(dropna=False) < 2)
+def _differing(runs: pd.DataFrame, column: Column) -> list[str]:
+    """The columns, of those ``alike``, in which runs of one scene that have values differ."""
+    having = runs[runs[column.title].notna()]
+    texts = having.reindex(columns=column.alike).astype(object).fillna("none").map(str)
+    return [key for key in texts if (texts[key].groupby(having["scene"]).nunique() > 1).any()]
 
 
 def _incomparable(runs: pd.DataFrame, columns: Sequence[Column]) -> list[str]:
     """The columns of scenes in which nothing is marked, and in what their runs differ."""
     scenes: dict[str, list[str]] = {}
     for scene, same in runs.groupby("scene", sort=False):
-        unmarked = [column for column in columns if not _is_comparable(same, column)]
-        for key in dict.fromkeys(column.alike for column in unmarked):
-            titles = ", ".join(column.title for column in unmarked if column.alike == key)
+        unmarked: dict[str, list[str]] = {}
+        for column in columns:
+            for key in _differing(same, column):
+                unmarked.setdefault(key, []).append(column.title)
+        for key, titles in unmarked.items():
             differ = "; ".join(same[key].fillna("none").map(str).unique())
             what = key.removeprefix("run.").replace("_", " ")
-            text = f"no comparison of {titles}: the runs differ in {what} ({differ})."
+            text = f"no comparison of {', '.join(titles)}: the runs differ in {what} ({differ})."
             scenes.setdefault(text, []).append(str(scene))
     return [f"{', '.join(names)}: {text}" for text, names in scenes.items()]
 
@@ -265,7 +271,7 @@ def _cells(
     cells = {}
     for column in columns:
         values = rows[column.title]
-        ranks = ranked(values, column) * _is_comparable(runs, column)
+        ranks = ranked(values, column) * (not _differing(runs, column))
         texts = map(shown, values, repeat(column), spread[column.title])
         cells[column.heading] = list(map(Cell, texts, ranks))
     # The number of runs that a row's values are means of, if it is more than one.
