@@ -201,6 +201,7 @@ def test_rows_of_different_benchmarks_are_no_rows_of_one_table(table, ran):
     [
         ("image_size", ([48, 40], [24, 20]), "image size ([48, 40]; [24, 20])"),
         ("test_frames", (20, 10), "test frames (20; 10)"),
+        ("exposure", (None, "equal"), "exposure (none; equal)"),
     ],
 )
 def test_scores_of_other_images_are_not_ranked(table, ran, key, values, said):
@@ -214,6 +215,15 @@ def test_scores_of_other_images_are_not_ranked(table, ran, key, values, said):
     assert {rank for block in found.blocks for rank in ranks(block, PSNR)} == {0}
     differ = f"no comparison of PSNR, SSIM: the runs differ in {said}."
     assert f"bush, flower, robot: {differ}" in found.notes
+
+
+def test_lpips_of_other_networks_is_not_ranked(table, ran):
+    ran("a", scores={"lpips": 0.1}, lpips_network="alex")
+    ran("b", scores={"lpips": 0.2, "psnr": 20.0}, ablation="base", lpips_network="vgg")
+    found = table()
+    assert set(ranks(found.blocks[0], LPIPS)) == {0} and set(ranks(found.blocks[0], PSNR)) == {1, 2}
+    differ = "no comparison of LPIPS: the runs differ in lpips network (alex; vgg)."
+    assert f"robot: {differ}" in found.notes
 
 
 def test_scenes_with_other_numbers_of_images_are_averaged_and_ranked(table, ran):

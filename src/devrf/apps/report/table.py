@@ -21,8 +21,8 @@ from devrf.errors import DevrfError
 UNKNOWN = "–"
 # Keys that a note names of those in which rows of one name differ.
 MOST_DIFFERENCES = 3
-# What scores depend on: the protocol, and size and number of the held-out images.
-OF_SCORES = ("run.benchmark", "run.image_size", "run.test_frames")
+# What scores depend on: the protocol; of the held-out images size, number, and what is left out.
+OF_SCORES = ("run.benchmark", "run.image_size", "run.test_frames", "run.exposure")
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ NO_WEIGHTS = (
 )
 PSNR = Column("PSNR", "dynamic.psnr", True, 2)
 SSIM = Column("SSIM", "dynamic.ssim", True, 3)
-LPIPS = Column("LPIPS", "dynamic.lpips", False, 4, OF_SCORES, NO_WEIGHTS)
+LPIPS = Column("LPIPS", "dynamic.lpips", False, 4, (*OF_SCORES, "run.lpips_network"), NO_WEIGHTS)
 NO_GPU = "no run is known to have used a GPU"
 GPU = Column("GPU (GB)", "peak_gpu_gb", False, 1, ("run.device",), NO_GPU)
 TIME = Column("Time", "train_seconds", False, None, ("run.device",))
