@@ -7,7 +7,7 @@ import os
 import shutil
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -121,8 +121,9 @@ def working_in(folder: Path, config: DictConfig) -> Iterator[None]:
         below = (walked for name in BEGUN for walked, *_ in walk(folder / name))
         recent = time.time() - WRITING
         for begun in (path for walked in (folder, *below) for path in walked.glob(f"{PARTIAL}*")):
-            if begun.lstat().st_mtime < recent:
-                remove(begun)
+            with suppress(FileNotFoundError):  # the viewer has just finished it
+                if begun.lstat().st_mtime < recent:
+                    remove(begun)
     was_new = is_rank_zero and not in_sweep() and holds_at_most(folder, AT_FIRST)
     try:
         yield

@@ -7,7 +7,7 @@ import logging
 import torch
 from torch import Tensor
 
-from devrf.geometry.poses import relative_to
+from devrf.geometry.poses import average_pose, relative_to
 from devrf.scenes.formats.llff_poses import PosedSet
 from devrf.scenes.splits import distinct_poses
 
@@ -29,10 +29,11 @@ def in_static_world(moving: PosedSet, views: int, static: PosedSet, world: Posed
     shared, fixed = moving.poses[:-views], moving.poses[-views:]
     if len(shared) == 0 or _are_among(shared, world.poses):
         return fixed
-    capture = similarity(static.poses, world.poses)
-    if capture and _are_among(relative_to(capture[0], shared, capture[1]), world.poses):
+    # As the static cameras were normalised.
+    middle, scale = average_pose(static.poses), float(world.bounds.max() / static.bounds.max())
+    if _are_among(relative_to(middle, shared, scale), world.poses):
         log.info("%s: in the world of %s", moving.file, static.file)
-        return relative_to(capture[0], fixed, capture[1])
+        return relative_to(middle, fixed, scale)
     count = min(len(shared), len(world))
     first = world.poses[:count]
     other = similarity(shared[:count], first)
