@@ -89,14 +89,14 @@ def inspection_figure(scene: Scene) -> Figure:
                 wspace=0.06,
                 hspace=CAPTION / tile,
             )
-            places = part.subplots(len(rows), COLUMNS, squeeze=False)
-            entries = [row[k] if k < len(row) else None for row in rows for k in range(COLUMNS)]
-            for axes, entry in zip(places.flat, entries, strict=True):
-                if entry is None:
-                    axes.set_axis_off()
-                else:
-                    axes.imshow(entry[0])
-                    axes.set(xticks=[], yticks=[], xlabel=entry[1], anchor="N")
+            places = part.add_gridspec(len(rows), COLUMNS)
+            for row, entries in enumerate(rows):
+                for column, entry in enumerate(entries):
+                    if entry is not None:  # empty axes take as long as others
+                        image, label = entry
+                        axes = part.add_subplot(places[row, column], anchor="N", xlabel=label)
+                        axes.imshow(image)
+                        axes.set(xticks=[], yticks=[])
     return figure
 
 
