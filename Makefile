@@ -26,7 +26,8 @@ BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --disable-pip-version-check \
 	$(if $(CONSTRAINTS),--constraint $(CONSTRAINTS)) --editable
 # A file's tests run in one process: what they share is made once. The last files are small ones.
-PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile \
+# The package is compiled once, whatever the shell says, not by each process that a test starts.
+PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile \
 	--no-loadscope-reorder --durations 15
 
 .PHONY: quickstart test docs house gpu-check rehearse chance fuzz splat-viewer format shell clean
