@@ -118,14 +118,23 @@ def test_a_canonical_field_that_is_given_belongs_to_the_deformation(devrf, tiny,
     assert outcome.err.startswith("devrf: ckpt: ")
 
 
-@pytest.fixture
-def cut_short(devrf, tiny, often, tmp_path):
-    """A command, and the checkpoints of it, left after iteration 4 of the canonical stage."""
+@pytest.fixture(scope="module")
+def left(devrf_in, tiny, often, tmp_path_factory):
+    """A command, and the folder in which it was left after iteration 4 of the canonical stage."""
     command = (*tiny, *often, "hydra.run.dir=run", "stage=canonical")
+    folder = tmp_path_factory.mktemp("left")
+    assert devrf_in(folder, *command, "trainer.max_steps=4").status == 2
+    return command, folder
+
+
+@pytest.fixture
+def cut_short(left, tmp_path):
+    """A command, and the checkpoints of a copy of what it has left."""
+    command, folder = left
     checkpoints = tmp_path / "run" / "checkpoints"
-    assert devrf(*command, "trainer.max_steps=4").status == 2
-    left = {path.name for path in checkpoints.glob("*.ckpt")}
-    assert left == {"canonical-progress-3.ckpt", "canonical-progress-4.ckpt"}
+    shutil.copytree(folder / "run", tmp_path / "run")
+    names = {path.name for path in checkpoints.glob("*.ckpt")}
+    assert names == {"canonical-progress-3.ckpt", "canonical-progress-4.ckpt"}
     return command, checkpoints
 
 
