@@ -148,6 +148,11 @@ def test_an_export_needs_the_packages_of_its_format_alone(of_run, tmp_path, monk
     said = f'devrf: {package} is not installed; run pip install "devrf[export]"\n'
     assert (outcome.status, outcome.err) == (2, said)
     assert not (tmp_path / "run").exists()
+
+
+def test_an_export_of_numbers_alone_needs_no_package(of_run, monkeypatch):
+    for package in ("skimage", "trimesh", "pxr"):
+        monkeypatch.setitem(sys.modules, package, None)
     assert of_run("stage=export", "export.tracks=[[0,0,0]]", "export.format=csv").status == 0
     # Gaussians of a method's own are written by nothing but devrf.
     monkeypatch.setattr("devrf.cli.render.export_scene", lambda *arguments: None)
