@@ -57,7 +57,8 @@ def test_a_capture_by_one_camera_needs_one_word_beside_its_folder(devrf, mill, t
     ],
 )
 def test_an_embedded_film_by_hand_is_learned_as_others_are(devrf, tiny_facing, typed, said) -> None:
-    outcome = devrf(*tiny_facing, "data.camera=handheld", *typed, "stage=inspect")
+    step = ("stage=prepare", "prepare.into=film")
+    outcome = devrf(*tiny_facing, "data.camera=handheld", *typed, *step)
     assert (outcome.status, outcome.err) == (0, "")
     assert "data.camera=handheld: one" in outcome.out and said in outcome.out
 

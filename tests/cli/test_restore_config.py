@@ -72,7 +72,9 @@ def test_in_a_folder_nothing_has_to_be_typed_again(devrf, tiny, run):
 
 
 def test_what_is_typed_differs(devrf, run):
-    assert devrf("stage=still", "hydra.run.dir=run", "video.frames=2").status == 0
+    assert (
+        devrf("stage=still", "still.height=20", "hydra.run.dir=run", "video.frames=2").status == 0
+    )
     assert (config(run).video.frames, config(run).data.frames) == (2, 3)
     outcome = devrf("hydra.run.dir=run", "loss.fine.render=2")
     assert outcome.status == 2 and outcome.err.startswith("devrf: loss.fine.render: ")
@@ -90,7 +92,7 @@ def test_what_is_made_of_a_checkpoint_goes_to_its_run(devrf, run, tmp_path):
     assert "deformation" in json.loads((run / "metrics.json").read_text())
     assert "deformation" not in json.loads((run / "canonical" / "metrics.json").read_text())
     alone = shutil.copy(last, tmp_path / "my copy.ckpt")
-    assert devrf("stage=still", f"ckpt='{alone}'").status == 0
+    assert devrf("stage=still", "still.height=20", f"ckpt='{alone}'").status == 0
     assert list((tmp_path / "outputs" / "robot" / "my copy" / "images").iterdir())
 
 
@@ -111,7 +113,7 @@ def test_on_the_folder_of_a_sweep_a_command_stands_for_one_on_each_learned_run(r
 
 def test_a_job_of_an_experiment_that_sweeps_does_not_start_its_sweep(devrf, run, edited):
     edited(lambda entry: entry["command"].update({"/experiment": "ablation_table"}))
-    assert devrf("stage=still", "hydra.run.dir=run").status == 0
+    assert devrf("stage=still", "still.height=20", "hydra.run.dir=run").status == 0
     assert (run / "images").is_dir()
 
 

@@ -127,7 +127,7 @@ def test_a_method_with_a_stage_of_its_own_needs_nothing_elsewhere(
     assert done.status == 0 and "needs about" in done.out, done.err
     scores = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert scores["dynamic"]["psnr"] > 8 and scores["method"] == "grey"
-    assert devrf(*asked, *tiny_data, "stage=still").status == 0
+    assert devrf(*asked, *tiny_data, "stage=still", "still.height=20").status == 0
     done = devrf(*asked, *tiny_data, "rehearse=true", "hydra.run.dir=rehearsed")
     assert "rehearsed: every stage learns" in done.out or "rehearse: " in done.err
 
