@@ -67,17 +67,21 @@ class Stop(Callback):
 
 
 class Trip(Callback):
-    """Fails in the second process, while the first goes on."""
+    """Fails in the second process as it learns motion, while the first goes on."""
 
     def on_train_start(self, trainer, stage):
-        if trainer.global_rank == 1:
+        if trainer.global_rank == 1 and stage.capture == "dynamic":
             raise DevrfError("data.root: gone")
 '''
-# Stands for the program in processes of which the second is killed, and the first goes on.
-KILLED = """
-import os, signal, time
-os.kill(os.getpid(), signal.SIGKILL) if os.environ["RANK"] == "1" else time.sleep(100)
+# Stands for the program in processes of which the second ends, and the first goes on.
+ENDED = """
+import os, signal, sys, time
+if os.environ["RANK"] != "1":
+    time.sleep(100)
+{}
 """
+FAILED = "print('devrf: data.root: gone', file=sys.stderr); sys.exit(2)"
+KILLED = "os.kill(os.getpid(), signal.SIGKILL)"
 
 
 @pytest.fixture(scope="module")
@@ -190,47 +194,45 @@ def test_one_process_records(pair):
 
 
 @pytest.mark.parametrize(
-    ("killed", "line"),
+    ("end", "line"),
     [
-        (False, "data.root: gone"),
-        (True, "trainer.devices: the process of rank 1 ended by SIGKILL; was"),
+        (FAILED, "data.root: gone"),
+        (KILLED, "trainer.devices: the process of rank 1 ended by SIGKILL; was"),
     ],
+    ids=["failed", "killed"],
 )
-def test_a_failure_of_one_process_ends_both_with_its_line(
-    warm, modules, tiny, tmp_path, killed, line
-):
+def test_a_process_that_ends_ends_the_command_with_its_line(warm, tiny, tmp_path, end, line):
+    (tmp_path / "devrf").mkdir()
+    (tmp_path / "devrf" / "__init__.py").touch()
+    (tmp_path / "devrf" / "__main__.py").write_text(ENDED.format(end))
     arguments = (*(word for word in tiny if word != "trainer=cpu"), *TWO, "stage=canonical")
     # A folder that is another whenever the command line is composed.
     arguments += ("hydra.run.dir=${now:%f}",)
-    own = {"path": str(modules)}
-    if killed:
-        (tmp_path / "devrf").mkdir()
-        (tmp_path / "devrf" / "__init__.py").touch()
-        (tmp_path / "devrf" / "__main__.py").write_text(KILLED)
-        own["path"] = str(tmp_path)
-    else:
-        arguments += ("+callbacks.trip._target_=witnesses.Trip",)
-    outcome = warm(tmp_path, *arguments, **own)
+    outcome = warm(tmp_path, *arguments, path=str(tmp_path))
     assert outcome.status == 2 and "Traceback" not in outcome.out
-    lines = [said for said in outcome.out.splitlines() if said.startswith("devrf: ")]
-    (said,) = (said for said in lines if "interrupted" not in said)
+    (said,) = (said for said in outcome.out.splitlines() if said.startswith("devrf: "))
     assert said.startswith(f"devrf: {line}")
 
 
-def test_a_sweeps_job_learns_in_processes_of_its_own_what_others_learn(
+def test_a_sweeps_job_learns_in_processes_of_its_own_until_one_fails(
     pair, warm, learning, modules, tmp_path
 ):
-    arguments = (*learning(tmp_path), "trainer.devices=2", "stage=canonical")
-    outcome = warm(tmp_path, "-m", *arguments, "hydra.sweep.dir=sweep", path=str(modules))
-    assert outcome.status == 0, outcome.out
+    trip = ("+callbacks.trip._target_=witnesses.Trip", "trainer.devices=2")
+    arguments = (*learning(tmp_path), *trip, "hydra.sweep.dir=sweep")
+    outcome = warm(tmp_path, "-m", *arguments, path=str(modules))
+    assert outcome.status == 3 and "Traceback" not in outcome.out
     assert (tmp_path / "sweep" / "0_robot" / "checkpoints" / "canonical.ckpt").is_file()
-    # Without a break, and without torchrun's nodes.
+    # What others learn, without a break and without torchrun's nodes.
     fields = [
         json.loads((folder / f"static-{rank}.json").read_text())["fields"]
         for folder in (pair[0], tmp_path)
         for rank in (0, 1)
     ]
     assert fields == fields[:1] * 4
+    lines = [said for said in outcome.out.splitlines() if said.startswith("devrf: ")]
+    failed, job, _ = (said for said in lines if "interrupted" not in said)
+    assert failed == "devrf: data.root: gone"
+    assert job.endswith("the process of rank 1 ended with status 2, and says why")
 
 
 def test_a_sweep_of_rehearsals_in_several_processes_has_no_objective(devrf, tiny, monkeypatch):
