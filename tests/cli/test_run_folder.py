@@ -48,7 +48,7 @@ def test_the_second_process_is_refused_until_the_first_is_killed(
     # A report of other runs may be written meanwhile.
     assert "no finished run below run" in devrf("stage=report", "report.runs=run").err
     warm.end(first)
-    assert devrf("stage=inspect", *tiny, "hydra.run.dir=run").status == 0
+    assert devrf("stage=prepare", "prepare.into=scene", *tiny, "hydra.run.dir=run").status == 0
     assert os.listdir(tmp_path / "run" / ".devrf") == ["lock"]
 
 
@@ -63,7 +63,7 @@ def test_files_that_a_killed_process_had_begun_are_removed(devrf, tiny, tmp_path
         os.utime(path, (time.time() - 100,) * 2)
     # A viewer, which takes no lock, is writing it.
     (tmp_path / "run" / "export" / ".partial-scene.html").write_text("half")
-    assert devrf("stage=inspect", *tiny, "hydra.run.dir=run").status == 0
+    assert devrf("stage=prepare", "prepare.into=scene", *tiny, "hydra.run.dir=run").status == 0
     left = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob(".partial-*")}
     assert left == {"run/notes/.partial-mine", "run/export/.partial-scene.html"}
 
