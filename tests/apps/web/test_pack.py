@@ -195,7 +195,7 @@ def test_the_controls_do_what_they_say(browser, file, tmp_path):
     actions = pytest.importorskip("selenium.webdriver.common.action_chains").ActionChains
     keys = pytest.importorskip("selenium.webdriver.common.keys").Keys
     choice = pytest.importorskip("selenium.webdriver.support.select").Select
-    browser.open(file.as_uri(), 360, 240)
+    browser.open(file.as_uri(), 360, 130)  # each pixel takes its time here
     browser.wait("document.body.className === 'ready'")
     browser.wait("document.getElementById('clock').textContent > '0.05'")  # time runs
     browser.element("play").click()
@@ -224,6 +224,9 @@ def test_the_controls_do_what_they_say(browser, file, tmp_path):
     assert float(nothing.std()) == 0
     part.select_by_visible_text("still")
     assert psnr(whole, browser.changed(nothing)) > 60
+    assert browser.said() == []
+    browser.open(file.as_uri() + "#time=1", 360, 240)  # in which hands and frusta have room
+    browser.wait("document.body.className === 'ready'")
 
     def pose() -> str:
         browser.element("link").click()
@@ -265,10 +268,10 @@ def test_the_controls_do_what_they_say(browser, file, tmp_path):
 
 def test_a_page_of_ones_own_shows_it_by_the_line_that_export_prints(browser, file):
     own = file.with_name("index.html")
-    style = "<style>iframe {width: 320px; height: 200px}</style>"  # each pixel takes its time here
+    style = "<style>iframe {width: 160px; height: 100px}</style>"
     own.write_text(f"<!doctype html><title>mine</title>{style}<p>a page of my own</p>{FRAME}")
     camera = Cameras.looking_at(
-        torch.tensor([[0.0, -4.0, 0.5]]), torch.zeros(1, 3), focal=360.0, width=320, height=200
+        torch.tensor([[0.0, -4.0, 0.5]]), torch.zeros(1, 3), focal=180.0, width=160, height=100
     )
     browser.open(own.as_uri(), 500, 400)
     browser.driver.switch_to.frame(0)
@@ -278,9 +281,9 @@ def test_a_page_of_ones_own_shows_it_by_the_line_that_export_prints(browser, fil
     framed = browser.canvas()
     browser.driver.switch_to.default_content()
     assert browser.run("return document.title") == "mine"
-    browser.open(file.as_uri() + link(camera, 0.4), 320, 200)
+    browser.open(file.as_uri() + link(camera, 0.4), 160, 100)
     alone = browser.canvas()
-    assert framed.shape == alone.shape == (200, 320, 3)
+    assert framed.shape == alone.shape == (100, 160, 3)
     assert framed.std() > 0.05 and psnr(framed, alone) > LEAST_PSNR
 
 
