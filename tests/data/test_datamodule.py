@@ -127,7 +127,7 @@ def test_an_embedded_scene_may_come_without_flow():
         "static_test_views": 1,
         "train_views": 1,
     }
-    module = ProceduralDataModule("random", flow="none", frames=2, supersample=1, **numbers)
+    module = ProceduralDataModule("robot", flow="none", frames=2, supersample=1, **numbers)
     assert module.scene.dynamic.train.flow is None
     module.provide({"forward_flow"})
     assert module.scene.dynamic.train.forward_flow is None

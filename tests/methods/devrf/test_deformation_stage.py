@@ -132,7 +132,7 @@ def test_motion_in_edges_of_the_box_is_the_same_in_any_unit(
     for factor in (1.0, 1024.0, 1 / 1024):  # of which numbers are rounded alike
         data = serve(enlarged(tiny_scene, factor))
         torch.manual_seed(0)
-        rest = fit(canonical(iterations=60), data=data).result()
+        rest = fit(canonical(iterations=30), data=data).result()
         stage = fit(DeformationStage(rest, schedule, box, loss), data=data)
         moved[factor] = stage.field.backward_slices[1:] / factor
     length = tiny_scene.bounds.whole.longest
