@@ -50,6 +50,7 @@ from devrf.checkpoints import checkpoint_file
 from devrf.cli.config import config_folder
 from devrf.engine.grid_adam import GridAdam
 from devrf.kernels.ahead import compile_ahead, grid_kernels, march_kernels
+from devrf.pictures import held_out
 
 
 class Fuse:
@@ -147,6 +148,7 @@ def hang(context: Any) -> None:
 def main() -> None:
     """Fork for each command that is asked for."""
     torch.set_num_threads(1)
+    held_out.MIN_HEIGHT = 40  # contact sheets of tiny images are small, too
     compile_ahead([*march_kernels(), *grid_kernels({1, 3, 12})], torch.device("cpu")).join()
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         compose("config")
