@@ -14,10 +14,9 @@ from devrf.data.batch import (
     all_pixels,
     concatenated,
     gather_image,
-    pixel_positions,
     wanted_pixels,
 )
-from devrf.geometry.cameras import Cameras
+from devrf.geometry.cameras import Cameras, pixel_positions
 from devrf.methods.batch import gather_batch
 from devrf.scenes.scene import OpticalFlow, Views
 
@@ -56,6 +55,11 @@ IMAGE, FLAT = torch.tensor([1, 0]), torch.tensor([9, 3])
 
 def test_pixel_positions_are_x_then_y():
     assert pixel_positions(FLAT, WIDTH).tolist() == [[1.5, 2.5], [3.5, 0.5]]
+    quarters = pixel_positions(FLAT[:1], WIDTH, per_pixel=4)
+    assert quarters.tolist() == [[1.25, 2.25], [1.75, 2.25], [1.25, 2.75], [1.75, 2.75]]
+    # One diagonal and the other, in turn.
+    pairs = pixel_positions(FLAT, WIDTH, per_pixel=2)
+    assert pairs.tolist() == [[1.25, 2.25], [1.75, 2.75], [3.75, 0.25], [3.25, 0.75]]
 
 
 def test_an_image_is_composited_cut_to_rows_and_shrunk():
@@ -110,6 +114,19 @@ def test_alpha_masks_are_composited_on_one_background_or_one_a_ray(background):
     torch.testing.assert_close(batch.alpha, torch.tensor([0.2, 0.2]))
 
 
+def test_a_pixel_has_several_rays_that_share_its_truth():
+    background = torch.tensor([[1.0, 0.0, 0.5], [0.2, 0.4, 0.6]])
+    single = gather_batch(views(), IMAGE, FLAT, background)
+    batch = gather_batch(views(), IMAGE, FLAT, background, per_pixel=4)
+    assert (len(batch.rays), batch.per_pixel, single.per_pixel) == (8, 4, 1)
+    assert torch.equal(batch.pixel, pixel_positions(FLAT, WIDTH, per_pixel=4))
+    expected = views().cameras.rays(batch.image, batch.pixel)
+    torch.testing.assert_close(batch.rays.directions, expected.directions)
+    for name in ("color", "alpha", "time", "frame", "image", "background", "flow", "flow_valid"):
+        truth = getattr(single, name)
+        assert torch.equal(getattr(batch, name), truth.repeat_interleave(4, dim=0)), name
+
+
 def test_images_without_alpha_or_flow():
     batch = gather_batch(views(channels=3, flow=False), IMAGE, FLAT, torch.zeros(3))
     assert batch.alpha is None and batch.flow is None and batch.flow_valid is None
@@ -117,9 +134,14 @@ def test_images_without_alpha_or_flow():
 
 
 @pytest.mark.parametrize("channels", [3, 4])
+@pytest.mark.parametrize("per_pixel", [1, 2, 4])
 @pytest.mark.parametrize("flow", [False, True])
 def test_a_kernel_looks_up_what_the_definition_does(
-    channels: int, flow: bool, rng: torch.Generator, monkeypatch: pytest.MonkeyPatch
+    channels: int,
+    flow: bool,
+    per_pixel: int,
+    rng: torch.Generator,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     shown = views(channels, flow)
     poses = Cameras.looking_at(
@@ -130,9 +152,9 @@ def test_a_kernel_looks_up_what_the_definition_does(
     image = torch.randint(2, (50,), generator=rng)
     flat = torch.randint(WIDTH * HEIGHT, (50,), generator=rng)
     behind = torch.rand(50, 3, generator=rng)
-    ours = gather_batch(shown, image, flat, behind)
+    ours = gather_batch(shown, image, flat, behind, per_pixel=per_pixel)
     monkeypatch.setattr("devrf.kernels.runtime._chosen", "torch")
-    theirs = gather_batch(shown, image, flat, behind)
+    theirs = gather_batch(shown, image, flat, behind, per_pixel=per_pixel)
     for name in ("color", "alpha", "time", "frame", "image", "pixel", "flow", "flow_valid"):
         torch.testing.assert_close(getattr(ours, name), getattr(theirs, name))
     for name in ("origins", "directions", "viewdirs"):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -13,6 +15,7 @@ from devrf.geometry.space import WORLD
 from devrf.methods.devrf import model as module
 from devrf.rendering.output import RenderedImage
 from devrf.rendering.renderer import MIN_CHUNK, Renderer, in_chunks
+from devrf.rendering.sampling import RenderSettings
 from pictures import assert_same_picture, plain_picture
 
 CPU = torch.device("cpu")
@@ -51,6 +54,37 @@ def test_any_size_and_any_background(moving, tiny_scene):
     empty = seen.opacity == 0
     assert empty.any()
     assert torch.equal(seen.color[empty][0], torch.tensor([0.0, 1.0, 0.0]))
+
+
+def test_a_pixel_is_the_mean_of_the_rays_that_it_had_in_learning(moving, tiny_scene):
+    cameras = tiny_scene.dynamic.test.cameras
+    focal = float(cameras.focal[0, 0])
+    moving.settings = replace(moving.settings, rays_per_pixel=2, focal=focal)
+    seen = Renderer(moving).view(cameras, 0, 0.5, 1.0)
+    twice = cameras.resized(2 * cameras.width, 2 * cameras.height).image_rays(0)
+    fine = plain_picture(moving, twice, 0.5, WHITE)
+
+    def means(values):
+        squares = values.view(cameras.height, 2, cameras.width, 2, -1)
+        return squares.mean(dim=(1, 3)).flatten(0, 1).squeeze(1)
+
+    torch.testing.assert_close(seen.color, means(fine.color))
+    torch.testing.assert_close(seen.opacity, means(fine.opacity))
+    quarters = [
+        values.view(cameras.height, 2, cameras.width, 2).permute(0, 2, 1, 3).reshape(-1, 4)
+        for values in (fine.opacity, fine.depth)
+    ]
+    expected = quarters[1].gather(1, quarters[0].argmax(dim=1, keepdim=True))[:, 0]
+    torch.testing.assert_close(seen.depth, expected)
+    single = plain_picture(moving, cameras.image_rays(0), 0.5, WHITE)
+    assert (single.color - seen.color).abs().max() > 0.05
+    assert_same_picture(Renderer(moving, smooth=False).view(cameras, 0, 0.5, 1.0), single)
+
+
+def test_a_larger_picture_has_one_ray_in_a_pixel():
+    learned = RenderSettings(0.5, 1e-3, near=0.0, far=1.0, rays_per_pixel=2, focal=100.0)
+    assert [learned.rays_at(focal) for focal in (50.0, 100.0, 199.0, 200.0)] == [4, 4, 4, 1]
+    assert replace(learned, rays_per_pixel=1).rays_at(100.0) == 1
 
 
 @pytest.fixture

@@ -131,8 +131,10 @@ def view(run: RunContext) -> None:
         server = Session(settings, viewpoints, scene, run.folder, run.config.ckpt)
         background = background_value(viewpoints.background)
         parts = model.moving_and_still(scene_radius(model, viewpoints.static))
-        renderers = {name: Renderer(part, times=CACHED) for name, part in parts.items()}
-        server.present(Drawing(Renderer(model, times=CACHED), background, renderers))
+        renderers = {
+            name: Renderer(part, times=CACHED, smooth=False) for name, part in parts.items()
+        }
+        server.present(Drawing(Renderer(model, times=CACHED, smooth=False), background, renderers))
     serve(server)
 
 

@@ -169,6 +169,8 @@ class FrameSortedPixels:
 class RayBatch:
     """R rays with the truth at their pixels.
 
+    Rays of one pixel follow one another, and have the same truth.
+
     Attributes:
         rays: R rays in the fields' space.
         color: (R, 3) RGB in [0, 1], composited on ``background``.
@@ -178,9 +180,10 @@ class RayBatch:
         frame: (R,) int64, the frame of the scene's clock that is nearest to that time.
         image: (R,) int64, the image of each ray among the views it was drawn from; those of
             several captures are numbered through.
-        pixel: (R, 2) x, y of the pixels' centres.
+        pixel: (R, 2) x, y of the rays in their images, in pixels.
         flow: (R, 2) pixels, backward optical flow, 0 where it is not valid; or None.
         flow_valid: (R,) bool, or None.
+        per_pixel: the rays of each pixel.
     """
 
     rays: Rays
@@ -193,11 +196,7 @@ class RayBatch:
     pixel: Tensor
     flow: Tensor | None
     flow_valid: Tensor | None
-
-
-def pixel_positions(flat: Tensor, width: int) -> Tensor:
-    """Centres (R, 2), x then y, of pixels given by their row-major number (R,)."""
-    return torch.stack([flat % width, flat // width], dim=-1) + 0.5
+    per_pixel: int = 1
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from devrf.data.batch import pixel_positions
 from devrf.data.flow import previous_images
 from devrf.errors import DevrfError, did_you_mean
+from devrf.geometry.cameras import pixel_positions
 from devrf.metrics.geometric import SOLID, depth_error, end_point_error
 from devrf.metrics.image import ms_ssim, psnr_masked, ssim_masked, ssim_partial
 from devrf.metrics.lpips import TRUNKS, Lpips, Network, load_lpips

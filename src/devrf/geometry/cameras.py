@@ -231,6 +231,10 @@ class Cameras:
             sizes=sizes,
         )
 
+    def shifted(self, shift: Tensor) -> Cameras:
+        """The same cameras whose rays go through ``shift`` (2,) beside the pixels' centres."""
+        return replace(self, center=self.center - shift)
+
     def of_height(self, height: int) -> Cameras:
         """The same cameras with images ``height`` pixels high and as wide as they were for it."""
         return self.resized(max(1, round(self.width * height / self.height)), height)
@@ -281,6 +285,29 @@ class Cameras:
             width,
             height,
         )
+
+
+def pixel_positions(flat: Tensor, width: int, per_pixel: int = 1) -> Tensor:
+    """Where the rays of pixels go through, (P · ``per_pixel``, 2), x then y, in pixels.
+
+    One ray goes through the pixel's centre. Four go through the middles of its quarters, row by
+    row; two through opposite quarters, on one diagonal and on the other in turn.
+
+    Args:
+        flat: (P,) row-major numbers of the pixels in their image.
+        width: of the image, in pixels.
+        per_pixel: 1, 2 or 4; the rays of a pixel follow one another.
+    """
+    corner = torch.stack([flat % width, flat // width], dim=-1)[:, None]
+    if per_pixel == 1:
+        return corner[:, 0] + 0.5
+    part = torch.arange(per_pixel, device=flat.device).expand(len(flat), -1)
+    right, down = part % 2, part // 2
+    if per_pixel == 2:
+        down = part
+        right = (part + torch.arange(len(flat), device=flat.device)[:, None]) % 2
+    middle = 0.5 * torch.stack([right, down], dim=-1) + 0.25
+    return (corner + middle).flatten(0, 1)
 
 
 def _on_image(local: Tensor, focal: Tensor, center: Tensor) -> tuple[Tensor, Tensor]:

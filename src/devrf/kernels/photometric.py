@@ -29,6 +29,7 @@ def photometric(
     truth: Tensor,
     alpha: Tensor | None,
     weights: Mapping[str, float],
+    per_pixel: int = 1,
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Σ weight · term () by kernels, and by name the values () of the terms, without gradients.
 
@@ -43,6 +44,7 @@ def photometric(
         truth: (R, 3) C.
         alpha: (R,) A, or None.
         weights: of some of the terms of :mod:`devrf.ops.photometric`.
+        per_pixel: the rays of a pixel, which follow one another and have the same C and A.
     """
     factors = wp.vec4(*(weights.get(name, 0.0) for name in TERMS))
     device, rays = color.device, len(samples.transmittance)
@@ -54,7 +56,7 @@ def photometric(
     parts = torch.empty(rays, len(TERMS) + 3, device=device)
     gradients = [torch.empty_like(each) for each in learned]
     results = gradients if background.requires_grad else [*gradients, truth.new_empty(0, 3)]
-    inputs = [factors, *(each.detach().contiguous() for each in given), parts, *results]
+    inputs = [factors, per_pixel, *(each.detach().contiguous() for each in given), parts, *results]
     launch(photometric_kernel, rays, inputs, device)
     sum_of_terms, *values = parts.mean(dim=0).unbind()
     (total,) = with_adjoint(
@@ -69,6 +71,7 @@ def photometric(
 def photometric_kernel(
     first: int,
     factors: wp.vec4,
+    per_pixel: int,
     weight: wp.array(dtype=float),
     color: wp.array(dtype=wp.vec3),
     transmittance: wp.array(dtype=float),
@@ -90,7 +93,12 @@ def photometric_kernel(
     ray = first + wp.tid()
     rays = float(transmittance.shape[0])
     end = transmittance[ray]
-    missed = image[ray] - truth[ray]
+    missed = wp.vec3()
+    beside = float(0.0)
+    begin = ray - ray % per_pixel
+    for other in range(begin, begin + per_pixel):
+        missed += (image[other] - truth[ray]) / float(per_pixel)
+        beside += transmittance[other] / float(per_pixel)
     of_image = (factors[0] * 2.0 / 3.0 / rays) * missed
     of_apart = factors[1] * 2.0 / rays
     by_sample = float(0.0)
@@ -111,7 +119,7 @@ def photometric_kernel(
     part[3] = -(p * wp.log(p) + (1.0 - p) * wp.log(1.0 - p))
     part[5] = 1.0 - end
     if alpha.shape[0] > 0:
-        beside = end - (1.0 - alpha[ray])
+        beside -= 1.0 - alpha[ray]
         of_end += factors[3] * 2.0 / rays * beside
         part[4] = beside * beside
         part[6] = alpha[ray]

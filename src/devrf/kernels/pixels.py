@@ -1,4 +1,4 @@
-"""Pixels of images: their rays, colours and optical flow; a thread looks up one pixel."""
+"""Pixels of images: their rays, colours and optical flow; a thread looks up one ray."""
 
 import torch
 import warp as wp
@@ -21,21 +21,25 @@ def look_up(
     image: Tensor,
     flat: Tensor,
     background: Tensor,
+    per_pixel: int,
 ) -> tuple[Tensor, ...]:
-    """Pixels' centres, rays and truth by a kernel; ``devrf.methods.batch`` has the definition.
+    """Rays and the truth at their pixels, by a kernel; ``devrf.methods.batch`` has the definition.
 
     Args:
         pixels: (N, H, W, 3 or 4) uint8, of fewer than 2³¹ pixels.
         cameras: the images'.
         of_images: times (N,), and frames (N,) int64.
         flow: (N, H, W, 2) and where it is valid (N, H, W); None.
-        image: (R,) int64, the image of each of the pixels that are looked up.
+        image: (R,) int64, the image of each ray; the rays of a pixel follow one another.
         flat: (R,) int64, row-major pixel number within it.
         background: (3,) or (R, 3) that images with alpha are composited on.
+        per_pixel: the rays of a pixel; :func:`~devrf.geometry.cameras.pixel_positions` says where
+            they go through.
 
     Returns:
-        Centres (R, 2), origins and directions of rays, colours (R, 3), alphas, times, frames (R,);
-        then flow (R, 2), 0 where it is not valid, and valid (R,). Empty: what images lack.
+        Positions in the images (R, 2), origins and directions of rays, colours (R, 3), alphas,
+        times, frames (R,); then flow (R, 2), 0 where it is not valid, and valid (R,). Empty: what
+        images lack.
     """
     count, device, has_alpha = len(image), image.device, pixels.shape[3] == 4
     nowhere = torch.empty(0, dtype=torch.bool, device=device)
@@ -48,9 +52,10 @@ def look_up(
         torch.empty(flows, 2, device=device),
         torch.empty(flows, dtype=torch.bool, device=device),
     ]
-    inputs = [pixels.shape[1], pixels.shape[2], pixels, cameras.camera_to_world, cameras.focal]
-    inputs += [cameras.center, *of_images, vectors, valid.flatten(), image, flat]
-    inputs += [background.contiguous().view(-1, 3), *results]
+    inputs = [per_pixel, pixels.shape[1], pixels.shape[2], pixels]
+    inputs += [cameras.camera_to_world, cameras.focal, cameras.center, *of_images]
+    inputs += [vectors, valid.flatten(), image, flat, background.contiguous().view(-1, 3)]
+    inputs += results
     launch(look_up_kernel(has_alpha), count, inputs, device)
     return tuple(results)
 
@@ -63,6 +68,7 @@ def look_up_kernel(has_alpha: bool) -> wp.Kernel:
     @wp.kernel(module="unique", enable_backward=False)
     def look_up(
         first: int,
+        per_pixel: int,
         height: int,
         width: int,
         pixels: wp.array(dtype=bytes_of),
@@ -93,17 +99,26 @@ def look_up_kernel(has_alpha: bool) -> wp.Kernel:
         row = image * height * width + flat
         x = float(flat % width) + 0.5
         y = float(flat / width) + 0.5
+        if per_pixel > 1:
+            part = number % per_pixel
+            right = part % 2
+            down = part / 2
+            if per_pixel == 2:
+                right = (part + number / 2) % 2
+                down = part
+            x += 0.5 * float(right) - 0.25
+            y += 0.5 * float(down) - 0.25
         result_pixel[number] = Xy(x, y)
         result_time[number] = times[image]
         result_frame[number] = frames[image]
 
-        right = (x - centers[image][0]) / focals[image][0]
+        across = (x - centers[image][0]) / focals[image][0]
         up = (y - centers[image][1]) / focals[image][1]
         origin = wp.vec3()
         direction = wp.vec3()
         for axis in range(3):
             pose = poses[3 * image + axis]
-            direction[axis] = pose[0] * right - pose[1] * up - pose[2]
+            direction[axis] = pose[0] * across - pose[1] * up - pose[2]
             origin[axis] = pose[3]
         result_origin[number] = origin
         result_direction[number] = direction / wp.max(wp.length(direction), 1.0e-12)

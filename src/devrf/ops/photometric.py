@@ -13,9 +13,24 @@ NEAREST = 1e-6
 TERMS = ("render", "per_sample_color", "entropy", "alpha_mask")
 
 
-def color_error(image: Tensor, truth: Tensor) -> Tensor:
-    """Mean |Ĉ − C|² over rays and channels, of Ĉ and C (R, 3)."""
-    return torch.nn.functional.mse_loss(image, truth)
+def pixel_means(values: Tensor, per_pixel: int) -> Tensor:
+    """The means (P, …) over the rays of each pixel, of values (P · ``per_pixel``, …) of rays."""
+    if per_pixel == 1:
+        return values
+    return values.reshape(-1, per_pixel, *values.shape[1:]).mean(dim=1)
+
+
+def color_error(image: Tensor, truth: Tensor, per_pixel: int = 1) -> Tensor:
+    """Mean |Ĉ − C|² over pixels and channels, of Ĉ and C (R, 3); Ĉ is a mean over a pixel's rays.
+
+    Args:
+        image: (R, 3) the colour of each ray.
+        truth: (R, 3) C, the same for all rays of a pixel.
+        per_pixel: the rays of a pixel, which follow one another.
+    """
+    return torch.nn.functional.mse_loss(
+        pixel_means(image, per_pixel), pixel_means(truth, per_pixel)
+    )
 
 
 def per_sample_color(weight: Tensor, color: Tensor, ray: Tensor, truth: Tensor) -> Tensor:
@@ -62,8 +77,11 @@ def distortion(
     return total / rays
 
 
-def alpha_mask_error(transmittance: Tensor, alpha: Tensor | None) -> Tensor:
-    """Mean (T_end − (1 − A))² of T_end and A (R,); 0 without A."""
+def alpha_mask_error(transmittance: Tensor, alpha: Tensor | None, per_pixel: int = 1) -> Tensor:
+    """Mean (T_end − (1 − A))² over pixels, of T_end and A (R,); 0 without A.
+
+    T_end is a mean over a pixel's rays, as in :func:`color_error`.
+    """
     if alpha is None:
         return transmittance.new_zeros(())
-    return (transmittance - (1 - alpha)).square().mean()
+    return pixel_means(transmittance - (1 - alpha), per_pixel).square().mean()

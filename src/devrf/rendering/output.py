@@ -51,6 +51,21 @@ class RenderedImage:
         return RenderedImage(output.color, output.depth, 1 - output.transmittance)
 
     @staticmethod
+    def mean(images: Sequence[RenderedImage]) -> RenderedImage:
+        """The picture whose pixels are the means of those of ``images``.
+
+        A pixel's depth is that of its most opaque ray: between two surfaces there is nothing.
+        """
+        if len(images) == 1:
+            return images[0]
+        color, depth, opacity = (
+            torch.stack([getattr(image, name) for image in images])
+            for name in ("color", "depth", "opacity")
+        )
+        seen = depth.gather(0, opacity.argmax(dim=0, keepdim=True))[0]
+        return RenderedImage(color.mean(dim=0), seen, opacity.mean(dim=0))
+
+    @staticmethod
     def joined(parts: Sequence[RenderedImage]) -> RenderedImage:
         """The rays of one part or more, one part after another."""
         if len(parts) == 1:

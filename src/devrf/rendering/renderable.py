@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from devrf.geometry.box import Box
+from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import Space
 from devrf.ops.splatting import Gaussians
 from devrf.rendering.view import ImageView, SurfaceField, View
@@ -52,6 +53,10 @@ class Renderable(StoredClass, nn.Module, ABC):
     @abstractmethod
     def at(self, time: float) -> View | ImageView:
         """The scene at ``time`` in [0, 1], ready to be looked at from anywhere."""
+
+    def rays_per_pixel(self, camera: Cameras) -> int:
+        """Rays of a pixel of a ``camera``'s picture, as a stage has learned it: 1 or 4."""
+        return 1
 
     def surface(self) -> SurfaceField | None:
         """The scene at rest as a field of which a surface can be taken; None: there is none.

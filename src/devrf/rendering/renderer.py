@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from devrf.geometry.box import Box
-from devrf.geometry.cameras import Cameras
+from devrf.geometry.cameras import Cameras, pixel_positions
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import Space, WorldSpace
 from devrf.rendering.output import RenderedImage
@@ -39,16 +39,18 @@ class Renderer:
     Views of the last few times are cached: a change of the model does not show at these times.
 
     Attributes:
+        smooth: whether a pixel is the mean of as many rays as it was in learning; else it is one.
         at: time in [0, 1] → the view of that time (:mod:`devrf.rendering.view`), cached.
     """
 
-    def __init__(self, model: Renderable, *, times: int = 4) -> None:
+    def __init__(self, model: Renderable, *, times: int = 4, smooth: bool = True) -> None:
         """Prepare to render a scene, which is not to be moved to another device afterwards.
 
         So many ``times`` are cached.
         """
         self.model = model
         self.device = model.device
+        self.smooth = smooth
         self.at = lru_cache(maxsize=times)(model.at)
 
     @torch.no_grad()
@@ -84,12 +86,23 @@ class Renderer:
         background: float | Tensor,
         crop: Box | None = None,
     ) -> RenderedImage:
-        """All H·W pixels of camera ``index`` at ``time``, in row-major order."""
+        """All H·W pixels of camera ``index`` at ``time``, in row-major order.
+
+        Where pixels have four rays, they are the means of four pictures, each by rays through
+        another quarter of them (docs/method.md#rays-of-a-pixel).
+        """
         camera = cameras[[index]].to(self.device)
         view = self.at(time)
         if isinstance(view, ImageView):
             return view.image(camera, self._color(background), crop)
-        return self.picture(camera.image_rays(0), time, background, crop)
+        per_pixel = self.model.rays_per_pixel(camera) if self.smooth else 1
+        first = torch.zeros(1, dtype=torch.int64, device=self.device)
+        middles = pixel_positions(first, width=1, per_pixel=per_pixel)
+        pictures = [
+            self.picture(camera.shifted(shift).image_rays(0), time, background, crop)
+            for shift in middles - 0.5
+        ]
+        return RenderedImage.mean(pictures)
 
     def _color(self, background: float | Tensor) -> Tensor:
         """The RGB (3,) of a background."""

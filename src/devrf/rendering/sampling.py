@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
-from annotated_types import Ge
+from annotated_types import Ge, Gt, Le
 from pydantic.dataclasses import dataclass
 
 from devrf.system.options import Options
 
 # A distance between samples, in voxels: shorter ones fill memory and show no more.
 Step = Annotated[float, Ge(0.01)]
+RaysPerPixel = Literal[1, 2, 4]
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,8 @@ class RenderSettings(Options):
             their colour is computed.
         near: the distance of the first sample, at least, in world units (or NDC).
         far: the distance of the last sample, at most, likewise.
+        rays_per_pixel: of the images that were learned from.
+        focal: the focal length of these images, in pixels.
     """
 
     key: ClassVar[str] = "sampling"
@@ -31,3 +34,13 @@ class RenderSettings(Options):
     alpha_threshold: float
     near: float
     far: float
+    rays_per_pixel: RaysPerPixel = 1
+    focal: Annotated[float, Gt(0), Le(1e9)] = 1.0
+
+    def rays_at(self, focal: float) -> int:
+        """Rays of a pixel of a picture of another ``focal`` length, in pixels: 4 or 1.
+
+        1 where it was 1 in learning, and in pictures that are twice as large or larger, where rays
+        through the centres are as close together as they were.
+        """
+        return 4 if self.rays_per_pixel > 1 and focal < 2 * self.focal else 1

@@ -18,6 +18,7 @@ from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.free_space import possibly_occupied, view_count, view_count_weight
+from devrf.methods.devrf.settings import Sampling
 from recorder import Entry, by_samples, recording
 
 SMALL = Architecture(channels=4, width=16, frequencies=2)
@@ -100,6 +101,19 @@ def test_coarse_and_few_pixels_make_a_coarse_grid_and_small_batches(fit):
     pixels = len(stages[1].pool)
     drawn = [len(stage.draw()[0]) for stage in stages]
     assert drawn == [4096, max(64, round(2 * pixels / 6))]
+
+
+def test_a_batch_has_as_many_rays_whatever_a_pixel_has(fit):
+    schedule = replace(CARVED, rays=103, iterations=2, upsample_at=())
+    stage = fit(CanonicalStage(schedule, SMALL, sampling=Sampling(rays_per_pixel=4)))
+    assert len(stage.draw()[0]) == 25  # 100 rays
+    settings = stage.scene_model.settings
+    assert settings.rays_per_pixel == 4
+    assert settings.focal == float(stage.scene.static.train.cameras.focal.median())
+    pixels = len(stage.pool)
+    often = replace(schedule, rays=10**6, epochs=2.0)
+    stage = fit(CanonicalStage(often, SMALL, sampling=Sampling(rays_per_pixel=4)))
+    assert len(stage.draw()[0]) == max(64, pixels)  # shown twice in two iterations
 
 
 def test_the_search_hands_over_to_a_radiance_field_with_room_for_motion(

@@ -93,4 +93,4 @@ class LiveView(Callback):
 
 def _renderer(stage: Stage) -> Renderer:
     """Renders the present state of the scene; it has no views of before."""
-    return Renderer(stage.current_model(), times=2)
+    return Renderer(stage.current_model(), times=2, smooth=False)

@@ -38,7 +38,7 @@ from devrf.methods.devrf.losses import (
     total_variation_weight,
 )
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.pixel_pools import rays_for_epochs, static_pool
+from devrf.methods.devrf.pixel_pools import pixels_for_epochs, static_pool
 from devrf.methods.devrf.plans import CanonicalPlan
 from devrf.methods.devrf.settings import (
     FINE_LOSS,
@@ -135,7 +135,8 @@ class CanonicalStage(Stage):
         with span("batch"):
             image, flat = self.draw()
             background = self.background(image, self.generator)
-            batch = gather_batch(views, image, flat, background, space=model.space)
+            per_pixel = model.settings.rays_per_pixel
+            batch = gather_batch(views, image, flat, background, model.space, per_pixel)
         output = render(
             batch.rays,
             model.canonical,
@@ -152,14 +153,16 @@ class CanonicalStage(Stage):
         return {"loss": loss.detach(), **terms}
 
     def draw(self) -> tuple[Tensor, Tensor]:
-        """Random pixels: the image of each (R,) and its row-major number there (R,), int64."""
+        """Random pixels: the image of each (P,) and its row-major number there (P,), int64."""
         assert self.pool is not None
         schedule = self.schedule
+        per_pixel = self.sampling.rays_per_pixel
         most = None
         if schedule.epochs is not None and not self.objective.searches:
             iterations = round(schedule.iterations / self.position.schedule_scale)
-            most = rays_for_epochs(schedule.epochs, len(self.pool), iterations)
-        return self.pool.draw(self.batch_size.rays(schedule.rays, most), self.generator)
+            most = per_pixel * pixels_for_epochs(schedule.epochs, len(self.pool), iterations)
+        rays = self.batch_size.rays(schedule.rays, most)
+        return self.pool.draw(max(1, rays // per_pixel), self.generator)
 
     def _objective(self, kind: str, loss: Mapping[str, float]) -> Objective:
         """The objective of a kind of phase, whose ``loss`` is weights with that of ``tv``."""
@@ -263,6 +266,8 @@ class CanonicalStage(Stage):
             alpha_threshold=self.objectives[phase.kind].alpha_threshold,
             near=self.scene.bounds.near,
             far=self.scene.bounds.far,
+            rays_per_pixel=self.sampling.rays_per_pixel,
+            focal=float(self.scene.static.train.cameras.focal.median()),
         )
 
     def enter(self, phase: CanonicalPhase) -> None:

@@ -31,7 +31,7 @@ from devrf.methods.devrf.extension import DeformationContext, Extension
 from devrf.methods.devrf.frame_store import FrameField
 from devrf.methods.devrf.losses import DeformationPrediction, FlowMean, batch_loss
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.pixel_pools import frame_pools, rays_for_epochs
+from devrf.methods.devrf.pixel_pools import frame_pools, pixels_for_epochs
 from devrf.methods.devrf.plans import DeformationPlan
 from devrf.methods.devrf.settings import DEFORMATION_LOSS, VisitSettings
 from devrf.methods.devrf.volume_rendering import possible_occupancy, render
@@ -127,7 +127,8 @@ class DeformationStage(Stage):
         with span("batch"):
             image, flat = self.draw()
             background = self.background(image, self.generator)
-            batch = gather_batch(views, image, flat, background, space=model.space)
+            per_pixel = model.settings.rays_per_pixel
+            batch = gather_batch(views, image, flat, background, model.space, per_pixel)
         output = render(
             batch.rays,
             model.canonical,
@@ -159,18 +160,20 @@ class DeformationStage(Stage):
     def draw(self) -> tuple[Tensor, Tensor]:
         """Random pixels of the frame, of its views in turn or of all.
 
-        The image of each (R,), and its row-major number there (R,), int64.
+        The image of each (P,), and its row-major number there (P,), int64.
         """
         frame = self.active
         phase = self.phase
         assert frame is not None and phase is not None
+        per_pixel = self.scene_model.settings.rays_per_pixel
         most = None
         if self.visit.epochs is not None:
             pixels = sum(len(pool) for pool in frame.pools)
             iterations = round((phase.stop - phase.start) / self.position.schedule_scale)
-            most = rays_for_epochs(self.visit.epochs, pixels, iterations)
+            most = per_pixel * pixels_for_epochs(self.visit.epochs, pixels, iterations)
         pool = frame.pools[self.position.iterations_done % len(frame.pools)]
-        return pool.draw(self.batch_size.rays(self.settings.rays, most), self.generator)
+        rays = self.batch_size.rays(self.settings.rays, most)
+        return pool.draw(max(1, rays // per_pixel), self.generator)
 
     @property
     def field(self) -> DeformationField:

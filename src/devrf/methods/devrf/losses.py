@@ -47,7 +47,7 @@ Predicted = TypeVar("Predicted", bound=Prediction)
 
 # Terms that compare rays with images; the equations are in devrf.ops.photometric.
 PHOTOMETRIC_TERMS: dict[str, Callable[[Prediction], Tensor]] = {
-    "render": lambda seen: color_error(seen.output.color, seen.batch.color),
+    "render": lambda seen: color_error(seen.output.color, seen.batch.color, seen.batch.per_pixel),
     "per_sample_color": lambda seen: per_sample_color(
         seen.output.samples.weight,
         seen.output.sample_color,
@@ -55,7 +55,9 @@ PHOTOMETRIC_TERMS: dict[str, Callable[[Prediction], Tensor]] = {
         seen.batch.color,
     ),
     "entropy": lambda seen: background_entropy(seen.output.transmittance),
-    "alpha_mask": lambda seen: alpha_mask_error(seen.output.transmittance, seen.batch.alpha),
+    "alpha_mask": lambda seen: alpha_mask_error(
+        seen.output.transmittance, seen.batch.alpha, seen.batch.per_pixel
+    ),
 }
 
 
@@ -211,8 +213,16 @@ def batch_loss(
     if not together:
         total, values = weighted_sum(others, weights)
         return total, values | visibility(output.transmittance, batch.alpha)
-    made_of = (output.samples, output.sample_color, output.background)
-    total, values = photometric(*made_of, output.color, batch.color, batch.alpha, together)
+    total, values = photometric(
+        output.samples,
+        output.sample_color,
+        output.background,
+        output.color,
+        batch.color,
+        batch.alpha,
+        together,
+        batch.per_pixel,
+    )
     for name, value in others.items():
         total = torch.add(total, value, alpha=weights[name])
     return total, values | {name: value.detach() for name, value in others.items()}

@@ -137,6 +137,10 @@ class DeVRFModel(Renderable):
             residual and residual(box, clock, voxels=8),
         )
 
+    def rays_per_pixel(self, camera: Cameras) -> int:
+        """As close together as in learning."""
+        return self.settings.rays_at(float(camera.focal.min()))
+
     def color_residual_at(self, time: float) -> ColorResidual | None:
         """q → A_t(q) at ``time``; None where colours are those of the canonical field."""
         return None if self.color_residual is None else self.color_residual.at(time)

@@ -27,8 +27,8 @@ IMAGES_ON_CPU = 1
 IMAGES_ON_GPU = 16
 # A ray hits cells that are at most so many cells away from it.
 HIT_CELLS = 2
-# The fewest rays of a batch, however few pixels there are.
-MIN_RAYS = 64
+# The fewest pixels of a batch, however few pixels there are.
+FEWEST = 64
 
 
 @torch.no_grad()
@@ -154,6 +154,6 @@ def images_of(views: Views, frame: int) -> Tensor:
     return (views.frames == frame).nonzero()[:, 0]
 
 
-def rays_for_epochs(epochs: float, pixels: int, iterations: int) -> int:
-    """Rays of a batch, of which ``iterations`` show each pixel ``epochs`` times."""
-    return max(round(epochs * pixels / iterations), MIN_RAYS)
+def pixels_for_epochs(epochs: float, pixels: int, iterations: int) -> int:
+    """Pixels of a batch, of which ``iterations`` show each of all ``pixels`` ``epochs`` times."""
+    return max(round(epochs * pixels / iterations), FEWEST)

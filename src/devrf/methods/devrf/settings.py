@@ -9,7 +9,7 @@ import torch
 from annotated_types import Ge, Lt
 from pydantic.dataclasses import dataclass
 
-from devrf.rendering.sampling import Step
+from devrf.rendering.sampling import RaysPerPixel, Step
 from devrf.system.options import NotNegative, Options, Positive
 
 Opacity = Annotated[float, Ge(0), Lt(1)]
@@ -54,6 +54,7 @@ class Sampling(Options):
         search_alpha_threshold: the same in the geometry search, which begins almost transparent;
             there it empties cells, too.
         occupancy_threshold: opacity of a step up to which a cell counts as empty.
+        rays_per_pixel: of a batch; a pixel's colour is their mean.
     """
 
     key: ClassVar[str] = "sampling"
@@ -62,6 +63,7 @@ class Sampling(Options):
     alpha_threshold: Opacity = 1e-4
     search_alpha_threshold: Opacity = 1e-7
     occupancy_threshold: Opacity = 1e-3
+    rays_per_pixel: RaysPerPixel = 1
 
 
 @dataclass(frozen=True)

@@ -73,10 +73,11 @@ class StartFromBest(Extension):
         views = context.views
         model = context.model
         pool = all_pixels(views, images_of(views, frame))
-        rays = max(1, round(context.batch_size.share * self._rays))
-        image, flat = pool.draw(rays, context.generator)
+        per_pixel = model.settings.rays_per_pixel
+        rays = round(context.batch_size.share * self._rays)
+        image, flat = pool.draw(max(1, rays // per_pixel), context.generator)
         background = context.background(image, context.generator)
-        batch = gather_batch(views, image, flat, background, space=model.space)
+        batch = gather_batch(views, image, flat, background, model.space, per_pixel)
         errors = []
         for backward, _ in starts:
             warp = context.field.warp_by(backward)
@@ -88,7 +89,7 @@ class StartFromBest(Extension):
                 batch.background,
                 backward_warp=warp,
             )
-            errors.append(float(color_error(output.color, batch.color)))
+            errors.append(float(color_error(output.color, batch.color, batch.per_pixel)))
         return errors
 
 
