@@ -44,7 +44,7 @@ class BatchSize:
         return self.share / self.processes
 
     def rays(self, rays: int, most: int | None = None) -> int:
-        """One process's part of a batch of ``rays``, or of ``most`` where that is less."""
+        """One process's part of a batch of ``rays``, or pixels; of ``most`` where that is less."""
         whole = rays if most is None else min(rays, most)
         return max(1, round(whole * self.of_process))
 

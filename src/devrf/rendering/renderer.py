@@ -39,7 +39,7 @@ class Renderer:
     Views of the last few times are cached: a change of the model does not show at these times.
 
     Attributes:
-        smooth: whether a pixel is the mean of as many rays as it was in learning; else it is one.
+        smooth: whether a pixel may be the mean of four rays; else it has one.
         at: time in [0, 1] → the view of that time (:mod:`devrf.rendering.view`), cached.
     """
 

@@ -11,6 +11,7 @@ from devrf.system.options import Options
 
 # A distance between samples, in voxels: shorter ones fill memory and show no more.
 Step = Annotated[float, Ge(0.01)]
+# Where they go through: devrf.geometry.cameras.pixel_positions.
 RaysPerPixel = Literal[1, 2, 4]
 
 
@@ -24,7 +25,7 @@ class RenderSettings(Options):
             their colour is computed.
         near: the distance of the first sample, at least, in world units (or NDC).
         far: the distance of the last sample, at most, likewise.
-        rays_per_pixel: of the images that were learned from.
+        rays_per_pixel: of a batch, in learning.
         focal: the focal length of these images, in pixels.
     """
 

@@ -156,13 +156,13 @@ class CanonicalStage(Stage):
         """Random pixels: the image of each (P,) and its row-major number there (P,), int64."""
         assert self.pool is not None
         schedule = self.schedule
-        per_pixel = self.sampling.rays_per_pixel
+        per_pixel = self.scene_model.settings.rays_per_pixel
         most = None
         if schedule.epochs is not None and not self.objective.searches:
             iterations = round(schedule.iterations / self.position.schedule_scale)
-            most = per_pixel * pixels_for_epochs(schedule.epochs, len(self.pool), iterations)
-        rays = self.batch_size.rays(schedule.rays, most)
-        return self.pool.draw(max(1, rays // per_pixel), self.generator)
+            most = pixels_for_epochs(schedule.epochs, len(self.pool), iterations)
+        pixels = self.batch_size.rays(schedule.rays // per_pixel, most)
+        return self.pool.draw(pixels, self.generator)
 
     def _objective(self, kind: str, loss: Mapping[str, float]) -> Objective:
         """The objective of a kind of phase, whose ``loss`` is weights with that of ``tv``."""

@@ -170,10 +170,10 @@ class DeformationStage(Stage):
         if self.visit.epochs is not None:
             pixels = sum(len(pool) for pool in frame.pools)
             iterations = round((phase.stop - phase.start) / self.position.schedule_scale)
-            most = per_pixel * pixels_for_epochs(self.visit.epochs, pixels, iterations)
+            most = pixels_for_epochs(self.visit.epochs, pixels, iterations)
         pool = frame.pools[self.position.iterations_done % len(frame.pools)]
-        rays = self.batch_size.rays(self.settings.rays, most)
-        return pool.draw(max(1, rays // per_pixel), self.generator)
+        drawn = self.batch_size.rays(self.settings.rays // per_pixel, most)
+        return pool.draw(drawn, self.generator)
 
     @property
     def field(self) -> DeformationField:
