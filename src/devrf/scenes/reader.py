@@ -163,7 +163,7 @@ class LayoutReader(SceneReader):
         if not layout.moves:
             return None
         if layout.thinned:
-            log.info("flow files dropped: data.frames=%s leaves out neighbours", self.frames)
+            log.info("no flow files are read: data.frames=%s leaves out neighbours", self.frames)
             return None
         return self.flow_of(layout.dynamic_train, views, direction)
 

@@ -177,7 +177,7 @@ def test_frames_keeps_the_first_and_the_last_time(scene_folder, caplog):
     scene = BlenderReader(scene_folder.root, frames=2).read()
     assert scene.dynamic.train.times.tolist() == [0, 0, 1, 1]
     assert scene.dynamic.test.times.tolist() == [0, 1]
-    assert scene.dynamic.train.flow is None and "flow files dropped" in caplog.text
+    assert scene.dynamic.train.flow is None and "no flow files are read" in caplog.text
     assert len(BlenderReader(scene_folder.root, frames=3).read().dynamic.train) == 6
 
 
