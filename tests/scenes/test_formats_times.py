@@ -39,6 +39,18 @@ def test_of_a_validation_split(single_folder, scene_folder, refusal):
     assert message.startswith(f"{single_folder}/transforms_val.json: its frames have no ")
 
 
+def test_a_static_set_is_at_rest_whatever_times_a_converter_gave_it(scene_folder):
+    def as_a_film(content: dict[str, Any]) -> None:
+        for k, frame in enumerate(content["frames"]):
+            frame["time"] = k / len(content["frames"])
+
+    for split in ("train", "test"):
+        scene_folder.edit(scene_folder.static / f"transforms_{split}.json", as_a_film)
+    scene = BlenderReader(scene_folder.root).read()
+    assert not scene.static.train.times.any() and not scene.static.test.times.any()
+    assert scene.clock.times == (0.0, 0.5, 1.0)
+
+
 def test_one_time_for_all_is_as_good_as_none(scene_folder):
     def at_zero(content: dict[str, Any]) -> None:
         for frame in content["frames"]:

@@ -25,7 +25,6 @@ from devrf.scenes.splits import (
     load_views,
     one_moment,
     standing,
-    static_split,
 )
 from devrf.scenes.transforms import TIME_TOLERANCE, SceneBounds, Transforms
 from devrf.scenes.validation import scene_error
@@ -130,8 +129,8 @@ def static_alone(train: Transforms, test: Transforms, why: str) -> Layout:
 def two_captures(static: Pair, dynamic: Pair) -> Layout:
     """The layout of a static and a dynamic capture, each with training and held-out images."""
     return Layout(
-        static_train=static_split(static[0]),
-        static_test=static_split(static[1]),
+        static_train=at_one_moment(static[0]),
+        static_test=at_one_moment(static[1]),
         dynamic_train=in_motion(dynamic[0]),
         dynamic_test=in_motion(dynamic[1]),
     )

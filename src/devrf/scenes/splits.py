@@ -149,16 +149,10 @@ def check_timed_alike(*sets: Transforms) -> None:
         )
 
 
-def static_split(transforms: Transforms) -> Split:
-    """A split of a static capture: every image its own view, time 0 unless the file has times."""
-    count = len(transforms.images)
-    times = torch.zeros(count) if transforms.times is None else torch.tensor(transforms.times)
-    return Split(transforms, times, torch.arange(count), False, torch.arange(count))
-
-
 def at_one_moment(transforms: Transforms) -> Split:
-    """A split of a static scene: as :func:`static_split`, at time 0 whatever the file says."""
-    return replace(static_split(transforms), times=torch.zeros(len(transforms.images)))
+    """A split of a scene at rest: every image its own view, at time 0 whatever the file says."""
+    order = torch.arange(len(transforms.images))
+    return Split(transforms, torch.zeros(len(order)), order, False, order)
 
 
 def one_moment(*sets: Transforms) -> bool:

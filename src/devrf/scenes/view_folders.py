@@ -18,7 +18,7 @@ from devrf.scenes.image_folders import ImageFolder, image_folder, listed_images
 from devrf.scenes.layout import Layout, Pair
 from devrf.scenes.lens import Intrinsics
 from devrf.scenes.scene import OpticalFlow, Views
-from devrf.scenes.splits import Split, file_sizes, static_split
+from devrf.scenes.splits import Split, at_one_moment, file_sizes
 from devrf.scenes.transforms import Transforms
 from devrf.scenes.validation import scene_error
 from devrf.system.files import utf8_path
@@ -149,7 +149,7 @@ def with_fixed_views(
         return Split(transforms, times, number, True, torch.arange(len(shots)))
 
     train = split_of([v for v in range(len(views)) if v != test])
-    return Layout(static_split(static[0]), static_split(static[1]), train, split_of([test]))
+    return Layout(at_one_moment(static[0]), at_one_moment(static[1]), train, split_of([test]))
 
 
 def flow_of_views(split: Split, views: Views, direction: FlowDirection) -> OpticalFlow | None:
