@@ -25,6 +25,43 @@ def test_in_one_file_and_not_in_the_other(scene_folder, refusal, bare, timed):
     assert message.startswith(f'{file}: its frames have no "time", but those of transforms_{timed}')
 
 
+def test_held_out_frames_without_times_that_are_fewer_than_those_learned_from(scene_folder, caplog):
+    for split in ("train", "test"):
+        scene_folder.edit(scene_folder.dynamic / f"transforms_{split}.json", drop_times)
+    BlenderReader(scene_folder.root).read()
+    assert "without times" not in caplog.text
+    file = scene_folder.dynamic / "transforms_test.json"
+    scene_folder.edit(file, lambda content: content["frames"].pop(1))
+    BlenderReader(scene_folder.root).read()
+    assert f"{file}: 2 frames without times, and 3 to learn from" in caplog.text
+
+
+def test_held_out_of_a_film_without_times_an_image_keeps_its_own(scene_folder):
+    """It was at time 0, the one of a set of one, and those around it moved together."""
+    file = scene_folder.dynamic / "transforms_train.json"
+
+    def film(content: dict[str, Any]) -> None:
+        drop_times(content)
+        for k, frame in enumerate(content["frames"]):
+            frame["transform_matrix"][0][3] += 0.1 * k
+
+    scene_folder.edit(file, film)
+    (scene_folder.dynamic / "transforms_test.json").unlink()
+    dynamic = BlenderReader(scene_folder.root).read().dynamic
+    assert dynamic.train.times.tolist() == pytest.approx([0.0, 0.2, 0.4, 0.6, 0.8])
+    assert dynamic.test.times.tolist() == [1.0]
+
+
+def test_by_their_order_absent_images_keep_their_times(tmp_path, balls):
+    root = tmp_path / "scene"
+    balls.write(root, None)
+    for k in (3, 4, 5):
+        (root / f"images/r_{k:03d}.png").unlink()
+    train = NerfstudioReader(root, times="order", missing="skip").read().dynamic.train
+    assert train.names[2:4] == ("images/r_002.png", "images/r_006.png")
+    assert train.times[2:4].tolist() == [0.25, 0.75]
+
+
 def test_in_dnerfs_layout(single_folder, scene_folder, refusal):
     file = single_folder / "transforms_test.json"
     scene_folder.edit(file, drop_times)

@@ -128,12 +128,18 @@ def static_alone(train: Transforms, test: Transforms, why: str) -> Layout:
 
 def two_captures(static: Pair, dynamic: Pair) -> Layout:
     """The layout of a static and a dynamic capture, each with training and held-out images."""
-    return Layout(
-        static_train=at_one_moment(static[0]),
-        static_test=at_one_moment(static[1]),
-        dynamic_train=in_motion(dynamic[0]),
-        dynamic_test=in_motion(dynamic[1]),
-    )
+    train, test = map(in_motion, dynamic)
+    learned, held_out = (len(distinct_times(split.times)) for split in (train, test))
+    untimed = dynamic[0].times is dynamic[1].times is None
+    if untimed and learned != held_out and dynamic[0].file != dynamic[1].file:
+        log.warning(
+            "%s: %d frames without times, and %d to learn from: both are taken to begin and to end "
+            'together; if they do not, give each frame its "time"',
+            dynamic[1].file,
+            held_out,
+            learned,
+        )
+    return Layout(at_one_moment(static[0]), at_one_moment(static[1]), train, test)
 
 
 def one_capture(train: Transforms, test: Transforms, static_until: float) -> Layout:

@@ -180,7 +180,8 @@ def in_motion(transforms: Transforms) -> Split:
 
 def _by_turns(transforms: Transforms) -> tuple[Tensor, bool]:
     """Times (N,) by the positions in the file, and whether its cameras are fixed."""
-    poses, positions = transforms.listed or (transforms.poses, range(len(transforms.images)))
+    assert transforms.listed is not None  # as of all files without times
+    poses, positions = transforms.listed
     order = torch.arange(len(poses))
     camera = distinct_poses(poses)
     views = int(camera.max()) + 1

@@ -135,8 +135,8 @@ class Transforms:
         cut_out: whether pixels that masks leave out are background; else they are ignored.
         downscale: the factor by which the images are yet to be made smaller; None: not chosen yet.
         skipped: number of images of the file that are absent, and left out.
-        listed: (M, 3, 4) the poses of all images of the file, absent ones too, and the positions of
-            the N among them; None: the N are all, or have times.
+        listed: (M, 3, 4) the poses of all images of the file, absent and held-out ones too, and the
+            positions of the N among them; None: they have times, or need none.
         bounds: the scene's bounds in the world of the file, if it states them.
         offset: the offset that is subtracted from positions (:mod:`devrf.geometry.offset`).
     """
@@ -266,8 +266,8 @@ class TransformsFiles:
         where = [f"{file}: frames[{index}]" for index in images]
         times = [frame.time for frame in frames]
         if times_by_order:
-            names = in_order((frame.file_path for frame in frames), name=str, where=file)
-            moments = {name: k / max(len(names) - 1, 1) for k, name in enumerate(names)}
+            ordered = in_order(names, name=str, where=file)  # absent images keep their times
+            moments = {name: k / max(len(ordered) - 1, 1) for k, name in enumerate(ordered)}
             times = [moments[frame.file_path] for frame in frames]
         stated = [t for t in times if t is not None]
         if stated and len(stated) < len(times):
@@ -279,7 +279,6 @@ class TransformsFiles:
         lenses = [frame_intrinsics(listing, f, at) for f, at in zip(frames, where, strict=True)]
         shared = cache(lambda: intrinsics_of(listing, file))  # only if it is needed
         masked = self._masks != "none"
-        gaps = len(images) < len(listing.frames) and not stated
         transforms = Transforms(
             file,
             tuple(own or shared() for own in lenses),
@@ -289,7 +288,7 @@ class TransformsFiles:
             tuple(self._mask(frame.mask_path, file) for frame in frames) if masked else None,
             cut_out=self._masks == "alpha",
             skipped=len(listing.frames) - len(frames),
-            listed=(subtracted(every_pose, self._offset).float(), (*images,)) if gaps else None,
+            listed=None if stated else (subtracted(every_pose, self._offset).float(), (*images,)),
             bounds=listing.scene_bounds,
             offset=self._offset,
         )
