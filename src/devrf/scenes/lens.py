@@ -176,12 +176,14 @@ class Intrinsics:
 def intrinsics_of(camera: CameraKeys, where: object) -> Intrinsics:
     """The intrinsics that the keys of a file, or of one of its frames, state.
 
-    A focal length counts before the angle of its axis. DevrfError if ``where`` has neither, or an
-    angle out of range.
+    A focal length counts before the angle of its axis. DevrfError if ``where`` has neither, an
+    angle out of range, or one side of the image alone.
     """
     c = camera
     distortion = Distortion((c.k1, c.k2, c.k3, c.k4), (c.p1, c.p2))
     size = None if c.w is None or c.h is None else (c.w, c.h)
+    if size is None and (c.w or c.h):
+        raise scene_error(where, '"w" and "h" go together, and one of them is missing; add it')
     focal = (c.fl_x, c.fl_y)
     angles = (c.camera_angle_x, c.camera_angle_y)
     if c.fl_x is None and angles == (None, None):

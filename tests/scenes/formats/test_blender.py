@@ -94,6 +94,14 @@ def test_either_angle_gives_the_focal_length_of_its_axis(scene_folder, said, foc
     assert cameras.center.tolist() == [[16, 12]] * 6
 
 
+def test_one_side_alone_says_no_size(scene_folder, refusal):
+    """Focal lengths would be taken for those of the file, however small it is."""
+    file = scene_folder.static / "transforms_train.json"
+    scene_folder.edit(file, lambda content: content.update(fl_x=100, w=64))
+    message = refusal(BlenderReader, scene_folder.root)
+    assert message == f'{file}: "w" and "h" go together, and one of them is missing; add it'
+
+
 def test_the_view_that_a_frame_states_replaces_the_files(scene_folder):
     def change(content):
         content.update(camera_angle_x=0.8, camera_angle_y=0.5)
