@@ -86,10 +86,12 @@ def test_what_is_refused(folder, message_of):
         put_json(file, whole | changed)
         return message_of(folder)
 
+    fewer = {key: whole[key][:2] for key in ("fn", "k", "w2c")}
+    assert "test_meta.json: lists 3 times, and train_meta.json 2; list all" in refused(**fewer)
     turned = [[torch.ones(4, 4).tolist()] * 4] * 3
     assert "w2c" in refused(w2c=[]) and "0/000000.png" in refused(w2c=turned)
     assert "fn, k and w2c do not list as many images" in refused(k=whole["k"][:2])
-    many = {key: [[whole[key][0][0]] * 25_001] * 2 for key in ("fn", "k", "w2c")}
+    many = {key: [[whole[key][0][0]] * 16_667] * 3 for key in ("fn", "k", "w2c")}
     assert "lists more than 50000 images" in refused(**many)
     assert "no such image" in refused(fn=[["9/000000.png"] * 4, *whole["fn"][1:]])
     assert "leads outside" in refused(fn=[["../../x.png"] * 4, *whole["fn"][1:]])

@@ -64,13 +64,22 @@ class PanopticReader(InwardReader):
     def layout(self, folder: Path) -> Layout:
         """See :meth:`devrf.scenes.reader.LayoutReader.layout`."""
         finder = ImageFinder(folder)
-        train = self._listed(folder / TRAIN, finder)
-        test = self._listed(folder / TEST, finder, train.offset)
+        files = (folder / TRAIN, folder / TEST)
+        what = "it lists the images and their cameras; add it"
+        learned, held_out = (read_json(file, _Meta, what) for file in files)
+        if len(held_out.fn) != len(learned.fn):
+            raise scene_error(
+                files[1],
+                f"lists {len(held_out.fn)} times, and {TRAIN} {len(learned.fn)}; list all of them",
+            )
+        train = self._listed(files[0], learned, finder)
+        test = self._listed(files[1], held_out, finder, train.offset)
         return with_static_times(train, test, None)
 
-    def _listed(self, file: Path, finder: ImageFinder, offset: Offset | None = None) -> Transforms:
+    def _listed(
+        self, file: Path, meta: _Meta, finder: ImageFinder, offset: Offset | None = None
+    ) -> Transforms:
         """The images of a file; positions lose the ``offset``, or one of their own."""
-        meta = read_json(file, _Meta, "it lists the images and their cameras; add it")
         fn, *others = ([len(taken) for taken in lists] for lists in (meta.fn, meta.k, meta.w2c))
         if others != [fn, fn]:
             raise scene_error(file, "fn, k and w2c do not list as many images; correct them")
