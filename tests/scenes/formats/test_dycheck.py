@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 
+from devrf.geometry.cameras import Distortion
 from devrf.scenes.formats.dycheck import DycheckReader
 from devrf.scenes.lens import Lens
 from layouts import write_camera
@@ -107,9 +108,28 @@ def test_key_points_are_shares_of_the_sides_of_the_images_that_have_them(folder)
     put(place / "skeleton.json", {"name": "unnamed"})
     keypoints = DycheckReader(folder, downscale=1).read().dynamic.keypoints
     assert keypoints.shape == (9, 2, 3)
-    assert keypoints[2].tolist() == [[0.5, 0.25, 1], [0.25, 0.5, 0]]
-    assert keypoints[7].tolist() == [[1, 1, 1], [0, 0, 1]]
+    shares = torch.tensor([[[0.5, 0.25, 1], [0.25, 0.5, 0]], [[1, 1, 1], [0, 0, 1]]])
+    torch.testing.assert_close(keypoints[[2, 7]], shares)
     assert not keypoints[[0, 1, 3, 4, 5, 6, 8]].any()
+
+
+def test_key_points_are_undistorted_as_the_images_are(folder, lens_directions):
+    """A point in the middle of a pixel is where a pinhole sees what the lens sees there."""
+    lens = Lens((44.0, 46.2), (21.0, 15.0), Distortion((-0.3, 0.1, 0.01, 0.0), (0.006, -0.008)))
+    file = folder / "camera/0_00002.json"
+    camera = json.loads(file.read_text())
+    radial, tangential = [-0.3, 0.1, 0.01], [0.006, -0.008]
+    bent = {"radial_distortion": radial, "tangential": tangential, "pixel_aspect_ratio": 1.05}
+    put(file, camera | bent)
+    put(folder / "keypoint/2x/train/0_00002.json", [[1.25, 1.75, 1], [18.25, 14.25, 0]])
+    dynamic = DycheckReader(folder, downscale=1).read().dynamic
+    views = dynamic.train.single(2)
+    seen = lens_directions(lens, WIDTH, HEIGHT)[[3, 28], [2, 36]]
+    pixels = views.cameras.focal * seen + views.cameras.center
+    assert dynamic.keypoints is not None
+    shares = pixels / views.cameras.extents
+    torch.testing.assert_close(dynamic.keypoints[2, :, :2], shares.float(), rtol=0, atol=1e-5)
+    assert float((shares * 20 - torch.tensor([1.25, 1.75])).abs().max()) > 0.1
 
 
 @pytest.mark.parametrize(

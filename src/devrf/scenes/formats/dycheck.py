@@ -9,12 +9,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
+import cv2
+import numpy as np
 import torch
 from pydantic import BaseModel, Field, RootModel
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
-from devrf.scenes.files import Ids, Number, inside, read_json, scene_folder
+from devrf.scenes.files import Ids, Number, Numbers, inside, read_json, scene_folder
 from devrf.scenes.formats.nerfies import Camera, ItemsReader, Listed
 from devrf.scenes.image_folders import Downscale, ImageFolder
 from devrf.scenes.names import ImageFinder
@@ -116,10 +118,12 @@ def _read_keypoints(folder: Path, views: Views) -> Tensor | None:
         file = inside(folder, place, f"{item}.json", folder / TRAIN)
         if not os.path.isfile(file):
             continue
-        points = torch.tensor(read_json(file, _Keypoints, "it has key points").root).view(-1, 3)
+        points = np.reshape(read_json(file, _Keypoints, "it has key points").root, (-1, 3))
         camera = read_json(folder / "camera" / f"{item}.json", Camera, "add it")
-        sides = torch.tensor(camera.image_size) / factors[0]
-        found[image] = torch.cat([points[:, :2] / sides, points[:, 2:]], dim=1)
+        cameras = views.cameras.single(image)
+        pixels = _directions(camera, factors[0] * points[:, :2]) * cameras.focal + cameras.center
+        seen = torch.from_numpy(points[:, 2:])
+        found[image] = torch.cat([pixels / cameras.extents, seen], dim=1).float()
         if len(points) != len(next(iter(found.values()))):
             raise scene_error(file, f"{len(points)} key points, but others have another number")
     if not found:
@@ -127,6 +131,21 @@ def _read_keypoints(folder: Path, views: Views) -> Tensor | None:
     keypoints = torch.zeros(len(views), *next(iter(found.values())).shape)
     keypoints[list(found)] = torch.stack([*found.values()])
     return keypoints
+
+
+def _directions(camera: Camera, pixels: Numbers) -> Tensor:
+    """(K, 2) float64: x/z and y/z, y down, of ``pixels`` (K, 2) of the full image, undistorted."""
+    focal, (cx, cy) = camera.focal_length, camera.principal_point
+    rows = [[focal, camera.skew, cx], [0, focal * camera.pixel_aspect_ratio, cy], [0, 0, 1]]
+    lens = np.array(rows, np.float64)
+    bent = np.linalg.solve(lens, np.pad(pixels, ((0, 0), (0, 1)), constant_values=1).T)[:2].T
+    k1, k2, k3 = camera.radial_distortion
+    distortion = np.array([k1, k2, *camera.tangential_distortion, k3])
+    until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
+    straight = [
+        cv2.undistortPoints(point[None], np.eye(3), distortion, criteria=until) for point in bent
+    ]
+    return torch.from_numpy(np.reshape(straight, (-1, 2)))
 
 
 def _read_split(file: Path) -> dict[str, float]:
