@@ -194,3 +194,15 @@ def test_more_frames_than_a_command_can_name_are_read(film, monkeypatch):
     read = [(k, number(picture)) for k, picture in frames_at(film("a.mp4"), [1, 3, 4])]
     assert read == [(1, 1), (3, 3), (4, 4)]
     assert not [*frames_at(film("a.mp4"), [])]
+
+
+def test_photographs_that_are_cut_out_are_refused(tmp_path):
+    """What is behind transparent pixels would be taken for what was there."""
+    picture = np.dstack([frame(1), np.full((HEIGHT, WIDTH), 255, np.uint8)])
+    for k in range(2):
+        Image.fromarray(picture).save(tmp_path / f"{k}.png")
+    assert [number(seen) for _, seen in pictures(tmp_path)] == [1, 1]
+    picture[0, 0, 3] = 0
+    Image.fromarray(picture).save(tmp_path / "1.png")
+    with pytest.raises(DevrfError, match=r"1\.png: is cut out by its alpha channel, which is not"):
+        [*pictures(tmp_path)]

@@ -19,7 +19,7 @@ import imageio_ffmpeg
 import numpy as np
 import numpy.typing as npt
 
-from devrf.scenes.files import existing_file
+from devrf.scenes.files import decoding, existing_file
 from devrf.scenes.image_folders import listed_images
 from devrf.scenes.images import open_image
 from devrf.scenes.validation import scene_error
@@ -252,7 +252,16 @@ def _ffmpeg(
 
 
 def _photograph(file: Path) -> Picture:
-    with open_image(file):  # OpenCV would decode much larger ones than Pillow opens
+    with open_image(file) as opened:  # OpenCV would decode much larger ones than Pillow opens
+        with decoding(file, "image", "convert it to PNG or JPEG"):
+            has_alpha = opened.mode in ("RGBA", "LA", "PA")
+            least = opened.getchannel("A").getextrema()[0] if has_alpha else 255
+        if least != 255:
+            raise scene_error(
+                file,
+                "is cut out by its alpha channel, which is not read here; save it without one (for "
+                "stage=capture with masks beside it, capture.alpha_masks)",
+            )
         image = cv2.imread(str(file), cv2.IMREAD_COLOR)
     if image is None:
         raise scene_error(file, "not a readable image; convert it to PNG or JPEG")
