@@ -73,21 +73,6 @@ def test_a_world_point_falls_on_the_pixel_computed_by_hand(llff_folder):
 
 
 @pytest.mark.parametrize(
-    ("inner", "focal", "center"),
-    [([64, 96, 80], (20, 20), (12, 8)), ([[64], [96], [80], [72], [44], [36]], (20, 18), (11, 9))],
-)
-def test_poses_without_intrinsics_take_them_from_their_own_file(llff_folder, inner, focal, center):
-    rows = llff_folder.static_rows()
-    matrix = rows[:, :15].reshape(9, 3, 5)[:, :, :4].reshape(9, 12)
-    llff_folder.save("static/poses_bounds.npy", np.concatenate([matrix, rows[:, 15:]], axis=1))
-    llff_folder.save("static/hwf_cxcy.npy", np.array(inner, dtype=float))
-    cameras = LlffReader(llff_folder.root).read().static.train.cameras
-    assert tuple(cameras.focal[0].tolist()) == focal
-    assert tuple(cameras.center[0].tolist()) == center
-    assert cameras.positions[:, 0].tolist() == pytest.approx([k - 4 for k in range(1, 8)])
-
-
-@pytest.mark.parametrize(
     ("names", "found"),
     [
         # By the images' names, by the numbers in them, by position.

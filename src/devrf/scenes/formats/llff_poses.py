@@ -96,29 +96,18 @@ class PosedSet:
 
 
 def read_static_poses(folder: Path) -> PosedSet:
-    """The cameras of ``poses_bounds.npy``: (N, 17), or (N, 14) next to ``hwf_cxcy.npy``.
+    """The cameras of ``poses_bounds.npy`` (N, 17); DevrfError if it is missing or something else.
 
-    A row is a 3×5 matrix (axes [down, right, back], position, [H, W, focal]) or a 3×4 one without
-    the last column, then least and largest depth. ``hwf_cxcy.npy`` holds H, W, focal; or H, W,
-    focal, cx, cy; or H, W, fx, fy, cx, cy; for all images. DevrfError if a file is missing or
-    holds something else.
+    A row is a 3×5 matrix (axes [down, right, back], position, [H, W, focal]), then least and
+    largest depth.
     """
     file = folder / POSES
-    inner = folder / "hwf_cxcy.npy"
-    rows = read_numbers(file, "the static cameras, (N, 17) or (N, 14)")
-    if rows.ndim != 2 or rows.shape[1] not in (14, 17) or len(rows) == 0:
-        raise scene_error(
-            file, f"has shape {rows.shape}, expected (N, 17), or (N, 14); write it again"
-        )
-    if rows.shape[1] == 17:
-        matrix = rows[:, :15].reshape(-1, 3, 5)
-        intrinsics = _of_columns(file, matrix[:, :, 4])
-    else:
-        matrix = rows[:, :12].reshape(-1, 3, 4)
-        intrinsics = (_shared(inner),) * len(rows)
-    down, right, back, position = (matrix[:, :, k] for k in range(4))
-    poses = np.stack([right, -down, back, position], axis=2)
-    return _posed_set(file, poses, intrinsics, file, rows[:, -2:])
+    rows = read_numbers(file, "the static cameras, (N, 17)")
+    if rows.ndim != 2 or rows.shape[1] != 17 or len(rows) == 0:
+        raise scene_error(file, f"has shape {rows.shape}, expected (N, 17); write it again")
+    matrix = rows[:, :15].reshape(-1, 3, 5)
+    down, right, *further = matrix.transpose(2, 0, 1)
+    return _posed_set(file, np.stack([right, -down, *further], axis=2), file, rows[:, 15:])
 
 
 Row = tuple[Number, Number, Number, Number, Number]
@@ -140,7 +129,7 @@ def read_precomputed_poses(folder: Path) -> PosedSet:
     """The cameras of NR-NeRF's ``precomputed.json``; DevrfError if it holds something else."""
     file = folder / PRECOMPUTED
     content = read_json(file, _Precomputed, "expected the cameras of a video")
-    return _of_matrices(file, np.array(content.poses), file, np.array(content.bds))
+    return _posed_set(file, np.array(content.poses), file, np.array(content.bds))
 
 
 def read_dynamic_poses(folder: Path) -> PosedSet:
@@ -155,52 +144,25 @@ def read_dynamic_poses(folder: Path) -> PosedSet:
     if matrix.ndim != 3 or matrix.shape[1:] != (3, 5) or len(matrix) == 0:
         raise scene_error(file, f"has shape {matrix.shape}, expected (N, 3, 5); write it again")
     bounds = read_numbers(depths, "least and largest depths, (N, 2)")
-    return _of_matrices(file, matrix, depths, bounds)
+    return _posed_set(file, matrix, depths, bounds)
 
 
-def _of_matrices(file: Path, matrix: Numbers, depths: Path, bounds: Numbers) -> PosedSet:
-    """The set of matrices (N, 3, 5), axes [right, up, back], and the bounds in ``depths``."""
+def _posed_set(file: Path, matrix: Numbers, depths: Path, bounds: Numbers) -> PosedSet:
+    """The set of matrices (N, 3, 5), axes [right, up, back], and the bounds in ``depths``.
+
+    DevrfError that names the file and the row at fault.
+    """
     if bounds.shape != (len(matrix), 2):
         raise scene_error(
             depths, f"has depths {bounds.shape}, expected ({len(matrix)}, 2); write it again"
         )
-    intrinsics = _of_columns(file, matrix[:, :, 4])
-    return _posed_set(file, matrix[:, :, :4], intrinsics, depths, bounds)
-
-
-def _of_columns(file: Path, columns: Numbers) -> tuple[Intrinsics, ...]:
-    """The intrinsics in columns H, W, focal (N, 3)."""
-    return tuple(_intrinsics(file, h, w, focal) for h, w, focal in columns.tolist())
-
-
-def _shared(file: Path) -> Intrinsics:
-    """The intrinsics in ``hwf_cxcy.npy``."""
-    values = read_numbers(file, "H, W, focal, cx, cy next to a poses_bounds.npy of (N, 14)")
-    if values.size not in (3, 5, 6):
-        raise scene_error(
-            file, f"holds {values.size} numbers, expected H, W, focal(s), cx, cy; write it again"
-        )
-    return _intrinsics(file, *values.flatten().tolist())
-
-
-def _intrinsics(file: Path, h: float, w: float, fx: float, *more: float) -> Intrinsics:
-    """The intrinsics in H, W, focal; H, W, focal, cx, cy; or H, W, fx, fy, cx, cy."""
-    fy = more[0] if len(more) == 3 else fx
-    cx, cy = more[-2:] or (w / 2, h / 2)
-    if min(h, w) < 1 or min(fx, fy) <= 0:
-        raise scene_error(
-            file, f"height {h:g}, width {w:g} or focal length {fx:g} is not above 0; correct it"
-        )
-    return Intrinsics((fx, fy), (cx, cy), (w, h))
-
-
-def _posed_set(
-    file: Path, poses: Numbers, intrinsics: tuple[Intrinsics, ...], depths: Path, bounds: Numbers
-) -> PosedSet:
-    """The set, or DevrfError that names the file and the row at fault."""
-    cameras = torch.from_numpy(np.ascontiguousarray(poses))
-    ranges = torch.from_numpy(np.ascontiguousarray(bounds))
+    for h, w, focal in matrix[:, :, 4].tolist():
+        if min(h, w) < 1 or focal <= 0:
+            what = f"height {h:g}, width {w:g} or focal length {focal:g} is not above 0; correct it"
+            raise scene_error(file, what)
+    cameras = torch.from_numpy(np.ascontiguousarray(matrix[:, :, :4]))
     check_poses(cameras, lambda row: f"{file}: camera {row}")
+    ranges = torch.from_numpy(np.ascontiguousarray(bounds))
     good = (ranges[:, 0] > 0) & (ranges[:, 0] < ranges[:, 1])
     if not bool(good.all()):
         raise scene_error(
@@ -208,4 +170,7 @@ def _posed_set(
             f"camera {int((~good).nonzero()[0])}: expected 0 < least depth < largest "
             "depth; correct it",
         )
+    intrinsics = tuple(
+        Intrinsics((focal, focal), (None, None), (w, h)) for h, w, focal in matrix[:, :, 4].tolist()
+    )
     return PosedSet(file, cameras, intrinsics, ranges)
