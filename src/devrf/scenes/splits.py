@@ -107,10 +107,7 @@ def distinct_poses(poses: Tensor) -> Tensor:
     for row, (start, stop) in enumerate(ends.T):
         if numbers[row] < 0:
             rows = order[start:stop]
-            for column in entries.T:
-                if len(rows) == 1:  # itself: soon, of most
-                    break
-                rows = rows[np.abs(column[rows] - column[row]) <= near]
+            rows = rows[(np.abs(entries[rows] - entries[row]) <= near).all(axis=1)]
             numbers[rows[numbers[rows] < 0]] = numbers[row] = count
             count += 1
     return torch.from_numpy(numbers)
