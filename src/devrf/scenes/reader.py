@@ -271,6 +271,13 @@ class PosedReader(InwardReader):
             bounds = replace(scene.bounds, reason=reason, box_source=box_source)
             return replace(scene, bounds=bounds)
         name = self.scene_name
+        for key, given in (("box", self.box), ("far", self.far)):
+            if given is not None:
+                raise scene_error(
+                    f"data.{key}",
+                    "the scene is forward-facing, and its space reaches from the near plane to "
+                    "infinity; leave it null, or set data.space=contracted",
+                )
         static, dynamic = centred(static, dynamic)
         if reader.near is None or reader.near <= 0:
             apart = float(static.train.cameras.positions.norm(dim=1).max())

@@ -18,6 +18,7 @@ import pytest
 import torch
 
 from devrf.data.kind import faces_forward
+from devrf.errors import DevrfError
 from devrf.geometry.cameras import Distortion
 from devrf.geometry.offset import added
 from devrf.scenes.formats.colmap import ColmapReader
@@ -129,6 +130,8 @@ def test_cameras_on_one_side_make_a_forward_facing_scene(tmp_path, ring_cameras)
     model = read_model(tmp_path / "sparse")
     depths = -points_in(normalised(model)[0], model)[:, 2].numpy()
     assert depths.min() == pytest.approx(4 / 3, rel=0.1)
+    with pytest.raises(DevrfError, match=r"^data\.box: the scene is forward-facing, and its space"):
+        ColmapReader(tmp_path, downscale=1, box=[[-1, -1, -1], [1, 1, 1]]).read()
     around = ColmapReader(tmp_path, downscale=1, space="contracted").read()
     assert around.kind == "inward" and not faces_forward("colmap", tmp_path, "world")
 
