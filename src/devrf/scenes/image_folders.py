@@ -6,7 +6,7 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -17,7 +17,7 @@ from pydantic import PlainValidator
 from devrf.errors import DevrfError
 from devrf.scenes.files import entries
 from devrf.scenes.images import SUFFIXES, image_size, unread
-from devrf.scenes.names import in_order
+from devrf.scenes.names import in_order, last_number
 from devrf.scenes.validation import scene_error
 from devrf.system.files import utf8_path
 
@@ -77,6 +77,27 @@ def listed_images(folder: Path, *, by_characters: bool = False) -> list[Path]:
     if not images:
         raise scene_error(folder, f"no images (looked for {', '.join(SUFFIXES)}){unread(folder)}")
     return in_order(images, name=lambda path: path.name, where=folder, by_characters=by_characters)
+
+
+def shot_together(folders: Sequence[Path]) -> list[list[Path]]:
+    """The images of cameras that take theirs together, a folder each, in the order of their names.
+
+    DevrfError if folders have different numbers of images. A warning says that the numbers in their
+    names differ: one camera may have begun later, or have lost an image.
+    """
+    taken = [listed_images(folder) for folder in folders]
+    for folder, images in zip(folders, taken, strict=True):
+        if len(images) != len(taken[0]):
+            raise scene_error(
+                folder,
+                f"has {len(images)} images, but {folders[0]} has {len(taken[0])}; each camera "
+                "needs one a time",
+            )
+        for image, first in zip(images, taken[0], strict=True):
+            if last_number(image.stem) != last_number(first.stem):
+                log.warning("%s is taken to show the moment of %s, by its place", image, first)
+                break
+    return taken
 
 
 # Images with a shorter side of fewer pixels teach little.

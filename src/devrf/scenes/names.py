@@ -70,6 +70,12 @@ def _by_number(stem: str, *, decimal: bool) -> list[str | int | Decimal]:
     return [*key, Decimal(end[0]), ""] if end else key
 
 
+def last_number(stem: str) -> int | None:
+    """The last number in a name without its suffix, if there is any."""
+    numbers = _NUMBER.findall(stem)
+    return int(numbers[-1]) if numbers else None
+
+
 class ImageFinder:
     """Finds the images below a scene's folder that lists name; each folder is read once.
 

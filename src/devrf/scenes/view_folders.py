@@ -14,9 +14,10 @@ from torch import Tensor
 
 from devrf.scenes.files import entries
 from devrf.scenes.flow_files import FlowDirection, stacked_flow
-from devrf.scenes.image_folders import ImageFolder, image_folder, listed_images
+from devrf.scenes.image_folders import ImageFolder, image_folder, shot_together
 from devrf.scenes.layout import Layout, Pair
 from devrf.scenes.lens import Intrinsics
+from devrf.scenes.names import last_number
 from devrf.scenes.scene import OpticalFlow, Views
 from devrf.scenes.splits import Split, at_one_moment, file_sizes
 from devrf.scenes.transforms import Transforms
@@ -51,7 +52,6 @@ def dynamic_folder(root: Path, name: str | None) -> Path | None:
 
 
 _VIEW = re.compile(r"view(\d{1,6})")
-_DIGITS = re.compile(r"\d+")
 
 
 @dataclass(frozen=True)
@@ -81,21 +81,18 @@ def view_folders(folder: Path, downscale: int) -> list[ViewFolder]:
                 f"no folder view{number} although there is {numbered[max(numbered)].name}; number "
                 "the fixed cameras' folders from 1 on, without zeros in front",
             )
-    views: list[ViewFolder] = []
-    for _, path in sorted(numbered.items()):
-        source = image_folder(path, downscale)
-        images = listed_images(source.path)
-        if views and len(images) != len(views[0].images):
+    sources = [image_folder(path, downscale) for _, path in sorted(numbered.items())]
+    for source in sources:
+        if source.downscale != sources[0].downscale:
             raise scene_error(
-                source.path,
-                f"has {len(images)} images, but {views[0].path} has "
-                f"{len(views[0].images)}; each view needs one a frame",
+                source.path.parent,
+                f"no folder {sources[0].path.name} as the other views have; add it",
             )
-        if views and source.downscale != views[0].downscale:
-            raise scene_error(
-                path, f"no folder {views[0].path.name} as the other views have; add it"
-            )
-        views.append(ViewFolder(source.path, source.downscale, images))
+    taken = shot_together([source.path for source in sources])
+    views = [
+        ViewFolder(source.path, source.downscale, images)
+        for source, images in zip(sources, taken, strict=True)
+    ]
     if min(len(views), len(views[0].images)) < 2:
         raise scene_error(
             folder,
@@ -164,7 +161,7 @@ def flow_of_views(split: Split, views: Views, direction: FlowDirection) -> Optic
     suffix = f"_{direction}.npz"
     ways: tuple[Callable[[int, Path], str | int | None], ...] = (
         lambda position, image: image.stem,
-        lambda position, image: _last_number(image.stem),
+        lambda position, image: last_number(image.stem),
         lambda position, image: position,
     )
     images = [split.transforms.images[k] for k in split.index.tolist()]
@@ -200,8 +197,3 @@ def _named(folder: Path, suffix: str) -> dict[str | int | None, Path]:
         if name.isdecimal():
             files[int(name)] = path
     return files
-
-
-def _last_number(stem: str) -> int | None:
-    numbers = _DIGITS.findall(stem)
-    return int(numbers[-1]) if numbers else None

@@ -76,6 +76,17 @@ def test_cameras_lenses_and_masks(folder, balls_are_where_they_project):
     assert not EasyVolcapReader(folder, downscale=1, masks="none").read().space.is_linear
 
 
+def test_a_camera_that_began_later_than_the_others_is_warned_of(folder, caplog):
+    """As many images as the others, each of them a moment late."""
+    images = folder / "images" / "02"
+    for time in reversed(range(TIMES)):
+        (images / f"{time:06d}.png").rename(images / f"{time + 1:06d}.png")
+    EasyVolcapReader(folder, downscale=1, masks="none").read()
+    first = folder / "images/00/000000.png"
+    said = f"{images}/000001.png is taken to show the moment of {first}, by its place"
+    assert caplog.messages.count(said) == 1
+
+
 def test_what_is_refused(folder, message_of):
     file = folder / "intri.yml"
     whole = file.read_text()
@@ -94,7 +105,7 @@ def test_what_is_refused(folder, message_of):
     assert "an alias" in refused("names:", "one: &one [1]\nmany: [*one, *one]\nnames:")
     file.write_text(whole)
     (folder / "images" / "02" / "000001.png").unlink()
-    assert "02: has 2 images, and others have 3" in message_of(folder)
+    assert f"02: has 2 images, but {folder}/images/00 has 3" in message_of(folder)
     assert "extri.yml: no such file" in message_of(_without(folder, "extri.yml"))
 
 

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from devrf.geometry.cameras import Distortion
 from devrf.scenes.files import Numbers, decoding, existing_file
-from devrf.scenes.image_folders import listed_images
+from devrf.scenes.image_folders import shot_together
 from devrf.scenes.layout import Layout, with_static_times
 from devrf.scenes.lens import Intrinsics
 from devrf.scenes.names import ImageFinder
@@ -57,32 +57,25 @@ class EasyVolcapReader(InwardReader):
         """See :meth:`devrf.scenes.reader.LayoutReader.layout`."""
         file = folder / INTRINSICS
         cameras = read_cameras(file, folder / EXTRINSICS)
-        files: dict[str, list[Path]] = {}
-        for name in cameras:
-            images = folder / "images" / name
+        folders = [folder / "images" / name for name in cameras]
+        for images in folders:
             if not os.path.isdir(images):
                 raise scene_error(images, f"no such folder; {INTRINSICS} names this camera; add it")
-            files[name] = listed_images(images)
-        counts = {name: len(images) for name, images in files.items()}
-        if len({*counts.values()}) > 1:
-            most = max(counts.values())
-            name = next(name for name, count in counts.items() if count < most)
-            raise scene_error(
-                folder / "images" / name,
-                f"has {counts[name]} images, and others have {most}; each camera needs one a time",
-            )
+        moments = [*zip(*shot_together(folders), strict=True)]
         masked = self.masks == "alpha" and os.path.isdir(folder / "masks")
-        last = max(max(counts.values()) - 1, 1)
+        last = max(len(moments) - 1, 1)
         shots = [
             Shot(
-                image=f"images/{name}/{files[name][time].name}",
+                image=f"images/{name}/{image.name}",
                 world_to_camera=world_to_camera,
                 intrinsics=intrinsics,
                 time=time / last,
-                mask=f"masks/{name}/{files[name][time].name}" if masked else None,
+                mask=f"masks/{name}/{image.name}" if masked else None,
             )
-            for time in range(max(counts.values()))
-            for name, (world_to_camera, intrinsics) in cameras.items()
+            for time, taken in enumerate(moments)
+            for image, (name, (world_to_camera, intrinsics)) in zip(
+                taken, cameras.items(), strict=True
+            )
         ]
         everything = posed_images(file, shots, ImageFinder(folder), "error")
         test = held_out_view(len(cameras), self.test_view)
