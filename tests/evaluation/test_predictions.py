@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import imageio.v3 as iio
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from devrf.apps.records import frame_rows
@@ -112,6 +113,17 @@ def test_pictures_in_their_order_whose_numbers_are_names_of_some_images(folder, 
     (folder / "dynamic" / "00002.png").unlink()
     line = refused(folder, {"dynamic": views})
     assert "no picture of view3/00007.png" in line and "2 of 3 are missing" in line
+
+
+def test_pictures_of_thousands_of_times_are_those_of_the_nearest(sets, tmp_path):
+    """Times nearer to one another than names are to times: each was that of the next image."""
+    one = sets["dynamic"][torch.zeros(2001, dtype=torch.long)]
+    views = replace(one, times=torch.arange(2001) / 2000, names=tuple(map(str, range(2001))))
+    for index in range(3):
+        picture = np.full((views.height, views.width, 3), 10 * index, np.uint8)
+        iio.imwrite(tmp_path / picture_name(views, index), picture)
+    found = pictures_in(tmp_path, views[torch.arange(3)])
+    assert [int(found(index)[0, 0, 0]) for index in range(3)] == [0, 10, 20]
 
 
 def test_a_name_that_is_misspelt_is_no_order(folder, sets):

@@ -197,13 +197,14 @@ def _named(folder: Path, views: Views) -> dict[int, Path]:
 
 
 def _at(views: Views, view: int, time: float) -> list[int]:
-    """The images of a camera at a time."""
+    """The images of a camera at the time nearest to one, if any is near."""
     numbers = sorted({*views.view.tolist()})
     if view >= len(numbers):
         return []
-    near = (views.view == numbers[view]) & ((views.times - time).abs() < SAME_TIME)
-    found: list[int] = near.nonzero()[:, 0].tolist()
-    return found
+    away = (views.times - time).abs().where(views.view == numbers[view], torch.inf)
+    nearest = away.min()
+    found: list[int] = (away == nearest).nonzero()[:, 0].tolist()
+    return found if nearest < SAME_TIME else []
 
 
 def _in_words(views: Views, index: int) -> str:
