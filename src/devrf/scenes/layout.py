@@ -251,10 +251,12 @@ def fewer(layout: Layout, train_views: int | None, frames: int | None) -> Layout
     if times is None:
         return replace(layout, dynamic_train=train)
 
+    known = distinct_times(train.used_times)
+
     def held_out(split: Split) -> Split:
-        thinned = at_times(split, times)
-        # Held-out times (D-NeRF's) need not be among the training times: then all stay.
-        return thinned if len(thinned.index) else split
+        # Most held-out times (D-NeRF's) need not be among the training times: then all stay.
+        among = len(at_times(split, known).index) > len(split.index) / 2
+        return at_times(split, times) if among else split
 
     return replace(
         layout,

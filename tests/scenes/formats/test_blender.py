@@ -189,6 +189,23 @@ def test_frames_keeps_the_first_and_the_last_time(scene_folder, caplog):
     assert len(BlenderReader(scene_folder.root, frames=3).read().dynamic.train) == 6
 
 
+def test_fewer_frames_leave_held_out_images_of_times_of_their_own(single_folder, scene_folder):
+    """First and last time alone are among those learned from: two images of four were scored."""
+
+    def from_first_to_last(content: dict[str, Any]) -> None:
+        for frame, time in zip(content["frames"], (0.0, 0.4, 1.0), strict=True):
+            frame["time"] = time
+        content["frames"].insert(
+            2, content["frames"][1] | {"file_path": "./test/r_003", "time": 0.6}
+        )
+
+    shutil.copy(single_folder / "test/r_001.png", single_folder / "test/r_003.png")
+    scene_folder.edit(single_folder / "transforms_test.json", from_first_to_last)
+    dynamic = BlenderReader(single_folder, frames=4).read().dynamic
+    assert len(dynamic.train) == 4
+    assert dynamic.test.times.tolist() == pytest.approx([0.0, 0.4, 0.6, 1.0])
+
+
 def test_flow_belongs_to_the_place_in_the_file(scene_folder):
     folder = scene_folder.dynamic / "train_flow"
     folder.mkdir()
