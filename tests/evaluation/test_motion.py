@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
+import imageio.v3 as iio
+import numpy as np
 import pytest
 import torch
 from torch.nn.functional import interpolate, max_pool2d
@@ -121,6 +123,10 @@ def test_without_exact_motion_masks_are_given_or_are_what_flow_moves(tmp_path, r
     masked, rule = with_motion_masks(views, "white", tmp_path)
     assert masked.motion_mask.flatten(1).float().mean(dim=1).tolist() == [0, 1, 0, 0]
     assert rule == f"given: {tmp_path}"
+    for file in tmp_path.iterdir():  # as labels
+        iio.imwrite(file, (iio.imread(file) > 127).astype(np.uint8))
+    labelled, _ = with_motion_masks(views, "white", tmp_path)
+    assert torch.equal(labelled.motion_mask, masked.motion_mask) and masked.motion_mask.any()
     (tmp_path / picture_name(views, 2)).unlink()
     with pytest.raises(DevrfError, match=r"has no picture of 2\.png"):
         with_motion_masks(views, "white", tmp_path)

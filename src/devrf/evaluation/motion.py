@@ -16,6 +16,7 @@ from devrf.evaluation.predictions import pictures_in
 from devrf.geometry.motion import MOVED, radius
 from devrf.rendering.renderer import Renderer
 from devrf.rendering.tracks import shown_points, track
+from devrf.scenes.masks import HALF, WHITE, white_in
 from devrf.scenes.optical_flow import ALPHA_THRESHOLD, estimator
 from devrf.scenes.scene import Background, Capture, Views
 from devrf.system.progress import followed
@@ -45,14 +46,17 @@ def with_motion_masks(
     ones that the views have, else those of :func:`shifted` pixels. None: no rule gives any.
 
     Raises:
-        DevrfError: a mask is missing in the folder ``given``, or of another size than its image.
+        DevrfError: a mask is missing in the folder ``given``, of another size than its image, or
+            one of labels other than 0 and 1.
     """
     if given is not None:
         mask = torch.zeros_like(views.pixels[..., 0], dtype=torch.bool)
         picture = pictures_in(Path(given), views)
-        for image in range(len(views)):
-            white = torch.tensor(picture(image)[..., 0]) > 127
-            mask[image, : white.shape[0], : white.shape[1]] = white
+        masks = [picture(image)[..., 0].copy() for image in range(len(views))]
+        labels = white_in(masks, given) < WHITE
+        for image, grey in enumerate(masks):
+            height, width = grey.shape
+            mask[image, :height, :width] = torch.from_numpy(grey) > (0 if labels else HALF)
         return replace(views, motion_mask=mask), f"given: {Path(given).resolve()}"
     if views.motion_mask is not None:
         return views, "exact"
