@@ -56,8 +56,9 @@ class SceneReader(Options, ABC):
         factor: the factor by which images were made smaller, set when they are read.
         has_flow_files: whether the layout may have flow files.
         background: the colour behind the alpha masks of RGBA images; RGB images stay as they are.
-        flow: ``auto`` reads files of backward flow if the scene has them, ``files`` requires them,
-            ``dis`` and ``raft`` estimate flow, ``none`` does without it.
+        flow: ``dis`` and ``raft`` estimate flow, ``none`` does without it; of layouts with flow
+            files ``auto`` reads those of backward flow if the scene has them, ``files`` requires
+            them.
         flow_cache: an ``.npz`` file for estimated flow; None: flow is estimated every time.
         exposure: whether the images of one moving camera get one exposure: ``auto``: if it changes
             by more than a seventh; ``equal``: always; ``none``: never.
@@ -75,7 +76,7 @@ class SceneReader(Options, ABC):
     name: str | None = None
     downscale: Downscale = "auto"
     background: Background = "white"
-    flow: FlowSource = "auto"
+    flow: EstimatedFlow = "auto"
     flow_cache: Path | None = None
     exposure: Exposure = "auto"
     frames: Several | None = None

@@ -14,7 +14,7 @@ from devrf.scenes.files import existing_folder
 from devrf.scenes.flow_files import FlowDirection, stacked_flow
 from devrf.scenes.image_folders import Downscale
 from devrf.scenes.layout import Layout, Pair, one_capture, static_alone, two_captures
-from devrf.scenes.reader import InwardReader, Time
+from devrf.scenes.reader import FlowSource, InwardReader, Time
 from devrf.scenes.scene import OpticalFlow, Views
 from devrf.scenes.splits import (
     Split,
@@ -57,6 +57,7 @@ class BlenderReader(InwardReader):
 
     has_flow_files: ClassVar[bool] = True
 
+    flow: FlowSource = "auto"  # type: ignore[assignment]
     downscale: Downscale = 1
     dynamic: str | None = None
     static_until: Time = 1.0

@@ -14,7 +14,7 @@ from devrf.scenes.image_folders import ImageFolder, image_folder
 from devrf.scenes.images import SUFFIXES
 from devrf.scenes.layout import Layout, static_alone
 from devrf.scenes.names import ImageFinder, present_images
-from devrf.scenes.reader import EstimatedFlow, FixedViewsReader, PosedReader
+from devrf.scenes.reader import FixedViewsReader, PosedReader
 from devrf.scenes.scene import Capture
 from devrf.scenes.sparse_model import Facing, SparseModel, normalised, scene_model
 from devrf.scenes.splits import parted
@@ -128,8 +128,6 @@ class ColmapReader(PosedReader, FixedViewsReader):
     """
 
     stater: ClassVar[str] = "the sparse model"
-
-    flow: EstimatedFlow = "auto"
 
     def layout(self, folder: Path) -> Layout:
         """See :meth:`devrf.scenes.reader.LayoutReader.layout`."""

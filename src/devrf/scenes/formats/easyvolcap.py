@@ -24,7 +24,7 @@ from devrf.scenes.image_folders import shot_together
 from devrf.scenes.layout import Layout, with_static_times
 from devrf.scenes.lens import Intrinsics
 from devrf.scenes.names import ImageFinder
-from devrf.scenes.reader import EstimatedFlow, InwardReader
+from devrf.scenes.reader import InwardReader
 from devrf.scenes.transforms import Shot, posed_images
 from devrf.scenes.validation import LARGEST, scene_error
 from devrf.scenes.view_folders import held_out_view
@@ -49,7 +49,6 @@ class EasyVolcapReader(InwardReader):
             masks are not read.
     """
 
-    flow: EstimatedFlow = "auto"
     test_view: Annotated[int, Field(strict=True)] = -1
     masks: Literal["alpha", "none"] = "alpha"
 

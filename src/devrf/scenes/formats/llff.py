@@ -24,7 +24,7 @@ from devrf.scenes.formats.llff_world import in_static_world
 from devrf.scenes.image_folders import ImageFolder, folder_size, image_folder, listed_images
 from devrf.scenes.layout import Layout, static_alone, without_static_set
 from devrf.scenes.names import in_order
-from devrf.scenes.reader import FixedViewsReader, Time
+from devrf.scenes.reader import FixedViewsReader, FlowSource, Time
 from devrf.scenes.scene import Capture, OpticalFlow, Scene, Views
 from devrf.scenes.space import forward_facing_scene
 from devrf.scenes.splits import Split, at_times, evenly_spread, every_nth, in_motion, parted
@@ -63,6 +63,7 @@ class LlffReader(FixedViewsReader):
 
     has_flow_files: ClassVar[bool] = True
 
+    flow: FlowSource = "auto"  # type: ignore[assignment]
     near: Positive | None = None
     monocular: bool | None = None
     static_until: Time = 1.0

@@ -31,7 +31,7 @@ from devrf.scenes.image_folders import ImageFolder, folder_size, image_folder
 from devrf.scenes.layout import Layout, one_capture
 from devrf.scenes.lens import Intrinsics
 from devrf.scenes.names import ImageFinder, present_images
-from devrf.scenes.reader import EstimatedFlow, InwardReader, Time
+from devrf.scenes.reader import InwardReader, Time
 from devrf.scenes.scene import Capture, Scene
 from devrf.scenes.splits import parted
 from devrf.scenes.transforms import SceneBounds, Transforms
@@ -131,7 +131,6 @@ class ItemsReader(InwardReader):
 
     listing: ClassVar[str]
 
-    flow: EstimatedFlow = "auto"
     holdout: Several = 8
     static_until: Time = 1.0
 

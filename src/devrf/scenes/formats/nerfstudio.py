@@ -17,7 +17,7 @@ from devrf.scenes.layout import (
     with_static_times,
 )
 from devrf.scenes.masks import Masks
-from devrf.scenes.reader import EstimatedFlow, PosedReader, Time
+from devrf.scenes.reader import PosedReader, Time
 from devrf.scenes.splits import parted
 from devrf.scenes.transforms import Transforms, TransformsFiles
 from devrf.scenes.validation import scene_error
@@ -55,7 +55,6 @@ class NerfstudioReader(PosedReader):
 
     stater: ClassVar[str] = f"scene_bounds in {FILE}"
 
-    flow: EstimatedFlow = "auto"
     holdout: Several = 8
     times: Literal["file", "order"] = "file"
     static_until: Time | None = None

@@ -22,7 +22,7 @@ from devrf.scenes.footage import VIDEOS, FootageHeader, Size, footage_header, fr
 from devrf.scenes.formats.llff_poses import PosedSet, read_static_poses
 from devrf.scenes.images import in_threads
 from devrf.scenes.names import in_order
-from devrf.scenes.reader import EstimatedFlow, SceneReader
+from devrf.scenes.reader import SceneReader
 from devrf.scenes.resampling import shrink_pixels
 from devrf.scenes.scene import Capture, Scene, Views
 from devrf.scenes.space import earliest, forward_facing_scene
@@ -153,7 +153,6 @@ class Neural3DVideoReader(SceneReader):
         train_views: train on the first so many of the cameras that are not held out; None: all.
     """
 
-    flow: EstimatedFlow = "auto"
     test_view: Whole = 0
     near: Positive = 1.0
     train_views: Count | None = None

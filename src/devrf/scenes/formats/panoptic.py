@@ -14,7 +14,7 @@ from devrf.scenes.files import MOST_IMAGES, Name, Positive, Vector3, Vector4, re
 from devrf.scenes.layout import Layout, with_static_times
 from devrf.scenes.lens import Intrinsics
 from devrf.scenes.names import ImageFinder
-from devrf.scenes.reader import EstimatedFlow, InwardReader
+from devrf.scenes.reader import InwardReader
 from devrf.scenes.transforms import Shot, Transforms, posed_images
 from devrf.scenes.validation import scene_error
 
@@ -58,7 +58,6 @@ class PanopticReader(InwardReader):
             ``seg/`` is background.
     """
 
-    flow: EstimatedFlow = "auto"
     masks: Literal["none", "alpha"] = "none"
 
     def layout(self, folder: Path) -> Layout:
