@@ -34,9 +34,9 @@ from torch.profiler import profile
 
 from devrf import selfcheck
 from devrf.cli.context import RunContext
-from devrf.evaluation.held_out import background_value
 from devrf.kernels.trilinear import interpolate
 from devrf.rendering.renderer import Renderer
+from devrf.scenes.scene import background_value
 from devrf.system.device import wait
 from devrf.system.files import write_json
 

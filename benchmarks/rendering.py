@@ -25,9 +25,8 @@ from devrf.apps.camera_paths import upward
 from devrf.apps.keyframes import Keyframe
 from devrf.apps.viewer.drawing import Drawing, Shot
 from devrf.cli.messages import report_user_errors
-from devrf.evaluation.held_out import background_value
 from devrf.rendering.renderer import Renderer
-from devrf.scenes.scene import Views
+from devrf.scenes.scene import Views, background_value
 
 # Frames of a viewer: so many, of so many rows; the degrees that its camera turns between two.
 VIEWED = 20

@@ -28,7 +28,6 @@ from devrf.checkpoints.progress import progress_files
 from devrf.data.rendered import ProceduralDataModule
 from devrf.engine.stage import Stage
 from devrf.errors import DevrfError
-from devrf.evaluation.held_out import background_value
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
@@ -38,6 +37,7 @@ from devrf.methods.devrf.extensions.tracks import StartAlongFlow
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import Sampling, VisitSettings
 from devrf.rendering.renderer import Renderer
+from devrf.scenes.scene import background_value
 
 log = logging.getLogger(__name__)
 

@@ -12,13 +12,13 @@ from rich.console import Group, RenderableType
 from torch import Tensor
 
 from devrf.apps.inspection.report import titled_table
-from devrf.evaluation.held_out import background_value, score
+from devrf.evaluation.held_out import score
 from devrf.metrics.image import psnr
 from devrf.pictures.images import evenly
 from devrf.rendering.renderable import Renderable
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.reduced import reduced
-from devrf.scenes.scene import Capture, CaptureName, Scene
+from devrf.scenes.scene import Capture, CaptureName, Scene, background_value
 
 # A rehearsal's images have at most so many pixels a side, and so many of a set are looked at.
 LONGEST = 64

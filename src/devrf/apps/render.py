@@ -34,11 +34,10 @@ from devrf.apps.video import (
 )
 from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError
-from devrf.evaluation.held_out import background_value
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.offset import NO_OFFSET, Offset
 from devrf.rendering.renderer import Renderer
-from devrf.scenes.scene import Views
+from devrf.scenes.scene import Views, background_value
 
 log = logging.getLogger(__name__)
 

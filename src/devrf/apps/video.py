@@ -14,11 +14,11 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from devrf.apps.still import DEPTH, MAX_ROWS, READABLE, still
-from devrf.evaluation.held_out import background_value, truth_image
+from devrf.evaluation.held_out import truth_image
 from devrf.geometry.cameras import Cameras
 from devrf.pictures.images import centred, image_grid, scaled
 from devrf.rendering.renderer import Renderer
-from devrf.scenes.scene import Background, Views
+from devrf.scenes.scene import Background, Views, background_value
 from devrf.system.options import Options, Positive, Share
 
 # Cameras, a time in [0, 1], a grey level behind, and the number of a camera → colour and depth as

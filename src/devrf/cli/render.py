@@ -25,7 +25,6 @@ from devrf.cli.restore_config import root
 from devrf.cli.resume import unfinished
 from devrf.cli.view import serve
 from devrf.errors import DevrfError
-from devrf.evaluation.held_out import background_value
 from devrf.evaluation.predictions import picture_name
 from devrf.pictures.images import write_image
 from devrf.pictures.video_file import write_pictures
@@ -33,7 +32,7 @@ from devrf.rendering.renderable import Renderable
 from devrf.rendering.renderer import Renderer
 from devrf.rendering.seen_points import scene_radius
 from devrf.rendering.tracks import moving_pixels
-from devrf.scenes.scene import Scene
+from devrf.scenes.scene import Scene, background_value
 from devrf.system.files import refuse_links, write_text
 from devrf.system.memory import free_cache
 from devrf.system.progress import followed

@@ -11,7 +11,7 @@ from torch import Tensor
 from devrf.geometry.box import constant
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.rays import Rays
-from devrf.scenes.scene import Views
+from devrf.scenes.scene import Background, Views, background_value, on_background
 
 
 @dataclass(frozen=True)
@@ -237,11 +237,8 @@ def gather_image(
     """
     view = views.single(image)
     first, last = rows
-    pixels = view.pixels[0, first:last].float() / 255
-    color, alpha = pixels[..., :3], pixels[..., 3:]
-    if view.has_alpha:
-        color = background + alpha * (color - background)
-    planes = [color, alpha]
+    pixels = view.pixels[0, first:last]
+    planes = [on_background(pixels, background), pixels[..., 3:].float() / 255]
     if view.valid_mask is not None:
         planes.append(view.valid_mask[0, first:last, :, None].float())
     means = torch.cat(planes, dim=2).permute(2, 0, 1)
@@ -271,7 +268,7 @@ def gather_image(
 class BackgroundColor:
     """Colours that images are composited on while a stage learns."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: Background) -> None:
         """``name``: ``white``, ``black`` or ``random``."""
         self.name = name
 
@@ -283,8 +280,7 @@ class BackgroundColor:
         device = generator.device
         if self.name == "random":
             return torch.rand(len(image), 3, device=device, generator=generator)
-        value = 0.0 if self.name == "black" else 1.0
-        return constant((value,) * 3, torch.float32, image.device)
+        return constant((background_value(self.name),) * 3, torch.float32, image.device)
 
 
 def concatenated(batches: Sequence[RayBatch]) -> RayBatch:

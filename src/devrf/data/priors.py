@@ -7,9 +7,8 @@ from typing import Literal
 
 import torch
 
-from devrf.data.batch import BackgroundColor
 from devrf.scenes.bounds import FALLBACK_BOUND_SCALE
-from devrf.scenes.scene import Background, Scene, Views
+from devrf.scenes.scene import Background, Scene, Views, background_value, on_background
 
 Priors = Literal["all", "none"]
 
@@ -33,7 +32,6 @@ def _bare(views: Views, background: Background) -> Views:
     """Images (N, H, W, 3) on the background, with cameras and times."""
     pixels = views.pixels
     if views.has_alpha:
-        behind = 255 * BackgroundColor(background)(pixels, torch.Generator())
-        opacity = pixels[..., 3:].float() / 255
-        pixels = (behind + opacity * (pixels[..., :3] - behind)).round().to(torch.uint8)
+        color = on_background(pixels, background_value(background))
+        pixels = (255 * color).round().to(torch.uint8)
     return replace(views, pixels=pixels, flow=None, forward_flow=None, depth=None)

@@ -11,7 +11,7 @@ from devrf.evaluation.suite import MetricInput, MetricSuite
 from devrf.metrics.image import psnr, psnr_masked, ssim, ssim_masked, ssim_within
 from devrf.rendering.output import RenderedImage
 from devrf.rendering.renderer import Renderer, points_at_depth
-from devrf.scenes.scene import Background, Views
+from devrf.scenes.scene import Background, Views, background_value, on_background
 
 
 @dataclass(frozen=True)
@@ -179,19 +179,6 @@ def truth_image(views: Views, index: int, background: Background) -> Tensor:
     A random background is white here.
     """
     return on_background(views.single(index).pixels[0], background_value(background))
-
-
-def on_background(pixels: Tensor, behind: float) -> Tensor:
-    """Pixels (..., 3 or 4) uint8 as RGB (..., 3) in [0, 1], those with alpha on a grey level."""
-    value = pixels.float() / 255
-    if value.shape[-1] == 3:
-        return value
-    return behind + value[..., 3:] * (value[..., :3] - behind)
-
-
-def background_value(background: Background) -> float:
-    """The grey level in [0, 1] behind held-out views."""
-    return 0.0 if background == "black" else 1.0
 
 
 def _color(image: RenderedImage, shape: tuple[int, int]) -> Tensor:

@@ -11,14 +11,14 @@ from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d
 
 from devrf.data.flow import previous_images
-from devrf.evaluation.held_out import HeldOutView, background_value, on_background
+from devrf.evaluation.held_out import HeldOutView
 from devrf.evaluation.predictions import pictures_in
 from devrf.geometry.motion import MOVED, radius
 from devrf.rendering.renderer import Renderer
 from devrf.rendering.tracks import shown_points, track
 from devrf.scenes.masks import HALF, WHITE, white_in
 from devrf.scenes.optical_flow import ALPHA_THRESHOLD, estimator
-from devrf.scenes.scene import Background, Capture, Views
+from devrf.scenes.scene import Background, Capture, Views, background_value, on_background
 from devrf.system.progress import followed
 
 # An image is compared with so many of its camera's, evenly spread over time.

@@ -27,12 +27,12 @@ from pydantic import BaseModel, Field
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from devrf.evaluation.held_out import background_value, on_background, truth_image
+from devrf.evaluation.held_out import truth_image
 from devrf.scenes.files import MOST_IMAGES, Name, Number, inside, read_json
 from devrf.scenes.footage import VIDEOS, Picture, footage_header, frames_at
 from devrf.scenes.image_folders import listed_images
 from devrf.scenes.images import decode, read_header
-from devrf.scenes.scene import Background, Views
+from devrf.scenes.scene import Background, Views, background_value, on_background
 from devrf.scenes.validation import scene_error
 from devrf.system.options import abbreviated
 

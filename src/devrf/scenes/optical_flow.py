@@ -19,7 +19,7 @@ from torch.nn.functional import pad
 from devrf.geometry.clock import FrameClock
 from devrf.scenes.flow_files import content_key, load_flow, save_flow
 from devrf.scenes.resampling import area_average
-from devrf.scenes.scene import OpticalFlow, Views
+from devrf.scenes.scene import OpticalFlow, Views, on_background
 from devrf.scenes.validation import scene_error
 
 log = logging.getLogger(__name__)
@@ -167,7 +167,8 @@ def flow_between(views: Views, image: int, other: int, between: Estimator) -> tu
     whole = [views.single(k).pixels[0] for k in (image, other)]
     height = min(pixels.shape[0] for pixels in whole)
     width = min(pixels.shape[1] for pixels in whole)
-    now, then = (_on_white(pixels[:height, :width]) for pixels in whole)
+    on_white = (on_background(pixels[:height, :width].cpu(), 1.0) for pixels in whole)
+    now, then = ((255 * color).round().to(torch.uint8) for color in on_white)
     there = between(now, then)
     back = between(then, now)
     valid = consistent(there, back)
@@ -211,12 +212,3 @@ def consistent(backward: Tensor, forward: Tensor) -> Tensor:
     length: Tensor = torch.linalg.vector_norm(backward, dim=-1)
     # NaN compares false: such vectors are not trusted.
     return inside & (miss < CLOSED_PIXELS + CLOSED_SHARE * length)
-
-
-def _on_white(image: Tensor) -> Tensor:
-    """(H, W, 3) uint8 on the CPU: an RGBA image over white; an RGB image as it is."""
-    image = image.cpu()
-    if image.shape[2] == 3:
-        return image
-    alpha = image[..., 3:].float() / 255
-    return (image[..., :3] * alpha + 255 * (1 - alpha)).round().to(torch.uint8)

@@ -22,6 +22,19 @@ CaptureName = Literal["static", "dynamic"]
 ImagesName = Literal["static", "dynamic", "at_rest"]
 
 
+def background_value(background: Background) -> float:
+    """The grey level in [0, 1] of a background; a random one is white where nothing is learned."""
+    return 0.0 if background == "black" else 1.0
+
+
+def on_background(pixels: Tensor, behind: float | Tensor) -> Tensor:
+    """Pixels (..., 3 or 4) uint8 as RGB (..., 3) in [0, 1], those with alpha on a colour."""
+    value = pixels.float() / 255
+    if value.shape[-1] == 3:
+        return value
+    return behind + value[..., 3:] * (value[..., :3] - behind)
+
+
 @dataclass(frozen=True)
 class OpticalFlow:
     """Optical flow of N images: backward, to one frame earlier in the same view.

@@ -37,13 +37,12 @@ from devrf.apps.web.pack import page
 from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.cli.render import FRAME
 from devrf.errors import DevrfError
-from devrf.evaluation.held_out import background_value
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.rendering.renderer import Renderer
-from devrf.scenes.scene import Scene
+from devrf.scenes.scene import Scene, background_value
 from devrf.system.printed import shown
 
 # The middle of a frustum that nothing covers.

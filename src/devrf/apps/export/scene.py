@@ -17,10 +17,10 @@ from devrf.apps.export.tracks import write_tracks
 from devrf.apps.export.usd import write_usd
 from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError
-from devrf.evaluation.held_out import background_value
 from devrf.rendering.renderable import Renderable
 from devrf.rendering.renderer import Renderer
 from devrf.rendering.seen_points import seen_points
+from devrf.scenes.scene import background_value
 from devrf.system.progress import followed
 
 log = logging.getLogger(__name__)

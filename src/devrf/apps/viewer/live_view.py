@@ -12,8 +12,8 @@ from devrf.apps.viewer.session import Session
 from devrf.callbacks.progress import in_one_line
 from devrf.engine.schedule import share_done
 from devrf.engine.stage import Stage
-from devrf.evaluation.held_out import background_value
 from devrf.rendering.renderer import Renderer
+from devrf.scenes.scene import background_value
 
 # Seconds between two pictures at least, however fast they are.
 PAUSE = 0.2

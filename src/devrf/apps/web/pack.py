@@ -43,7 +43,6 @@ from devrf.apps.camera_paths import upward
 from devrf.apps.captured_cameras import described, frustum_depth
 from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError
-from devrf.evaluation.held_out import background_value
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.contraction import ContractedSpace
 from devrf.geometry.ndc import NormalizedDevice
@@ -55,6 +54,7 @@ from devrf.ops.trilinear import shape_of
 from devrf.rendering.occupancy import Occupancy, dilate
 from devrf.rendering.renderable import Renderable
 from devrf.rendering.seen_points import scene_radius
+from devrf.scenes.scene import background_value
 from devrf.system.printed import shown
 
 # Displacements are rounded to this share of a cell, residual colours to this share of a logit:

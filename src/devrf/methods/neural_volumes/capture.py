@@ -6,9 +6,9 @@ import torch
 from torch import Tensor, nn
 
 from devrf.errors import DevrfError
-from devrf.evaluation.held_out import background_value, truth_image
+from devrf.evaluation.held_out import truth_image
 from devrf.methods.neural_volumes.settings import NeuralVolumesSettings
-from devrf.scenes.scene import Scene, Views
+from devrf.scenes.scene import Scene, Views, background_value
 
 
 def check_scene(scene: Scene) -> None:
