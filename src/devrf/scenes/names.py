@@ -10,7 +10,7 @@ import logging
 import os
 import re
 import unicodedata
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from decimal import Decimal
 from functools import cache
 from pathlib import Path
@@ -129,23 +129,14 @@ def _spelling(name: str) -> str:
 Missing = Literal["error", "skip"]
 
 
-def check_each_once(present: Mapping[int, Path], names: Sequence[str], file: Path) -> None:
-    """Refuse an image that ``file`` lists twice among ``names``: each takes memory anew.
-
-    ``present`` has the images that are there, by their positions in the list.
-    """
-    first = dict[Path, int]()
-    for k, image in present.items():
-        if first.setdefault(image, k) != k:
-            raise scene_error(file, f"lists {abbreviated(names[k])} twice; list each image once")
-
-
 def present_images(
     names: Sequence[str],
     file: Path,
     finder: ImageFinder,
     missing: Missing,
     relative_to: Path | None = None,
+    *,
+    once: bool = True,
 ) -> dict[int, Path]:
     """The existing images that ``file`` lists, by their positions in the list.
 
@@ -155,13 +146,18 @@ def present_images(
         finder: of the scene.
         missing: whether absent images are an error, or left out with one warning.
         relative_to: the folder that names are relative to; None: the file's.
+        once: whether an image may be listed only once, under whatever names.
 
     Raises:
-        DevrfError: an image is absent and must not be, or all are.
+        DevrfError: an image is absent and must not be, or all are; or one is listed twice.
     """
     root = finder.root
     listed = [inside(root, relative_to or file.parent, name, file) for name in names]
     present = {k: image for k, path in enumerate(listed) if (image := finder.find(path))}
+    first = dict[Path, int]()
+    for k, image in present.items():
+        if first.setdefault(image, k) != k and once:
+            raise scene_error(file, f"lists {abbreviated(names[k])} twice; list each image once")
     absent = [path for k, path in enumerate(listed) if k not in present]
     if absent and (missing == "error" or not present):
         add = "add them" if len(absent) > 1 else "correct its name or add it"

@@ -31,13 +31,7 @@ from devrf.scenes.files import (
 )
 from devrf.scenes.lens import CameraKeys, Intrinsics, frame_intrinsics, intrinsics_of
 from devrf.scenes.masks import Masks
-from devrf.scenes.names import (
-    ImageFinder,
-    Missing,
-    check_each_once,
-    in_order,
-    present_images,
-)
+from devrf.scenes.names import ImageFinder, Missing, in_order, present_images
 from devrf.scenes.validation import check_poses, scene_error
 
 TIME_TOLERANCE = 1e-6
@@ -200,7 +194,6 @@ def posed_images(
     root = finder.root
     names = [shot.image for shot in shots]
     present = present_images(names, file, finder, missing, relative_to=root)
-    check_each_once(present, names, file)
     kept = [shots[row] for row in present]
     poses = from_opencv(torch.stack([shot.world_to_camera for shot in kept]))
     check_poses(poses, lambda row: f"{file}: the camera of {kept[row].image}")
@@ -208,7 +201,7 @@ def posed_images(
     masks = None
     if all(shot.mask is not None for shot in kept):
         wanted = [str(shot.mask) for shot in kept]
-        found = present_images(wanted, file, finder, "error", relative_to=root)
+        found = present_images(wanted, file, finder, "error", relative_to=root, once=False)
         masks = tuple(found.values())
     return Transforms(
         file,
@@ -260,7 +253,6 @@ class TransformsFiles:
         check_poses(poses, lambda index: f"{file}: frames[{index}]: transform_matrix")
         names = [frame.file_path for frame in listing.frames]
         images = present_images(names, file, self._finder, self._missing)
-        check_each_once(images, names, file)
         every_pose, poses = poses, poses[[*images]]
         frames = [listing.frames[index] for index in images]
         where = [f"{file}: frames[{index}]" for index in images]

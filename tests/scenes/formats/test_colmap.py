@@ -63,6 +63,15 @@ def test_points_fall_on_the_pixels_that_show_them(folder, balls_are_where_they_p
         balls_are_where_they_project(views, balls)
 
 
+def test_one_image_has_one_pose(folder, ring_cameras, message_of):
+    """A name with another suffix means the file that is there, whose pose is another."""
+    ring = ring_cameras(COUNT, width=WIDTH, height=HEIGHT, angle=0.9)
+    names = [*NAMES[:-1], NAMES[0].replace(".png", ".jpg")]
+    shutil.rmtree(folder / "sparse")
+    write_sparse(folder / "sparse/0", ring, names, POINTS, "OPENCV", OPENCV)
+    assert "lists 'round/img_00.png' twice" in message_of(folder)
+
+
 def test_every_eighth_image_is_held_out_and_nothing_moves(folder, message_of):
     scene = ColmapReader(folder, downscale=1).read()
     assert [name[-6:-4] for name in scene.static.test.names] == ["00", "08", "16"]
