@@ -111,8 +111,8 @@ def footage_header(path: Path) -> FootageHeader:
 
 
 def frame_count(path: Path) -> int:
-    """The stated number of frames, at least 1: good enough for progress only."""
-    return max(1, footage_header(path).frames)
+    """The number of photographs; of a video, whose header may be wrong, at least 1."""
+    return len(listed_images(path)) if is_folder(path) else max(1, footage_header(path).frames)
 
 
 def pictures(path: Path) -> Iterator[tuple[float, Picture]]:

@@ -279,6 +279,7 @@ def test_masks_are_alpha_channels_and_labels_0_and_1_of_all_frames_together(mask
     folder = masks / "walk"
     for k in range(4):
         cv2.imwrite(str(folder / f"{k}.png"), np.dstack([0 * np.dstack([mask(k)] * 3), mask(k)]))
+    assert masks_of(masks, walk, 4) == folder
     shown = list(chosen_masks(folder, walk, [1, 3], SIZE))
     assert (shown[0] == mask(1)).all() and (shown[1] == mask(3)).all()
     for k in range(4):
