@@ -114,6 +114,13 @@ def test_one_moving_camera_gives_each_frame_a_time(capture, footage):
     assert scene.static.train is train  # there is no static set
 
 
+def test_cameras_are_found_again_if_the_scene_is_said_to_move(capture, footage, structure):
+    """Of a scene at rest what moves is not looked for."""
+    capture(static=footage[0], views=[], offsets=None, holdout=4)
+    assert capture(static=None, views=[footage[0]], offsets=None, holdout=4).moves
+    assert len(structure.calls) == 2
+
+
 def test_cameras_around_a_thing_share_a_contracted_world(capture):
     scene = capture()
     assert not scene.space.is_linear

@@ -226,7 +226,7 @@ def _model(
     into: Path, work: Path, moving: Chosen, fixed: Sequence[Chosen], settings: CaptureSettings
 ) -> SparseModel:
     first = {video.names[0]: video.path for video in fixed}
-    options = [settings.camera, settings.intrinsics, settings.matching]
+    options = [settings.camera, settings.intrinsics, settings.matching, settings.monocular]
     images = [
         [video.label, _stamp(video.path), video.positions, video.motion and _stamp(video.motion)]
         for video in (moving, *fixed)
