@@ -123,6 +123,16 @@ def test_frames_may_be_images_and_videos_have_any_suffix(folder):
     assert train.names[3:6] == ("cam02.MOV frame 1", "cam03 frame 1", "cam10.mp4 frame 1")
 
 
+def test_frames_of_another_number_than_the_others_are_warned_of(folder, caplog):
+    for name in ("cam00", "cam03"):
+        as_images(folder / f"{name}.mp4")
+    images = sorted((folder / "cam03").iterdir(), key=lambda path: -int(path.stem))
+    for path in images:
+        path.rename(path.with_stem(str(int(path.stem) + 1)))
+    Neural3DVideoReader(folder, downscale=1).read()
+    assert f"cam03/1.png is taken to show the moment of {folder}/cam00/0.png" in caplog.text
+
+
 def poses(folder: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
     np.save(folder / "poses_bounds.npy", change(np.load(folder / "poses_bounds.npy")))
 

@@ -18,8 +18,9 @@ import torch
 from torch import Tensor
 
 from devrf.scenes.files import Positive, entries, scene_folder
-from devrf.scenes.footage import VIDEOS, FootageHeader, Size, footage_header, frames_at
+from devrf.scenes.footage import VIDEOS, FootageHeader, Size, footage_header, frames_at, is_folder
 from devrf.scenes.formats.llff_poses import PosedSet, read_static_poses
+from devrf.scenes.image_folders import shot_together
 from devrf.scenes.images import in_threads
 from devrf.scenes.names import in_order
 from devrf.scenes.reader import SceneReader
@@ -90,6 +91,7 @@ def camera_videos(folder: Path) -> CameraVideos:
                 f"{_in_words(other)}, but {paths[0].relative_to(folder)} has {_in_words(header)}; "
                 "cut or convert it",
             )
+    shot_together([path for path in paths if is_folder(path)])  # warns of images of other numbers
     names = tuple(path.name for path in numbers)
     return CameraVideos(names, tuple(numbers.values()), tuple(paths), header)
 
