@@ -83,6 +83,55 @@ def test_what_is_typed_differs(devrf, run):
     assert outcome.err.startswith("devrf: data.widht: no such key; did you mean data.width")
 
 
+@pytest.mark.parametrize("stage", ["evaluate", "render", "still", "view", "export"])
+def test_what_would_have_to_be_learned_is_refused_where_nothing_learns(devrf, run, stage):
+    outcome = devrf(f"stage={stage}", "field.width=32", "hydra.run.dir=run")
+    assert (outcome.status, outcome.err.count("\n")) == (2, 1)
+    was = f"{run}/checkpoints/deformation.ckpt was made with 16, now it is 32"
+    assert outcome.err.startswith(f"devrf: field.width: {was}; stage={stage} learns nothing: ")
+
+
+@pytest.mark.parametrize(
+    ("typed", "key"),
+    [
+        ("sampling.rays_per_pixel=2", "sampling.rays_per_pixel"),
+        ("schedule.deformation.rays=32", "schedule.deformation.rays"),
+        ("schedule.seconds=60", "schedule.seconds"),
+        ("loss.deformation.flow=1", "loss.deformation.flow"),
+        ("data.flow=none", "data.flow"),
+        ("seed=1", "seed"),
+        ("method=dnerf", "method"),
+        ("experiment=cpu_small", "schedule.canonical."),
+    ],
+)
+def test_it_is_named_by_the_first_setting_that_differs(devrf, run, typed, key):
+    outcome = devrf("stage=still", typed, "hydra.run.dir=run")
+    assert outcome.status == 2 and outcome.err.startswith(f"devrf: {key}")
+    assert "was made with" in outcome.err
+
+
+@pytest.mark.parametrize(
+    "typed",
+    [
+        ["field.width=16", "seed=0", "facing=inward"],  # as it was learned
+        ["experiment=quickstart"],
+        ["priors=none", "data.supersample=1"],
+        ["+callbacks.mine=null", "trainer.max_steps=3", "kernels=torch", "logger=null"],
+    ],
+)
+def test_what_is_shown_may_differ(devrf, run, typed):
+    small = ("still.height=20", "hydra.run.dir=run")
+    outcome = devrf("stage=still", *typed, *small)
+    assert (outcome.status, outcome.err) == (0, "")
+
+
+def test_a_setting_that_was_not_typed_is_that_of_an_earlier_version(devrf, run, edited):
+    edited(lambda entry: entry["training_config"].update({"loss.deformation.flow": 7}))
+    small = ("still.height=20", "hydra.run.dir=run")
+    assert devrf("stage=still", "video.frames=2", *small).status == 0
+    assert devrf("stage=still", "loss.deformation.flow=7", *small).status == 0
+
+
 def test_what_is_made_of_a_checkpoint_goes_to_its_run(devrf, run, tmp_path):
     last, first = (run / "checkpoints" / f"{stage}.ckpt" for stage in ("deformation", "canonical"))
     assert devrf("stage=evaluate", f"ckpt={last}", "evaluation.metrics=[]").status == 0

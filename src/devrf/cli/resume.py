@@ -7,6 +7,8 @@ Each checkpoint holds the settings that decided its result:
 * either with other settings: the run is refused, naming the first that differs;
 * a deformation on top of another canonical field than the run's: it is learned anew.
 
+What only shows or scores a finished checkpoint refuses such settings, too, where they are typed.
+
 Settings of logging, scoring, rendering, the device, callbacks that only look, and the place of the
 data may differ.
 
@@ -32,6 +34,7 @@ from devrf.checkpoints.checkpoint import (
     GIVEN_REST,
     CheckpointMetadata,
     metadata_in,
+    metadata_of,
 )
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file, read_description
 from devrf.checkpoints.file_metadata import OWN_REST, digest_of
@@ -39,6 +42,7 @@ from devrf.checkpoints.progress import progress_files
 from devrf.cli.config import command_line, leaves, set_at, stage_section
 from devrf.cli.context import RunContext
 from devrf.cli.deciding_callbacks import deciding_callbacks
+from devrf.cli.restore_config import root
 from devrf.errors import DevrfError
 from devrf.system.files import LARGEST_RECORD, read_record, write_json
 from devrf.system.folder_lock import PLACE
@@ -52,6 +56,12 @@ NOTE = "done.json"  # in the folder of the lock
 NOTES = TypeAdapter(dict[str, str])
 # Settings of a datamodule or a stage that do not change the result.
 UNDECISIVE = {"root", "name", "flow_cache", "export", "store"}
+# Sections that say how to show or score what was learned, and with which images to compare it; the
+# last ones are no settings, but what a stage builds on.
+OF_WHAT_IS_SHOWN = {"data", "priors", "rehearse", "evaluation", "video", "callbacks"}
+OF_WHAT_IS_SHOWN |= {root(OWN_REST), root(GIVEN_REST)}
+# Settings of data that are of the learned room alone.
+OF_THE_ROOM = {f"data.{name}" for name in ("near", "far", "box", "bound_scale", "space", "flow")}
 
 
 @dataclass(frozen=True)
@@ -142,14 +152,41 @@ def _agrees(path: Path, metadata: CheckpointMetadata, training_config: Mapping[s
         log.info("%s: belongs to another canonical field; learned anew", path)
         return False
     key = next(k for k in [*training_config, *old] if old.get(k) != training_config.get(k))
-    before, now = (
-        json.dumps(settings[key])[:40] if key in settings else "nothing"
-        for settings in (old, training_config)
-    )
     raise DevrfError(
-        f"{key}: {path} was made with {before}, now it is {now}; give resume=false to begin "
+        f"{_made_otherwise(path, key, old, training_config)}; give resume=false to begin "
         "afresh (what is there is kept in previous-<n>/), or hydra.run.dir=FOLDER for another run"
     )
+
+
+def check_as_learned(run: RunContext) -> None:
+    """Check that nothing was typed that the run's checkpoint would have to be learned with.
+
+    Defaults that have changed since then are no mistake of the command.
+
+    Raises:
+        DevrfError: a typed setting, or one of a typed option, is another than it was learned with.
+    """
+    path = run.checkpoint()
+    metadata = metadata_of(path)
+    learned = {**metadata.earlier_configs, metadata.stage: metadata.training_config}
+    typed = {key for key, v in run.command.items() if metadata.command.get(key, ...) != v}
+    typed = {key for key in typed if root(key) not in OF_WHAT_IS_SHOWN or key in OF_THE_ROOM}
+    by_option = any(key[0] == "/" for key in typed)
+    for stage, before in learned.items():
+        now = deciding_settings(run.config, stage) if before else {}
+        for key in {**now, **before}:
+            asked = key in typed or (by_option and root(key) not in OF_WHAT_IS_SHOWN)
+            if asked and now.get(key) != before.get(key):
+                raise DevrfError(
+                    f"{_made_otherwise(path, key, before, now)}; stage={run.config.stage} learns "
+                    "nothing: leave it out, or learn another run with it (hydra.run.dir=FOLDER)"
+                )
+
+
+def _made_otherwise(path: Path, key: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """In which setting a file and the present command differ."""
+    old, new = (json.dumps(of[key])[:40] if key in of else "nothing" for of in (before, now))
+    return f"{key}: {path} was made with {old}, now it is {new}"
 
 
 def remove_progress(folder: Path, stage: str) -> None:
@@ -186,13 +223,13 @@ def note_done(run: RunContext, step: str) -> None:
 
 def _made_with(run: RunContext, step: str) -> str:
     """A digest of all that decides a step's results, and of their names."""
-    root = run.config.data.get("root")
+    data = run.config.data.get("root")
     keyframes = Path(str(run.config.video.path))
     is_path = keyframes.is_file() and keyframes.stat().st_size <= LARGEST_RECORD
     group, results = DECIDES[step]
     made = (
         *(digest_of(run.checkpoint()), devrf.__version__, sorted(run.config.get("logger") or ())),
-        *(_values(run.config, "data"), root and Path(root).resolve(), _values(run.config, group)),
+        *(_values(run.config, "data"), data and Path(data).resolve(), _values(run.config, group)),
         step == "evaluate" and run.datamodule.validation,
         step == "render" and is_path and keyframes.read_bytes(),
         sorted(path.name for path in run.folder.glob(results)),

@@ -35,7 +35,7 @@ from devrf.cli.preparation import capture, fetch, inspect, prepare, report, say_
 from devrf.cli.processes import connected, run_in_each, starts_processes
 from devrf.cli.rehearse import begin_anew, conclude
 from devrf.cli.render import export, render, still, view, write_scene_page
-from devrf.cli.resume import done, note_done, unfinished
+from devrf.cli.resume import check_as_learned, done, note_done, unfinished
 from devrf.cli.run_folder import archive_previous, working_in
 from devrf.cli.train import learn
 from devrf.engine.ddp import world_size
@@ -232,6 +232,9 @@ def _check(run: RunContext, learning: Names, steps: Names) -> None:
         raise DevrfError(f"ckpt: stage={config.stage} starts from nothing; give {instead}")
     if not learning and not set(SCENELESS_STAGES).isdisjoint(steps):
         return
+    scores_pictures = "evaluate" in steps and config.evaluation.predictions is not None
+    if not scores_pictures and not {*OF_A_CHECKPOINT}.isdisjoint(() if learning else steps):
+        check_as_learned(run)
     _ = run.datamodule
     instantiate(config.get("logger"), _convert_="all")  # which writes nothing
     for name in run.learning_stages:
@@ -239,7 +242,7 @@ def _check(run: RunContext, learning: Names, steps: Names) -> None:
     if learning or "evaluate" in steps:
         run.evaluation.check()
         check_objective(config.objective, run.evaluation.metrics)
-    if "evaluate" in steps and config.evaluation.predictions is not None:
+    if scores_pictures:
         if learning:
             raise DevrfError(
                 f"evaluation.predictions: stage={config.stage} scores what it learns; score "
