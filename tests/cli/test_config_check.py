@@ -95,7 +95,7 @@ def test_a_key_whose_only_reader_is_left_out_is_refused(composed):
     ("changes", "message"),
     [
         ({"outer__root": "???"}, "outer.root: required; give outer.root=PATH"),
-        ({"outer__weights": [1, "???"]}, "outer.weights.1: required; give "),
+        ({"outer__weights": [1, "???"]}, "outer.weights[1]: required; give "),
         ({"outer__rot": 1}, "outer.rot: no such key; did you mean outer.root?"),
         ({"sizes__inner__siez": 1}, "did you mean sizes.inner.size?"),
         ({"sizes__innr": {"size": 3}}, "sizes.innr.size: no part reads it; leave it out"),

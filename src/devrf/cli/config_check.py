@@ -80,7 +80,7 @@ def check_config(config: DictConfig) -> None:
     from devrf.system.options import expectation
 
     raw: Any = OmegaConf.to_container(config)
-    for key in sorted(_missing(raw)):
+    for key in sorted(OmegaConf.missing_keys(config)):
         value = "PATH" if key.endswith("root") else "VALUE"
         raise DevrfError(f"{key}: required; give {key}={value}")
     resolved: Any = OmegaConf.to_container(config, resolve=True)
@@ -156,15 +156,6 @@ def _section(hints: tuple[tuple[str, Any], ...]) -> TypeAdapter[Any]:
     kind = cast(Any, TypedDict)("Section", dict(hints), total=False)
     kind.__pydantic_config__ = {"extra": "forbid", "arbitrary_types_allowed": True}
     return TypeAdapter(kind)
-
-
-def _missing(node: Any, key: str = "") -> Iterator[str]:
-    """The keys of values that are still to be given."""
-    if node == "???":
-        yield key
-    rows = enumerate(node) if isinstance(node, list) else ()
-    for name, below in node.items() if isinstance(node, Mapping) else rows:
-        yield from _missing(below, f"{key}.{name}".lstrip("."))
 
 
 def _walk(node: Node, names: Names = (), inside: bool = False) -> Iterator[tuple[Names, Any]]:
