@@ -37,25 +37,11 @@ def report_user_errors() -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        if FULL_ERRORS or not is_user_error(error):
+        line = one_line(error)
+        if FULL_ERRORS or line is None:
             raise
-        print(f"devrf: {one_line(error)}", file=sys.stderr)
+        print(f"devrf: {line}", file=sys.stderr)
         raise SystemExit(2) from None
-
-
-def is_user_error(error: BaseException) -> bool:
-    """Whether the user can correct it: input, config, a missing extra, or a disk that refuses."""
-    cause = _cause(error)
-    if isinstance(cause, DevrfError):
-        return True
-    if isinstance(cause, ModuleNotFoundError) and cause.name in EXTRAS:
-        return True
-    if isinstance(error, OSError) and not isinstance(error, HydraException):
-        return error.errno in REFUSED
-    # Another error in a constructor of devrf is a fault of the program.
-    ours = "Error in call to target 'devrf." in str(error)
-    by_library = isinstance(error, HydraException | OmegaConfBaseException)
-    return (by_library and not ours) or _of_hydras_options(error)
 
 
 def _of_hydras_options(error: BaseException) -> bool:
@@ -74,15 +60,27 @@ def _cause(error: BaseException) -> BaseException:
     return first if isinstance(first, DevrfError) else cause if built else error
 
 
-def one_line(error: BaseException) -> str:
-    """The error's message on one line that begins with the key or file at fault."""
+def one_line(error: BaseException) -> str | None:
+    """What is wrong with input, config, installed extras or disk, beginning with the key or file.
+
+    None: the user cannot correct it.
+    """
     cause = _cause(error)
     text = str(cause)
+    # Another error in a constructor of devrf is a fault of the program.
+    ours = "Error in call to target 'devrf." in str(error)
+    by_library = isinstance(error, HydraException | OmegaConfBaseException)
     if isinstance(cause, DevrfError):
         pass
     elif isinstance(cause, ModuleNotFoundError) and cause.name in EXTRAS:
         extra = EXTRAS[cause.name]
         text = f'{cause.name} is not installed; run pip install "devrf[{extra}]"'
+    elif isinstance(error, OSError) and not by_library:
+        if error.errno not in REFUSED:
+            return None
+        text = f"{error.filename or 'output'}: {error.strerror}"
+    elif ours or not (by_library or _of_hydras_options(error)):
+        return None
     elif isinstance(error, MissingConfigException) and "/" in str(error.missing_cfg_file):
         group, _, option = str(error.missing_cfg_file).rpartition("/")
         of_hydra = group.startswith("hydra/")
@@ -94,8 +92,6 @@ def one_line(error: BaseException) -> str:
         text = f"{group}={option}: no such option{names}{more}{meant}"
     elif isinstance(error, OverrideParseException):
         text = _not_understood(str(error.override))
-    elif isinstance(error, OSError) and not isinstance(error, HydraException):
-        text = f"{error.filename or 'output'}: {error.strerror}"
     elif isinstance(error.__cause__, ConfigKeyError | ConfigAttributeError):
         # OmegaConf keeps the mapping that does not have the key.
         root = error.__cause__.parent_node._get_root()

@@ -20,7 +20,7 @@ from torch.distributed.elastic.multiprocessing.api import SignalException
 from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
 
 from devrf.cli.config import in_sweep, own_folders
-from devrf.cli.messages import FULL_ERRORS, is_user_error
+from devrf.cli.messages import FULL_ERRORS, one_line
 from devrf.engine.ddp import ManualDDP
 from devrf.errors import DevrfError
 from devrf.system.folder_lock import release_folder
@@ -53,7 +53,7 @@ def connected(strategy: Strategy) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        if not is_user_error(error):
+        if one_line(error) is None:
             # If another has failed, this one notices a broken connection: the launcher will end it.
             time.sleep(GRACE)
         raise

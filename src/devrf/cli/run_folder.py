@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf, read_write
 from omegaconf.errors import OmegaConfBaseException
 
 from devrf.cli.config import SWEEP_RECORD, in_sweep
-from devrf.cli.messages import is_user_error, report_user_errors
+from devrf.cli.messages import one_line, report_user_errors
 from devrf.errors import DevrfError
 from devrf.system.files import (
     PARTIAL,
@@ -129,7 +129,7 @@ def working_in(folder: Path, config: DictConfig) -> Iterator[None]:
         yield
         (folder / FAILURE).unlink(missing_ok=True)
     except Exception as error:
-        if was_new and is_user_error(error):
+        if was_new and one_line(error) is not None:
             remove_if_only(folder, {*AT_FIRST, "run.log"})
         raise
     finally:

@@ -19,11 +19,12 @@ from omegaconf import DictConfig
 
 from devrf.cli.config import SWEEP_RECORD, choices, overrides, scene_name
 from devrf.cli.config_check import sets_only
-from devrf.cli.messages import is_user_error, one_line
+from devrf.cli.messages import one_line
 from devrf.cli.run_folder import FAILURE, FolderLock
 from devrf.errors import DevrfError
 from devrf.system.files import remove_if_only, walk, write_json
 from devrf.system.folder_lock import PLACE, release_folder
+from devrf.system.printed import shown
 from devrf.system.process import forget_peak_memory
 
 log = logging.getLogger(__name__)
@@ -45,9 +46,9 @@ def record_failure(config: DictConfig, folder: Path) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        message = one_line(error)
-        if not is_user_error(error):
-            message = f"{type(error).__name__}: {message}"
+        mistake = one_line(error)
+        message = mistake or shown(f"{type(error).__name__}: {' '.join(str(error).split())}")
+        if mistake is None:
             log.error("the job failed", exc_info=error)
         failure = {
             "scene": scene_name(config),
@@ -55,7 +56,7 @@ def record_failure(config: DictConfig, folder: Path) -> Iterator[None]:
             "overrides": overrides(),
             "seed": config.get("seed"),
             "error": message,
-            "mistake": is_user_error(error),
+            "mistake": mistake is not None,
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
         }
         write_json(folder / FAILURE, failure)
