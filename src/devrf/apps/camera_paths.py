@@ -147,16 +147,21 @@ def captured(cameras: Cameras, target: Tensor, settings: VideoSettings) -> Camer
     return _with_one_lens(cameras, _poses(_resampled(views, passed, frames)).float())
 
 
+def quaternions(rotations: Tensor) -> Tensor:
+    """Quaternions (N, 4) of rotations (N, 3, 3), each with the sign nearer to the one before."""
+    turns = rotation_matrix_to_quaternion(rotations.contiguous())
+    same = (turns[1:] * turns[:-1]).sum(dim=1, keepdim=True) >= 0
+    return torch.cat([turns[:1], turns[1:] * (2.0 * same - 1).cumprod(dim=0)])
+
+
 def _views(cameras: Cameras, target: Tensor) -> Tensor:
     """Poses of N cameras as (N, 8) numbers whose means are poses that show the same.
 
-    They are a quaternion, with the sign that is nearer to that of the camera before, the point
-    ahead of the camera where it is nearest to ``target`` (3,), and its distance. Between cameras
-    around a point, a mean is as far from it, where a mean of positions would cut the chord.
+    They are a quaternion, the point ahead of the camera where it is nearest to ``target`` (3,), and
+    its distance. Between cameras around a point, a mean is as far from it, where a mean of
+    positions would cut the chord.
     """
-    turns = rotation_matrix_to_quaternion(cameras.camera_to_world[:, :, :3].contiguous())
-    same = (turns[1:] * turns[:-1]).sum(dim=1, keepdim=True) >= 0
-    turns = torch.cat([turns[:1], turns[1:] * (2.0 * same - 1).cumprod(dim=0)])
+    turns = quaternions(cameras.camera_to_world[:, :, :3])
     ahead = ((target - cameras.positions) * cameras.forwards).sum(dim=1, keepdim=True).clamp(min=0)
     return torch.cat([turns, cameras.positions + ahead * cameras.forwards, ahead], dim=1).double()
 

@@ -11,14 +11,11 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
-from kornia.geometry.conversions import (
-    quaternion_to_rotation_matrix,
-    rotation_matrix_to_quaternion,
-)
+from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 from torch import Tensor
 
-from devrf.apps.camera_paths import NAMES
+from devrf.apps.camera_paths import NAMES, quaternions
 from devrf.apps.video import MAX_FRAMES, Rate
 from devrf.checkpoints.checkpoint import ASPECT
 from devrf.errors import DevrfError
@@ -87,12 +84,12 @@ class CameraPath:
         rows = [[frame.seconds, frame.fov, frame.time] for frame in self.keyframes]
         knots, fovs, times = torch.tensor(rows, dtype=torch.float64).T.contiguous()
         seconds = seconds.double().clamp(knots[0], knots[-1])
-        controls = torch.cat([poses[:, :, 3], fovs[:, None], _quaternions(poses[:, :, :3])], dim=1)
+        controls = torch.cat([poses[:, :, 3], fovs[:, None], quaternions(poses[:, :, :3])], dim=1)
         values = hermite(knots, controls, seconds)
         position = values[:, :3]
         fov = values[:, 3:4]
         wxyz = values[:, 4:]
-        rotation = quaternion_to_rotation_matrix(torch.nn.functional.normalize(wxyz, dim=1))
+        rotation = quaternion_to_rotation_matrix(wxyz)
         path = torch.cat([rotation, position[:, :, None]], dim=2).float()
         time = torch.from_numpy(np.interp(seconds, knots, times))[:, None]
         rows = torch.cat([fov.clamp(1, 179), time.clamp(0, 1), seconds[:, None]], dim=1).tolist()
@@ -152,14 +149,6 @@ def hermite(knots: Tensor, values: Tensor, at: Tensor) -> Tensor:
         + u**2 * (3 - 2 * u) * values[after]
         + u**2 * (u - 1) * step * slope[after]
     )
-
-
-def _quaternions(rotations: Tensor) -> Tensor:
-    """Quaternions (K, 4) of rotations, each with the sign that is nearer to the one before."""
-    wxyz = rotation_matrix_to_quaternion(rotations)
-    flips = (wxyz[1:] * wxyz[:-1]).sum(dim=1) < 0
-    signs = torch.where(flips, -1.0, 1.0).to(wxyz).cumprod(dim=0)
-    return torch.cat([wxyz[:1], wxyz[1:] * signs[:, None]])
 
 
 def _with_seconds(keyframes: Any) -> Any:
