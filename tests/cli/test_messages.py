@@ -170,7 +170,7 @@ def test_a_file_where_the_run_folder_should_be(devrf, tmp_path, tiny):
 
 @pytest.mark.parametrize(
     ("stage", "key", "folder"),
-    [("canonical", "hydra.run.dir", "/proc/run"), ("prepare", "prepare.into", "x" * 300)],
+    [("canonical", "hydra.run.dir", "y" * 300), ("prepare", "prepare.into", "x" * 300)],
 )
 def test_a_folder_that_cannot_be_made(devrf, tiny, stage, key, folder):
     outcome = devrf(*tiny, f"stage={stage}", f"{key}={folder}")

@@ -57,13 +57,6 @@ def test_what_the_system_refuses_is_named_by_the_file(tmp_path: Path) -> None:
     assert caught.value.filename == str(tmp_path / "missing")
 
 
-@pytest.mark.skipif(not Path("/proc/self").exists(), reason="the system has no /proc")
-def test_where_no_folder_can_be_made_is_no_missing_file() -> None:
-    with pytest.raises(PermissionError) as caught, atomic_write(Path("/proc/a/b/c.txt")):
-        pass
-    assert caught.value.filename == "/proc/a"
-
-
 def test_json_takes_the_place_of_what_was_there(tmp_path: Path) -> None:
     path = tmp_path / "metrics.json"
     path.write_text("{ damaged")

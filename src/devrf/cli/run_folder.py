@@ -23,7 +23,6 @@ from devrf.system.files import (
     PARTIAL,
     close_logs,
     holds_at_most,
-    make_folder,
     refuse_links,
     remove,
     remove_if_only,
@@ -76,7 +75,9 @@ class FolderLock(Callback):
             # A report's default folder is a name in the folder of the runs.
             named = config.stage == "report" and folder == Path(str(config.report.runs)) / "report"
             refuse_links(folder, itself=named)
-            make_folder(folder)  # as Hydra does next, with a traceback where it cannot
+            folder.mkdir(
+                parents=True, exist_ok=True
+            )  # as Hydra does next, with a traceback where it cannot
             if config.stage in UNRECORDED:
                 with read_write(config.hydra):
                     config.hydra.output_subdir = None

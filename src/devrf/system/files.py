@@ -55,19 +55,6 @@ def utf8_path(path: Path) -> Path:
     return path
 
 
-def make_folder(folder: Path) -> None:
-    """Make ``folder`` and those above it, unless they exist.
-
-    Raises:
-        OSError: naming the first folder that cannot be made; below ``/proc``, where the system says
-            that a file is missing, a PermissionError: a missing file is a fault of the program.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except FileNotFoundError as error:
-        raise PermissionError(errno.EACCES, "no folder can be made there", error.filename) from None
-
-
 def refuse_links(folder: Path, *, itself: bool = False) -> None:
     """Raise a DevrfError if files that are written to a folder would go elsewhere.
 
@@ -98,7 +85,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
     Raises:
         OSError: naming ``path``: it cannot be written.
     """
-    make_folder(path.parent)
+    path.parent.mkdir(parents=True, exist_ok=True)
     # The suffix stays last: writers choose the format by it.
     partial = path.with_name(PARTIAL + path.name)
     partial.unlink(missing_ok=True)  # it may be a link

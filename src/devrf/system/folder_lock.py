@@ -16,7 +16,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from devrf.errors import DevrfError
-from devrf.system.files import REFUSED, make_folder
+from devrf.system.files import REFUSED
 
 log = logging.getLogger(__name__)
 
@@ -40,7 +40,7 @@ def lock_folder(folder: Path, key: str) -> None:
     if folder.resolve() in _held:
         return
     lock_files = folder / PLACE
-    make_folder(lock_files)
+    lock_files.mkdir(parents=True, exist_ok=True)
     lock, owner = FileLock(lock_files / LOCK), lock_files / OWNER
     try:
         lock.acquire(timeout=0)

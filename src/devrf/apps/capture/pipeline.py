@@ -39,7 +39,6 @@ from devrf.scenes.splits import every_nth
 from devrf.scenes.transforms import SceneBounds
 from devrf.system.files import (
     UNREADABLE,
-    make_folder,
     read_record,
     refuse_links,
     write_json,
@@ -182,7 +181,7 @@ def _surveyed(path: Path, work: Path) -> Survey:
         raise DevrfError(f"{path}: no such video; correct capture.static or capture.views")
     # Before a folder is made: a first frame that cannot be read ends here.
     next(pictures(path))
-    make_folder(work)
+    work.mkdir(parents=True, exist_ok=True)
 
     def make() -> dict[str, Any]:
         frames = followed(pictures(path), frame_count(path), f"looking at {path.name}")
