@@ -157,9 +157,47 @@ def bursts():
 def test_the_offset_is_found_within_a_quarter_of_a_frame(surveyed):
     first = surveyed(bursts(), 30, 8, begin=1.5)
     second = surveyed(bursts(), 24, 7, begin=1.5 - 0.77)
-    seconds, correlation = offset_between(first, second)
-    assert seconds == pytest.approx(-0.77, abs=0.25 / 24)
-    assert correlation > 0.95
+    found = offset_between(first, second)
+    assert found.seconds == pytest.approx(-0.77, abs=0.25 / 24)
+    assert found.correlation > 0.95 and found.sureness > 8 and found.rival is None
+
+
+def test_one_smooth_gesture_does_not_tell_when_a_film_began(surveyed):
+    """Any two pieces of it that rise are alike: at wrong offsets they correlate by 0.99."""
+
+    def one_side(at):
+        return 1 + np.sin(1.5 * at)
+
+    def other_side(at):
+        return 2 + np.sin(1.2 * at + 0.3) + 0.3 * at
+
+    one = surveyed(one_side, 20, 2)
+    for other in (surveyed(other_side, 20, 2, begin=0.5), surveyed(other_side, 2, 1.5)):
+        with pytest.raises(DevrfError, match=r"^b\.mp4: what moves in it does not tell .* chance"):
+            timeline(PATHS, [one, other], 10)
+
+
+def test_motion_that_repeats_is_refused_with_both_offsets(surveyed):
+    def walk(at):
+        return 1 + np.sin(2 * np.pi * at)
+
+    one, other = surveyed(walk, 30, 8), surveyed(walk, 30, 8, begin=0.3)
+    with pytest.raises(DevrfError, match=r"repeats: it began \+0\.30 or [+-]\d\.[37]0 s after a"):
+        timeline(PATHS, [one, other], 10)
+
+
+def test_films_of_an_hour_are_aligned(surveyed):
+    generator = np.random.default_rng(1)
+    times = generator.uniform(0, 3600, 2000)
+
+    def motion(at):
+        return (
+            0.1 + (np.abs(at[:, None] - times[np.searchsorted(times, at) % 2000, None]) < 1)[:, 0]
+        )
+
+    times.sort()
+    found = offset_between(surveyed(motion, 25, 3600), surveyed(motion, 25, 3300, begin=123.4))
+    assert found.seconds == pytest.approx(123.4, abs=0.02)
 
 
 def test_times_are_those_of_the_slower_video_in_the_common_part(surveyed):

@@ -18,10 +18,17 @@ log = logging.getLogger(__name__)
 # Signals are compared in steps of a quarter of a frame, in windows of at least half the shorter.
 STEPS_A_FRAME = 4
 LEAST_OVERLAP = 0.5
-# Steps of 40 minutes at 100 frames a second: the time that comparing takes goes with their square.
-MOST_STEPS = 2**20
-# Correlation of two views of one motion is above this; of unrelated motion it is rarely.
-SURE = 0.5
+# Steps of almost three hours at 100 frames a second.
+MOST_STEPS = 2**22
+# So many standard deviations above chance is an offset. At its best of all lags unrelated motion
+# comes to 3.5 one time in twenty, and to 4 one time in a hundred.
+SURE = 4.0
+# Of fewer independent values nothing is concluded: all rising pieces of smooth motion are alike.
+LEAST_VALUES = 6
+# Another lag that is as sure as this share of the best may be the right one as well.
+RIVAL = 0.8
+# Added where a number must not be 0, or 1.
+TINY = 1e-9
 
 _BY_HAND = (
     "give capture.offsets=[0, seconds that each further video began after the first, ...], or "
@@ -115,39 +122,86 @@ def offsets_found(paths: Sequence[Path], surveys: Sequence[Survey]) -> list[floa
             )
     offsets = [0.0]
     for path, survey in zip(paths[1:], surveys[1:], strict=True):
-        offset, correlation = offset_between(surveys[0], survey)
-        log.info(
-            "%s: began %+.3f s after %s (correlation %.2f)", path, offset, paths[0], correlation
-        )
-        if correlation < SURE:
+        found = offset_between(surveys[0], survey)
+        if found.sureness < SURE:
             raise DevrfError(
-                f"{path}: what moves in it does not tell when it began (correlation with "
-                f"{paths[0]} {correlation:.2f}, expected {SURE} or more); {_BY_HAND}"
+                f"{path}: what moves in it does not tell when it began ({found.sureness:.1f} "
+                f"standard deviations above chance beside {paths[0]}, expected {SURE} or more); "
+                f"{_BY_HAND}"
             )
-        offsets.append(offset)
+        if found.rival is not None:
+            raise DevrfError(
+                f"{path}: what moves in it repeats: it began {found.seconds:+.2f} or "
+                f"{found.rival:+.2f} s after {paths[0]}; {_BY_HAND}"
+            )
+        log.info(
+            "%s: began %+.3f s after %s (correlation %.2f, %.1f standard deviations above chance)",
+            path,
+            found.seconds,
+            paths[0],
+            found.correlation,
+            found.sureness,
+        )
+        offsets.append(found.seconds)
     return offsets
 
 
-def offset_between(first: Survey, second: Survey) -> tuple[float, float]:
-    """Seconds that the second video began after the first, and the correlation there.
+@dataclass(frozen=True)
+class Offset:
+    """When a video began.
+
+    Attributes:
+        seconds: after the first.
+        correlation: of the motion in both, at that offset.
+        sureness: how far that is above chance, in standard deviations.
+        rival: seconds of another offset that is about as sure; None: there is none.
+    """
+
+    seconds: float
+    correlation: float
+    sureness: float
+    rival: float | None
+
+
+def offset_between(first: Survey, second: Survey) -> Offset:
+    """When the second video began, from the motion in both.
 
     The amounts of motion a second, sampled on one clock, are correlated at every lag at which
-    they overlap by half of the shorter; the peak is refined by a parabola. A square root keeps a
-    part that is large in one view from deciding alone.
+    they overlap by half of the shorter. Two smooth signals correlate by chance, the more the fewer
+    independent values overlap: of n samples of unrelated signals the variance of the correlation r
+    is Σ_k ρ_a(k) ρ_b(k) / n with their autocorrelations ρ (Bartlett 1935), so that atanh r has that
+    of n' − 3 independent values, n' = n / Σ_k ρ_a(k) ρ_b(k) (Fisher 1915). The lag that is farthest
+    above chance is taken, and refined by a parabola. A square root of the motion keeps a part that
+    is large in one view from deciding alone.
     """
     step = 1 / (STEPS_A_FRAME * max(first.rate, second.rate))
     a, a_start = _sampled(first, step)
     b, b_start = _sampled(second, step)
     min_overlap = max(2, int(LEAST_OVERLAP * min(len(a), len(b))))
     lags = np.arange(min_overlap - len(b), len(a) - min_overlap + 1)
-    values = np.array([_correlation(a, b, int(lag)) for lag in lags])
-    best = int(values.argmax())
-    lag = float(lags[best])
-    if 0 < best < len(values) - 1:
-        left, middle, right = values[best - 1 : best + 2]
+    correlations, overlaps = _correlations(a, b, lags)
+    independent = overlaps / _samples_a_value(a, b)
+    sureness = np.arctanh(correlations.clip(TINY - 1, 1 - TINY))
+    sureness *= np.where(independent < LEAST_VALUES, 0.0, np.sqrt((independent - 3).clip(min=0)))
+    best = int(sureness.argmax())
+    seconds = lags * step + a_start - b_start
+    # A peak ends where it is half as high.
+    low = np.flatnonzero(sureness[:best] < sureness[best] / 2)
+    high = np.flatnonzero(sureness[best:] < sureness[best] / 2)
+    elsewhere = sureness.copy()
+    elsewhere[low[-1] if len(low) else 0 : best + high[0] if len(high) else None] = -np.inf
+    rival = int(elsewhere.argmax())
+    shift = 0.0
+    if 0 < best < len(sureness) - 1:
+        left, middle, right = sureness[best - 1 : best + 2]
         bend = left - 2 * middle + right
-        lag += 0.5 * (left - right) / bend if bend < 0 else 0.0
-    return lag * step + a_start - b_start, float(values[best])
+        shift = 0.5 * (left - right) / bend * step if bend < 0 else 0.0
+    return Offset(
+        seconds=float(seconds[best] + shift),
+        correlation=float(correlations[best]),
+        sureness=float(sureness[best]),
+        rival=float(seconds[rival]) if elsewhere[rival] > RIVAL * sureness[best] else None,
+    )
 
 
 def _sampled(survey: Survey, step: float) -> tuple[Signal, float]:
@@ -160,10 +214,43 @@ def _sampled(survey: Survey, step: float) -> tuple[Signal, float]:
     return np.interp(clock, middles, speed), float(middles[0])
 
 
-def _correlation(a: Signal, b: Signal, lag: int) -> float:
-    """The correlation of the overlap of two signals, the second moved by ``lag`` samples."""
-    low = max(0, lag)
-    high = min(len(a), len(b) + lag)
-    a = a[low:high]
-    b = b[low - lag : high - lag]
-    return float(np.corrcoef(a, b)[0, 1]) if a.std() * b.std() > 0 else -1.0
+def _correlations(
+    a: Signal, b: Signal, lags: npt.NDArray[np.int_]
+) -> tuple[Signal, npt.NDArray[np.int_]]:
+    """The correlation of the overlap of two signals, the second moved by each of L lags; samples.
+
+    Where one of them does not change, it is 0.
+    """
+    a, b = a - a.mean(), b - b.mean()
+    low, high = lags.clip(min=0), np.minimum(len(a), len(b) + lags)
+    overlap = high - low
+
+    def sums(signal: Signal, begin: npt.NDArray[np.int_]) -> Signal:
+        total = np.concatenate([[0.0], signal.cumsum()])
+        part: Signal = total[begin + overlap] - total[begin]
+        return part
+
+    size = len(a) + len(b)
+    products = np.fft.irfft(np.fft.rfft(a, size) * np.fft.rfft(b, size).conj(), size)[lags]
+    of_a, of_b = sums(a, low), sums(b, low - lags)
+    spread_a = sums(a**2, low) - of_a**2 / overlap
+    spread_b = sums(b**2, low - lags) - of_b**2 / overlap
+    spread = np.sqrt(spread_a.clip(min=0) * spread_b.clip(min=0))
+    changes = spread > 1e-9 * len(a) * a.std() * b.std()
+    correlations = np.zeros_like(spread)
+    np.divide(products - of_a * of_b / overlap, spread, out=correlations, where=changes)
+    return correlations, overlap
+
+
+def _samples_a_value(a: Signal, b: Signal) -> float:
+    """Σ_k ρ_a(k) ρ_b(k): how many samples of unrelated signals count as one."""
+    count = min(len(a), len(b))
+    both = np.ones(count)
+    for signal in (a - a.mean(), b - b.mean()):
+        power = np.abs(np.fft.rfft(signal, 2 * len(signal))) ** 2
+        products = np.fft.irfft(power, 2 * len(signal))[:count]
+        # Beyond its first zero an autocorrelation is mostly noise.
+        both *= np.where(np.minimum.accumulate(products) > 0, products, 0.0) / max(
+            products[0], TINY
+        )
+    return 1 + 2 * float(both[1:].sum())
