@@ -182,6 +182,9 @@ def test_a_run_ends_with_commands_that_work(devrf, tiny_data, short, tmp_path):
     assert value(parsed(shlex.split(learned)), "data.root") == str(tmp_path / root)
     assert value(parsed(shlex.split(view)), "hydra.run.dir") == run
     assert report == "stage=report"
+    # Beside outputs/, where a report looks.
+    done = devrf(*tiny_data, *quick, "hydra.run.dir=runs/one")
+    assert "  python -m devrf stage=report report.runs=runs\n" in done.out + "\n"
 
 
 # Commas in paths

@@ -172,4 +172,8 @@ def test_of_fixed_cameras_one_is_held_out(scene_folder, caplog):
 def test_of_two_cameras_none_can_be_held_out(scene_folder, refusal):
     (scene_folder.dynamic / "transforms_test.json").unlink()
     message = refusal(BlenderReader, scene_folder.root)
-    assert message.startswith(f"{scene_folder.dynamic}/transforms_test.json: no such file")
+    listing = scene_folder.dynamic / "transforms_test.json"
+    assert message.startswith(f"{listing}: no image of it is there, and transforms_train.json has")
+    listing.write_text((scene_folder.dynamic / "transforms_train.json").read_text())
+    dynamic = BlenderReader(scene_folder.root).read().dynamic
+    assert dynamic.test.names == dynamic.train.names

@@ -296,13 +296,13 @@ def bullet_time(ring: Ring, stop: float, settings: VideoSettings) -> Shots:
 def time_freeze(ring: Ring, stop: float, settings: VideoSettings) -> Shots:
     """Time runs to ``stop`` and stands still while the camera goes round; then it runs on.
 
-    Each takes a third of the frames.
+    Each takes a third of the frames. The camera stays where its way ends.
     """
     before, around, after = _thirds(stop, settings.frames)
     cameras = ring(replace(settings, frames=around))
     third = len(after)
     times = [*before.tolist(), *[stop] * around, *after.tolist()]
-    return cameras[[0] * third + list(range(around)) + [0] * third], times
+    return cameras[[0] * third + [*range(around)] + [around - 1] * third], times
 
 
 def _thirds(stop: float, frames: int) -> tuple[Tensor, int, Tensor]:

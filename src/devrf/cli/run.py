@@ -182,8 +182,11 @@ def _objective(run: RunContext, steps: Names) -> float | None:
         further = [[to_type("hydra.run.dir", run.place), *words.split()] for words in NEXT]
         if metrics.get("at_rest"):
             further[0].remove("still.time=0.35")
-        where = run.config.outputs
-        elsewhere = [] if where == "outputs" else [to_type("outputs", where)]
+        where, elsewhere = run.config.outputs, []
+        if Path(where).absolute() not in run.folder.parents:
+            elsewhere = [to_type("report.runs", run.place.parent)]
+        elif where != "outputs":
+            elsewhere = [to_type("outputs", where)]
         say_next(*further, ["stage=report", *elsewhere])
     return best
 

@@ -12,6 +12,7 @@ from kornia.geometry.conversions import rotation_matrix_to_quaternion
 from pxr import Gf, Usd, UsdGeom, UsdVol
 
 from devrf.apps.export.geometry import ExportSettings, MovingMesh, UpFrame, carried
+from devrf.apps.export.scene import export_scene
 from devrf.apps.export.splats import (
     DOWN,
     HARMONIC,
@@ -20,7 +21,11 @@ from devrf.apps.export.splats import (
     write_usd_splats,
 )
 from devrf.apps.export.surface import surface_of
+from devrf.checkpoints.checkpoint import Viewpoints
+from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
+from devrf.methods.gaussians.model import DeformableGaussians
+from devrf.methods.gaussians.settings import GaussiansSettings
 from devrf.ops.splatting import Gaussians, rotations, splat
 
 HEADER = (
@@ -118,6 +123,17 @@ def test_usd_holds_the_same_gaussians_at_each_time(moving_ball, around, tmp_path
     np.testing.assert_allclose(factors, rows[:, 6:9], atol=1e-6)
     assert field.GetRadianceSphericalHarmonicsDegreeAttr().Get() == 0
     assert stage.GetPrimAtPath("/scene/cameras/front").IsA(UsdGeom.Camera)
+
+
+def test_a_format_of_surfaces_is_refused_for_gaussians_by_what_takes_them(tiny_scene, tmp_path):
+    model = DeformableGaussians(GaussiansSettings(width=8, depth=1))
+    views = Viewpoints.of(tiny_scene)
+    for settings in (ExportSettings(), ExportSettings(format="usd")):
+        with pytest.raises(DevrfError, match="has Gaussians, and no surface .*=splats, export.f"):
+            export_scene(model, views, settings, tmp_path)
+    with pytest.raises(DevrfError, match="has no surface; give export.format=splats$"):
+        export_scene(model, views, ExportSettings(content="surface"), tmp_path)
+    assert not [*tmp_path.iterdir()]
 
 
 def test_a_methods_own_gaussians_leave_as_they_are(tmp_path):

@@ -85,6 +85,7 @@ def export_scene(
 
 def _takes_surface(model: Renderable, settings: ExportSettings) -> bool:
     """Whether a surface is exported, not points; refuses geometry that the method lacks."""
+    gaussians = model.gaussians_at(0.0) is not None
     carries = model.surface() is not None and model.forward_warp(0.0) is not None
     has = carries or model.surface_at(0.0) is not None
     wanted = has if settings.content == "auto" else settings.content != "points"
@@ -95,8 +96,8 @@ def _takes_surface(model: Renderable, settings: ExportSettings) -> bool:
         )
     if wanted and not has:
         raise DevrfError(
-            f"export.content: method={model.name} has no surface; give export.content=points "
-            "export.format=ply"
+            f"export.content: method={model.name} has no surface; give "
+            + ("export.format=splats" if gaussians else "export.content=points export.format=ply")
         )
     if wanted and not carries and settings.format in (*SINGLE, *SPLATS):
         raise DevrfError(
@@ -104,6 +105,12 @@ def _takes_surface(model: Renderable, settings: ExportSettings) -> bool:
             f"{settings.format} moves one; give export.format=ply or obj"
         )
     if not wanted and settings.format != "ply":
+        if gaussians and settings.content == "auto":
+            raise DevrfError(
+                f"export.format: method={model.name} has Gaussians, and no surface for "
+                f"{settings.format}; give export.format=splats, export.format=usd "
+                "export.content=splats, or export.format=ply for coloured points"
+            )
         why = "" if has else f"method={model.name} is exported as coloured points, and "
         raise DevrfError(
             f"export.format: {why}points are written as ply, not as {settings.format}; give "

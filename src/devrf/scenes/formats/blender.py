@@ -10,6 +10,7 @@ from typing import ClassVar
 
 from pydantic.dataclasses import dataclass
 
+from devrf.errors import DevrfError
 from devrf.scenes.files import existing_folder
 from devrf.scenes.flow_files import FlowDirection, stacked_flow
 from devrf.scenes.image_folders import Downscale
@@ -121,7 +122,13 @@ def _train_and_test(files: TransformsFiles, folder: Path) -> Pair:
     held_out = next(filter(files.any_image, listings), None)
     parts = None if held_out else _held_out_of(train)
     if parts is None:
-        _, tested = files.read(held_out or listings[0])
+        if held_out is None:
+            raise DevrfError(
+                f"{listings[0]}: no image of it is there, and {file.name} has too few cameras to "
+                "hold one out (one image, or one or two fixed cameras); list the images to score "
+                "there, or copy that file to score what is learned from"
+            )
+        _, tested = files.read(held_out)
         check_timed_alike(train, tested)
         return train, tested
     learned, scored = parts
