@@ -8,7 +8,6 @@ compute where those do not run.
 | ``march`` | ``march``: samples, warped and composited |
 | ``trilinear`` | ``interpolate``: values of a grid between its points; ``resample`` |
 | ``compositing`` | ``composite``: weights; ``composite_colors``; ``mean_distance``: depths |
-| ``color_network`` | ``decode``: features and directions → RGB |
 | ``splatting`` | ``splat``: a picture of 3D Gaussians |
 | ``spherical_harmonics`` | ``spherical_harmonics`` of directions |
 | ``photometric`` | the terms that compare rays with images |

@@ -12,12 +12,8 @@ from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 from devrf.kernels.march import march
 from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.canonical_field import (
-    CanonicalField,
-    ColorDecoder,
-    SigmoidColor,
-    VoxelGrid,
-)
+from devrf.methods.devrf.canonical_field import CanonicalField, VoxelGrid
+from devrf.methods.devrf.color_decoder import ColorDecoder, SigmoidColor
 from devrf.methods.devrf.volume_rendering import march_inputs
 from devrf.ops.compositing import composite
 from devrf.rendering.occupancy import Occupancy

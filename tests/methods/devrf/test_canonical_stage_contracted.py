@@ -15,9 +15,9 @@ from devrf.geometry.contraction import ContractedSpace
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import WORLD
 from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.canonical_field import ColorDecoder
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.color_decoder import ColorDecoder
 from devrf.methods.devrf.deformation_field import DeformationField, GridWarp
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage

@@ -10,9 +10,10 @@ from devrf.geometry.box import Box
 from devrf.methods.batch import gather_batch
 from devrf.methods.devrf import depth_crop
 from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.canonical_field import CanonicalField, SigmoidColor
+from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.color_decoder import SigmoidColor
 from devrf.methods.devrf.depth_crop import (
     crop,
     crop_to_visible,

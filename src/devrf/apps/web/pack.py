@@ -46,7 +46,7 @@ from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.contraction import ContractedSpace
 from devrf.geometry.ndc import NormalizedDevice
-from devrf.methods.devrf.canonical_field import ColorDecoder
+from devrf.methods.devrf.color_decoder import ColorDecoder
 from devrf.methods.devrf.deformation_field import DeformationField, GridWarp
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.volume_rendering import deformed_occupancy, march_inputs
@@ -196,15 +196,15 @@ def _weights(decoder: ColorDecoder, low: Tensor, high: Tensor) -> Tensor:
 
     The first layer takes shares of the features' ranges from ``low`` to ``high`` (C,).
     """
-    network = decoder.network
+    first, hidden, output = decoder.from_feature, decoder.hidden, decoder.output
     parts = (
-        (network.feature_bias + network.feature_weight @ low)[:, None],
-        network.feature_weight * (high - low),
-        network.direction_weight,
-        network.hidden_bias[:, None],
-        network.hidden_weight,
-        network.output_bias[:, None],
-        network.output_weight,
+        (first.bias + first.weight @ low)[:, None],
+        first.weight * (high - low),
+        decoder.from_direction.weight,
+        hidden.bias[:, None],
+        hidden.weight,
+        output.bias[:, None],
+        output.weight,
     )
     # Contributions of one input after the other to all outputs, each number a multiple of four.
     whole = [pad(part, (0, -part.shape[1] % 4, 0, -part.shape[0] % 4)).T for part in parts]

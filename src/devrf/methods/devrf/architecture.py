@@ -15,8 +15,9 @@ from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.space import Space
-from devrf.methods.devrf.canonical_field import CanonicalField, ColorDecoder, SigmoidColor
+from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
+from devrf.methods.devrf.color_decoder import ColorDecoder, SigmoidColor
 from devrf.scenes.scene import Scene
 from devrf.system.options import Options
 

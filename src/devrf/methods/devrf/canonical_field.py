@@ -13,7 +13,7 @@ from typing_extensions import TypedDict
 from devrf.checkpoints.stored_grids import StoredShape
 from devrf.geometry.box import Box
 from devrf.kernels.trilinear import interpolate
-from devrf.ops.color_network import ColorNetwork, decode
+from devrf.methods.devrf.color_decoder import ColorDecoder
 from devrf.ops.trilinear import resample, shape_of
 from devrf.system.plain_data import validate
 
@@ -55,66 +55,6 @@ class VoxelGrid(StoredShape):
     def resize(self, shape: tuple[int, int, int]) -> None:
         """Resample to another grid over the same box, trilinearly; a new parameter results."""
         self.values = nn.Parameter(resample(self.values, shape))
-
-
-class SigmoidColor(nn.Module):
-    """Three channels are the colour itself, before a sigmoid: no network, no view dependence."""
-
-    def forward(
-        self,
-        features: Tensor,
-        viewdirs: Tensor,
-        ray: Tensor,
-        residual: Tensor | None = None,
-    ) -> Tensor:
-        """RGB (S, 3) in [0, 1] of ``features`` (S, 3), whatever the direction."""
-        return torch.sigmoid(features if residual is None else features + residual)
-
-
-class ColorDecoder(nn.Module):
-    """c = sigmoid(MLP(f, d, sin(2^k d), cos(2^k d))) (docs/method.md#colour).
-
-    Attributes:
-        learns_directions: whether gradients reach the direction part of the first layer.
-    """
-
-    octaves: Tensor
-
-    def __init__(self, channels: int, width: int, frequencies: int = 4) -> None:
-        """Two hidden layers of ``width`` units, and so many octaves k = 0 … of the direction."""
-        super().__init__()
-        self.register_buffer("octaves", 2.0 ** torch.arange(frequencies), persistent=False)
-        self.from_feature = nn.Linear(channels, width)
-        self.from_direction = nn.Linear(3 + 6 * frequencies, width, bias=False)
-        self.hidden = nn.Linear(width, width)
-        self.output = nn.Linear(width, 3)
-        nn.init.zeros_(self.output.bias)
-        self.learns_directions = True
-
-    @property
-    def network(self) -> ColorNetwork:
-        """The weights."""
-        directions = self.from_direction.weight
-        return ColorNetwork(
-            self.from_feature.weight,
-            self.from_feature.bias,
-            directions if self.learns_directions else directions.detach(),
-            self.hidden.weight,
-            self.hidden.bias,
-            self.output.weight,
-            self.output.bias,
-            self.octaves,
-        )
-
-    def forward(
-        self,
-        features: Tensor,
-        viewdirs: Tensor,
-        ray: Tensor,
-        residual: Tensor | None = None,
-    ) -> Tensor:
-        """RGB (S, 3) in [0, 1], as :func:`~devrf.ops.color_network.decode` gives it."""
-        return decode(features, viewdirs, ray, self.network, residual)
 
 
 class CanonicalField(nn.Module):

@@ -20,7 +20,8 @@ from devrf.geometry.motion import moving
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import WORLD, Space, space_config, space_from
 from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.canonical_field import CanonicalField, ColorDecoder
+from devrf.methods.devrf.canonical_field import CanonicalField
+from devrf.methods.devrf.color_decoder import ColorDecoder
 from devrf.methods.devrf.deformation_field import DeformationField, GridWarp
 from devrf.methods.devrf.frame_store import NAMES, FrameField, fits_on_device
 from devrf.methods.devrf.losses import induced_flow

@@ -14,7 +14,7 @@ from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
-from devrf.methods.devrf.canonical_field import ColorDecoder, SigmoidColor
+from devrf.methods.devrf.color_decoder import ColorDecoder, SigmoidColor
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.extensions.color_residual import (
