@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from devrf.data.batch import all_pixels
+from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.methods.batch import gather_batch
 from devrf.methods.devrf import depth_crop
@@ -100,6 +101,24 @@ def test_a_field_is_cropped_to_the_wall_that_it_shows(forward_scene):
     after = model.at(0.0).render(batch.rays, batch.background)
     assert float(after.opacity.min()) > 1 - 1e-3
     torch.testing.assert_close(after.depth, before.depth, atol=0.02, rtol=0)
+
+
+def test_a_field_that_has_become_empty_is_refused_when_it_grows(
+    forward_scene, datamodule, trainer, monkeypatch
+):
+    class Emptied(CanonicalStage):
+        def enter(self, phase):
+            if self.phase is not None:
+                self.scene_model.canonical.density.values.data.fill_(-60)
+            super().enter(phase)
+
+    monkeypatch.setattr(datamodule, "given", forward_scene)
+    schedule = CanonicalSchedule(
+        0, min_views=1, iterations=4, side=20, upsample_at=(2,), rays=64, crop=True
+    )
+    stage = Emptied(schedule, Architecture(channels=4, width=16, frequencies=0, planes=32))
+    with pytest.raises(DevrfError, match="the field has become empty by iteration 2"):
+        trainer(max_epochs=1).fit(stage, datamodule=datamodule)
 
 
 def test_the_growing_grid_may_give_up_depths(forward_scene, datamodule, trainer, monkeypatch):

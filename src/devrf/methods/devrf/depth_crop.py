@@ -46,8 +46,10 @@ def crop_to_visible(model: DeVRFModel, scene: Scene, views: Views, pool: PixelPo
     field = model.canonical
     if not isinstance(space, NormalizedDevice):
         return
-    ends = visible_depths(*seen_along_rays(model, views, pool))
-    front, back = with_room(ends, field.box)
+    depths, weights, rays = seen_along_rays(model, views, pool)
+    if not len(depths):  # a field that has become empty is refused by its stage
+        return
+    front, back = with_room(visible_depths(depths, weights, rays), field.box)
     learned_from = [scene.static.train, scene.dynamic.train]
     box = box_between(learned_from, space, front, back).clipped(field.box)
     before = field.density.values.numel()
