@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
-from dataclasses import replace
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import torch
 from pydantic.dataclasses import dataclass
@@ -56,17 +55,15 @@ class DNeRFSettings(FieldSettings):
         time_bands: octaves of times: 10 in the release, 4 in the paper.
     """
 
+    rehearsal: ClassVar = {
+        **FieldSettings.rehearsal,
+        "deformation_width": 64,
+        "deformation_depth": 4,
+    }
+
     deformation_width: int = 256
     deformation_depth: int = 8
     time_bands: Bands = 10
-
-    def rehearsed(self, factor: float) -> Self:
-        """A small deformation, too."""
-        return replace(
-            super().rehearsed(factor),
-            deformation_width=min(self.deformation_width, 64),
-            deformation_depth=min(self.deformation_depth, 4),
-        )
 
 
 class DNeRF(DeformableField):

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal
 
 from annotated_types import Ge, Le
 from pydantic.dataclasses import dataclass
@@ -51,6 +50,8 @@ class GaussiansSettings(MethodSettings):
         reset_every: share of a stage after which opacities are at most ``RESET``; 0: never.
     """
 
+    rehearsal: ClassVar = {"start_points": 1000, "max_points": 2000, "width": 64, "depth": 3}
+
     start_points: Count = 100_000
     hull_side: Annotated[int, Ge(0), Le(512)] = 0
     start_opacity: Annotated[float, Ge(0.01), Le(0.99)] = 0.1
@@ -81,13 +82,3 @@ class GaussiansSettings(MethodSettings):
     prune_below: Share = 0.005
     prune_above: Positive = 0.1
     reset_every: Share = 0.075
-
-    def rehearsed(self, factor: float) -> Self:
-        """Few Gaussians, a narrow network of few layers."""
-        return replace(
-            super().rehearsed(factor),
-            start_points=min(self.start_points, 1000),
-            max_points=min(self.max_points, 2000),
-            width=min(self.width, 64),
-            depth=min(self.depth, 3),
-        )

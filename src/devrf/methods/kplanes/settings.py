@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 from annotated_types import Ge, Le, MinLen
 from pydantic.dataclasses import dataclass
@@ -40,6 +40,14 @@ class KPlanesSettings(OccupancySettings):
         teaching: iterations in which proposals come to learn ever less often.
     """
 
+    rehearsal: ClassVar = {
+        **OccupancySettings.rehearsal,
+        "resolution": 12,
+        "channels": 8,
+        "steps": 64,
+        "samples": 24,
+    }
+
     hull: bool = False
     empty_from: float | None = 0.05
     resolution: Several = 64
@@ -62,15 +70,11 @@ class KPlanesSettings(OccupancySettings):
     teaching: Count = 5000
 
     def rehearsed(self, factor: float) -> Self:
-        """Coarse planes of few channels, few samples."""
+        """Coarse proposals, which learn as often, too."""
         times = self.time_resolution
         return replace(
             super().rehearsed(factor),
-            resolution=min(self.resolution, 12),
             time_resolution=times and min(times, 16),
-            channels=min(self.channels, 8),
-            steps=min(self.steps, 64),
-            samples=min(self.samples, 24),
             proposal_samples=[min(count, 48) for count in self.proposal_samples],
             proposal_resolutions=[min(side, 32) for side in self.proposal_resolutions],
             annealing=max(1, round(self.annealing * factor)),

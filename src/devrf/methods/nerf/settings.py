@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Annotated, ClassVar, Literal, Self
 
@@ -20,13 +21,19 @@ Bands = Annotated[int, Ge(0), Le(32)]
 
 @dataclass(frozen=True)
 class MethodSettings(Options):
-    """Sizes and sampling of a method."""
+    """Sizes and sampling of a method.
+
+    Attributes:
+        rehearsal: the largest that settings are in a rehearsal, by name.
+    """
 
     key: ClassVar[str] = "ray_stage.model.settings"
+    rehearsal: ClassVar[Mapping[str, int]] = {}
 
     def rehearsed(self, factor: float) -> Self:
         """The settings at sizes for seconds on a CPU, in ``factor`` times the iterations."""
-        return self
+        smaller = {name: min(getattr(self, name), most) for name, most in self.rehearsal.items()}
+        return replace(self, **smaller)
 
     def check(self, name: str, holds: bool, expected: str) -> None:
         """Refuse by a DevrfError the setting ``name`` unless a condition ``holds``."""
@@ -45,13 +52,11 @@ class OccupancySettings(MethodSettings):
             after this share of a stage; None: never.
     """
 
+    rehearsal: ClassVar = {"occupancy_side": 32}
+
     occupancy_side: Several = 128
     hull: bool = True
     empty_from: Share | None = 0.25
-
-    def rehearsed(self, factor: float) -> Self:
-        """Coarser masks."""
-        return replace(super().rehearsed(factor), occupancy_side=min(self.occupancy_side, 32))
 
 
 @dataclass(frozen=True)
@@ -69,6 +74,9 @@ class PlacedSettings(OccupancySettings):
         steps: samples along the box's diagonal (occupancy).
     """
 
+    # Such networks learn from the first iteration on.
+    rehearsal: ClassVar = {**OccupancySettings.rehearsal, "width": 64, "depth": 4, "steps": 64}
+
     width: Several = 256
     depth: Several = 8
     skip: int | None = 5
@@ -77,16 +85,6 @@ class PlacedSettings(OccupancySettings):
     density_scale: float = 10.0
     initialisation: Initialisation = "uniform"
     steps: Samples = 128
-
-    def rehearsed(self, factor: float) -> Self:
-        """Narrow networks of few layers, which learn from the first iteration on; few samples."""
-        return replace(
-            super().rehearsed(factor),
-            width=min(self.width, 64),
-            depth=min(self.depth, 4),
-            skip=None if self.depth > 4 else self.skip,
-            steps=min(self.steps, 64),
-        )
 
 
 @dataclass(frozen=True)
@@ -102,15 +100,12 @@ class FieldSettings(PlacedSettings):
             other one (hierarchical).
     """
 
+    rehearsal: ClassVar = {**PlacedSettings.rehearsal, "coarse": 24, "fine": 24}
+
     sampling: Literal["hierarchical", "occupancy"] = "hierarchical"
     coarse: Samples = 64
     fine: Samples = 128
     separate_coarse: bool = False
-
-    def rehearsed(self, factor: float) -> Self:
-        """Few samples."""
-        smaller = super().rehearsed(factor)
-        return replace(smaller, coarse=min(self.coarse, 24), fine=min(self.fine, 24))
 
     def __post_init__(self) -> None:
         possible = self.sampling == "hierarchical" or not self.separate_coarse

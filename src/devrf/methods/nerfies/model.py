@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import replace
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal
 
 import torch
 from pydantic.dataclasses import dataclass
@@ -78,6 +77,8 @@ class NerfiesSettings(FieldSettings):
         elastic_rays: rays of a batch that the elastic term looks at; 0: all.
     """
 
+    rehearsal: ClassVar = {**FieldSettings.rehearsal, "warp_width": 64, "warp_depth": 4}
+
     skip: int | None = 4
     bands: Bands = 8
     initialisation: Initialisation = "glorot"
@@ -92,15 +93,6 @@ class NerfiesSettings(FieldSettings):
     window: Share = 0.32
     elastic: Literal["drawn", "full"] = "drawn"
     elastic_rays: Whole = 0
-
-    def rehearsed(self, factor: float) -> Self:
-        """A small warp, too."""
-        return replace(
-            super().rehearsed(factor),
-            warp_width=min(self.warp_width, 64),
-            warp_depth=min(self.warp_depth, 4),
-            warp_skip=None if self.warp_depth > 4 else self.warp_skip,
-        )
 
 
 class Nerfies(DeformableField):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 from annotated_types import Ge, Len
 from pydantic.dataclasses import dataclass
@@ -41,6 +41,8 @@ class NeuralVolumesSettings(MethodSettings):
         occupancy_side: the hulls have about side³ cells.
     """
 
+    rehearsal: ClassVar = {"code": 64, "encoder_width": 64, "warp_side": 16, "occupancy_side": 32}
+
     code: Count = 256
     encoder_views: Count = 3
     encoder_size: Sequence[int] = (512, 384)
@@ -59,19 +61,15 @@ class NeuralVolumesSettings(MethodSettings):
     occupancy_side: Several = 128
 
     def rehearsed(self, factor: float) -> Self:
-        """A volume and a warp of few voxels, by layers of few channels; small encoded images."""
+        """Volumes of few voxels, too, by layers of few channels; small encoded images."""
         multiple = 2 ** len(self.encoder_channels)
         return replace(
             super().rehearsed(factor),
-            code=min(self.code, 64),
             encoder_size=[min(edge, multiple) for edge in self.encoder_size],
             encoder_channels=[min(channels, 32) for channels in self.encoder_channels],
-            encoder_width=min(self.encoder_width, 64),
             template_channels=[min(channels, 64) for channels in self.template_channels[:5]],
-            warp_side=min(self.warp_side, 16),
             warp_channels=[min(channels, 32) for channels in self.warp_channels[:4]],
             step=max(self.step, 1 / 16),
-            occupancy_side=min(self.occupancy_side, 32),
         )
 
     def __post_init__(self) -> None:

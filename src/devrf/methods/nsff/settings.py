@@ -68,6 +68,8 @@ class NSFFSettings(PlacedSettings):
         warmup: the iterations at which the losses change.
     """
 
+    rehearsal: ClassVar = {**PlacedSettings.rehearsal, "samples": 48, "hard_rays": 64}
+
     density_noise: NotNegative = 1.0
     flow_reach: Positive | None = None
     blend: Literal["v", "additive"] = "v"
@@ -78,10 +80,5 @@ class NSFFSettings(PlacedSettings):
     warmup: Warmup = field(default_factory=Warmup)
 
     def rehearsed(self, factor: float) -> Self:
-        """Few samples, too, and a shorter beginning."""
-        return replace(
-            super().rehearsed(factor),
-            samples=min(self.samples, 48),
-            hard_rays=min(self.hard_rays, 64),
-            warmup=self.warmup.scaled(factor),
-        )
+        """A shorter beginning, too."""
+        return replace(super().rehearsed(factor), warmup=self.warmup.scaled(factor))

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, ClassVar
 
 from annotated_types import Gt, Lt, MinLen
 from pydantic.dataclasses import dataclass
@@ -39,6 +38,7 @@ class TiNeuVoxSettings(OccupancySettings):
         tv: weight of the grid's total variation over the rays of a batch.
     """
 
+    rehearsal: ClassVar = {**OccupancySettings.rehearsal, "side": 32, "width": 64}
     sampling: ClassVar[str] = "occupancy"
 
     hull: bool = False
@@ -59,11 +59,6 @@ class TiNeuVoxSettings(OccupancySettings):
     deformation_rate: Positive = 0.75
     starts_still: bool = False
     tv: NotNegative = 0.0
-
-    def rehearsed(self, factor: float) -> Self:
-        """A coarse grid, narrow networks."""
-        smaller = super().rehearsed(factor)
-        return replace(smaller, side=min(self.side, 32), width=min(self.width, 64))
 
     def __post_init__(self) -> None:
         fit = not any(max(self.strides) % stride for stride in self.strides)
