@@ -7,6 +7,7 @@ import logging
 
 import pytest
 import torch
+from lightning import Trainer
 from lightning.pytorch.callbacks import (
     DeviceStatsMonitor,
     EarlyStopping,
@@ -16,8 +17,9 @@ from lightning.pytorch.callbacks import (
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
-from devrf.callbacks import Previews
+from devrf.callbacks import GridUpscaling, LearningRateDecay, Previews
 from devrf.checkpoints.checkpoint import load_checkpoint
+from devrf.checkpoints.checkpoint_file import read_checkpoint_file
 from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
@@ -164,3 +166,16 @@ def test_the_devices_figures_are_logged(canonical, datamodule, trainer, tmp_path
 def test_a_fit_without_a_datamodule_is_refused(canonical, trainer):
     with pytest.raises(DevrfError, match="CanonicalStage: it learns from .* give datamodule="):
         trainer(max_epochs=1).fit(canonical(), [0])
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_a_fit_that_ended_early_leaves_the_state_of_a_gpus_random_numbers(
+    canonical, datamodule, tmp_path
+):
+    callbacks = [GridUpscaling(), LearningRateDecay()]
+    quiet = {"logger": False, "enable_checkpointing": False, "limit_val_batches": 0}
+    fitted = Trainer(accelerator="gpu", devices=1, max_steps=2, callbacks=callbacks, **quiet)
+    fitted.fit(canonical(), datamodule=datamodule)
+    fitted.save_checkpoint(tmp_path / "left.ckpt")  # the stage has been moved to the host
+    assert "cuda" in read_checkpoint_file(tmp_path / "left.ckpt")["progress"]["random"]

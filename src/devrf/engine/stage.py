@@ -129,7 +129,6 @@ class Stage(LightningModule, ABC):
         self.events: Counter[str] = Counter()
         self._progress: dict[str, Any] | None = None
         self._finished: dict[str, Any] | None = None
-        self._random: dict[str, Any] | None = None
 
     # What a subclass says.
 
@@ -319,7 +318,7 @@ class Stage(LightningModule, ABC):
 
         Nothing but iterations draws from it any more.
         """
-        self._finished = self._random = None
+        self._finished = None
         broadcast([*self.parameters(), *self.buffers()])
         if self._progress is not None:
             set_rng_state(self._progress["random"], self.device)
@@ -328,14 +327,12 @@ class Stage(LightningModule, ABC):
         self.has_begun = True
 
     def on_train_end(self) -> None:
-        """Keep what a GPU knows, or is quick at: Lightning moves the stage to the host next.
+        """Pack on a GPU what is complete: Lightning moves the stage to the host next.
 
-        What is packed needs the occupancy of each frame, 1.2 s at 160³ on two CPU cores.
+        That needs the occupancy of each frame, 1.2 s at 160³ on two CPU cores.
         """
-        if self.device.type == "cuda":
-            self._random = rng_state(self.device)
-            if self.is_complete and self.global_rank == 0:
-                self._finished = self.current_model().stored_state()
+        if self.device.type == "cuda" and self.is_complete and self.global_rank == 0:
+            self._finished = self.current_model().stored_state()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add the state that is not in tensors.
@@ -352,7 +349,8 @@ class Stage(LightningModule, ABC):
                 **self.batch_size.state(),
                 "phase": None if self.phase is None else self.phase.start,
                 "phase_state": {} if self.phase is None else self.phase_state(),
-                "random": self._random or rng_state(self.device),
+                # Once training is over, the stage itself is on the host.
+                "random": rng_state(self.trainer.strategy.root_device),
             }
         elif self.is_complete:
             compact = self._finished or self.current_model().stored_state()
