@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -17,7 +16,6 @@ from devrf.rendering.occupancy import Occupancy
 from devrf.scenes.scene import Views
 
 
-@dataclass
 class ActiveFrame:
     """Memory for a frame that is trained; one frame after another uses it.
 
@@ -35,20 +33,9 @@ class ActiveFrame:
         pools: the pixels to learn from; batches are drawn from each in turn.
     """
 
-    store: FrameStore
-    backward: Tensor
-    forward: Tensor
-    previous_forward: Tensor
-    occupancy: Occupancy
-    fields: Mapping[str, FrameField]
-    further: Mapping[str, Tensor]
-    number: int = 0
-    pools: list[PixelPool] = field(default_factory=list)
-
-    @staticmethod
-    def of(
-        store: FrameStore, occupancy: Occupancy, fields: Mapping[str, FrameField]
-    ) -> ActiveFrame:
+    def __init__(
+        self, store: FrameStore, occupancy: Occupancy, fields: Mapping[str, FrameField]
+    ) -> None:
         """Memory at the fields' present resolutions, on their device.
 
         Args:
@@ -57,18 +44,18 @@ class ActiveFrame:
             fields: further fields whose frames are learned, by name.
         """
         zeros = store.here.new_zeros(*store.shape, 3)
-        return ActiveFrame(
-            store=store,
-            backward=zeros.clone().requires_grad_(),
-            forward=zeros.clone().requires_grad_(),
-            previous_forward=zeros,
-            occupancy=Occupancy(torch.zeros_like(occupancy.mask), occupancy.box),
-            fields=fields,
-            further={
-                name: torch.zeros_like(field.values[0]).requires_grad_()
-                for name, field in fields.items()
-            },
-        )
+        self.store = store
+        self.backward = zeros.clone().requires_grad_()
+        self.forward = zeros.clone().requires_grad_()
+        self.previous_forward = zeros
+        self.occupancy = Occupancy(torch.zeros_like(occupancy.mask), occupancy.box)
+        self.fields = fields
+        self.further = {
+            name: torch.zeros_like(field.values[0]).requires_grad_()
+            for name, field in fields.items()
+        }
+        self.number = 0
+        self.pools: list[PixelPool] = []
 
     @property
     def slices(self) -> tuple[Tensor, Tensor]:

@@ -315,7 +315,7 @@ class DeformationStage(Stage):
         further: dict[str, FrameField] = {}
         for extension in self.extensions:
             further |= extension.frame_fields(context, level)
-        frame = ActiveFrame.of(self.field.frames, self.scene_model.occupancy, further)
+        frame = ActiveFrame(self.field.frames, self.scene_model.occupancy, further)
         context.active = frame
         context.weights = self.deformation_loss.weights_at(level)
         smoothing = self.deformation_loss.smoothing(level, self.field.shape)
