@@ -102,11 +102,6 @@ class RayStageSchedule:
     milestones: Mapping[str, int] = field(default_factory=dict)
 
     @property
-    def rays(self) -> int:
-        """Rays of a batch."""
-        return self.settings.rays
-
-    @property
     def total(self) -> int:
         """Iterations of the stage."""
         return self.settings.iterations

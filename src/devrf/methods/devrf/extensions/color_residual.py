@@ -65,11 +65,6 @@ class ColorResidualGrid(ColorResidualField, StoredShape):
             grid = grid.lerp(self.values[moment.after], moment.weight)
         return partial(interpolate, grid, box=self.box)
 
-    @torch.no_grad()
-    def copy(self, source: int, frame: int) -> None:
-        """Initialise ``frame``, from 1 on, from another."""
-        self.values[frame] = self.values[source]
-
 
 class LearnColorResidual(Extension):
     """Learns residuals beside the displacements, from some level on."""
@@ -194,9 +189,10 @@ class LearnColorResidual(Extension):
         """At the first level that learns it, start a frame from the one visited before it."""
         field = context.model.color_residual
         before = phase.frame - phase.step
-        if isinstance(field, ColorResidualGrid) and phase.level == self._first:
-            if before < len(field.clock):  # backwards, the last frame is the first
-                field.copy(before, phase.frame)
+        if field is None or phase.level != self._first:
+            return
+        if before < len(field.clock):  # backwards, the last frame is the first
+            field.values[phase.frame] = field.values[before]
 
     def color_residual(self, frame: ActiveFrame) -> ColorResidual | None:
         """q → A_t(q), as learned so far."""
