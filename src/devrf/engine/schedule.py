@@ -64,19 +64,18 @@ class Scheduled(Protocol):
     """A stage as callbacks of the schedule see it (docs/extending.md#schedule-callbacks).
 
     Attributes:
+        schedule: the present one for the stage's scene, a :class:`Schedule`.
+        configured_schedule: the one before it was scaled; None until then.
         phase: the phase whose tensors are ready; None before the first.
         position: the next iteration, and the factor of all learning rates.
         has_scheduled_rates: whether a callback sets the learning rates.
     """
 
+    schedule: Any
+    configured_schedule: Any
     phase: Any
     position: Position
     has_scheduled_rates: bool
-
-    @property
-    def schedule(self) -> Schedule:
-        """The schedule for the stage's scene."""
-        ...
 
     def enter(self, phase: Any) -> None:
         """Make grids and optimiser ready for a phase."""
@@ -107,19 +106,7 @@ def share_done(schedule: Schedule, iteration: int) -> float:
     return cost(schedule, 0, iteration) / cost(schedule, 0, schedule.total)
 
 
-class Scalable(Scheduled, Protocol):
-    """A stage whose schedule can be scaled while it learns.
-
-    Attributes:
-        schedule: the present one.
-        configured_schedule: the one before it was scaled; None until then.
-    """
-
-    schedule: Any
-    configured_schedule: Any
-
-
-def unscaled(stage: Scalable) -> Schedule:
+def unscaled(stage: Scheduled) -> Schedule:
     """A stage's schedule as it was configured."""
     schedule: Schedule = stage.configured_schedule or stage.schedule
     return schedule
@@ -146,7 +133,7 @@ def entered_phase(stage: Scheduled) -> Phase:
     return phase
 
 
-def scale_schedule(stage: Scalable, factor: float) -> None:
+def scale_schedule(stage: Scheduled, factor: float) -> None:
     """Have a stage go on at the same place of its schedule in ``factor`` times its iterations."""
     before = stage.schedule
     stage.configured_schedule = unscaled(stage)
