@@ -63,26 +63,20 @@ class Extension:
     """Adds to the deformation stage; a hook that is not overridden adds nothing.
 
     An extension is one file of ``extensions/`` and one block of ``schedule.extensions``; without
-    both, all else runs as before. The first three are read when the stage is built, then comes
+    both, all else runs as before. Its attributes are read when the stage is built, then comes
     :meth:`setup`. At each visit of a frame follow :meth:`initialise`, unless the visit is resumed,
     and where a level begins :meth:`frame_fields` and :meth:`begin_level`; in each iteration
     :meth:`weight_factor` and :meth:`color_residual`.
+
+    Attributes:
+        terms: further loss terms, by name.
+        weights: theirs, unless ``loss.deformation`` gives them.
+        scaled_terms: names from the config that have to be those of loss terms.
     """
 
-    @property
-    def terms(self) -> Mapping[str, DeformationTerm]:
-        """Further loss terms, by name."""
-        return {}
-
-    @property
-    def weights(self) -> Mapping[str, float]:
-        """Their weights, unless ``loss.deformation`` gives them."""
-        return {}
-
-    @property
-    def scaled_terms(self) -> Collection[str]:
-        """Names from the config that have to be those of loss terms."""
-        return ()
+    terms: Mapping[str, DeformationTerm] = {}
+    weights: Mapping[str, float] = {}
+    scaled_terms: Collection[str] = ()
 
     def setup(self, context: DeformationContext) -> None:
         """Add fields to the model and groups to the optimiser, before learning starts."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from functools import partial
 from typing import ClassVar, Literal
 
@@ -20,11 +20,7 @@ from devrf.methods.devrf.active_frame import ActiveFrame
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
 from devrf.methods.devrf.extension import DeformationContext, Extension
 from devrf.methods.devrf.frame_store import FrameField
-from devrf.methods.devrf.losses import (
-    DeformationPrediction,
-    DeformationTerm,
-    total_variation_weight,
-)
+from devrf.methods.devrf.losses import DeformationPrediction, total_variation_weight
 from devrf.methods.devrf.model import ColorResidualField
 from devrf.rendering.output import ColorResidual
 from devrf.scenes.scene import Views
@@ -69,6 +65,8 @@ class ColorResidualGrid(ColorResidualField, StoredShape):
 class LearnColorResidual(Extension):
     """Learns residuals beside the displacements, from some level on."""
 
+    scaled_terms: Mapping[str, float]
+
     def __init__(
         self,
         learn: Literal["never", "always", "auto"] = "never",
@@ -108,37 +106,24 @@ class LearnColorResidual(Extension):
         self._learning_rate = learning_rate
         self._start = start_level
         self._start_if_static = start_level_static_color
-        self._scale_if_drift = loss_scale_if_color_drift or {}
-        for name, factor in self._scale_if_drift.items():
+        self.scaled_terms = loss_scale_if_color_drift or {}
+        for name, factor in self.scaled_terms.items():
             term_key = f"{key}.loss_scale_if_color_drift.{name}"
             expect(factor >= 0, term_key, "at least 0", factor)
-        self._residual = residual
+        self.terms = {"residual": squared_residual}
+        # Where nothing can be learned there is none.
+        self.weights = {} if learn == "never" else {"residual": residual}
         self._tv = tv
         # Once set up: the first level that learns it, from 0; factors of weights from it on.
         self._first: int | None = None
         self._scale: Mapping[str, float] = {}
-
-    @property
-    def terms(self) -> Mapping[str, DeformationTerm]:
-        """``residual``, the size of the residuals."""
-        return {"residual": squared_residual}
-
-    @property
-    def weights(self) -> Mapping[str, float]:
-        """Its weight; none where nothing can be learned."""
-        return {} if self._learn == "never" else {"residual": self._residual}
-
-    @property
-    def scaled_terms(self) -> Collection[str]:
-        """Those that ``loss_scale_if_color_drift`` names."""
-        return self._scale_if_drift
 
     def setup(self, context: DeformationContext) -> None:
         """Build the residuals, zero, and their empty parameter group, if they are learned."""
         first, drifting = self._decide(context.datamodule.scene.dynamic.train)
         if first is None:
             return
-        self._scale = self._scale_if_drift if drifting else {}
+        self._scale = self.scaled_terms if drifting else {}
         # The ablation without levels has one.
         self._first = min(first, len(context.settings.levels)) - 1
         model = context.model

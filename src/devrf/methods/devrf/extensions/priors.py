@@ -6,7 +6,7 @@ See docs/method.md#elastic and docs/method.md#bending.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -15,7 +15,7 @@ from torch.nn.functional import adaptive_max_pool3d, max_pool3d
 from devrf.errors import expect
 from devrf.geometry.box import Box
 from devrf.methods.devrf.extension import DeformationContext, Extension
-from devrf.methods.devrf.losses import DeformationPrediction, DeformationTerm
+from devrf.methods.devrf.losses import DeformationPrediction
 from devrf.rendering.occupancy import Occupancy
 
 # c of docs/method.md#elastic and #bending: beyond it a place counts as torn or jointed, not as
@@ -129,12 +129,8 @@ class DeformationPrior(Extension):
         """
         self.name = name
         self.energy = energy
+        self.terms = {name: self._term}
         self._occupied: Tensor | None = None
-
-    @property
-    def terms(self) -> Mapping[str, DeformationTerm]:
-        """The energy, under its name."""
-        return {self.name: self._term}
 
     def begin_level(self, context: DeformationContext, level: int) -> None:
         """Find the cells of the level's grids that are occupied at rest."""
