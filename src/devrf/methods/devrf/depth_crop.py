@@ -10,18 +10,18 @@ from torch import Tensor, nn
 from devrf.data.batch import PixelPool
 from devrf.geometry.box import Box
 from devrf.geometry.ndc import NormalizedDevice
+from devrf.kernels.march import march
 from devrf.methods.batch import gather_batch
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.volume_rendering import render
+from devrf.methods.devrf.volume_rendering import march_inputs
 from devrf.scenes.bounds import box_between
 from devrf.scenes.scene import Scene, Views
 
 log = logging.getLogger(__name__)
 
-# As many rays are looked along, so many at a time.
+# As many rays are looked along.
 RAYS = 8192
-CHUNK = 2048
 # This share of all that is seen may lie in front of the box, and as much behind it: remains of fog.
 FOG = 0.1
 # So may the surfaces of this share of the rays: specks.
@@ -87,19 +87,11 @@ def seen_along_rays(
     """Samples on rays through pixels of ``pool``: depths z', weights, and rays, each (S,)."""
     # Evenly spread, not random: several processes have to find the same depths.
     subset = torch.linspace(0, len(pool) - 1, min(RAYS, len(pool)), dtype=torch.float64)
-    depths: list[Tensor] = []
-    weights: list[Tensor] = []
-    rays_of_samples: list[Tensor] = []
-    for k, part in enumerate(torch.split(subset.long().to(pool.image.device), CHUNK)):
-        image = pool.image[part].long()
-        flat = pool.flat[part].long()
-        black = torch.zeros(3, device=model.device)
-        rays = gather_batch(views, image, flat, black, model.space).rays
-        output = render(rays, model.canonical, model.occupancy, model.settings, black)
-        depths.append(output.samples.points[:, 2])
-        weights.append(output.samples.weight)
-        rays_of_samples.append(output.samples.ray + k * CHUNK)
-    return torch.cat(depths), torch.cat(weights), torch.cat(rays_of_samples)
+    image, flat = pool.pixels[:, subset.long().to(pool.pixels.device)].long()
+    black = torch.zeros(3, device=model.device)
+    rays = gather_batch(views, image, flat, black, model.space).rays
+    samples = march(rays, march_inputs(model.canonical, model.occupancy, model.settings))
+    return samples.points[:, 2], samples.weight, samples.ray
 
 
 def visible_depths(depths: Tensor, weights: Tensor, ray: Tensor) -> tuple[float, float]:

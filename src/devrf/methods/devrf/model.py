@@ -19,6 +19,7 @@ from devrf.geometry.clock import FrameClock
 from devrf.geometry.motion import moving
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import WORLD, Space, space_config, space_from
+from devrf.kernels.march import march
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.color_decoder import ColorDecoder
@@ -26,7 +27,7 @@ from devrf.methods.devrf.deformation_field import DeformationField, GridWarp
 from devrf.methods.devrf.frame_store import NAMES, FrameField, fits_on_device
 from devrf.methods.devrf.losses import induced_flow
 from devrf.methods.devrf.surface import CanonicalSurface
-from devrf.methods.devrf.volume_rendering import deformed_occupancy, render
+from devrf.methods.devrf.volume_rendering import deformed_occupancy, march_inputs, render
 from devrf.ops.compositing import LEAST_MASS, sum_by_ray
 from devrf.ops.trilinear import shape_of
 from devrf.rendering.occupancy import Occupancy
@@ -334,13 +335,11 @@ class DeVRFView:
 
         See docs/method.md#flow for φ_i, with ``time`` in place of t − 1.
         """
-        black = torch.zeros(3, device=rays.origins.device)
-        seen = render(
-            rays, self._canonical, self.occupancy, self._settings, black, self._backward_warp
-        )
-        ray, weight = seen.samples.ray, seen.samples.weight
+        inputs = march_inputs(self._canonical, self.occupancy, self._settings, self._backward_warp)
+        samples = march(rays, inputs)
+        ray, weight = samples.ray, samples.weight
         moved = induced_flow(
-            seen.samples.canonical,
+            samples.canonical,
             self._forward_warp(time),
             cameras,
             torch.zeros_like(ray),
