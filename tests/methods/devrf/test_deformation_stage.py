@@ -60,6 +60,11 @@ def test_a_scene_at_rest_has_no_motion_to_learn(rest, tiny_scene, serve, trainer
         trainer(max_steps=1).fit(DeformationStage(rest, SHORT), datamodule=module)
 
 
+def test_a_misspelt_mean_is_refused(rest):
+    with pytest.raises(DevrfError, match="loss.flow_mean: expected rays or samples, not ray"):
+        DeformationStage(rest, flow_mean="ray")
+
+
 @pytest.mark.parametrize("views", ["one", "all"])
 def test_a_visit_shows_its_pixels_as_often_as_said(rest, fit, views: Any):
     drawn = []

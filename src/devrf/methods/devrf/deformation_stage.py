@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from functools import cached_property
-from typing import Any
+from typing import Any, get_args
 
 from torch import Tensor
 
@@ -13,7 +13,7 @@ from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.flow import previous_images
 from devrf.engine.grid_adam import GridAdam
 from devrf.engine.stage import Stage, Terms
-from devrf.errors import DevrfError
+from devrf.errors import DevrfError, expect
 from devrf.geometry.space import WorldSpace
 from devrf.methods.batch import gather_batch
 from devrf.methods.devrf.active_frame import ActiveFrame
@@ -95,6 +95,7 @@ class DeformationStage(Stage):
         super().__init__(iterations_per_step)
         self.settings = schedule or DeformationSchedule()
         self.visit = visit or VisitSettings()
+        expect(flow_mean in get_args(FlowMean), "loss.flow_mean", "rays or samples", flow_mean)
         self.flow_mean = flow_mean
         self.extensions = tuple((extensions or {}).values())
         self.deformation_loss = DeformationLoss(loss, self.extensions, self.settings)

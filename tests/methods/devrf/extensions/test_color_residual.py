@@ -152,6 +152,8 @@ def test_a_checkpoint_keeps_the_colours(moving, tiny_scene):
 
 
 def test_wrong_settings_are_told(rest):
+    with pytest.raises(DevrfError, match="color_residual.learn: expected never, always or auto"):
+        LearnColorResidual("allways")  # type: ignore[arg-type]
     with pytest.raises(DevrfError, match="color_residual.side"):
         LearnColorResidual(side=1)
     with pytest.raises(DevrfError, match="flaw is no term of loss.deformation"):

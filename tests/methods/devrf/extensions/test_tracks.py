@@ -10,6 +10,7 @@ import torch
 
 from devrf.data.batch import PixelPool
 from devrf.data.flow import previous_images
+from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
@@ -178,3 +179,8 @@ def test_flow_starts_the_frames_of_the_first_level(tiny_scene):
         False,
     ]
     assert not any(StartAlongFlow("previous").changes(context, phase) for phase in phases)
+
+
+def test_a_misspelt_start_is_refused():
+    with pytest.raises(DevrfError, match="tracks.init_from: expected previous, flow or tracks"):
+        StartAlongFlow("trakcs")

@@ -96,6 +96,8 @@ class LearnColorResidual(Extension):
         """
         key = "schedule.extensions.color_residual"
         static = start_level_static_color
+        holds = learn in ("never", "always", "auto")
+        expect(holds, f"{key}.learn", "never, always or auto", learn)
         expect(start_level >= 1, f"{key}.start_level", "at least 1", start_level)
         good = static is None or static >= 1
         expect(good, f"{key}.start_level_static_color", "at least 1, or null", static)

@@ -14,6 +14,7 @@ from devrf.data.batch import PixelPool, all_pixels
 from devrf.data.flow import previous_images
 from devrf.engine.ddp import broadcast
 from devrf.engine.grid_adam import GridAdam
+from devrf.errors import expect
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import WORLD, Space
 from devrf.kernels.trilinear import interpolate
@@ -54,6 +55,9 @@ class StartAlongFlow(Extension):
             init_from: ``flow`` one frame back; ``tracks`` back to a frame in which the model shows
                 the pixel's colour; ``previous`` not at all.
         """
+        holds = init_from in ("previous", "flow", "tracks")
+        key = "schedule.extensions.tracks.init_from"
+        expect(holds, key, "previous, flow or tracks", init_from)
         self._init_from = init_from
         self._tracks: FlowTracks | None = None
 
