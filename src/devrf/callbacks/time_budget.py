@@ -160,8 +160,9 @@ class TimeBudget(Callback):
         phase = pl_module.phase
         entered = phase != self._phase
         if entered:
-            before = self._entering.get(phase.kind)
-            self._entering[phase.kind] = _running_mean(before, now - self._step_ended)
+            seconds = now - self._step_ended
+            mean = self._entering.get(phase.kind, seconds)
+            self._entering[phase.kind] = mean + LATEST * (seconds - mean)
         if self._is_due:
             self._scale(trainer, pl_module)
         if entered and self._phase is not None and phase.kind != self._phase.kind:
@@ -204,14 +205,16 @@ class TimeBudget(Callback):
 
     def _try(self, trainer: Trainer, stage: Stage, pace: float) -> None:
         """Note the pace of a step of the trial; then larger batches, or the schedule is scaled."""
+        assert stage.phase is not None
         share = stage.batch_size.share
         self._tried[share].append(pace)
         measured = self._tried[share][1:]  # the first step warms up
-        ends = len(self._tried[share]) * pace * self._phase_cost > TRIAL_SHARE * self._budget
+        most = TRIAL_SHARE * self._budget / stage.phase.cost
+        ends = len(self._tried[share]) * pace > most
         if trainer.strategy.broadcast(not (ends and measured) and len(measured) < 10):
             return
         larger = [other for other in self._tried if other > share]
-        long = measured and measured[-1] * self._phase_cost > TRIAL_SHARE * self._budget
+        long = measured and measured[-1] > most
         if trainer.strategy.broadcast(bool(larger) and not long):
             stage.batch_size.share = min(larger)
             return
@@ -220,11 +223,6 @@ class TimeBudget(Callback):
         of_batch = max((quick - slow) / (last - first), 0.0) if last > first else slow / first
         self._pace = Pace(max(slow - of_batch * first, 0.0), of_batch)
         self._scale(trainer, stage, first=True)
-
-    @property
-    def _phase_cost(self) -> float:
-        assert self._phase is not None
-        return self._phase.cost
 
     def _scale(self, trainer: Trainer, stage: Stage, *, first: bool = False) -> None:
         """Scale the schedule to the time that is left; ``first``: as the trial has just ended.
@@ -307,8 +305,3 @@ class TimeBudget(Callback):
             self._record.seconds,
             self._budget,
         )
-
-
-def _running_mean(mean: float | None, value: float) -> float:
-    """``mean`` with a further ``value``; alone where there is none."""
-    return value if mean is None else mean + LATEST * (value - mean)

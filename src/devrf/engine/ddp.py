@@ -80,11 +80,8 @@ def check_strategy(trainer: Trainer) -> None:
 
 def world_size() -> int:
     """The number of processes."""
-    return distributed.get_world_size() if _is_distributed() else 1
-
-
-def _is_distributed() -> bool:
-    return distributed.is_available() and distributed.is_initialized()
+    begun = distributed.is_available() and distributed.is_initialized()
+    return distributed.get_world_size() if begun else 1
 
 
 def average_gradients(parameters: Iterable[Tensor]) -> None:

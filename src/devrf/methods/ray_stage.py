@@ -120,7 +120,9 @@ class RayStage(Stage):
         images: list[Tensor] = []
         flats: list[Tensor] = []
         offset = 0
-        times_left = self._times_to_draw
+        # Fewer times in a part of the schedule's batch.
+        times = self.settings.times_per_batch
+        times_left = None if times is None else max(1, round(times * self.batch_size.share))
         for pool, count in zip(pools, counts, strict=True):
             frames = self.shown_frames(pool)
             image, flat = pool.draw(count, frames, self.generator, times=times_left)
@@ -218,12 +220,6 @@ class RayStage(Stage):
         self.scene_model.on_iteration(iteration * whole // total, whole)
         for name, at in self.schedule.milestones.items():
             self.events[name] = int(iteration >= at)
-
-    @property
-    def _times_to_draw(self) -> int | None:
-        """Number of times that a batch may have: fewer in a part of the schedule's batch."""
-        whole = self.settings.times_per_batch
-        return None if whole is None else max(1, round(whole * self.batch_size.share))
 
     def shown_frames(self, pool: FrameSortedPixels) -> int:
         """Number of frames that the curriculum shows by now."""
