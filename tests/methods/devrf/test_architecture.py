@@ -111,3 +111,17 @@ def test_planes_of_both_fields(forward_scene, fit, serve):
     moving = fit(DeformationStage(rest.result(), levels), data=data)
     assert moving.field.shape == moving.field.box.grid_shape(8**3, planes=6)
     assert (moving.field.shape[2], levels.grid(0)) == (6, (4**3, 3))
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"alpha_init": 1.0}, r"field\.alpha_init: expected below 1, not 1\.0"),
+        ({"search_alpha_init": 0.0}, r"field\.search_alpha_init: expected more than 0"),
+        ({"width": 0}, r"field\.width: expected at least 1"),
+        ({"planes": 1}, r"field\.planes: expected .*2"),
+    ],
+)
+def test_sizes_of_no_field_are_refused(settings: dict[str, Any], said: str) -> None:
+    with pytest.raises(DevrfError, match=said):
+        Architecture(**settings)

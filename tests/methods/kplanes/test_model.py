@@ -254,5 +254,7 @@ def test_scenes_of_every_space_are_learned_and_come_back(
 def test_impossible_sizes_are_refused() -> None:
     with pytest.raises(DevrfError, match="proposal_samples: expected as many numbers as"):
         replace(TINY, proposal_samples=(8,))
+    with pytest.raises(DevrfError, match="empty_from: expected at most 1"):
+        replace(TINY, empty_from=1.5)
     with pytest.raises(DevrfError, match="scales: expected at least 1 item"):
         replace(TINY, scales=())

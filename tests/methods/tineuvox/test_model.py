@@ -204,5 +204,7 @@ def test_a_surface_at_a_time_is_what_rays_meet_then(tiny_scene: Scene) -> None:
 def test_impossible_sizes_are_refused() -> None:
     with pytest.raises(DevrfError, match="strides: expected numbers that divide"):
         replace(TINY, strides=(1, 3, 4))
+    with pytest.raises(DevrfError, match="empty_from: expected at least 0"):
+        replace(TINY, empty_from=-1.0)
     with pytest.raises(DevrfError, match="upsample_at: expected ascending shares"):
         replace(TINY, upsample_at=(0.5, 0.2))

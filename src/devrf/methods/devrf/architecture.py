@@ -19,7 +19,7 @@ from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.color_decoder import ColorDecoder, SigmoidColor
 from devrf.scenes.scene import Scene
-from devrf.system.options import Options
+from devrf.system.options import Count, Options, Positive, Several
 
 log = logging.getLogger(__name__)
 
@@ -31,6 +31,8 @@ FEWEST, MOST = 32, 256
 
 # The opacity that a shorter search begins with, at most.
 MOST_OPAQUE = 1e-2
+# Of a voxel before anything is learned: nothing that a logarithm ends at.
+Opacity = Annotated[float, Gt(0), Lt(1)]
 
 
 @dataclass(frozen=True)
@@ -52,13 +54,13 @@ class Architecture(Options):
     key: ClassVar[str] = "field"
 
     channels: Annotated[int, Ge(1), Le(256)] = 12
-    width: int = 128
+    width: Count = 128
     frequencies: Annotated[int, Ge(0), Le(16)] = 4
-    alpha_init: float = 1e-2
-    contracted_opacity: Annotated[float, Gt(0), Lt(1)] = 0.65
-    search_alpha_init: float = 1e-6
-    planes: int | None = None
-    aspect: float = 1.0
+    alpha_init: Opacity = 1e-2
+    contracted_opacity: Opacity = 0.65
+    search_alpha_init: Opacity = 1e-6
+    planes: Several | None = None
+    aspect: Positive = 1.0
 
     def in_space(self, space: Space, side: float) -> Architecture:
         """The sizes that hold in ``space`` for a grid of ``side`` voxels along an edge."""

@@ -10,7 +10,7 @@ from annotated_types import Ge, Lt
 from pydantic.dataclasses import dataclass
 
 from devrf.rendering.sampling import RaysPerPixel, Step
-from devrf.system.options import NotNegative, Options, Positive
+from devrf.system.options import Count, NotNegative, Options, Positive
 
 Opacity = Annotated[float, Ge(0), Lt(1)]
 
@@ -85,12 +85,12 @@ class VisitSettings(Options):
 
     key: ClassVar[str] = "schedule.visit"
 
-    learning_rate: float = 1e-3
+    learning_rate: NotNegative = 1e-3
     unit: Literal["world", "box"] = "world"
     views: Literal["one", "all"] = "one"
     pixels: Literal["all", "occupied"] = "all"
     epochs: Positive | None = None
-    occupancy_every: int = 25
+    occupancy_every: Count = 25
     adam_state: Literal["fresh", "carried"] = "fresh"
     store: Literal["auto", "device", "host"] = "auto"
     store_half: bool | Literal["auto"] = "auto"

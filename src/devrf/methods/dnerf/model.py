@@ -14,6 +14,7 @@ from devrf.methods.nerf.deformable import DeformableField
 from devrf.methods.nerf.networks import SinusoidalEncoding, Trunk
 from devrf.methods.nerf.settings import Bands, FieldSettings
 from devrf.rendering.output import RenderOutput
+from devrf.system.options import Count
 
 # The last layer's weights begin in ±SMALL, so that the first displacements are next to zero.
 SMALL = 1e-4
@@ -61,8 +62,8 @@ class DNeRFSettings(FieldSettings):
         "deformation_depth": 4,
     }
 
-    deformation_width: int = 256
-    deformation_depth: int = 8
+    deformation_width: Count = 256
+    deformation_depth: Count = 8
     time_bands: Bands = 10
 
 

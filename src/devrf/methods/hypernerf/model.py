@@ -71,8 +71,8 @@ class HyperNeRFSettings(NerfiesSettings):
     ambient_bands: Annotated[Bands, Ge(1)] = 1
     ambient_delay: Share = 0.004
     ambient_window: Share = 0.04
-    slicing_width: int = 64
-    slicing_depth: int = 6
+    slicing_width: Count = 64
+    slicing_depth: Count = 6
     slicing_skip: int | None = 4
     slicing_bands: Bands = 6
 

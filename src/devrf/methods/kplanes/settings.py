@@ -10,7 +10,7 @@ from annotated_types import Ge, Le, MinLen
 from pydantic.dataclasses import dataclass
 
 from devrf.methods.nerf.settings import OccupancySettings, Samples
-from devrf.system.options import Count, Several
+from devrf.system.options import Count, Several, Share
 
 Pairing = Literal["product", "hexplane"]
 HIGHEST_DEGREE = 3  # of spherical harmonics
@@ -49,7 +49,7 @@ class KPlanesSettings(OccupancySettings):
     }
 
     hull: bool = False
-    empty_from: float | None = 0.05
+    empty_from: Share | None = 0.05
     resolution: Several = 64
     scales: Annotated[Sequence[Count], MinLen(1)] = (1, 2, 4, 8)
     time_resolution: Several | None = None

@@ -10,7 +10,7 @@ from annotated_types import Ge, Le
 from pydantic.dataclasses import dataclass
 
 from devrf.errors import expect
-from devrf.system.options import Options, Several, Share
+from devrf.system.options import Options, Positive, Several, Share
 
 Initialisation = Literal["uniform", "glorot"]
 
@@ -82,7 +82,7 @@ class PlacedSettings(OccupancySettings):
     skip: int | None = 5
     bands: Bands = 10
     direction_bands: Bands = 4
-    density_scale: float = 10.0
+    density_scale: Positive = 10.0
     initialisation: Initialisation = "uniform"
     steps: Samples = 128
 

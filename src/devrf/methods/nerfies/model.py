@@ -23,7 +23,7 @@ from devrf.methods.nerf.networks import (
 from devrf.methods.nerf.settings import Bands, FieldSettings, Initialisation, Samples
 from devrf.methods.nerfies.elastic import SCALE, drawn, jacobians, robust, strain
 from devrf.rendering.output import RenderOutput
-from devrf.system.options import Share, Whole
+from devrf.system.options import Count, Share, Whole
 
 # The heads' weights begin in [0, SMALL), so that the first motions are next to none.
 SMALL = 1e-4
@@ -85,9 +85,9 @@ class NerfiesSettings(FieldSettings):
     coarse: Samples = 128
     fine: Samples = 128
     separate_coarse: bool = True
-    code: int = 8
-    warp_width: int = 128
-    warp_depth: int = 6
+    code: Count = 8
+    warp_width: Count = 128
+    warp_depth: Count = 6
     warp_skip: int | None = 4
     warp_bands: Bands = 6
     window: Share = 0.32

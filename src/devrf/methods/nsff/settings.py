@@ -29,7 +29,7 @@ class Warmup(MethodSettings):
     steps_per_frame: Count = 1000
     min_frames: int = 30
     max_frames: int = 250
-    chained_from: float = 2.0
+    chained_from: NotNegative = 2.0
     prior_decay: Annotated[float, Ge(1)] = 10.0
 
     def __post_init__(self) -> None:

@@ -42,7 +42,7 @@ class TiNeuVoxSettings(OccupancySettings):
     sampling: ClassVar[str] = "occupancy"
 
     hull: bool = False
-    empty_from: float | None = None
+    empty_from: Share | None = None
     side: Several = 160
     channels: Count = 6
     strides: Annotated[Sequence[Count], MinLen(1)] = (1, 2, 4)
