@@ -11,11 +11,14 @@ from devrf.engine.position import Position
 from devrf.engine.schedule import entered_phase, phases, scale_schedule, unscaled
 from devrf.errors import DevrfError
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level, Visits
-from devrf.methods.ray_schedule import RaySchedule, RayStageSchedule
+from devrf.methods.ray_schedule import RaySchedule
 
 VISITS = Visits(DeformationSchedule([Level(4, 30), Level(6, 10)]), frames=3)
-RAYS = RayStageSchedule(
-    RaySchedule(iterations=100, rays=8, learning_rate=1.0, final_learning_rate=0.1),
+RAYS = RaySchedule(
+    iterations=100,
+    rays=8,
+    learning_rate=1.0,
+    final_learning_rate=0.1,
     growths=(20, 60),
     milestones={"all frames shown": 50},
 )

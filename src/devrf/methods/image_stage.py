@@ -14,7 +14,7 @@ from devrf.engine.protocol import ProtocolStage
 from devrf.errors import expect
 from devrf.methods.base import ImageTrainable
 from devrf.methods.ray_plan import REHEARSED_ITERATIONS, RayPlan
-from devrf.methods.ray_schedule import RaySchedule, RayStageSchedule
+from devrf.methods.ray_schedule import RaySchedule
 from devrf.methods.ray_stage import RayStage
 from devrf.scenes.scene import Views
 
@@ -95,7 +95,7 @@ class ImageStage(RayStage):
         """A pixel for each image."""
         return FrameSortedPixels.of_images(views)
 
-    def _with_method(self) -> RayStageSchedule:
+    def _with_method(self) -> RaySchedule:
         schedule = super()._with_method()
         changes = {WHOLE: self.half_size}
         if self.capture == "both":

@@ -23,6 +23,8 @@ GROWN = "grids grown"
 class RaySchedule(Options):
     """Iterations, rays and rates by which a method learns.
 
+    Of a stage it is a :class:`~devrf.engine.schedule.Schedule`.
+
     Attributes:
         iterations: of the whole protocol; each of its stages takes a share.
         rays: of a batch.
@@ -41,6 +43,8 @@ class RaySchedule(Options):
         times_per_batch: for a method whose cost grows with them, of a whole batch; of one of both
             captures the static images' time is one of them. None: any number.
         iterations_per_step: optimiser iterations in one Lightning step.
+        growths: iterations of a stage at which the method's grids grow, ascending; the stage says.
+        milestones: likewise, iterations of what happens once, by name.
     """
 
     key: ClassVar[str] = "ray_stage.schedule"
@@ -59,52 +63,18 @@ class RaySchedule(Options):
     decay: Literal["exponential", "cosine"] = "exponential"
     warmup: Annotated[float, Ge(0), Lt(1)] = 0.0
     iterations_per_step: Count = 10
+    growths: Sequence[int] = ()
+    milestones: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         positive = self.final_learning_rate > 0 or self.decay == "cosine"
         expected = "more than 0, or decay=cosine"
         expect(positive, f"{self.key}.final_learning_rate", expected, self.final_learning_rate)
 
-    def scaled(self, factor: float) -> RaySchedule:
-        """The schedule in ``factor`` times its iterations; the other numbers are shares of them."""
-        return replace(
-            self,
-            iterations=max(1, round(self.iterations * factor)),
-            centre_crop=math.ceil(self.centre_crop * factor),
-        )
-
-    def learning_rate_factor(self, iteration: int) -> float:
-        """At iteration n of N, with ρ = final / initial and x = n / (N − 1), after a warm-up.
-
-        ρ^x, or ρ + (1 − ρ) (1 + cos πx) / 2.
-        """
-        last = max(self.iterations - 1, 1)
-        done = min(iteration, last) / last
-        ratio = self.final_learning_rate / self.learning_rate
-        warmth = min(1.0, (iteration + 1) / (self.warmup * self.iterations + 1))
-        if self.decay == "cosine":
-            return warmth * (ratio + (1 - ratio) * (1 + math.cos(math.pi * done)) / 2)
-        return float(warmth * ratio**done)
-
-
-@dataclass(frozen=True)
-class RayStageSchedule:
-    """The schedule of a stage that learns a method (:class:`~devrf.engine.schedule.Schedule`).
-
-    Attributes:
-        settings: of this stage alone.
-        growths: iterations at which the method's grids grow, ascending.
-        milestones: iterations of what happens once, by name.
-    """
-
-    settings: RaySchedule
-    growths: tuple[int, ...] = ()
-    milestones: Mapping[str, int] = field(default_factory=dict)
-
     @property
     def total(self) -> int:
-        """Iterations of the stage."""
-        return self.settings.iterations
+        """Iterations."""
+        return self.iterations
 
     @property
     def planned_events(self) -> Mapping[str, int]:
@@ -124,17 +94,28 @@ class RayStageSchedule:
         number = min(bisect_right(edges, iteration), len(edges) - 1)
         return Phase(kind="rays", start=edges[number - 1], stop=edges[number])
 
-    def learning_rate_factor(self, iteration: int) -> float:
-        """That of the settings."""
-        return self.settings.learning_rate_factor(iteration)
-
-    def scaled(self, factor: float) -> RayStageSchedule:
+    def scaled(self, factor: float) -> RaySchedule:
         """As many phases in ``factor`` times the iterations, one each at least."""
         edges = [0]
         for edge in self._edges[1:]:
             edges.append(max(round(edge * factor), edges[-1] + 1))
-        return RayStageSchedule(
-            replace(self.settings.scaled(factor), iterations=edges[-1]),
-            growths=tuple(edges[1:-1]),
+        return replace(
+            self,
+            iterations=edges[-1],
+            centre_crop=math.ceil(self.centre_crop * factor),
+            growths=edges[1:-1],
             milestones={name: round(at * factor) for name, at in self.milestones.items()},
         )
+
+    def learning_rate_factor(self, iteration: int) -> float:
+        """At iteration n of N, with ρ = final / initial and x = n / (N − 1), after a warm-up.
+
+        ρ^x, or ρ + (1 − ρ) (1 + cos πx) / 2.
+        """
+        last = max(self.iterations - 1, 1)
+        done = min(iteration, last) / last
+        ratio = self.final_learning_rate / self.learning_rate
+        warmth = min(1.0, (iteration + 1) / (self.warmup * self.iterations + 1))
+        if self.decay == "cosine":
+            return warmth * (ratio + (1 - ratio) * (1 + math.cos(math.pi * done)) / 2)
+        return float(warmth * ratio**done)

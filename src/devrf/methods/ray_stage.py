@@ -26,7 +26,7 @@ from devrf.engine.stage import Stage, Terms
 from devrf.methods.base import Trainable
 from devrf.methods.batch import gather_batch
 from devrf.methods.ray_plan import RayPlan
-from devrf.methods.ray_schedule import GROWN, RaySchedule, RayStageSchedule
+from devrf.methods.ray_schedule import GROWN, RaySchedule
 from devrf.methods.weighted_loss import counted_weights, visibility, weighted_sum
 from devrf.scenes.scene import Views
 from devrf.scenes.space import dynamic_only
@@ -43,7 +43,7 @@ class RayStage(Stage):
     rate_keys = "ray_stage.schedule.learning_rate or the weights of ray_stage.loss"
     plan = RayPlan
     scene_model: Trainable[Any]
-    schedule: RayStageSchedule
+    schedule: RaySchedule
 
     def __init__(
         self,
@@ -70,8 +70,7 @@ class RayStage(Stage):
         self.capture = protocol_stage.capture
         self.protocol_stage = protocol_stage
         total = protocol_stage.share_of(schedule.iterations)
-        of_stage = replace(schedule, iterations=total)
-        self.schedule = RayStageSchedule(of_stage)
+        self.schedule = replace(schedule, iterations=total)
         self.static_share = static_share
         self.scene_model = model
         self._ready = earlier is not None
@@ -113,7 +112,7 @@ class RayStage(Stage):
         the model asks for.
         """
         rays = self.batch_size.rays(self._rays)
-        cropped = self.position.iteration < self.settings.centre_crop
+        cropped = self.position.iteration < self.schedule.centre_crop
         pools = self._centres if cropped else self.pools
         static = round(rays * self.static_share)
         counts = [static, rays - static] if len(pools) > 1 else [rays]
@@ -121,7 +120,7 @@ class RayStage(Stage):
         flats: list[Tensor] = []
         offset = 0
         # Fewer times in a part of the schedule's batch.
-        times = self.settings.times_per_batch
+        times = self.schedule.times_per_batch
         times_left = None if times is None else max(1, round(times * self.batch_size.share))
         for pool, count in zip(pools, counts, strict=True):
             frames = self.shown_frames(pool)
@@ -136,11 +135,6 @@ class RayStage(Stage):
             images.append(image)
             flats.append(flat)
         return torch.cat(images), torch.cat(flats)
-
-    @property
-    def settings(self) -> RaySchedule:
-        """The schedule's settings."""
-        return self.schedule.settings
 
     def setup(self, stage: str) -> None:
         """Give the model what it needs of the scene, and make the optimiser."""
@@ -157,31 +151,29 @@ class RayStage(Stage):
         self.scene_model.begin_stage(self.protocol_stage)
         if hasattr(self, "optimizer"):
             return
-        self.schedule = self._with_method()
-        settings = self.settings
-        highest = settings.learning_rate
+        self.schedule = schedule = self._with_method()
+        highest = schedule.learning_rate
         if not self.scene_model.has_hull:
-            highest = settings.learning_rate_without_hull or highest
+            highest = schedule.learning_rate_without_hull or highest
         groups = self.scene_model.param_groups()
         for group in groups:
             rate = highest * group.pop("rate", 1.0)
             group.update(lr=rate, base_lr=rate)
-        first, second = settings.betas
-        self.optimizer = GridAdam(groups, betas=(first, second), eps=settings.eps)
+        first, second = schedule.betas
+        self.optimizer = GridAdam(groups, betas=(first, second), eps=schedule.eps)
 
-    def _with_method(self) -> RayStageSchedule:
+    def _with_method(self) -> RaySchedule:
         """The schedule with what the method itself does in the course of the stage."""
-        settings = self.settings
-        total = settings.iterations
+        schedule, total = self.schedule, self.schedule.total
         milestones = dict(self.scene_model.milestones(total))
-        if settings.curriculum:
-            milestones["all frames shown"] = math.ceil(settings.curriculum * total)
-        if settings.centre_crop:
-            milestones["whole images shown"] = settings.centre_crop
-        if settings.warmup:
-            milestones["rate grown"] = math.ceil(settings.warmup * total)
-        growths = tuple(sorted({*self.scene_model.growths(total)}))
-        return RayStageSchedule(settings, growths, milestones)
+        if schedule.curriculum:
+            milestones["all frames shown"] = math.ceil(schedule.curriculum * total)
+        if schedule.centre_crop:
+            milestones["whole images shown"] = schedule.centre_crop
+        if schedule.warmup:
+            milestones["rate grown"] = math.ceil(schedule.warmup * total)
+        growths = sorted({*self.scene_model.growths(total)})
+        return replace(schedule, growths=growths, milestones=milestones)
 
     def enter(self, phase: Phase) -> None:
         """Let grids grow; when the stage begins or goes on, gather the pixels to draw from."""
@@ -197,14 +189,14 @@ class RayStage(Stage):
                 self.optimizer.replace(index, parameters, sources.get(group["name"]), **group)
         if self.pools:
             return
-        fewer = self.settings.rays_without_hull
+        fewer = self.schedule.rays_without_hull
         if fewer is not None and not self.scene_model.has_hull:
             self._rays = fewer
         views = [self.datamodule.training_views(name, self.device) for name in self.images]
         if self.scene_model.random_background and all(view_set.has_alpha for view_set in views):
             self.background = BackgroundColor("random")
         self.pools = [self.pool_of(view_set) for view_set in views]
-        if self.settings.centre_crop:
+        if self.schedule.centre_crop:
             self._centres = [FrameSortedPixels.of(view_set, centre=True) for view_set in views]
         self.scene_model.prepare_priors(views, self.weights)
 
@@ -223,7 +215,7 @@ class RayStage(Stage):
 
     def shown_frames(self, pool: FrameSortedPixels) -> int:
         """Number of frames that the curriculum shows by now."""
-        share = self.settings.curriculum * self.schedule.total
+        share = self.schedule.curriculum * self.schedule.total
         iteration = self.position.iteration
         if iteration >= share:
             return pool.frames
