@@ -91,6 +91,20 @@ def test_a_key_whose_only_reader_is_left_out_is_refused(composed):
         check_config(made)
 
 
+def test_a_key_of_another_method_that_is_added_is_warned_of(composed, monkeypatch, caplog):
+    """In a sweep over several methods it may be added to each, as docs/experiments.md says."""
+    word = "++sampling.rays_per_pixel=2"
+    made = composed("method=dnerf", word)
+    monkeypatch.setattr("devrf.cli.config_check.overrides", lambda: ["method=dnerf", word])
+    check_config(made)
+    said = "sampling.rays_per_pixel: nothing reads it here; it belongs to schedule="
+    assert [said in message for message in caplog.messages] == [True]
+    caplog.clear()
+    monkeypatch.setattr("devrf.cli.config_check.in_sweep", lambda: True)
+    check_config(made)
+    assert not caplog.messages
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

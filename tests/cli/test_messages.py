@@ -90,6 +90,14 @@ MISTAKES = {
         ["stage=prepare"],
         "prepare.into: stage=prepare needs a folder; give prepare.into=PATH",
     ),
+    "an objective that nothing scores, inspected": (
+        ["stage=inspect", "objective=dynamic.psnrr"],
+        "objective: ",
+    ),
+    "a program without pictures, inspected": (
+        ["stage=inspect", "evaluation.program=other"],
+        "evaluation.program: it names the program of evaluation.predictions, which are not given",
+    ),
 }
 
 
@@ -116,6 +124,18 @@ VALUES = {
     "a value in place of a part": (
         ["schedule.extensions.bending=1"],
         "schedule.extensions.bending: expected a section with _target_, not 1",
+    ),
+    "a value in place of a callback": (
+        ["callbacks.previews=true"],
+        "callbacks.previews: expected a section with _target_, or null, not True",
+    ),
+    "no previews": (
+        ["callbacks.previews.times=0"],
+        "callbacks.previews.times: expected at least 1",
+    ),
+    "seconds that are none": (
+        ["schedule.seconds=-3"],
+        "schedule.seconds: expected more than 0, not -3",
     ),
     "a value over a reference": (["trainer.deterministic=3"], "trainer.deterministic: expected a "),
     "part that is not there": (["data._target_=devrf.nothing"], "data._target_: cannot load"),

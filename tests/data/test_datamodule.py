@@ -26,6 +26,7 @@ from devrf.scenes.procedural import ProceduralForwardScene
 def test_the_scene_is_loaded_once_and_only_when_needed(tiny_scene, serve):
     module = serve(tiny_scene)
     assert module.loads == 0
+    assert type(module).__name__ in str(module)  # which Lightning's would end in an error
     module.setup("fit")
     module.setup("test")
     assert module.scene is tiny_scene and module.loads == 1

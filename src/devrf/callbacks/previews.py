@@ -11,6 +11,7 @@ from lightning.pytorch.trainer.states import TrainerFn
 from devrf.engine.stage import Stage
 from devrf.loggers.trackers import trackers
 from devrf.pictures.held_out import preview
+from devrf.system.options import Count
 
 
 class Previews(Callback):
@@ -23,7 +24,7 @@ class Previews(Callback):
         psnr: (iterations done, dB) of the validations of the present stage.
     """
 
-    def __init__(self, times: int = 6) -> None:
+    def __init__(self, times: Count = 6) -> None:
         """``times``: of each stage, evenly spread, the last at its end."""
         self.times = times
         self.psnr: list[tuple[int, float]] = []

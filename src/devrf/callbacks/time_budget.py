@@ -40,6 +40,7 @@ from devrf.engine.schedule import (
 from devrf.engine.stage import Stage
 from devrf.errors import DevrfError, expect
 from devrf.system.device import wait
+from devrf.system.options import Positive
 from devrf.system.plain_data import validate
 
 log = logging.getLogger(__name__)
@@ -83,7 +84,7 @@ class TimeBudget(Callback):
         largest_batch: the most of the schedule's batches that is drawn.
     """
 
-    def __init__(self, seconds: float | None = None, largest_batch: float = 1.0) -> None:
+    def __init__(self, seconds: Positive | None = None, largest_batch: float = 1.0) -> None:
         """Prepare to count.
 
         Args:

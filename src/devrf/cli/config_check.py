@@ -28,11 +28,13 @@ from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 from typing_extensions import TypedDict
 
-from devrf.cli.config import REFERENCE, config_folder, set_at
+from devrf.cli.config import REFERENCE, config_folder, in_sweep, overrides, set_at
 from devrf.errors import DevrfError, did_you_mean
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
+
+log = logging.getLogger(__name__)
 
 # Keys of the root.
 ROOT: dict[str, Any] = {
@@ -87,13 +89,24 @@ def check_config(config: DictConfig) -> None:
     # A key that is missing is wrong in its type, too.
     issues = _issues(dict.fromkeys(ROOT) | resolved, ROOT | {"**": Any}, ())
     read = tuple(f"{key}." for key in REFERENCE.findall(json.dumps(raw, default=str)))
+    # Keys of other methods, which a sweep over several may add to each.
+    added = tuple(
+        f"{word.partition('=')[0].lstrip('+')}." for word in overrides() if word[0] == "+"
+    )
     for names, value in _walk(raw):
         key = ".".join(names)
         if _is_part(value):
             part = reduce(getitem, names, resolved)
             issues += _issues(part, _settings(part, key), names)
-        elif key not in ROOT and not f"{key}.".startswith(read) and key not in _of_options():
+        elif key in ROOT or f"{key}.".startswith(read):
+            continue
+        elif f"{key}._target_" in _of_options() and value is not False:
+            said = "Input should be a section with _target_, or null"
+            issues.append((names, {"type": "section", "msg": said, "input": value}))
+        elif key not in _of_options():
             issues.append((names, {"type": UNKNOWN[0]}))
+        elif not in_sweep() and f"{key}.".startswith(added):
+            log.warning("%s: nothing reads it here; it belongs to %s", key, _of_options()[key])
     for names, issue in issues:
         if issue["type"] in UNKNOWN:
             lacking = [other[-1] for other, issue in issues if issue["type"] in LEFT]

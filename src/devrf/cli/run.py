@@ -242,7 +242,7 @@ def _check(run: RunContext, learning: Names, steps: Names) -> None:
     instantiate(config.get("logger"), _convert_="all")  # which writes nothing
     for name in run.learning_stages:
         run.plan(name)
-    if learning or "evaluate" in steps:
+    if learning or not {"evaluate", "inspect"}.isdisjoint(steps):
         run.evaluation.check()
         check_objective(config.objective, run.evaluation.metrics)
     if scores_pictures:

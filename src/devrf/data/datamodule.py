@@ -37,6 +37,10 @@ class SceneDataModule(LightningDataModule, ABC):
         self._scene: Scene | None = None
         self._on_device: dict[tuple[ImagesName, torch.device], Views] = {}
 
+    def __str__(self) -> str:
+        """As :func:`repr`: Lightning's measures loaders, which have no lengths before a fit."""
+        return repr(self)
+
     @abstractmethod
     def load(self) -> Scene:
         """Read or make the scene; called once, when it is first needed."""

@@ -145,9 +145,15 @@ class Evaluation:
         for name in self.metrics:
             if name not in MEASURES:
                 raise DevrfError(
-                    f"evaluation.metrics: no metric {name!r}; choose from {', '.join(MEASURES)}"
+                    f"evaluation.metrics: no metric {name!r}; choose from {', '.join(MEASURES)}, "
+                    "beside PSNR and SSIM, which are always measured"
                     f"{did_you_mean(name, MEASURES)}"
                 )
+        if self.predictions is None and self.program is not None:
+            raise DevrfError(
+                "evaluation.program: it names the program of evaluation.predictions, which are not "
+                "given; give them, or leave it out"
+            )
         if self.predictions is not None and not Path(self.predictions).exists():
             raise DevrfError(f"evaluation.predictions: no folder {self.predictions}; give another")
         if self.motion_masks is not None and not Path(self.motion_masks).is_dir():
