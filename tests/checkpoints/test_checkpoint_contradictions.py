@@ -145,7 +145,7 @@ def test_a_checkpoint_is_shown_or_refused(moving, tmp_path):
 
 @pytest.mark.filterwarnings("ignore")
 def test_gaussians_are_shown_or_refused(moving, tmp_path):
-    model = DeformableGaussians(GaussiansSettings(width=8, depth=2, harmonics=1))
+    model = DeformableGaussians(GaussiansSettings(width=8, depth=2, embedding=2, harmonics=1))
     model.cloud.begin(0.3 * torch.randn(50, 3), torch.rand(50, 3), torch.full((50,), 0.1), 0.5)
     content = read_checkpoint_file(moving)
     content["devrf"]["model"] = {"class": class_path(DeformableGaussians), **model.config()}
@@ -165,6 +165,10 @@ def test_gaussians_are_shown_or_refused(moving, tmp_path):
     color = ("state_dict", "scene_model.cloud.color")
     write_checkpoint_file(moving, changed(content, color, torch.zeros(1, 3)))
     with pytest.raises(DevrfError, match="parts of other numbers of Gaussians"):
+        show()
+    nearest = ("state_dict", "scene_model.cloud.neighbours")
+    write_checkpoint_file(moving, changed(content, nearest, torch.full((50, 6), 50)))
+    with pytest.raises(DevrfError, match="neighbours that are no Gaussians"):
         show()
     write_checkpoint_file(moving, content)
     count = INPUTS // 8

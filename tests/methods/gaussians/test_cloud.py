@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from devrf.methods.gaussians.cloud import (
+    NEIGHBOURS,
     RESET,
     Cloud,
     first_points,
@@ -83,6 +84,22 @@ def test_two_processes_split_alike(cloud: Cloud) -> None:
     torch.manual_seed(2)
     other.grow(RULE, EXTENT, reset=False)
     assert torch.equal(cloud.means, other.means)
+
+
+def test_neighbours_are_the_nearest_at_the_last_growth() -> None:
+    cloud = Cloud(degree=0, embedding=2)
+    points = torch.arange(20.0)[:, None].square().repeat(1, 3)
+    cloud.begin(points, points, torch.ones(20), 0.5)
+    assert sorted(cloud.neighbours[10].tolist()) == [6, 7, 8, 9, 11, 12]
+    assert cloud.neighbours.shape == (20, NEIGHBOURS)
+    with torch.no_grad():
+        cloud.embedding[:] = torch.arange(20.0)[:, None]
+        cloud.means[0] = points[10] + 0.1
+    sources = cloud.grow(GaussiansSettings(densify_above=9.0), EXTENT, reset=False)
+    assert sources["embedding"].tolist() == [*range(20)] and 0 in cloud.neighbours[10]
+    assert torch.equal(cloud.embedding[:, 0], torch.arange(20.0))
+    cloud.begin(points[:3], points[:3], torch.ones(3), 0.5)
+    assert [set(row) for row in cloud.neighbours.tolist()] == [{1, 2}, {0, 2}, {0, 1}]
 
 
 def test_it_begins_on_the_hull_with_the_colors_of_the_images(tiny_scene: Scene) -> None:

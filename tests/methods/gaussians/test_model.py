@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import ImageBatch
@@ -25,7 +27,8 @@ from devrf.scenes.scene import Scene, Views
 
 TINY = GaussiansSettings(
     start_points=150, hull_side=16, start_opacity=0.5, start_size=0.7, max_points=220, harmonics=1,
-    harmonics_every=0.5, width=16, depth=2, bands=2, time_bands=2, still=0.0, means_rate=0.1,
+    harmonics_every=0.5, width=16, depth=2, embedding=3, bands=2, time_bands=2, still=0.0,
+    means_rate=0.1,
     densify_from=0.25, densify_until=0.75, densify_every=0.25, densify_above=0.0, densify_share=0.2,
     split_above=0.0, prune_below=0.02, reset_every=0.0, all_decay=True,
 )  # fmt: skip
@@ -45,7 +48,8 @@ def stage(
     schedule = RaySchedule(iterations=iterations, rays=10_000, iterations_per_step=2, **rates)
     step = step or ProtocolStage("joint", "both")
     model = DeformableGaussians(settings)
-    return ImageStage(model, schedule, {"l1": 1.0, "ssim": 0.2}, step, earlier=rest, half_size=0.25)
+    loss = {"l1": 1.0, "ssim": 0.2, "embedding": 0.1}
+    return ImageStage(model, schedule, loss, step, earlier=rest, half_size=0.25)
 
 
 def test_moves_are_as_large_as_the_scene_in_any_unit() -> None:
@@ -215,12 +219,36 @@ def test_in_two_stages_the_cloud_stays_while_motion_is_learned(
     first = fit(stage(STATIC))
     cloud = first.scene_model.cloud
     assert len(cloud) > 150 and first.events["grids grown"] == 3
-    before = {name: getattr(cloud, name).detach().clone() for name in Cloud.parts}
+    before = {name: getattr(cloud, name).detach().clone() for name in Cloud.at_rest}
+    assert not cloud.embedding.any()
     second = fit(stage(DEFORMATION, first.result()))
     model = second.scene_model
-    assert [group["name"] for group in second.optimizer.param_groups] == ["deformation"]
+    groups = [group["name"] for group in second.optimizer.param_groups]
+    assert groups == ["deformation", "embedding"] and model.cloud.embedding.any()
     assert all(torch.equal(getattr(model.cloud, name), value) for name, value in before.items())
     assert model.last.bias.any() and second.events["grids grown"] == 0 and model.degree == 1
+
+
+def test_two_gaussians_at_one_place_move_apart_by_their_embeddings() -> None:
+    model = DeformableGaussians(TINY)
+    model.cloud.begin(torch.zeros(2, 3), torch.zeros(2, 3), torch.ones(2), 0.5)
+    batch = SimpleNamespace(color=torch.zeros(1, 3), valid=None)
+    output = SimpleNamespace(color=torch.zeros(1, 3))
+
+    def moves_and_term() -> tuple[Tensor, float]:
+        moves = model.moved(1.0)
+        assert moves is not None
+        term = model.loss_terms(output, batch, ["embedding"])["embedding"]
+        return moves[0], float(term.detach())
+
+    moves, term = moves_and_term()
+    torch.testing.assert_close(moves[0], moves[1])
+    assert term == 0
+    with torch.no_grad():
+        model.cloud.embedding[1] = torch.tensor([1.0, 2.0, -2.0])
+    moves, term = moves_and_term()
+    assert not torch.allclose(moves[0], moves[1])
+    assert term == 9  # each is the other's neighbour
 
 
 def test_the_loss_falls(fit: Callable[..., ImageStage]) -> None:
@@ -253,8 +281,8 @@ def test_pixels_that_are_not_valid_do_not_count(fit: Callable[..., ImageStage]) 
 def test_memory_is_that_of_as_many_as_there_may_be() -> None:
     model = DeformableGaussians(replace(TINY, max_points=1001))
     network = sum(p.numel() for p in (*model.trunk.parameters(), *model.last.parameters()))
-    # 3 + 3 + 4 + 1 numbers, and the colours of four harmonics; and the one that is there.
-    assert model.most_bytes == 4 * (network + 1002 * (11 + 3 * 4))
+    # 3 + 3 + 4 + 1 + 3 numbers, and the colours of four harmonics; and the one that is there.
+    assert model.most_bytes == 4 * (network + 1002 * (14 + 3 * 4))
 
 
 @pytest.mark.parametrize("space", ["ndc", "contracted"])

@@ -33,6 +33,8 @@ APART = 0.6
 NOT_FAR = 0.9
 # Points whose distances are computed at once.
 CHUNK = 1024
+# Nearest Gaussians whose embeddings are held alike.
+NEIGHBOURS = 6
 
 
 class Cloud(StoredShape):
@@ -45,24 +47,31 @@ class Cloud(StoredShape):
         opacity: (N,) logits.
         color: (N, 3) factors of the harmonic of degree 0.
         harmonics: (N, K, 3) factors of the others.
+        embedding: (N, E) what the deformation network is told of each beside its place.
+        neighbours: (N, 6) the nearest to each at the last growth, by row; (N, 0) if E is 0.
         seen: (N, 2) sums since the last growth: the length of ∂L/∂centre, and times it was seen.
         grown: () int64, the number of growths.
     """
 
-    parts: ClassVar = ("means", "scales", "quaternions", "opacity", "color", "harmonics")
-    resizable = dict.fromkeys((*parts, "seen"), 1)
+    at_rest: ClassVar = ("means", "scales", "quaternions", "opacity", "color", "harmonics")
+    parts: ClassVar = (*at_rest, "embedding")
+    resizable = dict.fromkeys((*parts, "neighbours", "seen"), 1)
     means: nn.Parameter
     scales: nn.Parameter
     quaternions: nn.Parameter
     opacity: nn.Parameter
     color: nn.Parameter
     harmonics: nn.Parameter
+    embedding: nn.Parameter
+    neighbours: Tensor
     seen: Tensor
     grown: Tensor
 
-    def __init__(self, degree: int) -> None:
+    def __init__(self, degree: int, embedding: int = 0) -> None:
         super().__init__()
-        self.degree = degree
+        self.degree, self.embedding_size = degree, embedding
+        nearest = torch.zeros(1, NEIGHBOURS if embedding else 0, dtype=torch.int64)
+        self.register_buffer("neighbours", nearest)
         self.register_buffer("grown", torch.zeros((), dtype=torch.int64))
         self.register_buffer("seen", torch.zeros(1, 2))
         self.begin(torch.zeros(1, 3), torch.full((1, 3), GREY), torch.ones(1), 0.5)
@@ -71,6 +80,8 @@ class Cloud(StoredShape):
         super()._load_from_state_dict(*args, **kwargs)
         if {len(getattr(self, name)) for name in self.resizable} != {len(self)}:
             raise ValueError("parts of other numbers of Gaussians")
+        if not ((self.neighbours >= 0) & (self.neighbours < len(self))).all():
+            raise ValueError("neighbours that are no Gaussians")
 
     def __len__(self) -> int:
         return len(self.means)
@@ -86,14 +97,24 @@ class Cloud(StoredShape):
             "opacity": torch.full((count,), math.log(opacity / (1 - opacity))),
             "color": (colors - GREY) / FACTORS[0],
             "harmonics": torch.zeros(count, others, 3),
+            "embedding": torch.zeros(count, self.embedding_size),
         }
         self._take({name: value.to(self.seen.device) for name, value in values.items()})
+        self._find_neighbours()
 
     def _take(self, values: dict[str, Tensor]) -> None:
         for name, value in values.items():
             learns = getattr(self, name).requires_grad if hasattr(self, name) else True
             setattr(self, name, nn.Parameter(value, requires_grad=learns))
         self.seen = self.seen.new_zeros(len(self.means), 2)
+        self.neighbours = self.neighbours.new_zeros(len(self.means), self.neighbours.shape[1])
+
+    @torch.no_grad()
+    def _find_neighbours(self) -> None:
+        if self.embedding_size and len(self) > 1:
+            found = nearest(self.means, NEIGHBOURS)[1]
+            again = torch.arange(NEIGHBOURS, device=found.device) % found.shape[1]
+            self.neighbours = found[:, again]
 
     @torch.no_grad()
     def keep(self, rows: Tensor) -> None:
@@ -174,6 +195,7 @@ class Cloud(StoredShape):
             values["opacity"] = values["opacity"].clamp(max=math.log(RESET / (1 - RESET)))
             sources["opacity"] = torch.full_like(source, -1)
         self._take(values)
+        self._find_neighbours()
         return sources
 
 
@@ -222,10 +244,22 @@ def median_colors(points: Tensor, views: Views) -> Tensor:
 
 
 def neighbour_distances(points: Tensor) -> Tensor:
-    """The mean distance (N,) of each point from its three nearest ones."""
-    count = min(4, len(points))
-    found: list[Tensor] = []
-    for part in torch.split(points, CHUNK):
-        nearest = torch.cdist(part, points).topk(count, largest=False).values
-        found.append(nearest[:, 1:].mean(dim=1) if count > 1 else torch.ones(len(part)))
-    return torch.cat(found).clamp(min=1e-6)
+    """The mean distance (N,) of each point from its three nearest ones; 1 of a single point."""
+    if len(points) == 1:
+        return points.new_ones(1)
+    return nearest(points, 3)[0].mean(dim=1).clamp(min=1e-6)
+
+
+def nearest(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """The points nearest to each of (N, 3): their distances and their rows, each (N, K).
+
+    K is ``count``, or less if there are fewer others.
+    """
+    distances, rows = [], []
+    for start in range(0, len(points), CHUNK):
+        away = torch.cdist(points[start : start + CHUNK], points)
+        away.diagonal(start).fill_(torch.inf)
+        found = away.topk(min(count, len(points) - 1), largest=False)
+        distances.append(found.values)
+        rows.append(found.indices)
+    return torch.cat(distances), torch.cat(rows)

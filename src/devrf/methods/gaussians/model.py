@@ -61,7 +61,7 @@ class DeformableGaussians(PlacedModel[ImageBatch], ImageTrainable):
     """
 
     name: ClassVar[str] = "gaussians"
-    losses: ClassVar[tuple[str, ...]] = ("l1", "ssim")
+    losses: ClassVar[tuple[str, ...]] = ("l1", "ssim", "embedding")
     random_background: ClassVar[bool] = True
     unbuilt: ClassVar[tuple[str, ...]] = ("start_points", "max_points")
     settings_class = GaussiansSettings
@@ -77,10 +77,10 @@ class DeformableGaussians(PlacedModel[ImageBatch], ImageTrainable):
         """Build the network, and a cloud of one; of published sizes if no settings are given."""
         s = settings or GaussiansSettings()
         super().__init__(s)
-        self.cloud = Cloud(s.harmonics)
+        self.cloud = Cloud(s.harmonics, s.embedding)
         self.encode = SinusoidalEncoding(3, s.bands, first=math.pi)
         self.encode_time = SinusoidalEncoding(1, s.time_bands, first=math.pi)
-        inputs = self.encode.size + self.encode_time.size
+        inputs = self.encode.size + s.embedding + self.encode_time.size
         self.trunk = Trunk(inputs, s.width, s.depth, skip=4)
         self.last = nn.Linear(s.width, 10)
         nn.init.normal_(self.last.weight, std=STILL)
@@ -118,7 +118,8 @@ class DeformableGaussians(PlacedModel[ImageBatch], ImageTrainable):
         place = self.placement.normalised(self.space.from_world(means))
         place = place.nan_to_num(0.0).clamp(-OUTERMOST, OUTERMOST)
         encoded = self.encode_time(means.new_full((1, 1), time)).expand(len(means), -1)
-        values = self.trunk(torch.cat([self.encode(place), encoded], dim=1))
+        inputs = [self.encode(place), self.cloud.embedding, encoded]
+        values = self.trunk(torch.cat(inputs, dim=1))
         mean, quaternion, scale = (begun * self.last(values)).split([3, 4, 3], dim=1)
         return self.placement.unit / USUAL_UNIT * mean, quaternion, scale
 
@@ -169,7 +170,7 @@ class DeformableGaussians(PlacedModel[ImageBatch], ImageTrainable):
     def loss_terms(
         self, output: RenderOutput, batch: ImageBatch, names: Collection[str]
     ) -> dict[str, Tensor]:
-        """``l1``, the mean absolute error; ``ssim``, 1 − SSIM."""
+        """``l1``, the mean absolute error; ``ssim``, 1 − SSIM; ``embedding`` of neighbours."""
         truth = batch.color
         if batch.valid is not None:
             truth = torch.where(batch.valid[:, None], truth, output.color)
@@ -177,17 +178,23 @@ class DeformableGaussians(PlacedModel[ImageBatch], ImageTrainable):
         if "ssim" in names:
             shape = (batch.camera.height, batch.camera.width, 3)
             terms["ssim"] = 1 - ssim_map(output.color.view(shape), truth.view(shape)).mean()
+        if "embedding" in names:
+            # The mean of |z_i − z_j|² over the nearest j of each Gaussian i (Bae et al. 2024).
+            own = self.cloud.embedding
+            apart = own[:, None] - own[self.cloud.neighbours]
+            terms["embedding"] = apart.square().sum(dim=2).mean() if own.numel() else own.sum()
         return {name: term for name, term in terms.items() if name in names}
 
     def parts(self) -> dict[str, Iterable[nn.Parameter]]:
-        """The cloud; the network that moves it."""
-        deformation = [*self.trunk.parameters(), *self.last.parameters()]
-        return {"canonical": self.cloud.parameters(), "deformation": deformation}
+        """The cloud; the network that moves it, and what it is told of each Gaussian."""
+        network = [*self.trunk.parameters(), *self.last.parameters()]
+        cloud = [getattr(self.cloud, name) for name in Cloud.at_rest]
+        return {"canonical": cloud, "deformation": network, "embedding": [self.cloud.embedding]}
 
     def param_groups(self) -> list[dict[str, Any]]:
-        """A group for each part of the cloud; the network."""
+        """A group for each part of the cloud at rest; the network; what it is told of each."""
         s = self.settings
-        rates = {name: getattr(s, f"{name}_rate") for name in Cloud.parts}
+        rates = {name: getattr(s, f"{name}_rate") for name in Cloud.at_rest}
         rates["means"] *= self.extent
         groups: list[dict[str, Any]] = []
         for group in super().param_groups():

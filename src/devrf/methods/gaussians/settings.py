@@ -30,6 +30,7 @@ class GaussiansSettings(MethodSettings):
         harmonics_every: share of a stage after which their degree grows by 1.
         width: units of each layer of the deformation network.
         depth: its layers; the input enters the fifth once more, if there is one.
+        embedding: numbers of each Gaussian that it reads beside its place, learned at its rate.
         bands: octaves of positions.
         time_bands: octaves of times.
         still: share of a stage in which nothing moves.
@@ -61,6 +62,7 @@ class GaussiansSettings(MethodSettings):
     harmonics_every: Share = 0.025
     width: Count = 256
     depth: Count = 8
+    embedding: Annotated[int, Ge(0), Le(64)] = 0
     bands: Bands = 10
     time_bands: Bands = 10
     still: Share = 0.075
