@@ -13,6 +13,7 @@ import pytest
 
 from devrf import selfcheck
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file, write_checkpoint_file
+from devrf.checkpoints.file_metadata import digest_of
 from devrf.errors import DevrfError
 from devrf.evaluation.objective import check_objective, objective
 from devrf.scenes.export import export
@@ -158,6 +159,11 @@ def test_a_deformation_of_another_canonical_field_is_not_passed_off_as_its_own(
     assert outcome.status == 0
     assert "deformation.ckpt: left out, it belongs to another canonical.ckpt" in outcome.out
     assert not {"dynamic", "deformation"} & set(metrics(folder))
+    assert outcome.out.count("left out") == 1
+    outcome = devrf("stage=export", f"hydra.run.dir={folder}", "export.format=html")
+    assert (outcome.status, outcome.err) == (0, "")
+    page = (folder / "export" / "scene.html").read_text("utf-8")
+    assert f'data-checkpoint="{digest_of(path)}"' in page
 
 
 # What is done already

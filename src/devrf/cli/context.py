@@ -83,6 +83,7 @@ class RunContext(ExitStack):
             itself needs has been estimated.
         is_trial: whether ``trainer.fast_dev_run`` asks for a step of each stage, with nothing kept.
         tried: the results of a trial's stages, by name.
+        left_out: checkpoints of the folder that build on others than the run's.
         chooses_size: whether the images' size is left to this run.
         step_began: the end of the step before; of the first step, the start of the run.
     """
@@ -108,6 +109,7 @@ class RunContext(ExitStack):
             config.still.height = config.still.height or LONGEST
         self.is_trial = bool(config.trainer.get("fast_dev_run"))
         self.tried: dict[str, LoadedCheckpoint] = {}
+        self.left_out: set[Path] = set()
         self.chooses_size = False
         self.step_began = time.perf_counter()
 
@@ -239,7 +241,8 @@ class RunContext(ExitStack):
     def checkpoint(self, name: str | None = None) -> Path:
         """The checkpoint ``ckpt``, else the run's own of a stage.
 
-        By default of the last stage, which may be a progress file.
+        By default of the last stage, which may be a progress file. A file that builds on another
+        checkpoint than the run's is passed over.
 
         Raises:
             DevrfError: there is none.
@@ -252,25 +255,26 @@ class RunContext(ExitStack):
             path = self.own_checkpoint(stage)
             unfinished = progress_files(path.parent, stage) if name is None else []
             for file in [path, *unfinished]:
-                if file.exists():
+                if file.exists() and not self._is_of_another(file, stage):
                     return file
         raise DevrfError(f"{path}: no such checkpoint; run stage={stage} first, or give ckpt=PATH")
 
-    def load(self, name: str | None = None, scene: Scene | None = None) -> LoadedCheckpoint:
-        """Load :meth:`checkpoint`; one that builds on another than the run's is passed over.
+    def _is_of_another(self, file: Path, stage: str) -> bool:
+        """Whether a stage's file builds on another checkpoint than the run's; says so once."""
+        below = self.protocol[stage].builds_on
+        if below is None or not (base := self.own_checkpoint(below)).is_file():
+            return False
+        rest = metadata_of(file).training_config.get(OWN_REST)
+        if not rest or digest_of(base) == rest:
+            return False
+        if file not in self.left_out:
+            self.left_out.add(file)
+            log.info("%s: left out, it belongs to another %s.ckpt than the run's", file, below)
+        return True
 
-        It has to be of the ``scene``; None takes any.
-        """
-        path = self.checkpoint(name)
-        metadata = metadata_of(path)
-        if self.config.ckpt is None and metadata.stage in self.learning_stages:
-            below = self.protocol[metadata.stage].builds_on
-            base = self.own_checkpoint(str(below))
-            rest = metadata.training_config.get(OWN_REST)
-            if rest and base.is_file() and digest_of(base) != rest:
-                log.info("%s: left out, it belongs to another %s.ckpt than the run's", path, below)
-                path = base
-        return load_checkpoint(path, scene, self.device)
+    def load(self, name: str | None = None, scene: Scene | None = None) -> LoadedCheckpoint:
+        """Load :meth:`checkpoint`, which has to be of the ``scene``; None takes any."""
+        return load_checkpoint(self.checkpoint(name), scene, self.device)
 
 
 def _strategy(config: DictConfig) -> Strategy:
