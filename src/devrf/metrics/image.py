@@ -5,16 +5,18 @@ from __future__ import annotations
 import torch
 from kornia.metrics import ssim as kornia_ssim
 from torch import Tensor
-from torch.nn.functional import conv2d, max_pool2d
-from torchmetrics.functional.image import multiscale_structural_similarity_index_measure
+from torch.nn.functional import avg_pool2d, conv2d, max_pool2d
+from torchmetrics.functional.image import structural_similarity_index_measure
 
 # SSIM's window, its side and Gaussian deviation in pixels; SSIM's constants for a range of 1.
 WINDOW = 11
 SIGMA = 1.5
 C1 = 0.01**2
 C2 = 0.03**2
-# The coarsest of MS-SSIM's five scales, 1/16 of the image, must hold a whole window.
-MS_SSIM_SMALLEST = 16 * WINDOW
+# The exponents of MS-SSIM's scales. The coarsest, 1/16 of the image, must hold a whole window.
+FINER_SCALES = (0.0448, 0.2856, 0.3001, 0.2363)
+COARSEST_SCALE = 0.1333
+MS_SSIM_SMALLEST = 2 ** len(FINER_SCALES) * WINDOW
 
 
 def psnr(prediction: Tensor, truth: Tensor) -> float:
@@ -54,7 +56,16 @@ def ms_ssim(prediction: Tensor, truth: Tensor) -> float | None:
     b = _batched(truth)
     if min(a.shape[-2:]) < MS_SSIM_SMALLEST:
         return None
-    return float(multiscale_structural_similarity_index_measure(a, b, data_range=1.0))
+    value = 1.0
+    for exponent in FINER_SCALES:
+        _, contrast = structural_similarity_index_measure(
+            a, b, data_range=1.0, return_contrast_sensitivity=True
+        )
+        value *= float(contrast.clamp(min=0)) ** exponent
+        a, b = avg_pool2d(a, 2), avg_pool2d(b, 2)
+    # torchmetrics counts windows beyond the image here, of which the coarsest scale has most.
+    whole: Tensor = kornia_ssim(a, b, window_size=WINDOW, max_val=1.0, padding="valid").mean()
+    return float(value * float(whole.clamp(min=0)) ** COARSEST_SCALE)
 
 
 def psnr_masked(prediction: Tensor, truth: Tensor, mask: Tensor) -> float | None:
