@@ -124,6 +124,14 @@ def test_points_of_a_world_ray_lie_on_its_ndc_ray(rng):
     torch.testing.assert_close(rays.at(torch.arange(50), share), device)
 
 
+@pytest.mark.parametrize("direction", [(-0.6, 0.0, 0.8), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)])
+def test_rays_that_do_not_look_ahead_meet_nothing_in_ndc(direction):
+    backwards = torch.tensor([direction])
+    rays = NDC.rays(Rays(torch.zeros(1, 3), backwards, backwards))
+    entry, leave = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)).crossing(rays, 0.0, 1.0)
+    assert bool(entry > leave)
+
+
 def test_world_distances_are_depths_of_the_same_points(rng):
     distance = 0.5 + 5 * torch.rand(50, generator=rng)
     ahead = torch.tensor([0.0, 0.0, -4.0])

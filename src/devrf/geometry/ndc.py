@@ -13,12 +13,15 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from devrf.geometry.box import Box
+from devrf.geometry.box import Box, constant
 from devrf.geometry.rays import Rays
 
 # A point at z' = 1 is moved so much nearer, to two million near planes: at infinity its pixel, and
 # all that is learned from it, would be NaN.
 BEFORE_INFINITY = 1e-6
+# Rays whose z falls by less than this a unit never cross the near plane. They begin at BEYOND.
+AHEAD = 1e-3
+BEYOND = 3.0
 
 
 @dataclass(frozen=True)
@@ -69,13 +72,15 @@ class NormalizedDevice:
     def rays(self, rays: Rays) -> Rays:
         """World rays as NDC rays: origin on the near plane, origin + direction at infinity.
 
-        The view directions stay those of the world.
+        The view directions stay those of the world. Rays that look back or aside meet nothing:
+        extended backwards they would see what is behind their camera.
         """
         o = rays.origins
-        d = rays.directions
+        ahead = rays.directions[:, 2:] < -AHEAD
+        d = torch.where(ahead, rays.directions, constant((0.0, 0.0, -1.0), o.dtype, o.device))
         start = o + d * (-(self.near + o[:, 2:]) / d[:, 2:])
         sx, sy = self.slopes
-        origin = self.from_world(start)
+        origin = torch.where(ahead, self.from_world(start), BEYOND)
         x = -sx * (d[:, 0] / d[:, 2] - start[:, 0] / start[:, 2])
         y = -sy * (d[:, 1] / d[:, 2] - start[:, 1] / start[:, 2])
         z = -2 * self.near / start[:, 2]
