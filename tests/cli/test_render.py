@@ -10,6 +10,8 @@ import socket
 import sys
 import threading
 import time
+from contextlib import closing
+from pathlib import Path
 
 import imageio.v3 as iio
 import pytest
@@ -17,6 +19,8 @@ import torch
 import trimesh
 
 from devrf.apps.keyframes import CameraPath, Keyframe, write_path
+from devrf.apps.settings import ViewerSettings
+from devrf.apps.viewer.page import PageServer
 from devrf.checkpoints.checkpoint import load_checkpoint
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file, write_checkpoint_file
 from devrf.checkpoints.file_metadata import digest_of, latest_checkpoint
@@ -295,6 +299,18 @@ def test_a_port_in_use_is_said_in_one_line(of_run, tmp_path, port):
     assert outcome.status == 2 and outcome.err.count("\n") == 1
     assert outcome.err.startswith("devrf: viewer.port: ") and str(used) in outcome.err
     assert not list(tmp_path.iterdir())
+
+
+def test_a_host_is_listened_to_or_refused_in_one_line(of_run, port):
+    outcome = of_run("stage=view", f"viewer.host={'a' * 64}.com")
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert outcome.err.startswith("devrf: viewer.host: cannot listen on aaaa")
+    settings = ViewerSettings(host="::1", port=port)
+    assert settings.address == f"http://[::1]:{port}"
+    if not socket.has_dualstack_ipv6():
+        pytest.skip("no IPv6 here")
+    with closing(PageServer(settings, Path())), socket.create_connection(("::1", port)):
+        pass
 
 
 def test_a_run_learns_the_same_with_the_viewer_beside(devrf, tmp_path, tiny, port):

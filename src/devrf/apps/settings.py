@@ -112,7 +112,13 @@ class ViewerSettings:
     @property
     def address(self) -> str:
         """The address for a browser."""
-        return f"http://{self.host}:{self.port}"
+        host = self.host if self.family == socket.AF_INET else f"[{self.host}]"
+        return f"http://{host}:{self.port}"
+
+    @property
+    def family(self) -> socket.AddressFamily:
+        """That of the host: IPv6 of such an address, else IPv4."""
+        return socket.AF_INET6 if ":" in self.host else socket.AF_INET
 
     def check_free(self) -> None:
         """Check that the address can be listened on.
@@ -121,18 +127,19 @@ class ViewerSettings:
             DevrfError: another program does, or the machine has no such address.
         """
         try:
-            address = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM)[0]
+            kind = socket.SOCK_STREAM
+            address = socket.getaddrinfo(self.host, self.port, self.family, kind)[0]
             with closing(socket.socket(address[0], socket.SOCK_STREAM)) as probe:
                 # As a server sets it: a port that was just given back is free.
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 probe.bind(address[4])
-        except OSError as error:
+        except (OSError, UnicodeError) as error:
             key = "host"
             remedy = "an address of this machine, such as viewer.host=127.0.0.1"
-            if error.errno == errno.EADDRINUSE:
+            why = error.strerror if isinstance(error, OSError) else "no name of a machine"
+            if isinstance(error, OSError) and error.errno == errno.EADDRINUSE:
                 key = "port"
                 remedy = f"another, such as viewer.port={self.port % 65535 + 1}"
             raise DevrfError(
-                f"viewer.{key}: cannot listen on {self.host}:{self.port} ({error.strerror}); "
-                f"give {remedy}"
+                f"viewer.{key}: cannot listen on {self.host}:{self.port} ({why}); give {remedy}"
             ) from None

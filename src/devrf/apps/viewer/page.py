@@ -81,7 +81,7 @@ class PageServer:
         self.settings = settings
         self._stop = threading.Event()
         handler = partial(_Handler, directory=str(folder.resolve()), names=own_names(settings.host))
-        self._server = _Server((settings.host, settings.port), handler, self._stop)
+        self._server = _Server(settings, handler, self._stop)
         threading.Thread(target=self._server.serve_forever, daemon=True).start()
 
     def serve(self) -> None:
@@ -104,10 +104,11 @@ class PageServer:
 class _Server(ThreadingHTTPServer):
     request_queue_size = 64  # clients that wait, and that are answered, at one time
 
-    def __init__(self, address: tuple[str, int], handler: Any, stop: threading.Event) -> None:
+    def __init__(self, settings: ViewerSettings, handler: Any, stop: threading.Event) -> None:
         self._places = threading.BoundedSemaphore(self.request_queue_size)
         self._stop = stop
-        super().__init__(address, handler)
+        self.address_family = settings.family
+        super().__init__((settings.host, settings.port), handler)
 
     def verify_request(self, request: Any, client_address: Any) -> bool:
         """Whether a client is answered, once others are: each may send megabytes of headers."""
