@@ -67,9 +67,7 @@ class Renderer:
         """
         view, background = self.at(time), self._color(background)
         assert not isinstance(view, ImageView)
-        rays, space = rays.to(self.device), self.model.space
-        cropped = crop and CroppedRays.of(rays, crop, space, self.model.depth_limits[0])
-        field_rays = cropped.rays if cropped else space.rays(rays)
+        field_rays, cropped = self._field_rays(rays, crop)
 
         def rendered(part: slice) -> RenderedImage:
             return view.render(field_rays[part], background)
@@ -104,6 +102,14 @@ class Renderer:
         ]
         return RenderedImage.mean(pictures)
 
+    def _field_rays(self, rays: Rays, crop: Box | None) -> tuple[Rays, CroppedRays | None]:
+        """World rays in the fields' space; only those that meet the ``crop``, if there is one."""
+        rays, space = rays.to(self.device), self.model.space
+        if crop is None:
+            return space.rays(rays), None
+        cropped = CroppedRays.of(rays, crop, space, self.model.depth_limits[0])
+        return cropped.rays, cropped
+
     def _color(self, background: float | Tensor) -> Tensor:
         """The RGB (3,) of a background."""
         if isinstance(background, Tensor):
@@ -112,23 +118,35 @@ class Renderer:
 
     @torch.no_grad()
     def induced_flow(
-        self, rays: Rays, pixels: Tensor, camera: Cameras, time: float, other: float
+        self,
+        rays: Rays,
+        pixels: Tensor,
+        camera: Cameras,
+        time: float,
+        other: float,
+        crop: Box | None = None,
     ) -> tuple[Tensor, Tensor] | None:
         """As :meth:`~devrf.rendering.view.MovingView.induced_flow`, of world rays, in chunks.
 
-        The flow at ``time`` from or to the time ``other``. None if views have no motion.
+        The flow at ``time`` from or to the time ``other``. What lies before a ``crop`` is left out;
+        rays that miss it have none. None if views have no motion.
         """
         view = self.at(time)
         if not isinstance(view, MovingView):
             return None
-        rays, pixels, camera = rays.to(self.device), pixels.to(self.device), camera.to(self.device)
-        field_rays = self.model.space.rays(rays)
+        pixels, camera = pixels.to(self.device), camera.to(self.device)
+        field_rays, cropped = self._field_rays(rays, crop)
+        hit = torch.ones_like(pixels[:, 0], dtype=torch.bool) if cropped is None else cropped.hit
+        vectors, masses = torch.zeros_like(pixels), torch.zeros_like(pixels[:, 0])
+        pixels = pixels[hit]
 
         def flow(part: slice) -> tuple[Tensor, Tensor]:
             return view.induced_flow(field_rays[part], pixels[part], camera, other)
 
         parts = in_chunks(flow, len(field_rays), view.chunk, self.device)
-        return torch.cat([mean for mean, _ in parts]), torch.cat([mass for _, mass in parts])
+        vectors[hit] = torch.cat([mean for mean, _ in parts])
+        masses[hit] = torch.cat([mass for _, mass in parts])
+        return vectors, masses
 
     def reach(self, position: Tensor) -> Box | None:
         """The scene's box, if a camera at ``position`` (3,) is so far off that it must be cropped.

@@ -138,6 +138,21 @@ def test_each_channel_has_a_frame_of_its_own(drawing, shot):
     assert int(opacity[0, 0, 0]) == 0 and int(opacity.max()) > 200
 
 
+def test_motion_is_that_of_the_picture_from_afar(drawing, shot):
+    def saturated(away):
+        """The share of colourful pixels from ``away`` times as far, as large in the picture."""
+        pose, fov = shot.keyframe.camera_to_world.clone(), math.radians(shot.keyframe.fov)
+        pose[:, 3] *= away  # it looks at the origin
+        fov = math.degrees(2 * math.atan(math.tan(fov / 2) / away))
+        keyframe = replace(shot.keyframe, camera_to_world=pose, fov=fov)
+        frame = drawn(drawing, replace(shot, channel="motion", keyframe=keyframe), 60)
+        return float((frame.pixels.amin(dim=2) < 200).float().mean())
+
+    assert saturated(1) > 0.01
+    for away in (1.5, 3, 10):  # rays begin at the box
+        assert saturated(away) == pytest.approx(saturated(1), rel=0.3)
+
+
 def test_a_part_is_drawn_by_its_own_renderer(drawing, learned, shot):
     whole = drawn(drawing, shot).pixels
     at_rest = Renderer(learned[0].scene_model)

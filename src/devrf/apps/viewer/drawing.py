@@ -150,7 +150,7 @@ class Drawing:
             vectors = torch.zeros_like(image.color[:, :2])
             if shot.channel == "motion":
                 rays, pixels = band.image_rays(0), band.pixel_grid()
-                flow = renderer.induced_flow(rays, pixels, band, time, later)
+                flow = renderer.induced_flow(rays, pixels, band, time, later, crop)
                 assert flow is not None  # the channel is offered where there is motion
                 vectors = flow[0] * (1 if later > time else -1)
             yield image, vectors
