@@ -424,6 +424,20 @@ def test_a_scene_at_rest_has_no_motion(learned, tiny_scene):
     assert described["times"] == [0.0] and described["defines"]["MOVES"] == 0
 
 
+def test_keys_of_controls_that_a_scene_has_not_do_nothing(browser, learned, tiny_scene, tmp_path):
+    path = tmp_path / "rest.html"
+    text = page(learned[0].scene_model, Viewpoints.of(tiny_scene), "tiny", "0123abcd")
+    path.write_text(text, encoding="utf-8")
+    browser.open(path.as_uri(), 120, 90)
+    browser.wait("document.body.className === 'ready'")
+    pressed = (
+        "document.body.dispatchEvent(new KeyboardEvent('keydown', {bubbles: true, code: '%s'}))"
+    )
+    for code, name, whether in (("KeyC", "cameras", True), ("KeyR", "rest", False)):
+        browser.run(pressed % code)
+        assert browser.run(f"return document.getElementById('{name}').checked") is whether
+
+
 def test_other_methods_are_refused_in_one_line(tiny_scene):
     model: Any = SimpleNamespace(name="tineuvox")
     with pytest.raises(DevrfError, match=r"^method=tineuvox: the page draws DeVRF's fields"):

@@ -541,7 +541,8 @@ class Page {
       const control = event.code === "Space" ? "button, input, select" : "select";
       if (event.ctrlKey || event.metaKey || event.altKey || event.repeat) return;
       if (event.target.matches(control)) return;
-      if (keys[event.code]) byId(keys[event.code]).click();
+      const named = byId(keys[event.code]);
+      if (named && !named.closest("[hidden]")) named.click();
       this.keys.add(event.code);
     });
     addEventListener("keyup", (event) => this.keys.delete(event.code));
