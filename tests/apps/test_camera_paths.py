@@ -11,6 +11,7 @@ from devrf.apps.camera_paths import (
     bullet_time,
     captured,
     orbit,
+    sector,
     spiral,
     swing,
     time_freeze,
@@ -63,6 +64,14 @@ def test_an_orbit_swings_within_the_sector_that_was_seen():
     heights = torch.rad2deg(torch.asin(cameras.positions[:, 2] / 2))
     torch.testing.assert_close(heights, torch.full((40,), 30.0), atol=3, rtol=0)
     assert float(upward(WALK)[2]) > 0.997
+
+
+@pytest.mark.parametrize(
+    ("degrees", "seen"), [([10], 0), ([10, 110], 100), ([10, 190], 360), ([0, 120, 240], 360)]
+)
+def test_few_cameras_stand_all_around_if_no_half_circle_lacks_one(degrees, seen):
+    _, extent = sector(torch.tensor(degrees).deg2rad())
+    assert math.degrees(extent) == pytest.approx(seen, abs=1e-3)
 
 
 @pytest.mark.parametrize("shuffled", [False, True])

@@ -25,7 +25,7 @@ from devrf.rendering.renderable import Renderable
 from devrf.rendering.renderer import Renderer, points_at_depth
 
 # Cameras stand all around if the widest gap between two, seen from above, is at most WIDEST_GAP, or
-# UNEVEN times the gap of evenly spaced ones.
+# UNEVEN times the gap of evenly spaced ones, and no more than half a circle.
 WIDEST_GAP = math.radians(60)
 UNEVEN = 1.5
 # The variance of cameras' own horizontals, as a share, below which their mean up counts.
@@ -90,7 +90,8 @@ def sector(angles: Tensor) -> tuple[float, float]:
     gaps = torch.diff(ascending, append=ascending[:1] + 2 * math.pi)
     widest = int(gaps.argmax())
     first = float(ascending[(widest + 1) % len(angles)])
-    if float(gaps[widest]) <= max(WIDEST_GAP, UNEVEN * 2 * math.pi / len(angles)):
+    uneven = min(UNEVEN * 2 / len(angles), 1.001) * math.pi  # two opposite ones are around it
+    if float(gaps[widest]) <= max(WIDEST_GAP, uneven):
         return first, 2 * math.pi
     return first, 2 * math.pi - float(gaps[widest])
 
