@@ -101,7 +101,7 @@ def test_what_would_have_to_be_learned_is_refused_where_nothing_learns(devrf, ru
         ("data.flow=none", "data.flow"),
         ("seed=1", "seed"),
         ("method=dnerf", "method"),
-        ("experiment=cpu_small", "schedule.canonical."),
+        ("experiment=cpu_small", "sampling.rays_per_pixel"),
     ],
 )
 def test_it_is_named_by_the_first_setting_that_differs(devrf, run, typed, key):
