@@ -71,13 +71,14 @@ def test_moves_are_as_large_as_the_scene_in_any_unit() -> None:
             torch.testing.assert_close(other, move)
 
 
-def test_nothing_moves_at_time_0_and_a_frame_later_all_does() -> None:
+@pytest.mark.parametrize("first", [0.5, 0.03])
+def test_nothing_moves_at_time_0_and_a_frame_later_all_does(first: float) -> None:
     model = DeformableGaussians(TINY)
-    model.clock = type(model.clock)((0.0, 0.5, 1.0))
+    model.clock = type(model.clock)((0.0, first, 1.0))
     with torch.no_grad():
         model.last.bias.copy_(torch.arange(10.0))
     assert model.moved(0.0) is None
-    full, half = model.moved(0.5), model.moved(0.25)
+    full, half = model.moved(first), model.moved(first / 2)
     assert full is not None and half is not None
     expected = [[[0.0, 1 / USUAL_UNIT, 2 / USUAL_UNIT]], [[3.0, 4, 5, 6]], [[7.0, 8, 9]]]
     for move, begun, value in zip(full, half, expected, strict=True):

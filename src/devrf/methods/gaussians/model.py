@@ -111,7 +111,8 @@ class DeformableGaussians(PlacedModel[ImageBatch], ImageTrainable):
         They grow from 0 at time 0 to the network's at the first frame after it, unless it moves the
         cloud at all times.
         """
-        begun = 1.0 if self.moves_at_rest else min(1.0, time * (len(self.clock) - 1))
+        moment = self.clock.at(time)
+        begun = 1.0 if self.moves_at_rest or moment.before else moment.weight
         if begun == 0 or not self.moves_now:
             return None
         means = self.cloud.means.detach()
