@@ -134,3 +134,9 @@ def test_distances_from_neighbours() -> None:
     expected = [1.0] + [(1 + 2 * math.sqrt(2)) / 3] * 3
     assert neighbour_distances(corners).tolist() == pytest.approx(expected)
     assert neighbour_distances(corners[:1]).tolist() == [1.0]
+
+
+def test_distances_are_right_far_from_the_origin() -> None:
+    points = 1024 + torch.rand(60, 3)
+    expected = torch.stack([(points - point).norm(dim=1).sort().values[1:4] for point in points])
+    torch.testing.assert_close(neighbour_distances(points), expected.mean(dim=1))

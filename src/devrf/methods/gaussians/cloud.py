@@ -257,7 +257,9 @@ def nearest(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """
     distances, rows = [], []
     for start in range(0, len(points), CHUNK):
-        away = torch.cdist(points[start : start + CHUNK], points)
+        # By products of matrices far from the origin no digit would be right.
+        mode = "donot_use_mm_for_euclid_dist"
+        away = torch.cdist(points[start : start + CHUNK], points, compute_mode=mode)
         away.diagonal(start).fill_(torch.inf)
         found = away.topk(min(count, len(points) - 1), largest=False)
         distances.append(found.values)
