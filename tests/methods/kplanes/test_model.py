@@ -17,6 +17,7 @@ from devrf.data.datamodule import SceneDataModule
 from devrf.engine.protocol import ProtocolStage
 from devrf.errors import DevrfError
 from devrf.geometry.rays import Rays
+from devrf.methods.batch import gather_batch
 from devrf.methods.kplanes.decoders import ExplicitDecoder, HybridDecoder, density_of
 from devrf.methods.kplanes.model import KPlanes
 from devrf.methods.kplanes.planes import SPACE, TIME, SixPlanes
@@ -193,6 +194,28 @@ def test_the_distortion_of_proposals_has_the_lengths_of_their_intervals(
     expected = (pairs + own).mean() / model.placement.half_edge
     terms = model.loss_terms(output, some_rays, {"distortion"})
     torch.testing.assert_close(terms["distortion"], expected, atol=1e-6, rtol=1e-4)
+
+
+@pytest.mark.parametrize("sampling", ["occupancy", "proposals"])
+def test_in_ndc_distortion_is_of_places_in_the_box(tiny_toy: Scene, sampling: Any) -> None:
+    model = KPlanes(replace(TINY, sampling=sampling, hull=False)).eval()
+    model.setup(tiny_toy)
+    views = tiny_toy.dynamic.train
+    image = torch.arange(len(views)).repeat_interleave(3)
+    batch = gather_batch(views, image, image * 37, torch.ones(3), tiny_toy.space)
+    output = model(batch)
+    extras = output.extras
+    unit = batch.rays.directions.norm(dim=1)
+    steps = torch.full_like(extras["weight"], float(model.step_length / unit.max()))
+    length = extras.get("length", steps) * unit[extras["ray"]] / model.placement.half_edge
+    expected = (extras["weight"].square() * length).sum() / 3
+    for ray in range(len(image)):
+        own = extras["ray"] == ray
+        weight, points = extras["weight"][own], extras["points"][own]  # in normalised space
+        apart = (points[:, None] - points).norm(dim=2)
+        expected += (weight[:, None] * weight * apart).sum()
+    terms = model.loss_terms(output, batch, {"distortion"})
+    torch.testing.assert_close(terms["distortion"], expected / len(image), atol=1e-6, rtol=1e-4)
 
 
 def test_time_has_half_as_many_points_as_frames() -> None:

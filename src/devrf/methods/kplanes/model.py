@@ -148,8 +148,12 @@ class KPlanes(DensityColorField):
         """
         rounds = [proposal.planes for proposal in cast("list[Proposal]", [*self.proposals])]
         extras = output.extras
-        # Even steps are of one length.
-        length = extras.get("length", torch.full_like(extras["weight"], self.step_length))
+        # Of a unit of each ray's direction, which has some other length in NDC.
+        unit = batch.rays.directions.norm(dim=1)
+        pace = unit[extras["ray"]] / self.placement.half_edge
+        # Even steps are as long for the longest.
+        even = self.step_length / unit.max()
+        length = extras.get("length", even.expand_as(pace))
         terms: dict[str, Callable[[], Tensor]] = {
             "render": lambda: nn.functional.mse_loss(output.color, batch.color),
             "tv": lambda: sum_of([each.total_variation() for each in (self.planes, *rounds)]),
@@ -159,10 +163,10 @@ class KPlanes(DensityColorField):
             "histogram": lambda: extras.get("histogram", nothing),
             "distortion": lambda: distortion(
                 extras["weight"],
-                extras["distance"] / self.placement.half_edge,
+                extras["distance"] * pace,
                 extras["ray"],
                 len(batch.time),
-                length=length / self.placement.half_edge,
+                length=length * pace,
             ),
         }
         nothing = output.color.new_zeros(())
