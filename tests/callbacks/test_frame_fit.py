@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from devrf.callbacks.frame_fit import FrameFit, complaint, in_ranges, lost
+from devrf.engine.position import Position
 from devrf.engine.provenance import Provenance
 from devrf.engine.schedule import Phase
 from devrf.engine.stage import Stage
@@ -22,6 +23,7 @@ class Visiting(Stage):
 
     def __init__(self) -> None:
         self.__dict__["phase"] = None
+        self.__dict__["position"] = Position()
         self.__dict__["provenance"] = Provenance(record={"seconds": 1.0})
         self.__dict__["name"] = "deformation"
 
@@ -84,6 +86,15 @@ def test_a_visit_that_a_budget_cuts_short_keeps_what_it_had():
     visit(fit, stage, 1, 1, 0.02)
     visit(fit, stage, 1, 1, 0.01, stop=7)
     assert fit.psnr == {1: pytest.approx(18.2391)}
+
+
+def test_what_was_rolled_back_does_not_count():
+    fit, stage = FrameFit(), Visiting()
+    fit.setup(TRAINER, stage, "fit")
+    visit(fit, stage, 1, 1, 0.1, float("nan"))
+    stage.position.roll_back(iteration=0, iterations_done=0, lr_scale=0.5)
+    visit(fit, stage, 1, 1, 0.01, 0.01)
+    assert fit.psnr == {1: pytest.approx(20)}
 
 
 def test_times_that_are_learned_at_once_have_no_figures():

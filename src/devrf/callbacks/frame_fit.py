@@ -35,8 +35,9 @@ class FrameFit(Callback):
         self._forget()
 
     def _forget(self) -> None:
-        # Kind of the phase, and frame: a budget changes the iterations of a visit on its way.
-        self._visit: tuple[str, int | None] | None = None
+        # Kind of the phase, frame, and rollbacks, before which errors may be no numbers: a budget
+        # changes the iterations of a visit on its way.
+        self._visit: tuple[str, int | None, int] | None = None
         # Of each frame's last visit so far: the sum () of its steps' errors, and their number.
         self._errors: dict[int, tuple[Tensor, int]] = {}
 
@@ -59,7 +60,8 @@ class FrameFit(Callback):
         """Go on with the visit that was interrupted, if one was."""
         assert isinstance(pl_module, Stage)
         phase = pl_module.phase
-        self._visit = None if phase is None else (phase.kind, phase.frame)
+        rollbacks = pl_module.position.num_rollbacks
+        self._visit = None if phase is None else (phase.kind, phase.frame, rollbacks)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -70,8 +72,9 @@ class FrameFit(Callback):
         error = (outputs or {}).get("render")
         if phase is None or phase.frame is None or error is None:
             return
-        if (phase.kind, phase.frame) != self._visit:
-            self._visit = (phase.kind, phase.frame)
+        visit = (phase.kind, phase.frame, pl_module.position.num_rollbacks)
+        if visit != self._visit:
+            self._visit = visit
             self._errors.pop(phase.frame, None)
         total, steps = self._errors.get(phase.frame, (torch.zeros_like(error), 0))
         self._errors[phase.frame] = (total.to(error.device) + error.detach(), steps + 1)
