@@ -164,11 +164,17 @@ def test_the_deformation_stage_goes_on_exactly(learn, rest, each, leaves):
     assert_same(learn(build, *leaves), learn(build))
 
 
-def test_a_fit_that_ended_by_its_steps_goes_on_exactly(learn, rest, datamodule, trainer, tmp_path):
+@pytest.mark.parametrize("scored", [False, True])
+def test_a_fit_that_ended_by_its_steps_goes_on_exactly(
+    learn, rest, datamodule, trainer, tmp_path, scored
+):
     build, path = deformation(rest, MOVING, ROUNDED), tmp_path / "left.ckpt"
     begin_at(3)
     first, second = trainer(max_steps=5), trainer(max_epochs=1)
-    first.fit(build(), datamodule=datamodule)
+    stage = build()
+    first.fit(stage, datamodule=datamodule)
+    if scored:
+        first.test(stage, datamodule=datamodule, verbose=False)
     first.save_checkpoint(path)  # mid-visit, after the frame was let go
     begin_at(99)
     stage = build()

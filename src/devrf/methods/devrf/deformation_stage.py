@@ -199,18 +199,20 @@ class DeformationStage(Stage):
             raise DevrfError(f"{self.scene.name}: is at rest; the canonical stage is all it takes")
         if self.scene.dynamic.train.by_moving_camera and self.deformation_loss.leave_out("flow"):
             log.info("the camera moves, and so does all that it sees: the flow loss is left out")
-        self.phase = None
-        self._left = {}
-        # No frame is active: what is loaded next is checked out when its phase is restored.
-        self.context = DeformationContext(
-            model=self.scene_model,
-            datamodule=self.datamodule,
-            settings=self.settings,
-            optimizer=self.optimizer,
-            generator=self.generator,
-            background=self.background,
-            batch_size=self.batch_size,
-        )
+        # Where a stage is only scored, it can still be saved, and go on from there.
+        if stage == "fit" or not hasattr(self, "context"):
+            self.phase = None
+            self._left = {}
+            # No frame is active: what is loaded next is checked out when its phase is restored.
+            self.context = DeformationContext(
+                model=self.scene_model,
+                datamodule=self.datamodule,
+                settings=self.settings,
+                optimizer=self.optimizer,
+                generator=self.generator,
+                background=self.background,
+                batch_size=self.batch_size,
+            )
         if self.scene_model.deformation is None:
             self._build_field()
             self.schedule = Visits(self.settings, len(self.field.clock))
