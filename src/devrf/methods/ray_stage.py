@@ -143,14 +143,17 @@ class RayStage(Stage):
         if datamodule is not None and datamodule.priors == "all":
             datamodule.provide(self.scene_model.priors)
         super().setup(stage)
+        if stage == "fit":  # pixels are gathered anew, and the colours behind them chosen
+            self.phase = None
+            self.pools = []
         if not self._ready:
             # A protocol without a stage that learns from the static set does not look at it.
             alone = self.capture == "dynamic" and self.protocol_stage.builds_on is None
             self.scene_model.setup(dynamic_only(self.scene) if alone else self.scene)
             self._ready = True
-        self.scene_model.begin_stage(self.protocol_stage)
         if hasattr(self, "optimizer"):
             return
+        self.scene_model.begin_stage(self.protocol_stage)
         self.schedule = schedule = self._with_method()
         highest = schedule.learning_rate
         if not self.scene_model.has_hull:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
+from lightning import Trainer
 from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
@@ -196,6 +198,28 @@ def test_a_stopped_run_goes_on_to_the_same_cloud(stopped_and_resumed: Callable[.
     assert int(cloud.grown) == 3 and resumed.scene_model.degree == 1
     state = resumed.optimizer.state[cloud.means]
     assert state["mean"].shape == cloud.means.shape
+
+
+@pytest.mark.parametrize("scored", [False, True])
+def test_the_same_stage_goes_on_exactly_scored_or_not(
+    fit: Callable[..., ImageStage],
+    same_weights: Callable[..., None],
+    datamodule: SceneDataModule,
+    trainer: Callable[..., Trainer],
+    tmp_path: Path,
+    scored: bool,
+) -> None:
+    torch.manual_seed(0)
+    whole = fit(stage())
+    torch.manual_seed(0)
+    first, left = trainer(max_steps=4), stage()  # two of its own
+    first.fit(left, datamodule=datamodule)
+    if scored:
+        first.test(left, datamodule=datamodule, verbose=False)
+    first.save_checkpoint(tmp_path / "left.ckpt")
+    fit(left, ckpt_path=tmp_path / "left.ckpt")
+    assert left.background.name == whole.background.name == "random"
+    same_weights(whole, left)
 
 
 def test_a_checkpoint_shows_what_was_learned(
