@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 
+from devrf.methods.gaussians import cloud as cloud_module
 from devrf.methods.gaussians.cloud import (
     NEIGHBOURS,
     RESET,
@@ -84,6 +85,17 @@ def test_two_processes_split_alike(cloud: Cloud) -> None:
     torch.manual_seed(2)
     other.grow(RULE, EXTENT, reset=False)
     assert torch.equal(cloud.means, other.means)
+
+
+def test_processes_count_what_each_has_seen(cloud: Cloud, monkeypatch: pytest.MonkeyPatch) -> None:
+    elsewhere = torch.tensor([[0.0, 0.0], [0.6, 1.0], [0.0, 0.0], [0.2, 1.0]])
+    monkeypatch.setattr(cloud_module, "world_size", lambda: 2)
+    monkeypatch.setattr(cloud_module, "average", lambda seen: (seen + elsewhere) / 2)
+    cloud.seen.zero_()
+    cloud.note(torch.tensor([[0.3, 0.4], [0.0, 0.2], [0.0, 0.0], [0.0, 0.0]]))
+    # A file has all of it, from which all of them go on.
+    expected = torch.tensor([[0.5, 1.0], [0.8, 2.0], [0.0, 0.0], [0.2, 1.0]])
+    torch.testing.assert_close(cloud.seen, expected)
 
 
 def test_neighbours_are_the_nearest_at_the_last_growth() -> None:

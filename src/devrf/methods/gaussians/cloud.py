@@ -145,7 +145,9 @@ class Cloud(StoredShape):
         """Count slopes of the centres (N, 2), per half of the image, of those that were seen."""
         length = slopes.norm(dim=1)
         shown = (length > 0) & length.isfinite()
-        self.seen += torch.stack([length.where(shown, 0.0), shown.to(length)], dim=1)
+        seen = torch.stack([length.where(shown, 0.0), shown.to(length)], dim=1)
+        processes = world_size()  # which go on from one file: all count what each has seen
+        self.seen += seen if processes == 1 else processes * average(seen)
 
     @torch.no_grad()
     def grow(self, settings: GaussiansSettings, extent: float, *, reset: bool) -> dict[str, Tensor]:
@@ -157,13 +159,12 @@ class Cloud(StoredShape):
         # Of both halves of what was split, and the same in all processes.
         rng = torch.Generator().manual_seed(int(self.grown))
         self.grown += 1
-        seen = average(self.seen) if world_size() > 1 else self.seen
         size = self.scales.exp().amax(dim=1)
         keep = self.opacity.sigmoid() >= settings.prune_below
         if settings.reset_every and self.grown * settings.densify_every > settings.reset_every:
             keep &= size <= settings.prune_above * extent
         keep |= ~keep.any()
-        want = torch.where(keep, seen[:, 0] / seen[:, 1].clamp(min=1), -1.0)
+        want = torch.where(keep, self.seen[:, 0] / self.seen[:, 1].clamp(min=1), -1.0)
         room = min(
             round(settings.densify_share * len(self)),
             settings.max_points - int(keep.sum()),
