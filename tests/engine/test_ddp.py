@@ -133,6 +133,22 @@ def test_each_process_and_step_draws_pixels_of_its_own(canonical, datamodule, tr
     assert len(set.union(*drawn.values())) == 4
 
 
+@pytest.mark.parametrize("processes", [1, 2])
+def test_what_methods_draw_in_several_processes_follows_from_the_step(
+    canonical, monkeypatch, processes
+):
+    torch.manual_seed(0)
+    stage = canonical()
+    stage.batch_size.processes = processes
+    drawn = []
+    for number in (0, 1, 0, 1):  # they draw unequally many, and a file has the state of one
+        monkeypatch.setattr(CanonicalStage, "global_rank", number)
+        stage.seed_random()
+        drawn.append(tuple(torch.rand(2 + number)[:2].tolist()))
+    assert len({*drawn}) == (4 if processes == 1 else 2)
+    assert (drawn[:2] == drawn[2:]) is (processes == 2)
+
+
 def test_a_strategy_that_cannot_follow_growing_grids_is_refused(monkeypatch, trainer):
     stage = CanonicalStage()
     stage.trainer = trainer()

@@ -214,7 +214,7 @@ class DivergenceGuard(Callback):
         stage.position.roll_back(iteration, good.iterations_done, self.rate_factor)
         stage.optimizer.forget()
         good.restore()
-        stage.position.seed_generator(stage.generator, stage.global_rank)
+        stage.seed_random()
         stage.trainer.should_stop = False
         self._count_from(stage)
         if again:

@@ -195,7 +195,7 @@ class Stage(LightningModule, ABC):
                 break
             position.advance()
         means = mean_terms(losses, self.batch_size.processes)
-        position.seed_generator(self.generator, self.global_rank)
+        self.seed_random()
         if self.is_complete:
             self.trainer.should_stop = True
         if "render" in means:
@@ -223,6 +223,16 @@ class Stage(LightningModule, ABC):
         with span("optimiser"):
             optimizer.step()
         self.batch_size.is_final = False
+
+    def seed_random(self) -> None:
+        """Have the next Lightning step's random numbers follow from its place in the schedule.
+
+        Of several processes those that a method draws itself, too: a progress file has the random
+        state of one.
+        """
+        self.position.seed_generator(self.generator, self.global_rank)
+        if self.batch_size.processes > 1:
+            torch.manual_seed(self.generator.initial_seed() ^ 1)
 
     def abort(self, why: str) -> None:
         """End the stage after the present step; the fit then raises an error that says ``why``."""
@@ -323,7 +333,7 @@ class Stage(LightningModule, ABC):
         if self._progress is not None:
             set_rng_state(self._progress["random"], self.device)
             self._progress = None
-        self.position.seed_generator(self.generator, self.global_rank)
+        self.seed_random()
         self.has_begun = True
 
     def on_train_end(self) -> None:
