@@ -164,6 +164,13 @@ def test_gains_are_over_three_scenes_or_more_and_name_the_worst(table, ran):
     assert [block.title for block in table().blocks] == ["bush", "flower", "robot", "room"]
 
 
+def test_a_multiple_of_time_is_unknown_where_a_scene_has_no_seconds(table, ran):
+    for scene, seconds in (("robot", 20), ("flower", 20), ("bush", None)):
+        ran(f"{scene}_base", scene, ablation="base")
+        ran(f"{scene}_full", scene, seconds=(10, seconds))
+    assert [cells[-1] for cells in texts(table().blocks[-1]).values()] == ["1.00×", "–"]
+
+
 def test_published_rows_stand_below_runs_of_the_same_scene_and_data(table, ran):
     ran("a", "lego")
     ran("at_rest", "lego", at_rest=True)

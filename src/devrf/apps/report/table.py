@@ -303,13 +303,14 @@ def _gains(rows: pd.DataFrame, average: pd.DataFrame) -> pd.DataFrame:
     psnr, seconds = (by_scene[title].reindex(average.index) for title in ("PSNR", "Time"))
     gain = psnr - psnr.iloc[0]
     least = zip(gain.min(axis=1), gain.idxmin(axis=1), strict=True)
+    times = seconds.div(seconds.iloc[0]).mean(axis=1, skipna=False)
     texts = pd.DataFrame(
         {
             "PSNR": psnr.mean(axis=1).map("{:.2f}".format),
             "PSNR, least": psnr.min(axis=1).map("{:.2f}".format),
             "gain over the first": gain.mean(axis=1).map("{:+.2f}".format),
             "gain, least": [f"{value:+.2f} ({scene})" for value, scene in least],
-            "time": seconds.div(seconds.iloc[0]).mean(axis=1).map("{:.2f}×".format),
+            "time": [UNKNOWN if math.isnan(value) else f"{value:.2f}×" for value in times],
         }
     )
     return texts.map(Cell).rename_axis(None)
