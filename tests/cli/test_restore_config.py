@@ -99,6 +99,9 @@ def test_what_would_have_to_be_learned_is_refused_where_nothing_learns(devrf, ru
         ("schedule.seconds=60", "schedule.seconds"),
         ("loss.deformation.flow=1", "loss.deformation.flow"),
         ("data.flow=none", "data.flow"),
+        ("data.shape=flower", "data.shape"),
+        ("data.speed=2", "data.speed"),
+        ("priors=none", "priors"),
         ("seed=1", "seed"),
         ("method=dnerf", "method"),
         ("experiment=cpu_small", "sampling.rays_per_pixel"),
@@ -115,7 +118,7 @@ def test_it_is_named_by_the_first_setting_that_differs(devrf, run, typed, key):
     [
         ["field.width=16", "seed=0", "facing=inward"],  # as it was learned
         ["experiment=quickstart"],
-        ["priors=none", "data.supersample=1"],
+        ["priors=all", "data.supersample=1"],
         ["+callbacks.mine=null", "trainer.max_steps=3", "kernels=torch", "logger=null"],
     ],
 )

@@ -58,10 +58,13 @@ NOTES = TypeAdapter(dict[str, str])
 UNDECISIVE = {"root", "name", "flow_cache", "export", "store"}
 # Sections that say how to show or score what was learned, and with which images to compare it; the
 # last ones are no settings, but what a stage builds on.
-OF_WHAT_IS_SHOWN = {"data", "priors", "rehearse", "evaluation", "video", "callbacks"}
+OF_WHAT_IS_SHOWN = {"data", "rehearse", "evaluation", "video", "callbacks"}
 OF_WHAT_IS_SHOWN |= {root(OWN_REST), root(GIVEN_REST)}
-# Settings of data that are of the learned room alone.
+# Settings of data that are of the learned room alone; and those by which an embedded scene is
+# another one, whose cameras are the same.
 OF_THE_ROOM = {f"data.{name}" for name in ("near", "far", "box", "bound_scale", "space", "flow")}
+OF_THE_ROOM |= {f"data.{name}" for name in ("shape", "scene_seed", "sliding", "surroundings")}
+OF_THE_ROOM |= {f"data.{name}" for name in ("texture", "speed", "light")}
 
 
 @dataclass(frozen=True)
