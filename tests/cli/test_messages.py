@@ -28,6 +28,10 @@ MISTAKES = {
     ),
     "option with dashes": (["--seed=1"], "--seed=1: no such option; write seed=1, or --help"),
     "template's group": (["debug=default"], "debug=default: no such group; rehearse=true takes"),
+    "no folder of runs": (
+        ["stage=report", "report.runs=null"],
+        "report.runs: expected a valid string",
+    ),
     "misspelt logger among several": (["logger=[csv,wand]"], "did you mean logger=wandb?"),
     "key of a logger": (
         ["logger.offline=true"],

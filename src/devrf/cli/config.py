@@ -99,7 +99,7 @@ def run_folder(_root_: Any) -> str:
         return f"{outputs}/{scene_folder_name(into.name)}/capture"
     if stage == "report":
         # A misspelt folder is not created: the step reports that there is none.
-        runs = report.runs if Path(report.runs).is_dir() else outputs
+        runs = report.runs if Path(str(report.runs)).is_dir() else outputs
         return str(ReportSettings(runs, report.into).folder)
     trial = [os.environ.get(name) for name in ("WANDB_SWEEP_ID", "WANDB_RUN_ID")]
     if all(trial):
