@@ -110,10 +110,11 @@ def test_a_rehearsal_is_no_run(paper, devrf_in):
     # No run goes on in its folder.
     done = devrf_in(folder, f"hydra.run.dir={place}", "rehearse=false", "stage=canonical")
     assert done.status == 2 and "rehearse: " in done.err and "resume=false" in done.err
-    # A command that names it looks at it.
+    # A command that names it looks at it, and leaves what was found when it learned.
+    before = record(place)["rehearsal"]
     done = devrf_in(folder, f"hydra.run.dir={place}", "stage=evaluate")
     assert done.status == 0, done.err
-    assert not (place / "metrics.json").exists()
+    assert not (place / "metrics.json").exists() and record(place)["rehearsal"] == before
 
 
 def test_a_rehearsal_leaves_a_run_alone(trained, devrf_in, tmp_path):

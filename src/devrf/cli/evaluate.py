@@ -102,7 +102,11 @@ def evaluate(run: RunContext) -> None:
     ran["wall_seconds"]["evaluate"] = run.step_seconds
     # A report takes metrics.json for the scores of a finished run.
     metrics = "metrics.json" if standing is None else "metrics-unfinished.json"
-    metrics = REHEARSAL if run.rehearses else metrics
+    if run.rehearses:
+        metrics = REHEARSAL
+        if not run.rehearsed:  # scored once more: what was found when it learned stays
+            with suppress(FileNotFoundError, *UNREADABLE):
+                head["rehearsal"] = json.loads(read_record(run.folder / metrics))["rehearsal"]
     _write_record(run, metrics, head | sections, ran)
     summary = shown_sections(sections)
     for name, values in summary.items():
