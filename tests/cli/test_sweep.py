@@ -177,3 +177,12 @@ def test_a_search_of_which_every_job_fails_says_so(devrf, tiny):
     assert [f"job {k}_robot_" in lines[k] and why in lines[k] for k in (0, 1)] == [True, True]
     assert "jobs failed: 0_robot_" in lines[2] and ", 1_robot_" in lines[2]
     assert "Traceback" not in outcome.err
+
+
+@installed("hydra_optuna_sweeper")
+def test_a_search_whose_objective_is_null_in_every_job_says_so(devrf, tiny):
+    words = ("objective=static.ms_ssim", "hydra.sweeper.n_trials=1", "video.frames=1")
+    outcome = devrf("-m", *tiny, *SEARCH, *words)  # of images of 176 pixels or more alone
+    assert outcome.status == 2 and "Traceback" not in outcome.err
+    said = "devrf: objective: null in every job of the search; choose another number\n"
+    assert outcome.err.endswith(said)

@@ -71,14 +71,17 @@ def naming_failures() -> Iterator[None]:
 
     Raises:
         SystemExit: with status 3: jobs failed. A search ends by an error if all of them did.
+        DevrfError: no job of a search has its objective.
     """
     began = time.time()
     problem: Exception | None = None
+    empty = False  # a search none of whose jobs has an objective
     FolderLock.sweep = None
     try:
         yield
     except Exception as error:
         problem = error
+        empty = "No trials are completed" in str(error)
     if (sweep := FolderLock.sweep) is not None:
         release_folder(sweep)
         if problem is not None:
@@ -88,8 +91,10 @@ def naming_failures() -> Iterator[None]:
         if failed := sorted(str(job.relative_to(sweep)) for job in failing):
             why = f"{FAILURE} in each folder below {sweep} says why"
             print(f"devrf: jobs failed: {', '.join(failed)}; {why}", file=sys.stderr)
-            if problem is None or "No trials are completed" in str(problem):
+            if problem is None or empty:
                 raise SystemExit(JOBS_FAILED)
+    if empty:
+        raise DevrfError("objective: null in every job of the search; choose another number")
     if problem is not None:
         raise problem
 
