@@ -91,13 +91,22 @@ def test_a_key_whose_only_reader_is_left_out_is_refused(composed):
         check_config(made)
 
 
-def test_a_key_of_another_method_that_is_added_is_warned_of(composed, monkeypatch, caplog):
+@pytest.mark.parametrize(
+    ("method", "key", "owner"),
+    [
+        ("dnerf", "sampling.rays_per_pixel", "schedule="),
+        ("devrf", "ray_stage.schedule.rays", "method=dnerf, "),
+    ],
+)
+def test_a_key_of_another_method_that_is_added_is_warned_of(
+    composed, monkeypatch, caplog, method, key, owner
+):
     """In a sweep over several methods it may be added to each, as docs/experiments.md says."""
-    word = "++sampling.rays_per_pixel=2"
-    made = composed("method=dnerf", word)
-    monkeypatch.setattr("devrf.cli.config_check.overrides", lambda: ["method=dnerf", word])
+    word = f"++{key}=2"
+    made = composed(f"method={method}", word)
+    monkeypatch.setattr("devrf.cli.config_check.overrides", lambda: [f"method={method}", word])
     check_config(made)
-    said = "sampling.rays_per_pixel: nothing reads it here; it belongs to schedule="
+    said = f"{key}: nothing reads it here; it belongs to {owner}"
     assert [said in message for message in caplog.messages] == [True]
     caplog.clear()
     monkeypatch.setattr("devrf.cli.config_check.in_sweep", lambda: True)

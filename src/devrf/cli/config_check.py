@@ -246,8 +246,8 @@ def _of_options() -> Mapping[str, str]:
     keys: dict[str, str] = {}
     for file in sorted(config_folder().glob("*/*.yaml")):
         group = file.parent.name
-        # The files of a schedule have the sections that belong to its size.
-        above = () if group == "schedule" else (group,)
+        # The files of a method and of a schedule have sections of their own.
+        above = () if group in ("method", "schedule") else (group,)
         nodes: list[tuple[Names, Any]] = [(above, yaml.load(file.read_bytes(), LOADER))]
         for names, node in nodes:
             key = ".".join(names)
