@@ -56,6 +56,9 @@ def connected(strategy: Strategy) -> Iterator[None]:
         if one_line(error) is None:
             # If another has failed, this one notices a broken connection: the launcher will end it.
             time.sleep(GRACE)
+        elif distributed.get_backend() == "gloo":
+            # Left open, its threads may abort the process at its end, in place of its status.
+            distributed.destroy_process_group()
         raise
     distributed.destroy_process_group()
 

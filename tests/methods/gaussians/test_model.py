@@ -327,7 +327,7 @@ def test_unbounded_scenes_are_learned_in_the_world(
     half, whole = scene.bounds.whole.scaled(0.45), scene.bounds.whole.scaled(0.901)
     assert whole.contains(places).all()
     assert half.contains(places).float().mean().item() == pytest.approx(1 / 8, abs=0.08)
-    learned = fit(stage(iterations=160), data=serve(scene))
+    learned = fit(stage(iterations=240), data=serve(scene))
     views = scene.dynamic.train
     time, truth = float(views.times[-1]), views.pixels[-1, ..., :3].float().view(-1, 3) / 255
 
