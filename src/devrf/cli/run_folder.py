@@ -75,9 +75,8 @@ class FolderLock(Callback):
             # A report's default folder is a name in the folder of the runs.
             named = config.stage == "report" and folder == Path(str(config.report.runs)) / "report"
             refuse_links(folder, itself=named)
-            folder.mkdir(
-                parents=True, exist_ok=True
-            )  # as Hydra does next, with a traceback where it cannot
+            # As Hydra does next, with a traceback where it cannot.
+            folder.mkdir(parents=True, exist_ok=True)
             if config.stage in UNRECORDED:
                 with read_write(config.hydra):
                     config.hydra.output_subdir = None

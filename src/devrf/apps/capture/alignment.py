@@ -27,7 +27,7 @@ SURE = 4.0
 LEAST_VALUES = 6
 # Another lag that is as sure as this share of the best may be the right one as well.
 RIVAL = 0.8
-# Added where a number must not be 0, or 1.
+# What must not be 0, or 1, is so far from it.
 TINY = 1e-9
 
 _BY_HAND = (
@@ -236,7 +236,7 @@ def _correlations(
     spread_a = sums(a**2, low) - of_a**2 / overlap
     spread_b = sums(b**2, low - lags) - of_b**2 / overlap
     spread = np.sqrt(spread_a.clip(min=0) * spread_b.clip(min=0))
-    changes = spread > 1e-9 * len(a) * a.std() * b.std()
+    changes = spread > TINY * len(a) * a.std() * b.std()
     correlations = np.zeros_like(spread)
     np.divide(products - of_a * of_b / overlap, spread, out=correlations, where=changes)
     return correlations, overlap
@@ -250,7 +250,6 @@ def _samples_a_value(a: Signal, b: Signal) -> float:
         power = np.abs(np.fft.rfft(signal, 2 * len(signal))) ** 2
         products = np.fft.irfft(power, 2 * len(signal))[:count]
         # Beyond its first zero an autocorrelation is mostly noise.
-        both *= np.where(np.minimum.accumulate(products) > 0, products, 0.0) / max(
-            products[0], TINY
-        )
+        products *= np.minimum.accumulate(products) > 0
+        both *= products / max(products[0], TINY)
     return 1 + 2 * float(both[1:].sum())

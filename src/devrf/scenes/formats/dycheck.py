@@ -142,9 +142,7 @@ def _directions(camera: Camera, pixels: Numbers) -> Tensor:
     k1, k2, k3 = camera.radial_distortion
     distortion = np.array([k1, k2, *camera.tangential_distortion, k3])
     until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
-    straight = [
-        cv2.undistortPoints(point[None], np.eye(3), distortion, criteria=until) for point in bent
-    ]
+    straight = cv2.undistortPoints(bent[:, None], np.eye(3), distortion, criteria=until)
     return torch.from_numpy(np.reshape(straight, (-1, 2)))
 
 
