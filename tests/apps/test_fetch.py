@@ -189,7 +189,7 @@ def test_an_archive_of_folders_in_one_another_is_refused(tmp_path):
 def trickle() -> Iterator[str]:
     """The address of a server that sends a part at once, then a byte now and then, for a minute.
 
-    ``/moved`` leads elsewhere, ``/busy`` asks to be asked later.
+    ``/moved`` leads elsewhere, ``/busy`` asks to be asked later, ``/slow`` sends headers alone.
     """
 
     class Handler(BaseHTTPRequestHandler):
@@ -199,11 +199,14 @@ def trickle() -> Iterator[str]:
                 "/moved": (302, "Location", "/there"),
                 "/busy": (503, "Retry-After", "30"),
             }.get(self.path, (200, "Server", ""))
+            if self.path == "/slow":
+                self.wfile.write(b"HTTP/1.0 200 OK\r\n")
             self.send_response(code)
             self.send_header(header, said)
-            self.end_headers()
+            if self.path != "/slow":
+                self.end_headers()
             with suppress(OSError):
-                self.wfile.write(bytes(2000))
+                self.wfile.write(bytes(2000) if self.path != "/slow" else b"X: ")
                 for _ in range(1200):
                     self.wfile.write(b"x")
                     time.sleep(0.05)
@@ -224,6 +227,7 @@ def trickle() -> Iterator[str]:
         ("lego.zip", {"LONGEST": 0.4}, "it comes too slowly"),
         ("lego.zip", {"LARGEST": 1000}, "more than 1.0 kB came"),
         ("moved", {"LONGEST": 0.4}, "it comes too slowly"),
+        ("slow", {"STALLED": 1.0}, "it comes too slowly"),
         ("busy", {}, "503 .*"),
     ],
 )
@@ -238,10 +242,11 @@ def test_a_download_without_end_is_ended(tmp_path, monkeypatch, trickle, path, l
 
 
 def test_a_download_that_is_interrupted_leaves_no_part(tmp_path, monkeypatch, trickle):
-    def interrupted(self: object, size: int) -> None:
+    def interrupted(self: object, seconds: float) -> None:
+        monkeypatch.undo()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("urllib3.response.HTTPResponse.read1", interrupted)
+    monkeypatch.setattr("multiprocessing.pool.ApplyResult.wait", interrupted)
     with pytest.raises(KeyboardInterrupt):
         fetched(
             published("lego", url=f"{trickle}/lego.zip"), FetchSettings(tmp_path), progress=False

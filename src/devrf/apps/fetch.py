@@ -12,6 +12,7 @@ import tomllib
 import zipfile
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -63,9 +64,10 @@ LARGEST = 2**34
 LARGEST_CATALOGUE = 2**20
 # Points in a line of a catalogue: time and memory for a name grow with the square of its parts.
 MOST_POINTS = 100
-# Seconds that a scene may take, and that a server may say nothing.
+# Seconds that a scene may take; that a server may say nothing; that nothing of a file may come.
 LONGEST = 6 * 3600
 PATIENCE = 60
+STALLED = 5 * PATIENCE
 # The file by which a scene's folder is known, by the layout that reads it.
 MARKERS = {
     "inward": "transforms_train.json",
@@ -243,9 +245,29 @@ def _download(scene: PublishedScene, folder: Path, progress: bool) -> dict[str, 
     import urllib3
 
     files = {name: folder / name for name in scene.downloads}
-    left, until = LARGEST, time.monotonic() + LONGEST
+    left, heard, until = LARGEST, 0.0, time.monotonic() + LONGEST
     bar = Progress(console=Console(stderr=True), disable=not progress)
-    with requests.Session() as session, bar:
+
+    def take(name: str, url: str) -> None:
+        nonlocal left, heard
+        with (
+            session.get(url, stream=True, timeout=PATIENCE) as answer,
+            atomic_write(files[name]) as begun,
+            begun.open("wb") as file,
+        ):
+            answer.raise_for_status()
+            size = int(answer.headers.get("Content-Length", 0)) or None
+            task = bar.add_task(name, total=size, visible=scene.is_archive)
+            while part := answer.raw.read1(2**20):  # what has come, be it a byte
+                heard = time.monotonic()
+                left -= len(part)
+                if left < 0:
+                    raise ValueError(f"more than {decimal(LARGEST)} came")
+                file.write(part)
+                bar.advance(task, len(part))
+
+    # A thread may be left alone: a server may send headers without end.
+    with requests.Session() as session, bar, ThreadPool(1) as thread:
         # A server may ask for any wait, and send any amount with a redirection, which is read.
         retries = urllib3.Retry(2, respect_retry_after_header=False)
         for scheme in ("http://", "https://"):
@@ -256,23 +278,14 @@ def _download(scene: PublishedScene, folder: Path, progress: bool) -> dict[str, 
         for name, url in bar.track(scene.downloads.items(), description=scene.name):
             if files[name].is_file():
                 continue
+            heard = time.monotonic()
+            taken = thread.apply_async(take, (name, url))
             try:
-                with (
-                    session.get(url, stream=True, timeout=PATIENCE) as answer,
-                    atomic_write(files[name]) as begun,
-                    begun.open("wb") as file,
-                ):
-                    answer.raise_for_status()
-                    size = int(answer.headers.get("Content-Length", 0)) or None
-                    task = bar.add_task(name, total=size, visible=scene.is_archive)
-                    while part := answer.raw.read1(2**20):  # what has come, be it a byte
-                        left -= len(part)
-                        if left < 0:
-                            raise ValueError(f"more than {decimal(LARGEST)} came")
-                        if time.monotonic() > until:
-                            raise TimeoutError("it comes too slowly")
-                        file.write(part)
-                        bar.advance(task, len(part))
+                while not taken.ready():
+                    taken.wait(0.2)
+                    if time.monotonic() > min(until, heard + STALLED):
+                        raise TimeoutError("it comes too slowly")
+                taken.get()
             except (OSError, ValueError, urllib3.exceptions.HTTPError) as error:
                 if getattr(error, "errno", None) is not None:  # the disk's
                     raise
@@ -280,6 +293,10 @@ def _download(scene: PublishedScene, folder: Path, progress: bool) -> dict[str, 
                     f"{url}: cannot be fetched ({error}); see that the network works, and that "
                     f"its page {scene.collection.page} names no other address"
                 ) from None
+            finally:
+                if not taken.ready():  # interrupted, or too slow
+                    left = 0  # ends the thread with the next bytes, and its file is removed
+                    taken.wait(1)
     return files
 
 
