@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from urllib.error import URLError
+from zipfile import ZIP_DEFLATED, ZipFile
 
 import pytest
 import torch
@@ -112,3 +113,13 @@ def test_weights_that_are_given_must_fit(tmp_path):
     for path in (noise, tmp_path / "no.pth", random_weights("alex", tmp_path)):
         with pytest.raises(DevrfError, match="not the weights of vgg"):
             load_lpips("vgg", path)
+
+
+def test_packed_weights_are_refused(tmp_path):
+    """A small file of packed zeros would fill the memory; torch itself packs nothing."""
+    packed = tmp_path / "packed.pth"
+    with ZipFile(random_weights("alex", tmp_path)) as whole, ZipFile(packed, "w") as archive:
+        for entry in whole.infolist():
+            archive.writestr(entry.filename, whole.read(entry), ZIP_DEFLATED, compresslevel=1)
+    with pytest.raises(DevrfError, match="not the weights of alex"):
+        load_lpips("alex", packed)

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Literal
+from zipfile import ZipFile, is_zipfile
 
 import torch
 from torch import Tensor, nn
@@ -203,6 +204,11 @@ def read_lpips(network: Network, path: Path) -> Lpips:
         linear = torch.load(weights_file, map_location="cpu", weights_only=True)
     heads = [linear[f"lin{number}.model.1.weight"] for number in range(5)]
     try:
+        if is_zipfile(path):
+            with ZipFile(path) as archive:
+                unpacked = sum(entry.file_size for entry in archive.infolist())
+            if unpacked > path.stat().st_size:  # torch packs nothing, and would read it all
+                raise ValueError(unpacked)
         stored = torch.load(path, map_location="cpu", weights_only=True)
         start = "features."
         features = {k.removeprefix(start): stored[k] for k in stored if k.startswith(start)}
