@@ -95,6 +95,13 @@ def test_an_error_before_the_first_job_ends_the_sweep_at_once(devrf, tmp_path, t
     assert not list(tmp_path.iterdir())
 
 
+def test_an_objective_that_no_job_has_ends_the_sweep_at_once(devrf, tmp_path, tiny):
+    outcome = devrf("-m", *tiny, "objective=static.psnrr", "seed=0,1")
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert outcome.err.startswith("devrf: objective: static has no 'psnrr'; choose from psnr, ")
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_plugin_that_is_missing_is_named_with_the_remedy(devrf, tmp_path, tiny, monkeypatch):
     devrf("--info", "searchpath")  # Hydra has looked for its plugins
     launchers = ConfigStore.instance().repo["hydra"]["launcher"]

@@ -19,6 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 from devrf.cli.config import SWEEP_RECORD, in_sweep
 from devrf.cli.messages import one_line, report_user_errors
 from devrf.errors import DevrfError
+from devrf.evaluation.objective import check_objective
 from devrf.system.files import (
     PARTIAL,
     close_logs,
@@ -86,10 +87,12 @@ class FolderLock(Callback):
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Lock the folder of a sweep, and write its record; each job locks its own folder.
 
-        Hydra's own sweeper writes the same record, others write none.
+        Hydra's own sweeper writes the same record, others write none. An objective that no job
+        would have ends the sweep here, and not each of its jobs.
         """
         folder = Path(config.hydra.sweep.dir)
         with report_user_errors():
+            check_objective(str(config.objective), config.evaluation.metrics)
             missing = [name for name in ("srun", "sbatch") if shutil.which(name) is None]
             if config.hydra.launcher._target_.endswith(".SlurmLauncher") and missing:
                 raise DevrfError(
