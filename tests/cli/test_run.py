@@ -236,6 +236,8 @@ def test_the_objective_is_looked_up():
     assert objective("dynamic.psnr", {"static": {"psnr": 30.0}}) == 30.0
     assert objective("validation.psnr", {"static": {"psnr": 30.0}}) == 30.0
     assert objective("dynamic.rest_pose_psnr", {"static": {"psnr": 30.0}}) is None
+    check_objective("dynamic.checkpoint_mb", [])
+    assert objective("dynamic.checkpoint_mb", {"static": {"checkpoint_mb": 2.0}}) == 2.0
     assert objective("validation.psnr", {**found, "validation": {"psnr": 10.0}}) == 10.0
 
 
@@ -249,6 +251,7 @@ def test_the_objective_is_looked_up():
         ("validation.seconds", "objective: validation has no 'seconds'"),
         ("deformation.flow_error", "objective: deformation has no 'flow_error'"),
         ("static.rest_pose_psnr", "objective: static has no 'rest_pose_psnr'"),
+        ("static.checkpoint_mb", "objective: static has no 'checkpoint_mb'"),
     ],
 )
 def test_any_other_objective_is_an_error(key, said):

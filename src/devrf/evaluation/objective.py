@@ -16,11 +16,11 @@ TRAINING = (
     "num_rollbacks",
     "lost_frames",
 )
-# Numbers of both sections of metrics.json, and of the dynamic one. Their second names are those of
-# DeVRF's stages.
+# Numbers of both sections of metrics.json, and of the dynamic one: of what moves, and the size of
+# the checkpoint, which has all. Their second names are those of DeVRF's stages.
 SCORES = ("psnr", "ssim")
-OF_BOTH = (*SCORES, *TRAINING, "checkpoint_mb")
-OF_MOTION = ("rest_pose_psnr", "flicker", "pck_t")
+OF_BOTH = (*SCORES, *TRAINING)
+OF_DYNAMIC = ("rest_pose_psnr", "flicker", "pck_t", "checkpoint_mb")
 STATIC = ("static", "canonical")
 DYNAMIC = ("dynamic", "deformation")
 # The section that metrics.json has only where the objective is one of its numbers.
@@ -38,7 +38,7 @@ def check_objective(key: str, metrics: Sequence[str]) -> None:
         expected = "static.NAME, dynamic.NAME or validation.NAME"
         raise DevrfError(f"objective: expected {expected}, not {key!r}")
     recorded = SCORES if section == VALIDATION else OF_BOTH
-    names = [*recorded, *metrics, *(OF_MOTION if section in DYNAMIC else ())]
+    names = [*recorded, *metrics, *(OF_DYNAMIC if section in DYNAMIC else ())]
     if name not in names:
         raise DevrfError(
             f"objective: {section} has no {name!r}; choose from {', '.join(names)}"
