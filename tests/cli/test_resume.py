@@ -66,10 +66,17 @@ def test_another_config_is_refused_by_the_name_of_the_key(again, run, arguments,
     assert contents(run / "checkpoints") == kept
 
 
-def test_a_deformation_cares_for_its_own_settings_only(again):
+def test_what_the_canonical_field_would_have_to_be_learned_with_is_refused_on_top_of_it(again, run):
     outcome = again("stage=deformation", "schedule.canonical.iterations=7")
-    assert outcome.status == 0
-    assert "deformation: learned already" in outcome.out
+    assert (outcome.status, outcome.err.count("\n")) == (2, 1)
+    was = f"{run}/checkpoints/canonical.ckpt was made with 6, now it is 7"
+    said = f"devrf: schedule.canonical.iterations: {was}; stage=deformation builds on that file: "
+    assert outcome.err.startswith(said)
+
+
+def test_a_deformation_has_a_seed_of_its_own(again):
+    outcome = again("stage=deformation", "seed=1", "resume=false")
+    assert (outcome.status, outcome.err) == (0, "")
 
 
 def test_beginning_afresh_keeps_the_old_run_whole(again, run):

@@ -7,7 +7,8 @@ Each checkpoint holds the settings that decided its result:
 * either with other settings: the run is refused, naming the first that differs;
 * a deformation on top of another canonical field than the run's: it is learned anew.
 
-What only shows or scores a finished checkpoint refuses such settings, too, where they are typed.
+What shows or scores a finished checkpoint, or builds on it, refuses such settings, too, where they
+are typed.
 
 Settings of logging, scoring, rendering, the device, callbacks that only look, and the place of the
 data may differ.
@@ -161,28 +162,32 @@ def _agrees(path: Path, metadata: CheckpointMetadata, training_config: Mapping[s
     )
 
 
-def check_as_learned(run: RunContext) -> None:
+def check_as_learned(run: RunContext, learning: str | None = None) -> None:
     """Check that nothing was typed that the run's checkpoint would have to be learned with.
 
-    Defaults that have changed since then are no mistake of the command.
+    Defaults that have changed since then are no mistake of the command. Where a stage is
+    ``learning``, the checkpoint is the one that it builds on, and its own settings are its own.
 
     Raises:
         DevrfError: a typed setting, or one of a typed option, is another than it was learned with.
     """
-    path = run.checkpoint()
+    path = run.checkpoint(None if learning is None else run.protocol[learning].builds_on)
+    own = {} if learning is None else deciding_settings(run.config, learning)
+    does = "learns nothing" if learning is None else "builds on that file"
     metadata = metadata_of(path)
     learned = {**metadata.earlier_configs, metadata.stage: metadata.training_config}
     typed = {key for key, v in run.command.items() if metadata.command.get(key, ...) != v}
     typed = {key for key in typed if root(key) not in OF_WHAT_IS_SHOWN or key in OF_THE_ROOM}
-    by_option = any(key[0] == "/" for key in typed)
+    # A stage that is learned may have another option than those before it.
+    by_option = learning is None and any(key[0] == "/" for key in typed)
     for stage, before in learned.items():
         now = deciding_settings(run.config, stage) if before else {}
         for key in {**now, **before}:
             asked = key in typed or (by_option and root(key) not in OF_WHAT_IS_SHOWN)
-            if asked and now.get(key) != before.get(key):
+            if asked and key not in own and now.get(key) != before.get(key):
                 raise DevrfError(
-                    f"{_made_otherwise(path, key, before, now)}; stage={run.config.stage} learns "
-                    "nothing: leave it out, or learn another run with it (hydra.run.dir=FOLDER)"
+                    f"{_made_otherwise(path, key, before, now)}; stage={run.config.stage} {does}: "
+                    "leave it out, or learn another run with it (hydra.run.dir=FOLDER)"
                 )
 
 

@@ -150,6 +150,9 @@ def _prepare_to_learn(run: RunContext, requested: Names, steps: Names) -> None:
     if learning != requested:
         stages = ", ".join(learning + steps)
         log.info("%s is at rest: %s; no motion is learned", run.config.scene, stages)
+    below = run.protocol[learning[0]].builds_on
+    if below is not None:
+        check_as_learned(run, learning[0])
     if run.rehearses:
         begin_anew(run, learning)
         return
@@ -160,7 +163,6 @@ def _prepare_to_learn(run: RunContext, requested: Names, steps: Names) -> None:
     if shortage is not None:
         raise DevrfError(f"{shortage}, or try all the same with memory_check=false")
     if not resume and not run.is_trial:
-        below = run.protocol[learning[0]].builds_on
         archive_previous(run.folder, *([] if below is None else [run.own_checkpoint(below)]))
     if needed is not None:
         log.info("%s", needed)
