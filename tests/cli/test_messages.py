@@ -73,6 +73,10 @@ MISTAKES = {
         ["schedule.deformation.levels.4={iterations:2}", "schedule.deformation.levels.3=null"],
         "schedule.deformation.levels: expected rows 1 to 3 with side and iterations",
     ),
+    "a word in place of a share": (
+        ["protocol.stages.canonical.iterations=true"],
+        "protocol.stages.canonical.iterations: expected a share above 0, at most 1, not True",
+    ),
     "unknown loss term": (["+loss.deformation.foo=1"], "unknown term 'foo'"),
     "unknown accelerator": (["trainer.accelerator=abacus"], "trainer: "),
     "several devices, each for itself": (
@@ -111,6 +115,10 @@ VALUES = {
     "samples of which none counts": (
         ["sampling.alpha_threshold=1"],
         "sampling.alpha_threshold: expected below 1, not 1",
+    ),
+    "a word in place of a number of rays": (
+        ["sampling.rays_per_pixel=true"],
+        "sampling.rays_per_pixel: expected 1, 2 or 4, not 'True'",
     ),
     "an opacity that is none": (
         ["sampling.search_alpha_threshold=nan"],

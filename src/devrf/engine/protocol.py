@@ -34,8 +34,8 @@ class ProtocolStage:
         key, captures = f"protocol.stages.{self.name}", get_args(CaptureChoice)
         expected = "static, dynamic or both"
         expect(self.capture in captures, f"{key}.capture", expected, repr(self.capture))
-        holds, expected = 0 < self.iterations <= 1, "a share above 0, at most 1"
-        expect(holds, f"{key}.iterations", expected, self.iterations)
+        holds = type(self.iterations) in (int, float) and 0 < self.iterations <= 1
+        expect(holds, f"{key}.iterations", "a share above 0, at most 1", self.iterations)
 
     def share_of(self, iterations: int) -> int:
         """The stage's share of a method's iterations."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, ClassVar, Literal
 
 from annotated_types import Ge, Gt, Le
+from pydantic import BeforeValidator
 from pydantic.dataclasses import dataclass
 
 from devrf.system.options import Options
@@ -12,7 +13,10 @@ from devrf.system.options import Options
 # A distance between samples, in voxels: shorter ones fill memory and show no more.
 Step = Annotated[float, Ge(0.01)]
 # Where they go through: devrf.geometry.cameras.pixel_positions.
-RaysPerPixel = Literal[1, 2, 4]
+# Pydantic would take true and 1.0 for 1.
+RaysPerPixel = Annotated[
+    Literal[1, 2, 4], BeforeValidator(lambda count: count if type(count) is int else str(count))
+]
 
 
 @dataclass(frozen=True)
