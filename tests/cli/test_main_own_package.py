@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from devrf.cli.config import config_folder
+from devrf.cli.config_check import CHANGES
 from devrf.scenes.export import export
 
 PAGE = Path(__file__).parents[2] / "docs" / "extending.md"
@@ -59,3 +61,25 @@ def test_configs_alone_need_no_package(devrf, tmp_path):
     for where in (["--config-dir", "mine"], ["hydra.searchpath=[file://mine]"]):
         said = devrf(*where, "experiment=seven", "--cfg", "job")
         assert said.status == 0 and "seed: 7" in said.out
+
+
+@pytest.mark.parametrize(
+    ("group", "content", "key"),
+    [
+        ("method", "defaults: [devrf]\nmethod: own\n", "method.method"),
+        ("experiment", "schedule: {seconds: 60}\n", "experiment.schedule.seconds"),
+    ],
+)
+def test_a_config_of_the_whole_without_the_line_that_says_so(devrf, tmp_path, group, content, key):
+    (tmp_path / "mine" / group).mkdir(parents=True)
+    (tmp_path / "mine" / group / "own.yaml").write_text(content)
+    outcome = devrf("--config-dir", "mine", f"{group}=own")
+    said = f"a file of {group}=NAME begins with the line '# @package _global_'"
+    expected = f"devrf: {key}: no part reads it; {said}\n"
+    assert (outcome.status, outcome.err) == (2, expected)
+
+
+def test_groups_of_configs_of_the_whole_are_known():
+    files = config_folder().glob("*/*.yaml")
+    groups = {file.parent.name for file in files if "@package _global_" in file.read_text()}
+    assert groups == {"method", "schedule", *CHANGES}

@@ -54,6 +54,9 @@ ROOT: dict[str, Any] = {
     "outputs": str | Path,
     "kernels": Literal["auto", "torch"],
 }
+# Groups whose files have no section of the group's name: they change those of other groups.
+CHANGES = {"ablation", "comparison", "experiment", "facing", "for_scene", "hparams_search"}
+CHANGES |= {"profile"}
 # A part that cannot be loaded ends the command with one line; Hydra would log it before.
 logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)
 # Hydra's own keys in a part's config.
@@ -229,6 +232,9 @@ def unknown_key(config: DictConfig, names: Names, others: Iterable[object] = ())
     there = OmegaConf.select(config, section) if section else config
     known = {*there, *others} - {name} if isinstance(there, DictConfig) else others
     group, *path = where.split(".")
+    if path and group in {"method", *CHANGES}:
+        header = f"a file of {group}=NAME begins with the line '# @package _global_'"
+        return DevrfError(f"{where}: no part reads it; {header}")
     deeper = [k for k in _of_options() if k.startswith(f"{group}.") and k.split(".")[2:] == path]
     meant = did_you_mean(name, sorted(map(str, known)), where[: -len(name)])
     if not meant and where in _of_options():
@@ -246,6 +252,8 @@ def _of_options() -> Mapping[str, str]:
     keys: dict[str, str] = {}
     for file in sorted(config_folder().glob("*/*.yaml")):
         group = file.parent.name
+        if group in CHANGES:
+            continue
         # The files of a method and of a schedule have sections of their own.
         above = () if group in ("method", "schedule") else (group,)
         nodes: list[tuple[Names, Any]] = [(above, yaml.load(file.read_bytes(), LOADER))]
