@@ -253,7 +253,9 @@ def test_a_callback_of_the_user_that_fails_is_named(devrf, tmp_path, tiny, monke
     done = devrf(*tiny, "stage=canonical", "+callbacks.mine._target_=watchers.Sampler")
     said = "callbacks.mine: Sampler.on_train_start failed (ValueError: no such layer)"
     assert (done.status, done.err) == (2, f"devrf: {said}\n")
-    assert "watchers.py" in done.out  # the traceback
+    assert "Traceback" not in done.out and "a callback failed" in done.out
+    (log,) = tmp_path.glob("outputs/robot/*/run.log")
+    assert "Traceback" in log.read_text() and "watchers.py" in log.read_text()
 
 
 def test_jobs_of_a_sweep_are_grouped_and_named(devrf, tmp_path, tiny, monkeypatch):

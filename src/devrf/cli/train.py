@@ -130,7 +130,7 @@ def _fit(run: RunContext, stage: Stage, begin: ResumePoint) -> None:
 
 @contextmanager
 def _named(callbacks: Mapping[str, Callback | None]) -> Iterator[None]:
-    """Say it if an error comes from a callback that is not devrf's; the log has its traceback.
+    """Say it if an error comes from a callback that is not devrf's; run.log has its traceback.
 
     Raises:
         DevrfError: naming the callback's key, its method and the error.

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import re
+from copy import copy
 from unicodedata import bidirectional, category
 
 # Control characters, halves of characters, ends of lines and paragraphs.
@@ -53,3 +54,13 @@ class LogFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """The record as text."""
         return "\n".join(map(shown, super().format(record).split("\n")))
+
+
+class TerminalFormatter(LogFormatter):
+    """The same without tracebacks, which are in the run's log."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The record as text."""
+        said = copy(record)  # other formatters get the record, too
+        said.exc_info = said.exc_text = None
+        return super().format(said)
