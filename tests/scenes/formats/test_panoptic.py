@@ -65,6 +65,14 @@ def test_the_first_images_are_the_static_set(folder):
     assert few.view.tolist() == [0, 1] * 2 and few.times.tolist() == [0.0, 0.0, 1.0, 1.0]
 
 
+def test_so_are_those_of_two_cameras(folder):
+    listed = json.loads((folder / "train_meta.json").read_text())
+    listed |= {key: [taken[:2] for taken in listed[key]] for key in ("fn", "k", "w2c", "cam_id")}
+    put_json(folder / "train_meta.json", listed)
+    scene = PanopticReader(folder, downscale=1).read()
+    assert scene.static.train.times.tolist() == [0.0, 0.0] and len(scene.dynamic.train) == 6
+
+
 def test_masks_cut_the_subject_out(folder, balls_are_where_they_project):
     scene = PanopticReader(folder, downscale=1, masks="alpha").read()
     for views in (scene.dynamic.train, scene.dynamic.test, scene.static.train):

@@ -80,7 +80,7 @@ class EasyVolcapReader(InwardReader):
         test = held_out_view(len(cameras), self.test_view)
         held_out = range(test, len(shots), len(cameras))
         learned = sorted({*range(len(shots))} - {*held_out})
-        return with_static_times(everything[learned], everything[held_out], None)
+        return with_static_times(everything[learned], everything[held_out], 0.0)
 
 
 def read_cameras(intrinsics: Path, extrinsics: Path) -> dict[str, tuple[Tensor, Intrinsics]]:

@@ -73,7 +73,7 @@ class PanopticReader(InwardReader):
             )
         train = self._listed(files[0], learned, finder)
         test = self._listed(files[1], held_out, finder, train.offset)
-        return with_static_times(train, test, None)
+        return with_static_times(train, test, 0.0)
 
     def _listed(
         self, file: Path, meta: _Meta, finder: ImageFinder, offset: Offset | None = None
