@@ -149,6 +149,10 @@ VALUES = {
         ["schedule.seconds=-3"],
         "schedule.seconds: expected more than 0, not -3",
     ),
+    "a word in place of a text or a part": (
+        ["trainer.accelerator=true"],
+        "trainer.accelerator: expected a valid string, not True",
+    ),
     "a value over a reference": (["trainer.deterministic=3"], "trainer.deterministic: expected a "),
     "part that is not there": (["data._target_=devrf.nothing"], "data._target_: cannot load"),
 }

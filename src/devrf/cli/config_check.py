@@ -121,7 +121,8 @@ def check_config(config: DictConfig) -> None:
             wrong.setdefault(set_at(config, names) or names[0], []).append(issue)
     for where, (issue, *others) in wrong.items():
         value = issue["input"]
-        said = expectation([each["msg"] for each in (issue, *others)], repr(value))
+        plain = [each["msg"] for each in (issue, *others) if each["type"] not in BUILT]
+        said = expectation(plain or [issue["msg"]], repr(value))
         choices = re.findall("'([^']+)'", said.rpartition(", not ")[0])
         if issue["type"] in BUILT:
             said = f"expected a section with _target_, not {value!r}"
