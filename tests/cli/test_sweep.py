@@ -102,6 +102,13 @@ def test_an_objective_that_no_job_has_ends_the_sweep_at_once(devrf, tmp_path, ti
     assert not list(tmp_path.iterdir())
 
 
+def test_metrics_that_are_no_list_are_refused_by_each_job(devrf, tmp_path, tiny):
+    outcome = devrf("-m", *tiny, *LEARN, "evaluation.metrics=null", "seed=0,1")
+    assert outcome.status == 3
+    assert outcome.err.count("evaluation.metrics: expected a valid array, not None\n") == 2
+    assert (tmp_path / "sweep" / "multirun.yaml").is_file()
+
+
 def test_a_plugin_that_is_missing_is_named_with_the_remedy(devrf, tmp_path, tiny, monkeypatch):
     devrf("--info", "searchpath")  # Hydra has looked for its plugins
     launchers = ConfigStore.instance().repo["hydra"]["launcher"]

@@ -92,7 +92,9 @@ class FolderLock(Callback):
         """
         folder = Path(config.hydra.sweep.dir)
         with report_user_errors():
-            check_objective(str(config.objective), config.evaluation.metrics)
+            # What is no list each job refuses.
+            if OmegaConf.is_list(config.evaluation.metrics):
+                check_objective(str(config.objective), config.evaluation.metrics)
             missing = [name for name in ("srun", "sbatch") if shutil.which(name) is None]
             if config.hydra.launcher._target_.endswith(".SlurmLauncher") and missing:
                 raise DevrfError(
