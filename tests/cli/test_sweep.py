@@ -155,6 +155,21 @@ def test_a_search_maximises_the_objective(devrf, tmp_path, tiny):
     assert {path.name for path in tmp_path.iterdir()} == {"sweep"}
 
 
+@installed("hydra_optuna_sweeper")
+@pytest.mark.parametrize(
+    ("typed", "said"),
+    [
+        ("hydra.sweeper.direction=up", "Please set either 'minimize' or 'maximize' to direction."),
+        ("loss.fine.render=interval(2,1)", "The `low` value must be smaller than or equal to the"),
+    ],
+)
+def test_what_a_search_cannot_take_is_one_line(devrf, tmp_path, tiny, typed, said):
+    outcome = devrf("-m", *tiny, *SEARCH, typed, "hydra.sweep.dir=sweep")
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert outcome.err.startswith(f"devrf: {said}")
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_folder_without_the_record_of_a_sweep_is_refused(devrf, tmp_path):
     outcome = devrf("stage=still", "hydra.sweep.dir=elsewhere")
     said = "no sweep is typed (-m); without one, and without experiment=, it names the folder of a"

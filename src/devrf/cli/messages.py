@@ -45,9 +45,9 @@ def report_user_errors() -> Iterator[None]:
 
 
 def _of_hydras_options(error: BaseException) -> bool:
-    """Whether Hydra refuses a command's options, for which it has no class of error."""
+    """Whether Hydra or Optuna refuses a command's options, for which it has no class of error."""
     modules = [""] + [frame.f_globals["__name__"] for frame, _ in walk_tb(error.__traceback__)]
-    return isinstance(error, ValueError) and modules[-1].startswith("hydra._internal.")
+    return isinstance(error, ValueError) and modules[-1].startswith(("hydra._internal.", "optuna."))
 
 
 def _cause(error: BaseException) -> BaseException:
