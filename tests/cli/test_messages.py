@@ -94,6 +94,11 @@ MISTAKES = {
     "scoring before training": (["stage=evaluate"], "canonical.ckpt: no such checkpoint"),
     "missing checkpoint": (["stage=render", "ckpt=no.ckpt"], "no.ckpt: no such checkpoint"),
     "checkpoint where none is used": (["ckpt=no.ckpt"], "ckpt: stage=pipeline starts from nothing"),
+    "an empty folder's name, which would be the present one": (
+        ["hydra.run.dir="],
+        "hydra.run.dir=: names nothing; give a path, or leave it out",
+    ),
+    "an empty name in quotes": (["ckpt=''"], "ckpt='': names nothing; give a path"),
     "no folder to prepare": (
         ["stage=prepare"],
         "prepare.into: stage=prepare needs a folder; give prepare.into=PATH",

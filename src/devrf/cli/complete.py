@@ -150,7 +150,7 @@ def quoted_path(argument: str) -> str:
     A comma separates paths, as it does other values, unless it is in the name of one that is there.
 
     Raises:
-        DevrfError: it names a file that no config can hold.
+        DevrfError: it names nothing, or a file that no config can hold.
     """
     match = KEY_VALUE.fullmatch(argument)
     if not match or match[2] not in PATHS:
@@ -165,7 +165,9 @@ def quoted_path(argument: str) -> str:
     with suppress(HydraException):
         (override,) = parsed([argument])
         read = override.value()
-        if read in (None, "", text) or (override.is_sweep_override() and not is_there):
+        if read == "":
+            raise DevrfError(f"{argument}: names nothing; give a path, or leave it out")
+        if read in (None, text) or (override.is_sweep_override() and not is_there):
             return argument
         # A folder's name may look like a number or a list.
         paths = [read if isinstance(read, str) else text]
