@@ -258,6 +258,16 @@ def test_a_callback_of_the_user_that_fails_is_named(devrf, tmp_path, tiny, monke
     assert "Traceback" in log.read_text() and "watchers.py" in log.read_text()
 
 
+@pytest.mark.parametrize(
+    ("group", "expected"),
+    [("callbacks", "one of Lightning's callbacks"), ("logger", "one of Lightning's loggers")],
+)
+def test_what_is_no_callback_and_no_logger_is_named(devrf, tmp_path, tiny, group, expected):
+    done = devrf(*tiny, "stage=canonical", f"+{group}.mine._target_=fractions.Fraction")
+    line = f"devrf: {group}.mine: expected {expected}, not Fraction(0, 1)\n"
+    assert (done.status, done.err) == (2, line)
+
+
 def test_jobs_of_a_sweep_are_grouped_and_named(devrf, tmp_path, tiny, monkeypatch):
     pytest.importorskip("wandb")
     monkeypatch.delenv("WANDB_MODE", raising=False)

@@ -36,7 +36,7 @@ from devrf.engine.needs import SIZE
 from devrf.engine.plan import StagePlan
 from devrf.engine.protocol import Protocol
 from devrf.engine.stage import Stage
-from devrf.errors import DevrfError
+from devrf.errors import DevrfError, expect
 from devrf.evaluation.objective import VALIDATION
 from devrf.evaluation.suite import Evaluation
 from devrf.loggers.trackers import Tracker, trackers
@@ -208,6 +208,9 @@ class RunContext(ExitStack):
         if not self.is_rank_zero or self.is_trial or self.rehearses:
             return []
         built = instantiate(self.config.get("logger"), _convert_="all") or {}
+        for key, logger in built.items():
+            is_one = logger is None or isinstance(logger, Logger)
+            expect(is_one, f"logger.{key}", "one of Lightning's loggers", repr(logger))
         loggers: list[Logger] = [*filter(None, built.values())]
         for tracker in trackers(loggers):
             self.push(lambda error, *_, ends=tracker: ends.close(failed=error is not None))

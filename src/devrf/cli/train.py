@@ -27,7 +27,7 @@ from devrf.callbacks import (
 from devrf.cli.context import RunContext
 from devrf.cli.resume import ResumePoint, beginning, remove_progress
 from devrf.engine.stage import Stage, fit
-from devrf.errors import DevrfError
+from devrf.errors import DevrfError, expect
 from devrf.loggers.csv_logger import ResumableCSVLogger
 from devrf.system.files import atomic_write
 from devrf.system.process import Interrupted
@@ -74,6 +74,9 @@ def _fit(run: RunContext, stage: Stage, begin: ResumePoint) -> None:
         if "callbacks" in run.config
         else {"grid_upscaling": GridUpscaling(), "learning_rate_decay": LearningRateDecay()}
     )
+    for key, callback in configured.items():
+        is_one = callback is None or isinstance(callback, Callback)
+        expect(is_one, f"callbacks.{key}", "one of Lightning's callbacks", repr(callback))
     callbacks = [TrainingRecord(), *filter(None, configured.values())]
     saving = next((hook for hook in callbacks if isinstance(hook, PeriodicCheckpoint)), None)
     if saving is None:  # no periodic files, but still one at a signal
