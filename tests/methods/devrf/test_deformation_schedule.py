@@ -130,9 +130,13 @@ def test_a_level_may_go_through_the_frames_backwards():
     schedule = DeformationSchedule((Level(4, 6), Level(6, 4, backwards=True)))
     assert course(schedule, 4)[3:] == [(1, 3, 24, 32), (1, 2, 32, 36), (1, 1, 36, 40)]
     assert [p.step for p in deformation_phases(schedule, 4)] == [1, 1, 1, -1, -1, -1]
-    # Without coarse to fine there is one level, and it begins at rest.
+    # Without coarse to fine there is one level; it begins at rest, without a level's own factors.
     alone = replace(schedule, coarse_to_fine=False)
     assert [p.frame for p in deformation_phases(alone, 4)] == [1, 2, 3]
+    finishing = Level(6, 4, lr_factor=0.1, lr_final_factor=0.1, other_terms=0.1)
+    for last in (Level(6, 4), finishing):
+        (level,) = DeformationSchedule((Level(4, 6), last), coarse_to_fine=False).levels
+        assert level == Level(6, 10)
 
 
 @given(

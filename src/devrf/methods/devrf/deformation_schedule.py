@@ -98,8 +98,9 @@ class DeformationSchedule(Options):
 
     Attributes:
         levels: coarse to fine.
-        coarse_to_fine: False spends all shares at the finest resolution, at the base rate, each
-            frame starting from the one before it (``ablation=base``, docs/method.md#ablations).
+        coarse_to_fine: False spends all shares at the finest resolution, at the base rate and with
+            whole weights, each frame starting from the one before it (``ablation=base``,
+            docs/method.md#ablations).
         decay: factor of the learning rate from a level to the next, if its side is another one.
         rays: of a batch.
         planes: grid points along z at the finest level, in proportion to ``side`` at the others;
@@ -140,9 +141,7 @@ class DeformationSchedule(Options):
     def __post_init__(self) -> None:
         if not self.coarse_to_fine:
             iterations = sum(level.iterations for level in self.levels)
-            finest = replace(
-                self.levels[-1], iterations=iterations, lr_factor=None, backwards=False
-            )
+            finest = Level(side=self.levels[-1].side, iterations=iterations)
             object.__setattr__(self, "levels", (finest,))
         if self.levels[0].backwards:
             raise DevrfError(
