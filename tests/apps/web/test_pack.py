@@ -32,6 +32,7 @@ from PIL import Image
 from browser import PATIENCE, psnr
 from devrf.apps.captured_cameras import described, thumbnail, write_thumbnails
 from devrf.apps.settings import ViewerSettings
+from devrf.apps.still import still
 from devrf.apps.viewer.page import PageServer
 from devrf.apps.web.pack import page
 from devrf.checkpoints.checkpoint import Viewpoints
@@ -54,6 +55,7 @@ for (const frustum of document.querySelectorAll("#frusta g:not([hidden]) polygon
 }
 """
 LEAST_PSNR = 45.0
+LEAST_PSNR_OF_DEPTH = 35.0  # the page's palette has nine colours
 # Of scenes whose colours change from one grid point to the next, and with the direction.
 LEAST_IN_HASTE = 23.0
 ROWS = 54
@@ -130,6 +132,10 @@ def test_a_browser_draws_what_the_renderer_does(browser, scenes, tmp_path, space
         assert truth.std() > 0.05
         assert psnr(picture, truth) >= LEAST_PSNR, moment
         assert browser.said() == []
+    choice = pytest.importorskip("selenium.webdriver.support.select").Select
+    choice(browser.element("channel")).select_by_visible_text("depth")
+    _, depth = still(renderer, camera, moment, behind)
+    assert psnr(browser.changed(picture), depth) >= LEAST_PSNR_OF_DEPTH
     moved = renderer.view(viewpoints.held_out.of_height(ROWS), 0, 1.0, behind).color
     assert psnr(moved, at_rest) < LEAST_PSNR - 3  # the times do not all look the same
     # Previews: no picture is finished, and none may take time.

@@ -30,7 +30,7 @@ uniform vec3 low, high, displacementLow, displacementHigh;  // the boxes of all 
 uniform float shift, delta, threshold, stepLength, near, far, displacementStep;
 uniform vec3 ndc;                    // 2f/W, 2f/H, near plane
 uniform vec3 center, innerHalf;      // of the scene; in contracted space of the inner box
-uniform float reach, shell;          // of depths about the centre; of contracted space
+uniform float reach, shell;          // of depths about the centre, in the world; of contracted space
 uniform bool warps, zeroOutsideBox;
 uniform float share, interval;       // of the frame after; from one to the other
 uniform vec3 eye, right, up, backward, background;
@@ -176,9 +176,17 @@ vec3 network(vec3 p, vec3 added) {
   return 1.0 / (1.0 + exp(-(logits.xyz + added)));
 }
 
+// Between the depths of geometry/space.py's depth_range.
 vec3 depthColor(float s, float opacity) {
-  float first = SPACE == 1 ? near : max(length(eye - center) - reach, 0.0);
-  float last = SPACE == 1 ? far : length(eye - center) + reach;
+#if SPACE == 1
+  float first = near, last = far;
+#elif SPACE == 2
+  float away = largest(abs(eye - center) / innerHalf), unit = dot(innerHalf, vec3(1.0 / 3.0));
+  float first = unit * max(away - 1.0 - shell * (1.0 - 1.0 / max(away, 1.0)), 0.0);
+  float last = unit * (away + 1.0 + shell);
+#else
+  float first = max(length(eye - center) - reach, 0.0), last = length(eye - center) + reach;
+#endif
   float close = 8.0 * (1.0 - clamp((s - first) / (last - first), 0.0, 1.0));
   int stop = min(int(close), 7);
   return mix(vec3(1.0), mix(palette[stop], palette[stop + 1], close - float(stop)), opacity);
