@@ -66,6 +66,15 @@ def test_an_orbit_swings_within_the_sector_that_was_seen():
     assert float(upward(WALK)[2]) > 0.997
 
 
+@pytest.mark.parametrize("elevation", [-90.0, -88.0, 0.0, 45.0, 88.5, 90.0])
+def test_an_orbit_turns_evenly_at_any_height(elevation):
+    settings = VideoSettings(frames=12, orbit_elevation=elevation)
+    right = orbit(FOUR, ORIGIN, settings).camera_to_world[:, :, 0]
+    torch.testing.assert_close(right[:, 2], torch.zeros(12), atol=1e-5, rtol=0)
+    cosines = (right * right.roll(-1, dims=0)).sum(dim=1)
+    torch.testing.assert_close(cosines, torch.full((12,), math.cos(math.pi / 6)))
+
+
 @pytest.mark.parametrize(
     ("degrees", "seen"), [([10], 0), ([10, 110], 100), ([10, 190], 360), ([0, 120, 240], 360)]
 )

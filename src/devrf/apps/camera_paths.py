@@ -77,8 +77,11 @@ def orbit(cameras: Cameras, target: Tensor, settings: VideoSettings) -> Cameras:
     east_and_north = offsets @ axes.T
     first, extent = sector(torch.atan2(east_and_north[:, 1], east_and_north[:, 0]))
     angle = turn if extent == 2 * math.pi else first + extent * (1 + turn.sin()) / 2
-    around = math.cos(elevation) * torch.stack([angle.cos(), angle.sin()], dim=1) @ axes
-    return _looking(cameras, target + radius * (around + math.sin(elevation) * up), target, up)
+    around = torch.stack([angle.cos(), angle.sin()], dim=1) @ axes
+    high, level = math.sin(elevation), math.cos(elevation)
+    # Up in the images, also straight above the target, where the cameras only turn.
+    upright = level * up - high * around
+    return _looking(cameras, target + radius * (level * around + high * up), target, upright)
 
 
 def sector(angles: Tensor) -> tuple[float, float]:
@@ -236,7 +239,10 @@ def _rigid(poses: Tensor) -> Tensor:
 
 
 def _looking(cameras: Cameras, positions: Tensor, target: Tensor, up: Tensor) -> Cameras:
-    """Cameras at ``positions`` (N, 3) with the captured ones' lens that look at ``target`` (3,)."""
+    """Cameras at ``positions`` (N, 3) with the captured ones' lens that look at ``target`` (3,).
+
+    ``up`` is (3,) or (N, 3).
+    """
     poses = Cameras.looking_at(
         positions, target.expand_as(positions), focal=1.0, width=1, height=1, up=up
     )

@@ -266,13 +266,14 @@ class Cameras:
             focal: focal length in pixels; the principal point is the image's centre.
             width: image width in pixels.
             height: image height in pixels.
-            up: (3,) the direction that is up in the images; None: world z.
+            up: (3,) or (N, 3), the direction that is up in the images; None: world z.
         """
         backward = torch.nn.functional.normalize(positions - targets, dim=-1)
         up = positions.new_tensor([0.0, 0.0, 1.0]) if up is None else up
+        up = up.expand_as(backward)
         # A camera that looks straight up or down has no horizon: any other direction serves.
-        other = torch.eye(3).to(up)[int(up.abs().argmin())]
-        vertical = (backward @ up).abs()[:, None] > 0.999
+        other = torch.eye(3).to(up)[up.abs().argmin(dim=-1)]
+        vertical = (backward * up).sum(dim=-1, keepdim=True).abs() > 0.999
         up = torch.where(vertical, other, up)
         right = torch.nn.functional.normalize(torch.linalg.cross(up, backward), dim=-1)
         upward = torch.linalg.cross(backward, right)
