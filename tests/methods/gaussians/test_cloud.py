@@ -15,6 +15,7 @@ from devrf.methods.gaussians.cloud import (
     first_points,
     hull_surface,
     median_colors,
+    nearest,
     neighbour_distances,
 )
 from devrf.methods.gaussians.settings import GaussiansSettings
@@ -146,6 +147,26 @@ def test_distances_from_neighbours() -> None:
     expected = [1.0] + [(1 + 2 * math.sqrt(2)) / 3] * 3
     assert neighbour_distances(corners).tolist() == pytest.approx(expected)
     assert neighbour_distances(corners[:1]).tolist() == [1.0]
+
+
+def test_the_nearest_are_those_of_all_distances() -> None:
+    points = torch.randn(3000, 3, generator=torch.Generator().manual_seed(0))
+    points[:40] *= 30
+    points[100:120] = points[99]  # more in one place than are asked for
+    distances, rows = nearest(points, 6)
+    apart = (points[:, None] - points).norm(dim=2)
+    torch.testing.assert_close(apart.gather(1, rows), distances)
+    expected = apart.fill_diagonal_(torch.inf).topk(6, largest=False).values
+    torch.testing.assert_close(distances, expected)
+    assert (rows != torch.arange(3000)[:, None]).all()
+
+
+@pytest.mark.parametrize("lost", [torch.nan, torch.inf, -3e38])
+def test_a_point_that_is_nowhere_has_neighbours_that_there_are(lost: float) -> None:
+    points = torch.rand(50, 3, generator=torch.Generator().manual_seed(0))
+    points[7] = lost
+    distances, rows = nearest(points, 6)
+    assert distances.isfinite().all() and ((rows >= 0) & (rows < 50)).all()
 
 
 def test_distances_are_right_far_from_the_origin() -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any, ClassVar
 
+import cv2
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import normalize, one_hot, pad
@@ -31,8 +33,10 @@ HALVED = 1 / 1.8
 APART = 0.6
 # Of an unbounded scene's box, on whose faces infinity is, so much holds the first points.
 NOT_FAR = 0.9
-# Points whose distances are computed at once.
-CHUNK = 1024
+# OpenCV's name of a k-d tree that is searched whole.
+KD_TREE = 4
+# Of coordinates whose squares a float holds.
+FARTHEST = 1e18
 # Nearest Gaussians whose embeddings are held alike.
 NEIGHBOURS = 6
 
@@ -256,13 +260,13 @@ def nearest(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
     K is ``count``, or less if there are fewer others.
     """
-    distances, rows = [], []
-    for start in range(0, len(points), CHUNK):
-        # By products of matrices far from the origin no digit would be right.
-        mode = "donot_use_mm_for_euclid_dist"
-        away = torch.cdist(points[start : start + CHUNK], points, compute_mode=mode)
-        away.diagonal(start).fill_(torch.inf)
-        found = away.topk(min(count, len(points) - 1), largest=False)
-        distances.append(found.values)
-        rows.append(found.indices)
-    return torch.cat(distances), torch.cat(rows)
+    count = min(count, len(points) - 1)
+    # Numbers whose squares are some, so that there is a row for each.
+    table = points.detach().nan_to_num().clamp(-FARTHEST, FARTHEST).cpu().numpy()
+    tree = cv2.flann_Index(table, {"algorithm": KD_TREE})  # type: ignore[attr-defined]
+    rows, squares = tree.knnSearch(table, count + 1, params={})
+    own = rows == np.arange(len(table))[:, None]
+    own[~own.any(axis=1), -1] = True  # of many points in one place
+    chosen = [found[~own].reshape(-1, count) for found in (squares, rows)]
+    distances, neighbours = (torch.from_numpy(found).to(points.device) for found in chosen)
+    return distances.sqrt(), neighbours.long()
