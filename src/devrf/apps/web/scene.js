@@ -344,7 +344,7 @@ class Page {
     const pose = given.map((value, k) => (k % 4 === 3 ? value - offset[(k - 3) / 4] : value));
     const numbers = pose.length === 12 && [...pose, middle[0], middle[1]].every(Number.isFinite);
     const poses = numbers && distance > 0 && fov > 0;
-    if (poses) this.camera = Camera.of({ pose, distance, fov: (fov * Math.PI) / 180, middle });
+    if (poses) this.look(Camera.of({ pose, distance, fov: (fov * Math.PI) / 180, middle }));
     if (time >= 0) this.setTime(time);
     return poses || time >= 0;
   }
@@ -583,10 +583,14 @@ class Page {
     });
     stage.addEventListener("dblclick", (event) => this.center(event.clientX, event.clientY));
     stage.addEventListener("contextmenu", (event) => event.preventDefault());
-    addEventListener("wheel", (event) => {
+    // Pinching a trackpad turns the wheel, and would enlarge the whole page, too.
+    const zoom = (event) => {
+      if (!stage.contains(event.target)) return;
+      event.preventDefault();
       const pixels = event.deltaY * (event.deltaMode ? 30 : 1);
-      if (stage.contains(event.target)) this.zoom(Math.exp(within(pixels, -300, 300) / 800));
-    });
+      this.zoom(Math.exp(within(pixels, -300, 300) / 800));
+    };
+    addEventListener("wheel", zoom, { passive: false });
   }
 }
 
