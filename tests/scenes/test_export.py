@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+import resource
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
+from devrf.cli.messages import one_line
 from devrf.errors import DevrfError
-from devrf.scenes.export import export
+from devrf.scenes.export import export, write_image
 from devrf.scenes.formats.blender import BlenderReader
 from devrf.scenes.formats.llff import LlffReader
 from devrf.scenes.formats.nerfstudio import NerfstudioReader
@@ -141,3 +143,15 @@ def test_a_film_by_hand_reads_back_the_same(tmp_path: Path) -> None:
     masks = back.dynamic.test.valid_mask
     assert masks is not None and torch.equal(masks, scene.dynamic.test.valid_mask)
     assert back.dynamic.train.valid_mask is None
+
+
+def test_an_image_that_has_no_room_is_one_line(tmp_path: Path) -> None:
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
+    noise = torch.randint(0, 256, (32, 32, 3), generator=torch.Generator().manual_seed(0))
+    try:
+        with pytest.raises(OSError) as caught:
+            write_image(tmp_path / "noise.png", noise)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert one_line(caught.value) == "a file that is written: File too large"

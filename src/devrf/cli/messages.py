@@ -78,7 +78,7 @@ def one_line(error: BaseException) -> str | None:
     elif isinstance(error, OSError) and not by_library:
         if error.errno not in REFUSED:
             return None
-        text = f"{error.filename or 'output'}: {error.strerror}"
+        text = f"{error.filename or 'a file that is written'}: {error.strerror}"
     elif ours or not (by_library or _of_hydras_options(error)):
         return None
     elif isinstance(error, MissingConfigException) and "/" in str(error.missing_cfg_file):

@@ -264,4 +264,6 @@ def _write_images(views: Views, numbers: Iterable[int], folder: Path) -> None:
 def write_image(file: Path, pixels: Tensor) -> None:
     """Write pixels (H, W) or (H, W, 3 or 4) as PNG, and the folders above it."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    iio.imwrite(file, pixels.to(torch.uint8).cpu().numpy())
+    # In memory first: on a full disk a library that has the file open fails once more.
+    image = iio.imwrite("<bytes>", pixels.to(torch.uint8).cpu().numpy(), extension=".png")
+    file.write_bytes(image)

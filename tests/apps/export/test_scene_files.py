@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import resource
 import struct
 from dataclasses import replace
 
@@ -19,6 +20,7 @@ from devrf.apps.export.sequence import mesh_files, point_file, write_files
 from devrf.apps.export.splats import MovingGaussians, write_usd_splats
 from devrf.apps.export.surface import surface_of
 from devrf.apps.export.usd import write_usd
+from devrf.errors import DevrfError
 from devrf.rendering.renderer import Renderer
 from devrf.rendering.seen_points import seen_points
 
@@ -169,6 +171,17 @@ def test_usd_has_a_sample_for_each_time(tmp_path, mesh, frame, around):
     x, y, _ = shown.Transform(Gf.Vec3d(*frame.points(mesh.vertices[0, 7]).tolist()))
     seen, _ = around.project_into(1, mesh.vertices[0, 7:8])
     assert [(x + 1) * 24, (1 - y) * 18] == pytest.approx(seen[0].tolist(), abs=1e-2)
+
+
+def test_usd_where_files_have_no_room_is_one_line(tmp_path, mesh, frame):
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
+    try:
+        with pytest.raises(DevrfError, match="ball.usdc: cannot be written; see that there is"):
+            write_usd(tmp_path / "ball.usdc", mesh, {}, frame, SECONDS)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not [*tmp_path.iterdir()]
 
 
 @pytest.mark.parametrize("metres", [0.1, 1000.0])

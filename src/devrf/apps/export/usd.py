@@ -11,6 +11,7 @@ from torch import Tensor
 
 from devrf.apps.export.geometry import MovingMesh, UpFrame, nearest, vertex_normals
 from devrf.apps.export.gltf import linear
+from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.system.files import atomic_write
 
@@ -61,7 +62,7 @@ class SceneFile:
 
     def write(self, path: Path, cameras: Mapping[str, Cameras], points: Tensor) -> None:
         """Write the stage, with the ``cameras`` by their names, which see ``points`` (T, V, 3)."""
-        from pxr import Gf, Sdf, UsdGeom
+        from pxr import Gf, Sdf, Tf, UsdGeom
 
         near = nearest(points)
         for name, camera in cameras.items():
@@ -75,7 +76,11 @@ class SceneFile:
             # Gf multiplies rows from the left.
             lens.AddTransformOp().Set(Gf.Matrix4d(self._frame.pose(camera).T.tolist()))
         with atomic_write(path) as partial:
-            self.stage.GetRootLayer().Export(str(partial))
+            try:
+                self.stage.GetRootLayer().Export(str(partial))
+            except Tf.ErrorException:  # it has no number of the system's
+                where = f"{path}: cannot be written"
+                raise DevrfError(f"{where}; see that there is room on the disk") from None
 
 
 def write_usd(
