@@ -196,6 +196,7 @@ def test_rows_of_different_benchmarks_are_no_rows_of_one_table(table, ran):
     assert "Benchmark embedded 1: robot. Benchmark devrf 1: lego." in words
     ran("c", scores={"psnr": 20.0})
     assert ranks(table().blocks[0], PSNR) == [0, 0]
+    assert "Benchmark embedded 1" not in caption(table())
     differ = "the runs differ in benchmark (embedded 1; none)."
     assert f"robot: no comparison of PSNR, SSIM: {differ}" in table().notes
     ran("d", benchmark="embedded 2", scores={"psnr": 30.0})

@@ -62,7 +62,7 @@ def test_failures_are_listed_with_their_reason(pig_and_robot, failed, runs):
 
 def test_latex_has_a_table_a_scene(pig_and_robot):
     text = latex(pig_and_robot())
-    assert text.isascii()
+    assert text.isascii() and text.count("{") == text.count("}")
     pig, robot = text.split(r"\begin{tabular}{lrrrrr}")[1:]
     rows = [re.split(r" *(?<!\\)& *", line.strip()) for line in pig.splitlines() if "&" in line]
     assert len(rows) == 1 + 3 + 9 and {len(row) for row in rows} == {6}
@@ -72,5 +72,6 @@ def test_latex_has_a_table_a_scene(pig_and_robot):
     )
     assert rows[3][:2] == [f"{FULL} (n = 2)", r"\textbf{30.00 $\pm$ 1.41}"]
     assert rows[4][0] == r"$\dagger$ D-NeRF"
+    assert r"}{!}{%" in text and r"\end{tabular}}" in text  # no wider than the page
     assert r"\caption{pig\_toy. Measured on" in text and r"\caption{robot. As above.}" in text
     assert re.search(r"^Ours w/ c2f +24.00² ", plain(pig_and_robot()), flags=re.MULTILINE)

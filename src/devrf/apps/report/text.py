@@ -41,7 +41,10 @@ def caption(table: Table) -> str:
     where = f" on {', '.join(devices)}" if len(devices) else ""
     repeated = bool((table.rows["count"] > 1).any())
     spread = " ± is the standard deviation over n runs." * repeated
-    scenes_of = table.runs.groupby("run.benchmark", sort=False)["scene"].unique()
+    # Of a scene whose runs all follow it.
+    others = table.runs.loc[table.runs["run.benchmark"].isna(), "scene"]
+    following = table.runs[~table.runs["scene"].isin(others)]
+    scenes_of = following.groupby("run.benchmark", sort=False)["scene"].unique()
     benchmarks = "".join(
         f" Benchmark {name}: {', '.join(scenes)}." for name, scenes in scenes_of.items()
     )
@@ -98,14 +101,18 @@ def plain(table: Table) -> str:
 
 
 def latex(table: Table) -> str:
-    """A table a scene, for a paper to input; it prints no notes and failures: comments."""
+    """A table a scene, for a paper to input; it prints no notes and failures: comments.
+
+    A table that is wider than the page is made smaller, by the package graphicx.
+    """
     parts = []
+    fitted = "\\resizebox{\\ifdim\\width>\\linewidth\\linewidth\\else\\width\\fi}{!}"
     words = caption(table)
     for block in table.blocks:
         title = printed.latex(f"{block.title}. {words}")
         parts.append(
             "\\begin{table}[t]\n\\centering\n\\scriptsize\n"
-            f"\\caption{{{title}}}\n{LATEX.table(block)}\n\\end{{table}}\n\n"
+            f"\\caption{{{title}}}\n{fitted}{{%\n{LATEX.table(block)}}}\n\\end{{table}}\n\n"
         )
         words = "As above."
     lines = [*table.notes, *(f"failed: {why}" for why in reasons(table.collection))]
