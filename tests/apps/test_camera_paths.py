@@ -126,6 +126,17 @@ def test_the_captured_path_is_straight_between_cameras_that_look_the_same_way():
     torch.testing.assert_close(path.forwards, walk.forwards[:1].expand(24, 3))
 
 
+def test_a_captured_path_past_the_pole_turns_evenly():
+    angle = torch.deg2rad(torch.linspace(30, 150, 25))
+    positions = torch.stack([angle.cos(), 0 * angle, angle.sin()], dim=1)
+    over = Cameras.looking_at(positions, 0 * positions, focal=20.0, width=15, height=10)
+    cameras = captured(over, ORIGIN, VideoSettings(frames=30))
+    turns = cameras.camera_to_world[:, :, :3]
+    trace = (turns[1:] * turns[:-1]).sum(dim=(1, 2))
+    degrees = torch.rad2deg(torch.acos((trace - 1) / 2))
+    assert degrees.max() < 1.5 * degrees.mean()
+
+
 def test_a_tour_is_shorter_than_always_going_to_the_nearest():
     places = torch.tensor([[2.0, 1], [0, 0], [4, 0], [1, 1], [1, 0], [3, 2]])
     # From (4, 0) the nearest are (2, 1), (1, 1), (1, 0), (0, 0); then all the way to (3, 2).

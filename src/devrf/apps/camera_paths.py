@@ -146,7 +146,7 @@ def captured(cameras: Cameras, target: Tensor, settings: VideoSettings) -> Camer
     views = torch.softmax(-0.5 * nearness**2, dim=1) @ views
     # Smoothing has slowed the camera down where it turned.
     poses = _poses(views)
-    passed = torch.cat([poses[:, :, 3] / reach, -poses[:, :, 2]], dim=1)
+    passed = torch.cat([poses[:, :, 3] / reach, -poses[:, :, 2], poses[:, :, 1]], dim=1)
     frames = torch.linspace(0, 1, settings.frames, dtype=torch.float64)
     return _with_one_lens(cameras, _poses(_resampled(views, passed, frames)).float())
 
