@@ -26,6 +26,7 @@ from devrf.checkpoints.checkpoint_file import read_checkpoint_file, write_checkp
 from devrf.checkpoints.file_metadata import digest_of, latest_checkpoint
 from devrf.cli.restore_config import parsed
 from devrf.cli.view import serves_page
+from devrf.errors import DevrfError
 
 
 @pytest.fixture
@@ -273,6 +274,32 @@ def test_a_page_is_that_of_the_last_checkpoint(trained, tmp_path):
     assert not serves_page(typed, run)  # of another version
     shutil.rmtree(run / "export" / "pictures")
     assert not serves_page(typed, run)
+
+
+def test_a_page_whose_images_are_away_is_written_once(devrf, trained, tmp_path, port, monkeypatch):
+    run = tmp_path / "run"
+    shutil.copytree(trained[0], run)
+    shutil.rmtree(run / "export")
+
+    def away(self):
+        raise DevrfError("robot: no such folder")
+
+    def viewed(*arguments):
+        sender = ended_by(signal.SIGINT, port)
+        outcome = devrf("stage=view", "hydra.run.dir=run", f"viewer.port={port}", *arguments)
+        sender.join()
+        assert (outcome.status, outcome.err) == (0, "")
+        return outcome.out
+
+    with monkeypatch.context() as patch:
+        patch.setattr("devrf.data.rendered.ProceduralDataModule.load", away)
+        assert "no such folder; the cameras on its page are shown without pictures" in viewed()
+        assert serves_page(parsed(["stage=view", "hydra.run.dir=run"]), run)
+        assert "no such folder" not in viewed()
+    pictures = run / "export" / "pictures"
+    assert not any(pictures.iterdir())
+    viewed("trainer.accelerator=cpu")  # more than the page is asked for, and the images are there
+    assert any(pictures.iterdir())
 
 
 def test_the_page_of_a_part_is_not_served_as_the_scene(trained, tmp_path, devrf):

@@ -119,9 +119,11 @@ def view(run: RunContext) -> None:
     model, viewpoints = _learned(run)
     server: PageServer | Session
     if settings.renderer == "browser" or (settings.renderer == "auto" and drawable(model)):
-        if run.config.ckpt is not None or not is_current(run.folder):
+        folder = run.folder / "export"
+        current = run.config.ckpt is None and is_current(run.folder)
+        if not current or not any((folder / PICTURES).iterdir()):
             _write_with_pictures(run, model, viewpoints)
-        server = PageServer(settings, run.folder / "export")
+        server = PageServer(settings, folder)
     else:
         from devrf.apps.viewer.drawing import Drawing
         from devrf.apps.viewer.session import Session  # an extra
@@ -174,6 +176,8 @@ def _write_with_pictures(run: RunContext, model: Renderable, viewpoints: Viewpoi
     scene = _with_images(run, "the cameras on its page are shown without pictures")
     if scene is not None:
         write_thumbnails(folder / PICTURES, scene, viewpoints)
+    # Without them an empty folder says that the page is written.
+    (folder / PICTURES).mkdir(parents=True, exist_ok=True)
     write_text(folder / PAGE, text)
 
 
