@@ -10,6 +10,7 @@ import torch
 from lightning import Callback, Trainer
 from lightning.pytorch.callbacks import LambdaCallback
 
+from devrf.callbacks import Previews
 from devrf.engine.schedule import scale_schedule
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
@@ -78,6 +79,15 @@ def test_the_whole_schedule_is_run_and_the_loss_falls(datamodule, trainer):
     box = stage.scene_model.canonical.box
     assert coarse == {box.grid_shape(16**3 // 2)} and fine == {box.grid_shape(16**3)}
     assert sum(watch.loss[-2:]) / 2 < 0.6 * watch.loss[0]
+
+
+def test_the_last_validation_scores_what_is_saved(datamodule, trainer):
+    looks, stage = Previews(times=3), CanonicalStage(CARVED, SMALL)
+    fit = trainer(looks, max_epochs=1, limit_val_batches=1)
+    fit.fit(stage, datamodule=datamodule)
+    iterations, last = looks.psnr[-1]
+    saved = fit.validate(stage, datamodule=datamodule, verbose=False)[0]["val/psnr"]
+    assert iterations == 60 and last == pytest.approx(saved, abs=1e-4)
 
 
 def test_the_dynamic_views_first_frames_are_learned_from_if_asked_for(fit):

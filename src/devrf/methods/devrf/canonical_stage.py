@@ -128,6 +128,7 @@ class CanonicalStage(Stage):
             for kind, loss in (("search", search_loss), ("fine", fine_loss))
         }
         self.pool: PixelPool | None = None
+        self._is_finished = False
 
     def iterate(self, views: Views) -> Terms:
         """Learn the scene at rest from one batch (docs/method.md#canonical-stage)."""
@@ -463,14 +464,23 @@ class CanonicalStage(Stage):
         self.events[DIRECTIONS] += begun
 
     @torch.no_grad()
-    def on_train_end(self) -> None:
-        """Empty what was never occupied, so that no deformed sample meets leftover fog."""
-        if not self.is_complete:
+    def _finish(self) -> None:
+        """Once all is learned empty what was never occupied: no deformed sample is to meet fog."""
+        if self._is_finished or not self.is_complete:
             return
+        self._is_finished = True
         self.scene_model.canonical.learn_directions(True)
         self._clear_unobserved()
         self._keep_occupied(self.opaque())
         self.scene_model.canonical.clear(~self.scene_model.occupancy.mask, alpha=1e-6)
+
+    def on_validation_start(self) -> None:
+        """Score at the end what is saved."""
+        self._finish()
+
+    def on_train_end(self) -> None:
+        """Finish the field."""
+        self._finish()
         super().on_train_end()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
