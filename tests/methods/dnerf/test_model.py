@@ -11,6 +11,7 @@ import torch
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
+from devrf.geometry.clock import FrameClock
 from devrf.methods.dnerf.model import DNeRF, DNeRFSettings
 from devrf.methods.ray_stage import RayStage
 from devrf.rendering.renderer import Renderer
@@ -40,6 +41,28 @@ def test_the_temporal_term_of_a_deformation_without_time_is_zero(
     assert set(terms) == {"temporal"} and terms["temporal"] > 0
     torch.nn.init.zeros_(model.deformation.output.weight)  # no time displaces anything
     assert model.loss_terms(model(some_rays), some_rays, ["temporal"])["temporal"] == 0
+
+
+def test_the_temporal_term_reaches_to_the_neighbours_of_frames_at_uneven_times(
+    tiny_scene: Scene, some_rays: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = DNeRF(TINY)
+    model.setup(tiny_scene)
+    model.clock = FrameClock((0.0, 0.1, 1.0))
+    output = model(some_rays)
+    output.extras["time"] = torch.full_like(output.extras["time"], 0.1)
+    asked: list[torch.Tensor] = []
+    displace = model.deformation.forward
+
+    def heard(points: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
+        asked.append(time)
+        return displace(points, time)
+
+    monkeypatch.setattr(model.deformation, "forward", heard)
+    model.loss_terms(output, some_rays, ["temporal"])
+    other = asked[1]
+    assert 0 <= other.min() < 0.02 and 0.9 < other.max() <= 1
+    assert (other < 0.1).float().mean() == pytest.approx(0.5, abs=0.1)
 
 
 @pytest.mark.parametrize("sampling", ["occupancy", "hierarchical"])

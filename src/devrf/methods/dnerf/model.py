@@ -10,6 +10,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
 from devrf.data.batch import RayBatch
+from devrf.geometry.box import constant
 from devrf.methods.nerf.deformable import DeformableField
 from devrf.methods.nerf.networks import SinusoidalEncoding, Trunk
 from devrf.methods.nerf.settings import Bands, FieldSettings
@@ -96,8 +97,11 @@ class DNeRF(DeformableField):
         if "temporal" in names:
             points = output.extras["points"].detach()
             time = output.extras["time"]
-            between = 1 / max(len(self.clock) - 1, 1)
-            other = (time + between * (2 * torch.rand_like(time) - 1)).clamp(0, 1)
+            side = 2 * torch.rand_like(time) - 1
+            beside = self.clock.frames_of(time) + side.sign().long()
+            times = constant(self.clock.times, time.dtype, time.device)
+            neighbour = times[beside.clamp(0, len(self.clock) - 1)]
+            other = time + side.abs() * (neighbour - time)
             change = self.deformation(points, time) - self.deformation(points, other)
             terms["temporal"] = change.square().sum()
         return terms
