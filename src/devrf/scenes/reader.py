@@ -13,6 +13,7 @@ from pydantic.dataclasses import dataclass
 
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
+from devrf.geometry.contraction import ContractedSpace
 from devrf.scenes.files import Number, scene_folder
 from devrf.scenes.flow_files import FlowDirection
 from devrf.scenes.image_folders import Downscale, SizeAt, whole_factor
@@ -210,6 +211,17 @@ class InwardReader(LayoutReader):
     box: BoxOption = None
     missing: Missing = "error"
     space: SpaceChoice = "auto"
+
+    def read(self) -> Scene:
+        """See :meth:`SceneReader.read`; DevrfError if an unbounded scene is given an end."""
+        scene = super().read()
+        if self.far is not None and isinstance(scene.space, ContractedSpace):
+            raise scene_error(
+                "data.far",
+                f"the scene is unbounded ({scene.bounds.reason}); leave it null, or set "
+                "data.space=world",
+            )
+        return scene
 
     def placed(self, layout: Layout, static: Capture, dynamic: Capture) -> Scene:
         """See :meth:`LayoutReader.placed`.

@@ -14,6 +14,7 @@ import imageio.v3 as iio
 import pytest
 import torch
 
+from devrf.errors import DevrfError
 from devrf.geometry.cameras import Distortion
 from devrf.scenes.formats.nerfies import NerfiesReader
 from devrf.scenes.lens import Lens
@@ -116,6 +117,8 @@ def test_without_alpha_masks_the_box_holds_the_backdrop(folder):
     unbounded = NerfiesReader(folder.root, downscale=1).read()
     assert not unbounded.space.is_linear
     assert unbounded.bounds.reason.startswith("the images have no")
+    with pytest.raises(DevrfError, match="data.far: the scene is unbounded .*data.space=world"):
+        NerfiesReader(folder.root, downscale=1, far=5.0).read()
     scene = NerfiesReader(folder.root, downscale=1, space="world").read()
     cameras, box = scene.static.train.cameras, scene.bounds.box
     for camera in range(len(cameras)):
