@@ -30,7 +30,7 @@ from devrf.methods.dnerf.model import DNeRFSettings
 from devrf.methods.neural_volumes.settings import NeuralVolumesSettings
 from devrf.metrics.image import psnr
 from devrf.rendering.renderer import Renderer
-from devrf.scenes.scene import Scene
+from devrf.scenes.scene import Scene, both_mapped
 from devrf.system.memory import own_memory
 
 
@@ -105,6 +105,19 @@ def test_another_scene_is_refused(canonical, tiny_scene):
     assert "another scene" in message and "robot" in message and "cat" in message
     # Lightning gives a name: ModelCheckpoint.best_model_path.
     assert load_checkpoint(str(canonical), None).metadata.scene == "robot"
+
+
+def test_another_scene_by_the_same_cameras_is_refused(canonical, tiny_scene):
+    def darker(share):
+        def change(views):
+            return replace(views, pixels=(views.pixels * share).to(torch.uint8))
+
+        static, dynamic = both_mapped(tiny_scene.static, tiny_scene.dynamic, change)
+        return replace(tiny_scene, name="cat", static=static, dynamic=dynamic)
+
+    assert darker(0.5).fingerprint == tiny_scene.fingerprint
+    assert "another scene" in refusal(canonical, darker(0.5))
+    load_checkpoint(canonical, darker(0.98))  # the same, read a little differently
 
 
 def test_checkpoints_of_others_are_refused(tmp_path):

@@ -48,6 +48,8 @@ UNSTORED = 2**16
 SIDE = 2**14
 # The most that one side of an image is longer than the other.
 ASPECT = 16
+# Mean colours of the same images, read with other settings, differ by no more than this.
+SAME_LOOK = 0.02
 # Figures of a training, by name: numbers, and words that say how it ran.
 TrainingFigures = dict[str, int | float | str | list[float] | None]
 
@@ -71,6 +73,7 @@ class CheckpointMetadata:
         complete: whether the stage has gone through its whole schedule.
         moves: whether the scene was seen at more than one time; None in a file of an earlier
             version.
+        look: the scene's, for those that share all cameras; empty in a file of an earlier version.
     """
 
     scene: Line
@@ -84,6 +87,7 @@ class CheckpointMetadata:
     command: dict[str, JsonValue] = field(default_factory=dict)
     complete: bool = True
     moves: bool | None = None
+    look: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -294,10 +298,11 @@ def check_scene(path: Path, metadata: CheckpointMetadata, scene: Scene) -> None:
     Raises:
         DevrfError: it does not.
     """
-    if metadata.fingerprint != scene.fingerprint:
+    alike = all(abs(a - b) <= SAME_LOOK for a, b in zip(metadata.look, scene.look, strict=False))
+    if metadata.fingerprint != scene.fingerprint or not alike:
         raise DevrfError(
-            f"{path}: belongs to another scene ({metadata.scene}: other cameras, times or image "
-            f"sizes than {scene.name}); train this scene, or set ckpt to its own checkpoint"
+            f"{path}: belongs to another scene ({metadata.scene}: other cameras, times, images or "
+            f"image sizes than {scene.name}); train this scene, or set ckpt to its own checkpoint"
         )
 
 

@@ -48,4 +48,5 @@ class Provenance:
             command=self.command,
             complete=complete,
             moves=scene.moves,
+            look=scene.look,
         )

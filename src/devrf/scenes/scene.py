@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d
 
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
@@ -383,3 +384,12 @@ class Scene:
                 for part in parts if cameras.sizes is None else [*parts, cameras.sizes]:
                     digest.update(part.float().cpu().numpy().tobytes())
         return digest.hexdigest()[:16]
+
+    @property
+    def look(self) -> tuple[float, ...]:
+        """Mean colours of quarters of two held-out images, on black, in [0, 1]."""
+        images = (self.static.test.pixels[:1], self.dynamic.test.pixels[-1:])
+        channels_first = (on_background(pixels, 0.0).permute(0, 3, 1, 2) for pixels in images)
+        return tuple(
+            torch.cat([adaptive_avg_pool2d(c, 2).flatten() for c in channels_first]).tolist()
+        )
