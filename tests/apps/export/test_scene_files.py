@@ -21,6 +21,7 @@ from devrf.apps.export.splats import MovingGaussians, write_usd_splats
 from devrf.apps.export.surface import surface_of
 from devrf.apps.export.usd import write_usd
 from devrf.errors import DevrfError
+from devrf.geometry.cameras import Cameras
 from devrf.rendering.renderer import Renderer
 from devrf.rendering.seen_points import seen_points
 
@@ -51,6 +52,13 @@ def test_the_frame_by_hand(around, up, expected):
     found = frame.points(torch.tensor([1.0, 2.0, 3.0]))
     assert found.tolist() == [0.5 * value for value in expected]
     assert torch.linalg.det(frame.rotation) == 1
+
+
+def test_up_is_that_of_cameras_that_look_down_from_one_side():
+    angle = torch.linspace(-0.5, 0.5, 6)
+    places = torch.stack([2 * angle.cos(), 2 * angle.sin(), torch.full_like(angle, 4.0)], dim=1)
+    cameras = Cameras.looking_at(places, torch.zeros(6, 3), focal=60.0, width=48, height=36)
+    assert UpFrame.of(cameras, "auto", 1.0).up == "z"
 
 
 def glb(path):

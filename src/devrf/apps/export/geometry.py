@@ -15,6 +15,7 @@ from annotated_types import Ge, Gt, Le, Len, Lt, MinLen
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from devrf.apps.camera_paths import upward
 from devrf.errors import DevrfError, expect
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
@@ -116,11 +117,11 @@ class UpFrame:
 
     @classmethod
     def of(cls, cameras: Cameras, up: Up, metres: float, offset: Offset = NO_OFFSET) -> UpFrame:
-        """The frame of a scene; ``auto`` takes the axis nearest to the cameras' mean up."""
+        """The frame of a scene; ``auto`` takes the axis nearest to what is up to the cameras."""
         if up == "auto":
-            mean = cameras.camera_to_world[:, :, 1].mean(dim=0)
-            axis = int(mean.abs().argmax())
-            up = cast(Up, "-" * bool(mean[axis] < 0) + "xyz"[axis])
+            direction = upward(cameras)
+            axis = int(direction.abs().argmax())
+            up = cast(Up, "-" * bool(direction[axis] < 0) + "xyz"[axis])
         axis = "xyz".index(up[-1])
         sign = -1.0 if up.startswith("-") else 1.0
         x = torch.zeros(3)

@@ -12,6 +12,7 @@ from pathlib import Path
 import torch
 import viser
 
+from devrf.apps.camera_paths import upward
 from devrf.apps.captured_cameras import distance_ahead
 from devrf.apps.keyframes import CameraPath, keyframes_of
 from devrf.apps.settings import ViewerSettings
@@ -189,10 +190,10 @@ class Session:
         self._frusta.show(controls.dynamic.value, controls.static.value, controls.playback.time)
 
     def _place_camera(self) -> None:
-        """Begin where the held-out camera is, with the cameras' mean up."""
+        """Begin where the held-out camera is, with what is up to the cameras."""
         static = self.viewpoints.static
         held_out = self.viewpoints.held_out
-        self.server.scene.set_up_direction(static.camera_to_world[:, :, 1].mean(dim=0).numpy())
+        self.server.scene.set_up_direction(upward(static).numpy())
         start = self.server.initial_camera
         target = held_out[[0]]
         ahead = target.positions[0] + distance_ahead(static) * target.forwards[0]
