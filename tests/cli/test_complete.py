@@ -177,8 +177,6 @@ def test_what_learns_one_moving_camera_is_named_and_not_chosen(scenes, scene):
         completed([f"data.root={scenes}/{scene}"])
     remarks = completed([f"data.root={scenes}/{scene}", "stage=inspect"]).remarks
     assert remarks[0].endswith(line)
-    written = completed([f"data.root={scenes}/{scene}", "stage=prepare"]).remarks
-    assert not any(lacks in remark for remark in written)  # nothing is learned
     remarks = completed([f"data.root={scenes}/{scene}", "method=devrf"]).remarks
     assert remarks[0].endswith(f"{lacks}; experiment=phone learns more of it")
 

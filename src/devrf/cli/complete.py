@@ -227,7 +227,7 @@ def _for_one_camera(scene: str, overrides: Sequence[Override]) -> Applied:
         line = f"{lacks}; give experiment=phone, on a GPU experiment=phone_gpu"
         if stage not in STEPS:
             raise DevrfError(line)
-        return Applied([], [line] if stage == "inspect" else [])
+        return Applied([], [line])
     if method and not any(values(overrides, key) for key in ("protocol", "comparison")):
         return Applied(["protocol=dynamic"])
     return Applied()
