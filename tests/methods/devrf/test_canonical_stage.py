@@ -81,13 +81,22 @@ def test_the_whole_schedule_is_run_and_the_loss_falls(datamodule, trainer):
     assert sum(watch.loss[-2:]) / 2 < 0.6 * watch.loss[0]
 
 
-def test_the_last_validation_scores_what_is_saved(datamodule, trainer):
+def test_the_last_validation_scores_what_is_saved(datamodule, trainer, tmp_path, monkeypatch):
     looks, stage = Previews(times=3), CanonicalStage(CARVED, SMALL)
     fit = trainer(looks, max_epochs=1, limit_val_batches=1)
     fit.fit(stage, datamodule=datamodule)
     iterations, last = looks.psnr[-1]
     saved = fit.validate(stage, datamodule=datamodule, verbose=False)[0]["val/psnr"]
     assert iterations == 60 and last == pytest.approx(saved, abs=1e-4)
+    # What is loaded has been finished: nothing is emptied a second time, which is not the same.
+    monkeypatch.setattr(CanonicalStage, "_clear_unobserved", lambda stage: pytest.fail("emptied"))
+    fit.save_checkpoint(tmp_path / "stage.ckpt")
+    loaded = CanonicalStage(CARVED, SMALL)
+    file = str(tmp_path / "stage.ckpt")
+    trainer(max_epochs=1).validate(loaded, datamodule=datamodule, ckpt_path=file, verbose=False)
+    assert loaded.is_complete
+    densities = [s.scene_model.canonical.density.values for s in (stage, loaded)]
+    torch.testing.assert_close(densities[0], densities[1], rtol=0, atol=0)
 
 
 def test_the_dynamic_views_first_frames_are_learned_from_if_asked_for(fit):

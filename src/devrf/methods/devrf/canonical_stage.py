@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
+from lightning.pytorch.trainer.states import TrainerFn
 from torch import Tensor
 
 from devrf.data.batch import PixelPool
@@ -475,8 +476,9 @@ class CanonicalStage(Stage):
         self.scene_model.canonical.clear(~self.scene_model.occupancy.mask, alpha=1e-6)
 
     def on_validation_start(self) -> None:
-        """Score at the end what is saved."""
-        self._finish()
+        """Score at the end of a fit what is saved; what is loaded has been finished."""
+        if self.trainer.state.fn == TrainerFn.FITTING:
+            self._finish()
 
     def on_train_end(self) -> None:
         """Finish the field."""
