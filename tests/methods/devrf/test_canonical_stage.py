@@ -93,7 +93,8 @@ def test_the_last_validation_scores_what_is_saved(datamodule, trainer, tmp_path,
     fit.save_checkpoint(tmp_path / "stage.ckpt")
     loaded = CanonicalStage(CARVED, SMALL)
     file = str(tmp_path / "stage.ckpt")
-    trainer(max_epochs=1).validate(loaded, datamodule=datamodule, ckpt_path=file, verbose=False)
+    again = trainer(max_epochs=1, limit_val_batches=1)
+    again.validate(loaded, datamodule=datamodule, ckpt_path=file, verbose=False)
     assert loaded.is_complete
     densities = [s.scene_model.canonical.density.values for s in (stage, loaded)]
     torch.testing.assert_close(densities[0], densities[1], rtol=0, atol=0)
