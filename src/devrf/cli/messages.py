@@ -44,7 +44,7 @@ def report_user_errors() -> Iterator[None]:
         raise SystemExit(2) from None
 
 
-def _of_hydras_options(error: BaseException) -> bool:
+def _of_refused_options(error: BaseException) -> bool:
     """Whether Hydra or Optuna refuses a command's options, for which it has no class of error."""
     modules = [""] + [frame.f_globals["__name__"] for frame, _ in walk_tb(error.__traceback__)]
     return isinstance(error, ValueError) and modules[-1].startswith(("hydra._internal.", "optuna."))
@@ -79,7 +79,7 @@ def one_line(error: BaseException) -> str | None:
         if error.errno not in REFUSED:
             return None
         text = f"{error.filename or 'a file that is written'}: {error.strerror}"
-    elif ours or not (by_library or _of_hydras_options(error)):
+    elif ours or not (by_library or _of_refused_options(error)):
         return None
     elif isinstance(error, MissingConfigException) and "/" in str(error.missing_cfg_file):
         group, _, option = str(error.missing_cfg_file).rpartition("/")

@@ -73,6 +73,7 @@ def test_cameras_lenses_and_masks(folder, balls_are_where_they_project):
     torch.testing.assert_close(train.cameras.positions.norm(dim=1), torch.full((12,), 4.0))
     second = EasyVolcapReader(folder, downscale=1, test_view=2).read().dynamic.test
     assert {Path(name).parent.name for name in second.names} == {"01"}
+    assert not EasyVolcapReader(folder, downscale=1, masks="none").read().space.is_linear
 
 
 def test_the_first_images_of_two_cameras_are_the_static_set(folder):
@@ -82,7 +83,6 @@ def test_the_first_images_of_two_cameras_are_the_static_set(folder):
         file.write_text("\n".join(line for line in lines if line.strip() not in others))
     scene = EasyVolcapReader(folder, downscale=1).read()
     assert scene.static.train.times.tolist() == [0.0, 0.0] and len(scene.dynamic.train) == 6
-    assert not EasyVolcapReader(folder, downscale=1, masks="none").read().space.is_linear
 
 
 def test_a_camera_that_began_later_than_the_others_is_warned_of(folder, caplog):
