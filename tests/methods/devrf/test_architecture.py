@@ -97,6 +97,19 @@ def test_a_scene_seen_from_all_around_gets_what_its_pixels_resolve(side, finer, 
     assert resolved_voxels(scene, schedule, box) == pytest.approx(voxels, abs=1)
 
 
+@pytest.mark.parametrize(("side", "told"), [(12, False), (40, True)])
+def test_voxels_far_finer_than_pixels_are_warned_of(side, told, caplog):
+    cameras = Cameras.looking_at(
+        torch.tensor([[4.0, 0, 0]]), torch.zeros(1, 3), focal=40.0, width=30, height=30
+    )
+    scene: Any = SimpleNamespace(space=WORLD, static=SimpleNamespace(train=None))
+    scene.static.train = SimpleNamespace(cameras=cameras)
+    box = Box((-0.5, -0.25, -0.25), (0.5, 0.25, 0.25))
+    # Pixels of 0.1, voxels of (1 / 4)^(1 / 3) / side: 1.9 and 6.3 to one.
+    assert resolved_voxels(scene, CanonicalSchedule(side=side, upsample_at=()), box) == side**3
+    assert ("learns single rays" in caplog.text) is told
+
+
 def test_planes_of_both_fields(forward_scene, fit, serve):
     data = serve(forward_scene)
     schedule = CanonicalSchedule(0, 8, iterations=10, side=12, upsample_at=(), rays=16)

@@ -27,7 +27,8 @@ log = logging.getLogger(__name__)
 # hardly tell two planes apart, while fog before the scene takes long to clear.
 PIXELS_PER_PLANE = 4.0
 FEWEST, MOST = 32, 256
-
+# Voxels to a pixel across from which on a field learns training views by heart, and no others.
+LEARNED_BY_HEART = 2.0
 
 # The opacity that a shorter search begins with, at most.
 MOST_OPAQUE = 1e-2
@@ -142,9 +143,21 @@ def resolved_voxels(scene: Scene, schedule: CanonicalSchedule, box: Box) -> int:
     # Around a hand-held camera's sparse points space is contracted; the images resolve no more
     # at their depth.
     fits = scene.space.is_linear or scene.dynamic.train.by_moving_camera
-    if finer is None or not fits or isinstance(scene.space, NormalizedDevice):
+    if not fits or isinstance(scene.space, NormalizedDevice):
         return whole
-    edge = scene.static.train.cameras.pixel_size(torch.tensor(box.middle)) / finer
+    pixel = scene.static.train.cameras.pixel_size(torch.tensor(box.middle))
+    if finer is None:
+        across = pixel * (whole / box.volume) ** (1 / 3)
+        if across > LEARNED_BY_HEART:
+            log.warning(
+                "schedule.canonical.side: %.4g voxels an edge are %.2g to a pixel, so fine that "
+                "each learns single rays: give larger images, or "
+                "schedule.canonical.voxels_per_pixel=1.3",
+                schedule.side,
+                across,
+            )
+        return whole
+    edge = pixel / finer
     least = 8 << len(schedule.upsample_at)  # as few as its first phase may have
     resolved = min(whole, max(int(box.volume / edge**3), least))
     if resolved < whole:
