@@ -9,6 +9,7 @@
                      network's first layer knows; blocks of four channels, one behind another
 ``weights``          the colour network, single precision
 ``moving``           255 where a canonical point moves (docs/stages.md#moving), else 0
+``palette``          the colours of stills' depths, from near to far; bytes
 ``distances-rest``   cells to the nearest occupied one at rest, a byte
 ``distances-K``      the same at all times between the frames K and K + 1
 ``displacement-K``   Δ_b of frame K in shares of a cell, half precision: devices may round what
@@ -35,7 +36,6 @@ from itertools import pairwise
 from typing import Any
 
 import torch
-from kornia.color import ColorMap
 from torch import Tensor
 from torch.nn.functional import normalize, pad
 
@@ -51,6 +51,7 @@ from devrf.methods.devrf.deformation_field import DeformationField, GridWarp
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.volume_rendering import deformed_occupancy, march_inputs
 from devrf.ops.trilinear import shape_of
+from devrf.pictures.images import depth_colors, to_bytes
 from devrf.rendering.occupancy import Occupancy, dilate
 from devrf.rendering.renderable import Renderable
 from devrf.rendering.seen_points import scene_radius
@@ -62,6 +63,8 @@ from devrf.system.printed import shown
 ROUNDED = 1 / 64
 # Grid points whose colours are found at once.
 CHUNK = 2**16
+# Colours of depths: as many as stills have.
+COLORS = 256
 # Texels in a texture's row of weights, four numbers each.
 ROW = 64
 
@@ -133,6 +136,8 @@ def _parts(model: DeVRFModel, cameras: Cameras) -> Iterator[tuple[str, Tensor]]:
     yield "weights", _weights(field.decoder, low, high)
     moves = model.moving_points(scene_radius(model, cameras))
     yield "moving", 255 * moves.to(torch.uint8)
+    depths = torch.linspace(0, 1, COLORS)[None]
+    yield "palette", to_bytes(depth_colors(depths, torch.ones_like(depths), near=0, far=1))[None]
     deformation = model.deformation
     residual = model.color_residual
     seen = _seen(deformation, rest.cell, occupied) if deformation else []
@@ -240,7 +245,6 @@ def _description(model: DeVRFModel, viewpoints: Viewpoints) -> dict[str, Any]:
         "delta": field.step_in_base_voxels(sampling.step),
         "threshold": sampling.alpha_threshold,
         "background": [background_value(viewpoints.background)] * 3,
-        "palette": ColorMap("viridis", num_colors=9).colors.T.tolist(),  # from far to near
         "center": inner.middle,
         "reach": inner.diagonal / 3,
     }

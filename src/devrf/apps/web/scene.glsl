@@ -24,6 +24,7 @@ const float MOTION_STEP = 0.05, MOTION_FULL = 0.02;
 uniform sampler3D density, features, weights;   // features: blocks of four channels
 uniform sampler3D rough;                        // preview colours
 uniform sampler3D moving;                       // 1 where canonical points move
+uniform sampler3D palette;                      // colours of depths, from near to far
 uniform sampler3D displacement0, displacement1, residual0, residual1; // before, after the time
 uniform usampler3D distances;
 uniform vec3 low, high, displacementLow, displacementHigh;  // the boxes of all fields, and of displacements
@@ -37,7 +38,6 @@ uniform vec3 eye, right, up, backward, background;
 uniform vec2 slope, middle;          // tangents of half the angles of view, of its middle's angles
 uniform vec4 frame;                  // x, y, width and height of the picture, in pixels
 uniform int channel, part;           // part: 1 shows what moves alone, 2 what stays
-uniform vec3 palette[9];
 out vec4 pixel;
 
 float largest(vec3 v) { return max(v.x, max(v.y, v.z)); }
@@ -187,9 +187,9 @@ vec3 depthColor(float s, float opacity) {
 #else
   float first = max(length(eye - center) - reach, 0.0), last = length(eye - center) + reach;
 #endif
-  float close = 8.0 * (1.0 - clamp((s - first) / (last - first), 0.0, 1.0));
-  int stop = min(int(close), 7);
-  return mix(vec3(1.0), mix(palette[stop], palette[stop + 1], close - float(stop)), opacity);
+  float behind = clamp((s - first) / (last - first), 0.0, 1.0);
+  vec3 look = texelFetch(palette, ivec3(1.0 + 254.0 * behind, 0, 0), 0).rgb; // the stills' steps
+  return mix(vec3(1.0), look, opacity);
 }
 
 vec2 onPicture(vec3 point) {

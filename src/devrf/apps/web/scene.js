@@ -49,14 +49,15 @@ const KINDS = {
   features: ["RGBA8", "RGBA", "UNSIGNED_BYTE", Uint8Array],
   weights: ["RGBA32F", "RGBA", "FLOAT", Float32Array],
   moving: ["R8", "RED", "UNSIGNED_BYTE", Uint8Array],
+  palette: ["RGB8", "RGB", "UNSIGNED_BYTE", Uint8Array],
   distances: ["R8UI", "RED_INTEGER", "UNSIGNED_BYTE", Uint8Array],
   displacement: ["RGB16F", "RGB", "HALF_FLOAT", Uint16Array],
   residual: ["RGB16F", "RGB", "HALF_FLOAT", Uint16Array],
 };
-// Textures by their units' numbers: five that stay; of what changes one before the time, one after.
-const UNITS = ["density", "rough", "features", "weights", "moving", "distances", "rest"];
-UNITS.push("displacement0", "displacement1", "residual0", "residual1");
-const [DISTANCES, REST] = [5, 6];
+// Textures by their units' numbers: six that stay; of what changes one before the time, one after.
+const UNITS = ["density", "rough", "features", "weights", "moving", "palette", "distances"];
+UNITS.push("rest", "displacement0", "displacement1", "residual0", "residual1");
+const [DISTANCES, REST] = [6, 7];
 
 class Graphics {
   constructor(canvas, scene) {
@@ -119,7 +120,7 @@ class Graphics {
       const [place, type] = uniforms[name] ?? [null, null];
       if (type === gl.FLOAT) gl.uniform1f(place, value);
       else if (type === gl.FLOAT_VEC2) gl.uniform2fv(place, value);
-      else if (type === gl.FLOAT_VEC3) gl.uniform3fv(place, value.flat());
+      else if (type === gl.FLOAT_VEC3) gl.uniform3fv(place, value);
       else if (type === gl.FLOAT_VEC4) gl.uniform4fv(place, value);
       else if (place) gl.uniform1i(place, value);
     }
@@ -147,7 +148,7 @@ class Graphics {
 
   /** Brings onto the device what is the same at all times. */
   async load() {
-    for (const kind of UNITS.slice(0, 5)) this.fill(kind, kind, await inflate(kind));
+    for (const kind of UNITS.slice(0, 6)) this.fill(kind, kind, await inflate(kind));
     this.fill("rest", "distances", await inflate("distances-rest"));
   }
 
