@@ -42,6 +42,7 @@ from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.model import DeVRFModel
+from devrf.pictures.images import UNKNOWN
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene, background_value
 from devrf.system.printed import shown
@@ -145,6 +146,32 @@ def test_a_browser_draws_what_the_renderer_does(browser, scenes, tmp_path, space
     browser.open(file.as_uri() + link(camera, moment), camera.width, camera.height)
     browser.wait("document.documentElement.dataset.quality === 'moving'")
     assert psnr(browser.picture(), truth) >= LEAST_IN_HASTE
+
+
+def test_what_lies_behind_a_forward_facing_scene_is_empty_in_all_channels(
+    browser, scenes, tmp_path
+):
+    choice = pytest.importorskip("selenium.webdriver.support.select").Select
+    model, viewpoints = scenes("ndc")
+    viewpoints = replace(viewpoints, background="black")
+    camera = viewpoints.held_out.of_height(ROWS)
+    turned = camera.camera_to_world[:, :, [2, 1, 0, 3]] * torch.tensor([-1.0, 1, 1, 1])
+    camera = replace(camera, camera_to_world=turned)  # by a right angle to the side
+    file = tmp_path / "scene.html"
+    file.write_text(page(model, viewpoints, "tiny", "0123abcd"), encoding="utf-8")
+    browser.open(file.as_uri() + link(camera, 0.4), camera.width, camera.height)
+    picture = browser.canvas()
+    color, depth = still(Renderer(model), camera, 0.4, background=0.0)
+    assert psnr(picture, color) >= LEAST_PSNR
+    channel = choice(browser.element("channel"))
+    channel.select_by_visible_text("depth")
+    picture = browser.changed(picture)
+    assert psnr(picture, depth) >= LEAST_PSNR and (depth == 1).double().mean() > 0.4
+    channel.select_by_visible_text("motion")
+    motion = browser.changed(picture)
+    behind = (color == 0).all(dim=-1)
+    assert behind.double().mean() > 0.4
+    assert (motion[behind] - UNKNOWN).abs().max() < 1 / 255
 
 
 @pytest.mark.parametrize("rows", [72, 155])

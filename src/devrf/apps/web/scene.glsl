@@ -214,8 +214,6 @@ vec3 motionColor(vec3 x) {
 void main() {
   vec2 onScreen = middle + slope * (2.0 * (gl_FragCoord.xy - frame.xy) / frame.zw - 1.0);
   vec3 direction = normalize(right * onScreen.x + up * onScreen.y - backward);
-  pixel = channel == PROBE ? vec4(0.0) : vec4(background, 1.0);
-  if (SPACE == 1 && direction.z > -1e-3) return; // it never crosses the near plane
   Ray ray = fieldRay(direction);
   vec3 cells = vec3(textureSize(distances, 0).zyx - 1) / (high - low);
 #if SPACE == 2
@@ -236,7 +234,8 @@ void main() {
   float pace = largest(abs(ray.direction) * cells);
 #endif
   float stride = STRIDE * stepLength;
-  int count = leave >= entry ? int(floor((leave - entry) / stride + 1e-3)) + 1 : 0;
+  bool meets = leave >= entry && (SPACE != 1 || direction.z < -1e-3); // or no near plane is crossed
+  int count = meets ? int(floor((leave - entry) / stride + 1e-3)) + 1 : 0;
   float samplesPerCell = 0.999 / max(pace * stride, 1e-9);
 
   vec3 color = vec3(0.0);
