@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
+import shutil
 import time
 from pathlib import Path
 
@@ -50,6 +52,21 @@ def test_the_second_process_is_refused_until_the_first_is_killed(
     warm.end(first)
     assert devrf("stage=prepare", "prepare.into=scene", *tiny, "hydra.run.dir=run").status == 0
     assert os.listdir(tmp_path / "run" / ".devrf") == ["lock"]
+
+
+def test_a_folder_that_cannot_be_written_is_named_with_the_words_that_choose_another(
+    devrf, trained, tmp_path, monkeypatch
+):
+    def refused(*_, **__):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), "run/.devrf/lock")
+
+    shutil.copytree(trained[0], tmp_path / "run")
+    monkeypatch.setattr(FileLock, "acquire", refused)
+    said = "devrf: run: cannot be written (Permission denied); use "
+    learned = "ckpt=run/checkpoints/deformation.ckpt "
+    for stage, words in [("inspect", ""), ("still", learned)]:
+        outcome = devrf(f"stage={stage}", "hydra.run.dir=run")
+        assert (outcome.status, outcome.err) == (2, f"{said}{words}hydra.run.dir=FOLDER\n")
 
 
 def test_files_that_a_killed_process_had_begun_are_removed(devrf, tiny, tmp_path):

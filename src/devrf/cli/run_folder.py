@@ -16,7 +16,8 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, read_write
 from omegaconf.errors import OmegaConfBaseException
 
-from devrf.cli.config import SWEEP_RECORD, in_sweep
+from devrf.checkpoints.file_metadata import latest_checkpoint
+from devrf.cli.config import OF_A_CHECKPOINT, SWEEP_RECORD, in_sweep
 from devrf.cli.messages import one_line, report_user_errors
 from devrf.errors import DevrfError
 from devrf.evaluation.objective import check_objective
@@ -30,6 +31,7 @@ from devrf.system.files import (
     walk,
 )
 from devrf.system.folder_lock import PLACE, lock_folder, release_folder
+from devrf.system.override import to_type
 
 log = logging.getLogger(__name__)
 
@@ -76,13 +78,17 @@ class FolderLock(Callback):
             # A report's default folder is a name in the folder of the runs.
             named = config.stage == "report" and folder == Path(str(config.report.runs)) / "report"
             refuse_links(folder, itself=named)
+            if config.stage not in UNRECORDED and not _is_worker(config):
+                lock_folder(folder, _elsewhere(config, folder))
             # As Hydra does next, with a traceback where it cannot.
             folder.mkdir(parents=True, exist_ok=True)
             if config.stage in UNRECORDED:
+                logs = OmegaConf.select(config.hydra, "job_logging.root.handlers") or []
                 with read_write(config.hydra):
                     config.hydra.output_subdir = None
-            elif not _is_worker(config):
-                lock_folder(folder, "hydra.run.dir")
+                    # The folder may be another's to write, and its log that of a run at work.
+                    if config.stage == "view" and "file" in logs:
+                        logs.remove("file")
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Lock the folder of a sweep, and write its record; each job locks its own folder.
@@ -139,6 +145,13 @@ def working_in(folder: Path, config: DictConfig) -> Iterator[None]:
         raise
     finally:
         release_folder(folder)
+
+
+def _elsewhere(config: DictConfig, folder: Path) -> str:
+    """The words before ``=FOLDER`` by which the command writes to another folder."""
+    learned = latest_checkpoint(folder) if config.stage in OF_A_CHECKPOINT else None
+    given = config.ckpt is not None or learned is None
+    return "hydra.run.dir" if given else f"{to_type('ckpt', learned)} hydra.run.dir"
 
 
 def _is_worker(config: DictConfig) -> bool:

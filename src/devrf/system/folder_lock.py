@@ -16,7 +16,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from devrf.errors import DevrfError
-from devrf.system.files import REFUSED
+from devrf.system.files import LOCKED_OUT, REFUSED
 
 log = logging.getLogger(__name__)
 
@@ -35,14 +35,14 @@ def lock_folder(folder: Path, key: str) -> None:
         key: the setting that chooses another folder.
 
     Raises:
-        DevrfError: another process works there.
+        DevrfError: another process works there, or nothing can be written there.
     """
     if folder.resolve() in _held:
         return
     lock_files = folder / PLACE
-    lock_files.mkdir(parents=True, exist_ok=True)
     lock, owner = FileLock(lock_files / LOCK), lock_files / OWNER
     try:
+        lock_files.mkdir(parents=True, exist_ok=True)
         lock.acquire(timeout=0)
     except Timeout:
         which = ""
@@ -53,6 +53,10 @@ def lock_folder(folder: Path, key: str) -> None:
             f"{key}=FOLDER"
         ) from None
     except (NotImplementedError, OSError) as error:
+        if isinstance(error, OSError) and error.errno in LOCKED_OUT:
+            raise DevrfError(
+                f"{folder}: cannot be written ({error.strerror}); use {key}=FOLDER"
+            ) from None
         if isinstance(error, OSError) and error.errno in REFUSED:
             raise
         log.warning(
