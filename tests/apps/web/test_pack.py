@@ -299,6 +299,53 @@ def test_the_controls_do_what_they_say(browser, file, tmp_path):
     assert browser.said() == []
 
 
+def test_beside_the_rest_state_cameras_and_a_double_click_do_what_they_do_without(browser, file):
+    actions = pytest.importorskip("selenium.webdriver.common.action_chains").ActionChains
+    width, height = 360, 240
+    browser.open(file.as_uri() + "#time=0", width, height)
+    browser.wait("document.body.className === 'ready'")
+
+    def target_of(x: int, y: int) -> np.ndarray:
+        browser.element("home").click()
+        picture = browser.element("picture")
+        hand = actions(browser.driver)
+        hand.move_to_element_with_offset(picture, x - width // 2, y - height // 2)
+        hand.double_click().perform()
+        browser.element("link").click()
+        words = browser.run("return location.hash")
+        pose, distance = (re.search(f"{word}=([^&]*)", words)[1] for word in ("pose", "distance"))
+        poses = np.array(pose.split(","), float).reshape(3, 4)
+        return poses[:, 3] - float(distance) * poses[:, 2]
+
+    def corners() -> np.ndarray:
+        browser.element("home").click()
+        browser.wait("document.querySelectorAll('#frusta g:not([hidden])').length > 0")
+        time.sleep(0.5)
+        points = "[...document.querySelectorAll('#frusta g:not([hidden]) polygon')]"
+        lists = browser.run(f"return {points}.map((lines) => lines.getAttribute('points'))")
+        return np.array([[float(word) for word in re.split("[ ,]", line)] for line in lists])
+
+    target = target_of(190, 120)
+    browser.element("cameras").click()
+    alone = corners().reshape(-1, 2)
+    browser.element("rest").click()
+    beside = corners().reshape(-1, 2)
+    middle = np.array([width / 2, height / 2])
+    assert beside == pytest.approx((alone - middle) / 2 + [3 * width / 4, height / 2], abs=0.02)
+    wheel = actions(browser.driver)
+    for _ in range(3):  # from farther off more cameras are seen
+        wheel.scroll_by_amount(0, 300)
+    wheel.perform()
+    time.sleep(0.5)
+    x, y = browser.run(CLICKABLE)
+    assert x >= width / 2  # what would lie on the rest state is cut off
+    browser.element("cameras").click()
+    assert np.linalg.norm(target) > 0.05  # not the middle
+    for x in (95, 275):
+        assert target_of(x, 120) == pytest.approx(target, abs=0.05)
+    assert browser.said() == []
+
+
 def test_a_page_of_ones_own_shows_it_by_the_line_that_export_prints(browser, file):
     own = file.with_name("index.html")
     style = "<style>iframe {width: 160px; height: 100px}</style>"

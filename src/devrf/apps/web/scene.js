@@ -197,10 +197,9 @@ class Graphics {
     return true;
   }
 
-  /** How far a ray through a pixel gets, in world units; 0 if it meets nothing. */
-  reach(uniforms, x, y) {
-    const { gl, canvas } = this;
-    const frame = [-x, -y, canvas.width, canvas.height];
+  /** How far the ray gets through the lower left corner, in world units; 0 if it meets nothing. */
+  reach(uniforms, frame) {
+    const { gl } = this;
     this.paint(this.program(0), { ...uniforms, channel: 3 }, frame, [0, 0, 1, 1]);
     const pixel = new Float32Array(1);
     gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(pixel.buffer));
@@ -359,13 +358,21 @@ class Page {
     this.state = null;
   }
 
-  /** Uniforms of each part of the picture: the rest state on the left, if it is wanted. */
+  /** Pictures side by side: the rest state is on the left, if it is wanted. */
+  get count() {
+    return byId("rest").checked ? 2 : 1;
+  }
+
+  /** Of half the angle that is shown: from as much farther that each half shows the whole width. */
+  get tangent() {
+    return this.count * Math.tan(this.camera.fov / 2);
+  }
+
+  /** Uniforms of each part of the picture. */
   parts() {
-    const { right, up, backward, eye, fov, middle } = this.camera;
+    const { right, up, backward, eye, middle } = this.camera;
     const { width, height } = this.graphics.canvas;
-    const count = byId("rest").checked ? 2 : 1;
-    // From as much farther that each half shows the whole width.
-    const tangent = count * Math.tan(fov / 2);
+    const { count, tangent } = this;
     const slope = [(tangent * width) / height / count, tangent];
     const [channel, part] = ["channel", "part"].map((id) => Number(byId(id).value));
     const view = { right, up, backward, eye, slope, middle, channel, part };
@@ -460,24 +467,26 @@ class Page {
     Object.assign(document.createElement("a"), { href, download }).click();
   }
 
-  /** Draws the captured cameras as frusta, if they are wanted. */
+  /** Draws the captured cameras as frusta, if they are wanted: into the picture on the right. */
   drawFrusta() {
-    const { right, up, backward, eye, fov, middle } = this.camera;
-    const wanted = byId("cameras").checked && !byId("rest").checked;
-    const scale = innerHeight / 2 / Math.tan(fov / 2);
+    const { right, up, backward, eye, middle } = this.camera;
+    const wanted = byId("cameras").checked;
+    const scale = innerHeight / 2 / this.tangent;
+    const left = innerWidth * (1 - 1 / this.count);
+    byId("frusta").style.clipPath = `inset(0 0 0 ${left}px)`;
     const place = (point) => {
       const away = along(point, -1, eye);
       const ahead = Math.max(-dot(away, backward), 1e-6);
       const [x, y] = [right, up].map((axis, k) => scale * (dot(away, axis) / ahead - middle[k]));
-      return [innerWidth / 2 + x, innerHeight / 2 - y];
+      return [(left + innerWidth) / 2 + x, innerHeight / 2 - y];
     };
     const distance = this.scene.frustum;
     this.scene.cameras.forEach((captured, k) => {
       const [image, lines] = this.frusta[k].children;
       const camera = Camera.of({ ...captured, distance });
       const tall = Math.tan(captured.fov / 2);
-      const [wide, [left, low]] = [tall * captured.aspect, captured.middle];
-      const corner = (x, y) => place(camera.moved(left + x * wide, low + y * tall, 0).target);
+      const [wide, [aside, low]] = [tall * captured.aspect, captured.middle];
+      const corner = (x, y) => place(camera.moved(aside + x * wide, low + y * tall, 0).target);
       const behind = dot(along(camera.eye, -1, eye), backward) > -2 * distance;
       this.frusta[k].toggleAttribute("hidden", !wanted || behind);
       const [a, b, c, d] = [corner(-1, 1), corner(1, 1), corner(1, -1), corner(-1, -1)];
@@ -497,12 +506,14 @@ class Page {
   center(x, y) {
     const { canvas } = this.graphics;
     const ratio = canvas.height / innerHeight;
-    const parts = this.parts();
-    const away = this.graphics.reach(parts[0], x * ratio, canvas.height - 1 - y * ratio);
+    const width = innerWidth / this.count;
+    const [part, left] = [this.parts()[Math.floor(x / width)], x % width];
+    const corner = [-left * ratio, y * ratio + 1 - canvas.height];
+    const away = this.graphics.reach(part, [...corner, width * ratio, canvas.height]);
     this.state = null; // a pixel was drawn over
-    if (away === 0 || parts.length > 1) return;
-    const { right, up, backward, eye, slope, middle } = parts[0];
-    const screen = [(2 * x) / innerWidth - 1, 1 - (2 * y) / innerHeight];
+    if (away === 0) return;
+    const { right, up, backward, eye, slope, middle } = part;
+    const screen = [(2 * left) / width - 1, 1 - (2 * y) / innerHeight];
     const [wide, high] = along(middle, 1, [0, 1].map((k) => slope[k] * screen[k]));
     const across = along(scaled(right, wide), high, up);
     const ahead = unit(along(across, -1, backward));
@@ -566,7 +577,7 @@ class Page {
       travelled += Math.hypot(x, y) * innerHeight;
       fingers.set(event.pointerId, event);
       const { camera } = this;
-      const height = 2 * Math.tan(camera.fov / 2);
+      const height = 2 * this.tangent;
       const other = [...fingers.values()].find(({ pointerId }) => pointerId !== event.pointerId);
       if (other) {
         const apart = (one) => Math.hypot(one.clientX - other.clientX, one.clientY - other.clientY);
