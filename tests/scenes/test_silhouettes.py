@@ -10,7 +10,7 @@ import torch
 
 from devrf.geometry.box import Box
 from devrf.scenes.scene import Views
-from devrf.scenes.silhouettes import motion_box, visual_hull
+from devrf.scenes.silhouettes import SEARCH, motion_box, visual_hull
 
 BallViews = Callable[..., Views]
 RADIUS = 0.35
@@ -21,7 +21,7 @@ PLACES = torch.stack(
 
 
 def test_box_holds_the_moving_ball_and_little_more(ball_views, cube):
-    box = motion_box(ball_views(PLACES, RADIUS), cube)
+    box = motion_box(ball_views(PLACES, RADIUS), cube.scaled(SEARCH))
     assert box is not None
     low, high = PLACES.amin(dim=0) - RADIUS, PLACES.amax(dim=0) + RADIUS
     assert bool(box.contains(torch.stack([low, high])).all())
@@ -33,7 +33,7 @@ def test_box_holds_the_moving_ball_and_little_more(ball_views, cube):
 
 def test_a_ball_far_smaller_than_a_grid_cell_is_not_lost(ball_views, cube):
     place = torch.tensor([[0.31, 0.17, 0.23], [0.52, 0.17, 0.23]])
-    box = motion_box(ball_views(place, 0.05), cube, resolution=12)
+    box = motion_box(ball_views(place, 0.05), cube.scaled(SEARCH), resolution=12)
     assert box is not None and bool(box.contains(place).all())
 
 
@@ -44,24 +44,24 @@ def test_a_ball_cut_off_by_one_image_is_kept_whole(ball_views, cube):
     alpha = views.pixels[..., 3]
     cut = alpha[:, :, [0, -1]].flatten(1).amax(dim=1) > 0
     assert bool(cut.any()) and not bool(cut.all())
-    box = motion_box(views, cube.scaled(1.6))
+    box = motion_box(views, cube.scaled(1.6 * SEARCH))
     assert box is not None and box.high[1] >= 1.9 + RADIUS
 
 
 def test_what_does_not_count_rules_nothing_out(ball_views, cube):
     views = ball_views(PLACES, RADIUS)
-    box = motion_box(views, cube)
+    box = motion_box(views, cube.scaled(SEARCH))
     valid_mask = torch.ones(views.pixels.shape[:3], dtype=torch.bool)
-    assert motion_box(replace(views, valid_mask=valid_mask), cube) == box
+    assert motion_box(replace(views, valid_mask=valid_mask), cube.scaled(SEARCH)) == box
     # Two of the four views see nothing that counts: the hull is that of the others, and larger.
     valid_mask[views.view < 2] = False
-    looser = motion_box(replace(views, valid_mask=valid_mask), cube)
+    looser = motion_box(replace(views, valid_mask=valid_mask), cube.scaled(SEARCH))
     assert box is not None and looser is not None
     assert all(a <= b for a, b in zip(looser.low, box.low, strict=True))
     assert all(a >= b for a, b in zip(looser.high, box.high, strict=True))
     assert looser != box
     valid_mask[:] = False
-    assert motion_box(replace(views, valid_mask=valid_mask), cube) is None
+    assert motion_box(replace(views, valid_mask=valid_mask), cube.scaled(SEARCH)) is None
 
 
 def test_no_box_without_alpha_masks_or_without_two_cameras_at_every_time(ball_views, cube):

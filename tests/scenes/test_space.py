@@ -137,6 +137,19 @@ def test_source_says_where_the_motion_box_came_from(ball_views):
     assert plain.motion is None and f"bound scale {FALLBACK_BOUND_SCALE}" in plain.source
 
 
+@pytest.mark.parametrize("reach", [1.0, 1.5])
+def test_the_box_holds_what_wide_images_show_beside_the_sphere_that_all_hold(ball_views, reach):
+    """Images of 96x80 px: 1.49 from the middle are in all of them, and across them 1.93."""
+    views = ball_views(torch.tensor([[reach, 0.0, 0.0]]), 0.25, count=8)
+    bounds = inward_bounds(views, None, [views], GivenBounds())
+    seen = box_from_cameras(views.cameras)
+    ends = torch.tensor([[reach - 0.25, -0.25, -0.25], [reach + 0.25, 0.25, 0.25]])
+    assert bool(bounds.box.contains(ends).all()) and bounds.box.union(seen) == bounds.box
+    assert bounds.box_source.endswith("silhouettes") == (bounds.box != seen) == (reach == 1.5)
+    plain = replace(views, pixels=views.pixels[..., :3])
+    assert inward_bounds(plain, None, [plain], GivenBounds()).box == seen
+
+
 def test_near_and_far_hold_for_what_moves_beyond_the_box(ball_views):
     views = ball_views(torch.tensor([[0.0, 0, 0], [0.9, 0, 0]]), 0.3)
     small = Box((-0.4, -0.4, -0.4), (0.4, 0.4, 0.4)).scaled(2.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
@@ -14,7 +14,7 @@ from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.scenes.scene import Bounds, GivenBounds, Views
-from devrf.scenes.silhouettes import motion_box
+from devrf.scenes.silhouettes import SEARCH, content_box, motion_box
 from devrf.scenes.validation import FARTHEST, scene_error
 
 # Room for motion if nothing else is known: the published scenes use 1.05 to 2.
@@ -29,6 +29,8 @@ NEAR_SHARE = 0.02
 # Shortest edge of a box, as a share of its distance from the origin: in a float32 a thousand
 # steps along it are still a thousand places.
 LEAST_EDGE = 1e-4
+# The source of a box from cameras.
+COMMON_VIEW = "the common view of the static cameras"
 # The remedy if the cameras do not determine the scene's bounds.
 GIVE = "set data.box=[[x,y,z],[x,y,z]], data.near and data.far"
 
@@ -146,6 +148,16 @@ def seen_radius(cameras: Cameras, center: Tensor) -> float:
     return float((distance * half_angle.sin()).median())
 
 
+def farthest_seen(cameras: Cameras, center: Tensor) -> float:
+    """Largest distance from ``center`` (3,) that the median camera's image holds across its axis.
+
+    distance · tan(the largest angle between its axis and the middle of an edge).
+    """
+    edge = torch.maximum(cameras.center, cameras.extents - cameras.center) / cameras.focal
+    distance = (cameras.positions - center).norm(dim=1)
+    return float((distance * edge.amax(dim=1)).median())
+
+
 def _turned_to_crops(cameras: Cameras) -> Cameras:
     """The cameras, with those of crops beside their axis turned to the crop's middle.
 
@@ -173,11 +185,13 @@ def _turned_to_crops(cameras: Cameras) -> Cameras:
     )
 
 
-def box_from_cameras(cameras: Cameras) -> Box:
-    """The cube around the point that all cameras look at; its half edge is :func:`seen_radius`."""
+def box_from_cameras(
+    cameras: Cameras, half_edge: Callable[[Cameras, Tensor], float] = seen_radius
+) -> Box:
+    """The cube around the point that all cameras look at, of that :func:`seen_radius`."""
     cameras = _turned_to_crops(cameras)
     center = axes_meet(cameras)
-    radius = seen_radius(cameras, center)
+    radius = half_edge(cameras, center)
     return resolved_box(center - radius, center + radius)
 
 
@@ -233,14 +247,22 @@ def inward_bounds(
     Arguments and errors are those of :func:`devrf.scenes.space.inward_space`.
     """
     scale = FALLBACK_BOUND_SCALE if given.scale == "auto" else float(given.scale)
-    box = given.box or box_from_cameras(static.cameras)
+    box = area = given.box or box_from_cameras(static.cameras)
+    box_source = "data.box is given" if given.box else COMMON_VIEW
+    if given.box is None and static.cut_out:
+        # A subject that fills wide or high images is larger than the sphere that all of them hold.
+        area = box_from_cameras(static.cameras, farthest_seen)
+        content = content_box(static, area.scaled(SEARCH))
+        if content is not None and content.union(box) != box:
+            box = box.union(content)
+            box_source += ", and the silhouettes"
     motion = None
     source = f"canonical box x bound scale {scale:g}"
     if dynamic is None and given.scale == "auto":
         scale = STATIC_BOUND_SCALE
         source = NO_MOTION
     elif dynamic is not None and given.scale == "auto":
-        motion = motion_box(dynamic, box)
+        motion = motion_box(dynamic, box.scaled(SEARCH).union(area))
         if motion is None:
             source += " (no alpha masks from two cameras at every time)"
         else:
@@ -262,7 +284,7 @@ def inward_bounds(
             f"expected 0 <= near < far, not {near:g} and {far:g}; the cameras say "
             f"data.near={nearest:.3g} data.far={farthest:.3g}",
         )
-    return Bounds(box, near, far, motion, scale, source, limited, given)
+    return Bounds(box, near, far, motion, scale, source, limited, given, box_source=box_source)
 
 
 # Cosine of the steepest angle, about 84 degrees, to −z: beyond it the box grows without bound.

@@ -29,7 +29,11 @@ UNSEEN = 2
 ALPHA_THRESHOLD = 127
 
 
-def motion_box(views: Views, box: Box, *, resolution: int = 64, search: float = 1.5) -> Box | None:
+# What moves is searched in so many times the box of the static scene.
+SEARCH = 1.5
+
+
+def motion_box(views: Views, area: Box, *, resolution: int = 64) -> Box | None:
     """The box of the union over all frames of the visual hulls.
 
     A point belongs to a frame's hull when at least two views see it inside their silhouettes
@@ -39,9 +43,8 @@ def motion_box(views: Views, box: Box, *, resolution: int = 64, search: float = 
 
     Args:
         views: the dynamic training views.
-        box: the static scene's, world units.
-        resolution: grid points along each edge of the searched box.
-        search: size of the searched box as a multiple of ``box``.
+        area: the searched box, world units.
+        resolution: grid points along each of its edges.
 
     Returns:
         The box in world units, a grid cell wider than the hulls on each side and not larger
@@ -49,9 +52,19 @@ def motion_box(views: Views, box: Box, *, resolution: int = 64, search: float = 
         some time, or when all hulls are empty.
     """
     frames = _frames(views)
-    if frames is None:
-        return None
-    area = box.scaled(search)
+    return None if frames is None else _box_of_hulls(views, frames, area, resolution)
+
+
+def content_box(views: Views, area: Box, *, resolution: int = 64) -> Box | None:
+    """The box of the visual hull of alpha masks of one state, as :func:`motion_box` defines it.
+
+    Arguments and result are those of :func:`motion_box`; ``views`` all show that state.
+    """
+    return _box_of_hulls(views, [[*range(len(views))]], area, resolution)
+
+
+def _box_of_hulls(views: Views, frames: list[list[int]], area: Box, resolution: int) -> Box | None:
+    """The box, within the area, of the union of the hulls of frames, each some of the views."""
     cell = area.longest / (resolution - 1)
     points = area.grid_points((resolution,) * 3, views.cameras.focal).reshape(-1, 3)
     low, high = area.corners(views.cameras.positions)
@@ -65,14 +78,16 @@ def motion_box(views: Views, box: Box, *, resolution: int = 64, search: float = 
         open_points = np.flatnonzero(~hull)
         inside_views = np.zeros(len(open_points), dtype=np.int64)
         for image in images:
-            key = (int(views.view[image]), views.cameras.size_of(image))
-            if key not in cached:
-                if len(cached) >= 16:  # moving cameras: no projection is used twice
-                    cached.clear()
-                camera = views.cameras.single(image)
-                projected = camera.project(torch.zeros_like(points[:, 0], dtype=torch.long), points)
-                cached[key] = _pixel_index(projected, camera).cpu().numpy()
-            verdict = masks[image][cached[key][open_points]]
+            if len(frames) == 1:  # no projection is used twice
+                pixels = _pixels_in(views.cameras.single(image), points[open_points])
+            else:
+                key = (int(views.view[image]), views.cameras.size_of(image))
+                if key not in cached:
+                    if len(cached) >= 16:  # nor is it where cameras move
+                        cached.clear()
+                    cached[key] = _pixels_in(views.cameras.single(image), points)
+                pixels = cached[key][open_points]
+            verdict = masks[image][pixels]
             keep = verdict != OUTSIDE
             open_points = open_points[keep]
             inside_views = inside_views[keep] + (verdict[keep] == INSIDE)
@@ -123,6 +138,12 @@ def _silhouette(view: Views, reach: int, threshold: int) -> Array:
     grown, near_unknown = (cv2.dilate(m.astype(np.uint8), square) > 0 for m in (solid, unknown))
     codes = np.select([unknown, grown, near_unknown], [UNSEEN, INSIDE, UNSEEN], OUTSIDE).ravel()
     return np.append(codes, UNSEEN if cut_off else OUTSIDE).astype(np.uint8)
+
+
+def _pixels_in(camera: Cameras, points: Tensor) -> Array:
+    """:func:`_pixel_index` of ``points`` (P, 3), world units, in one camera."""
+    projected = camera.project(torch.zeros_like(points[:, 0], dtype=torch.long), points)
+    return _pixel_index(projected, camera).cpu().numpy()
 
 
 def _pixel_index(projected: tuple[Tensor, Tensor], camera: Cameras) -> Tensor:

@@ -14,6 +14,7 @@ from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.poses import average_pose, relative_to
 from devrf.geometry.space import WORLD, Space
 from devrf.scenes.bounds import (
+    COMMON_VIEW,
     NO_MOTION,
     box_from_cameras,
     forward_bounds,
@@ -29,7 +30,7 @@ from devrf.scenes.scene import (
     Views,
     both_mapped,
 )
-from devrf.scenes.silhouettes import motion_box
+from devrf.scenes.silhouettes import SEARCH, motion_box
 from devrf.scenes.validation import scene_error
 
 log = logging.getLogger(__name__)
@@ -65,15 +66,17 @@ def inward_space(
     """
     box = given.box
     box_given = "data.box is given" if box else ""
-    where = box_given or "the common view of the static cameras"
+    where = box_given or COMMON_VIEW
     masks = "the images have alpha masks" if static.cut_out else "the images have no alpha masks"
     if choice == "world" or (choice == "auto" and (static.cut_out or box)):
         bounds = inward_bounds(static, dynamic, everyone, given)
         why = "data.space=world" if choice == "world" else box_given or masks
-        return WORLD, replace(bounds, reason=why, box_source=where)
+        return WORLD, replace(bounds, reason=why)
     inner = box or box_from_cameras(static.cameras)
     if box is None:
-        motion = motion_box(dynamic, inner) if dynamic is not None and dynamic.cut_out else None
+        motion = None
+        if dynamic is not None and dynamic.cut_out:
+            motion = motion_box(dynamic, inner.scaled(SEARCH))
         if motion is not None:
             inner = inner.union(motion)
             where += ", and the silhouettes' motion"
