@@ -95,6 +95,7 @@ PROBLEMS = [
     (changed(REST, where(lambda v: v.cameras.positions[:, 0] > 0)), "static training", "sector of"),
     (one_colour, "frame 001 view 0", "one colour"),
     (changed(REST, painted(5, slice(4), [90, 0, 91, 0])), "static train 005", "mask is empty"),
+    (changed(REST, painted(5, slice(3, 4), [255])), "static train 005", "opaque all over"),
     (changed(REST, ambiguous), "static train 007", "EXIF orientation"),
     (changed(REST_TEST, rgb), "static test", "without alpha masks"),
     (changed(REST_TEST, painted(slice(None), slice(3, 4), [255])), "static test", "opaque"),

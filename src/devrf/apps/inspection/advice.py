@@ -215,6 +215,11 @@ def _images(scene: Scene) -> Iterator[Advice]:
             "look at the alpha channel, or leave the image out",
         ),
         (
+            _is_opaque,
+            "opaque all over, while others of its set are cut out: its background is learned too",
+            "save it with the subject's alpha, or leave the image out",
+        ),
+        (
             _is_ambiguous,
             "its EXIF orientation says that it is to be seen turned; it is read as it is stored, "
             "since its camera does not tell",
@@ -253,6 +258,14 @@ def _is_flat(views: Views) -> Iterator[bool]:
 def _is_empty(views: Views) -> Iterator[bool]:
     for k in range(len(views)):
         yield views.has_alpha and int(_valid_pixels(views, k)[:, 3].max()) <= OPAQUE
+
+
+def _is_opaque(views: Views) -> list[bool]:
+    if not views.has_alpha:
+        return [False] * len(views)
+    least = views.pixels[..., 3].flatten(1).amin(dim=1)
+    opaque = least > OPAQUE
+    return (opaque & ~opaque.all()).tolist()  # of a whole set _alpha says so
 
 
 def _is_ambiguous(views: Views) -> list[bool]:
