@@ -367,6 +367,23 @@ def test_a_page_of_ones_own_shows_it_by_the_line_that_export_prints(browser, fil
     assert framed.std() > 0.05 and psnr(framed, alone) > LEAST_PSNR
 
 
+def test_a_frame_that_begins_collapsed_shows_the_scene_once_it_has_room(browser, file):
+    own = file.with_name("index.html")
+    own.write_text(f"<iframe src='{file.name}' style='width: 0; height: 0; border: 0'></iframe>")
+    browser.open(own.as_uri(), 300, 200)
+    browser.driver.switch_to.frame(0)
+    browser.wait("document.getElementById('clock').textContent > '0.5'")  # time runs, frames load
+    browser.driver.switch_to.default_content()
+    browser.run("document.querySelector('iframe').style = 'width: 80px; height: 60px; border: 0'")
+    browser.driver.switch_to.frame(0)
+    browser.wait("document.documentElement.dataset.rows === '60'")
+    browser.run("document.getElementById('play').click()")
+    picture = browser.canvas()
+    assert picture.shape == (60, 80, 3) and picture.std() > 0.05
+    assert browser.said() == []
+    browser.driver.switch_to.default_content()
+
+
 def test_fingers_turn_and_pinch(browser, file):
     browser.open(file.as_uri() + "#time=0", 390, 500)
     browser.wait("document.body.className === 'ready'")

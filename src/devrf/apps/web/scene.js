@@ -351,7 +351,9 @@ class Page {
 
   resize() {
     const ratio = Math.min(devicePixelRatio, 2);
-    const [width, height] = [innerWidth, innerHeight].map((edge) => Math.round(edge * ratio));
+    // A collapsed frame has no pixels, which graphics drivers refuse.
+    const edges = [innerWidth, innerHeight].map((edge) => Math.max(Math.round(edge * ratio), 1));
+    const [width, height] = edges;
     const { gl, canvas } = this.graphics;
     Object.assign(canvas, { width, height });
     gl.renderbufferStorage(gl.RENDERBUFFER, gl.RGBA8, width, height);
