@@ -384,6 +384,14 @@ def test_a_frame_that_begins_collapsed_shows_the_scene_once_it_has_room(browser,
     browser.driver.switch_to.default_content()
 
 
+@pytest.mark.parametrize("words", ["distance=Infinity&fov=40", "distance=3&fov=200"])
+def test_a_link_to_no_camera_leaves_the_first_one(browser, file, words):
+    browser.open(file.as_uri() + f"#pose=1,0,0,0,0,1,0,0,0,0,1,4&{words}&time=0.4")
+    wrong = browser.canvas()
+    browser.open(file.as_uri() + "#time=0.4")
+    assert psnr(wrong, browser.canvas()) > 60
+
+
 def test_fingers_turn_and_pinch(browser, file):
     browser.open(file.as_uri() + "#time=0", 390, 500)
     browser.wait("document.body.className === 'ready'")

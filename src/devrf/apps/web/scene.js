@@ -342,8 +342,8 @@ class Page {
     const [given, middle] = [list("pose", ""), list("middle", "0,0")];
     const { offset } = this.scene;
     const pose = given.map((value, k) => (k % 4 === 3 ? value - offset[(k - 3) / 4] : value));
-    const numbers = pose.length === 12 && [...pose, middle[0], middle[1]].every(Number.isFinite);
-    const poses = numbers && distance > 0 && fov > 0;
+    const numbers = [...pose, middle[0], middle[1], distance].every(Number.isFinite);
+    const poses = pose.length === 12 && numbers && distance > 0 && fov > 0 && fov < 180;
     if (poses) this.look(Camera.of({ pose, distance, fov: (fov * Math.PI) / 180, middle }));
     if (time >= 0) this.setTime(time);
     return poses || time >= 0;
