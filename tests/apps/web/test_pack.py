@@ -392,6 +392,23 @@ def test_a_link_to_no_camera_leaves_the_first_one(browser, file, words):
     assert psnr(wrong, browser.canvas()) > 60
 
 
+@pytest.mark.parametrize(
+    ("clipboard", "said"),
+    [
+        ("{writeText: async () => {}}", "the link is copied, and in the address"),
+        ("{writeText: async () => {throw new Error('denied')}}", "the link is in the address"),
+        ("undefined", "the link is in the address"),  # of a page that came over http
+    ],
+)
+def test_a_link_is_said_to_be_copied_where_it_is(browser, file, clipboard, said):
+    browser.open(file.as_uri() + "#time=0.4", 360, 130)
+    browser.canvas()
+    browser.run(f"Object.defineProperty(navigator, 'clipboard', {{value: {clipboard}}})")
+    browser.element("link").click()
+    browser.wait(f"document.getElementById('status').textContent === '{said}'")
+    assert "time=0.4" in browser.run("return location.hash") and browser.said() == []
+
+
 def test_fingers_turn_and_pinch(browser, file):
     browser.open(file.as_uri() + "#time=0", 390, 500)
     browser.wait("document.body.className === 'ready'")

@@ -538,10 +538,11 @@ class Page {
         Object.assign(this, { turning: false, saving: true });
         root.dataset.quality = "saving";
       },
-      link: () => {
+      link: async () => {
         history.replaceState(null, "", this.link);
-        navigator.clipboard?.writeText(location.href).catch(() => {});
-        byId("status").textContent = "the link is copied, and in the address";
+        const copying = navigator.clipboard?.writeText(location.href);
+        const copied = await copying?.then(() => "copied, and in", () => null);
+        byId("status").textContent = `the link is ${copied ?? "in"} the address`;
       },
     };
     for (const [id, act] of Object.entries(acts)) byId(id).addEventListener("click", act);
