@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from devrf.data import flow
-from devrf.data.flow import previous_images, with_flow
+from devrf.data.flow import previous_images, with_flow, with_forward_flow
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.optical_flow import frame_pairs
@@ -60,3 +60,19 @@ def test_the_image_one_frame_earlier(times, view, previous):
     views = replace(grey(len(times)), times=torch.tensor(times), view=torch.tensor(view))
     assert previous_images(views).tolist() == previous
     assert [(i, p) for i, p in enumerate(previous) if p != i] == frame_pairs(views)
+
+
+def test_flow_files_of_a_camera_that_left_a_frame_out_do_not_count(tiny_scene, caplog):
+    train = tiny_scene.dynamic.train
+    kept = [k for k in range(len(train)) if not (train.frames[k] == 1 and train.view[k] == 1)]
+    lacking = replace(train[torch.tensor(kept)], flow=None)
+    whole = OpticalFlow(torch.ones(5, 18, 24, 2), torch.ones(5, 18, 24, dtype=torch.bool))
+    of_files = replace(lacking, flow=whole)
+    scene = replace(tiny_scene, dynamic=replace(tiny_scene.dynamic, train=of_files))
+    pairs = frame_pairs(of_files)
+    backward = with_flow(scene, "auto", None).dynamic.train.flow
+    forward = with_forward_flow(scene, "auto", None, whole).dynamic.train.forward_flow
+    for number, flow_of_files in enumerate((backward, forward)):
+        valid = flow_of_files.valid.flatten(1).all(dim=1).nonzero()[:, 0].tolist()
+        assert valid == sorted(pair[number] for pair in pairs) and len(valid) == 2
+    assert "one frame earlier" in caplog.text and "one frame later" in caplog.text

@@ -20,7 +20,8 @@ log = logging.getLogger(__name__)
 def with_flow(scene: Scene, source: FlowSource, cache: Path | None) -> Scene:
     """The scene with flow of its moving training views, estimated if ``source`` says so.
 
-    Flow is valid only where the views' ``valid_mask`` is.
+    Estimated flow is valid only where the views' ``valid_mask`` is, flow from files only in images
+    whose view has one a frame earlier.
 
     Args:
         scene: as its reader gave it, with flow from files or without.
@@ -38,7 +39,10 @@ def with_flow(scene: Scene, source: FlowSource, cache: Path | None) -> Scene:
         if source == "files":
             raise scene_error("data.flow", "files: the scene has none; set data.flow=auto")
         log.info("%s: learned without optical flow", scene.name)
-    return scene
+    if train.flow is None:
+        return scene
+    flow = _from_frame_to_frame(train.flow, train)
+    return scene if flow is train.flow else _with_train(scene, replace(train, flow=flow))
 
 
 def with_forward_flow(
@@ -55,7 +59,7 @@ def with_forward_flow(
         files: forward flow from files, or None.
     """
     train = scene.dynamic.train
-    flow = files
+    flow = None if files is None else _from_frame_to_frame(files, train, forward=True)
     if flow is None and source in ("dis", "raft"):
         if cache is not None:
             cache = cache.with_name(f"{cache.stem}_forward{cache.suffix}")
@@ -63,6 +67,25 @@ def with_forward_flow(
     if flow is None:
         return scene
     return _with_train(scene, replace(train, forward_flow=_where_valid(flow, train)))
+
+
+def _from_frame_to_frame(flow: OpticalFlow, views: Views, *, forward: bool = False) -> OpticalFlow:
+    """The flow, valid only in images whose view has an image one frame earlier; or later.
+
+    Where a camera has left a frame out, its file leads to the frame before that.
+    """
+    leads = torch.zeros(len(views), dtype=torch.bool)
+    leads[[pair[forward] for pair in frame_pairs(views)]] = True
+    lost = (flow.valid.flatten(1).any(dim=1) & ~leads).nonzero()[:, 0].tolist()
+    if not lost:
+        return flow
+    log.warning(
+        "flow of %d images is left out, as of %s: its camera has no image one frame %s",
+        len(lost),
+        views.names[lost[0]],
+        "later" if forward else "earlier",
+    )
+    return replace(flow, valid=flow.valid & leads[:, None, None])
 
 
 def _where_valid(flow: OpticalFlow, views: Views) -> OpticalFlow:
