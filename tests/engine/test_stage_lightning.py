@@ -179,3 +179,11 @@ def test_a_fit_that_ended_early_leaves_the_state_of_a_gpus_random_numbers(
     fitted.fit(canonical(), datamodule=datamodule)
     fitted.save_checkpoint(tmp_path / "left.ckpt")  # the stage has been moved to the host
     assert "cuda" in read_checkpoint_file(tmp_path / "left.ckpt")["progress"]["random"]
+
+
+@pytest.mark.parametrize("key", ["min_steps", "min_epochs"])
+def test_a_fit_that_would_never_end_is_refused(canonical, datamodule, trainer, key):
+    with pytest.raises(DevrfError, match=f"trainer.{key}: expected none: the schedule says"):
+        trainer(max_epochs=1, max_time="00:00:00:05", **{key: 100}).fit(
+            canonical(), datamodule=datamodule
+        )

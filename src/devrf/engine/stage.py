@@ -41,7 +41,7 @@ from devrf.engine.protocol import CaptureChoice
 from devrf.engine.provenance import Provenance
 from devrf.engine.resumed_loops import resumed_fit_loop
 from devrf.engine.schedule import Phase, Schedule, entered_phase, scale_schedule
-from devrf.errors import DevrfError
+from devrf.errors import DevrfError, expect
 from devrf.evaluation.held_out import HeldOutView, score
 from devrf.evaluation.scoring import log_scores, log_validation
 from devrf.rendering.renderable import Renderable
@@ -259,14 +259,18 @@ class Stage(LightningModule, ABC):
         """Check the trainer, make the generator, and have checkpoints in devrf's format.
 
         Raises:
-            DevrfError: there is no datamodule, the precision is not 32 bit, or several processes
-                run with a strategy that does not support growing grids.
+            DevrfError: there is no datamodule, the precision is not 32 bit, Lightning is to go on
+                beyond the schedule, or several processes run with a strategy that does not support
+                growing grids.
         """
         if self.trainer.precision != "32-true":
             raise DevrfError(
                 f"trainer.precision: expected 32-true, not {self.trainer.precision}: positions "
                 "need all their digits"
             )
+        for key in ("min_steps", "min_epochs"):
+            value = getattr(self.trainer, key)
+            expect(not value, f"trainer.{key}", "none: the schedule says how long it takes", value)
         check_strategy(self.trainer)
         datamodule = getattr(self.trainer, "datamodule", None)
         if datamodule is None:
