@@ -56,6 +56,13 @@ def test_a_stage_that_is_cut_short_ends_the_pipeline_and_goes_on_without_the_lim
     torch.testing.assert_close(fields(tmp_path / "run"), fields(whole), rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("key", ["limit_train_batches", "overfit_batches", "val_check_interval"])
+def test_a_share_of_a_loader_that_never_ends_is_refused_in_one_line(devrf, command, key):
+    outcome = devrf(*command, "stage=canonical", f"+trainer.{key}=0.5")
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert outcome.err.startswith("devrf: trainer: When using an ") and "int" in outcome.err
+
+
 def test_a_callback_that_ends_a_stage_early_ends_the_pipeline(devrf, command, tmp_path):
     timer = "+callbacks.timer._target_=lightning.pytorch.callbacks.Timer"
     outcome = devrf(*command, timer, "+callbacks.timer.duration=00:00:00:00")

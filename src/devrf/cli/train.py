@@ -12,6 +12,7 @@ from typing import Any
 
 from hydra.utils import instantiate
 from lightning import Callback, Trainer
+from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import ModelCheckpoint
 from omegaconf import OmegaConf
 
@@ -136,7 +137,8 @@ def _named(callbacks: Mapping[str, Callback | None]) -> Iterator[None]:
     """Say it if an error comes from a callback that is not devrf's; run.log has its traceback.
 
     Raises:
-        DevrfError: naming the callback's key, its method and the error.
+        DevrfError: naming the callback's key, its method and the error; or a setting of the trainer
+            that Lightning refuses.
     """
     own = {
         id(callback): f"callbacks.{name}: {type(callback).__qualname__}"
@@ -153,6 +155,8 @@ def _named(callbacks: Mapping[str, Callback | None]) -> Iterator[None]:
                 log.error("a callback failed", exc_info=error)
                 said = f"{type(error).__name__}: {error}"
                 raise DevrfError(f"{callback}.{frame.f_code.co_name} failed ({said})") from error
+        if isinstance(error, MisconfigurationException):
+            raise DevrfError(f"trainer: {error}") from error
         raise
 
 
