@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -20,6 +21,7 @@ from devrf.methods.image_stage import WHOLE, ImagePlan, ImageStage
 from devrf.methods.ray_schedule import RaySchedule
 from devrf.rendering.output import RenderedImage, RenderOutput
 from devrf.scenes.scene import Scene
+from tiny_scenes import GivenScene
 
 RATES = {"learning_rate": 1e-2, "final_learning_rate": 1e-3}
 
@@ -137,3 +139,35 @@ def test_what_only_rays_have_is_refused() -> None:
         plan.check()
     with pytest.raises(DevrfError, match=r"ray_stage.half_size: expected in \[0, 1\), not 1"):
         image_stage(half_size=1.0)
+
+
+class ByAbsoluteError(Columns):
+    """It learns by another term than ``render``, from valid pixels."""
+
+    losses = ("l1",)
+
+    def growths(self, total: int) -> list[int]:
+        return []
+
+    def loss_terms(self, output: RenderOutput, batch: ImageBatch, names: Any) -> dict[str, Tensor]:
+        assert batch.valid is not None
+        return {"l1": (output.color - batch.color)[batch.valid].abs().mean()}
+
+
+def test_the_psnr_of_batches_is_that_of_valid_pixels(
+    fit: Callable[..., ImageStage], tiny_scene: Scene
+) -> None:
+    train = tiny_scene.dynamic.train
+    valid_mask = torch.zeros_like(train.pixels[..., 0], dtype=torch.bool)
+    valid_mask[:, :, ::2] = True
+    masked = replace(train, valid_mask=valid_mask)
+    scene = replace(tiny_scene, dynamic=replace(tiny_scene.dynamic, train=masked))
+    schedule = RaySchedule(iterations=1, rays=10_000, **RATES)
+    step = ProtocolStage("dynamic", "dynamic")
+    model = ByAbsoluteError()
+    nn.init.zeros_(model.rows)
+    stage = fit(ImageStage(model, schedule, {"l1": 1.0}, step), data=GivenScene(scene), every=1)
+    (batch,) = model.seen[:1]
+    shown = stage.trainer.callback_metrics["dynamic/render"]
+    assert float(shown) == pytest.approx(float(batch.color[batch.valid].square().mean()))
+    assert float(shown) != pytest.approx(float(batch.color.square().mean()), rel=1e-3)

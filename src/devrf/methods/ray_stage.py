@@ -9,7 +9,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import mse_loss
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import (
@@ -95,7 +94,10 @@ class RayStage(Stage):
             loss, terms = weighted_sum(values, self.weights)
             terms |= visibility(output.transmittance, batch.alpha)
             if "render" not in terms:  # what the curves' PSNR is of
-                terms["render"] = mse_loss(output.color.detach(), batch.color)
+                valid = batch.valid if isinstance(batch, ImageBatch) else None
+                missed = (output.color.detach() - batch.color).square().mean(dim=1)
+                missed = missed if valid is None else missed[valid]
+                terms["render"] = missed.sum() / max(len(missed), 1)
         self.optimise(loss)
         return {"loss": loss.detach(), **terms}
 
