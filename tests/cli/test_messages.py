@@ -83,6 +83,10 @@ MISTAKES = {
         ["trainer.devices=2"],
         "trainer.devices: 2 processes need trainer=ddp",
     ),
+    "a strategy that wraps what is learned": (
+        ["+trainer.strategy=ddp"],
+        "trainer.strategy: expected none, or trainer=ddp",
+    ),
     "gradients of several batches": (
         ["+trainer.accumulate_grad_batches=2"],
         "trainer.accumulate_grad_batches: stages take optimiser steps of their own",

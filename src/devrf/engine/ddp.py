@@ -11,10 +11,10 @@ from typing import Any
 
 import torch
 from lightning import Trainer
-from lightning.pytorch.strategies import DDPStrategy
+from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
 from torch import Tensor, distributed
 
-from devrf.errors import DevrfError
+from devrf.errors import DevrfError, expect
 
 # A grid of so many values or more exchanges only the points that were reached, if these are at
 # most a share of all: finding and gathering them costs time, too.
@@ -66,16 +66,19 @@ class ManualDDP(DDPStrategy):
 
 
 def check_strategy(trainer: Trainer) -> None:
-    """Check that several processes use :class:`ManualDDP`.
+    """Check that a trainer has one device, or several processes by :class:`ManualDDP`.
 
     Raises:
-        DevrfError: they use another strategy.
+        DevrfError: it has another strategy.
     """
-    if trainer.world_size > 1 and not isinstance(trainer.strategy, ManualDDP):
-        raise DevrfError(
-            f"trainer.devices: {trainer.world_size} processes need trainer=ddp (the strategy "
-            "devrf.engine.ddp.ManualDDP)"
-        )
+    if isinstance(trainer.strategy, ManualDDP):
+        return
+    ddp = "trainer=ddp (the strategy devrf.engine.ddp.ManualDDP)"
+    if trainer.world_size > 1:
+        raise DevrfError(f"trainer.devices: {trainer.world_size} processes need {ddp}")
+    name = type(trainer.strategy).__name__
+    alone = isinstance(trainer.strategy, SingleDeviceStrategy)
+    expect(alone, "trainer.strategy", f"none, or {ddp}", name)
 
 
 def world_size() -> int:
