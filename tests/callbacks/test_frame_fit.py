@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from types import SimpleNamespace
 from typing import Any
 
@@ -34,11 +35,19 @@ Visiting.__abstractmethods__ = frozenset()
 
 
 def visit(
-    fit: FrameFit, stage: Stage, level: int, frame: int | None, *errors: float, stop: int = 10
+    fit: FrameFit,
+    stage: Stage,
+    level: int,
+    frame: int | None,
+    *errors: float,
+    stop: int = 10,
+    batches: int = 1,
 ) -> None:
-    """Steps of these errors in the visit of ``frame`` at a level."""
+    """Steps of these errors, and so many batches, in the visit of ``frame`` at a level."""
     stage.__dict__["phase"] = Phase(kind=f"level {level}", start=0, stop=stop, frame=frame)
     for error in errors:
+        fit.on_train_batch_start(TRAINER, stage, None, 0)
+        stage.position.iterations_done += batches
         fit.on_train_batch_end(TRAINER, stage, {"render": torch.tensor(error)}, None, 0)
 
 
@@ -128,3 +137,11 @@ def test_frames_in_words():
     psnr = {1: 37.0, 2: 25.0, 3: 25.0, 4: 37.0, 5: 37.0}
     said = "frames 2 to 3 fit worse than the rest: 25.0 dB, the others 37.0"
     assert complaint(psnr, lost(psnr)) == said
+
+
+def test_a_step_of_fewer_batches_counts_less():
+    fit, stage = FrameFit(), Visiting()
+    fit.on_train_start(TRAINER, stage)
+    visit(fit, stage, 1, 1, 0.1, batches=10)
+    visit(fit, stage, 1, 1, 0.01, batches=5)
+    assert fit.psnr == {1: pytest.approx(-10 * math.log10((10 * 0.1 + 5 * 0.01) / 15))}

@@ -38,8 +38,9 @@ class FrameFit(Callback):
         # Kind of the phase, frame, and rollbacks, before which errors may be no numbers: a budget
         # changes the iterations of a visit on its way.
         self._visit: tuple[str, int | None, int] | None = None
-        # Of each frame's last visit so far: the sum () of its steps' errors, and their number.
+        # Of each frame's last visit so far: the sum () of its batches' errors, and their number.
         self._errors: dict[int, tuple[Tensor, int]] = {}
+        self._done = 0
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Forget the stage before."""
@@ -52,8 +53,8 @@ class FrameFit(Callback):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Go on with what :meth:`state_dict` gave."""
         self._errors = {
-            int(frame): (torch.tensor(float(total)), int(steps))
-            for frame, (total, steps) in state_dict["errors"].items()
+            int(frame): (torch.tensor(float(total)), int(batches))
+            for frame, (total, batches) in state_dict["errors"].items()
         }
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -63,10 +64,17 @@ class FrameFit(Callback):
         rollbacks = pl_module.position.num_rollbacks
         self._visit = None if phase is None else (phase.kind, phase.frame, rollbacks)
 
+    def on_train_batch_start(
+        self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int
+    ) -> None:
+        """Count the step's batches from here: the last step of a visit may have fewer."""
+        assert isinstance(pl_module, Stage)
+        self._done = pl_module.position.iterations_done
+
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Add the step's error to those of the frame's visit."""
+        """Add the errors of the step's batches to those of the frame's visit."""
         assert isinstance(pl_module, Stage)
         phase = pl_module.phase
         error = (outputs or {}).get("render")
@@ -76,8 +84,10 @@ class FrameFit(Callback):
         if visit != self._visit:
             self._visit = visit
             self._errors.pop(phase.frame, None)
-        total, steps = self._errors.get(phase.frame, (torch.zeros_like(error), 0))
-        self._errors[phase.frame] = (total.to(error.device) + error.detach(), steps + 1)
+        total, batches = self._errors.get(phase.frame, (torch.zeros_like(error), 0))
+        count = pl_module.position.iterations_done - self._done
+        added = total.to(error.device) + count * error.detach()
+        self._errors[phase.frame] = (added, batches + count)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Add the figures to the stage's record; say which frames were lost."""
@@ -97,8 +107,8 @@ class FrameFit(Callback):
     def psnr(self) -> dict[int, float]:
         """The training PSNR in dB of each frame, in order; :data:`BEST` at most."""
         return {
-            frame: min(-10 * math.log10(max(float(total) / steps, 1e-12)), BEST)
-            for frame, (total, steps) in sorted(self._errors.items())
+            frame: min(-10 * math.log10(max(float(total) / batches, 1e-12)), BEST)
+            for frame, (total, batches) in sorted(self._errors.items())
         }
 
 
