@@ -63,6 +63,11 @@ def test_a_share_of_a_loader_that_never_ends_is_refused_in_one_line(devrf, comma
     assert outcome.err.startswith("devrf: trainer: When using an ") and "int" in outcome.err
 
 
+def test_a_limit_of_time_may_be_a_mapping(devrf, command):
+    outcome = devrf(*command, "stage=canonical", "+trainer.max_time={minutes:30}")
+    assert (outcome.status, outcome.err) == (0, "")
+
+
 def test_a_callback_that_ends_a_stage_early_ends_the_pipeline(devrf, command, tmp_path):
     timer = "+callbacks.timer._target_=lightning.pytorch.callbacks.Timer"
     outcome = devrf(*command, timer, "+callbacks.timer.duration=00:00:00:00")

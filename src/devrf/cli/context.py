@@ -289,6 +289,6 @@ def _strategy(config: DictConfig) -> Strategy:
     for key, instead in OF_THE_RUN.items():
         if key in config.trainer:
             raise DevrfError(f"trainer.{key}: {instead}; leave it out")
-    trainer: Trainer = instantiate(config.trainer, logger=False)
+    trainer: Trainer = instantiate(config.trainer, logger=False, _convert_="all")
     check_strategy(trainer)
     return trainer.strategy

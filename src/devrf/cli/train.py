@@ -90,6 +90,7 @@ def _fit(run: RunContext, stage: Stage, begin: ResumePoint) -> None:
     with StopOnSignal(saving) as stop:
         trainer: Trainer = instantiate(
             run.config.trainer,
+            _convert_="all",
             callbacks=[*callbacks, stop],
             logger=run.loggers,
             default_root_dir=str(run.folder),
