@@ -154,6 +154,18 @@ def test_a_run_that_was_stopped_between_two_growths_goes_on_to_the_same_weights(
     assert stopped.scene_model.resolution < whole.scene_model.resolution
 
 
+def test_a_grid_that_has_not_grown_comes_back_and_is_forecast_as_if_it_had(
+    ray_stage: Callable[..., RayStage], fit: Callable[..., RayStage],
+    stored: Callable[[RayStage], LoadedCheckpoint],
+) -> None:  # fmt: skip
+    model = TiNeuVox(replace(TINY, side=48, upsample_at=(1.0, 1.0, 1.0)))
+    others = sum(p.numel() for p in model.parameters()) - model.grid.values.numel()
+    assert model.most_bytes == 4 * (others + 49**3 * 2)
+    stage = fit(ray_stage(model, loss=LOSS))
+    assert stored(stage).model.resolution == stage.scene_model.resolution
+    assert math.prod(stage.scene_model.resolution) < 49**3 / 4
+
+
 def test_two_stages_leave_the_canonical_part_as_it_was(
     ray_stage: Callable[..., RayStage], fit: Callable[..., RayStage]
 ) -> None:

@@ -65,8 +65,6 @@ class TiNeuVox(DensityColorField):
         super().set_place(box, space, depths)
         x, y, z = (edge / box.longest for edge in box.size)
         self.grid_box = Box((-x, -y, -z), (x, y, z))
-        # Its full size: a run's memory is estimated before ``setup``.
-        self.grid.resize(self._shape_after(len(self.settings.upsample_at)))
 
     def setup(self, scene: Scene) -> None:
         """Take bounds, times and hulls; make the grid as small as it is before it grows."""
@@ -77,6 +75,13 @@ class TiNeuVox(DensityColorField):
     def resolution(self) -> tuple[int, ...]:
         """Grid points along x, y, z."""
         return self.grid.shape
+
+    @property
+    def most_bytes(self) -> int:
+        """With a grid that has grown."""
+        s, values = self.settings, self.grid.values
+        grown = math.prod(self._shape_after(len(s.upsample_at))) * s.channels
+        return super().most_bytes + (grown - values.numel()) * values.element_size()
 
     @property
     def grid_channels(self) -> Collection[int]:
