@@ -161,6 +161,19 @@ def test_a_search_maximises_the_objective(devrf, tmp_path, tiny):
     [
         ("hydra.sweeper.direction=up", "Please set either 'minimize' or 'maximize' to direction."),
         ("loss.fine.render=interval(2,1)", "The `low` value must be smaller than or equal to the"),
+        (
+            "hydra.sweeper.storage=sqlite:////nowhere/x.db",
+            "hydra.sweeper.storage: expected a database that can be read and written, as "
+            "sqlite:///study.db ((sqlite3.OperationalError) unable to open database file)",
+        ),
+        (
+            "hydra.sweeper.storage=nowhere",
+            "hydra.sweeper.storage: expected a database that can be read and written, as ",
+        ),
+        (
+            "hydra.sweeper.storage=mysql://nowhere/x",
+            "hydra.sweeper.storage: expected a database that can be read and written, as ",
+        ),
     ],
 )
 def test_what_a_search_cannot_take_is_one_line(devrf, tmp_path, tiny, typed, said):

@@ -50,6 +50,13 @@ def _of_refused_options(error: BaseException) -> bool:
     return isinstance(error, ValueError) and modules[-1].startswith(("hydra._internal.", "optuna."))
 
 
+def _of_storage(error: BaseException) -> bool:
+    """Whether Optuna cannot use the storage of a search, of which SQLAlchemy or it says why."""
+    modules = [frame.f_globals["__name__"] for frame, _ in walk_tb(error.__traceback__)]
+    by_sql = type(error).__module__.startswith("sqlalchemy.")
+    return by_sql or (isinstance(error, ImportError) and "optuna.storages" in modules[-1])
+
+
 def _cause(error: BaseException) -> BaseException:
     """The first DevrfError in a chain of causes, else the error by which Hydra failed to build."""
     cause = error.__cause__
@@ -79,6 +86,9 @@ def one_line(error: BaseException) -> str | None:
         if error.errno not in REFUSED:
             return None
         text = f"{error.filename or 'a file that is written'}: {error.strerror}"
+    elif _of_storage(error):
+        expected = "expected a database that can be read and written, as sqlite:///study.db"
+        text = f"hydra.sweeper.storage: {expected} ({text.partition(chr(10))[0]})"
     elif ours or not (by_library or _of_refused_options(error)):
         return None
     elif isinstance(error, MissingConfigException) and "/" in str(error.missing_cfg_file):
