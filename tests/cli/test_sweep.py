@@ -183,6 +183,19 @@ def test_what_a_search_cannot_take_is_one_line(devrf, tmp_path, tiny, typed, sai
     assert not list(tmp_path.iterdir())
 
 
+@installed("hydra_optuna_sweeper")
+def test_a_search_with_a_storage_goes_on_with_other_trials(devrf, tmp_path, tiny):
+    import optuna
+
+    kept = {"study_name": "kept", "storage": f"sqlite:///{tmp_path}/kept.db"}
+    words = [f"hydra.sweeper.{key}={value}" for key, value in kept.items()]
+    for _ in range(2):  # of jobs that fail at once: they are not scored
+        assert devrf("-m", *tiny, *SEARCH, *words, "stage=canonical").status == 3
+    drawn = [trial.params for trial in optuna.load_study(**kept).trials]
+    assert len(drawn) == 4
+    assert all(drawn.count(trial) == 1 for trial in drawn)
+
+
 def test_a_folder_without_the_record_of_a_sweep_is_refused(devrf, tmp_path):
     outcome = devrf("stage=still", "hydra.sweep.dir=elsewhere")
     said = "no sweep is typed (-m); without one, and without experiment=, it names the folder of a"

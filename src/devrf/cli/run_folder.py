@@ -19,6 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 from devrf.checkpoints.file_metadata import latest_checkpoint
 from devrf.cli.config import OF_A_CHECKPOINT, SWEEP_RECORD, in_sweep
 from devrf.cli.messages import one_line, report_user_errors
+from devrf.cli.stored_study import draw_others
 from devrf.errors import DevrfError
 from devrf.evaluation.objective import check_objective
 from devrf.system.files import (
@@ -109,6 +110,7 @@ class FolderLock(Callback):
                 )
             for path in (folder, *folder.glob("[!.]*/")):
                 refuse_links(path)
+            draw_others(config.hydra.sweeper)
             lock_folder(folder, "hydra.sweep.dir")
             OmegaConf.save(config, folder / SWEEP_RECORD)
         FolderLock.sweep = folder

@@ -31,6 +31,8 @@ log = logging.getLogger(__name__)
 
 # The exit status of a sweep with failed jobs.
 JOBS_FAILED = 3
+# What Optuna says of a study without an objective, kept in memory or in a storage.
+EMPTY = ("No trials are completed yet.", "Record does not exist.")
 # Content of the sweep's folder before Hydra starts the first job.
 OF_SWEEP = {SWEEP_RECORD, PLACE}
 
@@ -81,7 +83,7 @@ def naming_failures() -> Iterator[None]:
         yield
     except Exception as error:
         problem = error
-        empty = "No trials are completed" in str(error)
+        empty = str(error) in EMPTY
     if (sweep := FolderLock.sweep) is not None:
         release_folder(sweep)
         if problem is not None:
