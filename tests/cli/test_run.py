@@ -252,6 +252,7 @@ def test_the_objective_is_looked_up():
         ("deformation.flow_error", "objective: deformation has no 'flow_error'"),
         ("static.rest_pose_psnr", "objective: static has no 'rest_pose_psnr'"),
         ("static.checkpoint_mb", "objective: static has no 'checkpoint_mb'"),
+        ("static.lost_frames", "objective: static has no 'lost_frames'"),
     ],
 )
 def test_any_other_objective_is_an_error(key, said):

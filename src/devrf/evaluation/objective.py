@@ -7,20 +7,14 @@ from typing import Any
 
 from devrf.errors import DevrfError, did_you_mean
 
-# Figures of the training, from the checkpoint, beside the scores.
-TRAINING = (
-    "seconds",
-    "iterations",
-    "iterations_per_second",
-    "peak_gpu_gb",
-    "num_rollbacks",
-    "lost_frames",
-)
+# Figures of any training, and of one of frames, from the checkpoint, beside the scores.
+ANY_TRAINING = ("seconds", "iterations", "iterations_per_second", "peak_gpu_gb", "num_rollbacks")
+TRAINING = (*ANY_TRAINING, "lost_frames")
 # Numbers of both sections of metrics.json, and of the dynamic one: of what moves, and the size of
 # the checkpoint, which has all. Their second names are those of DeVRF's stages.
 SCORES = ("psnr", "ssim")
-OF_BOTH = (*SCORES, *TRAINING)
-OF_DYNAMIC = ("rest_pose_psnr", "flicker", "pck_t", "checkpoint_mb")
+OF_BOTH = (*SCORES, *ANY_TRAINING)
+OF_DYNAMIC = ("rest_pose_psnr", "flicker", "pck_t", "checkpoint_mb", "lost_frames")
 STATIC = ("static", "canonical")
 DYNAMIC = ("dynamic", "deformation")
 # The section that metrics.json has only where the objective is one of its numbers.
