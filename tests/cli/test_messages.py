@@ -98,6 +98,11 @@ MISTAKES = {
     "scoring before training": (["stage=evaluate"], "canonical.ckpt: no such checkpoint"),
     "missing checkpoint": (["stage=render", "ckpt=no.ckpt"], "no.ckpt: no such checkpoint"),
     "checkpoint where none is used": (["ckpt=no.ckpt"], "ckpt: stage=pipeline starts from nothing"),
+    "a section that is left out": (
+        ["~evaluation"],
+        "~evaluation: evaluation cannot be left out; change values below it, or its own",
+    ),
+    "a section to which others refer": (["~schedule"], "~schedule: schedule cannot be left out"),
     "an empty folder's name, which would be the present one": (
         ["hydra.run.dir="],
         "hydra.run.dir=: names nothing; give a path, or leave it out",

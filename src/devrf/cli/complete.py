@@ -24,6 +24,7 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
 from devrf.cli.config import PATHS, SCENELESS_STAGES, STEPS, config_folder, group_choices
+from devrf.cli.config_check import NEEDED
 from devrf.cli.restore_config import (
     Applied,
     of_named_run,
@@ -91,6 +92,9 @@ def completed(arguments: Sequence[str]) -> Applied:
         if names and one and not isinstance(override.value(), str | list):
             line = override.input_line
             raise DevrfError(f"{line}: choose one of {', '.join(names)}, or leave it out")
+        if override.is_delete() and override.key_or_group in NEEDED:
+            kept = f"{override.key_or_group} cannot be left out; change values below it, or its own"
+            raise DevrfError(f"{override.input_line}: {kept} (--cfg job shows them)")
         _check_optional(override, options.config_dir, typed)
         if override.key_or_group == "debug":
             raise DevrfError(

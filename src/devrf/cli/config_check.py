@@ -54,6 +54,9 @@ ROOT: dict[str, Any] = {
     "outputs": str | Path,
     "kernels": Literal["auto", "torch"],
 }
+# What no configuration can be without.
+NEEDED = {*ROOT, "data", "evaluation", "trainer", "protocol", "experiment", "ablation"}
+NEEDED |= {"schedule", "field", "sampling", "loss", "video", "still", "export", "viewer", "report"}
 # Groups whose files have no section of the group's name: they change those of other groups.
 CHANGES = {"ablation", "comparison", "experiment", "facing", "for_scene", "hparams_search"}
 CHANGES |= {"profile"}
