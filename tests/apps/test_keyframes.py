@@ -23,6 +23,8 @@ from devrf.apps.keyframes import (
     read_path,
     write_path,
 )
+from devrf.apps.render import camera_path
+from devrf.apps.video import VideoSettings
 from devrf.errors import DevrfError
 
 
@@ -153,11 +155,30 @@ SCALED = [2 * value for value in MATRIX[:12]] + MATRIX[12:]
         (content(keyframes=[frame(fov=190)]), "p: keyframes[0].fov: "),
         (content(keyframes=[frame(matrix=SCALED)]), "p: keyframes[0].matrix: is no rigid"),
         (content(keyframes=[frame(), frame()]), "p: keyframes[1].seconds: "),
+        (
+            content(camera_path=[{"camera_to_world": MATRIX, "fov": 1}] * 90_001),
+            "p: camera_path: expected at most 90000 items, not 90001",
+        ),
     ],
 )
 def test_what_is_no_path_is_refused_in_one_line(data, expected):
     with pytest.raises(DevrfError, match=f"^{re.escape(expected)}"):
         path_from(data, "p")
+
+
+def test_a_file_of_too_long_a_video_is_named(tmp_path):
+    file = tmp_path / "a.json"
+    for keys, said in (
+        # A frame more than there may be.
+        ({"keyframes": [frame(), frame(seconds=90_000)], "fps": 1}, "the path takes 90000 s at 1 "),
+        ({"keyframes": [frame(), frame()]}, "keyframes[1].seconds: "),
+    ):
+        file.write_bytes(content(**keys))
+        with pytest.raises(DevrfError, match=f"^{re.escape(f'{file}: {said}')}"):
+            camera_path(VideoSettings(path=str(file)))
+    file.write_bytes(content(keyframes=[frame(), frame(seconds=89_999)], fps=1))
+    path = camera_path(VideoSettings(path=str(file)))
+    assert path is not None and path.frames == 90_000
 
 
 @pytest.mark.parametrize("key", ["camera_path", "keyframes"])

@@ -60,7 +60,10 @@ def camera_path(settings: VideoSettings, offset: Offset = NO_OFFSET) -> CameraPa
     if settings.path is None or settings.path in NAMES:
         return None
     path = read_path(Path(settings.path), offset)
-    _ = path.frames
+    try:
+        _ = path.frames
+    except DevrfError as error:
+        raise DevrfError(f"{settings.path}: {error}") from None
     return path
 
 
