@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 import torch
 
 from devrf.data.kind import by_one_camera
+from devrf.errors import DevrfError
 from devrf.geometry.cameras import Distortion
 from devrf.scenes.formats.nerfstudio import NerfstudioReader
 from devrf.scenes.lens import Lens
@@ -236,6 +238,17 @@ def test_a_film_far_from_the_origin_is_one_of_a_moving_camera(moving, balls):
     assert by_one_camera("nerfstudio", moving)
     film = NerfstudioReader(moving).read()
     assert film.is_monocular and film.offset == FAR
+
+
+def test_a_stated_far_is_for_a_space_with_an_end(moving, balls):
+    """A capture states what its points show, whatever the space; one that is typed is asked for."""
+    stated = {"space": "contracted", "near": 0.5, "far": 9.0}
+    balls.edit(moving, lambda c: c.update(scene_bounds=stated))
+    unbounded, ended = (NerfstudioReader(moving, space=s).read() for s in ("auto", "world"))
+    assert (unbounded.bounds.near, unbounded.bounds.far) == (0.5, math.inf)
+    assert (ended.bounds.near, ended.bounds.far) == (0.5, 9.0)
+    with pytest.raises(DevrfError, match=r"data.far: the scene is unbounded"):
+        NerfstudioReader(moving, far=9.0).read()
 
 
 def parts(scene: Scene) -> list[Views]:
