@@ -54,15 +54,16 @@ def test_the_second_process_is_refused_until_the_first_is_killed(
     assert os.listdir(tmp_path / "run" / ".devrf") == ["lock"]
 
 
+@pytest.mark.parametrize("why", [errno.EACCES, errno.EROFS, errno.ENOENT])  # the last is /proc's
 def test_a_folder_that_cannot_be_written_is_named_with_the_words_that_choose_another(
-    devrf, trained, tmp_path, monkeypatch
+    devrf, trained, tmp_path, monkeypatch, why
 ):
     def refused(*_, **__):
-        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), "run/.devrf/lock")
+        raise OSError(why, os.strerror(why), "run/.devrf/lock")
 
     shutil.copytree(trained[0], tmp_path / "run")
     monkeypatch.setattr(FileLock, "acquire", refused)
-    said = "devrf: run: cannot be written (Permission denied); use "
+    said = f"devrf: run: cannot be written ({os.strerror(why)}); use "
     learned = "ckpt=run/checkpoints/deformation.ckpt "
     for stage, words in [("inspect", ""), ("still", learned)]:
         outcome = devrf(f"stage={stage}", "hydra.run.dir=run")

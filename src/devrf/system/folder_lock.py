@@ -6,6 +6,7 @@ processes which one that is.
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 import socket
@@ -53,7 +54,8 @@ def lock_folder(folder: Path, key: str) -> None:
             f"{key}=FOLDER"
         ) from None
     except (NotImplementedError, OSError) as error:
-        if isinstance(error, OSError) and error.errno in LOCKED_OUT:
+        # Where the system alone makes folders, as in /proc, there is no such file.
+        if isinstance(error, OSError) and error.errno in {*LOCKED_OUT, errno.ENOENT}:
             raise DevrfError(
                 f"{folder}: cannot be written ({error.strerror}); use {key}=FOLDER"
             ) from None
