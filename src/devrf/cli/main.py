@@ -56,12 +56,12 @@ def entry() -> None:
     """
     # Hydra would print a traceback of its own and exit with 1 if it were not told to raise.
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    if "--version" in sys.argv:  # Hydra would print its own
-        print(f"devrf {devrf.__version__}")
-        return
     tune_for_cpu()
     try:
         with handle_signals(end_at_once), report_user_errors(), naming_failures():
+            if "--version" in sys.argv:  # Hydra would print its own
+                print(f"devrf {devrf.__version__}")
+                return
             without_reference(Path.cwd())
             for word in sys.argv[1:]:
                 utf8_path(Path(word))
