@@ -131,6 +131,20 @@ def test_jobs_in_processes_of_their_own(warm, tmp_path, tiny):
     assert failure(tmp_path / "sweep" / "1_robot_stage_report")["mistake"] is True
 
 
+@pytest.mark.parametrize("typed", ["data.shape=glob(*)", "seed=range(0,0)"])
+def test_a_sweep_without_a_job_is_refused(devrf, tmp_path, tiny, typed):
+    outcome = devrf("-m", *tiny, *LEARN, typed)
+    said = "the sweep has no jobs: what is typed as glob(…) or range(…) is empty"
+    assert (outcome.status, outcome.err) == (2, f"devrf: {said}\n")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_range_without_an_end_is_one_line(devrf, tmp_path, tiny):
+    outcome = devrf("-m", *tiny, *LEARN, "seed=range(0,1,0)")
+    assert (outcome.status, outcome.err) == (2, "devrf: range() arg 3 must not be zero\n")
+    assert not list(tmp_path.iterdir())
+
+
 @installed("hydra_optuna_sweeper")
 def test_a_search_maximises_the_objective(devrf, tmp_path, tiny):
     folder = ("hydra.sweep.dir=sweep", "video.frames=1", "evaluation.metrics=[]")

@@ -47,7 +47,8 @@ def report_user_errors() -> Iterator[None]:
 def _of_refused_options(error: BaseException) -> bool:
     """Whether Hydra or Optuna refuses a command's options, for which it has no class of error."""
     modules = [""] + [frame.f_globals["__name__"] for frame, _ in walk_tb(error.__traceback__)]
-    return isinstance(error, ValueError) and modules[-1].startswith(("hydra._internal.", "optuna."))
+    refusing = ("hydra._internal.", "hydra.core.override_parser.", "optuna.")
+    return isinstance(error, ValueError) and modules[-1].startswith(refusing)
 
 
 def _of_storage(error: BaseException) -> bool:

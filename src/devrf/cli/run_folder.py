@@ -58,9 +58,15 @@ class FolderLock(Callback):
 
     Attributes:
         sweep: the folder of the sweep that has begun, if one has.
+        jobs: how many have begun in this process.
     """
 
     sweep: Path | None = None
+    jobs = 0
+
+    def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Count a job."""
+        FolderLock.jobs += 1
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Lock the folder of a run; :func:`working_in` releases it."""

@@ -22,7 +22,7 @@ from devrf.cli.config_check import sets_only
 from devrf.cli.messages import one_line
 from devrf.cli.run_folder import FAILURE, FolderLock
 from devrf.errors import DevrfError
-from devrf.system.files import remove_if_only, walk, write_json
+from devrf.system.files import holds_at_most, remove_if_only, walk, write_json
 from devrf.system.folder_lock import PLACE, release_folder
 from devrf.system.printed import shown
 from devrf.system.process import forget_peak_memory
@@ -73,14 +73,17 @@ def naming_failures() -> Iterator[None]:
 
     Raises:
         SystemExit: with status 3: jobs failed. A search ends by an error if all of them did.
-        DevrfError: no job of a search has its objective.
+        DevrfError: there is no job, or none of a search has its objective.
     """
     began = time.time()
     problem: Exception | None = None
     empty = False  # a search none of whose jobs has an objective
-    FolderLock.sweep = None
+    FolderLock.sweep, FolderLock.jobs = None, 0
     try:
         yield
+        # A launcher may have jobs in other processes, which leave their folders.
+        if (sweep := FolderLock.sweep) and not FolderLock.jobs and holds_at_most(sweep, OF_SWEEP):
+            raise DevrfError("the sweep has no jobs: what is typed as glob(…) or range(…) is empty")
     except Exception as error:
         problem = error
         empty = str(error) in EMPTY
