@@ -17,7 +17,7 @@ from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
-from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.canonical_stage import CanonicalStage, warn_of_motion_beyond
 from devrf.methods.devrf.free_space import possibly_occupied, view_count, view_count_weight
 from devrf.methods.devrf.settings import Sampling
 from recorder import Entry, by_samples, recording
@@ -148,6 +148,15 @@ def test_the_search_hands_over_to_a_radiance_field_with_room_for_motion(
     assert motion is not None and box.union(motion) == box
     # The search's box was the whole rest box: it has been tightened.
     assert box.volume < tiny_scene.bounds.box.scaled(1.05).union(motion).volume
+
+
+@pytest.mark.parametrize(("share", "told"), [(0.3, True), (1.0, False)])
+def test_motion_beyond_the_fields_box_is_warned_of(tiny_recipe, caplog, share, told):
+    scene = replace(tiny_recipe, train_views=4)()  # by two views it has no end
+    warn_of_motion_beyond(scene.bounds.whole.scaled(share), scene)
+    assert ("what leaves it is cut off: give data.bound_scale=auto" in caplog.text) is told
+    warn_of_motion_beyond(scene.bounds.whole.scaled(0.3), replace(scene, dynamic=scene.static))
+    assert caplog.text.count("is cut off") == told
 
 
 def test_a_search_goes_on_past_renewals_of_its_occupancy_and_finds_the_robot(

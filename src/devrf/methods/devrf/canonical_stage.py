@@ -16,6 +16,7 @@ from devrf.engine.ddp import broadcast
 from devrf.engine.grid_adam import GridAdam
 from devrf.engine.stage import Stage, Terms
 from devrf.errors import DevrfError
+from devrf.geometry.box import Box
 from devrf.methods.batch import gather_batch
 from devrf.methods.devrf.architecture import Architecture, fitted_to, resolved_voxels
 from devrf.methods.devrf.canonical_field import CanonicalField
@@ -53,10 +54,17 @@ from devrf.ops.photometric import distortion
 from devrf.rendering.occupancy import Occupancy, bounding_box, dilate
 from devrf.rendering.output import VoxelOutput
 from devrf.rendering.sampling import RenderSettings
-from devrf.scenes.scene import CaptureName, Views
+from devrf.scenes.scene import CaptureName, Scene, Views
+from devrf.scenes.silhouettes import SEARCH, motion_box
 from devrf.system.profiling import span
 
 log = logging.getLogger(__name__)
+
+# Motion so far beyond the fields' box, as a share of its longest edge, is warned of; silhouettes of
+# few views enclose more than what moves.
+BEYOND = 0.2
+# Two cells of the grid on which they are intersected, as a share of its longest edge.
+SEARCHED_CELLS = 2 / 63
 
 
 @dataclass(frozen=True)
@@ -337,6 +345,7 @@ class CanonicalStage(Stage):
             box = occupancy.box
         elif bounds.motion is None:
             box = tight.scaled(bounds.scale)
+            warn_of_motion_beyond(box, self.scene)
         else:
             box = tight.scaled(1.05).union(bounds.motion)
         if bounds.limited:
@@ -493,3 +502,29 @@ class CanonicalStage(Stage):
         if fine and self.schedule.search_iterations:
             box = self.scene_model.canonical.box
             self.scene_model.canonical = self.architecture.radiance_field(box, 8, 8)
+
+
+def warn_of_motion_beyond(box: Box, scene: Scene) -> None:
+    """Say if silhouettes show motion where, outside the fields' ``box``, nothing is rendered."""
+    views = scene.dynamic.train
+    if not scene.moves or not views.cut_out:
+        return
+    area = scene.bounds.box.scaled(SEARCH).union(box)
+    shown = motion_box(views, area)
+    if shown is None:
+        return
+    faces = [(-1, box.low, shown.low, area.low), (1, box.high, shown.high, area.high)]
+    beyond = [
+        sign * (there - here)
+        for sign, ours, theirs, ends in faces
+        for here, there, end in zip(ours, theirs, ends, strict=True)
+        # Where it is the area that ends, and not the silhouettes, nothing is known.
+        if abs(end - there) > SEARCHED_CELLS * area.longest
+    ]
+    if max(beyond, default=0.0) > BEYOND * box.longest:
+        log.warning(
+            "data.bound_scale: the silhouettes show motion in %s, and fields live in %s; what "
+            "leaves it is cut off: give data.bound_scale=auto",
+            shown,
+            box,
+        )
