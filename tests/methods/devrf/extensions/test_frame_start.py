@@ -69,7 +69,9 @@ def test_the_candidate_of_the_least_error_is_what_the_frame_gets(stage, monkeypa
         for name, value in (("own", 1.0), ("as before", 2.0), ("carried along", 3.0))
     }
     monkeypatch.setattr(frame_start, "candidates", lambda *_: starts)
-    monkeypatch.setattr(StartFromBest, "_errors", lambda *_: [0.3, 0.1, 0.2])
+    errors = {1.0: 0.3, 2.0: 0.1, 3.0: 0.2}
+    monkeypatch.setattr(StartFromBest, "_batch", lambda *_: None)
+    monkeypatch.setattr(StartFromBest, "_error", lambda *of: errors[float(of[-1][0][0, 0, 0, 0])])
     StartFromBest(levels=1).initialise(stage, phase(7))  # of the second level
     assert not stage.field.forward_slices.any()
     StartFromBest(levels=2).initialise(stage, phase(7))

@@ -8,14 +8,16 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool3d, pad
 
-from devrf.data.batch import all_pixels
+from devrf.data.batch import RayBatch, all_pixels
 from devrf.engine.ddp import broadcast
 from devrf.errors import expect
 from devrf.geometry.box import Box
+from devrf.geometry.space import WorldSpace
 from devrf.kernels.trilinear import interpolate
 from devrf.methods.batch import gather_batch
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
 from devrf.methods.devrf.extension import DeformationContext, Extension
+from devrf.methods.devrf.extensions.splat_alignment import SplatAlignment
 from devrf.methods.devrf.frame_store import Directions
 from devrf.methods.devrf.pixel_pools import images_of
 from devrf.methods.devrf.volume_rendering import possible_occupancy, render
@@ -32,65 +34,103 @@ class StartFromBest(Extension):
 
     The candidates are the frame's displacements, and those of the frame visited before it: as they
     are, carried on along their velocity, and along their velocity smoothed. The frame has a copy of
-    the one before at the coarsest level.
+    the one before at the coarsest level; there, without optical flow, the best is compared with
+    what Gaussians make of it
+    (:class:`~devrf.methods.devrf.extensions.splat_alignment.SplatAlignment`).
     """
 
-    def __init__(self, levels: int = 0, rays: int = 4096) -> None:
+    def __init__(self, levels: int = 0, rays: int = 4096, gaussians: int = 0) -> None:
         """Choose the levels at which candidates are compared.
 
         Args:
-            levels: so many of the coarsest levels; 0: none.
+            levels: so many of the coarsest levels; 0: none, but for ``gaussians``.
             rays: pixels of all the frame's images that candidates are compared by.
+            gaussians: the most by which the best candidate of the coarsest level is moved on,
+                where no optical flow is known; 0: it is not.
         """
         key = "schedule.extensions.frame_start"
         expect(levels >= 0, f"{key}.levels", "at least 0", levels)
         expect(rays >= 1, f"{key}.rays", "at least 1", rays)
+        expect(gaussians >= 0, f"{key}.gaussians", "at least 0", gaussians)
         self._levels = levels
         self._rays = rays
+        self._gaussians = gaussians
+        self._alignment: SplatAlignment | None = None
+
+    def setup(self, context: DeformationContext) -> None:
+        """Forget the scene before."""
+        self._alignment = None
+
+    def begin_level(self, context: DeformationContext, level: int) -> None:
+        """Free the Gaussians after the coarsest level."""
+        if level > 0:
+            self._alignment = None
 
     def initialise(self, context: DeformationContext, phase: DeformationPhase) -> None:
         """Give the frame the displacements of the best candidate."""
-        if phase.level >= self._levels:
+        aligns = phase.level == 0 and self._aligns(context, phase.frame)
+        starts = candidates(context, phase) if aligns or phase.level < self._levels else {}
+        if len(starts) < 2 and not aligns:
             return
-        starts = candidates(context, phase)
-        if len(starts) < 2:
-            return
-        errors = self._errors(context, phase.frame, list(starts.values()))
-        best = min(zip(errors, starts, strict=True))[1]
-        log.debug(
-            "%s frame %d: %s", phase.kind, phase.frame, dict(zip(starts, errors, strict=True))
-        )
+        batch = self._batch(context, phase.frame)
+        errors = {name: self._error(context, batch, start) for name, start in starts.items()}
+        best = min(errors, key=errors.__getitem__)
+        if aligns:
+            starts["by Gaussians"] = self._aligned(context, phase.frame, starts[best])
+            errors["by Gaussians"] = self._error(context, batch, starts["by Gaussians"])
+            best = min(errors, key=errors.__getitem__)
+        log.debug("%s frame %d: %s", phase.kind, phase.frame, errors)
         field = context.field
         field.frames.write(phase.frame, starts[best])
         # Each process has looked at pixels of its own.
         broadcast([field.backward_slices[phase.frame], field.forward_slices[phase.frame]])
 
-    @torch.no_grad()
-    def _errors(
-        self, context: DeformationContext, frame: int, starts: list[Directions]
-    ) -> list[float]:
-        """Mean squared colour error of each start, on the same pixels of all the frame's images."""
+    def _aligns(self, context: DeformationContext, frame: int) -> bool:
+        """Whether Gaussians tell how a frame has moved: by several masked views, in world space.
+
+        Optical flow tells it better, and costs less.
+        """
         views = context.views
-        model = context.model
+        if self._gaussians == 0 or views.flow is not None:
+            return False
+        if not isinstance(context.model.space, WorldSpace) or len(images_of(views, frame)) < 2:
+            return False
+        return views.cut_out and context.datamodule.scene.static.train.cut_out
+
+    def _aligned(self, context: DeformationContext, frame: int, start: Directions) -> Directions:
+        """``start``, changed by what Gaussians that move on from it tell."""
+        model, views, box = context.model, context.views, context.field.box
+        if self._alignment is None:
+            at_rest = context.datamodule.scene.static.train
+            self._alignment = SplatAlignment(model, at_rest, self._gaussians)
+        images = images_of(views, frame).tolist()
+        change = self._alignment.change(model, views, images, forward=start[1], box=box)
+        return carried(start, change, box)
+
+    def _batch(self, context: DeformationContext, frame: int) -> RayBatch:
+        """The pixels of all the frame's images that its candidates are compared by."""
+        views = context.views
         pool = all_pixels(views, images_of(views, frame))
-        per_pixel = model.settings.rays_per_pixel
+        per_pixel = context.model.settings.rays_per_pixel
         rays = round(context.batch_size.share * self._rays)
         image, flat = pool.draw(max(1, rays // per_pixel), context.generator)
         background = context.background(image, context.generator)
-        batch = gather_batch(views, image, flat, background, model.space, per_pixel)
-        errors = []
-        for backward, _ in starts:
-            warp = context.field.warp_by(backward)
-            output = render(
-                batch.rays,
-                model.canonical,
-                possible_occupancy(model.occupancy, warp),
-                model.settings,
-                batch.background,
-                backward_warp=warp,
-            )
-            errors.append(float(color_error(output.color, batch.color, batch.per_pixel)))
-        return errors
+        return gather_batch(views, image, flat, background, context.model.space, per_pixel)
+
+    @torch.no_grad()
+    def _error(self, context: DeformationContext, batch: RayBatch, start: Directions) -> float:
+        """The mean squared colour error of a start."""
+        model = context.model
+        warp = context.field.warp_by(start[0])
+        output = render(
+            batch.rays,
+            model.canonical,
+            possible_occupancy(model.occupancy, warp),
+            model.settings,
+            batch.background,
+            backward_warp=warp,
+        )
+        return float(color_error(output.color, batch.color, batch.per_pixel))
 
 
 @torch.no_grad()
