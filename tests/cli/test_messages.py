@@ -215,7 +215,8 @@ def test_a_deformation_on_top_of_a_deformation(devrf, tmp_path, tiny, trained):
 def test_a_file_where_the_run_folder_should_be(devrf, tmp_path, tiny):
     (tmp_path / "taken").write_text("mine")
     outcome = devrf(*tiny, "hydra.run.dir=taken/run")
-    assert (outcome.status, outcome.err) == (2, f"devrf: {Path('taken/run')}: Not a directory\n")
+    said = "cannot be written (Not a directory); use hydra.run.dir=FOLDER"
+    assert (outcome.status, outcome.err) == (2, f"devrf: {Path('taken/run')}: {said}\n")
 
 
 @pytest.mark.parametrize(

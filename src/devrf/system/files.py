@@ -32,12 +32,10 @@ UNREADABLE = (LookupError, TypeError, ValueError, ArithmeticError, AttributeErro
 DEEPEST = 64
 # How the name of what is not whole yet begins.
 PARTIAL = ".partial-"
-# Errors of a place that is not this user's to write.
-LOCKED_OUT = {errno.EACCES, errno.EPERM, errno.EROFS}
 # Errors of a disk, its permissions, or a path that was given. A missing file may be a fault of the
 # program instead.
 REFUSED = {
-    *LOCKED_OUT,
+    *(errno.EACCES, errno.EPERM, errno.EROFS),
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO),
     *(errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ELOOP),
 }

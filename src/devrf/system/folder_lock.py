@@ -17,7 +17,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from devrf.errors import DevrfError
-from devrf.system.files import LOCKED_OUT, REFUSED
+from devrf.system.files import REFUSED
 
 log = logging.getLogger(__name__)
 
@@ -55,12 +55,10 @@ def lock_folder(folder: Path, key: str) -> None:
         ) from None
     except (NotImplementedError, OSError) as error:
         # Where the system alone makes folders, as in /proc, there is no such file.
-        if isinstance(error, OSError) and error.errno in {*LOCKED_OUT, errno.ENOENT}:
+        if isinstance(error, OSError) and error.errno in {*REFUSED, errno.ENOENT}:
             raise DevrfError(
                 f"{folder}: cannot be written ({error.strerror}); use {key}=FOLDER"
             ) from None
-        if isinstance(error, OSError) and error.errno in REFUSED:
-            raise
         log.warning(
             "%s: its file system has no locks; see that no other process works there", folder
         )
