@@ -137,7 +137,7 @@ class TimeBudget(Callback):
         self._most_iterations = pl_module.iterations_per_step
         pl_module.iterations_per_step = 1  # whose time is not known yet
         batch = pl_module.batch_size
-        batch.smallest = BATCHES[-1]
+        batch.smallest, batch.is_timed = BATCHES[-1], True
         most = min(self.largest_batch, batch.largest)
         self._tried: dict[float, list[float]] = {
             min(most, max(share, pl_module.useful_share)): [] for share in TRIED

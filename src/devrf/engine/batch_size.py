@@ -29,6 +29,7 @@ class BatchSize:
         processes: the number of processes that draw a batch together.
         keys: the config keys of what to lower where even that is too much.
         is_final: whether the optimiser is stepping, and the batch cannot be drawn again.
+        is_timed: whether a budget of seconds decides on the share.
     """
 
     share: float = 1.0
@@ -37,6 +38,7 @@ class BatchSize:
     processes: int = 1
     keys: tuple[str, ...] = ()
     is_final: bool = False
+    is_timed: bool = False
 
     @property
     def of_process(self) -> float:

@@ -112,15 +112,22 @@ def test_a_far_start_is_taken(rest, tiny_scene, fit, serve):
 
 
 @pytest.mark.parametrize(
-    ("gaussians", "flow", "masks", "frames"),
-    [(50, False, True, [1, 2]), (0, False, True, []), (50, True, True, []), (50, False, False, [])],
+    ("gaussians", "flow", "masks", "timed", "frames"),
+    [
+        (50, False, True, False, [1, 2]),
+        (0, False, True, False, []),
+        (50, True, True, False, []),
+        (50, False, False, False, []),
+        (50, False, True, True, []),
+    ],
 )
 def test_each_frame_of_the_coarsest_level_has_such_a_candidate(
-    gaussians, flow, masks, frames, asked, rest, tiny_scene, fit, serve
+    gaussians, flow, masks, timed, frames, asked, rest, tiny_scene, fit, serve
 ):
     levels = DeformationSchedule([Level(4, 1), Level(6, 1)], rays=16)
     start = StartFromBest(rays=64, gaussians=gaussians)
     stage = DeformationStage(rest, levels, extensions={"frame_start": start})
+    stage.batch_size.is_timed = timed
     fit(stage, data=serve(without(tiny_scene, flow=flow, masks=masks)))
     assert asked == frames
     assert bool(stage.field.forward_slices[1:].any())

@@ -88,10 +88,11 @@ class StartFromBest(Extension):
     def _aligns(self, context: DeformationContext, frame: int) -> bool:
         """Whether Gaussians tell how a frame has moved: by several masked views, in world space.
 
-        Optical flow tells it better, and costs less.
+        Optical flow tells it better, and costs less. In a budget of seconds the iterations that it
+        costs are worth more.
         """
         views = context.views
-        if self._gaussians == 0 or views.flow is not None:
+        if self._gaussians == 0 or views.flow is not None or context.batch_size.is_timed:
             return False
         if not isinstance(context.model.space, WorldSpace) or len(images_of(views, frame)) < 2:
             return False
