@@ -96,8 +96,8 @@ class RayStage(Stage):
             if "render" not in terms:  # what the curves' PSNR is of
                 valid = batch.valid if isinstance(batch, ImageBatch) else None
                 missed = (output.color.detach() - batch.color).square().mean(dim=1)
-                missed = missed if valid is None else missed[valid]
-                terms["render"] = missed.sum() / max(len(missed), 1)
+                counted = torch.ones_like(missed) if valid is None else valid.to(missed)
+                terms["render"] = (missed * counted).sum() / counted.sum().clamp(min=1)
         self.optimise(loss)
         return {"loss": loss.detach(), **terms}
 

@@ -96,7 +96,9 @@ class StartFromBest(Extension):
             return False
         if not isinstance(context.model.space, WorldSpace) or len(images_of(views, frame)) < 2:
             return False
-        return views.cut_out and context.datamodule.scene.static.train.cut_out
+        # Where Gaussians were made, all pixels were looked at.
+        at_rest = context.datamodule.scene.static.train
+        return self._alignment is not None or (views.cut_out and at_rest.cut_out)
 
     def _aligned(self, context: DeformationContext, frame: int, start: Directions) -> Directions:
         """``start``, changed by what Gaussians that move on from it tell."""
