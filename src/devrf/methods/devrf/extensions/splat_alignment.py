@@ -11,12 +11,12 @@ from kornia.filters import gaussian_blur2d
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
-from devrf.engine.grid_adam import GridAdam
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.kernels.splatting import splat
 from devrf.kernels.trilinear import interpolate
 from devrf.methods.devrf.extensions.priors import elastic_energy, occupied_cells
+from devrf.methods.devrf.extensions.smooth_change import smooth_change
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.ops.splatting import Gaussians
 from devrf.scenes.scene import Views
@@ -142,7 +142,6 @@ class SplatAlignment:
             color=looks["color"],
         )
 
-    @torch.enable_grad()
     def change(
         self, model: DeVRFModel, views: Views, images: Sequence[int], forward: Tensor, box: Box
     ) -> Tensor:
@@ -159,22 +158,14 @@ class SplatAlignment:
         base = self.points + interpolate(forward, self.points, box)
         shape = (forward.shape[0], forward.shape[1], forward.shape[2])
         occupied = occupied_cells(model.occupancy, box, shape)
-        # The edge of a pixel, world units; rates and roughness are in pixels, as images are.
-        middle = torch.tensor(box.middle)
-        pixel = max(image.camera.pixel_size(middle) for image in small)
         side = max(max(image.pixels.shape[1:]) for image in small)
         # As residuals grow with the square of the images' side, so does what stands beside them.
         elastic = ELASTIC * (side / LONGEST) ** 2
-        change = torch.zeros_like(forward).requires_grad_()
-        optimizer = GridAdam([change], lr=0.75 * pixel, betas=(0.9, 0.999))
-        for step in range(STEPS):
-            share = step / (STEPS - 1)
-            optimizer.param_groups[0]["lr"] = 0.75 * pixel * (1 - step / STEPS)
-            optimizer.zero_grad()
+
+        def misfit(change: Tensor, step: int) -> Tensor:
             moved = self._gaussians(base + interpolate(change, self.points, box), self._looks)
             loss = elastic * elastic_energy(forward + change, box, occupied)
-            rough = sum(change.diff(dim=axis).square().sum() for axis in range(3)) / pixel**2
-            loss = loss + SMOOTHNESS * rough / occupied.numel()
+            share = step / (STEPS - 1)
             sigma = side * FIRST_BLUR ** (1 - share) * LAST_BLUR**share
             radius = math.ceil(2.5 * sigma)
             for number in range(step * AT_ONCE, (step + 1) * AT_ONCE):
@@ -187,6 +178,9 @@ class SplatAlignment:
                 )
                 # As many pixels of a blurred image show a mass as σ² says.
                 loss = loss + sigma**2 * blurred.square().mean() / AT_ONCE
-            loss.backward()  # type: ignore[no-untyped-call]
-            optimizer.step()
-        return change.detach()
+            return loss
+
+        # Pixels to a unit of length.
+        middle = torch.tensor(box.middle)
+        scale = 1 / max(image.camera.pixel_size(middle) for image in small)
+        return smooth_change(misfit, like=forward, scale=scale, steps=STEPS, smoothness=SMOOTHNESS)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,7 +12,6 @@ from torch import Tensor
 from devrf.data.batch import PixelPool, all_pixels
 from devrf.data.flow import previous_images
 from devrf.engine.ddp import broadcast
-from devrf.engine.grid_adam import GridAdam
 from devrf.errors import expect
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import WORLD, Space
@@ -22,6 +20,7 @@ from devrf.methods.batch import gather_batch
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
 from devrf.methods.devrf.extension import DeformationContext, Extension
+from devrf.methods.devrf.extensions.smooth_change import smooth_change
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.pixel_pools import images_of
 from devrf.methods.devrf.volume_rendering import render
@@ -36,8 +35,6 @@ FARTHEST = 16
 # Tracks of a frame at most, chosen at random, and optimiser steps of a fit to them.
 MOST_TRACKS = 4096
 FIT_STEPS = 40
-# A change of a grid → residuals (N, 2 or 3) in pixels.
-Residual = Callable[[Tensor], Tensor]
 # Weight of differences between neighbouring voxels' changes in a fit.
 SMOOTHNESS = 0.01
 
@@ -273,23 +270,31 @@ def start_from_tracks(
     small = 1e-3 * field.box.longest
     points = tracks.canonical
 
-    def misses(start: Tensor) -> Residual:
-        there = points + interpolate(forward + start, points, field.box)
-        missed, slopes = _projected(tracks, there, cameras, space, small)
-        missed -= _moved(slopes, interpolate(start, points, field.box))
-        return lambda change: missed + _moved(slopes, interpolate(change, points, field.box))
-
-    _, slopes = _projected(tracks, points, cameras, space, small)
+    missed, slopes = _projected(tracks, points, cameras, space, small)
     # Pixels to a unit of length, along the axis that moves pixels most.
     scale = float(slopes.norm(dim=1).mean(dim=0).amax())
-    forward += _fit(misses, forward, scale, steps)
+
+    def missed_pixels(change: Tensor, step: int) -> Tensor:
+        nonlocal missed, slopes
+        way = interpolate(change, points, field.box)
+        if step in (0, steps // 2):
+            there = points + interpolate(forward + change.detach(), points, field.box)
+            missed, slopes = _projected(tracks, there, cameras, space, small)
+            missed -= _moved(slopes, way.detach())
+        return _robust(missed + _moved(slopes, way))
+
+    forward += smooth_change(
+        missed_pixels, like=forward, scale=scale, steps=steps, smoothness=SMOOTHNESS
+    )
     arrived = points + interpolate(forward, points, field.box)
     lost = arrived + interpolate(backward, arrived, field.box) - points
 
-    def errs(_: Tensor) -> Residual:
-        return lambda change: (lost + interpolate(change, arrived, field.box)) * scale
+    def round_trip(change: Tensor, step: int) -> Tensor:
+        return _robust((lost + interpolate(change, arrived, field.box)) * scale)
 
-    backward += _fit(errs, backward, scale, steps)
+    backward += smooth_change(
+        round_trip, like=backward, scale=scale, steps=steps, smoothness=SMOOTHNESS
+    )
     field.frames.write(frame, (backward, forward))
 
 
@@ -314,31 +319,6 @@ def _moved(slopes: Tensor, way: Tensor) -> Tensor:
     return (slopes * way[:, None]).sum(dim=-1)
 
 
-@torch.enable_grad()
-def _fit(
-    residual_about: Callable[[Tensor], Residual], like: Tensor, scale: float, steps: int
-) -> Tensor:
-    """The smooth change of a grid (X, Y, Z, 3) that makes residuals of it small.
-
-    Args:
-        residual_about: a change → residuals, linear about it.
-        like: a grid of the shape and device wanted.
-        scale: pixels per unit of the grid's values.
-        steps: Adam steps; the rate falls linearly from three quarters of a pixel a step.
-    """
-    change = torch.zeros_like(like).requires_grad_()
-    fastest = 0.75 / scale
-    optimizer = GridAdam([change], lr=fastest, betas=(0.9, 0.999))
-    residual = residual_about(change.detach())
-    for number in range(steps):
-        if number == steps // 2:
-            residual = residual_about(change.detach())
-        optimizer.param_groups[0]["lr"] = fastest * (1 - number / steps)
-        optimizer.zero_grad()
-        missed = residual(change)
-        error = torch.nn.functional.huber_loss(missed, torch.zeros_like(missed), delta=1.0)
-        rough = sum(change.diff(dim=axis).square().sum() for axis in range(3)) * scale**2
-        total: Tensor = error + SMOOTHNESS * rough / like.shape[:3].numel()
-        total.backward()  # type: ignore[no-untyped-call]
-        optimizer.step()
-    return change.detach()
+def _robust(residuals: Tensor) -> Tensor:
+    """The mean Huber error of residuals (N, 2 or 3) in pixels."""
+    return torch.nn.functional.huber_loss(residuals, torch.zeros_like(residuals), delta=1.0)
