@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,6 +17,7 @@ from devrf.methods.devrf.deformation_schedule import (
     Level,
     Visits,
 )
+from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.extensions import frame_start
 from devrf.methods.devrf.extensions.frame_start import (
     StartFromBest,
@@ -78,6 +80,30 @@ def test_the_candidate_of_the_least_error_is_what_the_frame_gets(stage, monkeypa
     assert (stage.field.backward_slices[1] == 2).all()
     assert (stage.field.forward_slices[1] == -2).all()
     assert not stage.field.forward_slices[2:].any()
+
+
+@pytest.mark.parametrize(
+    ("with_flow", "flow", "frames"),
+    [(True, True, [1, 2]), (False, True, []), (False, False, [1, 2])],
+)
+def test_where_flow_tells_the_motion_candidates_can_be_left_out(
+    with_flow, flow, frames, rest, tiny_scene, fit, serve, monkeypatch
+):
+    compared = []
+
+    def noted(context, phase):
+        compared.append(phase.frame)
+        return candidates(context, phase)
+
+    monkeypatch.setattr(frame_start, "candidates", noted)
+    scene = tiny_scene
+    if not flow:
+        views = replace(scene.dynamic.train, flow=None)
+        scene = replace(scene, dynamic=replace(scene.dynamic, train=views))
+    levels = DeformationSchedule([Level(4, 1), Level(6, 1)], rays=16)
+    start = StartFromBest(levels=1, with_flow=with_flow, rays=64)
+    fit(DeformationStage(rest, levels, extensions={"frame_start": start}), data=serve(scene))
+    assert compared == frames
 
 
 def test_a_translation_goes_on_as_it_was(cube: Box):

@@ -39,11 +39,14 @@ class StartFromBest(Extension):
     (:class:`~devrf.methods.devrf.extensions.splat_alignment.SplatAlignment`).
     """
 
-    def __init__(self, levels: int = 0, rays: int = 4096, gaussians: int = 0) -> None:
+    def __init__(
+        self, levels: int = 0, with_flow: bool = True, rays: int = 4096, gaussians: int = 0
+    ) -> None:
         """Choose the levels at which candidates are compared.
 
         Args:
             levels: so many of the coarsest levels; 0: none, but for ``gaussians``.
+            with_flow: also where optical flow tells how a frame has moved.
             rays: pixels of all the frame's images that candidates are compared by.
             gaussians: the most by which the best candidate of the coarsest level is moved on,
                 where no optical flow is known; 0: it is not.
@@ -53,6 +56,7 @@ class StartFromBest(Extension):
         expect(rays >= 1, f"{key}.rays", "at least 1", rays)
         expect(gaussians >= 0, f"{key}.gaussians", "at least 0", gaussians)
         self._levels = levels
+        self._with_flow = with_flow
         self._rays = rays
         self._gaussians = gaussians
         self._alignment: SplatAlignment | None = None
@@ -69,7 +73,8 @@ class StartFromBest(Extension):
     def initialise(self, context: DeformationContext, phase: DeformationPhase) -> None:
         """Give the frame the displacements of the best candidate."""
         aligns = phase.level == 0 and self._aligns(context, phase.frame)
-        starts = candidates(context, phase) if aligns or phase.level < self._levels else {}
+        compares = aligns or self._compares(context, phase.level)
+        starts = candidates(context, phase) if compares else {}
         if len(starts) < 2 and not aligns:
             return
         batch = self._batch(context, phase.frame)
@@ -85,6 +90,11 @@ class StartFromBest(Extension):
         # Each process has looked at pixels of its own.
         broadcast([field.backward_slices[phase.frame], field.forward_slices[phase.frame]])
 
+    def _compares(self, context: DeformationContext, level: int) -> bool:
+        """Whether candidates are compared at a level, even if there are no Gaussians."""
+        by_level = level < self._levels
+        return by_level and (self._with_flow or not context.views.flow_tells_motion)
+
     def _aligns(self, context: DeformationContext, frame: int) -> bool:
         """Whether Gaussians tell how a frame has moved: by several masked views, in world space.
 
@@ -92,7 +102,7 @@ class StartFromBest(Extension):
         costs are worth more.
         """
         views = context.views
-        if self._gaussians == 0 or views.flow is not None or context.batch_size.is_timed:
+        if self._gaussians == 0 or views.flow_tells_motion or context.batch_size.is_timed:
             return False
         if not isinstance(context.model.space, WorldSpace) or len(images_of(views, frame)) < 2:
             return False

@@ -64,10 +64,7 @@ class StartAlongFlow(Extension):
 
     def changes(self, context: DeformationContext, phase: DeformationPhase) -> bool:
         """Whether a phase starts along the flow: at the coarsest level, where there is one."""
-        recorded = context.views
-        # A moving camera's image moves with it.
-        has_flow = recorded.flow is not None and not recorded.by_moving_camera
-        asked = self._init_from != "previous" and has_flow
+        asked = self._init_from != "previous" and context.views.flow_tells_motion
         return asked and phase.level == 0
 
     def initialise(self, context: DeformationContext, phase: DeformationPhase) -> None:
