@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from devrf.geometry.box import Box
+from devrf.geometry.clock import FrameClock
 from devrf.kernels.trilinear import interpolate
 from devrf.methods.devrf.deformation_schedule import (
     DeformationPhase,
@@ -38,7 +39,7 @@ def stage(cube: Box) -> Any:
     field = SimpleNamespace(
         frames=frames,
         shape=frames.shape,
-        clock=range(4),
+        clock=FrameClock((0.0, 0.2, 0.4, 1.0)),
         box=cube,
         backward_slices=frames.backward_slices,
         forward_slices=frames.forward_slices,
@@ -63,6 +64,14 @@ def phase(iteration: int) -> DeformationPhase:
 def test_what_a_visit_may_start_from(stage, iteration, frame, names):
     assert phase(iteration).frame == frame
     assert list(candidates(stage, phase(iteration))) == names
+
+
+def test_what_is_carried_along_goes_as_far_as_its_time_says(stage):
+    # 0.1 in the time from 0.2 to 0.4; three times as long is left to the last frame.
+    stage.field.frames.write(2, (torch.full((2, 2, 2, 3), -0.1), torch.full((2, 2, 2, 3), 0.1)))
+    backward, forward = candidates(stage, phase(3))["carried along"]
+    torch.testing.assert_close(forward, torch.full((2, 2, 2, 3), 0.4))
+    torch.testing.assert_close(backward, torch.full((2, 2, 2, 3), -0.4))
 
 
 def test_the_candidate_of_the_least_error_is_what_the_frame_gets(stage, monkeypatch):

@@ -167,9 +167,12 @@ def candidates(context: DeformationContext, phase: DeformationPhase) -> dict[str
     if phase.level:
         starts["as before"] = previous
     if far in frames:
-        velocity = previous[1] - read(far)[1]
-        starts["carried along"] = carried(previous, velocity, field.box)
-        starts["carried along, smoothed"] = carried(previous, smoothed(velocity), field.box)
+        times = field.clock.times
+        # Rounded, since times are known up to rounding: evenly spaced frames go on by one step.
+        steps = round((times[phase.frame] - times[near]) / (times[near] - times[far]), 4)
+        way = steps * (previous[1] - read(far)[1])
+        starts["carried along"] = carried(previous, way, field.box)
+        starts["carried along, smoothed"] = carried(previous, smoothed(way), field.box)
     return starts
 
 
