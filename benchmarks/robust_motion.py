@@ -51,9 +51,9 @@ def bodies(numbers: Sequence[int]) -> Iterator[Case]:
     for number in numbers:
         frames = FRAMES // 2 if number % 2 else FRAMES
         words = ("data=procedural", "data.shape=random", "data.flow=none")
-        words += (f"data.scene_seed={number}",)
+        numbers = (f"data.scene_seed={number}", f"data.frames={frames}")
         fast = ", fast" if number % 2 else ""
-        yield Case(f"body {number}{fast}", (*words, f"data.frames={frames}"))
+        yield Case(f"body {number}{fast}", (*words, *numbers))
 
 
 def main() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable
+from itertools import count
 from typing import Any
 
 import pytest
@@ -98,6 +99,16 @@ def test_a_stage_ends_with_its_seconds_and_its_whole_schedule(timed, share: floa
     assert visits[0, 1] == pytest.approx(2 * visits[0, 2], rel=0.35)
     assert stage.schedule == VISITS.scaled(stage.position.schedule_scale)
     assert stage.optimizer.param_groups[0]["lr"] == pytest.approx(10**-0.25)
+
+
+@pytest.mark.parametrize("later", [0.02, 0.5, 3.0])
+def test_iterations_that_become_faster_or_slower_do_not_change_the_end(timed, later: float) -> None:
+    # As those of a field in which nothing is known to be empty at first. No kind of phase comes
+    # after the first.
+    number = count()
+    schedule = Visits(DeformationSchedule(levels=(Level(4, 100),), rays=16), frames=2)
+    stage = timed(2.0, by_batch=lambda _: 1.0 if next(number) < 20 else later, schedule=schedule)
+    assert stage.now == pytest.approx(2.0, rel=0.1)
 
 
 @pytest.mark.parametrize(("share", "rays"), [(0.4, 4), (2.5, 16)])

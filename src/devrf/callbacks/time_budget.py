@@ -3,8 +3,8 @@
 A short trial measures what iterations take, of two sizes of batches. Then the schedule is scaled
 (:func:`~devrf.engine.schedule.scale_schedule`): growths, decays and curricula take place as
 they do in the configured one. It is scaled again when the kind of phase has changed, and when a
-quarter of the time is over that was left at the last scaling; in the last phase the stage ends with
-its time.
+quarter of the time or of the iterations is over that was left at the last scaling; in the last
+phase the stage ends with its time.
 
 * The budget is that of the whole method. A stage has a share of it, in proportion to what its
   protocol calls ``iterations``, among the stages that are learned.
@@ -146,7 +146,8 @@ class TimeBudget(Callback):
             batch.share = min(self._tried)
         self._is_due = self._pace is not None  # of a run that goes on
         self._is_new_kind = False  # of a phase whose iterations were not measured yet
-        self._next = 0.0  # seconds at which the schedule is scaled again
+        # Seconds and iteration at which the schedule is scaled again.
+        self._next, self._next_iteration = 0.0, 0
         self._step_ended = self._record.seconds
 
     def on_train_batch_start(
@@ -198,7 +199,10 @@ class TimeBudget(Callback):
                 self._pace = Pace(self._pace.fixed * ratio, self._pace.of_batch * ratio)
         schedule = pl_module.schedule
         over = self._step_ended >= self._budget and self._phase.stop >= schedule.total
-        is_due = self._pace is not None and (self._is_new_kind or self._step_ended >= self._next)
+        # Iterations that have become faster reach a quarter of theirs first.
+        passed = self._step_ended >= self._next
+        passed |= pl_module.position.iteration >= self._next_iteration
+        is_due = self._pace is not None and (self._is_new_kind or passed)
         over, self._is_due = trainer.strategy.broadcast((over, is_due))
         if over:
             pl_module.position.iteration = schedule.total
@@ -238,6 +242,8 @@ class TimeBudget(Callback):
         scale_schedule(stage, factor)
         now = self._record.seconds
         self._next = now + max((self._budget - now) / 4, STEP_SHARE * self._budget)
+        place = stage.position.iteration
+        self._next_iteration = place + (stage.schedule.total - place) // 4
         self._is_new_kind = False
 
     def _scaling(self, stage: Stage, first: bool) -> tuple[float, float, int] | str:
