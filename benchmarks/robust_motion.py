@@ -47,13 +47,13 @@ class Case:
 
 
 def bodies(numbers: Sequence[int]) -> Iterator[Case]:
-    """Bodies put together at random, without flow: the odd ones with every second frame left out."""
+    """Bodies put together at random, without flow; the odd ones lack every second frame."""
     for number in numbers:
         frames = FRAMES // 2 if number % 2 else FRAMES
         words = ("data=procedural", "data.shape=random", "data.flow=none")
-        numbers = (f"data.scene_seed={number}", f"data.frames={frames}")
+        chosen = (f"data.scene_seed={number}", f"data.frames={frames}")
         fast = ", fast" if number % 2 else ""
-        yield Case(f"body {number}{fast}", (*words, *numbers))
+        yield Case(f"body {number}{fast}", (*words, *chosen))
 
 
 def main() -> None:
