@@ -243,7 +243,7 @@ class TimeBudget(Callback):
         now = self._record.seconds
         self._next = now + max((self._budget - now) / 4, STEP_SHARE * self._budget)
         place = stage.position.iteration
-        self._next_iteration = place + (stage.schedule.total - place) // 4
+        self._next_iteration = place + max((stage.schedule.total - place) // 4, 1)
         self._is_new_kind = False
 
     def _scaling(self, stage: Stage, first: bool) -> tuple[float, float, int] | str:

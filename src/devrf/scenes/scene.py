@@ -124,11 +124,6 @@ class Views:
         """Whether each image is its own view: the camera moved between all of them."""
         return len(set(self.view.tolist())) == len(self)
 
-    @property
-    def flow_tells_motion(self) -> bool:
-        """Whether optical flow is known that is the scene's: in a moving camera's all flows."""
-        return self.flow is not None and not self.by_moving_camera
-
     def __getitem__(self, index: Tensor) -> Views:
         """The views at positions ``index`` (K,) int64."""
         return replace(

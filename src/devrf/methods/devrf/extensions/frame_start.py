@@ -46,7 +46,7 @@ class StartFromBest(Extension):
 
         Args:
             levels: so many of the coarsest levels; 0: none, but for ``gaussians``.
-            with_flow: also where optical flow tells how a frame has moved.
+            with_flow: also where optical flow is known.
             rays: pixels of all the frame's images that candidates are compared by.
             gaussians: the most by which the best candidate of the coarsest level is moved on,
                 where no optical flow is known; 0: it is not.
@@ -93,7 +93,7 @@ class StartFromBest(Extension):
     def _compares(self, context: DeformationContext, level: int) -> bool:
         """Whether candidates are compared at a level, even if there are no Gaussians."""
         by_level = level < self._levels
-        return by_level and (self._with_flow or not context.views.flow_tells_motion)
+        return by_level and (self._with_flow or context.views.flow is None)
 
     def _aligns(self, context: DeformationContext, frame: int) -> bool:
         """Whether Gaussians tell how a frame has moved: by several masked views, in world space.
@@ -102,7 +102,7 @@ class StartFromBest(Extension):
         costs are worth more.
         """
         views = context.views
-        if self._gaussians == 0 or views.flow_tells_motion or context.batch_size.is_timed:
+        if self._gaussians == 0 or views.flow is not None or context.batch_size.is_timed:
             return False
         if not isinstance(context.model.space, WorldSpace) or len(images_of(views, frame)) < 2:
             return False
@@ -169,8 +169,8 @@ def candidates(context: DeformationContext, phase: DeformationPhase) -> dict[str
     if far in frames:
         times = field.clock.times
         # Rounded, since times are known up to rounding: evenly spaced frames go on by one step.
-        steps = round((times[phase.frame] - times[near]) / (times[near] - times[far]), 4)
-        way = steps * (previous[1] - read(far)[1])
+        ratio = round((times[phase.frame] - times[near]) / (times[near] - times[far]), 4)
+        way = ratio * (previous[1] - read(far)[1])
         starts["carried along"] = carried(previous, way, field.box)
         starts["carried along, smoothed"] = carried(previous, smoothed(way), field.box)
     return starts

@@ -35,7 +35,7 @@ REST_RATES = {"opacity": 0.1, "scale": 0.05, "color": 0.02}
 # the weights of the terms beside them.
 STEPS, AT_ONCE = 20, 2
 FIRST_BLUR, LAST_BLUR = 1 / 8, 1 / 64
-ELASTIC, SMOOTHNESS = 5e-3, 3e-3
+ELASTIC, SMOOTHNESS = 5e-3, 3.8e-3
 
 
 @dataclass(frozen=True)

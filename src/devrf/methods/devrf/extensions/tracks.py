@@ -64,8 +64,10 @@ class StartAlongFlow(Extension):
 
     def changes(self, context: DeformationContext, phase: DeformationPhase) -> bool:
         """Whether a phase starts along the flow: at the coarsest level, where there is one."""
-        asked = self._init_from != "previous" and context.views.flow_tells_motion
-        return asked and phase.level == 0
+        views = context.views
+        # All that a moving camera sees flows.
+        has_flow = views.flow is not None and not views.by_moving_camera
+        return self._init_from != "previous" and has_flow and phase.level == 0
 
     def initialise(self, context: DeformationContext, phase: DeformationPhase) -> None:
         """Fit the frame's displacements to the points to which its pixels are followed back."""
