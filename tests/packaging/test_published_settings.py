@@ -109,6 +109,10 @@ def test_the_rows_of_the_ablation_tables(composed, ablation, off):
     without = {name for name, weight in config.loss.deformation.items() if not weight}
     assert without == off | {"elastic", "bending", "alpha_mask"}
     assert config.schedule.deformation.coarse_to_fine is (ablation != "base")
+    # Where other settings start a frame better, these rows start it from the one before.
+    starts = composed("experiment=quickstart", f"ablation={ablation}").schedule.extensions
+    as_the_paper = starts.tracks.init_from == "previous" and not starts.frame_start.levels
+    assert (as_the_paper and not starts.frame_start.gaussians) is (ablation != "full")
 
 
 @pytest.mark.parametrize("scene", ["lego", "flower_360"])  # the others are alike
