@@ -1,9 +1,10 @@
 """Shows how much of a motion is found by chance: scenes × seeds, and the frames that are lost.
 
-Each run is a command of its own, on one core, in its own folder: what was learned is kept, and the
-same command goes on where it was ended. For each scene, over its seeds, it tells the mean PSNR of
-the held-out view in motion, of each seed; the worst frame; and how many frames are lost: more than
-4 dB below the median frame of the same view, or of the training views.
+Each run is a command of its own, on one core, in a folder named by scene, seed and what is typed:
+what was learned is kept, and the same command goes on where it was ended. For each scene, over
+its seeds, it tells the mean PSNR of the held-out view in motion, of each seed; the worst frame;
+and how many frames are lost: more than 4 dB below the median frame of the same view, or of the
+training views.
 
     python benchmarks/robust_motion.py experiment=best_small          # eight bodies, three seeds
     python benchmarks/robust_motion.py --small                        # minutes
@@ -12,6 +13,7 @@ the held-out view in motion, of each seed; the worst frame; and how many frames 
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import subprocess
@@ -89,7 +91,8 @@ def main() -> None:
 
 def learned(case: Case, seed: int, words: Sequence[str], into: Path) -> dict[str, Any] | None:
     """The figures of one run, which is learned first where it was not; None: it has failed."""
-    folder = into / f"{case.name.replace(', ', '-').replace(' ', '-')}-seed-{seed}"
+    typed = hashlib.sha256(" ".join([*case.words, *words]).encode()).hexdigest()[:8]
+    folder = into / f"{case.name.replace(', ', '-').replace(' ', '-')}-seed-{seed}-{typed}"
     if not (folder / "metrics.json").exists():
         command = [sys.executable, "-m", "devrf", *case.words, *words]
         command += [f"seed={seed}", f"hydra.run.dir={folder}"]
