@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import shutil
 import subprocess
 
@@ -118,6 +119,9 @@ def test_the_revision_is_that_of_a_checkout(tmp_path):
     git("-c", "commit.gpgsign=false", "commit", "-m", "one")
     git("tag", "v1")
     head = git("rev-parse", "HEAD")
+    index = (tmp_path / ".git" / "index").stat().st_ino
+    os.utime(tmp_path / "file", (0, 0))  # what git would renew its index for
     assert git_revision(tmp_path) == head
+    assert (tmp_path / ".git" / "index").stat().st_ino == index, "a lock was taken"
     (tmp_path / "file").write_text("two")
     assert git_revision(tmp_path) == f"{head}-dirty"

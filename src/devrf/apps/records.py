@@ -220,14 +220,19 @@ def git_revision(root: Path | None = None) -> str | None:
     root = Path(devrf.__file__).resolve().parents[2] if root is None else root
     if not (root / ".git").exists():  # a folder above may be another project's checkout
         return None
-    command = ["git", "describe", "--always", "--dirty", "--exclude=*", "--abbrev=40"]
+    # Without a lock, which a run that is killed would leave to every later commit.
+    command = ["git", "--no-optional-locks", "status", "--porcelain=v2", "--branch"]
+    command += ["--untracked-files=no"]
     try:
         result = subprocess.run(
             command, cwd=root, capture_output=True, text=True, timeout=10, check=True
         )
     except (OSError, subprocess.SubprocessError):
         return None
-    return result.stdout.strip() or None
+    head, *others = result.stdout.splitlines()
+    commit = head.removeprefix("# branch.oid ")
+    changed = any(not line.startswith("#") for line in others)
+    return None if commit == "(initial)" else commit + "-dirty" * changed
 
 
 def in_words(values: Mapping[str, Any]) -> str:
