@@ -105,6 +105,17 @@ def test_records_that_no_run_writes_are_skipped(runs, ran, key, value):
     assert found.skipped == (SKIPPED % file,)
 
 
+@pytest.mark.parametrize("key", ["scene", "method", "protocol"])
+def test_records_that_do_not_say_what_was_learned_are_skipped(runs, ran, key):
+    ran("good")
+    file = ran("strange") / "metrics.json"
+    record = json.loads(file.read_text()) | {"static": {"seconds": 1.0}}
+    file.write_text(json.dumps({k: v for k, v in record.items() if k != key}))
+    found = collect(runs)
+    assert list(found.runs["folder"]) == ["good"]
+    assert found.skipped == (SKIPPED % file,)
+
+
 FURTHER = [
     {"dynamic": {"psnr": 10**400, "ssim": -1e308, "lpips": math.nan, "seconds": "x"}},
     {"static": {"psnr": 1e308, "seconds": 1e300}, "run": {"seed": "x", "choices": []}},

@@ -184,7 +184,7 @@ def _finished(metrics: dict[str, Any]) -> dict[str, Any]:
         [number(metrics.get(f"{stage}.{key}")) for stage in stages]
         for key in ("seconds", "peak_gpu_gb")
     )
-    head = {key: metrics[key] for key in ("scene", "method")}
+    head = {key: metrics[key] for key in ("scene", "method", "protocol")}
     # NaN unless all are known.
     took = {"train_seconds": sum(seconds), "peak_gpu_gb": max(memory) + 0 * sum(memory)}
     return metrics | head | {"at_rest": at_rest} | took
