@@ -12,7 +12,7 @@ import torch
 from torch.nn.functional import interpolate, max_pool2d
 
 from devrf.errors import DevrfError
-from devrf.evaluation.motion import flicker, pck_t, shifted, with_motion_masks
+from devrf.evaluation.motion import flicker, mostly_lost, pck_t, shifted, with_motion_masks
 from devrf.evaluation.predictions import picture_name
 from devrf.evaluation.suite import MEASURES
 from devrf.geometry.motion import moving, radius
@@ -205,3 +205,21 @@ def test_key_points_of_a_moving_block_by_hand(block, filmed_from_above):
     capture = SimpleNamespace(train=views, keypoints=keypoints)
     assert pck_t(Renderer(block), capture) == pytest.approx(6 / 8)
     assert pck_t(Renderer(block), SimpleNamespace(train=views, keypoints=None)) is None
+
+
+@pytest.mark.parametrize(
+    ("at_rest", "motion", "pose", "lost"),
+    [
+        (40.0, 29.0, 20.0, True),
+        (40.0, 31.0, 20.0, False),
+        (40.0, 34.5, 35.0, False),  # hardly anything moves
+        (None, 20.0, 20.0, False),
+        (40.0, 20.0, None, False),  # of a method without a rest pose
+    ],
+)
+def test_motion_that_is_nearer_to_the_rest_pose_is_mostly_lost(at_rest, motion, pose, lost):
+    dynamic = {"psnr": motion, "rest_pose_psnr": pose}
+    line = mostly_lost({"static": {"psnr": at_rest}, "dynamic": dynamic})
+    expected = "much of the motion was not found: 29.0 dB, the rest pose 20.0, the scene at rest 40"
+    assert (line or "").startswith(expected) if lost else line is None
+    assert mostly_lost({"static": {"psnr": at_rest}}) is None

@@ -37,7 +37,7 @@ from devrf.cli.restore_config import as_typed
 from devrf.cli.resume import unfinished
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import HeldOutView
-from devrf.evaluation.motion import pck_t, with_motion_masks
+from devrf.evaluation.motion import mostly_lost, pck_t, with_motion_masks
 from devrf.evaluation.objective import VALIDATION, objective
 from devrf.evaluation.predictions import picture_name, read_predictions
 from devrf.evaluation.scoring import score_held_out, score_pictures
@@ -111,6 +111,8 @@ def evaluate(run: RunContext) -> None:
     summary = shown_sections(sections)
     for name, values in summary.items():
         log.info("%s: %s", name.replace("_", " "), in_words(values))
+    if complaint := mostly_lost(sections):
+        log.warning(complaint)
     best = objective(run.config.objective, sections)
     numbers = tracked_scores(sections | summary) | ({} if best is None else {"objective": best})
     for tracker in run.trackers:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -35,6 +36,8 @@ CHANGED = 0.05
 NOISE = 6.0
 # A point is followed rightly if it comes within this share of the image's larger side (DyCheck).
 NEAR = 0.05
+# The rest pose says something of the motion where it scores so many dB less than the scene at rest.
+TELLING = 6.0
 
 
 def with_motion_masks(
@@ -167,3 +170,21 @@ def pck_t(renderer: Renderer, capture: Capture) -> float | None:
             right += int((near & both).sum())
             total += int(both.sum())
     return round(right / total, 5) if total else None
+
+
+def mostly_lost(sections: Mapping[str, Mapping[str, Any]]) -> str | None:
+    """A line where the scene in motion scores nearer to the rest pose than to the scene at rest.
+
+    None: it does not, or the figures are not known, or do not tell since hardly anything moves.
+    """
+    at_rest = sections.get("static", {}).get("psnr")
+    dynamic = sections.get("dynamic", {})
+    motion, pose = dynamic.get("psnr"), dynamic.get("rest_pose_psnr")
+    if at_rest is None or motion is None or pose is None or at_rest - pose < TELLING:
+        return None
+    if motion >= (at_rest + pose) / 2:
+        return None
+    return (
+        f"much of the motion was not found: {motion:.1f} dB, the rest pose {pose:.1f}, "
+        f"the scene at rest {at_rest:.1f}"
+    )
