@@ -44,7 +44,7 @@ def stage(cube: Box) -> Any:
         backward_slices=frames.backward_slices,
         forward_slices=frames.forward_slices,
     )
-    return SimpleNamespace(field=field)
+    return SimpleNamespace(field=field, generator=None)
 
 
 def phase(iteration: int) -> DeformationPhase:

@@ -10,6 +10,7 @@ import torch
 from devrf.kernels.trilinear import interpolate
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
+from devrf.methods.devrf.extensions import frame_start
 from devrf.methods.devrf.extensions.frame_start import StartFromBest
 from devrf.methods.devrf.extensions.splat_alignment import LONGEST, SmallImage, SplatAlignment
 from devrf.scenes.scene import Scene, Views
@@ -131,3 +132,15 @@ def test_each_frame_of_the_coarsest_level_has_such_a_candidate(
     fit(stage, data=serve(without(tiny_scene, flow=flow, masks=masks)))
     assert asked == frames
     assert bool(stage.field.forward_slices[1:].any())
+
+
+@pytest.mark.parametrize(("enough", "frames"), [(0.0, [1, 2]), (1e6, [])])
+def test_where_candidates_show_a_frame_well_enough_there_are_none(
+    enough, frames, asked, rest, tiny_scene, fit, serve, monkeypatch
+):
+    monkeypatch.setattr(frame_start, "ENOUGH", enough)
+    levels = DeformationSchedule([Level(4, 1), Level(6, 1)], rays=16)
+    start = StartFromBest(levels=2, rays=64, gaussians=50)
+    stage = DeformationStage(rest, levels, extensions={"frame_start": start})
+    fit(stage, data=serve(without(tiny_scene, flow=False, masks=True)))
+    assert asked == frames

@@ -27,6 +27,8 @@ log = logging.getLogger(__name__)
 
 # Rounds of the search for a point's position one frame before.
 ROUNDS = 2
+# A start whose error is so many times that of the rest state at most needs no Gaussians.
+ENOUGH = 2.0
 
 
 class StartFromBest(Extension):
@@ -36,7 +38,8 @@ class StartFromBest(Extension):
     are, carried on along their velocity, and along their velocity smoothed. The frame has a copy of
     the one before at the coarsest level; there, without optical flow, the best is compared with
     what Gaussians make of it
-    (:class:`~devrf.methods.devrf.extensions.splat_alignment.SplatAlignment`).
+    (:class:`~devrf.methods.devrf.extensions.splat_alignment.SplatAlignment`), unless it shows the
+    frame about as well as the rest state shows the first one.
     """
 
     def __init__(
@@ -60,10 +63,12 @@ class StartFromBest(Extension):
         self._rays = rays
         self._gaussians = gaussians
         self._alignment: SplatAlignment | None = None
+        self._error_at_rest: float | None = None
 
     def setup(self, context: DeformationContext) -> None:
         """Forget the scene before."""
         self._alignment = None
+        self._error_at_rest = None
 
     def begin_level(self, context: DeformationContext, level: int) -> None:
         """Free the Gaussians after the coarsest level."""
@@ -77,10 +82,10 @@ class StartFromBest(Extension):
         starts = candidates(context, phase) if compares else {}
         if len(starts) < 2 and not aligns:
             return
-        batch = self._batch(context, phase.frame)
+        batch = self._batch(context, phase.frame, context.generator)
         errors = {name: self._error(context, batch, start) for name, start in starts.items()}
         best = min(errors, key=errors.__getitem__)
-        if aligns:
+        if aligns and errors[best] > ENOUGH * self._at_rest(context):
             starts["by Gaussians"] = self._aligned(context, phase.frame, starts[best])
             errors["by Gaussians"] = self._error(context, batch, starts["by Gaussians"])
             best = min(errors, key=errors.__getitem__)
@@ -101,9 +106,9 @@ class StartFromBest(Extension):
         Optical flow tells it better, and costs less. In a budget of seconds the iterations that it
         costs are worth more.
         """
-        views = context.views
-        if self._gaussians == 0 or views.flow is not None or context.batch_size.is_timed:
+        if self._gaussians == 0 or context.batch_size.is_timed or context.views.flow is not None:
             return False
+        views = context.views
         if not isinstance(context.model.space, WorldSpace) or len(images_of(views, frame)) < 2:
             return False
         # Where Gaussians were made, all pixels were looked at.
@@ -120,14 +125,28 @@ class StartFromBest(Extension):
         change = self._alignment.change(model, views, images, forward=start[1], box=box)
         return carried(start, change, box)
 
-    def _batch(self, context: DeformationContext, frame: int) -> RayBatch:
+    def _at_rest(self, context: DeformationContext) -> float:
+        """The error of the rest state in the first frame; 0 where no image shows that."""
+        if len(images_of(context.views, 0)) == 0:
+            return 0.0
+        if self._error_at_rest is None:
+            # Whenever it is asked for, as after a resume, the draws of visits are the same.
+            generator = torch.Generator(context.model.device).manual_seed(0)
+            batch = self._batch(context, 0, generator)
+            still = context.field.frames.here.new_zeros(*context.field.shape, 3)
+            self._error_at_rest = self._error(context, batch, (still, still))
+        return self._error_at_rest
+
+    def _batch(
+        self, context: DeformationContext, frame: int, generator: torch.Generator
+    ) -> RayBatch:
         """The pixels of all the frame's images that its candidates are compared by."""
         views = context.views
         pool = all_pixels(views, images_of(views, frame))
         per_pixel = context.model.settings.rays_per_pixel
         rays = round(context.batch_size.share * self._rays)
-        image, flat = pool.draw(max(1, rays // per_pixel), context.generator)
-        background = context.background(image, context.generator)
+        image, flat = pool.draw(max(1, rays // per_pixel), generator)
+        background = context.background(image, generator)
         return gather_batch(views, image, flat, background, context.model.space, per_pixel)
 
     @torch.no_grad()

@@ -12,7 +12,7 @@ from devrf.engine.grid_adam import GridAdam
 # A change (X, Y, Z, 3) and the number of the step → how badly it explains what is seen.
 Misfit = Callable[[Tensor, int], Tensor]
 # How far a value goes in the first step, in pixels.
-FASTEST = 0.75
+FASTEST = 1.0
 
 
 @torch.enable_grad()
@@ -31,7 +31,7 @@ def smooth_change(
         smoothness: λ.
     """
     change = torch.zeros_like(like).requires_grad_()
-    optimizer = GridAdam([change], lr=FASTEST / scale, betas=(0.9, 0.999))
+    optimizer = GridAdam([change], lr=FASTEST / scale, betas=(0.8, 0.9))
     for step in range(steps):
         optimizer.param_groups[0]["lr"] = FASTEST / scale * (1 - step / steps)
         optimizer.zero_grad()

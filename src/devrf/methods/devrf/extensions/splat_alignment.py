@@ -33,7 +33,7 @@ REST_RATES = {"opacity": 0.1, "scale": 0.05, "color": 0.02}
 # Steps of a frame's change, and images that each looks at, in turn; the standard deviation, as a
 # share of the longer side, by which residuals are blurred at the first step and at the last; and
 # the weights of the terms beside them.
-STEPS, AT_ONCE = 20, 2
+STEPS, AT_ONCE = 80, 2
 FIRST_BLUR, LAST_BLUR = 1 / 8, 1 / 64
 ELASTIC, SMOOTHNESS = 5e-3, 3.8e-3
 
