@@ -111,7 +111,8 @@ def evaluate(run: RunContext) -> None:
     summary = shown_sections(sections)
     for name, values in summary.items():
         log.info("%s: %s", name.replace("_", " "), in_words(values))
-    if complaint := mostly_lost(sections):
+    complaint = mostly_lost(sections)
+    if complaint is not None and not run.rehearses:  # which says itself what was learned
         log.warning(complaint)
     best = objective(run.config.objective, sections)
     numbers = tracked_scores(sections | summary) | ({} if best is None else {"objective": best})

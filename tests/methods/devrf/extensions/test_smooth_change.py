@@ -3,7 +3,9 @@
 import torch
 from torch import Tensor
 
-from devrf.methods.devrf.extensions.smooth_change import smooth_change
+from devrf.geometry.box import Box
+from devrf.kernels.trilinear import interpolate
+from devrf.methods.devrf.extensions.smooth_change import led_back, smooth_change
 
 # Pixels to a unit of the grid's values.
 SCALE = 50.0
@@ -45,3 +47,22 @@ def test_neighbours_of_what_is_seen_follow_it_where_changes_are_smooth():
 
     torch.testing.assert_close(neighbour(0.0), torch.zeros(3))
     assert neighbour(1.0).min() > 0.5
+
+
+def test_points_are_led_back_from_where_they_arrive(cube: Box, rng: torch.Generator):
+    points = 0.5 * (2 * torch.rand(200, 3, generator=rng) - 1)
+    grid = cube.grid_points((9, 9, 9), torch.empty(0)).view(9, 9, 9, 3)
+    forward = torch.zeros_like(grid)
+    forward[..., 0] = 0.2 + 0.1 * grid[..., 0]
+    backward = led_back(
+        torch.zeros_like(forward),
+        forward,
+        points=points,
+        box=cube,
+        scale=SCALE,
+        steps=60,
+        smoothness=1e-3,
+    )
+    arrived = points + interpolate(forward, points, cube)
+    missed = arrived + interpolate(backward, arrived, cube) - points
+    assert float(missed.norm(dim=1).max()) * SCALE < 0.5

@@ -17,6 +17,7 @@ from devrf.kernels.trilinear import interpolate
 from devrf.methods.batch import gather_batch
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
 from devrf.methods.devrf.extension import DeformationContext, Extension
+from devrf.methods.devrf.extensions.smooth_change import led_back
 from devrf.methods.devrf.extensions.splat_alignment import SplatAlignment
 from devrf.methods.devrf.frame_store import Directions
 from devrf.methods.devrf.pixel_pools import images_of
@@ -29,6 +30,8 @@ log = logging.getLogger(__name__)
 ROUNDS = 2
 # A start whose error is so many times that of the rest state at most needs no Gaussians.
 ENOUGH = 2.0
+# Steps in which Δ_b is fitted to Δ_f, and the weight of differences between neighbours' changes.
+BACK_STEPS, BACK_SMOOTHNESS = 30, 0.01
 
 
 class StartFromBest(Extension):
@@ -86,8 +89,9 @@ class StartFromBest(Extension):
         errors = {name: self._error(context, batch, start) for name, start in starts.items()}
         best = min(errors, key=errors.__getitem__)
         if aligns and errors[best] > ENOUGH * self._at_rest(context):
-            starts["by Gaussians"] = self._aligned(context, phase.frame, starts[best])
-            errors["by Gaussians"] = self._error(context, batch, starts["by Gaussians"])
+            aligned = self._aligned(context, phase.frame, starts[best])
+            starts |= aligned
+            errors |= {name: self._error(context, batch, aligned[name]) for name in aligned}
             best = min(errors, key=errors.__getitem__)
         log.debug("%s frame %d: %s", phase.kind, phase.frame, errors)
         field = context.field
@@ -115,15 +119,27 @@ class StartFromBest(Extension):
         at_rest = context.datamodule.scene.static.train
         return self._alignment is not None or (views.cut_out and at_rest.cut_out)
 
-    def _aligned(self, context: DeformationContext, frame: int, start: Directions) -> Directions:
-        """``start``, changed by what Gaussians that move on from it tell."""
+    def _aligned(
+        self, context: DeformationContext, frame: int, start: Directions
+    ) -> dict[str, Directions]:
+        """``start``, changed by what Gaussians that move on from it tell; two of different Δ_b."""
         model, views, box = context.model, context.views, context.field.box
         if self._alignment is None:
             at_rest = context.datamodule.scene.static.train
             self._alignment = SplatAlignment(model, at_rest, self._gaussians)
         images = images_of(views, frame).tolist()
         change = self._alignment.change(model, views, images, forward=start[1], box=box)
-        return carried(start, change, box)
+        backward, forward = carried(start, change, box)
+        fitted = led_back(
+            backward,
+            forward,
+            self._alignment.points,
+            box,
+            scale=1 / views.cameras.pixel_size(torch.tensor(box.middle)),
+            steps=BACK_STEPS,
+            smoothness=BACK_SMOOTHNESS,
+        )
+        return {"by Gaussians": (backward, forward), "by Gaussians, led back": (fitted, forward)}
 
     def _at_rest(self, context: DeformationContext) -> float:
         """The error of the rest state in the first frame; 0 where no image shows that."""

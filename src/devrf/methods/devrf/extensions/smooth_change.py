@@ -6,8 +6,11 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor
+from torch.nn.functional import huber_loss
 
 from devrf.engine.grid_adam import GridAdam
+from devrf.geometry.box import Box
+from devrf.kernels.trilinear import interpolate
 
 # A change (X, Y, Z, 3) and the number of the step → how badly it explains what is seen.
 Misfit = Callable[[Tensor, int], Tensor]
@@ -40,3 +43,40 @@ def smooth_change(
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
     return change.detach()
+
+
+def led_back(
+    backward: Tensor,
+    forward: Tensor,
+    points: Tensor,
+    box: Box,
+    scale: float,
+    steps: int,
+    smoothness: float,
+) -> Tensor:
+    """Δ_b, changed so that it leads the points q back to where they come from, from q + Δ_f(q).
+
+    Args:
+        backward: (X, Y, Z, 3) Δ_b to begin with.
+        forward: (X, Y, Z, 3) Δ_f.
+        points: (N, 3) q.
+        box: of the grids.
+        scale: pixels per unit of length.
+        steps: of the fit.
+        smoothness: of the change, see :func:`smooth_change`.
+    """
+    arrived = points + interpolate(forward, points, box)
+    lost = arrived + interpolate(backward, arrived, box) - points
+
+    def round_trip(change: Tensor, step: int) -> Tensor:
+        return robust((lost + interpolate(change, arrived, box)) * scale)
+
+    change = smooth_change(
+        round_trip, like=backward, scale=scale, steps=steps, smoothness=smoothness
+    )
+    return backward + change
+
+
+def robust(residuals: Tensor) -> Tensor:
+    """The mean Huber error of residuals (N, 2 or 3) in pixels."""
+    return huber_loss(residuals, torch.zeros_like(residuals), delta=1.0)

@@ -20,7 +20,7 @@ from devrf.methods.batch import gather_batch
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
 from devrf.methods.devrf.extension import DeformationContext, Extension
-from devrf.methods.devrf.extensions.smooth_change import smooth_change
+from devrf.methods.devrf.extensions.smooth_change import led_back, robust, smooth_change
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.pixel_pools import images_of
 from devrf.methods.devrf.volume_rendering import render
@@ -280,19 +280,19 @@ def start_from_tracks(
             there = points + interpolate(forward + change.detach(), points, field.box)
             missed, slopes = _projected(tracks, there, cameras, space, small)
             missed -= _moved(slopes, way.detach())
-        return _robust(missed + _moved(slopes, way))
+        return robust(missed + _moved(slopes, way))
 
     forward += smooth_change(
         missed_pixels, like=forward, scale=scale, steps=steps, smoothness=SMOOTHNESS
     )
-    arrived = points + interpolate(forward, points, field.box)
-    lost = arrived + interpolate(backward, arrived, field.box) - points
-
-    def round_trip(change: Tensor, step: int) -> Tensor:
-        return _robust((lost + interpolate(change, arrived, field.box)) * scale)
-
-    backward += smooth_change(
-        round_trip, like=backward, scale=scale, steps=steps, smoothness=SMOOTHNESS
+    backward = led_back(
+        backward,
+        forward,
+        points,
+        field.box,
+        scale=scale,
+        steps=steps,
+        smoothness=SMOOTHNESS,
     )
     field.frames.write(frame, (backward, forward))
 
@@ -316,8 +316,3 @@ def _projected(
 def _moved(slopes: Tensor, way: Tensor) -> Tensor:
     """Displacements (N, 2) in pixels of points that move by ``way`` (N, 3)."""
     return (slopes * way[:, None]).sum(dim=-1)
-
-
-def _robust(residuals: Tensor) -> Tensor:
-    """The mean Huber error of residuals (N, 2 or 3) in pixels."""
-    return torch.nn.functional.huber_loss(residuals, torch.zeros_like(residuals), delta=1.0)
