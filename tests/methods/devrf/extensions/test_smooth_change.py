@@ -65,4 +65,8 @@ def test_points_are_led_back_from_where_they_arrive(cube: Box, rng: torch.Genera
     )
     arrived = points + interpolate(forward, points, cube)
     missed = arrived + interpolate(backward, arrived, cube) - points
+    none = led_back(
+        forward, forward, points=points[:0], box=cube, scale=SCALE, steps=1, smoothness=1.0
+    )
+    assert torch.equal(none, forward)
     assert float(missed.norm(dim=1).max()) * SCALE < 0.5

@@ -54,7 +54,9 @@ def led_back(
     steps: int,
     smoothness: float,
 ) -> Tensor:
-    """Δ_b, changed so that it leads the points q back to where they come from, from q + Δ_f(q).
+    """Δ_b, changed so that it leads the points q back from where they arrive, q + Δ_f(q).
+
+    Without points it stays as it is.
 
     Args:
         backward: (X, Y, Z, 3) Δ_b to begin with.
@@ -65,6 +67,8 @@ def led_back(
         steps: of the fit.
         smoothness: of the change, see :func:`smooth_change`.
     """
+    if len(points) == 0:
+        return backward
     arrived = points + interpolate(forward, points, box)
     lost = arrived + interpolate(backward, arrived, box) - points
 
