@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import torch
@@ -114,7 +115,7 @@ class Views:
         """Whether the images carry an alpha mask."""
         return self.pixels.shape[3] == 4
 
-    @property
+    @cached_property
     def cut_out(self) -> bool:
         """Whether the alpha masks leave out anything: some are not opaque."""
         return self.has_alpha and bool((self.pixels[..., 3] < 255).any())

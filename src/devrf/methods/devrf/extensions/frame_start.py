@@ -66,12 +66,12 @@ class StartFromBest(Extension):
         self._rays = rays
         self._gaussians = gaussians
         self._alignment: SplatAlignment | None = None
-        self._error_at_rest: float | None = None
+        self._rest_error: float | None = None
 
     def setup(self, context: DeformationContext) -> None:
         """Forget the scene before."""
         self._alignment = None
-        self._error_at_rest = None
+        self._rest_error = None
 
     def begin_level(self, context: DeformationContext, level: int) -> None:
         """Free the Gaussians after the coarsest level."""
@@ -88,7 +88,7 @@ class StartFromBest(Extension):
         batch = self._batch(context, phase.frame, context.generator)
         errors = {name: self._error(context, batch, start) for name, start in starts.items()}
         best = min(errors, key=errors.__getitem__)
-        if aligns and errors[best] > ENOUGH * self._at_rest(context):
+        if aligns and errors[best] > ENOUGH * self._error_at_rest(context):
             aligned = self._aligned(context, phase.frame, starts[best])
             starts |= aligned
             errors |= {name: self._error(context, batch, aligned[name]) for name in aligned}
@@ -115,9 +115,7 @@ class StartFromBest(Extension):
         views = context.views
         if not isinstance(context.model.space, WorldSpace) or len(images_of(views, frame)) < 2:
             return False
-        # Where Gaussians were made, all pixels were looked at.
-        at_rest = context.datamodule.scene.static.train
-        return self._alignment is not None or (views.cut_out and at_rest.cut_out)
+        return views.cut_out and context.datamodule.scene.static.train.cut_out
 
     def _aligned(
         self, context: DeformationContext, frame: int, start: Directions
@@ -141,17 +139,17 @@ class StartFromBest(Extension):
         )
         return {"by Gaussians": (backward, forward), "by Gaussians, led back": (fitted, forward)}
 
-    def _at_rest(self, context: DeformationContext) -> float:
+    def _error_at_rest(self, context: DeformationContext) -> float:
         """The error of the rest state in the first frame; 0 where no image shows that."""
         if len(images_of(context.views, 0)) == 0:
             return 0.0
-        if self._error_at_rest is None:
+        if self._rest_error is None:
             # Whenever it is asked for, as after a resume, the draws of visits are the same.
             generator = torch.Generator(context.model.device).manual_seed(0)
             batch = self._batch(context, 0, generator)
             still = context.field.frames.here.new_zeros(*context.field.shape, 3)
-            self._error_at_rest = self._error(context, batch, (still, still))
-        return self._error_at_rest
+            self._rest_error = self._error(context, batch, (still, still))
+        return self._rest_error
 
     def _batch(
         self, context: DeformationContext, frame: int, generator: torch.Generator
